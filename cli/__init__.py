@@ -1,0 +1,1 @@
+"""Command line of turbrestore: parse, call one function of the library, save."""

@@ -1,0 +1,94 @@
+"""Entry point: the commands, and how failures end."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from cyclopts import App, CycloptsError
+
+from turbrestore import __version__
+from turbrestore.errors import ConfigurationError, InputNotFoundError, TurbrestoreError
+
+if TYPE_CHECKING:
+    from cyclopts.argument import ArgumentCollection
+
+INTERRUPTED = 130
+STORAGE_FAILURE = 74
+BUG = 1
+
+
+def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
+    """Fill what no flag has set from the TOML file named by ``--config``."""
+    from pathlib import Path
+
+    from cyclopts.config import Toml
+
+    for argument in arguments:
+        if "--config" in argument.names and argument.tokens:
+            path = Path(argument.tokens[0].value)
+            if not path.is_file():
+                raise InputNotFoundError(f"{path}: no such settings file")
+            Toml(path, use_commands_as_keys=False)(app, commands, arguments)
+
+
+def build() -> App:
+    """Assemble the application; commands are imported when they run."""
+    app = App(
+        name="turbrestore",
+        help="Restore one sharp image from a video of a static scene seen through atmospheric turbulence.",
+        help_epilogue="Example: turbrestore restore haze.mp4 sharp.png",
+        version=__version__,
+        config=settings_file,
+        result_action="return_value",
+    )
+    package = __package__ or "turbrestore_cli"
+    app.command(f"{package}.restore:restore", help="Restore a video: the whole chain, input first, output last.")
+    app.command(f"{package}.stages:centroid", help="Find the centroid of a video.")
+    app.command(f"{package}.stages:flow", help="Measure the flow from one image to every frame of a video.")
+    app.command(f"{package}.stages:identify", help="Identify the dynamics of flows.")
+    app.command(f"{package}.stages:filter_", name="filter", help="Filter a video with known centroid and dynamics.")
+    app.command(f"{package}.stages:deconvolve", help="Deblur an image.")
+    app.command(f"{package}.inspection:info", help="Say what a video is.")
+    app.command(f"{package}.inspection:evaluate", help="Compare a result with the truth.")
+    return app
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Words after the program's name; by default those of the process.
+
+    Returns
+    -------
+    int
+        Exit code: 0 done, 2 usage, 65 bad data, 66 no such input, 73 cannot create the output, 74 I/O error,
+        130 interrupted, 1 a bug.
+    """
+    words = sys.argv[1:] if arguments is None else arguments
+    try:
+        build()(words, exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        return _fail(str(error), ConfigurationError.exit_code)
+    except TurbrestoreError as error:
+        return _fail(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        return _fail("interrupted", INTERRUPTED)
+    except OSError as error:
+        return _fail(f"{error.filename or 'system'}: {error.strerror or error}", STORAGE_FAILURE)
+    except MemoryError:
+        return _fail("out of memory; use --roi, fewer --train frames or a smaller video", BUG)
+    return 0
+
+
+def _fail(message: str, code: int) -> int:
+    text = " ".join(message.split())
+    sys.stderr.write(f"turbrestore: {text}\n")
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

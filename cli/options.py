@@ -1,0 +1,60 @@
+"""Options that several commands share, and how they are read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from turbrestore.errors import ConfigurationError
+from turbrestore.frame_source import FrameRange, Roi
+
+# A switch without a "--no-" twin.
+Flag = Annotated[bool, Parameter(negative="")]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which part of a video to read.
+
+    Parameters
+    ----------
+    frames : str, optional
+        Range of frames, ``start:stop`` or ``start:stop:step``, as ``0:200``; either end may be left out.
+    roi : str, optional
+        Region ``x,y,width,height`` in pixels.
+    """
+
+    frames: str | None = None
+    roi: str | None = None
+
+    def frame_range(self) -> FrameRange | None:
+        """Return (start, stop, step), None where left out."""
+        if self.frames is None:
+            return None
+        parts = self.frames.split(":")
+        if len(parts) not in (2, 3):
+            raise ConfigurationError(f"--frames: expected start:stop or start:stop:step, found {self.frames!r}")
+        start, stop, step = (_whole_number("--frames", part) if part else None for part in [*parts, ""][:3])
+        return start, stop, step
+
+    def region(self) -> Roi | None:
+        """Return (x, y, width, height)."""
+        if self.roi is None:
+            return None
+        parts = self.roi.split(",")
+        if len(parts) != 4:
+            raise ConfigurationError(f"--roi: expected x,y,width,height, found {self.roi!r}")
+        x, y, width, height = (_whole_number("--roi", part) for part in parts)
+        return x, y, width, height
+
+
+def _whole_number(option: str, text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        raise ConfigurationError(f"{option}: expected whole numbers, found {text!r}") from None
+    if value < 0:
+        raise ConfigurationError(f"{option}: expected numbers from 0, found {value}")
+    return value

@@ -1,0 +1,95 @@
+"""``turbrestore restore``: the whole chain."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from turbrestore.errors import ConfigurationError
+from turbrestore.images import check_output, read_image, write_image
+from turbrestore.pipeline import RestoreParams
+from turbrestore.pipeline import restore as run_pipeline
+from turbrestore.video import open_frames
+
+from .options import Flag, Selection
+from .output import check_keep, describe, print_json, save_stages, summary, write_settings
+from .progress import progress_bars, say
+
+
+def restore(
+    input: Path,
+    output: Path,
+    /,
+    *,
+    sigma: float | None = None,
+    selection: Annotated[Selection, Parameter(name="*")] = Selection(),
+    params: Annotated[RestoreParams, Parameter(name="*")] = RestoreParams(),
+    config: Path | None = None,
+    keep: Path | None = None,
+    truth: Path | None = None,
+    bit_depth: int | None = None,
+    overwrite: Flag = False,
+    json: Flag = False,
+    quiet: Flag = False,
+) -> None:
+    """Restore one sharp image from a video of a static scene.
+
+    Parameters
+    ----------
+    input : Path
+        Video (mp4, mkv, avi, mov, webm, gif), TIFF stack, SER, .npy, or folder of images.
+    output : Path
+        Image to write: .png (8 or 16 bit) or .tif (8, 16 bit or float).
+    sigma : float
+        Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.
+    config : Path
+        TOML file with settings; flags win over it.
+    keep : Path
+        Folder for the result of every stage.
+    truth : Path
+        Image of the true scene: every stage is compared with it.
+    bit_depth : int
+        Bits per channel of the output, 8, 16 or 32 (float, TIFF only).  Those of the input by default.
+    overwrite : bool
+        Replace existing outputs.
+    json : bool
+        Print what was done, as JSON, on standard output.
+    quiet : bool
+        No progress and no remarks.
+    """
+    settings = _with_sigma(params, sigma)
+    settings_path = output.with_name(output.name + ".toml")
+    check_output(output, [path for path in (input, config, truth) if path is not None], overwrite)
+    check_output(settings_path, [input], overwrite or config == settings_path, suffixes=None)
+    check_keep(keep, overwrite)
+    scene = None if truth is None else read_image(truth).image
+    source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
+    for warning in source.warnings:
+        say(f"{source.name}: {warning}", quiet)
+    with progress_bars(quiet) as progress:
+        restoration = run_pipeline(source, settings, progress)
+    depth = source.bit_depth if bit_depth is None else bit_depth
+    report = describe(restoration, scene)
+    write_image(output, restoration.image, depth, overwrite)
+    write_settings(settings_path, settings)
+    if keep is not None:
+        save_stages(keep, restoration, depth)
+    if json:
+        print_json({"input": str(input), "output": str(output), "settings": str(settings_path), **report})
+    else:
+        say(summary(output, restoration), quiet)
+
+
+def _with_sigma(params: RestoreParams, sigma: float | None) -> RestoreParams:
+    if sigma is None:
+        return params
+    if params.until != "deconvolve":
+        raise ConfigurationError(f"--sigma: has no effect with --until {params.until}; leave one of them out")
+    if params.deconvolution.sigma not in (None, sigma):
+        raise ConfigurationError(
+            f"--sigma: {sigma} contradicts deconvolution.sigma = {params.deconvolution.sigma}; leave one of them out"
+        )
+    return dataclasses.replace(params, deconvolution=dataclasses.replace(params.deconvolution, sigma=sigma))

@@ -1,0 +1,240 @@
+"""One command a stage: artifact in, artifact out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from cyclopts import Parameter
+
+from turbrestore.alternating import Filtered, FilterParams, filter_frames
+from turbrestore.artifacts import load_artifact, load_flows, load_stage_image, save_artifact, save_flows
+from turbrestore.centroid import Centroid, CentroidParams, find_centroid
+from turbrestore.deconvolution import Deconvolution, DeconvolutionParams
+from turbrestore.deconvolution import deconvolve as deconvolve_image
+from turbrestore.dynamics import DynamicsParams, FlowDynamics
+from turbrestore.dynamics import identify as identify_flows
+from turbrestore.flow import FlowParams, estimate_flow
+from turbrestore.images import IMAGE_OUTPUT_SUFFIXES, check_output, read_image, write_image
+from turbrestore.pipeline import stage_counter, training_share
+from turbrestore.psf import estimate_blur
+from turbrestore.video import open_frames
+
+from .options import Flag, Selection
+from .progress import progress_bars, say
+
+ARTIFACT = (".npz",)
+
+
+def centroid(
+    input: Path,
+    output: Path,
+    /,
+    *,
+    train: int | None = None,
+    selection: Annotated[Selection, Parameter(name="*")] = Selection(),
+    centroid: CentroidParams = CentroidParams(),
+    flow: FlowParams = FlowParams(),
+    overwrite: Flag = False,
+    quiet: Flag = False,
+) -> None:
+    """Find the centroid of the training frames of a video.
+
+    Parameters
+    ----------
+    input : Path
+        Video.
+    output : Path
+        Artifact to write, .npz; it holds the flows as well.
+    train : int
+        Frames to use, from the first on.
+    centroid : CentroidParams
+        Centroid iteration.
+    flow : FlowParams
+        Optical flow.
+    overwrite : bool
+        Replace an existing output.
+    quiet : bool
+        No progress and no remarks.
+    """
+    check_output(output, [input], overwrite, ARTIFACT)
+    source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
+    count = training_share(len(source), source.shape[1:], train)
+    with progress_bars(quiet) as progress:
+        found = find_centroid(
+            source.read(0, count), centroid, flow, stage_counter(progress, "centroid", count * centroid.iterations)
+        )
+    save_artifact(output, found, overwrite)
+    sizes = ", ".join(f"{size:.2f}" for size in found.mean_flow_sizes)
+    say(f"{output}: centroid of {count} frames, mean flow {sizes} pixels", quiet)
+
+
+def flow(
+    reference: Path,
+    input: Path,
+    output: Path,
+    /,
+    *,
+    selection: Annotated[Selection, Parameter(name="*")] = Selection(),
+    flow: FlowParams = FlowParams(),
+    overwrite: Flag = False,
+    quiet: Flag = False,
+) -> None:
+    """Measure the flow from one image to every frame of a video.
+
+    Parameters
+    ----------
+    reference : Path
+        Image, or centroid artifact.
+    input : Path
+        Video.
+    output : Path
+        Flows to write, .npy of shape (T, H, W, 2), pixels.
+    flow : FlowParams
+        Optical flow.
+    overwrite : bool
+        Replace an existing output.
+    quiet : bool
+        No progress and no remarks.
+    """
+    check_output(output, [reference, input], overwrite, (".npy",))
+    image = load_stage_image(reference)
+    source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
+    with progress_bars(quiet) as progress:
+        flows = estimate_flow(image, source.read(), flow, stage_counter(progress, "flow", len(source)))
+    save_flows(output, flows, overwrite)
+    say(f"{output}: {len(flows)} flows, root mean square {float(np.sqrt(np.mean(flows**2))):.2f} pixels", quiet)
+
+
+def identify(
+    flows: Path,
+    output: Path,
+    /,
+    *,
+    dynamics: DynamicsParams = DynamicsParams(),
+    overwrite: Flag = False,
+    quiet: Flag = False,
+) -> None:
+    """Identify the dynamics of flows.
+
+    Parameters
+    ----------
+    flows : Path
+        Centroid artifact (.npz), or flows (.npy).
+    output : Path
+        Artifact to write, .npz.
+    dynamics : DynamicsParams
+        Dynamic texture of the flow.
+    overwrite : bool
+        Replace an existing output.
+    quiet : bool
+        No remarks.
+    """
+    check_output(output, [flows], overwrite, ARTIFACT)
+    found = identify_flows(load_flows(flows), dynamics)
+    save_artifact(output, found, overwrite)
+    for note in found.notes:
+        say(f"{output}: {note}", quiet)
+    say(f"{output}: {found.rank} states hold {100 * found.energy_share:.0f} % of the motion", quiet)
+
+
+def filter_(
+    input: Path,
+    centroid: Path,
+    dynamics: Path,
+    output: Path,
+    /,
+    *,
+    selection: Annotated[Selection, Parameter(name="*")] = Selection(),
+    filter: FilterParams = FilterParams(),
+    flow: FlowParams = FlowParams(),
+    overwrite: Flag = False,
+    quiet: Flag = False,
+) -> None:
+    """Filter a video with known centroid and dynamics.
+
+    Parameters
+    ----------
+    input : Path
+        Video; its first frames are those that the centroid was found from.
+    centroid : Path
+        Centroid artifact.
+    dynamics : Path
+        Dynamics artifact.
+    output : Path
+        Artifact (.npz) or image (.png, .tif) to write.
+    filter : FilterParams
+        Alternating-estimation Kalman filter.
+    flow : FlowParams
+        Optical flow.
+    overwrite : bool
+        Replace an existing output.
+    quiet : bool
+        No progress and no remarks.
+    """
+    check_output(output, [input, centroid, dynamics], overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
+    start, model = load_artifact(centroid, Centroid), load_artifact(dynamics, FlowDynamics)
+    source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
+    total = len(source) * filter.inner_iterations - len(start.flows)
+    with progress_bars(quiet) as progress:
+        filtered = filter_frames(
+            source, start.image, model, filter, flow, start.flows, stage_counter(progress, "filter", total)
+        )
+    _write(output, filtered, source.bit_depth, overwrite)
+    say(f"{output}: {len(source)} frames filtered", quiet)
+
+
+def deconvolve(
+    input: Path,
+    output: Path,
+    /,
+    *,
+    sigma: float | None = None,
+    guide: Path | None = None,
+    deconvolution: DeconvolutionParams = DeconvolutionParams(),
+    bit_depth: int | None = None,
+    overwrite: Flag = False,
+    quiet: Flag = False,
+) -> None:
+    """Deblur an image.
+
+    Parameters
+    ----------
+    input : Path
+        Image, or artifact of the filter or the centroid.
+    output : Path
+        Image (.png, .tif) or artifact (.npz) to write.
+    sigma : float
+        Standard deviation of the Gaussian blur, pixels.  Estimated by default.
+    guide : Path
+        Image or artifact that the nonlocal weights are taken from; the input by default, the centroid in the paper.
+    deconvolution : DeconvolutionParams
+        Method and its settings.
+    bit_depth : int
+        Bits per channel of an image that is written: 8, 16 or 32; by default those of the input, 16 for artifacts.
+    overwrite : bool
+        Replace an existing output.
+    quiet : bool
+        No progress and no remarks.
+    """
+    inputs = [path for path in (input, guide) if path is not None]
+    check_output(output, inputs, overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
+    image = load_stage_image(input)
+    guide_image = image if guide is None else load_stage_image(guide)
+    if sigma is None:
+        sigma = deconvolution.sigma if deconvolution.sigma is not None else estimate_blur(image).sigma
+    with progress_bars(quiet) as progress:
+        counter = stage_counter(progress, "deconvolve", deconvolution.iterations)
+        result = deconvolve_image(image, sigma, deconvolution, guide=guide_image, progress=counter)
+    if bit_depth is None:
+        bit_depth = 16 if input.suffix in ARTIFACT else read_image(input).bit_depth
+    _write(output, result, bit_depth, overwrite)
+    say(f"{output}: blur of {sigma:.2f} pixels removed" if sigma > 0 else f"{output}: no blur removed", quiet)
+
+
+def _write(output: Path, result: Filtered | Deconvolution, bit_depth: int, overwrite: bool) -> None:
+    if output.suffix in ARTIFACT:
+        save_artifact(output, result, overwrite)
+    else:
+        write_image(output, result.image, bit_depth, overwrite)

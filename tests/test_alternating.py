@@ -1,0 +1,217 @@
+import itertools
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from conftest import make_sequence
+
+from turbrestore.alternating import FilterParams, filter_frames
+from turbrestore.centroid import find_centroid
+from turbrestore.dynamics import DynamicsParams, identify
+from turbrestore.errors import ConfigurationError, DataError
+from turbrestore.flow import FlowParams
+from turbrestore.kalman import Gaussian, PixelGaussian, predict, update, update_pixels
+from turbrestore.metrics import psnr
+from turbrestore.warp import warp
+
+INSIDE = (slice(12, -12), slice(12, -12))
+
+
+def quality(image, sequence, blur=1.0):
+    return psnr(image[INSIDE], cv2.GaussianBlur(sequence.scene, (0, 0), blur)[INSIDE])
+
+
+def start(sequence, train=None, **dynamics):
+    centroid = find_centroid(sequence.frames[:train])
+    return centroid, identify(centroid.flows, DynamicsParams(**dynamics))
+
+
+# Weak and strong, smooth and rough, correlated in time and not.
+@pytest.mark.parametrize(
+    "statistics",
+    [
+        {"seed": 1},
+        {"seed": 2, "rms": 0.5},
+        {"seed": 3, "rms": 2.5, "correlation_length": 20.0},
+        {"seed": 4, "correlation_length": 8.0, "rms": 1.0},
+        {"seed": 5, "persistence": 0.0},
+        {"seed": 6, "count": 8},
+    ],
+    ids=str,
+)
+def test_the_filter_never_ends_worse_than_the_centroid(statistics):
+    sequence = make_sequence(**statistics)
+    train = len(sequence.frames) // 2
+    centroid, dynamics = start(sequence, train)
+    filtered = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows)
+    assert quality(filtered.image, sequence) >= quality(centroid.image, sequence)
+
+
+def test_keeping_the_residual_beats_dropping_it():
+    sequence = make_sequence(seed=4, correlation_length=8.0)
+    centroid, dynamics = start(sequence)
+    keep, drop = (
+        filter_frames(
+            sequence.frames,
+            centroid.image,
+            dynamics,
+            FilterParams(residual=residual, sharpness=0, inner_iterations=1),
+            known_flows=centroid.flows,
+        )
+        for residual in ("keep", "drop")
+    )
+    assert quality(keep.image, sequence) > quality(drop.image, sequence) + 0.5
+    assert keep.motion_share > 0.5
+    assert drop.motion_share == 0
+
+
+def test_in_the_subspace_it_is_the_linear_kalman_filter(sequence):
+    """Flows that the model explains exactly: each part must follow the textbook filter."""
+    count, rank = 12, 3
+    _, model = start(sequence, rank=rank)
+    rng = np.random.default_rng(0)
+    states = rng.normal(0, 20, (count, rank))
+    flows = np.stack([model.mean_flow + (model.C @ xi.astype(np.float32)).reshape(96, 96, 2) for xi in states])
+    model = replace(model, R=0.04, residual_variance=np.zeros((96, 96), np.float32))
+    reference, frames = sequence.frames.mean(axis=0), sequence.frames[:count]
+    noise, prior_frames = 1e-3, 2.0
+    params = FilterParams(sharpness=0, image_noise=noise, prior_frames=prior_frames, inner_iterations=1)
+    filtered = filter_frames(frames, reference, model, params, known_flows=flows)
+
+    flow = Gaussian(np.zeros(rank), model.state_covariance)
+    image = PixelGaussian(reference, np.full((96, 96), noise / prior_frames, np.float32))
+    for frame, xi, found in zip(frames, states, filtered.flow_states, strict=True):
+        # With CᵀC = I the measurement Cᵀ(W − W̄) = ξ + Cᵀr says all that W does.
+        flow, _ = update(predict(flow, model.A, model.Q), xi, np.eye(rank), model.R * np.eye(rank))
+        assert np.allclose(found, flow.mean, rtol=1e-4, atol=1e-4)
+        estimate = model.mean_flow + (model.C @ flow.mean.astype(np.float32)).reshape(96, 96, 2)
+        image, _ = update_pixels(image, warp(frame, estimate), noise)
+    assert np.abs(filtered.image - image.mean).max() < 1e-3
+    assert np.allclose(filtered.variance, image.variance)
+
+
+def test_without_drift_and_sharpness_it_is_the_average_of_registered_frames(sequence):
+    centroid, dynamics = start(sequence, rank=2)
+    # Everything outside the subspace counts as motion, so each frame is warped by its measured flow.
+    dynamics = replace(dynamics, residual_variance=np.full((96, 96), 1e12, np.float32))
+    params = FilterParams(sharpness=0, inner_iterations=1)
+    filtered = filter_frames(sequence.frames, centroid.image, dynamics, params, known_flows=centroid.flows)
+    average = np.mean([warp(f, w) for f, w in zip(sequence.frames, centroid.flows, strict=True)], axis=0)
+    # The diffuse prior of variance 1 still weighs as much as Z of a frame.
+    assert np.abs(filtered.image - average).max() < 2e-3
+    assert np.allclose(filtered.gains, 1 / np.arange(1, 17), atol=2e-3)
+
+
+def test_the_diffuse_prior_forgets_the_reference(sequence):
+    centroid, dynamics = start(sequence)
+    tinted = filter_frames(sequence.frames, centroid.image + 0.1, dynamics, known_flows=centroid.flows)
+    plain = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows)
+    assert np.abs(tinted.image - plain.image)[INSIDE].mean() < 1e-3
+
+
+def test_sharper_frames_weigh_more():
+    sequence = make_sequence(seed=7, blur=0.0)
+    blurry = np.stack([cv2.GaussianBlur(f, (0, 0), 2.5) if k % 2 else f for k, f in enumerate(sequence.frames)])
+    centroid = find_centroid(blurry)
+    dynamics = identify(centroid.flows)
+    plain, sharp = (
+        filter_frames(blurry, centroid.image, dynamics, FilterParams(sharpness=b), known_flows=centroid.flows)
+        for b in (0.0, 2.0)
+    )
+    assert quality(sharp.image, sequence, blur=0.5) > quality(plain.image, sequence, blur=0.5) + 1
+
+
+def test_a_second_inner_iteration_does_not_count_frames_twice(sequence):
+    centroid, dynamics = start(sequence)
+    once, twice = (
+        filter_frames(
+            sequence.frames,
+            centroid.image,
+            dynamics,
+            FilterParams(inner_iterations=n, sharpness=0),
+            known_flows=centroid.flows,
+        )
+        for n in (1, 2)
+    )
+    assert np.allclose(once.variance, twice.variance)
+
+
+def test_drift_keeps_the_gain_up(sequence):
+    centroid, dynamics = start(sequence)
+    params = FilterParams(sharpness=0, image_noise=1e-3, image_drift=1e-4, inner_iterations=1)
+    filtered = filter_frames(sequence.frames, centroid.image, dynamics, params, known_flows=centroid.flows)
+    # Steady state of Σ⁺ = (Σ + S) Z / (Σ + S + Z).
+    drift, noise = 1e-4, 1e-3
+    prior = (drift + np.sqrt(drift**2 + 4 * drift * noise)) / 2
+    assert filtered.gains[-1] == pytest.approx(prior / (prior + noise), rel=0.02)
+
+
+def test_frames_are_streamed_a_block_at_a_time(sequence):
+    centroid, dynamics = start(sequence, 4)
+    taken, furthest = 0, 0
+
+    def stream():
+        nonlocal taken
+        for frame in itertools.islice(itertools.cycle(sequence.frames), 40):
+            taken += 1
+            yield frame
+
+    def progress(_):
+        nonlocal furthest
+        furthest = max(furthest, taken - progress.done)
+        progress.done += 1
+
+    progress.done = 0
+    params = FilterParams(block=5, inner_iterations=1)
+    filtered = filter_frames(stream(), centroid.image, dynamics, params, known_flows=centroid.flows, progress=progress)
+    assert len(filtered.gains) == 40
+    # Four training frames need no new flow; beyond them at most a block is in hand.
+    assert furthest <= 4 + 5
+
+
+def test_threads_do_not_change_the_result(sequence):
+    centroid, dynamics = start(sequence)
+    one, three = (
+        filter_frames(sequence.frames, centroid.image, dynamics, flow_params=FlowParams(threads=n)).image
+        for n in (1, 3)
+    )
+    assert (one == three).all()
+
+
+def test_colour_moves_with_luminance(sequence):
+    tint = np.array([1.0, 0.8, 0.6], np.float32)
+    frames = sequence.frames[:4, ..., None] * tint
+    centroid = find_centroid(frames)
+    filtered = filter_frames(frames, centroid.image, identify(centroid.flows), known_flows=centroid.flows)
+    assert filtered.image.shape == (96, 96, 3)
+    assert np.abs(filtered.image / tint - filtered.image[..., :1])[INSIDE].max() < 0.01
+
+
+def test_a_model_without_motion_works(sequence):
+    still = np.repeat(sequence.frames[:1], 5, axis=0)
+    dynamics = identify(np.zeros((5, 96, 96, 2), np.float32))
+    filtered = filter_frames(still, still[0], dynamics)
+    assert np.abs(filtered.image - still[0])[INSIDE].max() < 0.02
+
+
+def test_bad_input_is_refused(sequence):
+    centroid, dynamics = start(sequence, 4)
+    with pytest.raises(DataError, match="at least 1, found 0"):
+        filter_frames([], centroid.image, dynamics)
+    with pytest.raises(DataError, match="at least 4, found 2"):
+        filter_frames(sequence.frames[:2], centroid.image, dynamics, known_flows=centroid.flows)
+    with pytest.raises(DataError, match="dynamics: expected flows of"):
+        filter_frames(sequence.frames[:, :64], centroid.image[:64], dynamics)
+    for bad in (
+        {"residual": "half"},
+        {"inner_iterations": 0},
+        {"block": 0},
+        {"sharpness": -1.0},
+        {"sharpness_window": 0.0},
+        {"image_noise": 0.0},
+        {"image_drift": -1.0},
+        {"prior_frames": -1.0},
+    ):
+        with pytest.raises(ConfigurationError, match=f"^{next(iter(bad))}: expected"):
+            FilterParams(**bad)

@@ -1,0 +1,63 @@
+"""Rules of the layout, read off the source."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "turbrestore"
+# A module imports only from those before it.
+ORDER = [
+    "errors", "arrays", "parallel", "pixels", "images", "frame_source", "integrity", "ser", "tiff", "container",
+    "video", "warp", "flow", "centroid", "dynamics", "kalman", "alternating", "psf", "nonlocal_tv", "deconvolution",
+    "synthesis", "metrics", "pipeline", "artifacts",
+]  # fmt: skip
+HEAVY = {"torch", "kornia", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")
+
+
+def imports(path):
+    """Pairs of (top-level or not, imported module) of one file, relative imports as ``.name``."""
+    tree = ast.parse(path.read_text())
+    top = {id(node) for node in tree.body}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((id(node) in top, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield id(node) in top, "." * node.level + (node.module or node.names[0].name)
+
+
+def layer(path):
+    relative = path.relative_to(PACKAGE)
+    return relative.parts[0].removesuffix(".py")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: p.stem)
+def test_imports_point_downward(path):
+    rank = ORDER.index(layer(path))
+    for _, name in imports(path):
+        if name.startswith("."):
+            target = name.lstrip(".").split(".")[0]
+            same_folder = layer(path) == "synthesis" and not name.startswith("..")
+            assert same_folder or ORDER.index(target) < rank, f"{path.name} imports {name}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: p.stem)
+def test_heavy_imports_stay_inside_functions(path):
+    at_top = {name.split(".")[0] for top, name in imports(path) if top}
+    assert not at_top & HEAVY
+
+
+def test_every_module_is_placed():
+    assert {layer(path) for path in MODULES} == set(ORDER)
+
+
+@pytest.mark.parametrize("action", ["import turbrestore", "import turbrestore_cli.__main__ as m; m.main(['--help'])"])
+def test_nothing_heavy_is_loaded(action):
+    code = (
+        f"{action}\nimport sys\nprint(sorted({{'torch', 'kornia', 'matplotlib', 'cv2', 'scipy'}} & set(sys.modules)))"
+    )
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.splitlines()[-1] == "[]"

@@ -1,0 +1,141 @@
+import threading
+
+import numpy as np
+import pytest
+
+from turbrestore.errors import ConfigurationError, DataError
+from turbrestore.flow import (
+    FLOW_METHODS,
+    DisParams,
+    FarnebackParams,
+    FlowParams,
+    TvL1Params,
+    estimate_flow,
+    iterate_flows,
+    normalise_contrast,
+)
+from turbrestore.metrics import endpoint_error
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
+from turbrestore.warp import warp
+
+
+def texture(seed=0, size=96):
+    rng = np.random.default_rng(seed)
+    field = smooth_flows(1, size, size, rng, SmoothFlowParams(rms=0.15, correlation_length=2.0))[0, ..., 0]
+    return np.clip(0.5 + field, 0, 1)
+
+
+def pair(seed=0, rms=1.5):
+    """A reference, a frame, and the flow between them by the sign rule."""
+    flow = smooth_flows(1, 96, 96, np.random.default_rng(seed + 100), SmoothFlowParams(rms=rms))[0]
+    frame = texture(seed)
+    return warp(frame, flow), frame, flow
+
+
+# Largest end-point errors, pixels, for motion of 1.5 px a component on dense texture.
+@pytest.mark.parametrize(("method", "bound"), [("dis", 0.12), ("tvl1", 0.2), ("farneback", 0.3)])
+@pytest.mark.parametrize("seed", range(2))
+def test_known_motion_is_found(method, bound, seed):
+    reference, frame, truth = pair(seed)
+    found = estimate_flow(reference, frame[None], FlowParams(method=method))[0]
+    assert endpoint_error(found[8:-8, 8:-8], truth[8:-8, 8:-8]) < bound
+
+
+@pytest.mark.parametrize("method", FLOW_METHODS)
+def test_equal_images_do_not_move(method):
+    image = texture()
+    flow = estimate_flow(image, image[None], FlowParams(method=method))[0]
+    # Farneback invents motion within its neighbourhood of the border.
+    assert np.abs(flow[12:-12, 12:-12]).max() < 1e-3
+
+
+@pytest.mark.parametrize("method", FLOW_METHODS)
+def test_flat_images_give_finite_flow(method):
+    flat = np.full((32, 32), 0.5, np.float32)
+    assert np.isfinite(estimate_flow(flat, flat[None], FlowParams(method=method))).all()
+
+
+def test_classic_tvl1_finds_the_motion():
+    reference, frame, truth = pair(3)
+    found = estimate_flow(reference, frame[None], FlowParams(method="tvl1", tvl1=TvL1Params.classic()))[0]
+    assert endpoint_error(found[8:-8, 8:-8], truth[8:-8, 8:-8]) < 0.2
+
+
+def test_threads_do_not_change_the_result():
+    frames = np.stack([pair(seed)[1] for seed in range(5)])
+    one, three = (estimate_flow(texture(), frames, FlowParams(threads=n)) for n in (1, 3))
+    assert (one == three).all()
+
+
+def test_dark_and_faint_texture_registers_as_well_as_bright():
+    reference, frame, truth = pair(1)
+    faint = estimate_flow(0.1 + 0.05 * reference, (0.1 + 0.05 * frame)[None], FlowParams(contrast_floor=1e-4))[0]
+    assert endpoint_error(faint[8:-8, 8:-8], truth[8:-8, 8:-8]) < 0.15
+
+
+def test_normalised_contrast_has_zero_mean_and_unit_deviation():
+    image = texture(size=256) * np.linspace(0.1, 1, 256, dtype=np.float32)
+    normalised = normalise_contrast(image, 10.0, floor=1e-6)
+    thirds = np.array_split(normalised, 3, axis=1)
+    assert [round(float(part.mean()), 1) for part in thirds] == pytest.approx([0, 0, 0], abs=0.1)
+    assert [float(part.std()) for part in thirds] == pytest.approx([1, 1, 1], abs=0.1)
+
+
+def test_colour_is_measured_on_luminance():
+    reference, frame, _ = pair(0)
+    grey = estimate_flow(reference, frame[None])
+    colour = estimate_flow(np.repeat(reference[..., None], 3, 2), np.repeat(frame[None, ..., None], 3, 3))
+    assert np.abs(grey - colour).max() < 0.05
+
+
+def test_progress_is_told_of_every_frame():
+    calls = []
+    estimate_flow(texture(), np.stack([texture()] * 4), progress=calls.append)
+    assert calls == [1, 1, 1, 1]
+
+
+def test_frames_are_read_only_a_few_ahead():
+    taken = 0
+
+    def stream():
+        nonlocal taken
+        for _ in range(100):
+            taken += 1
+            yield texture()
+
+    flows = iterate_flows(texture(), stream(), FlowParams(threads=2))
+    next(flows)
+    assert taken <= 6
+    flows.close()
+    assert threading.active_count() < 10
+
+
+@pytest.mark.parametrize("size", [(8, 8), (15, 64)])
+def test_images_too_small_for_flow_are_refused(size):
+    image = np.zeros(size, np.float32)
+    with pytest.raises(DataError, match="at least 16×16 pixels"):
+        estimate_flow(image, image[None])
+
+
+def test_frames_of_another_size_are_refused():
+    with pytest.raises(DataError, match="frame 0: expected"):
+        estimate_flow(texture(size=96), texture(size=64)[None])
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: FlowParams(method="sift"), "method"),
+        (lambda: FlowParams(contrast_window=-1), "contrast_window"),
+        (lambda: FlowParams(contrast_floor=0), "contrast_floor"),
+        (lambda: FlowParams(threads=-1), "threads"),
+        (lambda: DisParams(patch_stride=9), "patch_stride"),
+        (lambda: DisParams(finest_scale=9), "finest_scale"),
+        (lambda: TvL1Params(median=2), "median"),
+        (lambda: TvL1Params(warps=0), "warps"),
+        (lambda: FarnebackParams(neighbourhood=6), "neighbourhood"),
+    ],
+)
+def test_bad_settings_name_themselves(make, name):
+    with pytest.raises(ConfigurationError, match=f"^{name}: expected"):
+        make()

@@ -1,0 +1,255 @@
+"""Stage results on disk: one ``.npz`` file each, arrays plus a JSON header, never a pickle.
+
+The header names the kind of result and the version of this layout, and holds every field that is not an array.
+Flow stacks by themselves are plain ``.npy`` files, which anything reads and which can be memory-mapped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .alternating import Filtered
+from .arrays import FloatArray, check_flow, check_image
+from .centroid import Centroid
+from .deconvolution import Deconvolution
+from .dynamics import FlowDynamics
+from .errors import DataError, InputNotFoundError
+from .images import atomic_output, check_output, read_image
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+SCHEMA = 1
+KINDS: dict[str, type[DataclassInstance]] = {
+    "centroid": Centroid,
+    "dynamics": FlowDynamics,
+    "filtered": Filtered,
+    "deconvolution": Deconvolution,
+}
+_HEADER = "header"
+
+Result = TypeVar("Result", bound="DataclassInstance")
+
+
+def save_artifact(path: str | os.PathLike[str], result: DataclassInstance, overwrite: bool = False) -> None:
+    """Write a stage result.
+
+    Parameters
+    ----------
+    path : path
+        Must end in ``.npz``.
+    result : Centroid, FlowDynamics, Filtered or Deconvolution
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    ConfigurationError
+        Another suffix.
+    OutputError
+        The file exists, or its folder does not.
+    StorageError
+        Writing failed; nothing is left behind.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile
+    >>> from turbrestore.dynamics import FlowDynamics, identify
+    >>> dynamics = identify(np.random.default_rng(0).normal(size=(5, 4, 4, 2)).astype(np.float32))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_artifact(folder + "/dynamics.npz", dynamics)
+    ...     again = load_artifact(folder + "/dynamics.npz", FlowDynamics)
+    >>> bool((again.A == dynamics.A).all())
+    True
+    """
+    target = Path(path)
+    check_output(target, overwrite=overwrite, suffixes=(".npz",))
+    kind = _kind_of(type(result))
+    values = {item.name: getattr(result, item.name) for item in dataclasses.fields(result)}
+    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    others = {name: value for name, value in values.items() if name not in arrays}
+    header = json.dumps({"kind": kind, "schema": SCHEMA, "fields": others})
+    with atomic_output(target, overwrite) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, **{_HEADER: np.array(header)}, **arrays)
+
+
+def load_artifact(path: str | os.PathLike[str], kind: type[Result]) -> Result:
+    """Read a stage result back.
+
+    Parameters
+    ----------
+    path : path
+        File written by :func:`save_artifact`.
+    kind : type
+        Class that is expected.
+
+    Returns
+    -------
+    instance of ``kind``
+
+    Raises
+    ------
+    InputNotFoundError
+        There is no such file.
+    DataError
+        The file is damaged, of another kind, or of another version of the layout.
+
+    Examples
+    --------
+    >>> from turbrestore.centroid import Centroid
+    >>> load_artifact("missing.npz", Centroid)
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.InputNotFoundError: missing.npz: no such file
+    """
+    name, (found, fields) = _kind_of(kind), _read(Path(path))
+    if found != name:
+        raise DataError(f"{path}: expected a {name} artifact, found a {found} artifact")
+    return _build(Path(path), kind, fields)
+
+
+def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
+    """Read an image file, or the image of an artifact that has one.
+
+    Parameters
+    ----------
+    path : path
+        Image, or ``.npz`` of a centroid, a filtered or a deconvolved image.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W) or (H, W, 3)
+
+    Raises
+    ------
+    InputNotFoundError
+        There is no such file.
+    DataError
+        The file is damaged or holds no image.
+
+    Examples
+    --------
+    >>> load_stage_image("missing.npz")
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.InputNotFoundError: missing.npz: no such file
+    """
+    source = Path(path)
+    if source.suffix != ".npz":
+        return read_image(source).image
+    kind, fields = _read(source)
+    if "image" not in fields:
+        raise DataError(f"{source}: expected an artifact with an image, found a {kind} artifact")
+    return check_image(fields["image"], str(source))
+
+
+def save_flows(path: str | os.PathLike[str], flows: ArrayLike, overwrite: bool = False) -> None:
+    """Write flows as a ``.npy`` file.
+
+    Parameters
+    ----------
+    path : path
+        Must end in ``.npy``.
+    flows : array_like, shape (T, H, W, 2)
+        Pixels.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    ConfigurationError
+        Another suffix.
+    OutputError
+        The file exists, or its folder does not.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_flows(folder + "/flows.npy", np.zeros((2, 4, 4, 2)))
+    ...     load_flows(folder + "/flows.npy").shape
+    (2, 4, 4, 2)
+    """
+    target = Path(path)
+    check_output(target, overwrite=overwrite, suffixes=(".npy",))
+    with atomic_output(target, overwrite) as temporary, temporary.open("wb") as stream:
+        np.save(stream, check_flow(flows, "flows"), allow_pickle=False)
+
+
+def load_flows(path: str | os.PathLike[str]) -> FloatArray:
+    """Read flows from a ``.npy`` file, or those of a centroid artifact.
+
+    Parameters
+    ----------
+    path : path
+        ``.npy``, or ``.npz`` of a centroid.
+
+    Returns
+    -------
+    ndarray, float32, shape (T, H, W, 2)
+        Memory-mapped if it comes from ``.npy``.
+
+    Raises
+    ------
+    InputNotFoundError
+        There is no such file.
+    DataError
+        The file is damaged or holds something else.
+
+    Examples
+    --------
+    >>> load_flows("missing.npy")
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.InputNotFoundError: missing.npy: no such file
+    """
+    source = Path(path)
+    if source.suffix == ".npz":
+        return load_artifact(source, Centroid).flows
+    if not source.is_file():
+        raise InputNotFoundError(f"{source}: no such file")
+    try:
+        flows = np.load(source, mmap_mode="r", allow_pickle=False)
+    except (OSError, EOFError, ValueError) as error:
+        raise DataError(f"{source}: expected flows in a .npy file, found something else") from error
+    if flows.ndim != 4:
+        raise DataError(f"{source}: expected flows of shape (T, H, W, 2), found {flows.shape}")
+    return check_flow(flows, str(source))
+
+
+def _read(source: Path) -> tuple[str, dict[str, Any]]:
+    """Kind and fields of an artifact."""
+    if not source.is_file():
+        raise InputNotFoundError(f"{source}: no such file")
+    try:
+        with np.load(source, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+        header: dict[str, Any] = json.loads(str(arrays.pop(_HEADER)))
+        kind, schema, fields = str(header["kind"]), header["schema"], {**header["fields"], **arrays}
+    except (OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+        raise DataError(f"{source}: expected an artifact of turbrestore, found something else or damage") from error
+    if schema != SCHEMA or kind not in KINDS:
+        raise DataError(f"{source}: expected an artifact of layout {SCHEMA}, found a {kind} of layout {schema}")
+    return kind, fields
+
+
+def _build(source: Path, kind: type[Result], fields: dict[str, Any]) -> Result:
+    expected = {item.name for item in dataclasses.fields(kind)}
+    if set(fields) != expected:
+        raise DataError(f"{source}: expected the fields {sorted(expected)}, found {sorted(fields)}")
+    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})
+
+
+def _kind_of(cls: type) -> str:
+    for name, known in KINDS.items():
+        if known is cls:
+            return name
+    raise DataError(f"artifact: expected one of {', '.join(KINDS)}, found {cls.__name__}")

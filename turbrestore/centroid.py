@@ -1,0 +1,166 @@
+"""The centroid: the image at the mean geometry of the frames (paper 3, §3.2, eq. 12).
+
+Symbols
+-------
+q : current estimate of the centroid
+W_i : flow from q to frame I_i; W̄ their mean, which vanishes at the centroid
+V : inverse flow, ``(id + V) = (id + W̄)^{-1}``
+
+The image moves *with* the mean flow, so backward warping needs the inverse, ``q ← q ∘ (id + W̄)^{-1}``; the paper
+leaves this open.  Two departures from it: flows are composed and frames are interpolated once, where the paper warps
+the warped image again in every iteration; and ``fused`` (the default) averages all registered frames, where the
+paper (``single``) keeps one warped frame with all of its noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arrays import FloatArray, check_frames
+from .errors import require
+from .flow import FlowParams, estimate_flow
+from .parallel import map_ahead
+from .warp import compose_flows, invert_flow, warp
+
+MODES = ("fused", "single")
+
+
+@dataclass(frozen=True)
+class CentroidParams:
+    """How the centroid is iterated.
+
+    Parameters
+    ----------
+    mode : {"fused", "single"}
+        Average of the registered frames, or one warped frame as in the paper.
+    iterations : int
+        Largest number of iterations; each costs one flow per frame.  The paper runs 10.
+    tolerance : float
+        Stop when the mean flow is shorter than this, pixels (mean over the image).  Flow methods have a bias of about
+        that size, so what is left below it is not corrected: that would bend the image.
+    start : int
+        Frame that ``single`` warps; ``fused`` starts from the temporal mean.
+    """
+
+    mode: Literal["fused", "single"] = "fused"
+    iterations: int = 5
+    tolerance: float = 0.2
+    start: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.mode in MODES, f"mode: expected one of {', '.join(MODES)}, found {self.mode!r}")
+        require(self.iterations >= 1, f"iterations: expected 1 or more, found {self.iterations}")
+        require(self.tolerance >= 0, f"tolerance: expected 0 or more pixels, found {self.tolerance}")
+        require(self.start >= 0, f"start: expected a frame number from 0, found {self.start}")
+
+
+@dataclass(frozen=True)
+class Centroid:
+    """The centroid of a stack of frames.
+
+    Attributes
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        The centroid (ρ̃ in the paper).
+    flows : ndarray, float32, shape (T, H, W, 2)
+        Flows from the centroid to each frame, pixels.
+    mean_flow_sizes : ndarray, float64, shape (iterations,)
+        Mean length of W̄ found in each iteration, pixels.  Those above the tolerance have been corrected.
+    converged : bool
+        Whether the last of them is below the tolerance.
+    """
+
+    image: FloatArray
+    flows: FloatArray
+    mean_flow_sizes: np.ndarray
+    converged: bool
+
+
+def find_centroid(
+    frames: ArrayLike,
+    params: CentroidParams | None = None,
+    flow_params: FlowParams | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Centroid:
+    """Iterate to the centroid of ``frames``.
+
+    Parameters
+    ----------
+    frames : array_like, shape (T, H, W) or (T, H, W, 3)
+        At least two frames.
+    params : CentroidParams, optional
+        Mode and stopping.
+    flow_params : FlowParams, optional
+        How flow is measured.
+    progress : callable, optional
+        Called with 1 after each flow.
+
+    Returns
+    -------
+    Centroid
+
+    Raises
+    ------
+    DataError
+        Fewer than two frames, wrong shapes or values that are not finite.
+    ConfigurationError
+        ``start`` is not a frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:48, :48]
+    >>> left, right = (0.5 + 0.2 * np.sin((x + s) / 3.0) * np.cos(y / 4.0) for s in (-0.5, 0.5))
+    >>> centroid = find_centroid(np.stack([left, right]).astype(np.float32))
+    >>> centroid.converged, centroid.image.shape
+    (True, (48, 48))
+    """
+    params = params or CentroidParams()
+    stack = check_frames(frames, at_least=2)
+    require(params.start < len(stack), f"start: expected a frame below {len(stack)}, found {params.start}")
+    image = stack.mean(axis=0, dtype=np.float32) if params.mode == "fused" else stack[params.start]
+    total = np.zeros((*stack.shape[1:3], 2), np.float32)
+    sizes: list[float] = []
+    while True:
+        flows = estimate_flow(image, stack, flow_params, progress)
+        mean_flow = flows.mean(axis=0, dtype=np.float32)
+        sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
+        converged = sizes[-1] <= params.tolerance
+        if not converged:
+            recentre = invert_flow(mean_flow)
+            total = compose_flows(total, recentre)
+            for index in range(len(flows)):
+                flows[index] = compose_flows(flows[index], recentre)
+        image = mean_registered(stack, flows) if params.mode == "fused" else warp(stack[params.start], total)
+        if converged or len(sizes) == params.iterations:
+            return Centroid(image, flows, np.array(sizes), converged)
+
+
+def mean_registered(frames: FloatArray, flows: FloatArray) -> FloatArray:
+    """Average of frames warped onto the reference that their flows start from.
+
+    Parameters
+    ----------
+    frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
+    flows : ndarray, float32, shape (T, H, W, 2)
+        Pixels.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W) or (H, W, 3)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> mean_registered(np.ones((2, 4, 4), np.float32), np.zeros((2, 4, 4, 2), np.float32))[0]
+    array([1., 1., 1., 1.], dtype=float32)
+    """
+    total = np.zeros(frames.shape[1:], np.float64)
+    for _, registered in map_ahead(lambda pair: warp(*pair), zip(frames, flows, strict=True)):
+        total += registered
+    return (total / len(frames)).astype(np.float32)

@@ -1,0 +1,419 @@
+"""Still images in and out, and how any file is written.
+
+Every file is written under a temporary name in its folder and takes its real name only when it is complete
+(:func:`atomic_output`), so a failure leaves nothing behind.
+
+OpenCV decodes the images, because imageio and Pillow cut 16-bit RGB down to 8 bits. The size is taken from the
+header first: OpenCV would allocate whatever a forged header asks for.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import secrets
+import warnings
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arrays import FloatArray, check_image, from_unit
+from .errors import ConfigurationError, DataError, InputNotFoundError, OutputError, StorageError
+from .pixels import MAX_PIXELS, PixelArray, check_depth, check_pixel_count, depth_of, full_scale_of, to_unit
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
+IMAGE_OUTPUT_SUFFIXES = (".png", ".tif", ".tiff")
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFile:
+    """A still image and what its file said about it.
+
+    Attributes
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        Intensities in [0, 1], RGB.
+    bit_depth : int
+        8, 16, or 32 for floating point files.
+    warnings : tuple of str
+        What was left out, such as an alpha channel.
+    """
+
+    image: FloatArray
+    bit_depth: int
+    warnings: tuple[str, ...] = ()
+
+
+def read_image(path: str | os.PathLike[str]) -> ImageFile:
+    """Read a still image.
+
+    Parameters
+    ----------
+    path : path-like
+        PNG, JPEG, TIFF (one page), BMP, PGM, PPM or WebP file.
+
+    Returns
+    -------
+    ImageFile
+
+    Raises
+    ------
+    InputNotFoundError
+        No such file.
+    DataError
+        Not an image, damaged, too large, more than one page, or values that are no intensities.
+    StorageError
+        The file cannot be read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_image(folder + "/a.png", np.array([[0.0, 1.0]], np.float32), bit_depth=8)
+    ...     read_image(folder + "/a.png")
+    ImageFile(image=array([[0., 1.]], dtype=float32), bit_depth=8, warnings=())
+    """
+    path = Path(path)
+    pixels, notes = read_pixels(path)
+    return ImageFile(to_unit(pixels, full_scale_of(pixels.dtype, str(path)), str(path)), depth_of(pixels.dtype), notes)
+
+
+def read_pixels(path: Path) -> tuple[PixelArray, tuple[str, ...]]:
+    """Read a still image as its file has it: grey or RGB, alpha dropped, values not scaled.
+
+    Parameters
+    ----------
+    path : Path
+        See :func:`read_image`.
+
+    Returns
+    -------
+    pixels : ndarray, shape (H, W) or (H, W, 3)
+        In the type of the file.
+    warnings : tuple of str
+        What was left out.
+
+    Raises
+    ------
+    InputNotFoundError, DataError, StorageError
+        As :func:`read_image`.
+    """
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        raise DataError(f"{path}: expected an image ({', '.join(IMAGE_SUFFIXES)}), found {path.suffix or 'no suffix'}")
+    with input_errors(path):
+        data = path.read_bytes()
+    if not data:
+        raise DataError(f"{path}: the file is empty")
+    _check_header(path, data)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise DataError(f"{path}: cannot be decoded as an image; the file is damaged or of an unsupported kind")
+    if pixels.ndim == 2:
+        return pixels, ()
+    notes = ("alpha channel ignored",) if pixels.shape[2] == 4 else ()
+    return np.ascontiguousarray(pixels[..., 2::-1]), notes
+
+
+def write_image(
+    path: str | os.PathLike[str], image: ArrayLike, bit_depth: int | None = None, overwrite: bool = False
+) -> None:
+    """Write a still image as PNG or TIFF, chosen by the suffix.
+
+    Parameters
+    ----------
+    path : path-like
+        Ends in ``.png``, ``.tif`` or ``.tiff``.
+    image : array_like, shape (H, W) or (H, W, 3)
+        Intensities; values outside [0, 1] are clipped.
+    bit_depth : int, optional
+        1 to 8 gives 8 bits, 9 to 16 gives 16 bits (always scaled to the full range of the file), 32 gives
+        floating point in TIFF and 16 bits in PNG. By default 32.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    ConfigurationError
+        Unsupported suffix or bit depth.
+    DataError
+        The image has the wrong shape or is not finite.
+    OutputError
+        The file exists, or its folder is missing or not writable.
+    StorageError
+        Writing failed half-way; nothing is left behind.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_image(folder + "/a.tif", np.full((2, 2), 0.3, np.float32))
+    ...     read_image(folder + "/a.tif").image[0]
+    array([0.3, 0.3], dtype=float32)
+    """
+    path = Path(path)
+    check_output(path, overwrite=overwrite)
+    depth = check_depth(32 if bit_depth is None else bit_depth)
+    data = _encode(path, check_image(image, "image"), depth)
+    atomic_write(path, data, overwrite=overwrite)
+
+
+def check_output(
+    path: str | os.PathLike[str],
+    inputs: Iterable[str | os.PathLike[str]] = (),
+    overwrite: bool = False,
+    suffixes: Collection[str] | None = IMAGE_OUTPUT_SUFFIXES,
+) -> None:
+    """Refuse an output that cannot be created, before any work begins.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to be written.
+    inputs : iterable of path-like
+        Files and folders that are read; the output is none of them, under any name, nor inside such a folder.
+    overwrite : bool
+        Whether an existing file may be replaced.
+    suffixes : collection of str, optional
+        Suffixes that the writer supports, lower case with the dot; None allows any.
+
+    Raises
+    ------
+    ConfigurationError
+        Unsupported suffix.
+    OutputError
+        The path is a folder, an input, exists already, or its folder is missing or not writable.
+
+    Examples
+    --------
+    >>> check_output("result.xyz")
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.ConfigurationError: result.xyz: expected a name that ends in .png, .tif or .tiff, found .xyz
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffixes is not None and suffix not in suffixes:
+        *others, last = suffixes
+        names = f"{', '.join(others)} or {last}" if others else last
+        raise ConfigurationError(f"{path}: expected a name that ends in {names}, found {suffix or 'no suffix'}")
+    try:
+        folder = Path(os.path.realpath(path)).parent
+        if path.is_dir():
+            raise OutputError(f"{path}: is a folder; name a file in it")
+        if not folder.is_dir():
+            raise OutputError(f"{path}: the folder {folder} does not exist; create it first")
+        for source in map(Path, inputs):
+            _check_not_input(path, folder, source)
+        if path.exists() and not overwrite:
+            raise OutputError(f"{path}: exists already; choose another name or allow overwriting")
+        if not os.access(folder, os.W_OK):
+            raise OutputError(f"{path}: the folder {folder} is not writable")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be created ({error.strerror or error})") from error
+
+
+@contextmanager
+def atomic_output(path: str | os.PathLike[str], overwrite: bool = False) -> Iterator[Path]:
+    """Give a temporary file in the folder of ``path``, and rename it to ``path`` when the block has succeeded.
+
+    Whatever ends the block early, Ctrl-C included, removes the temporary file and leaves ``path`` as it was.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to be written; a symbolic link is followed.
+    overwrite : bool
+        Replace an existing file.
+
+    Yields
+    ------
+    Path
+        An empty file to write to.
+
+    Raises
+    ------
+    OutputError
+        The file exists, or no file can be created in its folder.
+    StorageError
+        Writing failed half-way.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with atomic_output(folder + "/a.txt") as temporary:
+    ...         _ = temporary.write_text("complete")
+    ...     Path(folder, "a.txt").read_text()
+    'complete'
+    """
+    check_output(path, overwrite=overwrite, suffixes=None)
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{secrets.token_hex(8)}.part")
+    try:
+        temporary.open("xb").close()
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be created ({error.strerror or error})") from error
+    try:
+        yield temporary
+        # A new descriptor flushes what the writer left to the system, whoever wrote it.
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(target)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror or error}); nothing was saved") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def atomic_write(path: str | os.PathLike[str], data: bytes, overwrite: bool = False) -> None:
+    """Write a whole file or nothing.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to be written.
+    data : bytes
+        Its content.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    OutputError, StorageError
+        As :func:`atomic_output`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     atomic_write(folder + "/a.json", b"{}")
+    ...     Path(folder, "a.json").read_bytes()
+    b'{}'
+    """
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextmanager
+def input_errors(path: Path) -> Iterator[None]:
+    """Turn the system's errors while reading ``path`` into turbrestore's.
+
+    Parameters
+    ----------
+    path : Path
+        The file or folder that is read.
+
+    Raises
+    ------
+    InputNotFoundError
+        It does not exist.
+    StorageError
+        It cannot be read, for example for want of permission.
+
+    Examples
+    --------
+    >>> with input_errors(Path("missing.mkv")):
+    ...     Path("missing.mkv").read_bytes()
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.InputNotFoundError: missing.mkv: no such file or folder
+    """
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise InputNotFoundError(f"{path}: no such file or folder") from error
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def _check_header(path: Path, data: bytes) -> None:
+    """Refuse by the header what must not be decoded: too many pixels, several pages, broken PNG checksums."""
+    if path.suffix.lower() in (".tif", ".tiff"):
+        import tifffile
+
+        try:
+            with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+                pages, width, height = len(tiff.pages), tiff.pages.first.imagewidth, tiff.pages.first.imagelength
+        except Exception as error:  # tifffile documents no closed list of exceptions for damaged files
+            raise DataError(f"{path}: not a TIFF file, or damaged ({first_line(error)})") from error
+        if pages != 1:
+            raise DataError(f"{path}: expected one image, found {pages} pages; read it as a video")
+    else:
+        width, height = _pillow_size(path, data)
+    check_pixel_count(width, height, str(path))
+
+
+def _pillow_size(path: Path, data: bytes) -> tuple[int, int]:
+    import PIL.Image
+
+    try:
+        with warnings.catch_warnings():
+            # Pillow's own limit is lower than MAX_PIXELS and would speak twice.
+            warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
+            with PIL.Image.open(io.BytesIO(data)) as header:
+                size = header.size
+                # Checks PNG checksums without inflating; libpng would print its complaint to the terminal.
+                header.verify()
+    except PIL.Image.DecompressionBombError as error:
+        raise DataError(f"{path}: expected up to {MAX_PIXELS} pixels, found far more ({first_line(error)})") from error
+    except Exception as error:  # Pillow raises SyntaxError, ValueError, struct.error, … by the format
+        raise DataError(f"{path}: not an image, or damaged ({first_line(error)})") from error
+    return size
+
+
+def _encode(path: Path, image: FloatArray, depth: int) -> bytes:
+    is_tiff = path.suffix.lower() != ".png"
+    if depth == 32 and is_tiff:
+        pixels: PixelArray = np.clip(image, 0, 1)
+    else:
+        pixels = from_unit(image, 8 if depth <= 8 else 16)
+    if is_tiff:
+        import tifffile
+
+        buffer = io.BytesIO()
+        photometric = "minisblack" if image.ndim == 2 else "rgb"
+        tifffile.imwrite(buffer, pixels, photometric=photometric, metadata=None)
+        return buffer.getvalue()
+    done, data = cv2.imencode(".png", pixels if image.ndim == 2 else pixels[..., ::-1])
+    if not done:
+        raise StorageError(f"{path}: the PNG encoder failed on an image of shape {image.shape}")
+    return data.tobytes()
+
+
+def first_line(error: BaseException) -> str:
+    r"""First line of an error's message, for messages of one line.
+
+    Parameters
+    ----------
+    error : BaseException
+        Any error.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> first_line(ValueError("too short\nmore"))
+    'too short'
+    """
+    # A failed look-up says no more than its key.
+    lines = [] if isinstance(error, LookupError) else str(error).splitlines()
+    return (lines or [type(error).__name__])[0]
+
+
+def _check_not_input(path: Path, folder: Path, source: Path) -> None:
+    if source.is_dir() and source.samefile(folder):
+        raise OutputError(f"{path}: lies in the input folder {source}; choose another folder")
+    if path.exists() and source.exists() and path.samefile(source):
+        raise OutputError(f"{path}: is the input {source}; choose another name")

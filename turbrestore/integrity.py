@@ -1,0 +1,139 @@
+"""Damage that decoders do not report: files that were cut short, and FFV1 slices whose checksum fails.
+
+A truncated Matroska file decodes without complaint to fewer frames. The outermost element of each container states
+its own size, so comparing it with the size of the file finds every cut, whatever the codec and frame rate.
+
+An FFV1 encoder can add a checksum to each slice (CRC-32, polynomial 0x04C11DB7, most significant bit first, start
+0; RFC 9043, sections 4.3 and 4.9). The decoder only logs a mismatch, and logs are global to the process. The bits
+of zlib's CRC-32 run the other way round, so it computes the same checksum on bit-reversed bytes.
+"""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import BinaryIO
+
+_REVERSED_BITS = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
+_EBML_HEADER, _MATROSKA_SEGMENT = b"\x1aE\xdf\xa3", b"\x18S\x80g"
+_MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"moof", b"mfra", b"wide", b"free", b"skip", b"pnot", b"styp", b"sidx")
+# Some writers count the RIFF header into the size that excludes it.
+_RIFF_SLACK = 16
+
+
+def is_cut_short(path: Path) -> bool:
+    """Whether a video file ends before its outermost structure does.
+
+    Parameters
+    ----------
+    path : Path
+        Matroska or WebM, MP4 or MOV, AVI or GIF, told by content. Others are never called cut short, nor are live
+        recordings that do not state their size.
+
+    Returns
+    -------
+    bool
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "a.avi")
+    ...     _ = path.write_bytes(b"RIFF" + (1000).to_bytes(4, "little") + b"AVI " + bytes(500))
+    ...     is_cut_short(path)
+    True
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(12)
+        if head.startswith(_EBML_HEADER):
+            return _matroska_end(file, size) > size
+        if head.startswith(b"RIFF"):
+            return _riff_end(file, size) > size + _RIFF_SLACK
+        if head[4:8] in _MP4_BOXES:
+            return _mp4_end(file, size) > size
+        if head.startswith(b"GIF8"):
+            file.seek(max(0, size - 256))
+            return not file.read().rstrip(b"\0").endswith(b";")
+    return False
+
+
+def ffv1_slices_intact(packet: bytes) -> bool | None:
+    """Whether all slices of an FFV1 frame pass their checksums.
+
+    Parameters
+    ----------
+    packet : bytes
+        One coded frame, FFV1 version 3.
+
+    Returns
+    -------
+    bool or None
+        None if the bytes are not divided into slices with checksums.
+
+    Examples
+    --------
+    >>> ffv1_slices_intact(b"no slices in here") is None
+    True
+    """
+    end, intact = len(packet), True
+    while end > 0:
+        # Footer of a slice: size of what precedes it (3 bytes), error status (1), checksum (4).
+        start = end - 8 - int.from_bytes(packet[max(0, end - 8) : max(0, end - 5)], "big")
+        if end < 8 or start < 0:
+            return None
+        # Over data and checksum together the remainder is 0; zlib inverts before and after.
+        intact = intact and zlib.crc32(packet[start:end].translate(_REVERSED_BITS), 0xFFFFFFFF) == 0xFFFFFFFF
+        end = start
+    return intact
+
+
+def _matroska_end(file: BinaryIO, size: int) -> int:
+    position = 0
+    while position < size:
+        file.seek(position)
+        head = file.read(12)
+        # What other programs append belongs to no Matroska structure.
+        if not head.startswith((_EBML_HEADER, _MATROSKA_SEGMENT)) or len(head) < 5:
+            break
+        length = 9 - head[4].bit_length()
+        field = head[4 : 4 + length]
+        if length > 8 or len(field) < length:
+            break
+        content = int.from_bytes(field, "big") & ((1 << 7 * length) - 1)
+        if content == (1 << 7 * length) - 1:
+            break  # all ones: size unknown, a live recording
+        position += 4 + length + content
+    return position
+
+
+def _riff_end(file: BinaryIO, size: int) -> int:
+    position = 0
+    while position + 8 <= size:
+        file.seek(position)
+        tag, length = file.read(4), int.from_bytes(file.read(4), "little")
+        if tag != b"RIFF" or length == 0:
+            break
+        position += 8 + length + length % 2
+    return position
+
+
+def _mp4_end(file: BinaryIO, size: int) -> int:
+    position = 0
+    while position + 8 <= size:
+        file.seek(position)
+        head = file.read(16)
+        length = int.from_bytes(head[:4], "big")
+        if head[4:8] not in _MP4_BOXES and position + length > size:
+            break  # appended by other programs
+        if length == 1:
+            length = int.from_bytes(head[8:], "big")
+        if length < 8:
+            break  # 0: to the end of the file
+        position += length
+    return position

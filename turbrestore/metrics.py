@@ -1,0 +1,263 @@
+"""How good is a restoration: against ground truth, and without it.
+
+A restoration knows the scene only up to the mean displacement of its video, and some methods crop.  :func:`align`
+takes both out once, for every figure: the result is located inside the truth by normalised cross-correlation, a
+remaining sub-pixel shift is found by phase correlation, and a border is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arrays import FloatArray, check_flow, check_image
+from .errors import DataError
+
+BORDER = 30
+# A margin that the sub-pixel shift may pull in from outside, cut off after it.
+_GUARD = 6
+_LARGEST_SHIFT = 3.0
+# What is left after the border must hold the 7×7 window of the structural similarity.
+_SMALLEST = 2 * BORDER + 8
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Figures of a result against the truth.
+
+    Attributes
+    ----------
+    psnr : float
+        Peak signal-to-noise ratio after alignment, dB.
+    psnr_fit : float
+        The same after the best gain and offset, dB.
+    ssim : float
+        Structural similarity after that fit.
+    """
+
+    psnr: float
+    psnr_fit: float
+    ssim: float
+
+
+def compare(result: ArrayLike, truth: ArrayLike) -> Comparison:
+    """Compare a result with the truth, both reduced to grey by the mean of the channels.
+
+    Parameters
+    ----------
+    result : array_like, shape (H, W) or (H, W, 3)
+        At least 68×68 pixels; may be a crop of the scene.
+    truth : array_like, shape (H', W') or (H', W', 3)
+        The scene.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    DataError
+        An image is too small, larger than the truth, or not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> truth = np.random.default_rng(0).random((128, 128)).astype(np.float32)
+    >>> round(compare(truth + 0.1, truth).psnr)
+    20
+    """
+    from skimage.metrics import structural_similarity
+
+    a, t = align(result, truth)
+    design = np.stack([a.ravel(), np.ones(a.size, np.float32)], axis=1)
+    gain, offset = np.linalg.lstsq(design, t.ravel(), rcond=None)[0]
+    fitted = (gain * a + offset).astype(np.float32)
+    ssim = structural_similarity(t, np.clip(fitted, 0, 1), data_range=1.0)
+    return Comparison(psnr(a, t), psnr(fitted, t), float(ssim))
+
+
+def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Cut result and truth to the same interior, after removing crop and global shift.
+
+    Parameters
+    ----------
+    result : array_like, shape (H, W) or (H, W, 3)
+    truth : array_like, shape (H', W') or (H', W', 3)
+
+    Returns
+    -------
+    result, truth : ndarray, float32
+        Same shape, grey.
+
+    Raises
+    ------
+    DataError
+        An image is too small, or the result does not fit inside the truth.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> truth = np.random.default_rng(0).random((128, 128)).astype(np.float32)
+    >>> a, t = align(truth[4:, 7:], truth)
+    >>> bool(np.allclose(a, t, atol=0.02))
+    True
+    """
+    from skimage.registration import phase_cross_correlation
+
+    image, scene = _grey(result, "result"), _grey(truth, "truth")
+    for name, array in (("result", image), ("truth", scene)):
+        if min(array.shape) < _SMALLEST:
+            raise DataError(f"{name}: expected at least {_SMALLEST} pixels a side to be compared, found {array.shape}")
+    margin = BORDER - _GUARD
+    core = image[margin:-margin, margin:-margin]
+    if core.shape[0] > scene.shape[0] + 2 * margin or core.shape[1] > scene.shape[1] + 2 * margin:
+        raise DataError(f"result: expected at most the size of the truth {scene.shape}, found {image.shape}")
+    match = cv2.matchTemplate(np.pad(scene, margin, mode="reflect"), core, cv2.TM_CCOEFF_NORMED)
+    y, x = (int(v) - margin for v in np.unravel_index(int(match.argmax()), match.shape))
+    top, left = max(y, 0), max(x, 0)
+    bottom, right = min(y + core.shape[0], scene.shape[0]), min(x + core.shape[1], scene.shape[1])
+    a, t = core[top - y : bottom - y, left - x : right - x], scene[top:bottom, left:right]
+    shift = phase_cross_correlation(t, a, upsample_factor=20)[0]
+    if np.abs(shift).max() < _LARGEST_SHIFT:
+        matrix = np.array([[1, 0, shift[1]], [0, 1, shift[0]]], np.float32)
+        a = cv2.warpAffine(a, matrix, a.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    inside = slice(_GUARD, -_GUARD)
+    return a[inside, inside], t[inside, inside]
+
+
+def psnr(image: ArrayLike, truth: ArrayLike) -> float:
+    """Peak signal-to-noise ratio for full scale 1, without alignment.
+
+    Parameters
+    ----------
+    image, truth : array_like, same shape
+
+    Returns
+    -------
+    float
+        dB; infinite for equal images.
+
+    Raises
+    ------
+    DataError
+        Shapes differ.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> round(psnr(np.full((4, 4), 0.1), np.zeros((4, 4))), 3)
+    20.0
+    """
+    a, t = np.asarray(image, np.float64), np.asarray(truth, np.float64)
+    if a.shape != t.shape:
+        raise DataError(f"image: expected the shape of the truth {t.shape}, found {a.shape}")
+    error = float(np.mean((a - t) ** 2))
+    return float("inf") if error == 0 else -10 * float(np.log10(error))
+
+
+def sharpness(image: ArrayLike, reference: ArrayLike) -> float:
+    """Mean gradient magnitude relative to that of a reference, for example the temporal mean.
+
+    Parameters
+    ----------
+    image, reference : array_like, shape (H, W) or (H, W, 3)
+
+    Returns
+    -------
+    float
+        Above 1 where the image is sharper than the reference.
+
+    Raises
+    ------
+    DataError
+        The reference has no gradient.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> ramp = np.tile(np.linspace(0, 1, 128, dtype=np.float32), (128, 1))
+    >>> round(sharpness(ramp, 0.5 * ramp), 3)
+    2.0
+    """
+    gradients = [
+        float(np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)).mean())
+        for grey in (_grey(image, "image"), _grey(reference, "reference"))
+    ]
+    if gradients[1] == 0:
+        raise DataError("reference: expected an image with some contrast, found one colour")
+    return gradients[0] / gradients[1]
+
+
+def overshoot(image: ArrayLike, reference: ArrayLike, tolerance: float = 0.05) -> float:
+    """Share of pixels outside the local range (7×7) of a reference by more than a tolerance: where ringing shows.
+
+    Parameters
+    ----------
+    image, reference : array_like, shape (H, W) or (H, W, 3)
+        Same size.
+    tolerance : float
+        Share of full scale.
+
+    Returns
+    -------
+    float
+        0 to 1.
+
+    Raises
+    ------
+    DataError
+        Sizes differ.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> flat = np.full((64, 64), 0.5, np.float32)
+    >>> overshoot(flat, flat), overshoot(flat + 0.1, flat)
+    (0.0, 1.0)
+    """
+    a, r = _grey(image, "image"), _grey(reference, "reference")
+    if a.shape != r.shape:
+        raise DataError(f"image: expected the size of the reference {r.shape}, found {a.shape}")
+    box = np.ones((7, 7), np.uint8)
+    high, low = cv2.dilate(r, box) + tolerance, cv2.erode(r, box) - tolerance
+    return float(np.mean((a > high) | (a < low)))
+
+
+def endpoint_error(flow: ArrayLike, truth: ArrayLike) -> float:
+    """Mean length of the difference of two flows.
+
+    Parameters
+    ----------
+    flow, truth : array_like, shape (H, W, 2) or (T, H, W, 2)
+        Pixels.
+
+    Returns
+    -------
+    float
+        Pixels.
+
+    Raises
+    ------
+    DataError
+        Shapes differ.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> endpoint_error(np.zeros((2, 2, 2)), np.full((2, 2, 2), (3.0, 4.0)))
+    5.0
+    """
+    a, t = check_flow(flow), check_flow(truth, "truth")
+    if a.shape != t.shape:
+        raise DataError(f"flow: expected the shape of the truth {t.shape}, found {a.shape}")
+    difference = a - t
+    return float(np.hypot(difference[..., 0], difference[..., 1]).mean())
+
+
+def _grey(image: ArrayLike, name: str) -> FloatArray:
+    array = check_image(image, name)
+    grey = array.mean(axis=-1) if array.ndim == 3 else array
+    return np.ascontiguousarray(grey, np.float32)

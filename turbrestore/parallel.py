@@ -1,0 +1,84 @@
+"""Work on a stream of items in threads, a few items ahead, results in order."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+import cv2
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def map_ahead(
+    function: Callable[[Item], Result], items: Iterable[Item], threads: int = 0
+) -> Iterator[tuple[Item, Result]]:
+    """Yield ``(item, function(item))`` in order while threads work a few items ahead.
+
+    Memory is bounded by a handful of items and results, however many there are.  OpenCV's own threads are switched
+    off meanwhile: items run side by side already.
+
+    Parameters
+    ----------
+    function : callable
+        Should release the interpreter lock, as OpenCV and NumPy do.
+    items : iterable
+        Consumed lazily, in the calling thread.
+    threads : int
+        0 means one per available core.
+
+    Yields
+    ------
+    item, result
+
+    Examples
+    --------
+    >>> list(map_ahead(abs, [-1, 2]))
+    [(-1, 1), (2, 2)]
+    """
+    workers = threads or available_cores()
+    with _one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
+        pending: deque[tuple[Item, Future[Result]]] = deque()
+        try:
+            for item in items:
+                pending.append((item, pool.submit(function, item)))
+                if len(pending) > 2 * workers:
+                    done, future = pending.popleft()
+                    yield done, future.result()
+            while pending:
+                done, future = pending.popleft()
+                yield done, future.result()
+        finally:
+            # After an error or an early end nobody asks for the rest.
+            for _, future in pending:
+                future.cancel()
+
+
+def available_cores() -> int:
+    """Count the cores that this process may use.
+
+    Returns
+    -------
+    int
+
+    Examples
+    --------
+    >>> available_cores() >= 1
+    True
+    """
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _one_opencv_thread() -> Iterator[None]:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

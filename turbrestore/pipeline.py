@@ -1,0 +1,304 @@
+"""The whole chain: frames → centroid → flow dynamics → alternating filter → deconvolution (paper 3, Figure 9)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .alternating import Filtered, FilterParams, filter_frames
+from .arrays import FloatArray
+from .centroid import Centroid, CentroidParams, find_centroid
+from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve
+from .dynamics import DynamicsParams, FlowDynamics, identify
+from .errors import DataError, require
+from .flow import MIN_SIDE, FlowParams
+from .frame_source import FrameSource
+from .psf import BlurEstimate, estimate_blur
+
+STAGES = ("centroid", "identify", "filter", "deconvolve")
+# Contrast below one grey level of an 8-bit camera is no scene.
+_LEAST_CONTRAST = 1 / 255
+_FEWEST_TRAINED, _MOST_TRAINED = 40, 100
+# Training frames and their flows stay in memory: 12 bytes a pixel for grey frames, up to this many bytes.
+_TRAINING_BYTES = 1.5e9
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class RestoreParams:
+    """Settings of the whole chain.
+
+    Parameters
+    ----------
+    train : int, optional
+        Frames, from the first on, that give the centroid and the flow dynamics.  By default all of up to 40, then
+        half of them, at most 100.
+    until : {"centroid", "identify", "filter", "deconvolve"}
+        Last stage to run.
+    flow : FlowParams
+        Optical flow.
+    centroid : CentroidParams
+        Centroid iteration.
+    dynamics : DynamicsParams
+        Dynamic texture of the flow.
+    filter : FilterParams
+        Alternating-estimation Kalman filter.
+    deconvolution : DeconvolutionParams
+        Deconvolution.
+    """
+
+    train: int | None = None
+    until: Literal["centroid", "identify", "filter", "deconvolve"] = "deconvolve"
+    flow: FlowParams = field(default_factory=FlowParams)
+    centroid: CentroidParams = field(default_factory=CentroidParams)
+    dynamics: DynamicsParams = field(default_factory=DynamicsParams)
+    filter: FilterParams = field(default_factory=FilterParams)
+    deconvolution: DeconvolutionParams = field(default_factory=DeconvolutionParams)
+
+    def __post_init__(self) -> None:
+        require(self.train is None or self.train >= 2, f"train: expected 2 frames or more, found {self.train}")
+        require(self.until in STAGES, f"until: expected one of {', '.join(STAGES)}, found {self.until!r}")
+
+
+@dataclass(frozen=True)
+class Restoration:
+    """The restored image and everything it came from.
+
+    Attributes
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        Result of the last stage that ran.
+    mean : ndarray, float32, shape of ``image``
+        Temporal mean of the frames that were read: all of them once the filter has run, else the training frames.
+    centroid : Centroid
+    dynamics : FlowDynamics or None
+    filtered : Filtered or None
+    blur : BlurEstimate or None
+        Estimated blur of the filtered image; None where sigma was given.
+    deconvolution : Deconvolution or None
+    train : int
+        Number of training frames.
+    frame_count : int
+        Number of frames that were read.
+    seconds : dict of str to float
+        Wall time of each stage.
+    """
+
+    image: FloatArray
+    mean: FloatArray
+    centroid: Centroid
+    dynamics: FlowDynamics | None
+    filtered: Filtered | None
+    blur: BlurEstimate | None
+    deconvolution: Deconvolution | None
+    train: int
+    frame_count: int
+    seconds: dict[str, float]
+
+
+def restore(
+    frames: FrameSource | ArrayLike, params: RestoreParams | None = None, progress: Progress | None = None
+) -> Restoration:
+    """Restore one image from frames of a static scene.
+
+    The frames are read once, from the first to the last; only the training frames stay in memory.
+
+    Parameters
+    ----------
+    frames : FrameSource or array_like, shape (T, H, W) or (T, H, W, 3)
+        At least two frames of at least 16×16 pixels.
+    params : RestoreParams, optional
+        Settings of every stage.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    Restoration
+
+    Raises
+    ------
+    DataError
+        Too few, too small, damaged or constant frames.
+    ConfigurationError
+        More training frames than frames.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from turbrestore.synthesis.scenes import resolution_chart
+    >>> from turbrestore.synthesis.smooth_flow import distort, smooth_flows
+    >>> rng = np.random.default_rng(0)
+    >>> frames = distort(resolution_chart(64, 64), smooth_flows(6, 64, 64, rng), rng, blur=1.0, noise=0.01)
+    >>> restoration = restore(frames)
+    >>> restoration.image.shape, restoration.train
+    ((64, 64), 6)
+    """
+    params = params or RestoreParams()
+    source = frames if isinstance(frames, FrameSource) else FrameSource.from_array(frames)
+    train = training_share(len(source), source.shape[1:], params.train)
+    stages = STAGES[: STAGES.index(params.until) + 1]
+    clock = _Clock()
+    stream = iter(source)
+    training = _read_training(stream, train)
+    clock.lap("read")
+    centroid = find_centroid(
+        training, params.centroid, params.flow, stage_counter(progress, "centroid", train * params.centroid.iterations)
+    )
+    clock.lap("centroid")
+    image, mean = centroid.image, training.mean(axis=0, dtype=np.float32)
+    dynamics = filtered = deconvolution = blur = None
+    if "identify" in stages:
+        dynamics = identify(centroid.flows, params.dynamics)
+        clock.lap("identify")
+    if "filter" in stages and dynamics is not None:
+        summed = _Sum(training, stream)
+        total = len(source) * params.filter.inner_iterations - train
+        filtered = filter_frames(
+            summed,
+            centroid.image,
+            dynamics,
+            params.filter,
+            params.flow,
+            centroid.flows,
+            stage_counter(progress, "filter", total),
+        )
+        image, mean = filtered.image, summed.mean()
+        clock.lap("filter")
+    if "deconvolve" in stages:
+        sigma = params.deconvolution.sigma
+        if sigma is None:
+            blur = estimate_blur(image)
+            sigma = blur.sigma
+        counter = stage_counter(progress, "deconvolve", params.deconvolution.iterations)
+        deconvolution = deconvolve(image, sigma, params.deconvolution, guide=centroid.image, progress=counter)
+        image = deconvolution.image
+        clock.lap("deconvolve")
+    count = len(source) if filtered is not None else train
+    return Restoration(image, mean, centroid, dynamics, filtered, blur, deconvolution, train, count, clock.seconds)
+
+
+def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int | None = None) -> int:
+    """How many frames the centroid and the flow dynamics are taken from.
+
+    Parameters
+    ----------
+    frame_count : int
+        Frames there are.
+    frame_shape : tuple of int
+        (H, W) or (H, W, 3).
+    wanted : int, optional
+        What the user asked for.
+
+    Returns
+    -------
+    int
+        ``wanted``; else all of up to 40 frames, then half of them, at most 100 and at most what 1.5 GB hold.
+
+    Raises
+    ------
+    DataError
+        Fewer than two frames, or frames too small.
+    ConfigurationError
+        More wanted than there are.
+
+    Examples
+    --------
+    >>> [training_share(n, (256, 256)) for n in (5, 40, 60, 120, 900)]
+    [5, 40, 40, 60, 100]
+    """
+    if frame_count < 2:
+        raise DataError(f"frames: expected at least 2 to restore an image from, found {frame_count}")
+    if min(frame_shape[:2]) < MIN_SIDE:
+        raise DataError(
+            f"frames: expected at least {MIN_SIDE}×{MIN_SIDE} pixels, found {frame_shape[1]}×{frame_shape[0]}"
+        )
+    if wanted is not None:
+        require(wanted <= frame_count, f"train: expected at most the {frame_count} frames there are, found {wanted}")
+        return wanted
+    share = min(max(frame_count // 2, _FEWEST_TRAINED), _MOST_TRAINED)
+    frame_bytes = 4 * (int(np.prod(frame_shape)) + 2 * frame_shape[0] * frame_shape[1])
+    return min(frame_count, max(2, min(share, int(_TRAINING_BYTES // frame_bytes))))
+
+
+def stage_counter(progress: Progress | None, stage: str, total: int) -> Callable[[int], None] | None:
+    """Turn ``progress(stage, done, total)`` into the callback of one stage, which is told of single steps.
+
+    Parameters
+    ----------
+    progress : callable or None
+    stage : str
+        Name of the stage.
+    total : int
+        Largest number of steps.
+
+    Returns
+    -------
+    callable or None
+        Takes a number of steps; None if ``progress`` is.
+
+    Examples
+    --------
+    >>> step = stage_counter(lambda stage, done, total: print(stage, done, total), "filter", 5)
+    >>> step(2)
+    filter 2 5
+    """
+    if progress is None:
+        return None
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        progress(stage, done, total)
+
+    return advance
+
+
+class _Clock:
+    """Wall time between laps."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.seconds[name] = now - self._last
+        self._last = now
+
+
+class _Sum:
+    """Frames passed on, and their sum kept, so that the mean of all costs no second reading."""
+
+    def __init__(self, training: FloatArray, rest: Iterable[FloatArray]) -> None:
+        self._training, self._rest = training, rest
+        self._total = np.zeros(training.shape[1:])
+        self._count = 0
+
+    def __iter__(self) -> Iterator[FloatArray]:
+        for frames in (self._training, self._rest):
+            for frame in frames:
+                self._total += frame
+                self._count += 1
+                yield frame
+
+    def mean(self) -> FloatArray:
+        return (self._total / self._count).astype(np.float32)
+
+
+def _read_training(stream: Iterator[FloatArray], train: int) -> FloatArray:
+    training = np.stack(list(islice(stream, train)))
+    contrast = float(np.ptp(training.mean(axis=0)))
+    if contrast < _LEAST_CONTRAST:
+        raise DataError(
+            f"frames: expected a scene with some contrast, found one intensity within {contrast:.1g} of full scale"
+        )
+    return training

@@ -1,0 +1,1 @@
+"""Synthetic scenes and turbulent sequences."""

@@ -1,0 +1,144 @@
+"""Sequences with known motion: smooth random flows that change steadily, and frames distorted by them.
+
+The simplest turbulence there is: each component of the flow is a stationary Gaussian field in space (Gaussian
+correlation) and an autoregression of order one in time.  It has no physics in it; it serves where the true flow must
+be known, in tests, examples and benchmarks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import FloatArray, check_flow, check_image
+from ..errors import require
+from ..warp import invert_flow, warp
+
+
+@dataclass(frozen=True)
+class SmoothFlowParams:
+    """Statistics of a smooth random flow.
+
+    Parameters
+    ----------
+    rms : float
+        Root mean square of each component, pixels.
+    correlation_length : float
+        Standard deviation of the Gaussian that smooths white noise into the field, pixels.
+    persistence : float
+        Correlation of one frame with the next, 0 (independent) to below 1.
+    """
+
+    rms: float = 1.5
+    correlation_length: float = 16.0
+    persistence: float = 0.8
+
+    def __post_init__(self) -> None:
+        require(self.rms >= 0, f"rms: expected 0 pixels or more, found {self.rms}")
+        require(
+            self.correlation_length > 0,
+            f"correlation_length: expected a positive number of pixels, found {self.correlation_length}",
+        )
+        require(0 <= self.persistence < 1, f"persistence: expected 0 to below 1, found {self.persistence}")
+
+
+def smooth_flows(
+    count: int, height: int, width: int, rng: np.random.Generator, params: SmoothFlowParams | None = None
+) -> FloatArray:
+    """Draw a sequence of smooth random flows.
+
+    Parameters
+    ----------
+    count : int
+        Number of frames.
+    height, width : int
+        Size in pixels.
+    rng : numpy.random.Generator
+        Source of randomness.
+    params : SmoothFlowParams, optional
+        Statistics.
+
+    Returns
+    -------
+    ndarray, float32, shape (count, height, width, 2)
+        Pixels.
+
+    Raises
+    ------
+    ConfigurationError
+        A size is not positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> flows = smooth_flows(50, 64, 64, np.random.default_rng(1), SmoothFlowParams(rms=2.0))
+    >>> flows.shape, bool(1.5 < flows.std() < 2.5)
+    ((50, 64, 64, 2), True)
+    """
+    require(min(count, height, width) >= 1, f"size: expected positive numbers, found {count}×{height}×{width}")
+    params = params or SmoothFlowParams()
+    fresh = np.sqrt(1 - params.persistence**2)
+    flows = np.empty((count, height, width, 2), np.float32)
+    for index in range(count):
+        field = _smooth_field(height, width, rng, params.correlation_length) * params.rms
+        flows[index] = field if index == 0 else params.persistence * flows[index - 1] + fresh * field
+    return flows
+
+
+def distort(
+    scene: ArrayLike, flows: ArrayLike, rng: np.random.Generator, blur: float = 0.0, noise: float = 0.0
+) -> FloatArray:
+    """Frames of a scene seen through flows: ``I_k = (Kρ) ∘ w_k⁻¹`` plus noise (paper 3, eq. 6).
+
+    Parameters
+    ----------
+    scene : array_like, shape (H, W) or (H, W, 3)
+        ρ.
+    flows : array_like, shape (T, H, W, 2)
+        From the scene to each frame, pixels.
+    rng : numpy.random.Generator
+        Source of the noise.
+    blur : float
+        Standard deviation of the Gaussian K, pixels.
+    noise : float
+        Standard deviation of the noise, intensity.
+
+    Returns
+    -------
+    ndarray, float32, shape (T, H, W) or (T, H, W, 3)
+        Clipped to [0, 1].
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree.
+    ConfigurationError
+        ``blur`` or ``noise`` is negative.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> distort(np.full((8, 8), 0.5), np.zeros((3, 8, 8, 2)), rng, blur=1.0).shape
+    (3, 8, 8)
+    """
+    require(blur >= 0, f"blur: expected 0 pixels or more, found {blur}")
+    require(noise >= 0, f"noise: expected 0 or more, found {noise}")
+    image, stack = check_image(scene, "scene"), check_flow(flows, "flows")
+    blurred = cv2.GaussianBlur(image, (0, 0), blur) if blur > 0 else image
+    frames = np.stack([warp(blurred, invert_flow(flow)) for flow in stack])
+    if noise > 0:
+        frames += rng.normal(0.0, noise, frames.shape).astype(np.float32)
+    return np.clip(frames, 0.0, 1.0)
+
+
+def _smooth_field(height: int, width: int, rng: np.random.Generator, length: float) -> FloatArray:
+    """Gaussian field of unit variance, correlated over ``length`` pixels, without a border effect."""
+    margin = int(np.ceil(4 * length))
+    white = rng.standard_normal((height + 2 * margin, width + 2 * margin, 2), dtype=np.float32)
+    smooth = cv2.GaussianBlur(white, (0, 0), length)[margin : margin + height, margin : margin + width]
+    # White noise through a Gaussian of deviation s keeps a share 1 / (4 π s²) of its variance.
+    return smooth * np.float32(np.sqrt(4 * np.pi) * length)
