@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import sys
 from typing import TYPE_CHECKING
 
@@ -69,6 +71,9 @@ def main(arguments: list[str] | None = None) -> int:
         130 interrupted, 1 a bug.
     """
     words = sys.argv[1:] if arguments is None else arguments
+    # The libraries that decode images print their own complaints; ours is the one line that counts.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     try:
         build()(words, exit_on_error=False, print_error=False)
     except CycloptsError as error:

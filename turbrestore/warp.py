@@ -219,7 +219,7 @@ def _cubic(image: FloatArray, flow: FloatArray) -> FloatArray:
     return top + to_lower * (row(lower) - top)
 
 
-def _spline_pair(position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _spline_pair(position: FloatArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Two positions and a blend whose bilinear samples weigh four neighbours as the cubic B-spline does."""
     whole = np.floor(position)
     t = position - whole
