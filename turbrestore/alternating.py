@@ -27,7 +27,7 @@ Departures from the paper, each with its reason:
 * Every inner iteration starts from the prediction, not from its own result, so a frame counts once; on a linear
   model the iteration then changes nothing.
 * Z may vary from pixel to pixel: it falls where a frame is locally sharper than usual, by ``exp(−β z)`` with z the
-  standardised local gradient energy.  β = 0 is the paper's scalar gain.
+  standardised local sharpness.  β = 0 is the paper's scalar gain.
 * The image starts from a diffuse prior (``prior_frames=0``) and takes the training frames in first; the paper starts
   from the centroid.
 """
@@ -60,8 +60,8 @@ _IMAGE_NOISE_FLOOR = 6e-8
 _FLOW_NOISE_FLOOR = 1e-6
 # Standardised sharpness beyond this is an outlier, not a better frame.
 _LARGEST_SCORE = 3.0
-# Gradient energies that differ by less than this share differ too little in blur to be worth fewer frames.
-_LEAST_SPREAD = 0.08
+# Sharpness that differs by less than this share is not worth averaging fewer frames.
+_LEAST_SPREAD = 0.03
 # Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels it correlates over.
 _SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
 
@@ -170,10 +170,12 @@ class Filtered:
 class _NoiseModel:
     """What the first block says of the frames.
 
-    Z, the usual gradient energy per pixel, the factor that turns a deviation from it into a score, and G.
+    Z, the gradient of the starting image, the usual sharpness per pixel, the factor that turns a deviation from it
+    into a score, and G.
     """
 
     image_noise: float
+    template: tuple[FloatArray, FloatArray]
     usual: FloatArray
     score_scale: FloatArray
     motion_share: FloatArray
@@ -355,57 +357,58 @@ def _noise_model(
     frames: list[FloatArray], flows: FloatArray, image: FloatArray, dynamics: FlowDynamics, params: FilterParams
 ) -> _NoiseModel:
     """Temporal statistics of the first block, registered by its flows."""
+    template = _gradient(luminance(image))
 
     def measure(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
         registered = luminance(warp(*pair))
-        return registered, _gradient_energy(registered, params.sharpness_window)
+        return registered, _sharpness(registered, template, params.sharpness_window)
 
     shape = image.shape[:2]
     total, squares, sharp, sharp_squares = (np.zeros(shape) for _ in range(4))
-    for _, (registered, energy) in map_ahead(measure, zip(frames, flows, strict=True)):
+    for _, (registered, sharpness) in map_ahead(measure, zip(frames, flows, strict=True)):
         total += registered
         squares += np.square(registered, dtype=np.float64)
-        sharp += energy
-        sharp_squares += np.square(energy, dtype=np.float64)
+        sharp += sharpness
+        sharp_squares += np.square(sharpness, dtype=np.float64)
     count = len(frames)
     variance = np.maximum(squares / count - (total / count) ** 2, 0.0) * count / max(count - 1, 1)
     usual = sharp / count
     # The flattest fifth of the image varies by sensor noise alone; elsewhere blur and misregistration add to it.
-    sensor_noise = float(variance[usual <= np.quantile(usual, 0.2)].mean())
+    energy = _smooth(template[0] ** 2 + template[1] ** 2, params.sharpness_window)
+    sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
     spread = np.maximum(sharp_squares / count - usual**2, 0.0)
     measured = params.image_noise if params.image_noise is not None else float(variance.mean())
     share = np.zeros(shape, np.float32)
     if params.residual == "keep":
-        share = _motion_share(image, sensor_noise, dynamics, params.sharpness_window)
+        share = _motion_share(energy, sensor_noise, dynamics, params.sharpness_window)
     return _NoiseModel(
         max(measured, _IMAGE_NOISE_FLOOR),
+        template,
         usual.astype(np.float32),
-        _score_scale(usual, spread, sensor_noise, params.sharpness_window),
+        _score_scale(usual, spread, energy * _SOBEL_NOISE * sensor_noise, params.sharpness_window),
         share,
     )
 
 
-def _score_scale(usual: np.ndarray, spread: np.ndarray, sensor_noise: float, window: float) -> FloatArray:
-    """Factor from a deviation of the gradient energy to the best estimate of its standardised noise-free part.
+def _score_scale(usual: np.ndarray, spread: np.ndarray, noise: np.ndarray, window: float) -> FloatArray:
+    """Factor from a deviation of the sharpness to the best estimate of its standardised noise-free part.
 
-    Of the variance of the energy, noise explains 4 E σ_g² / N, with σ_g² the noise of a gradient component and N the
-    independent pixels in the window; what is left is sharpness.
+    Noise of the gradient, projected on the template, explains ``noise`` over the number of independent pixels in the
+    window of the variance ``spread``; what is left is sharpness.
     """
-    noise_of_gradient = _SOBEL_NOISE * sensor_noise
-    explained = 4 * usual * noise_of_gradient / (4 * np.pi * window**2 / _SOBEL_AREA)
-    sharpness = np.sqrt(np.maximum(spread - explained, 0.0))
-    return (sharpness / np.maximum(spread + (_LEAST_SPREAD * usual) ** 2, 1e-18)).astype(np.float32)
+    explained = noise / (4 * np.pi * window**2 / _SOBEL_AREA)
+    deviation = np.sqrt(np.maximum(spread - explained, 0.0))
+    return (deviation / np.maximum(spread + (_LEAST_SPREAD * usual) ** 2, 1e-18)).astype(np.float32)
 
 
-def _motion_share(image: FloatArray, noise: float, dynamics: FlowDynamics, window: float) -> FloatArray:
+def _motion_share(energy: FloatArray, noise: float, dynamics: FlowDynamics, window: float) -> FloatArray:
     """G = R_motion / (R_motion + R_noise), with R_noise the Cramér–Rao bound of a shift seen through the window.
 
     A shift of a patch with gradients ∇ρ in noise of variance σ² cannot be measured better than
     σ² / (½ Σ |∇ρ|²) per axis; what the residual varies beyond that is motion.
     """
     area = 4 * np.pi * window**2
-    information = area * 0.5 * _gradient_energy(luminance(image), window)
-    noise_variance = noise / np.maximum(information, 1e-12)
+    noise_variance = noise / np.maximum(area * 0.5 * energy, 1e-12)
     total = np.maximum(dynamics.residual_variance, 0.0)
     return (1.0 - np.minimum(noise_variance / np.maximum(total, 1e-12), 1.0)).astype(np.float32)
 
@@ -414,14 +417,25 @@ def _frame_noise(registered: FloatArray, model: _NoiseModel, params: FilterParam
     """Z of one frame: lower where it is sharper than usual, the same on average over the frames."""
     if params.sharpness == 0:
         return model.image_noise
-    energy = _gradient_energy(luminance(registered), params.sharpness_window)
-    score = model.score_scale * (energy - model.usual)
-    score = np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)
+    sharpness = _sharpness(luminance(registered), model.template, params.sharpness_window)
+    score = np.clip(model.score_scale * (sharpness - model.usual), -_LARGEST_SCORE, _LARGEST_SCORE)
     # For a normal score the mean of exp(β z − β²/2) is one: the information per frame stays 1/Z.
     return np.float32(model.image_noise) * np.exp(0.5 * params.sharpness**2 - params.sharpness * score)
 
 
-def _gradient_energy(image: FloatArray, window: float) -> FloatArray:
-    dx = cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8)
-    dy = cv2.Sobel(image, cv2.CV_32F, 0, 1, scale=1 / 8)
-    return cv2.GaussianBlur(dx * dx + dy * dy, (0, 0), window)
+def _sharpness(registered: FloatArray, template: tuple[FloatArray, FloatArray], window: float) -> FloatArray:
+    """Gradient of a frame projected on that of the template, in a Gaussian window.
+
+    A blurred frame has a smaller projection.  So has one that is torn, misregistered or covered, though its gradient
+    may be large: plain gradient energy would prefer it.  And noise, being linear here, does not add up.
+    """
+    dx, dy = _gradient(registered)
+    return _smooth(dx * template[0] + dy * template[1], window)
+
+
+def _gradient(image: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(image, cv2.CV_32F, 0, 1, scale=1 / 8)
+
+
+def _smooth(image: FloatArray, window: float) -> FloatArray:
+    return cv2.GaussianBlur(image, (0, 0), window)
