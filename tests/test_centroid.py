@@ -47,7 +47,7 @@ def test_flows_start_from_the_centroid_and_average_out(sequence, mode):
     unregistered = [np.abs(f - centroid.image)[INSIDE].mean() for f in sequence.frames]
     assert np.mean(errors) < 0.5 * np.mean(unregistered)
     mean_flow = centroid.flows.mean(axis=0)[INSIDE]
-    assert np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean() < 0.1
+    assert np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean() <= CentroidParams().tolerance
 
 
 def test_opposite_shifts_meet_in_the_middle(sequence):

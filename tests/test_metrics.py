@@ -9,7 +9,7 @@ from turbrestore.synthesis.scenes import resolution_chart
 
 @pytest.fixture(scope="module")
 def scene():
-    return cv2.GaussianBlur(resolution_chart(160, 192), (0, 0), 1.2)
+    return cv2.GaussianBlur(resolution_chart(160, 192), (0, 0), 1.6)
 
 
 def test_psnr_of_known_noise(scene):
@@ -21,7 +21,8 @@ def test_psnr_of_known_noise(scene):
 def test_a_global_shift_costs_next_to_nothing(scene, shift):
     matrix = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
     moved = cv2.warpAffine(scene, matrix, scene.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    assert compare(moved, scene).psnr > 34
+    # Unaligned, the same images are 12 to 20 dB apart.
+    assert compare(moved, scene).psnr > 30
 
 
 def test_a_crop_is_found(scene):
