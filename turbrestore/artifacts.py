@@ -230,7 +230,8 @@ def _read(source: Path) -> tuple[str, dict[str, Any]]:
     if not source.is_file():
         raise InputNotFoundError(f"{source}: no such file")
     try:
-        with np.load(source, allow_pickle=False) as archive:
+        # Opened here because np.load leaves the file open when it is no archive.
+        with source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
         header: dict[str, Any] = json.loads(str(arrays.pop(_HEADER)))
         kind, schema, fields = str(header["kind"]), header["schema"], {**header["fields"], **arrays}

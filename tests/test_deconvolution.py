@@ -1,0 +1,426 @@
+"""Solvers against dense algebra, brute force and the Euler–Lagrange equations; the border; stopping; settings."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+from scipy import fft, optimize
+from skimage import data
+
+from turbrestore import deconvolution
+from turbrestore.deconvolution import (
+    BOUNDARIES,
+    METHODS,
+    ConjugateGradients,
+    DeconvolutionParams,
+    PrimalDual,
+    PrimalDualState,
+    Problem,
+    Regulariser,
+    automatic_fidelity,
+    deconvolve,
+    local_divergence,
+    local_gradient,
+)
+from turbrestore.errors import ConfigurationError, DataError
+from turbrestore.nonlocal_tv import (
+    NonlocalParams,
+    nonlocal_divergence,
+    nonlocal_gradient,
+    nonlocal_magnitude,
+    nonlocal_total_variation,
+    nonlocal_weights,
+    project_to_unit,
+)
+from turbrestore.psf import gaussian_otf, gaussian_psf, laplacian_symbol, psf_to_otf
+
+TV = Regulariser(
+    local_gradient,
+    lambda p: -local_divergence(p),
+    lambda p: p / np.maximum(np.sqrt((p**2).sum(axis=0)), 1),
+    lambda u: float(np.sqrt((local_gradient(u) ** 2).sum(axis=0)).sum()),
+    8.0,
+)
+
+
+def nonlocal_regulariser(guide: np.ndarray, h: float = 0.5) -> Regulariser:
+    graph = nonlocal_weights(guide, NonlocalParams(patch=3, search=5, best=4, h=h))
+    return Regulariser(
+        lambda u: nonlocal_gradient(graph, u),
+        lambda p: -nonlocal_divergence(graph, p),
+        lambda p: project_to_unit(graph, p),
+        lambda u: nonlocal_total_variation(graph, u),
+        graph.norm_squared,
+    )
+
+
+def small_problem(seed: int, fidelity: float, shape: tuple[int, int] = (8, 8), margin: int = 2) -> Problem:
+    rng = np.random.default_rng(seed)
+    seen = np.zeros(shape, np.float32)
+    seen[margin : shape[0] - margin, margin : shape[1] - margin] = 1
+    return Problem(rng.random(shape).astype(np.float32), seen, gaussian_otf(shape, 0.7), fidelity)
+
+
+def dense(operator, shape: tuple[int, int]) -> np.ndarray:
+    unit = np.eye(shape[0] * shape[1], dtype=np.float32).reshape(-1, *shape)
+    return np.stack([operator(u).ravel() for u in unit], axis=1).astype(np.float64)
+
+
+def dense_blur(problem: Problem) -> np.ndarray:
+    shape = problem.seen.shape
+    return dense(lambda u: fft.irfft2(problem.otf * fft.rfft2(u), s=shape), shape)
+
+
+def solve(solver: PrimalDual, problem: Problem, iterations: int) -> np.ndarray:
+    state = solver.start(problem.observed)
+    for _ in range(iterations):
+        state = solver.step(problem, state)
+    return state.image
+
+
+def camera(size: int, sigma: float, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Photograph, and a crop of it after blur and noise of a larger scene."""
+    scene = data.camera()[40 : 40 + size + 48, 100 : 100 + size + 48].astype(np.float32) / 255
+    blurred = cv2.GaussianBlur(scene, (0, 0), sigma)
+    blurred += np.random.default_rng(seed).normal(0, noise, scene.shape).astype(np.float32)
+    inside = slice(24, 24 + size)
+    return scene[inside, inside], blurred[inside, inside]
+
+
+def psnr(image: np.ndarray, truth: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((image - truth) ** 2)))
+
+
+# --- operators -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(1, 5), (7, 6)])
+def test_local_divergence_is_the_negative_adjoint_of_the_gradient(shape):
+    rng = np.random.default_rng(0)
+    u, v = rng.normal(size=shape).astype(np.float32), rng.normal(size=(2, *shape)).astype(np.float32)
+    assert np.vdot(local_gradient(u), v) == pytest.approx(-np.vdot(u, local_divergence(v)), abs=1e-4)
+
+
+def test_gradient_of_the_data_term_is_that_of_its_value():
+    # An asymmetric kernel, for which a convolution and its adjoint differ.
+    psf = np.random.default_rng(1).random((3, 3))
+    problem = dataclasses.replace(small_problem(1, 7.0), otf=psf_to_otf(psf, (8, 8)))
+    rng = np.random.default_rng(2)
+    u, direction = rng.random((2, 8, 8)).astype(np.float32)
+    gradient = fft.irfft2(problem.gradient_spectrum(u), s=u.shape)
+    difference = (problem.misfit(u + 0.1 * direction) - problem.misfit(u - 0.1 * direction)) / 0.2
+    assert np.vdot(gradient, direction) == pytest.approx(difference, rel=1e-4)
+
+
+def test_blur_matches_opencv_inside():
+    image = np.random.default_rng(3).random((40, 44)).astype(np.float32)
+    blurred = fft.irfft2(gaussian_otf(image.shape, 1.2) * fft.rfft2(image), s=image.shape)
+    expected = cv2.GaussianBlur(image, (13, 13), 1.2)
+    assert np.abs(blurred - expected)[8:-8, 8:-8].max() < 2e-3
+
+
+# --- primal-dual -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("margin", [0, 2])
+def test_one_step_is_the_proximal_step_of_the_filled_in_data(margin):
+    problem = small_problem(4, 30.0, margin=margin)
+    rng = np.random.default_rng(5)
+    u = rng.random((8, 8)).astype(np.float32)
+    p = TV.project(rng.normal(size=(2, 8, 8)).astype(np.float32))
+    after = PrimalDual(TV).step(problem, PrimalDualState(u, p)).image
+    relaxed = u + (after - u) / deconvolution._RELAXATION
+    tau = deconvolution._PRIMAL_STEP / np.sqrt(TV.norm_squared)
+    blur = dense_blur(problem)
+    target = (u - tau * TV.adjoint(p)).ravel()
+    filled = np.where(problem.seen > 0, problem.observed, (blur @ u.ravel()).reshape(8, 8)).ravel()
+    # Least squares: ‖(v − target)/√τ‖² + ‖√λ(Bv − filled)‖².
+    system = np.concatenate([np.eye(64) / np.sqrt(tau), np.sqrt(30.0) * blur])
+    expected = np.linalg.lstsq(system, np.concatenate([target / np.sqrt(tau), np.sqrt(30.0) * filled]), rcond=None)[0]
+    assert relaxed.ravel() == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("margin", [0, 2])
+@pytest.mark.parametrize("penalty", ["tv", "nltv"])
+def test_optimum_matches_brute_force(penalty, margin):
+    problem = small_problem(6, 20.0, margin=margin)
+    regulariser = TV if penalty == "tv" else nonlocal_regulariser(problem.observed)
+    found = solve(PrimalDual(regulariser), problem, 3000)
+    blur = dense_blur(problem)
+    if penalty == "tv":
+        edges = dense(regulariser.gradient, (8, 8)).reshape(2, 64, 64)
+        owners = np.stack([np.arange(64)] * 2)
+    else:
+        graph = nonlocal_weights(problem.observed, NonlocalParams(patch=3, search=5, best=4, h=0.5))
+        edges = dense(regulariser.gradient, (8, 8)).reshape(2, -1, 64)
+        owners = np.stack([graph.tails, graph.heads])
+    matrix, owners, seen = edges.reshape(-1, 64), owners.ravel(), problem.seen.ravel()
+
+    def smoothed(u: np.ndarray) -> tuple[float, np.ndarray]:
+        residual = seen * (blur @ u - problem.observed.ravel())
+        gradient = matrix @ u
+        magnitude = np.sqrt(np.bincount(owners, gradient**2, minlength=64) + 1e-8)
+        slope = 20.0 * blur.T @ residual + matrix.T @ (gradient / magnitude[owners])
+        return 10.0 * residual @ residual + magnitude.sum(), slope
+
+    best = optimize.minimize(
+        smoothed, problem.observed.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 5000, "ftol": 1e-15}
+    )
+    energy = problem.misfit(found) + regulariser.value(found)
+    assert energy == pytest.approx(best.fun, rel=2e-3)
+    assert np.abs((found.ravel() - best.x)[seen > 0]).max() < 0.02
+
+
+def test_optimum_solves_the_euler_lagrange_equation_of_the_paper():
+    """``λ k*∗(k∗u − f) + L[u] = 0`` (eq. 24) at pixels where |∇_w u| > 0, there and at their neighbours."""
+    problem = small_problem(7, 60.0, shape=(12, 12), margin=0)
+    graph = nonlocal_weights(problem.observed, NonlocalParams(patch=3, search=5, best=4, h=0.5))
+    regulariser = nonlocal_regulariser(problem.observed)
+    u = solve(PrimalDual(regulariser), problem, 6000)
+    magnitude = nonlocal_magnitude(graph, nonlocal_gradient(graph, u)).ravel().astype(np.float64)
+    assert np.mean(magnitude > 0.01) > 0.5
+    w = np.zeros((144, 144))
+    w[graph.tails, graph.heads] = graph.weights
+    w += w.T
+    flat = u.ravel().astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1 / magnitude
+        curvature = -((flat[None] - flat[:, None]) * (inverse[:, None] + inverse[None]) * w).sum(axis=1)
+    data_slope = fft.irfft2(problem.gradient_spectrum(u), s=u.shape).ravel()
+    # Where a neighbour's gradient vanishes, L is a set and the equation an inclusion.
+    regular = (magnitude > 0.01) & ~((w > 0) & (magnitude <= 0.01)[None]).any(axis=1)
+    assert regular.sum() > 20
+    assert np.abs(curvature[regular]).mean() > 0.5
+    assert np.abs(data_slope + curvature)[regular].max() < 0.02
+
+
+@pytest.mark.parametrize("method", ["nltv", "tv"])
+def test_stopping_rule_loses_nothing(method):
+    truth, blurred = camera(96, 1.5, 0.003)
+    stopped = deconvolve(blurred, 1.5, DeconvolutionParams(method=method))
+    exhaustive = deconvolve(blurred, 1.5, DeconvolutionParams(method=method, iterations=2000, tolerance=0))
+    assert stopped.converged
+    assert stopped.iterations < 200
+    assert not exhaustive.converged
+    # The last pixels before the border are hardly determined: there stopping early may be the better estimate.
+    assert psnr(stopped.image, truth) > psnr(exhaustive.image, truth) - 0.05
+    inside = (slice(6, -6), slice(6, -6))
+    assert abs(psnr(stopped.image[inside], truth[inside]) - psnr(exhaustive.image[inside], truth[inside])) < 0.05
+    assert exhaustive.objective[-1] < exhaustive.objective[0]
+
+
+# --- wiener and tikhonov ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["wiener", "tikhonov"])
+def test_periodic_solution_is_the_closed_form(method):
+    rng = np.random.default_rng(8)
+    image = (0.3 + 0.4 * cv2.GaussianBlur(rng.random((20, 24)), (0, 0), 1.0)).astype(np.float32)
+    params = DeconvolutionParams(method=method, boundary="periodic", fidelity=80.0)
+    result = deconvolve(image, 0.9, params)
+    otf = gaussian_otf(image.shape, 0.9).astype(np.float64)
+    symbol = laplacian_symbol(*image.shape) if method == "wiener" else 1.0
+    mean = image.mean()
+    expected = mean + fft.irfft2(80.0 * otf * fft.rfft2(image - mean) / (80.0 * otf**2 + symbol), s=image.shape)
+    assert expected.min() > 0
+    assert expected.max() < 1
+    assert result.image == pytest.approx(expected, abs=1e-5)
+    assert (result.converged, result.iterations) == (True, 1)
+
+
+@pytest.mark.parametrize("method", ["wiener", "tikhonov"])
+def test_masked_solution_is_that_of_dense_least_squares(method):
+    rng = np.random.default_rng(9)
+    image = (0.3 + 0.4 * cv2.GaussianBlur(rng.random((9, 7)), (0, 0), 1.0)).astype(np.float32)
+    sigma, fidelity, mean = 0.7, 50.0, image.mean(dtype=np.float64)
+    result = deconvolve(image, sigma, DeconvolutionParams(method=method, fidelity=fidelity, tolerance=1e-7))
+    # Margins of 4σ or more, on both sides, up to a size that transforms fast.
+    shape = tuple(fft.next_fast_len(size + 2 * 3, real=True) for size in image.shape)
+    top, left = ((p - n) // 2 for p, n in zip(shape, image.shape, strict=True))
+    seen = np.zeros(shape, bool)
+    seen[top : top + 9, left : left + 7] = True
+    otf = gaussian_otf(shape, sigma)
+    blur = dense(lambda u: fft.irfft2(otf * fft.rfft2(u), s=shape), shape)[seen.ravel()]
+    penalty = dense(local_gradient, shape) if method == "wiener" else np.eye(seen.size)
+    system = np.concatenate([np.sqrt(fidelity) * blur, penalty])
+    right = np.concatenate([np.sqrt(fidelity) * (image.ravel() - mean), np.zeros(len(penalty))])
+    solution = np.linalg.lstsq(system, right, rcond=None)[0]
+    expected = mean + solution.reshape(shape)[seen].reshape(image.shape)
+    assert result.converged
+    assert result.image == pytest.approx(np.clip(expected, 0, 1), abs=2e-4)
+    residual = system @ solution - right
+    assert result.objective[-1] == pytest.approx(residual @ residual / 2, rel=1e-3)
+
+
+def test_conjugate_gradients_stay_where_they_are_when_solved():
+    problem = dataclasses.replace(small_problem(10, 10.0), observed=np.full((8, 8), 0.5, np.float32))
+    solver = ConjugateGradients(laplacian_symbol(8, 8))
+    state = solver.start(problem)
+    for _ in range(20):
+        state = solver.step(problem, state)
+    assert state.image == pytest.approx(0.5, abs=1e-5)
+
+
+# --- the whole stage -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+@pytest.mark.parametrize("method", METHODS)
+def test_a_constant_image_stays_what_it_is(method, boundary):
+    flat = np.full((20, 24), 0.37, np.float32)
+    result = deconvolve(flat, 1.5, DeconvolutionParams(method=method, boundary=boundary))
+    assert result.image == pytest.approx(0.37, abs=1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_without_blur_the_image_is_left_alone(method):
+    image = np.random.default_rng(11).normal(0.5, 0.5, (12, 12, 3)).astype(np.float32)
+    for nothing in (0, np.ones((1, 1))):
+        result = deconvolve(image, nothing, DeconvolutionParams(method=method))
+        assert np.array_equal(result.image, image)
+        assert (result.sigma, result.iterations, result.converged) == (0, 0, True)
+
+
+@pytest.mark.parametrize(("method", "gain"), [("nltv", 3.5), ("tv", 3.5), ("wiener", 3.0), ("tikhonov", 2.5)])
+def test_every_method_restores_a_photograph(method, gain):
+    truth, blurred = camera(96, 1.5, 0.002)
+    result = deconvolve(blurred, 1.5, DeconvolutionParams(method=method))
+    assert psnr(result.image, truth) > psnr(blurred, truth) + gain
+    assert result.noise == pytest.approx(0.002, rel=0.3)
+    assert result.fidelity == pytest.approx(automatic_fidelity(method, blurred, result.noise))
+    assert len(result.recorded) == len(result.objective) == len(result.changes)
+    assert result.recorded[-1] == result.iterations
+
+
+@pytest.mark.parametrize("method", ["nltv", "tv", "wiener"])
+def test_the_border_is_restored_as_well_as_the_interior(method):
+    sigma = 1.5
+    truth, blurred = camera(96, sigma, 0.002)
+    border = np.ones(truth.shape, bool)
+    border[6:-6, 6:-6] = False
+    errors = {}
+    for boundary in BOUNDARIES:
+        result = deconvolve(blurred, sigma, DeconvolutionParams(method=method, boundary=boundary))
+        squares = (result.image - truth) ** 2
+        errors[boundary] = np.sqrt(squares[border].mean()), np.sqrt(squares[~border].mean())
+    at_border, inside = errors["unknown"]
+    before = np.sqrt(((blurred - truth) ** 2)[border].mean())
+    assert at_border < 1.5 * inside
+    assert at_border < 0.75 * before
+    assert at_border < 0.5 * errors["periodic"][0]
+
+
+def test_fidelity_trades_noise_for_sharpness():
+    _, blurred = camera(48, 1.0, 0.01)
+    soft, hard = (
+        deconvolve(blurred, 1.0, DeconvolutionParams(method="tv", fidelity=f)).image for f in (100.0, 10000.0)
+    )
+    assert TV.value(hard) > 1.5 * TV.value(soft)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_automatic_fidelity_is_near_the_best(method):
+    truth, blurred = camera(80, 1.5, 0.008)
+    automatic = deconvolve(blurred, 1.5, DeconvolutionParams(method=method))
+    scores = [
+        psnr(deconvolve(blurred, 1.5, DeconvolutionParams(method=method, fidelity=automatic.fidelity * f)).image, truth)
+        for f in (0.1, 0.3, 3.0, 10.0)
+    ]
+    assert psnr(automatic.image, truth) > max(scores) - 0.4
+
+
+def test_a_sampled_psf_does_as_its_gaussian():
+    _, blurred = camera(48, 1.5, 0.002)
+    params = DeconvolutionParams(method="tv")
+    by_sigma, by_psf = deconvolve(blurred, 1.5, params), deconvolve(blurred, gaussian_psf(1.5), params)
+    assert by_psf.sigma == pytest.approx(1.5, rel=0.01)
+    assert np.abs(by_psf.image - by_sigma.image).mean() < 2e-3
+
+
+def test_an_asymmetric_psf_moves_the_image_back():
+    truth, _ = camera(48, 1.5, 0.0)
+    psf = np.zeros((3, 5))
+    psf[1, 4], psf[1, 2] = 0.6, 0.4
+    blurred = cv2.filter2D(truth, -1, psf[::-1, ::-1], borderType=cv2.BORDER_REFLECT)
+    result = deconvolve(blurred, psf, DeconvolutionParams(method="tv", fidelity=3000.0))
+    assert psnr(result.image, truth) > psnr(blurred, truth) + 8
+
+
+def test_channels():
+    grey, blurred = camera(48, 1.5, 0.0)
+    gain = np.array([0.9, 0.6, 0.3], np.float32)
+    params = DeconvolutionParams(method="wiener", fidelity=300.0, tolerance=1e-6)
+    each = deconvolve(blurred[..., None] * gain, 1.5, dataclasses.replace(params, channels="each"))
+    for channel in range(3):
+        alone = deconvolve(blurred * gain[channel], 1.5, params)
+        assert each.image[..., channel] == pytest.approx(alone.image, abs=2e-3)
+    kept = deconvolve(blurred[..., None] * gain + 0.05, 1.5, params)
+    # The differences between channels, which are chroma, are those of the input.
+    chroma = (kept.image - kept.image[..., :1]) - (blurred[..., None] * (gain - gain[0]))
+    unclipped = ((kept.image > 0) & (kept.image < 1)).all(axis=-1)
+    assert np.abs(chroma[unclipped]).max() < 1e-5
+    assert psnr(kept.image, grey[..., None] * gain + 0.05) > psnr(blurred[..., None] * gain, grey[..., None] * gain)
+
+
+def test_weights_come_from_the_guide():
+    truth, blurred = camera(48, 1.5, 0.002)
+    params = DeconvolutionParams(iterations=60)
+    own = deconvolve(blurred, 1.5, params)
+    same = deconvolve(blurred, 1.5, params, guide=np.repeat(blurred[..., None], 3, axis=2))
+    # Nothing resembles anything in a guide of noise: other weights, another image.
+    other = deconvolve(blurred, 1.5, params, guide=np.random.default_rng(12).random(blurred.shape))
+    assert same.image == pytest.approx(own.image, abs=5e-3)
+    assert np.abs(other.image - own.image).mean() > 5 * np.abs(same.image - own.image).mean()
+    blurry = deconvolve(blurred, 1.5, dataclasses.replace(params, sharpen_guide=False))
+    assert psnr(blurry.image, truth) > psnr(blurred, truth) + 2
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (3, 2), (5, 5, 3)])
+@pytest.mark.parametrize("method", METHODS)
+def test_tiny_images(method, shape):
+    image = np.random.default_rng(13).random(shape).astype(np.float32)
+    result = deconvolve(image, 1.0, DeconvolutionParams(method=method, iterations=20, channels="each"))
+    assert result.image.shape == shape
+    assert np.isfinite(result.image).all()
+    assert result.image.min() >= 0
+    assert result.image.max() <= 1
+
+
+def test_progress_counts_iterations_and_inputs_stay():
+    _, blurred = camera(32, 1.0, 0.0)
+    colour = np.repeat(blurred[..., None], 3, axis=2)
+    before, counted = colour.copy(), []
+    result = deconvolve(colour, 1.0, DeconvolutionParams(channels="each"), progress=counted.append)
+    assert sum(counted) == result.iterations
+    assert np.array_equal(colour, before)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"method": "magic"},
+        {"boundary": "mirror"},
+        {"channels": "red"},
+        {"sigma": -1.0},
+        {"fidelity": 0.0},
+        {"fidelity": np.inf},
+        {"iterations": 0},
+        {"tolerance": -1.0},
+    ],
+)
+def test_impossible_settings_are_refused(settings):
+    with pytest.raises(ConfigurationError, match=f"{next(iter(settings))}: expected"):
+        DeconvolutionParams(**settings)
+
+
+def test_unusable_inputs_are_refused():
+    image = np.zeros((8, 8), np.float32)
+    with pytest.raises(ConfigurationError, match="sigma_or_psf"):
+        deconvolve(image, -1.0)
+    with pytest.raises(DataError, match="psf"):
+        deconvolve(image, np.ones((2, 2)))
+    with pytest.raises(DataError, match="guide: expected the size"):
+        deconvolve(image, 1.0, guide=np.zeros((8, 9)))
+    with pytest.raises(DataError, match="image"):
+        deconvolve(np.full((8, 8), np.nan), 1.0)
