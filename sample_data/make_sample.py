@@ -1,7 +1,7 @@
-"""Make the sample clip and its ground truth: python sample_data/make_sample.py
+"""Make the sample clip and its ground truth.
 
-The scene is the project's own resolution chart.  Smooth random flows bend it, a blur that changes from frame to frame
-softens it, and noise is added; the clip is written as 8-bit FFV1.
+Run ``python sample_data/make_sample.py``.  The scene is the project's own resolution chart.  Smooth random flows bend
+it, a blur that changes from frame to frame softens it, and noise is added; the clip is written as 8-bit FFV1.
 """
 
 from pathlib import Path
@@ -28,7 +28,9 @@ def main() -> None:
     # Over a long time the displacement averages to zero; a clip this short needs help to show the true geometry.
     flows -= flows.mean(axis=0)
     blurs = rng.uniform(*BLURS, FRAMES)
-    frames = [distort(scene, flow[None], rng, blur=blur, noise=NOISE)[0] for flow, blur in zip(flows, blurs, strict=True)]
+    frames = [
+        distort(scene, flow[None], rng, blur=blur, noise=NOISE)[0] for flow, blur in zip(flows, blurs, strict=True)
+    ]
     write_video(FOLDER / "chart.mkv", frames, RATE, bit_depth=8, overwrite=True)
     write_image(FOLDER / "chart_truth.png", scene, 8, overwrite=True)
 

@@ -61,3 +61,21 @@ def test_nothing_heavy_is_loaded(action):
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.splitlines()[-1] == "[]"
+
+
+def test_public_names_load_and_hide_no_module():
+    import turbrestore
+
+    modules = {path.stem for path in PACKAGE.iterdir()}
+    for name in turbrestore.__all__:
+        assert getattr(turbrestore, name).__module__.startswith("turbrestore.")
+        assert name not in modules
+
+
+def test_the_test_command_of_the_readme_is_what_ci_runs():
+    root = PACKAGE.parent
+    commands = [line.removeprefix(".venv-ci/bin/") for line in (root / ".ci" / "run").read_text().splitlines()]
+    readme = (root / "README.md").read_text()
+    for command in ("pip install --quiet -c constraints.txt -e '.[torch,dev]'", "python -m pytest"):
+        assert command in commands
+        assert command.replace(" --quiet", "") in readme

@@ -28,6 +28,8 @@ from .parallel import map_ahead
 from .warp import compose_flows, invert_flow, warp
 
 MODES = ("fused", "single")
+# A mean flow that keeps this share of its length from one iteration to the next is the bias of the flow method.
+_STALLED = 0.8
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,8 @@ class CentroidParams:
     iterations : int
         Largest number of iterations; each costs one flow per frame.  The paper runs 10.
     tolerance : float
-        Stop when the mean flow is shorter than this, pixels (mean over the image).  Flow methods have a bias of about
-        that size, so what is left below it is not corrected: that would bend the image.
+        Stop when the mean flow is shorter than this, pixels (mean over the image), or shrinks by less than a fifth.
+        What is left is the bias of the flow method; it is not corrected, which would bend the image.
     start : int
         Frame that ``single`` warps; ``fused`` starts from the temporal mean.
     """
@@ -70,9 +72,10 @@ class Centroid:
     flows : ndarray, float32, shape (T, H, W, 2)
         Flows from the centroid to each frame, pixels.
     mean_flow_sizes : ndarray, float64, shape (iterations,)
-        Mean length of W̄ found in each iteration, pixels.  Those above the tolerance have been corrected.
+        Mean length of W̄ found in each iteration, pixels.  All but the last have been corrected, and the last too if
+        the iteration has not converged.
     converged : bool
-        Whether the last of them is below the tolerance.
+        Whether the last of them is below the tolerance or no longer shrinks.
     """
 
     image: FloatArray
@@ -130,7 +133,8 @@ def find_centroid(
         flows = estimate_flow(image, stack, flow_params, progress)
         mean_flow = flows.mean(axis=0, dtype=np.float32)
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
-        converged = sizes[-1] <= params.tolerance
+        stalled = len(sizes) > 1 and sizes[-1] > _STALLED * sizes[-2]
+        converged = sizes[-1] <= params.tolerance or stalled
         if not converged:
             recentre = invert_flow(mean_flow)
             total = compose_flows(total, recentre)

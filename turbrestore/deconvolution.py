@@ -113,7 +113,7 @@ class DeconvolutionParams:
     method: Literal["nltv", "tv", "wiener", "tikhonov"] = "nltv"
     sigma: float | None = None
     fidelity: float | None = None
-    iterations: int = 200
+    iterations: int = 300
     tolerance: float = 2e-4
     boundary: Literal["unknown", "periodic"] = "unknown"
     channels: Literal["luminance", "each"] = "luminance"

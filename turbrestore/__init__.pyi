@@ -1,0 +1,34 @@
+from .alternating import Filtered as Filtered
+from .alternating import FilterParams as FilterParams
+from .alternating import filter_frames as filter_frames
+from .artifacts import load_artifact as load_artifact
+from .artifacts import save_artifact as save_artifact
+from .centroid import Centroid as Centroid
+from .centroid import CentroidParams as CentroidParams
+from .centroid import find_centroid as find_centroid
+from .deconvolution import Deconvolution as Deconvolution
+from .deconvolution import DeconvolutionParams as DeconvolutionParams
+from .deconvolution import deconvolve as deconvolve
+from .dynamics import DynamicsParams as DynamicsParams
+from .dynamics import FlowDynamics as FlowDynamics
+from .dynamics import identify as identify
+from .dynamics import predict_flow as predict_flow
+from .dynamics import simulate as simulate
+from .errors import TurbrestoreError as TurbrestoreError
+from .flow import FlowParams as FlowParams
+from .flow import estimate_flow as estimate_flow
+from .frame_source import FrameSource as FrameSource
+from .images import read_image as read_image
+from .images import write_image as write_image
+from .metrics import compare as compare
+from .pipeline import Restoration as Restoration
+from .pipeline import RestoreParams as RestoreParams
+from .pipeline import restore as restore
+from .psf import BlurEstimate as BlurEstimate
+from .psf import estimate_blur as estimate_blur
+from .video import open_frames as open_frames
+from .video import write_video as write_video
+from .warp import compose_flows as compose_flows
+from .warp import invert_flow as invert_flow
+
+__version__: str
