@@ -49,7 +49,7 @@ from .dynamics import FlowDynamics, flow_of
 from .errors import DataError, require
 from .flow import FlowParams, iterate_flows
 from .kalman import Gaussian, PixelGaussian, predict, predict_pixels, update_information, update_pixels
-from .parallel import map_ahead
+from .parallel import map_ahead, one_thread_each
 from .warp import warp
 
 RESIDUALS = ("keep", "drop")
@@ -280,10 +280,11 @@ def filter_frames(
         Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance),
     )
     setting = _Setting(dynamics, model, params, flow_params, progress)
-    state, records = _filter_block(state, first, flows, setting)
-    while block := list(islice(stream, params.block)):
-        state, done = _filter_block(state, block, None, setting)
-        records += done
+    with one_thread_each():
+        state, records = _filter_block(state, first, flows, setting)
+        while block := list(islice(stream, params.block)):
+            state, done = _filter_block(state, block, None, setting)
+            records += done
     return Filtered(
         image=state.image.mean.astype(np.float32),
         variance=state.image.variance.astype(np.float32),

@@ -32,6 +32,7 @@ from scipy import linalg
 
 from .arrays import FloatArray, check_flow
 from .errors import ConfigurationError, DataError
+from .parallel import one_thread_each
 
 Float64Array = NDArray[np.float64]
 
@@ -198,6 +199,7 @@ class SimulatedFlows:
         return (self[k] for k in range(len(self)))
 
 
+@one_thread_each()
 def identify(flows: FloatArray | Iterable[FloatArray], params: DynamicsParams | None = None) -> FlowDynamics:
     """Fit the dynamic texture to a training sequence of flows (paper 3, sections 3.1 and 3.2).
 

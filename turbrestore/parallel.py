@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 import cv2
+from threadpoolctl import threadpool_limits
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -20,8 +21,8 @@ def map_ahead(
 ) -> Iterator[tuple[Item, Result]]:
     """Yield ``(item, function(item))`` in order while threads work a few items ahead.
 
-    Memory is bounded by a handful of items and results, however many there are.  OpenCV's own threads are switched
-    off meanwhile: items run side by side already.
+    Memory is bounded by a handful of items and results, however many there are.  The threads of OpenCV and BLAS are
+    switched off meanwhile: items run side by side already.
 
     Parameters
     ----------
@@ -42,7 +43,7 @@ def map_ahead(
     [(-1, 1), (2, 2)]
     """
     workers = threads or available_cores()
-    with _one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
+    with one_thread_each(), ThreadPoolExecutor(workers) as pool:
         pending: deque[tuple[Item, Future[Result]]] = deque()
         try:
             for item in items:
@@ -75,10 +76,22 @@ def available_cores() -> int:
 
 
 @contextmanager
-def _one_opencv_thread() -> Iterator[None]:
+def one_thread_each() -> Iterator[None]:
+    """Keep OpenCV and BLAS from starting threads of their own, and give them back what they had afterwards.
+
+    Beside busy threads a BLAS call on two threads is not twice as fast but tens of times slower: each waits for the
+    other to be scheduled.
+
+    Examples
+    --------
+    >>> with one_thread_each():
+    ...     cv2.getNumThreads()
+    1
+    """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        yield
+        with threadpool_limits(limits=1, user_api="blas"):
+            yield
     finally:
         cv2.setNumThreads(before)
