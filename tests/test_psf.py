@@ -108,6 +108,18 @@ def test_the_fit_recovers_the_blur_of_a_scene_that_obeys_its_model(sigma, noise)
     assert np.abs(np.log(estimate.model / estimate.power)).mean() < 0.25
 
 
+def test_noise_is_taken_out_of_the_spectrum():
+    clean = natural_field(np.random.default_rng(8), (192, 160), 1.5)
+    without = estimate_blur(clean, 0.0).power
+    ratios = []
+    for seed in range(12):
+        noisy = clean + np.random.default_rng(seed).normal(0, 0.01, clean.shape).astype(np.float32)
+        power = estimate_blur(noisy, 0.01).power
+        # Near the cutoff, where noise adds 6 % on average.
+        ratios.append((power / without[: len(power)])[-4:].mean())
+    assert np.median(ratios) == pytest.approx(1, abs=0.03)
+
+
 @pytest.mark.parametrize("sigma", [1.0, 1.5, 2.5])
 def test_blur_of_a_photograph_is_found_within_a_quarter_pixel_and_not_exceeded_much(sigma):
     blurred = cv2.GaussianBlur(camera(), (0, 0), sigma)

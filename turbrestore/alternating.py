@@ -62,6 +62,8 @@ _FLOW_NOISE_FLOOR = 1e-6
 _LARGEST_SCORE = 3.0
 # Sharpness that differs by less than this share is not worth averaging fewer frames.
 _LEAST_SPREAD = 0.03
+# Areas that a map shrinks or grows by more than this factor are not to be trusted: Z is so many times larger there.
+_LEAST_STRETCH, _DISTRUST = 0.3, 1e3
 # Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels it correlates over.
 _SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
 
@@ -346,12 +348,28 @@ def _update_motion(
         yield _Motion(frame, measured, state, float(np.sqrt(np.mean(np.square(unforeseen)))))
 
 
-def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, float | FloatArray]:
+def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, FloatArray]:
     """Frame on the image by Ŵ, and its noise Z (eq. 15)."""
     modelled = flow_of(setting.dynamics, motion.state.mean)
     share = setting.model.motion_share[..., None]
-    registered = warp(motion.frame, modelled + share * (motion.measured - modelled))
-    return registered, _frame_noise(registered, setting.model, setting.params)
+    estimate = modelled + share * (motion.measured - modelled)
+    registered = warp(motion.frame, estimate)
+    return registered, _frame_noise(registered, setting.model, setting.params) * _distrust(estimate)
+
+
+def _distrust(flow: FloatArray) -> FloatArray:
+    """Factor on Z: large where the map id + Ŵ folds or stretches beyond what air does.
+
+    Paper 3 takes the maps to be diffeomorphisms.  Where the estimate is none, the flow has lost its way, and what it
+    brings there may have more contrast than the scene.
+    """
+    (ux, uy), (vx, vy) = (
+        (cv2.Sobel(part, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(part, cv2.CV_32F, 0, 1, scale=1 / 8))
+        for part in (np.ascontiguousarray(flow[..., 0]), np.ascontiguousarray(flow[..., 1]))
+    )
+    stretch = (1 + ux) * (1 + vy) - uy * vx
+    lost = ((stretch < _LEAST_STRETCH) | (stretch > 1 / _LEAST_STRETCH)).astype(np.uint8)
+    return np.where(cv2.dilate(lost, np.ones((5, 5), np.uint8)), np.float32(_DISTRUST), np.float32(1))
 
 
 def _noise_model(
