@@ -348,13 +348,13 @@ def _update_motion(
         yield _Motion(frame, measured, state, float(np.sqrt(np.mean(np.square(unforeseen)))))
 
 
-def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, FloatArray]:
+def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, float | FloatArray]:
     """Frame on the image by Ŵ, and its noise Z (eq. 15)."""
     modelled = flow_of(setting.dynamics, motion.state.mean)
     share = setting.model.motion_share[..., None]
     estimate = modelled + share * (motion.measured - modelled)
     registered = warp(motion.frame, estimate)
-    return registered, _frame_noise(registered, setting.model, setting.params) * _distrust(estimate)
+    return registered, _frame_noise(registered, estimate, setting.model, setting.params)
 
 
 def _distrust(flow: FloatArray) -> FloatArray:
@@ -432,14 +432,17 @@ def _motion_share(energy: FloatArray, noise: float, dynamics: FlowDynamics, wind
     return (1.0 - np.minimum(noise_variance / np.maximum(total, 1e-12), 1.0)).astype(np.float32)
 
 
-def _frame_noise(registered: FloatArray, model: _NoiseModel, params: FilterParams) -> float | FloatArray:
-    """Z of one frame: lower where it is sharper than usual, the same on average over the frames."""
+def _frame_noise(
+    registered: FloatArray, flow: FloatArray, model: _NoiseModel, params: FilterParams
+) -> float | FloatArray:
+    """Z of one frame: lower where it is sharper than usual, much higher where its flow is lost."""
     if params.sharpness == 0:
         return model.image_noise
     sharpness = _sharpness(luminance(registered), model.template, params.sharpness_window)
     score = np.clip(model.score_scale * (sharpness - model.usual), -_LARGEST_SCORE, _LARGEST_SCORE)
     # For a normal score the mean of exp(β z − β²/2) is one: the information per frame stays 1/Z.
-    return np.float32(model.image_noise) * np.exp(0.5 * params.sharpness**2 - params.sharpness * score)
+    noise = np.float32(model.image_noise) * np.exp(0.5 * params.sharpness**2 - params.sharpness * score)
+    return noise * _distrust(flow)
 
 
 def _sharpness(registered: FloatArray, template: tuple[FloatArray, FloatArray], window: float) -> FloatArray:
