@@ -36,7 +36,7 @@ def test_frames_and_flows_of_wrong_shape_are_refused():
         check_flow(np.zeros((4, 4, 3)))
     with pytest.raises(DataError, match="floating point or unsigned"):
         check_image([["a", "b"]])
-    with pytest.raises(DataError, match="expected numbers"):
+    with pytest.raises(DataError, match="expected real numbers"):
         check_flow("text")
 
 

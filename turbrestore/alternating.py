@@ -46,7 +46,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_flow, check_image, luminance
 from .dynamics import FlowDynamics, flow_of
-from .errors import DataError, require
+from .errors import DataError, require, require_between
 from .flow import FlowParams, iterate_flows
 from .kalman import Gaussian, PixelGaussian, predict, predict_pixels, update_information, update_pixels
 from .parallel import map_ahead, one_thread_each
@@ -106,19 +106,14 @@ class FilterParams:
             self.residual in RESIDUALS,
             f"residual: expected one of {', '.join(RESIDUALS)}, found {self.residual!r}",
         )
-        require(self.inner_iterations >= 1, f"inner_iterations: expected 1 or more, found {self.inner_iterations}")
-        require(self.block >= 1, f"block: expected 1 frame or more, found {self.block}")
-        require(0 <= self.sharpness <= 10, f"sharpness: expected 0 to 10, found {self.sharpness}")
-        require(
-            self.sharpness_window > 0,
-            f"sharpness_window: expected a positive width, found {self.sharpness_window}",
-        )
-        require(
-            self.image_noise is None or self.image_noise > 0,
-            f"image_noise: expected a positive variance, found {self.image_noise}",
-        )
-        require(self.image_drift >= 0, f"image_drift: expected 0 or more, found {self.image_drift}")
-        require(self.prior_frames >= 0, f"prior_frames: expected 0 or more, found {self.prior_frames}")
+        require_between("inner_iterations", self.inner_iterations, 1, 100)
+        require_between("block", self.block, 1, 10_000, "frames")
+        require_between("sharpness", self.sharpness, 0, 10)
+        require_between("sharpness_window", self.sharpness_window, 0.3, 100, "pixels")
+        if self.image_noise is not None:
+            require_between("image_noise", self.image_noise, 1e-12, 1)
+        require_between("image_drift", self.image_drift, 0, 1)
+        require_between("prior_frames", self.prior_frames, 0, 1e6)
 
 
 @dataclass(frozen=True)
@@ -173,13 +168,14 @@ class _NoiseModel:
     """What the first block says of the frames.
 
     Z, the gradient of the starting image, the usual sharpness per pixel, the factor that turns a deviation from it
-    into a score, and G.
+    into a score, the variance of that score over the frames, and G.
     """
 
     image_noise: float
     template: tuple[FloatArray, FloatArray]
     usual: FloatArray
     score_scale: FloatArray
+    score_variance: FloatArray
     motion_share: FloatArray
 
 
@@ -268,14 +264,16 @@ def filter_frames(
     if image.shape[:2] != dynamics.shape:
         raise DataError(f"dynamics: expected flows of {image.shape[:2]} pixels, found {dynamics.shape}")
     flows = None if known_flows is None else check_flow(known_flows, "known_flows")
-    stream = (check_image(frame, f"frame {index}") for index, frame in enumerate(frames))
+    if flows is not None and (flows.ndim != 4 or flows.shape[1:3] != dynamics.shape):
+        raise DataError(f"known_flows: expected shape (K, {image.shape[0]}, {image.shape[1]}, 2), found {flows.shape}")
+    stream = _checked(frames, image.shape)
     first = list(islice(stream, params.block if flows is None else len(flows)))
     if not first or (flows is not None and len(first) < len(flows)):
         wanted = 1 if flows is None else len(flows)
         raise DataError(f"frames: expected at least {wanted}, found {len(first)}")
     if flows is None:
         flows = np.stack([flow for _, flow in iterate_flows(image, first, flow_params)])
-    model = _noise_model(first, flows, image, dynamics, params)
+    model = _noise_model(first, flows, image, dynamics, params, flow_params.threads)
     prior_variance = model.image_noise / params.prior_frames if params.prior_frames else _DIFFUSE
     state = FilterState(
         PixelGaussian(image, np.full(image.shape[:2], prior_variance, np.float32)),
@@ -296,6 +294,14 @@ def filter_frames(
         image_noise=model.image_noise,
         motion_share=float(model.motion_share.mean()),
     )
+
+
+def _checked(frames: Iterable[ArrayLike], shape: tuple[int, ...]) -> Iterator[FloatArray]:
+    for index, frame in enumerate(frames):
+        image = check_image(frame, f"frame {index}")
+        if image.shape != shape:
+            raise DataError(f"frame {index}: expected shape {shape} as the reference has, found {image.shape}")
+        yield image
 
 
 def _filter_block(
@@ -373,7 +379,12 @@ def _distrust(flow: FloatArray) -> FloatArray:
 
 
 def _noise_model(
-    frames: list[FloatArray], flows: FloatArray, image: FloatArray, dynamics: FlowDynamics, params: FilterParams
+    frames: list[FloatArray],
+    flows: FloatArray,
+    image: FloatArray,
+    dynamics: FlowDynamics,
+    params: FilterParams,
+    threads: int,
 ) -> _NoiseModel:
     """Temporal statistics of the first block, registered by its flows."""
     template = _gradient(luminance(image))
@@ -384,7 +395,7 @@ def _noise_model(
 
     shape = image.shape[:2]
     total, squares, sharp, sharp_squares = (np.zeros(shape) for _ in range(4))
-    for _, (registered, sharpness) in map_ahead(measure, zip(frames, flows, strict=True)):
+    for _, (registered, sharpness) in map_ahead(measure, zip(frames, flows, strict=True), threads):
         total += registered
         squares += np.square(registered, dtype=np.float64)
         sharp += sharpness
@@ -400,11 +411,13 @@ def _noise_model(
     share = np.zeros(shape, np.float32)
     if params.residual == "keep":
         share = _motion_share(energy, sensor_noise, dynamics, params.sharpness_window)
+    scale = _score_scale(usual, spread, energy * _SOBEL_NOISE * sensor_noise, params.sharpness_window)
     return _NoiseModel(
         max(measured, _IMAGE_NOISE_FLOOR),
         template,
         usual.astype(np.float32),
-        _score_scale(usual, spread, energy * _SOBEL_NOISE * sensor_noise, params.sharpness_window),
+        scale,
+        (scale**2 * spread).astype(np.float32),
         share,
     )
 
@@ -440,9 +453,9 @@ def _frame_noise(
         return model.image_noise
     sharpness = _sharpness(luminance(registered), model.template, params.sharpness_window)
     score = np.clip(model.score_scale * (sharpness - model.usual), -_LARGEST_SCORE, _LARGEST_SCORE)
-    # For a normal score the mean of exp(β z − β²/2) is one: the information per frame stays 1/Z.
-    noise = np.float32(model.image_noise) * np.exp(0.5 * params.sharpness**2 - params.sharpness * score)
-    return noise * _distrust(flow)
+    # For a normal score of variance s² the mean of exp(β z − β² s² / 2) is one: the information per frame stays 1/Z.
+    exponent = 0.5 * params.sharpness**2 * model.score_variance - params.sharpness * score
+    return np.float32(model.image_noise) * np.exp(exponent) * _distrust(flow)
 
 
 def _sharpness(registered: FloatArray, template: tuple[FloatArray, FloatArray], window: float) -> FloatArray:

@@ -122,10 +122,10 @@ def check_flow(flow: ArrayLike, name: str = "flow") -> FloatArray:
     >>> check_flow(np.zeros((2, 3, 2))).dtype
     dtype('float32')
     """
-    try:
-        array = np.asarray(flow, dtype=np.float32)
-    except (TypeError, ValueError):
-        raise DataError(f"{name}: expected numbers, found {type(flow).__name__}") from None
+    values = np.asarray(flow)
+    if values.dtype.kind not in "fiu":
+        raise DataError(f"{name}: expected real numbers, found {values.dtype}")
+    array = values.astype(np.float32, copy=False)
     if array.ndim not in (3, 4) or array.shape[-1] != 2:
         raise DataError(f"{name}: expected shape (H, W, 2) or (T, H, W, 2), found {array.shape}")
     return _finite(array, name)

@@ -35,6 +35,7 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "deconvolution": Deconvolution,
 }
 _HEADER = "header"
+_SCALARS: dict[str, Any] = {"float": (int, float), "int": int, "bool": bool, "tuple[str, ...]": list}
 
 Result = TypeVar("Result", bound="DataclassInstance")
 
@@ -143,7 +144,7 @@ def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
     turbrestore.errors.InputNotFoundError: missing.npz: no such file
     """
     source = Path(path)
-    if source.suffix != ".npz":
+    if source.suffix.lower() != ".npz":
         return read_image(source).image
     kind, fields = _read(source)
     if "image" not in fields:
@@ -212,7 +213,7 @@ def load_flows(path: str | os.PathLike[str]) -> FloatArray:
     turbrestore.errors.InputNotFoundError: missing.npy: no such file
     """
     source = Path(path)
-    if source.suffix == ".npz":
+    if source.suffix.lower() == ".npz":
         return load_artifact(source, Centroid).flows
     if not source.is_file():
         raise InputNotFoundError(f"{source}: no such file")
@@ -246,6 +247,11 @@ def _build(source: Path, kind: type[Result], fields: dict[str, Any]) -> Result:
     expected = {item.name for item in dataclasses.fields(kind)}
     if set(fields) != expected:
         raise DataError(f"{source}: expected the fields {sorted(expected)}, found {sorted(fields)}")
+    for item in dataclasses.fields(kind):
+        # Annotations are text here; what is no number, flag or list of text is an array.
+        wanted = _SCALARS.get(str(item.type), np.ndarray)
+        if not isinstance(fields[item.name], wanted) or isinstance(fields[item.name], bool) is not (wanted is bool):
+            raise DataError(f"{source}: expected {item.name} to be {item.type}, found {fields[item.name]!r:.40}")
     return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})
 
 

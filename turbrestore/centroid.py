@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_frames
-from .errors import require
+from .errors import require, require_between
 from .flow import FlowParams, estimate_flow
 from .parallel import map_ahead
 from .warp import compose_flows, invert_flow, warp
@@ -56,8 +56,8 @@ class CentroidParams:
 
     def __post_init__(self) -> None:
         require(self.mode in MODES, f"mode: expected one of {', '.join(MODES)}, found {self.mode!r}")
-        require(self.iterations >= 1, f"iterations: expected 1 or more, found {self.iterations}")
-        require(self.tolerance >= 0, f"tolerance: expected 0 or more pixels, found {self.tolerance}")
+        require_between("iterations", self.iterations, 1, 1000)
+        require_between("tolerance", self.tolerance, 0, 1000, "pixels")
         require(self.start >= 0, f"start: expected a frame number from 0, found {self.start}")
 
 
@@ -123,7 +123,7 @@ def find_centroid(
     >>> centroid.converged, centroid.image.shape
     (True, (48, 48))
     """
-    params = params or CentroidParams()
+    params, flow_params = params or CentroidParams(), flow_params or FlowParams()
     stack = check_frames(frames, at_least=2)
     require(params.start < len(stack), f"start: expected a frame below {len(stack)}, found {params.start}")
     image = stack.mean(axis=0, dtype=np.float32) if params.mode == "fused" else stack[params.start]
@@ -140,12 +140,16 @@ def find_centroid(
             total = compose_flows(total, recentre)
             for index in range(len(flows)):
                 flows[index] = compose_flows(flows[index], recentre)
-        image = mean_registered(stack, flows) if params.mode == "fused" else warp(stack[params.start], total)
+        image = (
+            mean_registered(stack, flows, flow_params.threads)
+            if params.mode == "fused"
+            else warp(stack[params.start], total)
+        )
         if converged or len(sizes) == params.iterations:
             return Centroid(image, flows, np.array(sizes), converged)
 
 
-def mean_registered(frames: FloatArray, flows: FloatArray) -> FloatArray:
+def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0) -> FloatArray:
     """Average of frames warped onto the reference that their flows start from.
 
     Parameters
@@ -153,6 +157,8 @@ def mean_registered(frames: FloatArray, flows: FloatArray) -> FloatArray:
     frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
     flows : ndarray, float32, shape (T, H, W, 2)
         Pixels.
+    threads : int
+        Frames warped side by side; 0 means one per available core.
 
     Returns
     -------
@@ -165,6 +171,6 @@ def mean_registered(frames: FloatArray, flows: FloatArray) -> FloatArray:
     array([1., 1., 1., 1.], dtype=float32)
     """
     total = np.zeros(frames.shape[1:], np.float64)
-    for _, registered in map_ahead(lambda pair: warp(*pair), zip(frames, flows, strict=True)):
+    for _, registered in map_ahead(lambda pair: warp(*pair), zip(frames, flows, strict=True), threads):
         total += registered
     return (total / len(frames)).astype(np.float32)

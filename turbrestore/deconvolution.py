@@ -50,7 +50,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from .arrays import FloatArray, check_image, luminance
-from .errors import DataError, require
+from .errors import DataError, require, require_between
 from .nonlocal_tv import (
     NonlocalParams,
     nonlocal_divergence,
@@ -127,13 +127,12 @@ class DeconvolutionParams:
             ("channels", self.channels, CHANNELS),
         ):
             require(value in known, f"{name}: expected one of {', '.join(known)}, found {value!r}")
-        require(self.sigma is None or self.sigma >= 0, f"sigma: expected 0 or more pixels, found {self.sigma}")
-        require(
-            self.fidelity is None or 0 < self.fidelity < np.inf,
-            f"fidelity: expected a positive number, found {self.fidelity}",
-        )
-        require(self.iterations >= 1, f"iterations: expected 1 or more, found {self.iterations}")
-        require(self.tolerance >= 0, f"tolerance: expected 0 or more, found {self.tolerance}")
+        if self.sigma is not None:
+            require_between("sigma", self.sigma, 0, 1000, "pixels")
+        if self.fidelity is not None:
+            require_between("fidelity", self.fidelity, 1e-6, 1e9)
+        require_between("iterations", self.iterations, 1, 100_000)
+        require_between("tolerance", self.tolerance, 0, 1)
 
 
 @dataclass(frozen=True, eq=False)

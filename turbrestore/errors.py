@@ -41,6 +41,35 @@ class StorageError(TurbrestoreError):
     exit_code = 74
 
 
+def require_between(name: str, value: float, low: float, high: float, unit: str = "") -> None:
+    """Raise :class:`ConfigurationError` unless ``low <= value <= high``; NaN never does.
+
+    Parameters
+    ----------
+    name : str
+        Name of the setting.
+    value : float
+        What was set.
+    low, high : float
+        Smallest and largest value that make sense.
+    unit : str
+        Unit of the value, for the message.
+
+    Raises
+    ------
+    ConfigurationError
+        The value lies outside.
+
+    Examples
+    --------
+    >>> require_between("width", float("inf"), 0, 100, "pixels")
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.ConfigurationError: width: expected 0 to 100 pixels, found inf
+    """
+    require(low <= value <= high, f"{name}: expected {low:g} to {high:g}{' ' * bool(unit)}{unit}, found {value:g}")
+
+
 def require(condition: bool, message: str) -> None:
     """Raise :class:`ConfigurationError` with ``message`` unless ``condition`` holds.
 

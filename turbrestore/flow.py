@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, check_frames, check_image, luminance
-from .errors import DataError, require
+from .errors import DataError, require, require_between
 from .parallel import map_ahead
 
 MIN_SIDE = 16
@@ -64,8 +64,8 @@ class DisParams:
             1 <= self.patch_stride <= self.patch_size,
             f"patch_stride: expected 1 to patch_size ({self.patch_size}), found {self.patch_stride}",
         )
-        require(self.refinements >= 0, f"refinements: expected 0 or more, found {self.refinements}")
-        require(self.smoothness > 0, f"smoothness: expected a positive number, found {self.smoothness}")
+        require_between("refinements", self.refinements, 0, 1000)
+        require_between("smoothness", self.smoothness, 1e-3, 1e4)
 
 
 @dataclass(frozen=True)
@@ -96,10 +96,9 @@ class TvL1Params:
     scales: int = 5
 
     def __post_init__(self) -> None:
-        require(self.attachment > 0, f"attachment: expected a positive number, found {self.attachment}")
+        require_between("attachment", self.attachment, 1e-4, 1e3)
         for name in ("warps", "outer_iterations", "inner_iterations", "scales"):
-            value = getattr(self, name)
-            require(value >= 1, f"{name}: expected 1 or more, found {value}")
+            require_between(name, getattr(self, name), 1, 1000)
         require(self.median in (1, 3, 5), f"median: expected 1 (off), 3 or 5, found {self.median}")
 
     @classmethod
@@ -130,9 +129,9 @@ class FarnebackParams:
     neighbourhood: int = 5
 
     def __post_init__(self) -> None:
-        require(self.window >= 3, f"window: expected 3 pixels or more, found {self.window}")
-        require(self.levels >= 1, f"levels: expected 1 or more, found {self.levels}")
-        require(self.iterations >= 1, f"iterations: expected 1 or more, found {self.iterations}")
+        require_between("window", self.window, 3, 255, "pixels")
+        require_between("levels", self.levels, 1, 20)
+        require_between("iterations", self.iterations, 1, 1000)
         require(self.neighbourhood in (5, 7), f"neighbourhood: expected 5 or 7 pixels, found {self.neighbourhood}")
 
 
@@ -172,9 +171,9 @@ class FlowParams:
             self.method in FLOW_METHODS,
             f"method: expected one of {', '.join(FLOW_METHODS)}, found {self.method!r}",
         )
-        require(self.contrast_window >= 0, f"contrast_window: expected 0 or more, found {self.contrast_window}")
-        require(self.contrast_floor > 0, f"contrast_floor: expected a positive number, found {self.contrast_floor}")
-        require(self.threads >= 0, f"threads: expected 0 (automatic) or more, found {self.threads}")
+        require_between("contrast_window", self.contrast_window, 0, 1000, "pixels")
+        require_between("contrast_floor", self.contrast_floor, 1e-6, 1)
+        require_between("threads", self.threads, 0, 256)
 
 
 def estimate_flow(

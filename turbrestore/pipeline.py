@@ -25,6 +25,8 @@ STAGES = ("centroid", "identify", "filter", "deconvolve")
 # Contrast below one grey level of an 8-bit camera is no scene.
 _LEAST_CONTRAST = 1 / 255
 _FEWEST_TRAINED, _MOST_TRAINED = 40, 100
+# A blur wider than this share of the image leaves nothing to restore.
+_SIGMAS_A_SIDE = 8
 # Training frames and their flows stay in memory: 12 bytes a pixel for grey frames, up to this many bytes.
 _TRAINING_BYTES = 1.5e9
 
@@ -64,6 +66,10 @@ class RestoreParams:
 
     def __post_init__(self) -> None:
         require(self.train is None or self.train >= 2, f"train: expected 2 frames or more, found {self.train}")
+        require(
+            self.until == STAGES[-1] or self.deconvolution.sigma is None,
+            f"deconvolution.sigma: has no effect with until = {self.until}; leave one of them out",
+        )
         require(self.until in STAGES, f"until: expected one of {', '.join(STAGES)}, found {self.until!r}")
 
 
@@ -144,6 +150,7 @@ def restore(
     params = params or RestoreParams()
     source = frames if isinstance(frames, FrameSource) else FrameSource.from_array(frames)
     train = training_share(len(source), source.shape[1:], params.train)
+    _check_sigma(params.deconvolution.sigma, source.shape)
     stages = STAGES[: STAGES.index(params.until) + 1]
     clock = _Clock()
     stream = iter(source)
@@ -221,6 +228,7 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
             f"frames: expected at least {MIN_SIDE}×{MIN_SIDE} pixels, found {frame_shape[1]}×{frame_shape[0]}"
         )
     if wanted is not None:
+        require(wanted >= 2, f"train: expected 2 frames or more, found {wanted}")
         require(wanted <= frame_count, f"train: expected at most the {frame_count} frames there are, found {wanted}")
         return wanted
     share = min(max(frame_count // 2, _FEWEST_TRAINED), _MOST_TRAINED)
@@ -292,6 +300,14 @@ class _Sum:
 
     def mean(self) -> FloatArray:
         return (self._total / self._count).astype(np.float32)
+
+
+def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
+    largest = min(shape[1:3]) / _SIGMAS_A_SIDE
+    require(
+        sigma is None or sigma <= largest,
+        f"sigma: expected at most {largest:g} pixels for frames of {shape[2]}×{shape[1]}, found {sigma}",
+    )
 
 
 def _read_training(stream: Iterator[FloatArray], train: int) -> FloatArray:
