@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import sys
@@ -13,14 +14,15 @@ from cyclopts import App, CycloptsError
 from cyclopts.config import Dict
 
 from turbrestore import __version__
-from turbrestore.errors import ConfigurationError, InputNotFoundError, TurbrestoreError
+from turbrestore.errors import ConfigurationError, InputNotFoundError, StorageError, TurbrestoreError
 
 if TYPE_CHECKING:
     from cyclopts.argument import ArgumentCollection
 
 INTERRUPTED = 130
-STORAGE_FAILURE = 74
 BUG = 1
+# What a settings file must not decide behind the user's back.
+NOT_SETTINGS = {"config", "overwrite", "keep", "truth", "json", "quiet"}
 
 
 def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
@@ -39,9 +41,12 @@ def _read_toml(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputNotFoundError(f"{path}: no such settings file")
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        record = tomllib.loads(path.read_text("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: expected settings as TOML, found {error}") from error
+    for name in NOT_SETTINGS & {key.replace("-", "_") for key in record}:
+        raise ConfigurationError(f"{path}: {name} belongs on the command line, not in a settings file")
+    return record
 
 
 def build() -> App:
@@ -82,28 +87,35 @@ def main(arguments: list[str] | None = None) -> int:
         130 interrupted, 1 a bug.
     """
     words = sys.argv[1:] if arguments is None else arguments
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     # The libraries that decode images print their own complaints; ours is the one line that counts.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     try:
         build()(words, exit_on_error=False, print_error=False)
-    except CycloptsError as error:
-        return _fail(str(error), ConfigurationError.exit_code)
-    except TurbrestoreError as error:
-        return _fail(str(error), error.exit_code)
-    except KeyboardInterrupt:
-        return _fail("interrupted", INTERRUPTED)
-    except OSError as error:
-        return _fail(f"{error.filename or 'system'}: {error.strerror or error}", STORAGE_FAILURE)
-    except MemoryError:
-        return _fail("out of memory; use --roi, fewer --train frames or a smaller video", BUG)
+    except BrokenPipeError:
+        # The reader has seen enough; a second complaint at exit would be about the same.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (CycloptsError, TurbrestoreError, KeyboardInterrupt, OSError, MemoryError) as error:
+        message, code = _explain(error)
+        sys.stderr.write(f"turbrestore: {' '.join(message.split())}\n")
+        return code
     return 0
 
 
-def _fail(message: str, code: int) -> int:
-    text = " ".join(message.split())
-    sys.stderr.write(f"turbrestore: {text}\n")
-    return code
+def _explain(error: BaseException) -> tuple[str, int]:
+    """One line and an exit code for a failure that is no bug."""
+    if isinstance(error, TurbrestoreError):
+        return str(error), error.exit_code
+    if isinstance(error, CycloptsError):
+        return str(error), ConfigurationError.exit_code
+    if isinstance(error, OSError):
+        return f"{error.filename or 'system'}: {error.strerror or error}", StorageError.exit_code
+    if isinstance(error, MemoryError):
+        return "out of memory; use --roi, fewer --train frames or a smaller video", BUG
+    return "interrupted", INTERRUPTED
 
 
 if __name__ == "__main__":

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from cyclopts import Parameter
 
+from turbrestore.deconvolution import DeconvolutionParams
 from turbrestore.errors import ConfigurationError
 from turbrestore.frame_source import FrameRange, Roi
 
@@ -48,6 +49,17 @@ class Selection:
             raise ConfigurationError(f"--roi: expected x,y,width,height, found {self.roi!r}")
         x, y, width, height = (_whole_number("--roi", part) for part in parts)
         return x, y, width, height
+
+
+def known_sigma(sigma: float | None, deconvolution: DeconvolutionParams) -> DeconvolutionParams:
+    """Put ``--sigma`` into the settings; it is short for ``--deconvolution.sigma``."""
+    if sigma is None:
+        return deconvolution
+    if deconvolution.sigma not in (None, sigma):
+        raise ConfigurationError(
+            f"--sigma: {sigma} contradicts deconvolution.sigma = {deconvolution.sigma}; leave one of them out"
+        )
+    return replace(deconvolution, sigma=sigma)
 
 
 def _whole_number(option: str, text: str) -> int:

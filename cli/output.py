@@ -19,6 +19,11 @@ from turbrestore.images import atomic_write, check_output, write_image
 from turbrestore.metrics import compare
 from turbrestore.pipeline import Restoration, RestoreParams
 
+from .options import Selection
+
+_ARTIFACTS = ("centroid", "dynamics", "filtered", "deconvolution")
+_IMAGES = ("mean", "centroid", "filtered", "deconvolved")
+
 
 def print_json(record: dict[str, Any]) -> None:
     """Write one JSON object to standard output; what is not a finite number becomes null."""
@@ -86,13 +91,24 @@ def summary(output: Path, restoration: Restoration) -> str:
     return ", ".join(words)
 
 
-def check_keep(folder: Path | None, overwrite: bool) -> None:
-    """Refuse a folder for the stages that cannot be used, before any work begins."""
+def check_keep(folder: Path | None, taken: list[Path], overwrite: bool) -> None:
+    """Refuse a folder for the stages that cannot be used, before any work begins.
+
+    It is new or empty, unless overwriting is allowed, and none of the paths ``taken`` by inputs and outputs.
+    """
     if folder is None:
         return
-    check_output(folder / "centroid.npz" if folder.is_dir() else folder, overwrite=overwrite, suffixes=None)
-    if folder.exists() and not folder.is_dir():
+    if folder.resolve() in {path.resolve() for path in taken}:
+        raise OutputError(f"{folder}: is an input or output already; name another folder to keep the stages in")
+    if not folder.exists():
+        check_output(folder, suffixes=None)
+        return
+    if not folder.is_dir():
         raise OutputError(f"{folder}: is a file; name a folder to keep the stages in")
+    if not overwrite and any(folder.iterdir()):
+        raise OutputError(f"{folder}: is not empty; choose another folder or allow overwriting")
+    for name in (*(f"{stage}.npz" for stage in _ARTIFACTS), *(f"{image}.png" for image in _IMAGES)):
+        check_output(folder / name, overwrite=True, suffixes=None)
 
 
 def save_stages(folder: Path, restoration: Restoration, bit_depth: int) -> None:
@@ -101,23 +117,26 @@ def save_stages(folder: Path, restoration: Restoration, bit_depth: int) -> None:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be created ({error.strerror})") from error
-    results = {
-        "centroid": restoration.centroid,
-        "dynamics": restoration.dynamics,
-        "filtered": restoration.filtered,
-        "deconvolution": restoration.deconvolution,
-    }
-    for name, result in results.items():
-        if result is not None:
+    images = stage_images(restoration)
+    for name in _ARTIFACTS:
+        result = getattr(restoration, name)
+        if result is None:
+            # What an earlier run left would not belong to this one.
+            (folder / f"{name}.npz").unlink(missing_ok=True)
+        else:
             save_artifact(folder / f"{name}.npz", result, overwrite=True)
-    for name, image in stage_images(restoration).items():
-        write_image(folder / f"{name}.png", image, bit_depth, overwrite=True)
+    for name in _IMAGES:
+        if name in images:
+            write_image(folder / f"{name}.png", images[name], bit_depth, overwrite=True)
+        else:
+            (folder / f"{name}.png").unlink(missing_ok=True)
 
 
-def write_settings(path: Path, params: RestoreParams) -> None:
+def write_settings(path: Path, params: RestoreParams, selection: Selection, bit_depth: int | None) -> None:
     """Write settings as TOML that ``--config`` reads; those left to be measured are left out."""
     head = f"# Settings of a run of turbrestore {__version__}; --config with this file repeats it.\n"
-    atomic_write(path, (head + tomli_w.dumps(_without_none(dataclasses.asdict(params)))).encode(), overwrite=True)
+    record = {"bit_depth": bit_depth, **dataclasses.asdict(selection), **dataclasses.asdict(params)}
+    atomic_write(path, (head + tomli_w.dumps(_without_none(record))).encode(), overwrite=True)
 
 
 def _without_none(record: dict[str, Any]) -> dict[str, Any]:

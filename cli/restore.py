@@ -8,13 +8,14 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from turbrestore.errors import ConfigurationError
 from turbrestore.images import check_output, read_image, write_image
+from turbrestore.metrics import comparable
 from turbrestore.pipeline import RestoreParams
 from turbrestore.pipeline import restore as run_pipeline
+from turbrestore.pixels import check_depth
 from turbrestore.video import open_frames
 
-from .options import Flag, Selection
+from .options import Flag, Selection, known_sigma
 from .output import check_keep, describe, print_json, save_stages, summary, write_settings
 from .progress import progress_bars, say
 
@@ -60,36 +61,28 @@ def restore(
     quiet : bool
         No progress and no remarks.
     """
-    settings = _with_sigma(params, sigma)
-    settings_path = output.with_name(output.name + ".toml")
+    settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
+    if bit_depth is not None:
+        check_depth(bit_depth)
     check_output(output, [path for path in (input, config, truth) if path is not None], overwrite)
+    settings_path = output.with_name(output.name + ".toml")
     check_output(settings_path, [input], overwrite or config == settings_path, suffixes=None)
-    check_keep(keep, overwrite)
-    scene = None if truth is None else read_image(truth).image
+    check_keep(keep, [input, output, settings_path], overwrite)
+    scene = None if truth is None else comparable(read_image(truth).image, "truth")
     source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
     for warning in source.warnings:
         say(f"{source.name}: {warning}", quiet)
+    if scene is not None:
+        comparable(source.read(0, 1)[0], source.name)
     with progress_bars(quiet) as progress:
         restoration = run_pipeline(source, settings, progress)
     depth = source.bit_depth if bit_depth is None else bit_depth
     report = describe(restoration, scene)
-    write_image(output, restoration.image, depth, overwrite)
-    write_settings(settings_path, settings)
     if keep is not None:
         save_stages(keep, restoration, depth)
+    write_image(output, restoration.image, depth, overwrite)
+    write_settings(settings_path, settings, selection, bit_depth)
     if json:
         print_json({"input": str(input), "output": str(output), "settings": str(settings_path), **report})
     else:
         say(summary(output, restoration), quiet)
-
-
-def _with_sigma(params: RestoreParams, sigma: float | None) -> RestoreParams:
-    if sigma is None:
-        return params
-    if params.until != "deconvolve":
-        raise ConfigurationError(f"--sigma: has no effect with --until {params.until}; leave one of them out")
-    if params.deconvolution.sigma not in (None, sigma):
-        raise ConfigurationError(
-            f"--sigma: {sigma} contradicts deconvolution.sigma = {params.deconvolution.sigma}; leave one of them out"
-        )
-    return dataclasses.replace(params, deconvolution=dataclasses.replace(params.deconvolution, sigma=sigma))

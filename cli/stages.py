@@ -15,13 +15,15 @@ from turbrestore.deconvolution import Deconvolution, DeconvolutionParams
 from turbrestore.deconvolution import deconvolve as deconvolve_image
 from turbrestore.dynamics import DynamicsParams, FlowDynamics
 from turbrestore.dynamics import identify as identify_flows
+from turbrestore.errors import require
 from turbrestore.flow import FlowParams, estimate_flow
 from turbrestore.images import IMAGE_OUTPUT_SUFFIXES, check_output, read_image, write_image
 from turbrestore.pipeline import stage_counter, training_share
+from turbrestore.pixels import check_depth
 from turbrestore.psf import estimate_blur
 from turbrestore.video import open_frames
 
-from .options import Flag, Selection
+from .options import Flag, Selection, known_sigma
 from .progress import progress_bars, say
 
 ARTIFACT = (".npz",)
@@ -218,23 +220,27 @@ def deconvolve(
     quiet : bool
         No progress and no remarks.
     """
+    sigma = known_sigma(sigma, deconvolution).sigma
+    if bit_depth is not None:
+        check_depth(bit_depth)
+        require(output.suffix.lower() not in ARTIFACT, "--bit-depth: has no effect on an artifact; leave it out")
     inputs = [path for path in (input, guide) if path is not None]
     check_output(output, inputs, overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
     image = load_stage_image(input)
     guide_image = image if guide is None else load_stage_image(guide)
     if sigma is None:
-        sigma = deconvolution.sigma if deconvolution.sigma is not None else estimate_blur(image).sigma
+        sigma = estimate_blur(image).sigma
     with progress_bars(quiet) as progress:
         counter = stage_counter(progress, "deconvolve", deconvolution.iterations)
         result = deconvolve_image(image, sigma, deconvolution, guide=guide_image, progress=counter)
     if bit_depth is None:
-        bit_depth = 16 if input.suffix in ARTIFACT else read_image(input).bit_depth
+        bit_depth = 16 if input.suffix.lower() in ARTIFACT else read_image(input).bit_depth
     _write(output, result, bit_depth, overwrite)
     say(f"{output}: blur of {sigma:.2f} pixels removed" if sigma > 0 else f"{output}: no blur removed", quiet)
 
 
 def _write(output: Path, result: Filtered | Deconvolution, bit_depth: int, overwrite: bool) -> None:
-    if output.suffix in ARTIFACT:
+    if output.suffix.lower() in ARTIFACT:
         save_artifact(output, result, overwrite)
     else:
         write_image(output, result.image, bit_depth, overwrite)

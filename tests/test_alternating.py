@@ -121,6 +121,17 @@ def test_the_diffuse_prior_forgets_the_reference(sequence):
     assert np.abs(tinted.image - plain.image)[INSIDE].mean() < 1e-3
 
 
+@pytest.mark.parametrize("sharpness", [0.0, 2.0])
+def test_frames_alike_carry_the_same_information_whatever_the_weighting(sequence, sharpness):
+    still = np.repeat(sequence.scene[None], 20, axis=0)
+    still = still + np.random.default_rng(0).normal(0, 0.01, still.shape).astype(np.float32)
+    dynamics = identify(np.zeros((20, 96, 96, 2), np.float32))
+    known = np.zeros((20, 96, 96, 2), np.float32)
+    params = FilterParams(sharpness=sharpness, inner_iterations=1)
+    filtered = filter_frames(still, still.mean(axis=0), dynamics, params, known_flows=known)
+    assert np.median(filtered.variance) * 20 / filtered.image_noise == pytest.approx(1, abs=0.15)
+
+
 def test_sharper_frames_weigh_more():
     sequence = make_sequence(seed=7, blur=0.0)
     blurry = np.stack([cv2.GaussianBlur(f, (0, 0), 2.5) if k % 2 else f for k, f in enumerate(sequence.frames)])

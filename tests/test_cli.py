@@ -67,9 +67,9 @@ class TestRestore:
 
     def test_settings_beside_the_result_repeat_it(self, run, clip, tmp_path):
         first, second = tmp_path / "a.png", tmp_path / "b.png"
-        assert (
-            run("restore", clip, first, "--sigma", "0.9", "--train", "5", "--flow.method", "farneback", *QUICK)[0] == 0
-        )
+        part = ["--frames", "1:8", "--roi", "4,0,72,80", "--bit-depth", "16"]
+        settings = [*part, "--sigma", "0.9", "--train", "5", "--flow.method", "farneback"]
+        assert run("restore", clip, first, *settings, *QUICK)[0] == 0
         settings = tmp_path / "a.png.toml"
         assert tomllib.loads(settings.read_text())["flow"]["method"] == "farneback"
         assert run("restore", clip, second, "--config", settings, "--quiet")[0] == 0
@@ -236,7 +236,17 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, make, code, par
         (["--train", "1"], 2, "train"),
         (["--train", "900"], 2, "8 frames"),
         (["--sigma", "-1"], 2, "sigma"),
-        (["--sigma", "1", "--until", "filter"], 2, "--until filter"),
+        (["--sigma", "inf"], 2, "sigma"),
+        (["--sigma", "nan"], 2, "sigma"),
+        (["--sigma", "60"], 2, "sigma"),
+        (["--until", "filter", "--deconvolution.sigma", "1"], 2, "until"),
+        (["--flow.dis.smoothness", "inf"], 2, "smoothness"),
+        (["--flow.contrast-window", "inf"], 2, "contrast_window"),
+        (["--filter.image-noise", "1e300"], 2, "image_noise"),
+        (["--filter.sharpness-window", "nan"], 2, "sharpness_window"),
+        (["--dynamics.frames-per-state", "inf"], 2, "frames_per_state"),
+        (["--bit-depth", "20"], 2, "bit"),
+        (["--sigma", "1", "--until", "filter"], 2, "until = filter"),
         (["--sigma", "1", "--deconvolution.sigma", "2"], 2, "contradicts"),
         (["--frames", "5"], 2, "--frames"),
         (["--frames", "a:b"], 2, "--frames"),
@@ -262,6 +272,7 @@ def test_bad_settings_name_themselves_and_leave_nothing(run, clip, tmp_path, wor
         ('[flow]\nmethod = "sift"\n', "sift"),
         ("train = \n", "settings.toml"),
         ("[flow.dis]\npatch_stride = 40\n", "patch_stride"),
+        ("overwrite = true\n", "overwrite belongs on the command line"),
     ],
 )
 def test_bad_settings_files_are_refused(run, clip, tmp_path, text, part):
@@ -282,10 +293,16 @@ def test_outputs_that_cannot_be(run, clip, tmp_path):
     fails(run("restore", copy, tmp_path / "link.png", "--overwrite"), 73, "link.png")
     fails(run("restore", folder, folder / "b.png"), 73, "frames")
     fails(run("restore", clip, tmp_path / "none" / "o.png"), 73, "does not exist")
-    fails(run("restore", clip, tmp_path), 2)
+    (tmp_path / "folder.png").mkdir()
+    fails(run("restore", clip, tmp_path / "folder.png"), 73, "is a folder")
+    fails(run("restore", clip, ""), 2)
     fails(run("restore", clip, "/proc/o.png"), 73, "/proc")
     fails(run("restore", clip, tmp_path / "o.jpg"), 2, ".png")
     fails(run("restore", clip, tmp_path / "o.png", "--keep", copy), 73, "copy.png")
+    fails(run("restore", clip, tmp_path / "o.png", "--keep", tmp_path / "o.png"), 73, "already")
+    fails(run("restore", folder, tmp_path / "o.png", "--keep", folder, "--overwrite"), 73, "already")
+    fails(run("restore", clip, tmp_path / "o.png", "--keep", folder), 73, "not empty")
+    assert [path.name for path in folder.iterdir()] == ["a.png"]
     assert copy.read_bytes() == clip.read_bytes()
 
 
@@ -328,3 +345,22 @@ def test_the_installed_command_answers(tmp_path):
     failed = subprocess.run([command, "info", "none.mkv"], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert failed.returncode == 66
     assert "Traceback" not in failed.stderr
+
+
+def test_a_smaller_set_of_stages_leaves_none_of_a_larger_one(run, clip, tmp_path):
+    keep = tmp_path / "keep"
+    assert run("restore", clip, tmp_path / "a.png", "--keep", keep, *QUICK)[0] == 0
+    assert (
+        run("restore", clip, tmp_path / "b.png", "--keep", keep, "--until", "centroid", "--overwrite", *QUICK)[0] == 0
+    )
+    assert {path.name for path in keep.iterdir()} == {"centroid.npz", "centroid.png", "mean.png"}
+
+
+def test_stage_commands_check_their_settings(run, clip, tmp_path):
+    fails(run("centroid", clip, tmp_path / "c.npz", "--train", "-3"), 2, "train")
+    image = SAMPLE / "chart_truth.png"
+    fails(run("deconvolve", image, tmp_path / "d.npz", "--bit-depth", "8"), 2, "bit-depth")
+    fails(run("deconvolve", image, tmp_path / "d.png", "--sigma", "1", "--deconvolution.sigma", "2"), 2, "contradicts")
+    assert run("centroid", clip, tmp_path / "C.NPZ", *QUICK[:2], "--quiet")[0] == 0
+    assert run("identify", tmp_path / "C.NPZ", tmp_path / "d.npz", "--quiet")[0] == 0
+    fails(run("filter", SAMPLE / "chart.mkv", tmp_path / "C.NPZ", tmp_path / "d.npz", tmp_path / "f.npz"), 65, "shape")

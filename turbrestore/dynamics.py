@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from .arrays import FloatArray, check_flow
-from .errors import ConfigurationError, DataError
+from .errors import ConfigurationError, DataError, require_between
 from .parallel import one_thread_each
 
 Float64Array = NDArray[np.float64]
@@ -81,16 +81,12 @@ class DynamicsParams:
     ridge: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.rank is not None and self.rank < 0:
-            raise ConfigurationError(f"rank: expected a number of at least 0 or none, found {self.rank}")
-        if not 0 < self.energy <= 1:
-            raise ConfigurationError(f"energy: expected a share above 0 and at most 1, found {self.energy}")
-        if self.max_rank < 0:
-            raise ConfigurationError(f"max_rank: expected a number of at least 0, found {self.max_rank}")
-        if not self.frames_per_state >= 1:
-            raise ConfigurationError(f"frames_per_state: expected at least 1, found {self.frames_per_state}")
-        if not 0 <= self.ridge < np.inf:
-            raise ConfigurationError(f"ridge: expected a finite number of at least 0, found {self.ridge}")
+        if self.rank is not None:
+            require_between("rank", self.rank, 0, 10_000, "states")
+        require_between("energy", self.energy, 1e-6, 1)
+        require_between("max_rank", self.max_rank, 0, 10_000, "states")
+        require_between("frames_per_state", self.frames_per_state, 1, 1000)
+        require_between("ridge", self.ridge, 0, 1e12)
 
 
 @dataclass(frozen=True, eq=False)

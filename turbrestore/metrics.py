@@ -107,10 +107,7 @@ def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """
     from skimage.registration import phase_cross_correlation
 
-    image, scene = _grey(result, "result"), _grey(truth, "truth")
-    for name, array in (("result", image), ("truth", scene)):
-        if min(array.shape) < _SMALLEST:
-            raise DataError(f"{name}: expected at least {_SMALLEST} pixels a side to be compared, found {array.shape}")
+    image, scene = comparable(_grey(result, "result"), "result"), comparable(_grey(truth, "truth"), "truth")
     margin = BORDER - _GUARD
     core = image[margin:-margin, margin:-margin]
     if core.shape[0] > scene.shape[0] + 2 * margin or core.shape[1] > scene.shape[1] + 2 * margin:
@@ -126,6 +123,36 @@ def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
         a = cv2.warpAffine(a, matrix, a.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     inside = slice(_GUARD, -_GUARD)
     return a[inside, inside], t[inside, inside]
+
+
+def comparable(image: FloatArray, name: str) -> FloatArray:
+    """Return ``image`` if it is large enough for :func:`compare`.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W) or (H, W, 3)
+    name : str
+        How the error message calls it.
+
+    Returns
+    -------
+    ndarray
+        The image itself.
+
+    Raises
+    ------
+    DataError
+        A side is shorter than 68 pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> comparable(np.zeros((68, 100), np.float32), "truth").shape
+    (68, 100)
+    """
+    if min(image.shape[:2]) < _SMALLEST:
+        raise DataError(f"{name}: expected at least {_SMALLEST} pixels a side to be compared, found {image.shape[:2]}")
+    return image
 
 
 def psnr(image: ArrayLike, truth: ArrayLike) -> float:
