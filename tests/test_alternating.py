@@ -237,3 +237,19 @@ def test_bad_input_is_refused(sequence):
     ):
         with pytest.raises(ConfigurationError, match=f"^{next(iter(bad))}: expected"):
             FilterParams(**bad)
+
+
+def test_frames_whose_flow_folds_count_for_little(sequence):
+    dynamics = identify(np.zeros((6, 96, 96, 2), np.float32))
+    frames = np.repeat(sequence.frames[:1], 6, axis=0)
+    known = np.zeros((6, 96, 96, 2), np.float32)
+    # In three frames a region is turned over: x + dx falls as x grows.
+    x = np.arange(96, dtype=np.float32)
+    known[::2, 30:60, 30:60, 0] = -2 * (x[30:60] - 45)
+    dynamics = replace(dynamics, residual_variance=np.full((96, 96), 1e9, np.float32))
+    params = FilterParams(inner_iterations=1)
+    filtered = filter_frames(frames, frames[0], dynamics, params, known_flows=known)
+    region = (slice(36, 54), slice(36, 54))
+    plain = np.mean([warp(f, w) for f, w in zip(frames, known, strict=True)], axis=0)
+    assert np.abs(filtered.image - frames[0])[region].max() < 0.05
+    assert np.abs(plain - frames[0])[region].max() > 0.1

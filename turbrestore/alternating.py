@@ -27,7 +27,8 @@ Departures from the paper, each with its reason:
 * Every inner iteration starts from the prediction, not from its own result, so a frame counts once; on a linear
   model the iteration then changes nothing.
 * Z may vary from pixel to pixel: it falls where a frame is locally sharper than usual, by ``exp(−β z)`` with z the
-  standardised local sharpness.  β = 0 is the paper's scalar gain.
+  standardised local sharpness, the gradient of the frame projected on that of the reference; and it rises where the
+  flow folds, which a diffeomorphism does not.  β = 0 is the paper's scalar gain.
 * The image starts from a diffuse prior (``prior_frames=0``) and takes the training frames in first; the paper starts
   from the centroid.
 """
@@ -62,8 +63,8 @@ _FLOW_NOISE_FLOOR = 1e-6
 _LARGEST_SCORE = 3.0
 # Sharpness that differs by less than this share is not worth averaging fewer frames.
 _LEAST_SPREAD = 0.03
-# Areas that a map shrinks or grows by more than this factor are not to be trusted: Z is so many times larger there.
-_LEAST_STRETCH, _DISTRUST = 0.3, 1e3
+# Z is so many times larger where a map folds.
+_DISTRUST = 1e3
 # Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels it correlates over.
 _SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
 
@@ -364,7 +365,7 @@ def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, float | F
 
 
 def _distrust(flow: FloatArray) -> FloatArray:
-    """Factor on Z: large where the map id + Ŵ folds or stretches beyond what air does.
+    """Factor on Z: large where the map id + Ŵ folds.
 
     Paper 3 takes the maps to be diffeomorphisms.  Where the estimate is none, the flow has lost its way, and what it
     brings there may have more contrast than the scene.
@@ -374,8 +375,9 @@ def _distrust(flow: FloatArray) -> FloatArray:
         for part in (np.ascontiguousarray(flow[..., 0]), np.ascontiguousarray(flow[..., 1]))
     )
     stretch = (1 + ux) * (1 + vy) - uy * vx
-    lost = ((stretch < _LEAST_STRETCH) | (stretch > 1 / _LEAST_STRETCH)).astype(np.uint8)
-    return np.where(cv2.dilate(lost, np.ones((5, 5), np.uint8)), np.float32(_DISTRUST), np.float32(1))
+    folded = (stretch <= 0).astype(np.float32)
+    # Faded out: an abrupt change of weights would show as an edge.
+    return np.power(np.float32(_DISTRUST), _smooth(cv2.dilate(folded, np.ones((7, 7), np.uint8)), 2.0))
 
 
 def _noise_model(
@@ -448,7 +450,7 @@ def _motion_share(energy: FloatArray, noise: float, dynamics: FlowDynamics, wind
 def _frame_noise(
     registered: FloatArray, flow: FloatArray, model: _NoiseModel, params: FilterParams
 ) -> float | FloatArray:
-    """Z of one frame: lower where it is sharper than usual, much higher where its flow is lost."""
+    """Z of one frame: lower where it is sharper than usual, much higher where its flow folds."""
     if params.sharpness == 0:
         return model.image_noise
     sharpness = _sharpness(luminance(registered), model.template, params.sharpness_window)
