@@ -1,4 +1,4 @@
-"""Time of a whole restoration against the bare flow calls it makes, and memory against the number of frames.
+"""Time of a whole restoration against the bare flow calls it makes, memory against frames, and time of the help.
 
 Run ``python benchmarks/speed.py``; it prints a table and exits with 1 when a bound is broken.  Both times are taken in
 the same process, in turn, because machines differ and drift; peak memory is that of child processes.
@@ -23,8 +23,23 @@ from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
-TIME_BOUND, MEMORY_BOUND_MB = 1.6, 50.0
+TIME_BOUND, MEMORY_BOUND_MB, HELP_BOUND = 1.6, 50.0, 6.0
 THREADS = 2
+
+
+def help_ratio(runs: int) -> tuple[float, float]:
+    """Median seconds of ``turbrestore --help``, and its ratio to starting Python and importing NumPy."""
+
+    def seconds(code: str) -> float:
+        begun = time.perf_counter()
+        subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=True)
+        return time.perf_counter() - begun
+
+    pairs = [
+        (seconds("from turbrestore_cli.__main__ import main; main(['--help'])"), seconds("import numpy"))
+        for _ in range(runs)
+    ]
+    return float(np.median([a for a, _ in pairs])), float(np.median([a / b for a, b in pairs]))
 
 
 def make_frames(count: int, size: int) -> np.ndarray:
@@ -97,7 +112,10 @@ def main() -> int:
     few, many = peak_memory(260, 128), peak_memory(2060, 128)
     print("| filtered frames | peak memory, MB | growth, MB | bound |\n|---|---|---|---|")
     print(f"| 200 | {few:.0f} | | |\n| 2,000 | {many:.0f} | {many - few:.1f} | {MEMORY_BOUND_MB:.0f} |")
-    return int(ratio > TIME_BOUND or many - few > MEMORY_BOUND_MB)
+    help_seconds, help_cost = help_ratio(9)
+    print("\n| --help, s | ratio to importing NumPy | bound |\n|---|---|---|")
+    print(f"| {help_seconds:.2f} | {help_cost:.2f} | {HELP_BOUND:.0f} |")
+    return int(help_cost > HELP_BOUND or ratio > TIME_BOUND or many - few > MEMORY_BOUND_MB)
 
 
 if __name__ == "__main__":
