@@ -54,11 +54,19 @@ def test_every_module_is_placed():
     assert {layer(path) for path in MODULES} == set(ORDER)
 
 
-@pytest.mark.parametrize("action", ["import turbrestore", "import turbrestore_cli.__main__ as m; m.main(['--help'])"])
-def test_nothing_heavy_is_loaded(action):
-    code = (
-        f"{action}\nimport sys\nprint(sorted({{'torch', 'kornia', 'matplotlib', 'cv2', 'scipy'}} & set(sys.modules)))"
-    )
+LIBRARIES = {"torch", "kornia", "matplotlib", "cv2", "scipy"}
+
+
+@pytest.mark.parametrize(
+    ("action", "absent"),
+    [
+        ("import turbrestore", LIBRARIES | {"numpy"}),
+        ("import turbrestore_cli.__main__ as m; m.main(['--help'])", LIBRARIES),
+        ("import turbrestore_cli.__main__ as m; m.main(['restore', '--help'])", LIBRARIES - {"cv2", "scipy"}),
+    ],
+)
+def test_nothing_heavy_is_loaded(action, absent):
+    code = f"{action}\nimport sys\nprint(sorted({absent} & set(sys.modules)))"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.splitlines()[-1] == "[]"
 
