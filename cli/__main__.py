@@ -17,7 +17,7 @@ from turbrestore import __version__
 from turbrestore.errors import ConfigurationError, InputNotFoundError, StorageError, TurbrestoreError
 
 if TYPE_CHECKING:
-    from cyclopts.argument import ArgumentCollection
+    from cyclopts.argument import Argument, ArgumentCollection
 
 INTERRUPTED = 130
 BUG = 1
@@ -26,7 +26,7 @@ NOT_SETTINGS = {"config", "overwrite", "keep", "truth", "json", "quiet"}
 
 
 def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
-    """Fill what no flag has set from the TOML file named by ``--config``."""
+    """Fill what no flag has set from the TOML file named by ``--config``, and check whole numbers."""
     for argument in arguments:
         if "--config" in argument.names and argument.tokens:
             path = Path(argument.tokens[0].value)
@@ -35,6 +35,16 @@ def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollec
             for command in reversed(commands):
                 record = {command: record}
             Dict(record, source=str(path))(app, commands, arguments)
+    for argument in arguments:
+        if argument.hint in (int, int | None):
+            _refuse_fractions(argument)
+
+
+def _refuse_fractions(argument: Argument) -> None:
+    """Whole numbers must be written as such: conversion alone would round 3.5 frames to 4."""
+    for token in argument.tokens:
+        if token.value and not token.value.lstrip("+-").isdecimal():
+            raise ConfigurationError(f"{argument.name}: expected a whole number, found {token.value!r}")
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -234,6 +234,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, make, code, par
         (["--flow.method", "sift"], 2, "sift"),
         (["--train", "many"], 2, "train"),
         (["--train", "1"], 2, "train"),
+        (["--train", "3.5"], 2, "--train: expected a whole number"),
+        (["--filter.block", "2.9"], 2, "block"),
         (["--train", "900"], 2, "8 frames"),
         (["--sigma", "-1"], 2, "sigma"),
         (["--sigma", "inf"], 2, "sigma"),
@@ -272,6 +274,7 @@ def test_bad_settings_name_themselves_and_leave_nothing(run, clip, tmp_path, wor
         ('[flow]\nmethod = "sift"\n', "sift"),
         ("train = \n", "settings.toml"),
         ("[flow.dis]\npatch_stride = 40\n", "patch_stride"),
+        ("train = 3.5\n", "whole number"),
         ("overwrite = true\n", "overwrite belongs on the command line"),
     ],
 )
