@@ -22,7 +22,7 @@ def blurred():
 
 @pytest.fixture(scope="module")
 def restoration(blurred):
-    return restore(blurred.frames, replace(QUICK, deconvolution=DeconvolutionParams(sigma=1.1)))
+    return restore(blurred.frames, replace(QUICK, train=14, deconvolution=DeconvolutionParams(sigma=1.1)))
 
 
 def test_every_stage_improves_on_the_one_before(blurred, restoration):
