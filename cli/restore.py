@@ -27,7 +27,6 @@ def restore(
     *,
     sigma: float | None = None,
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
-    params: Annotated[RestoreParams, Parameter(name="*")] = RestoreParams(),
     config: Path | None = None,
     keep: Path | None = None,
     truth: Path | None = None,
@@ -35,6 +34,8 @@ def restore(
     overwrite: Flag = False,
     json: Flag = False,
     quiet: Flag = False,
+    # Last, so that the help lists what is often used before the settings of every stage.
+    params: Annotated[RestoreParams, Parameter(name="*")] = RestoreParams(),
 ) -> None:
     """Restore one sharp image from a video of a static scene.
 
