@@ -38,7 +38,7 @@ _FLOOR_MARGIN = 8.0
 _SLOPE_UNCERTAINTY = 0.4
 # Intensity by which a result may leave the local range of the image, and the share of pixels that may do so.
 _OVERSHOOT = 0.05
-_OVERSHOOT_SHARE = 0.03
+_OVERSHOOT_SHARE = 0.025
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +294,7 @@ def estimate_blur(image: ArrayLike, noise: float | None = None) -> BlurEstimate:
     subtracted, and σ fitted from 0.02 cycles per pixel to where P first falls below 8 n². Paper 3 picks σ by hand.
 
     σ is then lowered until a Wiener result leaves the local range (7×7) of the image by more than 5 % of full
-    scale at no more than 3 % of the pixels, where ringing would show. Below 0.5 pixels it becomes 0: leave the
+    scale at no more than 2.5 % of the pixels, where ringing would show. Below 0.5 pixels it becomes 0: leave the
     image alone.
 
     Parameters
