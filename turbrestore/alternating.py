@@ -36,19 +36,19 @@ Departures from the paper, each with its reason:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import FloatArray, check_flow, check_image, luminance
+from .arrays import FloatArray, check_flow, check_image
 from .dynamics import FlowDynamics, flow_of
 from .errors import DataError, require, require_between
 from .flow import FlowParams, iterate_flows
+from .frame_noise import FrameNoise, measure_frame_noise, noise_of_frame
 from .kalman import Gaussian, PixelGaussian, predict, predict_pixels, update_information, update_pixels
 from .parallel import map_ahead, one_thread_each
 from .warp import warp
@@ -56,17 +56,8 @@ from .warp import warp
 RESIDUALS = ("keep", "drop")
 # Variance of an image nothing is known of: full scale, squared.
 _DIFFUSE = 1.0
-# Smallest variances, so that noise-free synthetic data keep every gain defined: (1/4096 of full scale)², (0.001 px)².
-_IMAGE_NOISE_FLOOR = 6e-8
+# Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
 _FLOW_NOISE_FLOOR = 1e-6
-# Standardised sharpness beyond this is an outlier, not a better frame.
-_LARGEST_SCORE = 3.0
-# Sharpness that differs by less than this share is not worth averaging fewer frames.
-_LEAST_SPREAD = 0.03
-# Z is so many times larger where a map folds.
-_DISTRUST = 1e3
-# Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels it correlates over.
-_SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
 
 
 @dataclass(frozen=True)
@@ -165,27 +156,11 @@ class Filtered:
 
 
 @dataclass(frozen=True)
-class _NoiseModel:
-    """What the first block says of the frames.
-
-    Z, the gradient of the starting image, the usual sharpness per pixel, the factor that turns a deviation from it
-    into a score, the variance of that score over the frames, and G.
-    """
-
-    image_noise: float
-    template: tuple[FloatArray, FloatArray]
-    usual: FloatArray
-    score_scale: FloatArray
-    score_variance: FloatArray
-    motion_share: FloatArray
-
-
-@dataclass(frozen=True)
 class _Setting:
     """What stays the same from frame to frame."""
 
     dynamics: FlowDynamics
-    model: _NoiseModel
+    model: FrameNoise
     params: FilterParams
     flow_params: FlowParams
     progress: Callable[[int], None] | None
@@ -274,7 +249,17 @@ def filter_frames(
         raise DataError(f"frames: expected at least {wanted}, found {len(first)}")
     if flows is None:
         flows = np.stack([flow for _, flow in iterate_flows(image, first, flow_params)])
-    model = _noise_model(first, flows, image, dynamics, params, flow_params.threads)
+    model = measure_frame_noise(
+        first,
+        flows,
+        image,
+        dynamics.residual_variance,
+        params.sharpness_window,
+        params.image_noise,
+        flow_params.threads,
+    )
+    if params.residual == "drop":
+        model = replace(model, motion_share=np.zeros_like(model.motion_share))
     prior_variance = model.image_noise / params.prior_frames if params.prior_frames else _DIFFUSE
     state = FilterState(
         PixelGaussian(image, np.full(image.shape[:2], prior_variance, np.float32)),
@@ -361,118 +346,4 @@ def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, float | F
     share = setting.model.motion_share[..., None]
     estimate = modelled + share * (motion.measured - modelled)
     registered = warp(motion.frame, estimate)
-    return registered, _frame_noise(registered, estimate, setting.model, setting.params)
-
-
-def _distrust(flow: FloatArray) -> FloatArray:
-    """Factor on Z: large where the map id + Ŵ folds.
-
-    Paper 3 takes the maps to be diffeomorphisms.  Where the estimate is none, the flow has lost its way, and what it
-    brings there may have more contrast than the scene.
-    """
-    (ux, uy), (vx, vy) = (
-        (cv2.Sobel(part, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(part, cv2.CV_32F, 0, 1, scale=1 / 8))
-        for part in (np.ascontiguousarray(flow[..., 0]), np.ascontiguousarray(flow[..., 1]))
-    )
-    stretch = (1 + ux) * (1 + vy) - uy * vx
-    folded = (stretch <= 0).astype(np.float32)
-    # Faded out: an abrupt change of weights would show as an edge.
-    return np.power(np.float32(_DISTRUST), _smooth(cv2.dilate(folded, np.ones((7, 7), np.uint8)), 2.0))
-
-
-def _noise_model(
-    frames: list[FloatArray],
-    flows: FloatArray,
-    image: FloatArray,
-    dynamics: FlowDynamics,
-    params: FilterParams,
-    threads: int,
-) -> _NoiseModel:
-    """Temporal statistics of the first block, registered by its flows."""
-    template = _gradient(luminance(image))
-
-    def measure(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
-        registered = luminance(warp(*pair))
-        return registered, _sharpness(registered, template, params.sharpness_window)
-
-    shape = image.shape[:2]
-    total, squares, sharp, sharp_squares = (np.zeros(shape) for _ in range(4))
-    for _, (registered, sharpness) in map_ahead(measure, zip(frames, flows, strict=True), threads):
-        total += registered
-        squares += np.square(registered, dtype=np.float64)
-        sharp += sharpness
-        sharp_squares += np.square(sharpness, dtype=np.float64)
-    count = len(frames)
-    variance = np.maximum(squares / count - (total / count) ** 2, 0.0) * count / max(count - 1, 1)
-    usual = sharp / count
-    # The flattest fifth of the image varies by sensor noise alone; elsewhere blur and misregistration add to it.
-    energy = _smooth(template[0] ** 2 + template[1] ** 2, params.sharpness_window)
-    sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
-    spread = np.maximum(sharp_squares / count - usual**2, 0.0)
-    measured = params.image_noise if params.image_noise is not None else float(variance.mean())
-    share = np.zeros(shape, np.float32)
-    if params.residual == "keep":
-        share = _motion_share(energy, sensor_noise, dynamics, params.sharpness_window)
-    scale = _score_scale(usual, spread, energy * _SOBEL_NOISE * sensor_noise, params.sharpness_window)
-    return _NoiseModel(
-        max(measured, _IMAGE_NOISE_FLOOR),
-        template,
-        usual.astype(np.float32),
-        scale,
-        (scale**2 * spread).astype(np.float32),
-        share,
-    )
-
-
-def _score_scale(usual: np.ndarray, spread: np.ndarray, noise: np.ndarray, window: float) -> FloatArray:
-    """Factor from a deviation of the sharpness to the best estimate of its standardised noise-free part.
-
-    Noise of the gradient, projected on the template, explains ``noise`` over the number of independent pixels in the
-    window of the variance ``spread``; what is left is sharpness.
-    """
-    explained = noise / (4 * np.pi * window**2 / _SOBEL_AREA)
-    deviation = np.sqrt(np.maximum(spread - explained, 0.0))
-    return (deviation / np.maximum(spread + (_LEAST_SPREAD * usual) ** 2, 1e-18)).astype(np.float32)
-
-
-def _motion_share(energy: FloatArray, noise: float, dynamics: FlowDynamics, window: float) -> FloatArray:
-    """G = R_motion / (R_motion + R_noise), with R_noise the Cramér–Rao bound of a shift seen through the window.
-
-    A shift of a patch with gradients ∇ρ in noise of variance σ² cannot be measured better than
-    σ² / (½ Σ |∇ρ|²) per axis; what the residual varies beyond that is motion.
-    """
-    area = 4 * np.pi * window**2
-    noise_variance = noise / np.maximum(area * 0.5 * energy, 1e-12)
-    total = np.maximum(dynamics.residual_variance, 0.0)
-    return (1.0 - np.minimum(noise_variance / np.maximum(total, 1e-12), 1.0)).astype(np.float32)
-
-
-def _frame_noise(
-    registered: FloatArray, flow: FloatArray, model: _NoiseModel, params: FilterParams
-) -> float | FloatArray:
-    """Z of one frame: lower where it is sharper than usual, much higher where its flow folds."""
-    if params.sharpness == 0:
-        return model.image_noise
-    sharpness = _sharpness(luminance(registered), model.template, params.sharpness_window)
-    score = np.clip(model.score_scale * (sharpness - model.usual), -_LARGEST_SCORE, _LARGEST_SCORE)
-    # For a normal score of variance s² the mean of exp(β z − β² s² / 2) is one: the information per frame stays 1/Z.
-    exponent = 0.5 * params.sharpness**2 * model.score_variance - params.sharpness * score
-    return np.float32(model.image_noise) * np.exp(exponent) * _distrust(flow)
-
-
-def _sharpness(registered: FloatArray, template: tuple[FloatArray, FloatArray], window: float) -> FloatArray:
-    """Gradient of a frame projected on that of the template, in a Gaussian window.
-
-    A blurred frame has a smaller projection.  So has one that is torn, misregistered or covered, though its gradient
-    may be large: plain gradient energy would prefer it.  And noise, being linear here, does not add up.
-    """
-    dx, dy = _gradient(registered)
-    return _smooth(dx * template[0] + dy * template[1], window)
-
-
-def _gradient(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(image, cv2.CV_32F, 0, 1, scale=1 / 8)
-
-
-def _smooth(image: FloatArray, window: float) -> FloatArray:
-    return cv2.GaussianBlur(image, (0, 0), window)
+    return registered, noise_of_frame(registered, estimate, setting.model, setting.params.sharpness)

@@ -1,0 +1,234 @@
+"""How far a registered frame can be trusted: the measurement noise of the image in the alternating filter.
+
+Symbols
+-------
+Z : variance of a registered frame about the image (paper 3, eq. 15)
+z : sharpness of a frame at a pixel, standardised over the frames; β its weight, ``Z ∝ exp(−β z)``
+G : share of the flow outside the model's subspace that is motion and not noise
+R : variance of that flow
+
+The paper takes Z to be one number.  Here it falls where a frame is locally sharper than usual, which is the idea of
+lucky imaging inside the Kalman gain, and rises where the flow folds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from .arrays import FloatArray, luminance
+from .parallel import map_ahead
+from .warp import warp
+
+# Smallest variance, so that noise-free synthetic data keep every gain defined: (1/4096 of full scale)².
+_IMAGE_NOISE_FLOOR = 6e-8
+# Standardised sharpness beyond this is an outlier, not a better frame.
+_LARGEST_SCORE = 3.0
+# Sharpness that differs by less than this share is not worth averaging fewer frames.
+_LEAST_SPREAD = 0.03
+# Z is so many times larger where a map folds.
+_DISTRUST = 1e3
+# Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels it correlates over.
+_SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
+
+
+@dataclass(frozen=True)
+class FrameNoise:
+    """What a block of registered frames says of all frames.
+
+    Attributes
+    ----------
+    image_noise : float
+        Z before sharpness, squared intensity.
+    template : tuple of two ndarrays, float32, shape (H, W)
+        Gradient of the image that the frames are registered to, along x and y, intensity per pixel.
+    usual : ndarray, float32, shape (H, W)
+        Mean sharpness over the frames.
+    score_scale : ndarray, float32, shape (H, W)
+        Factor from a deviation of the sharpness to z.
+    score_variance : ndarray, float32, shape (H, W)
+        Variance of z over the frames.
+    motion_share : ndarray, float32, shape (H, W)
+        G, 0 to 1.
+    window : float
+        Standard deviation of the window in which sharpness is measured, pixels.
+    """
+
+    image_noise: float
+    template: tuple[FloatArray, FloatArray]
+    usual: FloatArray
+    score_scale: FloatArray
+    score_variance: FloatArray
+    motion_share: FloatArray
+    window: float
+
+
+def measure_frame_noise(
+    frames: list[FloatArray],
+    flows: FloatArray,
+    image: FloatArray,
+    residual_variance: FloatArray,
+    window: float = 3.0,
+    image_noise: float | None = None,
+    threads: int = 0,
+) -> FrameNoise:
+    """Temporal statistics of frames registered by their flows.
+
+    Parameters
+    ----------
+    frames : list of ndarray, float32, shape (H, W) or (H, W, 3)
+    flows : ndarray, float32, shape (T, H, W, 2)
+        From the image to each frame, pixels.
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        What the frames are registered to.
+    residual_variance : ndarray, shape (H, W)
+        R, squared pixels.
+    window : float
+        Standard deviation of the window in which sharpness is measured, pixels.
+    image_noise : float, optional
+        Z, squared intensity; by default the mean temporal variance of the registered frames.
+    threads : int
+        Frames warped side by side; 0 means one per available core.
+
+    Returns
+    -------
+    FrameNoise
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frames = list(np.random.default_rng(0).normal(0.5, 0.1, (50, 16, 16)).astype(np.float32))
+    >>> still = np.zeros((50, 16, 16, 2), np.float32)
+    >>> model = measure_frame_noise(frames, still, np.full((16, 16), 0.5, np.float32), np.ones((16, 16), np.float32))
+    >>> round(model.image_noise, 3)
+    0.01
+    """
+    template = _gradient(luminance(image))
+
+    def measure(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+        registered = luminance(warp(*pair))
+        return registered, _sharpness(registered, template, window)
+
+    total, squares, sharp, sharp_squares = (np.zeros(image.shape[:2]) for _ in range(4))
+    for _, (registered, sharpness) in map_ahead(measure, zip(frames, flows, strict=True), threads):
+        total += registered
+        squares += np.square(registered, dtype=np.float64)
+        sharp += sharpness
+        sharp_squares += np.square(sharpness, dtype=np.float64)
+    count = len(frames)
+    variance = np.maximum(squares / count - (total / count) ** 2, 0.0) * count / max(count - 1, 1)
+    usual = sharp / count
+    spread = np.maximum(sharp_squares / count - usual**2, 0.0)
+    # The flattest fifth of the image varies by sensor noise alone; elsewhere blur and misregistration add to it.
+    energy = _smooth(template[0] ** 2 + template[1] ** 2, window)
+    sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
+    scale = _score_scale(usual, spread, energy * _SOBEL_NOISE * sensor_noise, window)
+    return FrameNoise(
+        image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
+        template=template,
+        usual=usual.astype(np.float32),
+        score_scale=scale,
+        score_variance=(scale**2 * spread).astype(np.float32),
+        motion_share=_motion_share(energy, sensor_noise, residual_variance, window),
+        window=window,
+    )
+
+
+def noise_of_frame(registered: FloatArray, flow: FloatArray, model: FrameNoise, sharpness: float) -> float | FloatArray:
+    """Z of one frame: lower where it is sharper than usual, much higher where its flow folds.
+
+    Parameters
+    ----------
+    registered : ndarray, float32, shape (H, W) or (H, W, 3)
+        The frame, warped onto the image.
+    flow : ndarray, float32, shape (H, W, 2)
+        The flow it was warped by, pixels.
+    model : FrameNoise
+    sharpness : float
+        β; 0 gives the same number for every frame and pixel, as in the paper.
+
+    Returns
+    -------
+    float or ndarray, float32, shape (H, W)
+        Squared intensity.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frames = list(np.random.default_rng(0).normal(0.5, 0.1, (50, 16, 16)).astype(np.float32))
+    >>> still = np.zeros((50, 16, 16, 2), np.float32)
+    >>> model = measure_frame_noise(frames, still, np.full((16, 16), 0.5, np.float32), np.ones((16, 16), np.float32))
+    >>> noise_of_frame(frames[0], still[0], model, sharpness=0.0) == model.image_noise
+    True
+    """
+    if sharpness == 0:
+        return model.image_noise
+    seen = _sharpness(luminance(registered), model.template, model.window)
+    score = np.clip(model.score_scale * (seen - model.usual), -_LARGEST_SCORE, _LARGEST_SCORE)
+    # For a normal score of variance s² the mean of exp(β z − β² s² / 2) is one: the information per frame stays 1/Z.
+    exponent = 0.5 * sharpness**2 * model.score_variance - sharpness * score
+    return np.float32(model.image_noise) * np.exp(exponent) * _distrust(flow)
+
+
+def _distrust(flow: FloatArray) -> FloatArray:
+    """Factor on Z: large where the map id + Ŵ folds.
+
+    Paper 3 takes the maps to be diffeomorphisms.  Where the estimate is none, the flow has lost its way, and what it
+    brings there may have more contrast than the scene.
+    """
+    (ux, uy), (vx, vy) = (
+        (cv2.Sobel(part, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(part, cv2.CV_32F, 0, 1, scale=1 / 8))
+        for part in (np.ascontiguousarray(flow[..., 0]), np.ascontiguousarray(flow[..., 1]))
+    )
+    stretch = (1 + ux) * (1 + vy) - uy * vx
+    folded = (stretch <= 0).astype(np.float32)
+    # Faded out: an abrupt change of weights would show as an edge.
+    return np.power(np.float32(_DISTRUST), _smooth(cv2.dilate(folded, np.ones((7, 7), np.uint8)), 2.0))
+
+
+def _score_scale(usual: np.ndarray, spread: np.ndarray, noise: np.ndarray, window: float) -> FloatArray:
+    """Factor from a deviation of the sharpness to the best estimate of its standardised noise-free part.
+
+    Noise of the gradient, projected on the template, explains ``noise`` over the number of independent pixels in the
+    window of the variance ``spread``; what is left is sharpness.
+    """
+    explained = noise / (4 * np.pi * window**2 / _SOBEL_AREA)
+    deviation = np.sqrt(np.maximum(spread - explained, 0.0))
+    return (deviation / np.maximum(spread + (_LEAST_SPREAD * usual) ** 2, 1e-18)).astype(np.float32)
+
+
+def _motion_share(energy: FloatArray, noise: float, residual_variance: np.ndarray, window: float) -> FloatArray:
+    """G = R_motion / (R_motion + R_noise), with R_noise the Cramér–Rao bound of a shift seen through the window.
+
+    A shift of a patch with gradients ∇ρ in noise of variance σ² cannot be measured better than
+    σ² / (½ Σ |∇ρ|²) per axis; what the residual varies beyond that is motion.
+    """
+    area = 4 * np.pi * window**2
+    noise_variance = noise / np.maximum(area * 0.5 * energy, 1e-12)
+    total = np.maximum(residual_variance, 0.0)
+    return (1.0 - np.minimum(noise_variance / np.maximum(total, 1e-12), 1.0)).astype(np.float32)
+
+
+def _sharpness(registered: FloatArray, template: tuple[FloatArray, FloatArray], window: float) -> FloatArray:
+    """Gradient of a frame projected on that of the template, in a Gaussian window.
+
+    A blurred frame has a smaller projection.  So has one that is torn, misregistered or covered, though its gradient
+    may be large: plain gradient energy would prefer it.  And noise, being linear here, does not add up.
+    """
+    dx, dy = _gradient(registered)
+    return _smooth(dx * template[0] + dy * template[1], window)
+
+
+def _gradient(image: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(image, cv2.CV_32F, 0, 1, scale=1 / 8)
+
+
+def _smooth(image: FloatArray, window: float) -> FloatArray:
+    return cv2.GaussianBlur(image, (0, 0), window)
