@@ -1,21 +1,57 @@
-"""PSNR of every stage on simulated clips, with the blur given by hand, against bounds.
+"""Restore a table of clips by simple methods, by every stage of the pipeline and by its defaults, and score them.
 
-Run ``TURBRESTORE_DATA=DIR python benchmarks/quality.py``.  It prints a table and exits with 1 when a bound is broken or
-a stage is worse than the one before; without the data it says so and exits with 0.
+Run ``python benchmarks/quality.py``; it prints a Markdown document.  Clips: synthetic ones made here, and those under
+the folder that ``TURBRESTORE_DATA`` names, where there are any.  ``--clips`` takes names or patterns, ``--images``
+writes the images side by side, ``--json`` the figures, ``--write`` the document.
+
+``--bounds`` instead restores a few simulated clips with the blur given by hand, and exits with 1 when a bound is
+broken or a stage is worse than the one before; without the data it says so and exits with 0.
 """
 
 from __future__ import annotations
 
-import os
+import argparse
+import dataclasses
+import json
 import sys
+import time
+from collections.abc import Callable, Iterable
+from itertools import accumulate
 from pathlib import Path
 
+import cv2
+import numpy as np
+from clips import COUNT, LARGEST_SIDE, MOST_FRAMES, SCREEN_SIDE, SMOOTH_SIDE, Clip, data_folder, find_clips
+from words import can_read, share_read
+
+from turbrestore.alternating import FilterParams
+from turbrestore.arrays import FloatArray
+from turbrestore.centroid import CentroidParams, mean_registered
 from turbrestore.deconvolution import DeconvolutionParams
-from turbrestore.images import read_image
-from turbrestore.metrics import compare
-from turbrestore.pipeline import RestoreParams, restore
+from turbrestore.errors import TurbrestoreError
+from turbrestore.flow import estimate_flow
+from turbrestore.images import atomic_write, read_image, write_image
+from turbrestore.metrics import appearance, compare
+from turbrestore.pipeline import Restoration, RestoreParams, restore
 from turbrestore.video import open_frames
 
+# The paper's choices, with this project's optical flow and automatic fidelity.
+PAPER = RestoreParams(
+    centroid=CentroidParams(mode="single"),
+    filter=FilterParams(residual="drop", sharpness=0.0),
+    deconvolution=DeconvolutionParams(sigma=1.45, sharpen_guide=False),
+)
+METHODS = {
+    "middle frame": "one frame as it is",
+    "mean": "temporal mean of all frames",
+    "median": "temporal median of all frames",
+    "registered": "mean of all frames after one registration to the temporal mean, by the pipeline's optical flow",
+    "centroid": "first stage of the pipeline: iterated centroid of the training frames",
+    "filtered": "second stage: alternating Kalman filter over all frames",
+    "paper": "the paper's settings: one warped frame as the centroid, flow outside the subspace dropped, no weights "
+    "by sharpness, nonlocal TV against a Gaussian of σ = 1.45 px with weights from the centroid as it is",
+    "default": "the whole pipeline, blind",
+}
 # Clip: sigma by hand, pixels, and the least PSNR of the result, dB.
 BOUNDS = {
     "ao_camera_medium": (1.0, 27.5),
@@ -23,12 +59,126 @@ BOUNDS = {
     "purdue1_chart_medium": (1.2, 19.5),
     "ao_brick_weak": (0.8, 33.0),
 }
+PANEL_COLUMNS, LABEL_HEIGHT = 3, 18
+
+Figures = dict[str, float]
+Results = dict[str, dict[str, Figures]]
 
 
 def main() -> int:
-    """Print the table."""
-    root = Path(os.environ.get("TURBRESTORE_DATA", "")) / "simulated"
-    if not root.is_dir():
+    """Measure and print."""
+    options = _options()
+    if options.bounds:
+        return check_bounds()
+    results: Results = {}
+    try:
+        for name, load in find_clips(options.clips).items():
+            started = time.perf_counter()
+            clip = load()
+            restored = restorations(clip)
+            results[name] = {method: figures(image, clip, s) for method, (image, s) in restored.items()}
+            if clip.words and clip.peers and can_read():
+                results[name]["peers"] = {"words": max(share_read(peer, clip.words) for peer in clip.peers.values())}
+            if options.images is not None:
+                options.images.mkdir(parents=True, exist_ok=True)
+                write_image(options.images / f"{name}.png", panel(restored, clip), 8, overwrite=True)
+            print(f"{name}: {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
+    except TurbrestoreError as error:
+        print(f"quality: {error}", file=sys.stderr)
+        return error.exit_code
+    text = document(results)
+    print(text, end="")
+    if options.write is not None:
+        atomic_write(options.write, text.encode(), overwrite=True)
+    if options.json is not None:
+        atomic_write(options.json, (json.dumps(results, indent=2) + "\n").encode(), overwrite=True)
+    return 0
+
+
+def restorations(clip: Clip) -> dict[str, tuple[FloatArray, float]]:
+    """Image and wall time, s, of each method."""
+    frames = clip.frames
+    images = {
+        "middle frame": _timed(lambda: frames[len(frames) // 2]),
+        "mean": _timed(lambda: frames.mean(axis=0)),
+        "median": _timed(lambda: np.median(frames, axis=0)),
+        "registered": _timed(lambda: mean_registered(frames, estimate_flow(frames.mean(axis=0), frames))),
+    }
+    whole = restore(frames)
+    until = dict(zip(whole.seconds, accumulate(whole.seconds.values()), strict=True))
+    images["centroid"] = whole.centroid.image, until["centroid"]
+    images["filtered"] = _filtered(whole), until["filter"]
+    images["paper"] = _timed(lambda: restore(frames, PAPER).image)
+    images["default"] = whole.image, until["deconvolve"]
+    return images
+
+
+def figures(image: FloatArray, clip: Clip, seconds: float) -> Figures:
+    """All that can be measured of one restored image."""
+    seen = appearance(image, clip.frames.mean(axis=0)) if clip.truth is None else compare(image, clip.truth)
+    measured = {name: round(value, 4) for name, value in dataclasses.asdict(seen).items()}
+    if clip.words and can_read():
+        measured["words"] = round(share_read(image, clip.words), 4)
+    return measured | {"seconds": round(seconds, 2)}
+
+
+def panel(restored: dict[str, tuple[FloatArray, float]], clip: Clip) -> FloatArray:
+    """Images of all methods and the truth side by side, each under its name."""
+    pictures = {name: image for name, (image, _) in restored.items()}
+    if clip.truth is not None:
+        pictures["truth"] = clip.truth
+    height, width = np.max([picture.shape[:2] for picture in pictures.values()], axis=0)
+    tiles = []
+    for name, picture in pictures.items():
+        tile = np.zeros((height + LABEL_HEIGHT, width, 3), np.uint8)
+        cv2.putText(tile, name, (4, LABEL_HEIGHT - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
+        colour = picture if picture.ndim == 3 else picture[..., None]
+        tile[LABEL_HEIGHT : LABEL_HEIGHT + len(picture), : picture.shape[1]] = np.rint(255 * np.clip(colour, 0, 1))
+        tiles.append(tile)
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % PANEL_COLUMNS)
+    rows = [np.hstack(tiles[start : start + PANEL_COLUMNS]) for start in range(0, len(tiles), PANEL_COLUMNS)]
+    return np.vstack(rows).astype(np.float32) / np.float32(255)
+
+
+def document(results: Results) -> str:
+    """Markdown of everything that was measured."""
+    parts = [
+        "# Quality\n",
+        "What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --write docs/quality.md` measures: clips restored by "
+        "simple methods, by every stage of the pipeline and by its defaults.\n",
+        "".join(f"- **{method}**: {meaning}.\n" for method, meaning in METHODS.items()),
+        f"Clips called `smooth_…` ({COUNT} frames of {SMOOTH_SIDE}×{SMOOTH_SIDE}: smooth random flow, Gaussian blur of "
+        f"1 to 2 px, noise 0.01) and `screens_…` ({COUNT} frames of {SCREEN_SIDE}×{SCREEN_SIDE} through phase screens, "
+        "weak, medium and strong: D/r0 1.2, 2.5 and 5) are made on the spot.  The others come from the folder that "
+        f"`TURBRESTORE_DATA` names; of real clips the first {MOST_FRAMES} frames and, where there is no text to read, "
+        f"the middle {LARGEST_SIDE}×{LARGEST_SIDE} pixels are used.  Results are aligned with the truth once "
+        "(`turbrestore.metrics.align`).\n",
+    ]
+    for heading, figure, digits in (
+        ("PSNR, dB", "psnr", 2),
+        ("Structural similarity, after the best gain and offset", "ssim", 3),
+    ):
+        rows = _rows(results, "psnr", figure)
+        parts.append(f"## {heading}\n\n{_table(rows, METHODS, digits, average=True)}")
+    parts.append(_words_section(results))
+    for heading, figure, digits in (
+        ("Sharpness without truth: mean gradient relative to the temporal mean", "sharpness", 2),
+        ("Overshoot without truth: share of pixels outside the local range of the temporal mean", "overshoot", 4),
+    ):
+        rows = {name: row for name, row in _rows(results, figure, figure).items() if name not in _scored(results)}
+        parts.append(f"## {heading}\n\n{_table(rows, METHODS, digits)}")
+    rows = _rows(results, "seconds", "seconds")
+    parts.append(
+        "## Wall time, s\n\nOnly ratios carry over to another machine; a stage includes those before it.\n\n"
+        + _table(rows, METHODS, 1, average=True)
+    )
+    return "\n".join(parts)
+
+
+def check_bounds() -> int:
+    """Print PSNR of every stage with the blur given by hand; 1 if a bound is broken."""
+    root = data_folder()
+    if root is None or not (root / "simulated").is_dir():
         print("TURBRESTORE_DATA names no folder with simulated clips; nothing to measure")
         return 0
     print(
@@ -37,19 +187,79 @@ def main() -> int:
     )
     failed = False
     for name, (sigma, bound) in BOUNDS.items():
+        folder = root / "simulated" / name
         params = RestoreParams(deconvolution=DeconvolutionParams(sigma=sigma))
-        restoration = restore(open_frames(root / name / "clip.mkv"), params)
-        if restoration.filtered is None:
-            return 1
-        truth = read_image(root / name / "truth.png").image
-        images = (restoration.mean, restoration.centroid.image, restoration.filtered.image, restoration.image)
-        figures = [compare(image, truth).psnr for image in images]
-        mean, centroid, filtered, deconvolved = figures
+        restoration = restore(open_frames(folder / "clip.mkv"), params)
+        truth = read_image(folder / "truth.png").image
+        images = (restoration.mean, restoration.centroid.image, _filtered(restoration), restoration.image)
+        mean, centroid, filtered, deconvolved = stages = [compare(image, truth).psnr for image in images]
         failed |= not (mean < centroid <= filtered < deconvolved and deconvolved >= bound)
-        seconds = sum(restoration.seconds.values())
-        cells = " | ".join(f"{figure:.2f}" for figure in figures)
-        print(f"| {name} | {sigma} | {cells} | {bound} | {seconds:.1f} |", flush=True)
+        cells = " | ".join(f"{stage:.2f}" for stage in stages)
+        print(f"| {name} | {sigma} | {cells} | {bound} | {sum(restoration.seconds.values()):.1f} |", flush=True)
     return int(failed)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="names or patterns; all by default")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="write one panel of images a clip")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
+    parser.add_argument("--bounds", action="store_true", help="check PSNR with the blur given by hand")
+    return parser.parse_args()
+
+
+def _timed(action: Callable[[], FloatArray]) -> tuple[FloatArray, float]:
+    started = time.perf_counter()
+    image = action()
+    return image, time.perf_counter() - started
+
+
+def _filtered(restoration: Restoration) -> FloatArray:
+    if restoration.filtered is None:
+        raise RuntimeError("the filter did not run")
+    return restoration.filtered.image
+
+
+def _scored(results: Results) -> set[str]:
+    """Names of the clips with truth."""
+    return {name for name, methods in results.items() if "psnr" in methods["default"]}
+
+
+def _rows(results: Results, needed: str, figure: str) -> dict[str, Figures]:
+    """Figures of the clips that have them."""
+    return {
+        name: {method: found[figure] for method, found in methods.items() if figure in found}
+        for name, methods in results.items()
+        if needed in methods["default"]
+    }
+
+
+def _words_section(results: Results) -> str:
+    heading = "## Share of the words that tesseract reads\n\n"
+    if not can_read():
+        return heading + "Not measured: tesseract is not installed.\n"
+    rows = _rows(results, "words", "words")
+    columns = [*METHODS]
+    note = ""
+    if any("peers" in row for row in rows.values()):
+        columns.append("peers")
+        note = "peers: the best of the results of trained networks that lie beside the clip.\n\n"
+    return heading + note + _table(rows, columns, 2, average=True)
+
+
+def _table(rows: dict[str, Figures], columns: Iterable[str], digits: int, average: bool = False) -> str:
+    """Markdown table; with ``average``, a last row of the mean of every complete column."""
+    if not rows:
+        return "No such clip was measured.\n"
+    names = [*columns]
+    lines = [f"| clip | {' | '.join(names)} |", f"|---|{'---:|' * len(names)}"]
+    complete = {name: [row[name] for row in rows.values() if name in row] for name in names}
+    means = {name: float(np.mean(found)) for name, found in complete.items() if len(found) == len(rows)}
+    for clip, row in [*rows.items(), *([("**mean**", means)] if average else [])]:
+        cells = " | ".join(f"{row[name]:.{digits}f}" if name in row else "–" for name in names)
+        lines.append(f"| {clip} | {cells} |")
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

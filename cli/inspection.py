@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from cyclopts import Parameter
 
-from turbrestore.images import read_image
-from turbrestore.metrics import compare
+from turbrestore.arrays import FloatArray, check_flow
+from turbrestore.artifacts import load_flows, load_stage_image
+from turbrestore.errors import DataError, require
+from turbrestore.images import input_errors, read_image
+from turbrestore.metrics import appearance, compare, compare_flows
 from turbrestore.pipeline import training_share
 from turbrestore.video import open_frames
 
 from .options import Flag, Selection
 from .output import print_json
+
+FLOW_SUFFIXES = (".npy", ".npz", ".flo")
+# First bytes of a Middlebury flow file: 202021.25 as a float.
+FLO_MAGIC = b"PIEH"
 
 
 def info(
@@ -51,20 +60,59 @@ def info(
     _report(record, json)
 
 
-def evaluate(result: Path, truth: Path, /, *, json: Flag = False) -> None:
+def evaluate(
+    result: Path,
+    truth: Path | None = None,
+    /,
+    *,
+    reference: Path | None = None,
+    json: Flag = False,
+) -> None:
     """Compare a result with the truth, after taking out crop and global shift.
+
+    Images: PSNR, PSNR and structural similarity after the best gain and offset, sharpness and overshoot.  Flows:
+    end-point error.
 
     Parameters
     ----------
     result : Path
-        Image.
+        Image, or artifact with an image (.npz); flows (.npy, centroid .npz, .flo) where the truth is flows.
     truth : Path
-        Image of the true scene.
+        Image of the true scene, or true flows.
+    reference : Path
+        Image of the same size, such as a frame or the temporal mean: sharpness and overshoot are measured against it.
     json : bool
         Print JSON.
     """
-    comparison = compare(read_image(result).image, read_image(truth).image)
-    _report({name: round(value, 4) for name, value in dataclasses.asdict(comparison).items()}, json)
+    figures: dict[str, float] = {}
+    if truth is not None and truth.suffix.lower() in FLOW_SUFFIXES:
+        require(reference is None, "--reference: has no effect on flows; leave it out")
+        figures |= dataclasses.asdict(compare_flows(_read_flows(result), _read_flows(truth)))
+    else:
+        require(truth is not None or reference is not None, "evaluate: expected a truth or --reference, found neither")
+        image = load_stage_image(result)
+        if truth is not None:
+            figures |= dataclasses.asdict(compare(image, read_image(truth).image))
+        if reference is not None:
+            figures |= dataclasses.asdict(appearance(image, read_image(reference).image))
+    _report({name: _rounded(value) for name, value in figures.items()}, json)
+
+
+def _read_flows(path: Path) -> FloatArray:
+    """Flows of shape (T, H, W, 2); one from a .flo file."""
+    if path.suffix.lower() != ".flo":
+        return load_flows(path)
+    with input_errors(path):
+        data = path.read_bytes()
+    header = np.frombuffer(data[:12].ljust(12, b"\0"), "<i4")
+    width, height = int(header[1]), int(header[2])
+    if data[:4] != FLO_MAGIC or len(data) != 12 + 8 * width * height or width < 1:
+        raise DataError(f"{path}: expected a flow in a .flo file, found something else or damage")
+    return check_flow(np.frombuffer(data, "<f4", offset=12).reshape(1, height, width, 2), str(path))
+
+
+def _rounded(value: float) -> float | None:
+    return None if math.isnan(value) else round(value, 4)
 
 
 def _report(record: dict[str, object], as_json: bool) -> None:

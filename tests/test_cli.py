@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore.images import read_image
+from turbrestore.images import read_image, write_image
 from turbrestore.video import write_video
 from turbrestore_cli.__main__ import main
 
@@ -325,11 +325,72 @@ def test_info_says_what_a_video_is(run, clip):
     fails(run("info", "missing.mkv"), 66)
 
 
-def test_evaluate_compares_with_the_truth(run):
-    truth = SAMPLE / "chart_truth.png"
-    code, out, _ = run("evaluate", truth, truth, "--json")
-    assert code == 0
-    assert json.loads(out) == {"psnr": None, "psnr_fit": None, "ssim": 1.0}
+class TestEvaluate:
+    TRUTH = SAMPLE / "chart_truth.png"
+
+    def test_against_the_truth(self, run):
+        code, out, _ = run("evaluate", self.TRUTH, self.TRUTH, "--json")
+        assert code == 0
+        assert json.loads(out) == {"psnr": None, "psnr_fit": None, "ssim": 1.0, "sharpness": 1.0, "overshoot": 0.0}
+
+    def test_a_brighter_crop_is_located_first(self, run, tmp_path):
+        truth = read_image(self.TRUTH).image
+        write_image(tmp_path / "crop.png", truth[3:, 5:] * 0.8 + 0.1, 16)
+        code, out, _ = run("evaluate", tmp_path / "crop.png", self.TRUTH, "--json")
+        assert code == 0
+        figures = json.loads(out)
+        # The drawing uses 0.12 and 0.88: at most 0.08 off.
+        assert 22 < figures["psnr"] < 30
+        assert figures["psnr_fit"] > 60
+        assert figures["sharpness"] == pytest.approx(0.8, abs=0.01)
+
+    def test_against_a_reference_without_truth(self, run, tmp_path):
+        truth = read_image(self.TRUTH).image
+        write_image(tmp_path / "soft.png", cv2.GaussianBlur(truth, (0, 0), 1.5), 16)
+        code, out, _ = run("evaluate", self.TRUTH, "--reference", tmp_path / "soft.png", "--json")
+        assert code == 0
+        figures = json.loads(out)
+        assert set(figures) == {"sharpness", "overshoot"}
+        assert figures["sharpness"] > 1.1
+        code, out, _ = run("evaluate", self.TRUTH, self.TRUTH, "--reference", tmp_path / "soft.png")
+        assert code == 0
+        assert [line.split()[0] for line in out.splitlines()] == ["psnr", "psnr", "ssim", "sharpness", "overshoot"]
+        assert f"{figures['sharpness']}" in out
+
+    @pytest.mark.parametrize("suffix", [".npy", ".flo"])
+    def test_flows_give_an_end_point_error(self, run, tmp_path, suffix):
+        flows = np.random.default_rng(0).normal(0, 1, (1, 5, 7, 2)).astype(np.float32)
+        paths = [tmp_path / f"{name}{suffix}" for name in ("measured", "true")]
+        for path, flow in zip(paths, (flows + np.float32(3), flows), strict=True):
+            if suffix == ".flo":
+                cv2.writeOpticalFlow(str(path), flow[0])
+            else:
+                np.save(path, flow)
+        code, out, err = run("evaluate", *paths, "--json")
+        assert code == 0, err
+        figures = json.loads(out)
+        assert figures["endpoint_error"] == pytest.approx(np.sqrt(18), abs=1e-3)
+        assert figures["endpoint_error_centred"] is None
+
+    def test_bad_input_is_one_line(self, run, tmp_path):
+        write_image(tmp_path / "small.png", np.full((20, 20), 0.5), 8)
+        write_image(tmp_path / "flat.png", np.full((100, 100), 0.5), 8)
+        np.save(tmp_path / "flows.npy", np.zeros((2, 8, 8, 2), np.float32))
+        np.save(tmp_path / "fewer.npy", np.zeros((1, 8, 8, 2), np.float32))
+        (tmp_path / "cut.flo").write_bytes(b"PIEH\x08\0\0\0\x08\0\0\0123")
+        fails(run("evaluate", self.TRUTH), 2, "expected a truth or --reference")
+        fails(run("evaluate", "none.png", self.TRUTH), 66, "none.png")
+        fails(run("evaluate", self.TRUTH, "none.png"), 66, "none.png")
+        fails(run("evaluate", tmp_path / "small.png", self.TRUTH), 65, "result: expected at least 68 pixels")
+        fails(run("evaluate", self.TRUTH, tmp_path / "flat.png"), 65, "truth: expected an image with some contrast")
+        fails(run("evaluate", self.TRUTH, "--reference", tmp_path / "small.png"), 65, "expected the size")
+        fails(run("evaluate", tmp_path / "flows.npy", self.TRUTH), 65, "flows.npy: expected an image")
+        fails(run("evaluate", self.TRUTH, tmp_path / "flows.npy"), 65, "expected flows")
+        fails(run("evaluate", tmp_path / "fewer.npy", tmp_path / "flows.npy"), 65, "flows: expected shape")
+        fails(run("evaluate", tmp_path / "cut.flo", tmp_path / "flows.npy"), 65, "cut.flo: expected a flow")
+        fails(run("evaluate", "none.flo", tmp_path / "flows.npy"), 66, "none.flo")
+        flows = ("evaluate", tmp_path / "flows.npy", tmp_path / "flows.npy", "--reference", self.TRUTH)
+        fails(run(*flows), 2, "--reference: has no effect on flows")
 
 
 def test_interruption_ends_with_130(run, clip, tmp_path, monkeypatch):

@@ -2,7 +2,8 @@
 
 A restoration knows the scene only up to the mean displacement of its video, and some methods crop.  :func:`align`
 takes both out once, for every figure: the result is located inside the truth by normalised cross-correlation, a
-remaining sub-pixel shift is found by phase correlation, and a border is left out.
+remaining sub-pixel shift is found by phase correlation, and a border is left out.  For the same reason measured flows
+are known up to a flow that does not change; :func:`compare_flows` says what is left without it.
 """
 
 from __future__ import annotations
@@ -36,11 +37,52 @@ class Comparison:
         The same after the best gain and offset, dB.
     ssim : float
         Structural similarity after that fit.
+    sharpness : float
+        Mean gradient magnitude relative to that of the truth, after alignment.
+    overshoot : float
+        Share of pixels outside the local range of the truth, after alignment; see :func:`overshoot`.
     """
 
     psnr: float
     psnr_fit: float
     ssim: float
+    sharpness: float
+    overshoot: float
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Figures of a result where there is no truth.
+
+    Attributes
+    ----------
+    sharpness : float
+        Mean gradient magnitude relative to that of the reference.
+    overshoot : float
+        Share of pixels outside the local range of the reference; see :func:`overshoot`.
+    """
+
+    sharpness: float
+    overshoot: float
+
+
+@dataclass(frozen=True)
+class FlowComparison:
+    """Figures of flows against the true ones, pixels.
+
+    Attributes
+    ----------
+    endpoint_error : float
+        Mean length of the difference.
+    endpoint_error_centred : float
+        The same after the mean difference over time is taken out at every pixel; NaN for a single flow.
+    true_length : float
+        Mean length of the true flows, to compare with.
+    """
+
+    endpoint_error: float
+    endpoint_error_centred: float
+    true_length: float
 
 
 def compare(result: ArrayLike, truth: ArrayLike) -> Comparison:
@@ -60,7 +102,7 @@ def compare(result: ArrayLike, truth: ArrayLike) -> Comparison:
     Raises
     ------
     DataError
-        An image is too small, larger than the truth, or not finite.
+        An image is too small, of one colour, larger than the truth, or not finite.
 
     Examples
     --------
@@ -76,7 +118,71 @@ def compare(result: ArrayLike, truth: ArrayLike) -> Comparison:
     gain, offset = np.linalg.lstsq(design, t.ravel(), rcond=None)[0]
     fitted = (gain * a + offset).astype(np.float32)
     ssim = structural_similarity(t, np.clip(fitted, 0, 1), data_range=1.0)
-    return Comparison(psnr(a, t), psnr(fitted, t), float(ssim))
+    return Comparison(psnr(a, t), psnr(fitted, t), float(ssim), sharpness(a, t), overshoot(a, t))
+
+
+def appearance(result: ArrayLike, reference: ArrayLike) -> Appearance:
+    """Sharpness and overshoot of a result against a frame, or the temporal mean, that shows the same pixels.
+
+    Parameters
+    ----------
+    result, reference : array_like, shape (H, W) or (H, W, 3)
+        Same size; they are not aligned.
+
+    Returns
+    -------
+    Appearance
+
+    Raises
+    ------
+    DataError
+        Sizes differ, or the reference has no contrast.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> ramp = np.tile(np.linspace(0, 1, 128, dtype=np.float32), (128, 1))
+    >>> appearance(ramp, ramp)
+    Appearance(sharpness=1.0, overshoot=0.0)
+    """
+    share = overshoot(result, reference)
+    return Appearance(sharpness(result, reference), share)
+
+
+def compare_flows(flows: ArrayLike, truth: ArrayLike) -> FlowComparison:
+    """Compare flows with the true ones.
+
+    Parameters
+    ----------
+    flows, truth : array_like, shape (T, H, W, 2)
+        Pixels; memory maps are read flow by flow.
+
+    Returns
+    -------
+    FlowComparison
+
+    Raises
+    ------
+    DataError
+        Shapes differ or are none of flows.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> compare_flows(np.zeros((5, 2, 2, 2)), np.full((5, 2, 2, 2), (3.0, 4.0)))
+    FlowComparison(endpoint_error=5.0, endpoint_error_centred=0.0, true_length=5.0)
+    """
+    a, t = check_flow(flows, "flows"), check_flow(truth, "truth")
+    if a.shape != t.shape or a.ndim != 4:
+        raise DataError(f"flows: expected shape (T, H, W, 2) as the truth {t.shape}, found {a.shape}")
+    offset = np.zeros(t.shape[1:])
+    for flow, true in zip(a, t, strict=True):
+        offset += (flow - true) / np.float64(len(t))
+    pairs = [
+        (_length(flow - true), _length(flow - true - offset), _length(true)) for flow, true in zip(a, t, strict=True)
+    ]
+    plain, centred, true_length = (float(np.mean(column)) for column in zip(*pairs, strict=True))
+    return FlowComparison(plain, centred if len(t) > 1 else float("nan"), true_length)
 
 
 def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -95,7 +201,7 @@ def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
     Raises
     ------
     DataError
-        An image is too small, or the result does not fit inside the truth.
+        An image is too small, the truth is of one colour, or the result does not fit inside it.
 
     Examples
     --------
@@ -108,6 +214,8 @@ def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
     from skimage.registration import phase_cross_correlation
 
     image, scene = comparable(_grey(result, "result"), "result"), comparable(_grey(truth, "truth"), "truth")
+    if np.ptp(scene) == 0:
+        raise DataError("truth: expected an image with some contrast, found one colour")
     margin = BORDER - _GUARD
     core = image[margin:-margin, margin:-margin]
     if core.shape[0] > scene.shape[0] + 2 * margin or core.shape[1] > scene.shape[1] + 2 * margin:
@@ -280,8 +388,11 @@ def endpoint_error(flow: ArrayLike, truth: ArrayLike) -> float:
     a, t = check_flow(flow), check_flow(truth, "truth")
     if a.shape != t.shape:
         raise DataError(f"flow: expected the shape of the truth {t.shape}, found {a.shape}")
-    difference = a - t
-    return float(np.hypot(difference[..., 0], difference[..., 1]).mean())
+    return _length(a - t)
+
+
+def _length(flow: np.ndarray) -> float:
+    return float(np.hypot(flow[..., 0], flow[..., 1]).mean())
 
 
 def _grey(image: ArrayLike, name: str) -> FloatArray:

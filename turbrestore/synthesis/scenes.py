@@ -1,8 +1,14 @@
-"""Scenes to look at through turbulence, drawn at any size."""
+"""Scenes to look at through turbulence, at any size: a resolution chart, a page of words, and pictures.
+
+The pictures are those of scikit-image that its wheel brings along; nothing is downloaded.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib.resources import as_file, files
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -10,11 +16,34 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..errors import require
+from ..images import read_image
+
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont, ImageFont
 
 SMALLEST = 64
+# Grey pictures, then those in colour.
+PICTURES = {
+    "camera": "camera.png",
+    "brick": "brick.png",
+    "grass": "grass.png",
+    "gravel": "gravel.png",
+    "coins": "coins.png",
+    "moon": "moon.png",
+    "page": "page.png",
+    "astronaut": "astronaut.png",
+    "cat": "chelsea.png",
+    "coffee": "coffee.png",
+    "rocket": "rocket.jpg",
+}
+# Common words of five to eight letters, which a text recogniser has in its dictionary.
+WORDS = ("harbour", "window", "engine", "seventh", "market", "glacier", "copper", "journey", "planet", "bridge")
 _DARK, _BRIGHT = 0.12, 0.88
 # Drawn this many times larger and averaged down: no jagged edges.
 _OVERSAMPLING = 4
+_LINE_SPACING = 1.2
+# Letters are about half as high as the size of their font.
+_SMALLEST_FONT = 6
 
 
 def resolution_chart(height: int = 256, width: int = 256) -> FloatArray:
@@ -57,6 +86,115 @@ def resolution_chart(height: int = 256, width: int = 256) -> FloatArray:
             small = cv2.resize(inner, (w - 2 * margin, h - 2 * margin), interpolation=cv2.INTER_AREA)
             chart[top + margin : top + h - margin, left + margin : left + w - margin] = small
     return chart
+
+
+def picture(name: str, height: int, width: int) -> FloatArray:
+    """Photograph or texture of scikit-image: its largest central part of the right proportions, resized.
+
+    Parameters
+    ----------
+    name : str
+        One of ``PICTURES``.
+    height, width : int
+        Size in pixels.  Pixels are averaged by area where the picture shrinks and interpolated where it grows; most
+        have 512 pixels a side, beyond which they look soft.
+
+    Returns
+    -------
+    ndarray, float32, shape (height, width) or (height, width, 3)
+
+    Raises
+    ------
+    ConfigurationError
+        Unknown name, or a size that is not positive.
+
+    Examples
+    --------
+    >>> picture("brick", 100, 300).shape, picture("coffee", 64, 64).shape
+    ((100, 300), (64, 64, 3))
+    """
+    require(name in PICTURES, f"picture: expected one of {', '.join(PICTURES)}, found {name!r}")
+    require(min(height, width) >= 1, f"size: expected at least 1 pixel a side, found {width}×{height}")
+    # Read from its folder: the functions of skimage.data may start a download.
+    with as_file(files("skimage.data") / PICTURES[name]) as path:
+        whole = read_image(path).image
+    scale = min(whole.shape[0] / height, whole.shape[1] / width)
+    rows, columns = (max(1, round(scale * side)) for side in (height, width))
+    top, left = (whole.shape[0] - rows) // 2, (whole.shape[1] - columns) // 2
+    part = whole[top : top + rows, left : left + columns]
+    method = cv2.INTER_AREA if scale >= 1 else cv2.INTER_CUBIC
+    return np.clip(cv2.resize(part, (width, height), interpolation=method), 0.0, 1.0)
+
+
+def printed_words(height: int, width: int, words: Sequence[str] = WORDS) -> FloatArray:
+    """Page of printed words, as large as they fit, for measuring how much of a text can be read.
+
+    Parameters
+    ----------
+    height, width : int
+        Size in pixels, at least 64.
+    words : sequence of str
+        What is printed, line by line from the upper left.
+
+    Returns
+    -------
+    ndarray, float32, shape (height, width)
+
+    Raises
+    ------
+    ConfigurationError
+        The size is too small, or there are no words, or they do not fit at three pixels of letter height.
+
+    Examples
+    --------
+    >>> page = printed_words(128, 192, ["haze", "mirage"])
+    >>> page.shape, round(float(page.min()), 2), round(float(page.max()), 2)
+    ((128, 192), 0.12, 0.88)
+    """
+    from PIL import Image, ImageDraw
+
+    require(min(height, width) >= SMALLEST, f"size: expected at least {SMALLEST} pixels a side, found {width}×{height}")
+    require(any(word.strip() for word in words), "words: expected at least one word, found none")
+    margin = max(4, min(height, width) // 20) * _OVERSAMPLING
+    room = (width * _OVERSAMPLING - 2 * margin, height * _OVERSAMPLING - 2 * margin)
+    font, lines = _largest_print(words, *room)
+    require(bool(lines), f"words: expected what fits on {width}×{height} pixels, found {len(words)}; print fewer")
+    ink = Image.new("L", (width * _OVERSAMPLING, height * _OVERSAMPLING))
+    drawing = ImageDraw.Draw(ink)
+    pitch = room[1] / len(lines)
+    for index, line in enumerate(lines):
+        drawing.text((margin, margin + (index + 0.5) * pitch), line, fill=255, font=font, anchor="lm")
+    share = cv2.resize(np.asarray(ink, np.float32) / 255, (width, height), interpolation=cv2.INTER_AREA)
+    return (_BRIGHT + (_DARK - _BRIGHT) * share).astype(np.float32)
+
+
+def _largest_print(words: Sequence[str], width: int, height: int) -> tuple[FreeTypeFont | ImageFont, list[str]]:
+    """Largest font with which the words fit, and the lines they make; no lines if there is none."""
+    from PIL import ImageFont
+
+    size = float(height)
+    while True:
+        font = ImageFont.load_default(size)
+        lines = _broken_lines(words, font, width)
+        fits = bool(lines) and len(lines) * _LINE_SPACING * size <= height
+        # A twelfth of an octave less each time.
+        size *= 2 ** (-1 / 12)
+        if fits or size < _SMALLEST_FONT * _OVERSAMPLING:
+            return font, lines if fits else []
+
+
+def _broken_lines(words: Sequence[str], font: FreeTypeFont | ImageFont, width: int) -> list[str]:
+    """Words in lines no longer than ``width`` pixels; no lines if a word is."""
+    lines: list[str] = []
+    for word in words:
+        if font.getlength(word) > width:
+            return []
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and font.getlength(longer) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
 
 
 def _bars(height: int, width: int) -> FloatArray:
@@ -115,4 +253,8 @@ def _checkerboard(height: int, width: int) -> FloatArray:
     return np.where((x // side + y // side) % 2 == 0, _DARK, _BRIGHT).astype(np.float32)
 
 
-SCENES: dict[str, Callable[[int, int], FloatArray]] = {"chart": resolution_chart}
+SCENES: dict[str, Callable[[int, int], FloatArray]] = {
+    "chart": resolution_chart,
+    "words": printed_words,
+    **{name: partial(picture, name) for name in PICTURES},
+}

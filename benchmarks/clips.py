@@ -1,0 +1,139 @@
+"""Clips that benchmarks restore: the project's own synthetic ones, and stored ones where there are any.
+
+Stored clips lie under the folder that ``TURBRESTORE_DATA`` names: ``simulated/NAME/clip.*`` with ``truth.png``, and
+``real/NAME/clip.*`` with ``words.txt`` where the text is known and ``peer_*.png`` where other methods' results are.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatch
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from turbrestore.arrays import FloatArray
+from turbrestore.errors import InputNotFoundError
+from turbrestore.images import read_image
+from turbrestore.synthesis.anisoplanatic import phase_screen_frames
+from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
+from turbrestore.synthesis.scenes import SCENES, printed_words
+from turbrestore.synthesis.smooth_flow import distort, smooth_flows
+from turbrestore.video import open_frames
+
+# Synthetic clips: frames and pixels a side.
+COUNT, SMOOTH_SIDE, SCREEN_SIDE = 60, 192, 256
+SMOOTH_SCENES = ("chart", "camera", "words", "cat")
+SCREEN_SCENES = (("weak", "chart"), ("medium", "camera"), ("medium", "brick"), ("strong", "words"))
+# Small print: tesseract reads all of it through a Gaussian of 1.5 px, and half of it through one of 2.5 px.
+TEXT = (
+    *("harbour", "window", "engine", "seventh", "market", "glacier", "copper", "journey", "planet", "bridge"),
+    *("lantern", "quarter", "silence", "meadow", "thunder", "captain", "ribbon", "orchard", "pepper", "village"),
+    *("marble", "sunset", "library", "compass", "feather"),
+)
+PIXELS_A_WORD = 10
+# What is read of real clips, so that a benchmark of all takes minutes.
+MOST_FRAMES, LARGEST_SIDE = 60, 320
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Frames and what is known about them.
+
+    Attributes
+    ----------
+    frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
+    truth : ndarray or None
+        The scene.
+    words : tuple of str
+        Words to be read; none where there is no text.
+    peers : dict of str to ndarray
+        Results of other methods.
+    """
+
+    frames: FloatArray
+    truth: FloatArray | None = None
+    words: tuple[str, ...] = ()
+    peers: dict[str, FloatArray] = field(default_factory=dict)
+
+
+def find_clips(patterns: Sequence[str] = ()) -> dict[str, Callable[[], Clip]]:
+    """Loaders of the clips whose names match one of the patterns, of all clips without patterns.
+
+    Raises
+    ------
+    InputNotFoundError
+        A pattern matches nothing.
+    """
+    known = {**_synthetic(), **_stored()}
+    for pattern in patterns:
+        if not any(fnmatch(name, pattern) for name in known):
+            raise InputNotFoundError(f"{pattern}: no such clip; there are {', '.join(known)}")
+    return {name: load for name, load in known.items() if not patterns or any(fnmatch(name, one) for one in patterns)}
+
+
+def data_folder() -> Path | None:
+    """Folder of stored clips, None where there is none."""
+    named = os.environ.get("TURBRESTORE_DATA", "")
+    return Path(named) if named and Path(named).is_dir() else None
+
+
+def _synthetic() -> dict[str, Callable[[], Clip]]:
+    smooth = {f"smooth_{scene}": partial(_smooth, scene) for scene in SMOOTH_SCENES}
+    screens = {f"screens_{strength}_{scene}": partial(_screens, strength, scene) for strength, scene in SCREEN_SCENES}
+    return {**smooth, **screens}
+
+
+def _smooth(scene: str) -> Clip:
+    """Smooth random flows without physics, a Gaussian blur that changes from frame to frame, and noise."""
+    rng = np.random.default_rng(SMOOTH_SCENES.index(scene))
+    truth, words = _scene(scene, SMOOTH_SIDE)
+    flows = smooth_flows(COUNT, SMOOTH_SIDE, SMOOTH_SIDE, rng)
+    # The scene is the geometry that is looked for.
+    flows -= flows.mean(axis=0)
+    frames = [distort(truth, flow[None], rng, blur=1 + rng.random(), noise=0.01)[0] for flow in flows]
+    return Clip(np.stack(frames), truth, words)
+
+
+def _screens(strength: str, scene: str) -> Clip:
+    truth, words = _scene(scene, SCREEN_SIDE)
+    params = PhaseScreenParams(d_over_r0=STRENGTHS[strength])
+    frames = phase_screen_frames(truth, COUNT, np.random.default_rng(1), params)
+    return Clip(np.stack([frame.image for frame in frames]), truth, words)
+
+
+def _scene(name: str, side: int) -> tuple[FloatArray, tuple[str, ...]]:
+    """Scene and the words on it."""
+    if name != "words":
+        return SCENES[name](side, side), ()
+    words = TEXT[: side // PIXELS_A_WORD]
+    return printed_words(side, side, words), words
+
+
+def _stored() -> dict[str, Callable[[], Clip]]:
+    root = data_folder()
+    if root is None:
+        return {}
+    files = sorted(root.glob("simulated/*/clip.*")) + sorted(root.glob("real/*/clip.*"))
+    return {path.parent.name: partial(_read, path) for path in files}
+
+
+def _read(path: Path) -> Clip:
+    truth, text = path.with_name("truth.png"), path.with_name("words.txt")
+    peers = {peer.stem.removeprefix("peer_"): read_image(peer).image for peer in sorted(path.parent.glob("peer_*.png"))}
+    if truth.is_file():
+        return Clip(open_frames(path).read(), read_image(truth).image, peers=peers)
+    words = tuple(text.read_text().split()) if text.is_file() else ()
+    return Clip(_middle(path, whole=bool(words)), words=words, peers=peers)
+
+
+def _middle(path: Path, whole: bool) -> FloatArray:
+    """First frames of a video, cut to their middle unless the whole of it is wanted."""
+    count, height, width = open_frames(path).shape[:3]
+    side = max(height, width) if whole else LARGEST_SIDE
+    h, w = min(height, side), min(width, side)
+    region = ((width - w) // 2, (height - h) // 2, w, h)
+    return open_frames(path, frames=(0, min(count, MOST_FRAMES), None), roi=region).read()
