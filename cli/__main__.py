@@ -77,6 +77,7 @@ def build() -> App:
     app.command(f"{package}.stages:identify", help="Identify the dynamics of flows.")
     app.command(f"{package}.stages:filter_", name="filter", help="Filter a video with known centroid and dynamics.")
     app.command(f"{package}.stages:deconvolve", help="Deblur an image.")
+    app.command(f"{package}.synthesis:synthesize", help="Make a turbulent video with known truth and flow.")
     app.command(f"{package}.inspection:info", help="Say what a video is.")
     app.command(f"{package}.inspection:evaluate", help="Compare a result with the truth.")
     return app

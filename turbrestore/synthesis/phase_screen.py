@@ -1,0 +1,382 @@
+"""Random phase screens of von Kármán statistics, as differences of optical path.
+
+Symbols
+-------
+Φ : power spectrum of :func:`turbrestore.synthesis.atmosphere.phase_spectrum`; f : frequency, cycles/m.
+P : period of the lattice, m.  w(f) = 1 − exp(−(f P/2)⁴) : share of Φ that the lattice carries.
+
+A Fourier lattice of period P has no frequencies below 1/P, and around 1/P the spectrum falls so steeply that a value
+at the middle of a cell does not stand for the cell.  The spectrum is therefore divided: w Φ, which is smooth on the
+scale 1/P, goes to a lattice (filtered white noise), and the rest, (1 − w) Φ, to plane waves.  Every wave stands for one
+stratum of the plane (ring × sector), has the power of its stratum and a frequency drawn inside it with density Φ, so
+that the expected structure function is exact and not only close, as it is for the customary sub-harmonics at fixed
+frequencies (Lane, Glindemann and Dainty 1992).  The waves repeat nowhere; the lattice repeats after P, and its axes are
+turned against the wind so that what comes back, comes back elsewhere.
+
+The widely used ``ft_sh_phase_screen`` of aotools (1.0.8) seeds two generators with the same number, one for the
+lattice and one for the sub-harmonics, whenever a seed is given; the two parts then share their draws.  Here they follow
+each other in one generator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft, special
+from scipy.interpolate import make_interp_spline
+
+from ..arrays import FloatArray
+from ..errors import require
+from .atmosphere import Layer, PhaseScreenParams, phase_spectrum
+
+Float64Array = NDArray[np.float64]
+
+# The share passes from waves to lattice about two cells off the origin.
+_CROSSOVER = 2.0
+_STEEPNESS = 4
+_RINGS_PER_DECADE = 7
+_SECTORS = 12
+_SMALLEST_SCREEN, _LARGEST_SCREEN = 512, 2048
+_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+# Waves vary so slowly over the field of view that a spline through every 8th pixel follows them to 1e-3.
+_WAVE_SPACING = 8
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseScreen:
+    """Difference of optical path over an unbounded plane, and its slope averaged over an aperture.
+
+    Attributes
+    ----------
+    path : ndarray, float32, shape (n, n)
+        Lattice part, m.
+    slopes : ndarray, float32, shape (2, n, n)
+        Tilt (x, y) of the plane fitted to the lattice part over the aperture around each point, rad.
+    spacing : float
+        Between lattice points, m.
+    axes : ndarray, float64, shape (2, 2)
+        Rows are the unit vectors of the lattice in the coordinates of the scene.
+    frequencies : ndarray, float64, shape (m, 2)
+        Of the plane waves, cycles/m, in the coordinates of the scene.
+    waves : ndarray, complex128, shape (m,)
+        Amplitudes, m: the wave is ``Re(a exp(−2πi f·x))``, that is Re a cos + Im a sin.
+    wave_slopes : ndarray, complex128, shape (2, m)
+        Amplitudes of the tilts of the waves over the aperture, rad, in the same sense.
+    """
+
+    path: FloatArray
+    slopes: FloatArray
+    spacing: float
+    axes: Float64Array
+    frequencies: Float64Array
+    waves: NDArray[np.complex128]
+    wave_slopes: NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class Turbulence:
+    """Layers of a path, each with a phase screen.
+
+    Attributes
+    ----------
+    params : PhaseScreenParams
+    layers : tuple of Layer
+    screens : tuple of PhaseScreen
+    """
+
+    params: PhaseScreenParams
+    layers: tuple[Layer, ...]
+    screens: tuple[PhaseScreen, ...]
+
+    def drift(self, time: float) -> Float64Array:
+        """How far the wind has carried each layer.
+
+        Parameters
+        ----------
+        time : float
+            s.
+
+        Returns
+        -------
+        ndarray, float64, shape (layers, 2)
+            m.
+        """
+        return np.array([layer.velocity for layer in self.layers]) * time
+
+
+def draw_screen(
+    size: int,
+    spacing: float,
+    r0: float,
+    outer_scale: float,
+    inner_scale: float,
+    rng: np.random.Generator,
+    *,
+    wavelength: float,
+    aperture: float,
+    turn: float = 0.0,
+) -> PhaseScreen:
+    """Draw a phase screen.
+
+    Parameters
+    ----------
+    size : int
+        n, points along a side of the lattice.
+    spacing : float
+        Between them, m.
+    r0, outer_scale, inner_scale : float
+        Fried parameter and scales, m.
+    rng : numpy.random.Generator
+        Source of randomness.
+    wavelength : float
+        At which r0 holds, m.
+    aperture : float
+        Diameter over which the slopes are averaged, m.
+    turn : float
+        Angle of the lattice, rad.
+
+    Returns
+    -------
+    PhaseScreen
+
+    Raises
+    ------
+    ConfigurationError
+        Fewer than 8 points.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> screen = draw_screen(64, 0.01, 0.05, 5.0, 0.0, np.random.default_rng(0), wavelength=5e-7, aperture=0.1)
+    >>> sample_path(screen, [0.0, 100.0], [0.0, 0.0]).shape
+    (2,)
+    """
+    require(size >= 8, f"size: expected at least 8 points, found {size}")
+    period = size * spacing
+    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    along, across = fft.rfftfreq(size, spacing), fft.fftfreq(size, spacing)[:, None]
+    f = np.hypot(along, across)
+    power = phase_spectrum(f, r0, outer_scale, inner_scale) * _lattice_share(f, period)
+    amplitude = (np.sqrt(power) * (size / period * wavelength / (2 * np.pi))).astype(np.float32)
+    spectrum = fft.rfft2(rng.standard_normal((size, size), dtype=np.float32)) * amplitude
+    path = fft.irfft2(spectrum, s=(size, size))
+    spectrum *= (2j * np.pi * tilt_response(f * aperture)).astype(np.complex64)
+    slopes = np.empty((2, size, size), np.float32)
+    for axis in range(2):
+        component = (axes[0, axis] * along + axes[1, axis] * across).astype(np.float32)
+        slopes[axis] = fft.irfft2(spectrum * component, s=(size, size))
+    frequencies, waves = _draw_waves(period, r0, outer_scale, inner_scale, rng)
+    waves *= wavelength / (2 * np.pi)
+    response = tilt_response(np.hypot(*frequencies.T) * aperture)
+    wave_slopes = -2j * np.pi * frequencies.T * response * waves
+    return PhaseScreen(path, slopes, spacing, axes, frequencies, waves, wave_slopes)
+
+
+def draw_turbulence(params: PhaseScreenParams, shape: tuple[int, ...], rng: np.random.Generator) -> Turbulence:
+    """Draw a phase screen for every layer, wide enough that nothing repeats within the field of view.
+
+    Parameters
+    ----------
+    params : PhaseScreenParams
+    shape : (int, int)
+        Rows and columns of the field of view, pixels.
+    rng : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    Turbulence
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> turbulence = draw_turbulence(PhaseScreenParams(layers=2), (64, 64), np.random.default_rng(0))
+    >>> [screen.path.shape for screen in turbulence.screens]
+    [(512, 512), (512, 512)]
+    """
+    layers, screens = params.path(), []
+    for number, layer in enumerate(layers):
+        diameter = layer.shrink * params.aperture
+        width = float(np.hypot(shape[0], shape[1])) * params.pixel_angle * layer.distance + diameter
+        finest = max(diameter / params.pupil_samples, params.inner_scale / 4, width / _LARGEST_SCREEN)
+        size = max(_SMALLEST_SCREEN, fft.next_fast_len(int(width / finest), real=True))
+        along = np.arctan2(layer.velocity[1], layer.velocity[0])
+        screen = draw_screen(
+            size,
+            finest,
+            layer.r0,
+            params.outer_scale,
+            params.inner_scale,
+            rng,
+            wavelength=params.wavelength,
+            aperture=diameter,
+            turn=along + (number + 1) * _GOLDEN_ANGLE,
+        )
+        screens.append(screen)
+    return Turbulence(params, layers, tuple(screens))
+
+
+def tilt_flow(turbulence: Turbulence, x: Float64Array, y: Float64Array, drift: Float64Array) -> FloatArray:
+    """Displacement by tilt on a grid of pixels.
+
+    Parameters
+    ----------
+    turbulence : Turbulence
+    x, y : ndarray, float64, shapes (w,) and (h,)
+        Columns and rows, pixels from the line of sight, evenly spaced.
+    drift : ndarray, float64, shape (layers, 2)
+        Of :meth:`Turbulence.drift`, m.
+
+    Returns
+    -------
+    ndarray, float32, shape (h, w, 2)
+        Pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> turbulence = draw_turbulence(PhaseScreenParams(layers=2), (64, 64), np.random.default_rng(0))
+    >>> tilt_flow(turbulence, np.arange(8.0), np.arange(4.0), turbulence.drift(0.5)).shape
+    (4, 8, 2)
+    """
+    angle = turbulence.params.pixel_angle
+    (node_x, to_x), (node_y, to_y) = _spline(x), _spline(y)
+    flow = np.zeros((len(y), len(x), 2), np.float32)
+    smooth = np.zeros((2, len(node_y), len(node_x)))
+    for layer, screen, shift in zip(turbulence.layers, turbulence.screens, drift, strict=True):
+        scale = layer.distance * angle
+        at_x, at_y = np.broadcast_arrays(scale * x - shift[0], (scale * y - shift[1])[:, None])
+        for axis, slope in enumerate(sample_lattice(screen, screen.slopes, at_x, at_y)):
+            flow[..., axis] += np.float32(layer.shrink) * slope
+        across = np.exp(-2j * np.pi * np.outer(screen.frequencies[:, 0], scale * node_x - shift[0]))
+        down = np.exp(-2j * np.pi * np.outer(scale * node_y - shift[1], screen.frequencies[:, 1]))
+        for axis in range(2):
+            smooth[axis] += layer.shrink * ((down * screen.wave_slopes[axis]) @ across).real
+    for axis in range(2):
+        flow[..., axis] += to_y @ smooth[axis].astype(np.float32) @ to_x.T
+    return flow / np.float32(angle)
+
+
+def sample_path(screen: PhaseScreen, x: ArrayLike, y: ArrayLike) -> FloatArray:
+    """Difference of optical path at any points.
+
+    Parameters
+    ----------
+    screen : PhaseScreen
+    x, y : array_like, one shape
+        Positions, m.
+
+    Returns
+    -------
+    ndarray, float32, shape of ``x``
+        m.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> screen = draw_screen(64, 0.01, 0.05, 5.0, 0.0, np.random.default_rng(0), wavelength=5e-7, aperture=0.1)
+    >>> bool(sample_path(screen, 0.02, 0.03) == sample_path(screen, 0.02, 0.03))
+    True
+    """
+    u, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+    phases = np.multiply.outer(u, screen.frequencies[:, 0]) + np.multiply.outer(v, screen.frequencies[:, 1])
+    smooth = (np.exp(-2j * np.pi * phases) @ screen.waves).real
+    (flat,) = sample_lattice(screen, [screen.path], u.reshape(1, -1), v.reshape(1, -1))
+    return np.asarray(smooth + flat.reshape(u.shape), np.float32)
+
+
+def sample_lattice(
+    screen: PhaseScreen, planes: Iterable[FloatArray], x: Float64Array, y: Float64Array
+) -> list[FloatArray]:
+    """Look up planes on the lattice between their points, bilinear and periodic.
+
+    Parameters
+    ----------
+    screen : PhaseScreen
+    planes : iterable of ndarray, float32, shape (n, n)
+        ``screen.path`` or ``screen.slopes``.
+    x, y : ndarray, float64, shape (a, b)
+        Positions, m, no more than some periods apart.
+
+    Returns
+    -------
+    list of ndarray, float32, shape (a, b)
+        One a plane.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> screen = draw_screen(64, 0.01, 0.05, 5.0, 0.0, np.random.default_rng(0), wavelength=5e-7, aperture=0.1)
+    >>> (at,) = sample_lattice(screen, [screen.path], np.array([[0.02]]), np.array([[0.03]]))
+    >>> bool(np.isclose(at[0, 0], screen.path[3, 2], rtol=1e-3))
+    True
+    """
+    size = len(screen.path)
+    maps = []
+    for axis in screen.axes / screen.spacing:
+        position = axis[0] * x + axis[1] * y
+        # Whole periods are taken off in double precision; single precision is enough for what remains.
+        position -= size * np.floor(position.flat[0] / size)
+        maps.append(position.astype(np.float32))
+    return [cv2.remap(plane, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for plane in planes]
+
+
+def tilt_response(cycles: ArrayLike) -> Float64Array:
+    """Share of a wave's slope that the plane fitted over a circular aperture keeps: ``8 J2(πfD)/(πfD)²``.
+
+    Noll (1976), from the transform of Zernike tilt.
+
+    Parameters
+    ----------
+    cycles : array_like
+        f D, cycles across the aperture.
+
+    Returns
+    -------
+    ndarray, float64, shape of ``cycles``
+
+    Examples
+    --------
+    >>> tilt_response([0.0, 1.0]).round(3)
+    array([1.   , 0.393])
+    """
+    x = np.maximum(np.pi * np.abs(np.asarray(cycles, np.float64)), 1e-2)
+    # J2 by recurrence: SciPy has fast routines for J0 and J1 only.
+    return 8 * (2 * special.j1(x) / x - special.j0(x)) / x**2
+
+
+def _lattice_share(f: Float64Array, period: float) -> Float64Array:
+    return -np.expm1(-((f * period / _CROSSOVER) ** _STEEPNESS))
+
+
+def _draw_waves(
+    period: float, r0: float, outer_scale: float, inner_scale: float, rng: np.random.Generator
+) -> tuple[Float64Array, NDArray[np.complex128]]:
+    """Frequencies and amplitudes (rad), one wave a stratum; half the plane is enough for real waves."""
+    # Beyond the last ring waves carry less than 1e-7 of Φ; within the first Φ is flat and tilts nothing.
+    last = 2 * _CROSSOVER / period
+    first = min(0.05 / outer_scale, last / 10)
+    count = int(np.ceil(_RINGS_PER_DECADE * np.log10(last / first)))
+    edges = np.concatenate([[0.0], np.geomspace(first, last, count)])
+    f = np.concatenate([[0.0], np.geomspace(first / 100, last, 4000)])
+    density = 2 * np.pi * f * phase_spectrum(f, r0, outer_scale, inner_scale) * (1 - _lattice_share(f, period))
+    below = np.concatenate([[0.0], np.cumsum(np.diff(f) * (density[1:] + density[:-1]) / 2)])
+    at_edges = np.interp(edges, f, below)
+    power = np.diff(at_edges)[:, None] / _SECTORS
+    shape = (count, _SECTORS)
+    radius = np.interp(at_edges[:-1, None] + rng.random(shape) * np.diff(at_edges)[:, None], below, f)
+    angle = (np.arange(_SECTORS) + rng.random(shape)) * np.pi / _SECTORS
+    frequencies = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1).reshape(-1, 2)
+    amplitudes = (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) * np.sqrt(power)
+    return frequencies, amplitudes.ravel()
+
+
+def _spline(pixels: Float64Array) -> tuple[Float64Array, FloatArray]:
+    """Nodes that span the pixels, and the matrix that takes values at the nodes to the pixels by a cubic spline."""
+    count = max(4, int(np.ceil(np.ptp(pixels) / _WAVE_SPACING)) + 1)
+    nodes = np.linspace(pixels[0], max(pixels[-1], pixels[0] + 1), count)
+    return nodes, make_interp_spline(nodes, np.eye(count))(pixels).astype(np.float32)
