@@ -64,7 +64,8 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
             "converged": restoration.deconvolution.converged,
         }
     if restoration.blur is not None:
-        record["blur"] = {"sigma": restoration.blur.sigma, "uncertainty": restoration.blur.uncertainty}
+        names = ("sigma", "uncertainty", "exponent", "noise", "reduction", "evidence")
+        record["blur"] = {name: getattr(restoration.blur, name) for name in names}
     if truth is not None:
         stages = {name: dataclasses.asdict(compare(image, truth)) for name, image in stage_images(restoration).items()}
         record["stages"] = stages

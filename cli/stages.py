@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from turbrestore.alternating import Filtered, FilterParams, filter_frames
 from turbrestore.artifacts import load_artifact, load_flows, load_stage_image, save_artifact, save_flows
+from turbrestore.blur_estimation import estimate_blur
 from turbrestore.centroid import Centroid, CentroidParams, find_centroid
 from turbrestore.deconvolution import Deconvolution, DeconvolutionParams
 from turbrestore.deconvolution import deconvolve as deconvolve_image
@@ -18,9 +19,9 @@ from turbrestore.dynamics import identify as identify_flows
 from turbrestore.errors import require
 from turbrestore.flow import FlowParams, estimate_flow
 from turbrestore.images import IMAGE_OUTPUT_SUFFIXES, check_output, read_image, write_image
-from turbrestore.pipeline import stage_counter, training_share
+from turbrestore.pipeline import blur_to_remove, stage_counter, training_share
 from turbrestore.pixels import check_depth
-from turbrestore.psf import estimate_blur
+from turbrestore.psf import KOLMOGOROV
 from turbrestore.video import open_frames
 
 from .options import Flag, Selection, known_sigma
@@ -208,7 +209,7 @@ def deconvolve(
     output : Path
         Image (.png, .tif) or artifact (.npz) to write.
     sigma : float
-        Standard deviation of the Gaussian blur, pixels.  Estimated by default.
+        Width of the blur, pixels; a Gaussian unless --deconvolution.exponent says otherwise.  Estimated by default.
     guide : Path
         Image or artifact that the nonlocal weights are taken from; the input by default, the centroid in the paper.
     deconvolution : DeconvolutionParams
@@ -220,7 +221,7 @@ def deconvolve(
     quiet : bool
         No progress and no remarks.
     """
-    sigma = known_sigma(sigma, deconvolution).sigma
+    deconvolution = known_sigma(sigma, deconvolution)
     if bit_depth is not None:
         check_depth(bit_depth)
         require(output.suffix.lower() not in ARTIFACT, "--bit-depth: has no effect on an artifact; leave it out")
@@ -228,15 +229,17 @@ def deconvolve(
     check_output(output, inputs, overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
     image = load_stage_image(input)
     guide_image = image if guide is None else load_stage_image(guide)
-    if sigma is None:
-        sigma = estimate_blur(image).sigma
+    estimate = None
+    if deconvolution.sigma is None:
+        estimate = estimate_blur(image, exponent=deconvolution.exponent or KOLMOGOROV)
+    width, settings = blur_to_remove(estimate, deconvolution)
     with progress_bars(quiet) as progress:
         counter = stage_counter(progress, "deconvolve", deconvolution.iterations)
-        result = deconvolve_image(image, sigma, deconvolution, guide=guide_image, progress=counter)
+        result = deconvolve_image(image, width, settings, guide=guide_image, progress=counter)
     if bit_depth is None:
         bit_depth = 16 if input.suffix.lower() in ARTIFACT else read_image(input).bit_depth
     _write(output, result, bit_depth, overwrite)
-    say(f"{output}: blur of {sigma:.2f} pixels removed" if sigma > 0 else f"{output}: no blur removed", quiet)
+    say(f"{output}: blur of {width:.2f} pixels removed" if width > 0 else f"{output}: no blur removed", quiet)
 
 
 def _write(output: Path, result: Filtered | Deconvolution, bit_depth: int, overwrite: bool) -> None:

@@ -24,8 +24,8 @@ from .metrics import compare as compare
 from .pipeline import Restoration as Restoration
 from .pipeline import RestoreParams as RestoreParams
 from .pipeline import restore as restore
-from .psf import BlurEstimate as BlurEstimate
-from .psf import estimate_blur as estimate_blur
+from .blur_estimation import BlurEstimate as BlurEstimate
+from .blur_estimation import estimate_blur as estimate_blur
 from .video import open_frames as open_frames
 from .video import write_video as write_video
 from .warp import compose_flows as compose_flows

@@ -60,10 +60,12 @@ from .nonlocal_tv import (
     project_to_unit,
 )
 from .psf import (
+    GAUSSIAN,
     Spectrum,
+    blur_otf,
+    check_exponent,
     check_psf,
     estimate_noise,
-    gaussian_otf,
     laplacian_symbol,
     psf_to_otf,
     wiener_fidelity,
@@ -92,7 +94,10 @@ class DeconvolutionParams:
     method : {"nltv", "tv", "wiener", "tikhonov"}
         Penalty: nonlocal TV, TV, squared gradient, squared deviation from the mean.
     sigma : float, optional
-        Standard deviation of the blur, pixels, for callers that ask here; by default it is to be estimated.
+        Width of the blur, pixels, for callers that ask here; by default it is to be estimated.
+    exponent : float, optional
+        Shape of a blur that is known by its width: 2 is a Gaussian, 5/3 turbulence; see
+        :func:`turbrestore.psf.blur_otf`.  By default 2 for a given width, and 5/3 for one that is estimated.
     fidelity : float, optional
         λ: more is sharper and noisier; by default from the noise of the image, see :func:`automatic_fidelity`.
     iterations : int
@@ -112,6 +117,7 @@ class DeconvolutionParams:
 
     method: Literal["nltv", "tv", "wiener", "tikhonov"] = "nltv"
     sigma: float | None = None
+    exponent: float | None = None
     fidelity: float | None = None
     iterations: int = 200
     tolerance: float = 1e-4
@@ -129,6 +135,8 @@ class DeconvolutionParams:
             require(value in known, f"{name}: expected one of {', '.join(known)}, found {value!r}")
         if self.sigma is not None:
             require_between("sigma", self.sigma, 0, 1000, "pixels")
+        if self.exponent is not None:
+            check_exponent(self.exponent)
         if self.fidelity is not None:
             require_between("fidelity", self.fidelity, 1e-6, 1e9)
         require_between("iterations", self.iterations, 1, 100_000)
@@ -330,7 +338,7 @@ def deconvolve(
     image : array_like, shape (H, W) or (H, W, 3)
         f.
     sigma_or_psf : float, or array_like of shape (h, w) with odd sizes
-        Standard deviation of a Gaussian blur, pixels, or a sampled point spread function. Without blur (0, or a
+        Width of a blur of shape ``params.exponent``, pixels, or a sampled point spread function. Without blur (0, or a
         single pixel) the image comes back as it is: an image that is not blurred is best left alone.
     params : DeconvolutionParams, optional
         Method and settings. ``params.sigma`` is not used here.
@@ -371,7 +379,7 @@ def deconvolve(
         return Deconvolution(pixels, 0.0, fidelity, noise, 0, True, nothing.astype(np.int64), nothing, nothing)
     widths = _margins(planes[0].shape, margin if params.boundary == "unknown" else None)
     shape = tuple(size + sum(width) for size, width in zip(planes[0].shape, widths, strict=True))
-    otf = gaussian_otf(shape, sigma) if psf is None else psf_to_otf(psf, shape)
+    otf = blur_otf(shape, sigma, params.exponent or GAUSSIAN) if psf is None else psf_to_otf(psf, shape)
     seen = np.pad(np.ones_like(planes[0]), widths)
     problems = [Problem(np.pad(plane, widths, mode="symmetric"), seen, otf, fidelity) for plane in planes]
     result = _solve(problems, params, _padded_guide(guide, planes[0].shape, widths), progress)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Literal
 
@@ -13,13 +13,14 @@ from numpy.typing import ArrayLike
 
 from .alternating import Filtered, FilterParams, filter_frames
 from .arrays import FloatArray
+from .blur_estimation import BlurEstimate, estimate_blur
 from .centroid import Centroid, CentroidParams, find_centroid
 from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve
 from .dynamics import DynamicsParams, FlowDynamics, identify
 from .errors import DataError, require
 from .flow import MIN_SIDE, FlowParams
 from .frame_source import FrameSource
-from .psf import BlurEstimate, estimate_blur
+from .psf import KOLMOGOROV
 
 STAGES = ("centroid", "identify", "filter", "deconvolve")
 # Contrast below one grey level of an 8-bit camera is no scene.
@@ -180,16 +181,45 @@ def restore(
         image, mean = filtered.image, summed.mean()
         clock.lap("filter")
     if "deconvolve" in stages:
-        sigma = params.deconvolution.sigma
-        if sigma is None:
-            blur = estimate_blur(image)
-            sigma = blur.sigma
+        if params.deconvolution.sigma is None:
+            blur = estimate_blur(image, exponent=params.deconvolution.exponent or KOLMOGOROV)
         counter = stage_counter(progress, "deconvolve", params.deconvolution.iterations)
-        deconvolution = deconvolve(image, sigma, params.deconvolution, guide=centroid.image, progress=counter)
+        deconvolution = deconvolve(
+            image, *blur_to_remove(blur, params.deconvolution), guide=centroid.image, progress=counter
+        )
         image = deconvolution.image
         clock.lap("deconvolve")
     count = len(source) if filtered is not None else train
     return Restoration(image, mean, centroid, dynamics, filtered, blur, deconvolution, train, count, clock.seconds)
+
+
+def blur_to_remove(
+    estimate: BlurEstimate | None, deconvolution: DeconvolutionParams
+) -> tuple[float, DeconvolutionParams]:
+    """Width of the blur, and settings that know its shape: those asked for, else those estimated.
+
+    Parameters
+    ----------
+    estimate : BlurEstimate or None
+        Needed where ``deconvolution.sigma`` is None.
+    deconvolution : DeconvolutionParams
+        Settings.
+
+    Returns
+    -------
+    sigma : float
+        Pixels.
+    deconvolution : DeconvolutionParams
+
+    Examples
+    --------
+    >>> sigma, params = blur_to_remove(None, DeconvolutionParams(sigma=1.5))
+    >>> sigma, params.exponent
+    (1.5, None)
+    """
+    if deconvolution.sigma is not None or estimate is None:
+        return deconvolution.sigma or 0.0, deconvolution
+    return estimate.sigma, replace(deconvolution, exponent=estimate.exponent)
 
 
 def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int | None = None) -> int:

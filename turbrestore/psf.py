@@ -1,10 +1,11 @@
-"""Blur: Gaussian point spread functions, their transfer functions, and a cautious estimate of the blur of an image.
+"""Blur: point spread functions, their transfer functions, and the noise of an image.
 
 Symbols (paper 3, section 5)
 ----------------------------
 k : point spread function (PSF), sums to 1; its Fourier transform is the transfer function (OTF).
-σ : standard deviation of a Gaussian k, pixels.
-ν : spatial frequency, cycles per pixel.
+σ : width of k, pixels: standard deviation of a Gaussian, or of the Gaussian that passes one half at the same frequency.
+ν : spatial frequency, cycles per pixel; ν_h the one that passes one half.
+p : exponent of the transfer function.
 n : standard deviation of the noise, intensity.
 
 Transfer functions are half-spectra as :func:`scipy.fft.rfft2` lays them out, so
@@ -13,7 +14,6 @@ Transfer functions are half-spectra as :func:`scipy.fft.rfft2` lays them out, so
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -27,49 +27,8 @@ from .errors import DataError, require
 Float64Array = NDArray[np.float64]
 Spectrum = NDArray[Any]
 
-# Below this a Gaussian passes 30 % at the highest frequency of the grid: no more than pixels themselves blur.
-_SMALLEST_SIGMA = 0.5
-# Half-widths of rings in the spectrum, cycles per pixel, below and above which a fit means nothing.
-_LOWEST_FREQUENCY = 0.02
-_RING = 1 / 128
-# Share of the noise floor at which the spectrum stops telling about the scene.
-_FLOOR_MARGIN = 8.0
-# Natural and drawn scenes have power ν^-1.6 to ν^-2.4; the fit assumes ν^-2.
-_SLOPE_UNCERTAINTY = 0.4
-# Intensity by which a result may leave the local range of the image, and the share of pixels that may do so.
-_OVERSHOOT = 0.05
-_OVERSHOOT_SHARE = 0.025
-
-
-@dataclass(frozen=True, eq=False)
-class BlurEstimate:
-    """Estimated Gaussian blur of an image, with what it was read from.
-
-    Attributes
-    ----------
-    sigma : float
-        Standard deviation to remove, pixels; 0 means that the image should be left alone.
-    uncertainty : float
-        One standard deviation of ``fitted``: scatter of the fit, and scenes whose spectrum falls slower or faster
-        than the fit assumes; infinite where no fit is possible.
-    noise : float
-        Standard deviation of the noise that was assumed, intensity.
-    fitted : float
-        σ that fits the spectrum best, before overshoot limits it.
-    cutoff : float
-        Highest frequency that was used, cycles per pixel.
-    frequencies, power, model : ndarray, float64, shape (n,)
-        Rings that were used: frequency (cycles per pixel), power above the noise, and the fitted curve.
-    """
-
-    sigma: float
-    uncertainty: float
-    noise: float
-    fitted: float
-    cutoff: float
-    frequencies: Float64Array
-    power: Float64Array
-    model: Float64Array
+# Exponents of the transfer function: a Gaussian, and a long exposure through Kolmogorov turbulence (Fried 1966).
+GAUSSIAN, KOLMOGOROV = 2.0, 5 / 3
 
 
 def gaussian_psf(sigma: float) -> FloatArray:
@@ -132,6 +91,87 @@ def gaussian_otf(shape: tuple[int, int], sigma: float) -> FloatArray:
     _check_sigma(sigma)
     rows, columns = (np.exp(-2 * (np.pi * sigma * nu) ** 2) for nu in _frequencies(shape))
     return (rows * columns).astype(np.float32)
+
+
+def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -> FloatArray:
+    """Transfer function ``exp(−ln 2 (ν/ν_h)^p)`` on a periodic grid, ``ν_h = √(ln 2 / 2) / (π σ)``.
+
+    p = 2 is the Gaussian of :func:`gaussian_otf`.  p = 5/3 is a long exposure through Kolmogorov turbulence (Fried
+    1966); its point spread function has a narrower core and wider wings.  An average of frames with blurs of different
+    widths has wings as well: on fused frames of two simulators the measured transfer function follows p = 1.2 to 1.8.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of the image.
+    sigma : float
+        Width, pixels: standard deviation of the Gaussian with the same ν_h.
+    exponent : float
+        p, 1 to 2.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W // 2 + 1)
+        1 at frequency 0.
+
+    Raises
+    ------
+    ConfigurationError
+        ``sigma`` is negative or not finite, or ``exponent`` outside 1 to 2.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> bool(np.allclose(blur_otf((8, 8), 1.0), gaussian_otf((8, 8), 1.0), atol=1e-6))
+    True
+    """
+    _check_sigma(sigma)
+    check_exponent(exponent)
+    if sigma == 0:
+        return np.ones((shape[0], shape[1] // 2 + 1), np.float32)
+    rows, columns = _frequencies(shape)
+    return np.exp(-np.log(2) * (np.hypot(rows, columns) / half_frequency(sigma)) ** exponent).astype(np.float32)
+
+
+def half_frequency(sigma: float) -> float:
+    """Frequency at which a Gaussian passes one half: ``√(ln 2 / 2) / (π σ)``.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation, pixels, above 0.
+
+    Returns
+    -------
+    float
+        Cycles per pixel.
+
+    Examples
+    --------
+    >>> round(half_frequency(1.0), 4)
+    0.1874
+    """
+    return float(np.sqrt(np.log(2) / 2) / (np.pi * sigma))
+
+
+def check_exponent(exponent: float) -> None:
+    """Refuse an exponent that :func:`blur_otf` does not take.
+
+    Parameters
+    ----------
+    exponent : float
+        p.
+
+    Raises
+    ------
+    ConfigurationError
+        Outside 1 to 2.
+
+    Examples
+    --------
+    >>> check_exponent(2.0)
+    """
+    require(1 <= exponent <= 2, f"exponent: expected 1 to 2 (a Gaussian), found {exponent}")
 
 
 def psf_to_otf(psf: ArrayLike, shape: tuple[int, int]) -> NDArray[np.complex64]:
@@ -284,117 +324,6 @@ def estimate_noise(image: ArrayLike) -> float:
     mask = np.array([1, -2, 1], np.float32)
     residual = cv2.sepFilter2D(grey, cv2.CV_32F, mask, mask)[1:-1, 1:-1] / 6
     return float(np.median(np.abs(residual)) / 0.6745)
-
-
-def estimate_blur(image: ArrayLike, noise: float | None = None) -> BlurEstimate:
-    """Estimate the Gaussian blur of an image, erring on the side of too little.
-
-    The power spectrum of a scene falls about as ν^-2, so that of the blurred scene follows
-    ``log P = c − 2 log ν − 4π²σ²ν²``. P is averaged over rings of the Hann-windowed image, the noise floor n² is
-    subtracted, and σ fitted from 0.02 cycles per pixel to where P first falls below 8 n². Paper 3 picks σ by hand.
-
-    σ is then lowered until a Wiener result leaves the local range (7×7) of the image by more than 5 % of full
-    scale at no more than 2.5 % of the pixels, where ringing would show. Below 0.5 pixels it becomes 0: leave the
-    image alone.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        Colour is reduced to luminance.
-    noise : float, optional
-        Standard deviation of the noise, intensity; estimated by default.
-
-    Returns
-    -------
-    BlurEstimate
-
-    Raises
-    ------
-    DataError
-        Wrong shape or values that are not finite.
-    ConfigurationError
-        ``noise`` is negative or not finite.
-
-    Examples
-    --------
-    >>> import cv2, numpy as np
-    >>> walk = np.random.default_rng(0).normal(size=(2, 128, 1)).cumsum(axis=1)
-    >>> scene = (0.5 + 0.02 * (walk[0] + walk[1].T)).astype(np.float32)
-    >>> bool(1.5 < estimate_blur(cv2.GaussianBlur(scene, (0, 0), 2.0)).fitted < 2.5)
-    True
-    """
-    grey = luminance(check_image(image))
-    noise = estimate_noise(grey) if noise is None else noise
-    require(np.isfinite(noise) and noise >= 0, f"noise: expected a finite number of 0 or more, found {noise}")
-    frequencies, power, counts = _informative_rings(grey, noise)
-    if len(frequencies) < 4:
-        return BlurEstimate(0.0, float("inf"), noise, 0.0, 0.0, frequencies, power, power)
-    fitted, scatter, model = _fit_gaussian(frequencies, power, counts)
-    flatter, steeper = (_fit_gaussian(frequencies, power, counts, 2 + sign * _SLOPE_UNCERTAINTY)[0] for sign in (-1, 1))
-    uncertainty = float(np.hypot(scatter, (flatter - steeper) / 2))
-    sigma = _without_overshoot(grey, fitted, noise)
-    return BlurEstimate(sigma, uncertainty, noise, fitted, float(frequencies[-1]), frequencies, power, model)
-
-
-def _informative_rings(grey: FloatArray, noise: float) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Frequency, power above the noise floor and count of the rings that the fit uses."""
-    height, width = grey.shape
-    window = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1])
-    centred = (grey - np.average(grey, weights=window)) * window
-    power = np.abs(fft.fft2(centred)) ** 2 / np.sum(window**2)
-    radius = np.hypot(fft.fftfreq(height)[:, None], fft.fftfreq(width))
-    ring = np.rint(radius / _RING).astype(np.intp)
-    inside = (radius >= _LOWEST_FREQUENCY) & (radius <= 0.5)
-    counts = np.bincount(ring[inside]).astype(np.float64)
-    filled = counts > 0
-    counts = counts[filled]
-    mean_power, mean_radius = (np.bincount(ring[inside], v[inside])[filled] / counts for v in (power, radius))
-    # An image without noise still ends somewhere: float32 keeps seven digits.
-    floor = max(noise**2, 1e-7 * float(mean_power.max(initial=0)))
-    below = np.flatnonzero(mean_power <= _FLOOR_MARGIN * floor)
-    end = below[0] if len(below) else len(mean_power)
-    return mean_radius[:end], mean_power[:end] - noise**2, counts[:end]
-
-
-def _fit_gaussian(
-    frequencies: Float64Array, power: Float64Array, counts: Float64Array, slope: float = 2.0
-) -> tuple[float, float, Float64Array]:
-    """Fit ``log P = c − slope·log ν − 4π²σ²ν²`` with rings weighed by their size: σ, its deviation, the curve."""
-    weights = np.sqrt(counts)
-    design = np.stack([np.ones_like(frequencies), -((2 * np.pi * frequencies) ** 2)], axis=1)
-    target = np.log(power) + slope * np.log(frequencies)
-    solution = np.linalg.lstsq(design * weights[:, None], target * weights, rcond=None)[0]
-    residual = (target - design @ solution) * weights
-    covariance = np.linalg.inv((design * weights[:, None]).T @ (design * weights[:, None]))
-    deviation = np.sqrt(covariance[1, 1] * np.sum(residual**2) / (len(target) - 2))
-    sigma = float(np.sqrt(max(solution[1], 0.0)))
-    model = np.exp(design @ solution - slope * np.log(frequencies))
-    # d(σ²) = 2σ dσ, which says nothing near 0.
-    return sigma, float(deviation / (2 * max(sigma, _SMALLEST_SIGMA))), model
-
-
-def _without_overshoot(grey: FloatArray, sigma: float, noise: float) -> float:
-    """Lower ``sigma`` until a Wiener result stays within the local range of the image; 0 if nothing is left."""
-    margin = int(np.ceil(4 * sigma))
-    # Where the two sides of the reflected image meet it rings whatever the blur: look at the image proper.
-    padded = cv2.copyMakeBorder(grey, margin, margin, margin, margin, cv2.BORDER_REFLECT)
-    height, width = grey.shape
-    fidelity = wiener_fidelity(grey, noise)
-    box = np.ones((7, 7), np.uint8)
-    high, low = cv2.dilate(grey, box) + _OVERSHOOT, cv2.erode(grey, box) - _OVERSHOOT
-    while sigma >= _SMALLEST_SIGMA:
-        result = _sharpen(padded, sigma, fidelity)[margin : margin + height, margin : margin + width]
-        if np.mean((result > high) | (result < low)) <= _OVERSHOOT_SHARE:
-            return sigma
-        sigma *= 0.95
-    return 0.0
-
-
-def _sharpen(image: FloatArray, sigma: float, fidelity: float) -> FloatArray:
-    """Wiener deconvolution of a periodic image: ``λ k*∗(k∗u − f) = Δu`` (paper 3, after eq. 21) in Fourier."""
-    otf = gaussian_otf((image.shape[0], image.shape[1]), sigma)
-    denominator = fidelity * otf**2 + laplacian_symbol(image.shape[0], image.shape[1])
-    return fft.irfft2(fidelity * otf * fft.rfft2(image) / denominator, s=image.shape)
 
 
 def _frequencies(shape: tuple[int, ...]) -> tuple[Float64Array, Float64Array]:

@@ -1,0 +1,94 @@
+"""Widths of known blurs, found blind, and the cost against its definition."""
+
+import cv2
+import numpy as np
+import pytest
+
+from turbrestore.blur_estimation import _cost, _gradients, _most_detailed, _reduce, estimate_blur
+from turbrestore.errors import ConfigurationError, DataError
+from turbrestore.psf import GAUSSIAN, KOLMOGOROV, blur_otf
+from turbrestore.synthesis.scenes import SCENES
+
+
+def blurred(name, sigma, noise, seed=0, size=256):
+    scene = SCENES[name](size, size)
+    scene = cv2.GaussianBlur(scene, (0, 0), sigma) if sigma else scene
+    return (scene + np.random.default_rng(seed).normal(0, noise, scene.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ["camera", "chart", "words", "grass"])
+@pytest.mark.parametrize(("sigma", "noise"), [(1.0, 0.002), (2.0, 0.01), (4.0, 0.005)])
+def test_the_width_of_a_gaussian_is_found(name, sigma, noise):
+    estimate = estimate_blur(blurred(name, sigma, noise), exponent=GAUSSIAN)
+    assert 0.75 * sigma < estimate.sigma < 1.25 * sigma
+    assert 0 < estimate.uncertainty < 0.5 * sigma
+
+
+def test_the_width_of_a_turbulent_blur_is_found_and_depends_on_the_shape():
+    scene = SCENES["camera"](256, 256)
+    image = np.fft.irfft2(blur_otf(scene.shape, 1.6, KOLMOGOROV) * np.fft.rfft2(scene), s=scene.shape)
+    image = (image + np.random.default_rng(1).normal(0, 0.002, scene.shape)).astype(np.float32)
+    assert estimate_blur(image).sigma == pytest.approx(1.6, rel=0.15)
+    assert estimate_blur(image).exponent == KOLMOGOROV
+
+
+@pytest.mark.parametrize("name", ["chart", "words", "camera"])
+def test_sharp_scenes_keep_the_width_of_their_pixels(name):
+    assert estimate_blur(blurred(name, 0, 0.002)).sigma == 0.35
+
+
+def test_wide_blurs_are_read_from_a_reduced_image():
+    assert estimate_blur(blurred("words", 4.0, 0.005), exponent=GAUSSIAN).reduction >= 3
+    assert estimate_blur(blurred("words", 0.9, 0.005), exponent=GAUSSIAN).reduction == 1
+
+
+def test_more_noise_makes_the_estimate_less_sure_and_not_wider():
+    low, high = (estimate_blur(blurred("camera", 1.5, noise), exponent=GAUSSIAN) for noise in (0.002, 0.04))
+    assert high.evidence < low.evidence
+    assert high.sigma < 1.3 * 1.5
+
+
+def test_images_that_say_nothing_are_left_alone():
+    for image in (np.zeros((1, 1)), np.random.default_rng(3).random((2, 90)), np.full((64, 64), 0.3)):
+        estimate = estimate_blur(image)
+        assert (estimate.sigma, estimate.uncertainty) == (0, np.inf)
+
+
+def test_colour_counts_as_luminance():
+    image = blurred("camera", 1.5, 0.005, size=128)
+    assert estimate_blur(np.repeat(image[..., None], 3, axis=2)).sigma == pytest.approx(
+        estimate_blur(image).sigma, rel=1e-3
+    )
+
+
+def test_the_cost_is_the_evidence_of_independent_gradients_where_there_is_no_blur():
+    # Without blur the gradients do not mix: γ = max(y² − λ, 0) in closed form, and L = mean of y²/(λ+γ) + log(λ+γ).
+    image = SCENES["camera"](64, 64)
+    gradients = _gradients(image)
+    noise, y = 0.02, gradients.planes.astype(float)
+    total = np.maximum(y**2, 2 * noise**2)
+    exact = np.mean(y**2 / total + np.log(total))
+    # The updates approach the optimum slowly where γ → 0, from above.
+    assert exact <= _cost(gradients, 1e-3, GAUSSIAN, noise) < exact + 0.1
+
+
+def test_a_reduction_averages_whole_blocks():
+    image = np.random.default_rng(4).random((13, 9)).astype(np.float32)
+    assert np.allclose(_reduce(image, 4), image[:12, :8].reshape(3, 4, 2, 4).mean(axis=(1, 3)), atol=1e-6)
+
+
+def test_the_most_detailed_part_holds_the_detail():
+    image = np.zeros((300, 400), np.float32)
+    image[200:280, 250:350] = np.random.default_rng(5).random((80, 100))
+    part = _most_detailed(image)
+    assert part.shape == (129, 129)
+    assert part.sum() == pytest.approx(image.sum())
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(ConfigurationError, match="noise"):
+        estimate_blur(np.zeros((32, 32)), noise=-0.1)
+    with pytest.raises(ConfigurationError, match="exponent"):
+        estimate_blur(np.zeros((32, 32)), exponent=3.0)
+    with pytest.raises(DataError):
+        estimate_blur(np.full((32, 32), np.nan))

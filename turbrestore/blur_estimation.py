@@ -1,0 +1,267 @@
+"""Blind estimation of the width of a blur by the marginal likelihood of a sparse scene.
+
+The gradients of a sharp scene are sparse: few are large, most vanish.  A blur that is too narrow or too wide asks for
+gradients that are less sparse, so the likelihood of the image, with the scene integrated out, peaks at the blur it was
+taken with.  (Maximising over scene and blur together would not do: that prefers no blur at all.)  Paper 3 picks the
+width by hand.
+
+Symbols
+-------
+y : gradients of the image, one plane along x and one along y, tapered at the border; m values in all
+x : gradients of the scene, ``y = k ∗ x + noise``; γ : prior variance of each, ``x_i ~ N(0, γ_i)``
+k : point spread function of :func:`turbrestore.psf.blur_otf`; ‖k‖² its energy, σ its width
+n : standard deviation of the noise of the image; λ = 2 n², that of y
+C : posterior variance of each x
+
+The cost is the variational bound of the negative logarithm of the marginal likelihood (Wipf and Zhang, Revisiting
+Bayesian blind deconvolution, JMLR 2014):
+
+    L(σ) = (1/m) min over x and γ of  ‖y − k ∗ x‖² / λ + Σ_i x_i² / γ_i + log(λ + γ_i ‖k‖²)
+
+x is found by conjugate gradients for γ given, and ``γ_i = x_i² + C_i`` with ``C_i = 1 / (‖k‖² / λ + 1 / γ_i)``.
+
+A wide blur is looked for in a reduced image, where it is about a pixel wide again and where the noise of compression,
+which is no blurred scene, averages out.  The search starts at the strongest reduction and ends where the blur is
+resolved.  Reducing by r averages r×r pixels, whose variance (r² − 1) / 12 is taken out again.
+
+n is more than the noise of the image: no real blur follows the family of k exactly, and a scene of high contrast
+shows that more.  Below, it is the noise and a share of the contrast; the width found depends on it (math in
+``docs/decisions/blur.md``), which is what ``uncertainty`` measures.
+
+A fused image is never sharper than its pixels and the interpolation in registration: the smallest width found is
+0.35 px, and that is also the answer where a wider blur is hardly more likely.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
+
+from .arrays import FloatArray, check_image, luminance
+from .errors import require
+from .psf import KOLMOGOROV, check_exponent, estimate_noise, half_frequency
+
+Float64Array = NDArray[np.float64]
+
+# Factors by which the image is reduced, and the smallest side that is left.
+_REDUCTIONS = (8, 6, 4, 3, 2, 1)
+_SMALLEST_SIDE, _SMALLEST_IMAGE = 48, 16
+# Widths that are tried, pixels of the reduced image; the first is that of a sharp image.
+_WIDTHS = np.array([0.35, 0.45, 0.55, 0.65, 0.8, 0.95, 1.1, 1.3, 1.55, 1.85, 2.2, 2.6])
+# A blur of this many pixels of the reduced image is resolved, and needs no finer one.
+_RESOLVED = 0.7
+# By how much a blurred scene must be likelier than a sharp one, in units of L.
+_EVIDENCE = 0.125
+# Side of the part that is looked at, the one with most detail, and of its taper; pixels.
+_PART, _TAPER = 128, 8
+# n is this many times the noise, and this share of the contrast.
+_NOISE_FACTOR, _MISFIT = 1.5, 0.025
+_LEAST_NOISE = 1e-4
+# Updates of γ, and conjugate gradient steps in each.
+_UPDATES, _STEPS = 16, 8
+
+
+@dataclass(frozen=True, eq=False)
+class BlurEstimate:
+    """Estimated blur of an image, with what it was read from.
+
+    Attributes
+    ----------
+    sigma : float
+        Width of the blur, pixels: standard deviation of the Gaussian whose transfer function passes one half at the
+        same frequency; 0 where the image says nothing.
+    uncertainty : float
+        Half of the difference between the widths found with half and with twice the noise, pixels; infinite where
+        the image says nothing.
+    exponent : float
+        Shape of the blur, see :func:`turbrestore.psf.blur_otf`.
+    noise : float
+        n of the reduced image, intensity.
+    reduction : int
+        r.
+    evidence : float
+        How much higher L is for a sharp image.
+    widths : ndarray, float64, shape (k,)
+        Widths that were tried on the reduced image, in pixels of the image.
+    costs : ndarray, float64, shape (k,)
+        L of each.
+    """
+
+    sigma: float
+    uncertainty: float
+    exponent: float
+    noise: float
+    reduction: int
+    evidence: float
+    widths: Float64Array
+    costs: Float64Array
+
+
+def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV) -> BlurEstimate:
+    """Estimate the width of the blur of an image.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W) or (H, W, 3)
+        Colour is reduced to luminance.
+    noise : float, optional
+        Standard deviation of the noise, intensity; estimated by default.
+    exponent : float
+        Shape of the blur, 1 to 2: 5/3 for images fused from turbulent frames, 2 for a Gaussian.
+
+    Returns
+    -------
+    BlurEstimate
+
+    Raises
+    ------
+    DataError
+        Wrong shape or values that are not finite.
+    ConfigurationError
+        ``noise`` is negative or not finite, or ``exponent`` outside 1 to 2.
+
+    Examples
+    --------
+    >>> import cv2
+    >>> from turbrestore.synthesis.scenes import SCENES
+    >>> blurred = cv2.GaussianBlur(SCENES["camera"](128, 128), (0, 0), 2.0)
+    >>> bool(1.7 < estimate_blur(blurred, exponent=2.0).sigma < 2.3)
+    True
+    """
+    grey = luminance(check_image(image))
+    require(
+        noise is None or (np.isfinite(noise) and noise >= 0),
+        f"noise: expected a finite number of 0 or more, found {noise}",
+    )
+    check_exponent(exponent)
+    if min(grey.shape) < _SMALLEST_IMAGE or np.ptp(grey) <= _LEAST_NOISE:
+        return BlurEstimate(0.0, float("inf"), exponent, noise or 0.0, 1, 0.0, np.zeros(0), np.zeros(0))
+    for factor in _REDUCTIONS:
+        if factor > 1 and min(grey.shape) < factor * _SMALLEST_SIDE:
+            continue
+        part = _gradients(_most_detailed(_reduce(grey, factor)))
+        level = _effective_noise(_reduce(grey, factor), factor, noise)
+        costs = _costs(part, exponent, level)
+        evidence = float(costs[0] - costs.min())
+        width = _widen(_lowest(costs), factor)
+        if evidence >= _EVIDENCE and width >= _RESOLVED * factor:
+            break
+    less, more = (_widen(_lowest(_costs(part, exponent, share * level)), factor) for share in (0.5, 2.0))
+    sigma = width if evidence >= _EVIDENCE else float(_WIDTHS[0])
+    return BlurEstimate(sigma, abs(more - less) / 2, exponent, level, factor, evidence, factor * _WIDTHS[: len(costs)], costs)
+
+
+def _effective_noise(reduced: FloatArray, factor: int, noise: float | None) -> float:
+    """Noise and misfit of the reduced image."""
+    level = estimate_noise(reduced) if noise is None else noise / factor
+    return max(float(np.hypot(_NOISE_FACTOR * level, _MISFIT * reduced.std())), _LEAST_NOISE)
+
+
+def _costs(gradients: _Gradients, exponent: float, noise: float) -> Float64Array:
+    """L of widths from the smallest on, until it has risen three times: it has one minimum."""
+    costs: list[float] = []
+    for width in _WIDTHS:
+        costs.append(_cost(gradients, float(width), exponent, noise))
+        if len(costs) > 3 and costs[-4] < costs[-3] < costs[-2] < costs[-1]:
+            break
+    return np.array(costs)
+
+
+def _widen(width: float, factor: int) -> float:
+    """Width in the image of a blur in the reduced image, without the pixels that were averaged."""
+    return float(np.sqrt(max((factor * width) ** 2 - (factor**2 - 1) / 12, _WIDTHS[0] ** 2)))
+
+
+def _lowest(costs: Float64Array) -> float:
+    """Width of the lowest cost, between those tried by a parabola through three."""
+    index = int(np.argmin(costs))
+    if not 0 < index < len(costs) - 1:
+        return float(_WIDTHS[index])
+    x = np.log(_WIDTHS[index - 1 : index + 2] / _WIDTHS[index])
+    curvature, slope, _ = np.polyfit(x, costs[index - 1 : index + 2], 2)
+    return float(_WIDTHS[index] * np.exp(-slope / (2 * curvature)))
+
+
+def _reduce(grey: FloatArray, factor: int) -> FloatArray:
+    height, width = (size // factor for size in grey.shape)
+    return cv2.resize(grey[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _most_detailed(image: FloatArray) -> FloatArray:
+    """Square with the largest energy of the Laplacian."""
+    height, width = (min(_PART + 1, size) for size in image.shape)
+    energy = np.square(cv2.Laplacian(cv2.GaussianBlur(image, (0, 0), 1.0), cv2.CV_32F))
+    total = cv2.integral(energy)
+    inside = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
+    top, left = np.unravel_index(int(inside.argmax()), inside.shape)
+    return image[top : top + height, left : left + width]
+
+
+@dataclass(frozen=True, eq=False)
+class _Gradients:
+    """y, its half-spectrum, and the frequency of each entry of one."""
+
+    planes: FloatArray
+    spectrum: NDArray[np.complex64]
+    frequency: FloatArray
+
+
+def _gradients(image: FloatArray) -> _Gradients:
+    dx, dy = image[:-1, 1:] - image[:-1, :-1], image[1:, :-1] - image[:-1, :-1]
+    rows, columns = (_taper(size) for size in dx.shape)
+    planes = np.stack([dx, dy]) * np.outer(rows, columns)
+    frequency = np.hypot(fft.fftfreq(len(rows))[:, None], fft.rfftfreq(len(columns)))
+    return _Gradients(planes, fft.rfft2(planes), frequency.astype(np.float32))
+
+
+def _taper(size: int) -> FloatArray:
+    """Ones that fall to 0 at both ends, where a blurred scene goes on beyond the part that is looked at."""
+    steps = np.arange(1, size + 1, dtype=np.float32)
+    return np.minimum(np.minimum(steps, steps[::-1]) / (_TAPER + 1), 1)
+
+
+def _cost(gradients: _Gradients, width: float, exponent: float, noise: float) -> float:
+    """L of one width."""
+    y = gradients.planes
+    otf = np.exp(-np.log(2) * (gradients.frequency / half_frequency(width)) ** exponent).astype(np.float32)
+    transform = partial(fft.irfft2, s=y.shape[1:])
+    energy = np.float32(np.square(transform(otf)).sum())
+    variance = np.float32(2 * noise**2)
+    power, right = otf**2 / variance, transform(otf * gradients.spectrum) / variance
+    x, prior = y, np.full_like(y, max(float(np.square(y).mean()), 1e-10))
+    for _ in range(_UPDATES):
+        precision = np.reciprocal(prior)
+        posterior = np.reciprocal(energy / variance + precision)
+        x = _solve(power, precision, right, posterior, x)
+        prior = x**2 + posterior
+    misfit = np.square(y - transform(otf * fft.rfft2(x))).sum(dtype=np.float64) / variance
+    return float(misfit + np.sum(x**2 / prior + np.log(variance + prior * energy), dtype=np.float64)) / y.size
+
+
+def _solve(
+    power: FloatArray, precision: FloatArray, right: FloatArray, preconditioner: FloatArray, start: FloatArray
+) -> FloatArray:
+    """Conjugate gradients on ``(KᵀK / λ + 1 / γ) x = Kᵀy / λ``; ``power`` is |K|² / λ in Fourier."""
+
+    def apply(v: FloatArray) -> FloatArray:
+        return fft.irfft2(power * fft.rfft2(v), s=v.shape[1:]) + precision * v
+
+    x = start
+    residual = right - apply(x)
+    direction = preconditioned = preconditioner * residual
+    decrease = np.vdot(residual, preconditioned)
+    for _ in range(_STEPS):
+        if decrease <= 0:
+            break
+        image = apply(direction)
+        length = decrease / np.vdot(direction, image)
+        x, residual = x + length * direction, residual - length * image
+        preconditioned = preconditioner * residual
+        before, decrease = decrease, np.vdot(residual, preconditioned)
+        direction = preconditioned + (decrease / before) * direction
+    return x
