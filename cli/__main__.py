@@ -80,6 +80,10 @@ def build() -> App:
     app.command(f"{package}.synthesis:synthesize", help="Make a turbulent video with known truth and flow.")
     app.command(f"{package}.inspection:info", help="Say what a video is.")
     app.command(f"{package}.inspection:evaluate", help="Compare a result with the truth.")
+    moments = App(name="moments", help="Compare estimators for slow sensors of fast motion, on simulated frames.")
+    moments.command(f"{package}.moments:wavefront", help="A wavefront sensor that is exposed all the time.")
+    moments.command(f"{package}.moments:mirror", help="A steered mirror seen by a slow camera.")
+    app.command(moments)
     return app
 
 

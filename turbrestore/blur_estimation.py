@@ -54,9 +54,10 @@ _SMALLEST_SIDE, _SMALLEST_IMAGE = 48, 16
 # Widths that are tried, pixels of the reduced image; the first is that of a sharp image.
 _WIDTHS = np.array([0.35, 0.45, 0.55, 0.65, 0.8, 0.95, 1.1, 1.3, 1.55, 1.85, 2.2, 2.6])
 # A blur of this many pixels of the reduced image is resolved, and needs no finer one.
-_RESOLVED = 0.7
-# By how much a blurred scene must be likelier than a sharp one, in units of L.
-_EVIDENCE = 0.125
+_RESOLVED = 0.6
+# By how much a blurred scene must be likelier than a sharp one, in units of L: in a reduced image, and in the image
+# itself, where photographs are a little soft.
+_EVIDENCE, _EVIDENCE_UNREDUCED = 0.05, 0.125
 # Side of the part that is looked at, the one with most detail, and of its taper; pixels.
 _PART, _TAPER = 128, 8
 # n is this many times the noise, and this share of the contrast.
@@ -149,10 +150,11 @@ def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float 
         costs = _costs(part, exponent, level)
         evidence = float(costs[0] - costs.min())
         width = _widen(_lowest(costs), factor)
-        if evidence >= _EVIDENCE and width >= _RESOLVED * factor:
+        if factor > 1 and evidence >= _EVIDENCE and _lowest(costs) >= _RESOLVED:
             break
     less, more = (_widen(_lowest(_costs(part, exponent, share * level)), factor) for share in (0.5, 2.0))
-    sigma = width if evidence >= _EVIDENCE else float(_WIDTHS[0])
+    certain = factor > 1 or evidence >= _EVIDENCE_UNREDUCED
+    sigma = width if certain else float(_WIDTHS[0])
     return BlurEstimate(sigma, abs(more - less) / 2, exponent, level, factor, evidence, factor * _WIDTHS[: len(costs)], costs)
 
 

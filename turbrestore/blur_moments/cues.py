@@ -162,6 +162,42 @@ class FrameBlur:
 
 
 @dataclass(frozen=True, eq=False)
+class BlurReference:
+    """What the frames of a sequence have in common, so that other frames of it can be held against them.
+
+    Attributes
+    ----------
+    spectrum : ndarray, float64, shape (tiles, rings)
+        P̄ above the noise, squared intensity.
+    misfit : ndarray, float64, shape (tiles, rings)
+        Factor on the expected squared error of each ring, by which the fit weighs it less.
+    size : ndarray, float64, shape (tiles, rings)
+        Mean squared residual of each ring, in units of what is expected.
+    offset : ndarray, float64, shape (tiles,)
+        Mean of s before it is made 0, squared pixels.
+    spread : ndarray, float64, shape (tiles,)
+        Variance of s over the frames that noise does not explain, pixels to the fourth.
+    least : ndarray, float64, shape (tiles,)
+        Best estimate of s of the sharpest frame, squared pixels.
+    noise : float
+        Standard deviation of the white noise of a frame, intensity.
+    shape : tuple of int
+        Height and width of a frame, pixels.
+    params : CueParams
+    """
+
+    spectrum: Float64Array
+    misfit: Float64Array
+    size: Float64Array
+    offset: Float64Array
+    spread: Float64Array
+    least: Float64Array
+    noise: float
+    shape: tuple[int, int]
+    params: CueParams
+
+
+@dataclass(frozen=True, eq=False)
 class FusionRule:
     """Share of every frame in every pixel, ``w = scale · max(threshold − extra, 0)``; see :func:`fusion_rule`.
 
@@ -318,17 +354,105 @@ def frame_blur(frames: ArrayLike, noise: float, params: CueParams | None = None)
     >>> frame_blur(frames, noise=1e-4).extra.ravel().astype(float).round(1).tolist()
     [0.0, 1.0, 0.0]
     """
+    return refer_blur(frames, noise, params)[1]
+
+
+def refer_blur(
+    frames: ArrayLike, noise: float, params: CueParams | None = None
+) -> tuple[BlurReference, FrameBlur]:
+    """Blur of every frame, as :func:`frame_blur` gives it, and the reference that other frames are held against.
+
+    Parameters
+    ----------
+    frames : array_like, shape (T, H, W) or (T, H, W, 3), at least two
+    noise : float
+        Standard deviation of the white noise of a frame, intensity.
+    params : CueParams, optional
+
+    Returns
+    -------
+    reference : BlurReference
+    blur : FrameBlur
+
+    Raises
+    ------
+    DataError
+        Fewer than two frames, or frames smaller than 16 pixels.
+    ConfigurationError
+        The noise is negative.
+
+    Examples
+    --------
+    See :func:`blur_against`.
+    """
     params = params or CueParams()
     stack = check_frames(frames, at_least=2)
     floor = _floor(noise)
     spectra = _Spectra.of(stack.shape[1:3], params)
     averaging, k2, counts = spectra.cells()
-    power = np.stack([spectra.power(luminance(frame)) @ averaging for frame in stack]).astype(np.float64)
-    s, deviation = _relative_to_mean(power, floor, k2, counts, spectra, params)
-    shape = (len(stack), len(spectra.grid.rows), len(spectra.grid.columns))
-    extra = _above_sharpest(s, deviation)
-    relative, deviations, extras = (part.reshape(shape).astype(np.float32) for part in (s, deviation, extra))
-    return FrameBlur(relative, deviations, extras, spectra.grid)
+    power = _ring_power(stack, spectra, averaging)
+    spectrum, misfit = _common_spectrum(power, floor, k2, counts, spectra, params)
+    s, gathered, residual = _score(power, spectrum, misfit, floor, (k2, counts), spectra, params)
+    size, offset = residual.mean(axis=0), s.mean(axis=0)
+    s = s - offset
+    deviation = _deviation(s, gathered, size)
+    spread = np.maximum((s**2 - deviation**2).mean(axis=0), 0.0)
+    estimate = _posterior(s, deviation, spread)
+    least = estimate.min(axis=0)
+    reference = BlurReference(spectrum, misfit, size, offset, spread, least, noise, spectra.grid.shape, params)
+    return reference, _frame_blur(s, deviation, estimate - least, spectra.grid)
+
+
+def blur_against(frames: ArrayLike, reference: BlurReference, noise: float | None = None) -> FrameBlur:
+    """Blur of frames, or of an image fused from them, relative to the frames of a reference.
+
+    Each is judged by itself, so that frames can come one by one.
+
+    Parameters
+    ----------
+    frames : array_like, shape (T, H, W) or (T, H, W, 3)
+        Of the same scene.
+    reference : BlurReference
+        From :func:`refer_blur`.
+    noise : float, optional
+        Standard deviation of the white noise of these frames, intensity; by default that of the reference.
+
+    Returns
+    -------
+    FrameBlur
+        ``relative`` to the mean of the frames of the reference, ``extra`` above the sharpest of them, at least 0.
+
+    Raises
+    ------
+    DataError
+        Frames of another size than those of the reference.
+    ConfigurationError
+        The noise is negative.
+
+    Examples
+    --------
+    >>> import cv2, numpy as np
+    >>> scene = np.random.default_rng(0).normal(0.5, 0.1, (48, 48)).cumsum(0).cumsum(1).astype(np.float32) % 1
+    >>> frames = np.stack([cv2.GaussianBlur(scene, (0, 0), sigma) for sigma in (1.0, 1.414, 1.0)])
+    >>> reference, _ = refer_blur(frames, noise=1e-4)
+    >>> soft = cv2.GaussianBlur(scene, (0, 0), 1.6)
+    >>> blur_against(soft[None], reference).extra.ravel().astype(float).round(1).tolist()
+    [1.6]
+    """
+    stack = check_frames(frames)
+    if stack.shape[1:3] != reference.shape:
+        raise DataError(f"frames: expected the size {reference.shape} of the reference, found {stack.shape[1:3]}")
+    floor = _floor(reference.noise if noise is None else noise)
+    spectra = _Spectra.of(reference.shape, reference.params)
+    averaging, k2, counts = spectra.cells()
+    power = _ring_power(stack, spectra, averaging)
+    s, gathered, _ = _score(
+        power, reference.spectrum, reference.misfit, floor, (k2, counts), spectra, reference.params
+    )
+    s = s - reference.offset
+    deviation = _deviation(s, gathered, reference.size)
+    estimate = _posterior(s, deviation, reference.spread)
+    return _frame_blur(s, deviation, np.maximum(estimate - reference.least, 0.0), spectra.grid)
 
 
 def tile_map(values: ArrayLike, grid: TileGrid) -> FloatArray:
@@ -533,9 +657,40 @@ def frame_noise_factor(rule: FusionRule, index: int, largest: float = 100.0) -> 
     >>> round(float(frame_noise_factor(rule, 0)[0, 0]), 2)
     1.0
     """
+    return noise_factor(rule, rule.blur.extra[index], largest)
+
+
+def noise_factor(rule: FusionRule, extra: FloatArray, largest: float = 100.0) -> FloatArray:
+    """The same for a frame that the rule was not made from.
+
+    Parameters
+    ----------
+    rule : FusionRule
+    extra : ndarray, float32, shape (m, n)
+        Blur of the frame in every tile, above that of the sharpest frame of the rule, squared pixels.
+    largest : float
+        Instead of infinity where the frame gets no share.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W)
+
+    Raises
+    ------
+    ConfigurationError
+        ``largest`` is below 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frames = np.random.default_rng(0).normal(0.5, 0.1, (5, 48, 48)).astype(np.float32)
+    >>> rule = fusion_rule(frame_blur(frames, noise=0.1), np.ones((48, 48)), noise=0.1)
+    >>> bool((noise_factor(rule, np.full((1, 1), 9.0, np.float32), largest=50.0) == 50.0).all())
+    True
+    """
     require(largest >= 1, f"largest: expected 1 or more, found {largest}")
-    share = len(rule.blur.extra) * frame_weight(rule, index)
-    return np.reciprocal(np.maximum(share, np.float32(1 / largest)))
+    weight = rule.scale * np.maximum(rule.threshold - tile_map(extra, rule.blur.grid), 0)
+    return np.reciprocal(np.maximum(len(rule.blur.extra) * weight, np.float32(1 / largest)))
 
 
 def fuse_frames(frames: ArrayLike, rule: FusionRule) -> FloatArray:
@@ -729,7 +884,12 @@ def _weight(
     return signal / variance, signal
 
 
-def _relative_to_mean(
+def _ring_power(frames: FloatArray, spectra: _Spectra, averaging: FloatArray) -> Float64Array:
+    """Power of frames in rings, shape (T, tiles, rings)."""
+    return np.stack([spectra.power(luminance(frame)) @ averaging for frame in frames]).astype(np.float64)
+
+
+def _common_spectrum(
     power: Float64Array,
     floor: float,
     k2: Float64Array,
@@ -737,25 +897,47 @@ def _relative_to_mean(
     spectra: _Spectra,
     params: CueParams,
 ) -> tuple[Float64Array, Float64Array]:
-    """Fit s and its deviation, shape (T, tiles), from the power in rings, shape (T, tiles, rings)."""
+    """Spectrum that the frames are blurred versions of, and misfit of each ring, from power (T, tiles, rings)."""
     reference = np.maximum(power.mean(axis=0) - floor, 0.0)
     s = np.zeros(power.shape[:2])
     misfit = np.ones(power.shape[1:])
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS - 1):
         design = k2 * spectra.widening(2 * [reference.mean(axis=0)], k2)
-        s, information, residual = _fit_frames(power - floor, reference, floor, design, counts, s, misfit, params)
+        s, _, residual = _fit_frames(power - floor, reference, floor, design, counts, s, misfit, params)
         # The slope of the logarithm of a spectrum, and with it the smear by the window, depends on s itself.
         s = s + 2 * spectra.smear * s**2
         s -= s.mean(axis=0)
         decay = np.exp(-np.clip(s[..., None] * design, -_LARGEST_EXPONENT, _LARGEST_EXPONENT))
         reference = np.maximum(((power - floor) * decay).sum(axis=0) / (decay**2).sum(axis=0), 0.0)
         misfit = np.clip(misfit * residual.mean(axis=0), _SMALLEST_MISFIT, _LARGEST_MISFIT)
+    return reference, misfit
+
+
+def _score(
+    power: Float64Array,
+    spectrum: Float64Array,
+    misfit: Float64Array,
+    floor: float,
+    rings: tuple[Float64Array, Float64Array],
+    spectra: _Spectra,
+    params: CueParams,
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Fit s, shape (T, tiles), to a known spectrum; also information about s and squared residual of every ring."""
+    k2, counts = rings
+    design = k2 * spectra.widening(2 * [spectrum.mean(axis=0)], k2)
+    s = np.zeros(power.shape[:2])
+    for _ in range(2):
+        s, information, residual = _fit_frames(power - floor, spectrum, floor, design, counts, s, misfit, params)
     gathered = information * design**2
+    leverage = gathered / (gathered.sum(axis=-1, keepdims=True) + 1 / _PRIOR**2)
+    return s + 2 * spectra.smear * s**2, gathered, residual / np.maximum(1 - leverage, 0.1)
+
+
+def _deviation(s: Float64Array, gathered: Float64Array, size: Float64Array) -> Float64Array:
+    """Standard deviation of s from what rings say of it and the mean squared residual of each."""
     total = gathered.sum(axis=-1) + 1 / _PRIOR**2
-    leverage = gathered / total[..., None]
-    size = (residual / np.maximum(1 - leverage, 0.1)).mean(axis=0)
     variance = (_CORRELATED * (gathered * np.maximum(size, 1.0)).sum(axis=-1) + 1 / _PRIOR**2) / total**2
-    return s, np.hypot(np.sqrt(variance), _WINDOW_ERROR * s)
+    return np.hypot(np.sqrt(variance), _WINDOW_ERROR * s)
 
 
 def _fit_frames(
@@ -783,11 +965,14 @@ def _fit_frames(
     return s, information, difference**2 * weight / signal
 
 
-def _above_sharpest(s: Float64Array, deviation: Float64Array) -> Float64Array:
-    """Posterior mean of s, whose variance over the frames is what noise does not explain, less its minimum."""
-    spread = np.maximum((s**2 - deviation**2).mean(axis=0), 0.0)
-    estimate = s * spread / (spread + deviation**2)
-    return estimate - estimate.min(axis=0)
+def _posterior(s: Float64Array, deviation: Float64Array, spread: Float64Array) -> Float64Array:
+    """Posterior mean of s, whose variance over the frames, ``spread``, is what noise does not explain."""
+    return s * spread / np.maximum(spread + deviation**2, 1e-30)
+
+
+def _frame_blur(s: Float64Array, deviation: Float64Array, extra: Float64Array, grid: TileGrid) -> FrameBlur:
+    shape = (len(s), len(grid.rows), len(grid.columns))
+    return FrameBlur(*(part.reshape(shape).astype(np.float32) for part in (s, deviation, extra)), grid)
 
 
 def _waterline(s: FloatArray, c: FloatArray, noise: float) -> tuple[FloatArray, FloatArray]:

@@ -1,0 +1,149 @@
+"""Figures 4 to 7 of both papers, from the experiments: four panels in one picture.
+
+Needs matplotlib, which nothing else does.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+from typing import Any
+
+import numpy as np
+
+from ..errors import ConfigurationError
+from .experiments import Experiment
+
+# Colour and dash of every observer, the same in all panels.
+_STYLES = {"O1": ("tab:blue", "--"), "O2": ("tab:orange", ":"), "O3": ("tab:red", "-"), "image_map": ("tab:green", "-")}
+# Seconds of a run that the overview shows.
+_OVERVIEW = 5.0
+
+
+def new_figure() -> Any:
+    """Empty figure; asked for before a long computation, it tells whether there can be one.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+    """
+    try:
+        # Optional packages are loaded by name, so that type checkers do without them as well.
+        return importlib.import_module("matplotlib.figure").Figure(figsize=(12, 8), layout="constrained")
+    except ImportError as error:
+        raise ConfigurationError(
+            "plot: expected matplotlib, which is not installed; run pip install matplotlib"
+        ) from error
+
+
+def draw_wavefront(experiment: Experiment) -> bytes:
+    """Figures 4 to 7 of paper 1.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Of :func:`~.experiments.wavefront`.
+
+    Returns
+    -------
+    bytes
+        PNG: estimates by the first and by the second moment; error after every frame; error at the fast rate;
+        estimates within one exposure.
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+    """
+    figure, panels = _four_panels("Wavefront sensor: slope θ, first seed")
+    t, steps = _times(experiment), experiment.timing.frame_steps
+    truth = experiment.truth.ravel()
+    panels[0].plot(t, truth, "k", label="truth")
+    for name in ("O1", "O2"):
+        panels[0].plot(t, experiment.estimates[name].ravel(), **_style(name))
+    _label(panels[0], "Figure 4: first or second moment alone", "time, s", "θ")
+    for name in ("O1", "O3", "image_map"):
+        panels[1].plot(experiment.errors[name], **_style(name))
+        panels[2].plot(t, experiment.estimates[name].ravel() - truth, **_style(name))
+    _label(panels[1], f"Figure 5: error of the state, mean of {experiment.seeds} seeds", "frame", "‖x̂ − x‖")
+    _label(panels[2], "Figure 6: error at the fast rate", "time, s", "θ̂ − θ")
+    last = slice(truth.size - steps, truth.size)
+    panels[3].plot(t[last], truth[last], "k", label="truth")
+    for name in ("O1", "O3", "image_map"):
+        panels[3].plot(t[last], experiment.estimates[name].ravel()[last], **_style(name))
+    _label(panels[3], "Figure 7: within one exposure", "time, s", "θ")
+    return _png(figure)
+
+
+def draw_mirror(experiment: Experiment) -> bytes:
+    """Figures 4 to 7 of paper 2.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Of :func:`~.experiments.mirror`.
+
+    Returns
+    -------
+    bytes
+        PNG: overview with the exposures shaded; one slow step; error at the instants of correction; error over the
+        slow steps.
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+    """
+    figure, panels = _four_panels("Steered mirror: output y, first seed")
+    t, steps, exposed = _times(experiment), experiment.timing.frame_steps, experiment.timing.exposure_steps
+    shown = min(int(_OVERVIEW / experiment.timing.fast_period), t.size)
+    middle = len(experiment.truth) // 2
+    for panel, part in ((panels[0], slice(0, shown)), (panels[1], slice(middle * steps, (middle + 1) * steps))):
+        panel.plot(t[part], experiment.truth.ravel()[part], "k", label="truth")
+        for name in ("O1", "O2", "O3"):
+            panel.plot(t[part], experiment.estimates[name].ravel()[part], **_style(name))
+        for start in range(part.start, part.stop, steps):
+            panel.axvspan(t[start], t[min(start + exposed, t.size - 1)], color="0.9", zorder=0)
+    _label(panels[0], "Figure 4: overview, exposures shaded", "time, s", "y")
+    _label(panels[1], "Figure 5: one slow step", "time, s", "y")
+    for name in ("O1", "O2", "O3"):
+        away = np.abs(experiment.estimates[name] - experiment.truth)
+        panels[2].plot(away[:, 0], **_style(name))
+        panels[3].plot(np.sqrt((away**2).sum(1)), **_style(name))
+    _label(panels[2], "Figure 6: error at the instants of correction", "frame", "|ŷ − y|")
+    _label(panels[3], "Figure 7: error over the slow step", "frame", "‖ŷ − y‖₂")
+    return _png(figure)
+
+
+def _four_panels(title: str) -> tuple[Any, list[Any]]:
+    figure = new_figure()
+    figure.suptitle(title)
+    return figure, list(figure.subplots(2, 2).ravel())
+
+
+def _times(experiment: Experiment) -> Any:
+    timing = experiment.timing
+    return timing.trigger + timing.fast_period * np.arange(experiment.truth.size)
+
+
+def _style(name: str) -> dict[str, Any]:
+    colour, dash = _STYLES[name]
+    return {"color": colour, "linestyle": dash, "label": name.replace("_", " "), "linewidth": 1.2}
+
+
+def _label(panel: Any, title: str, x: str, y: str) -> None:
+    panel.set_title(title, fontsize=10)
+    panel.set_xlabel(x)
+    panel.set_ylabel(y)
+    panel.legend(fontsize=8, loc="upper right")
+
+
+def _png(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()
