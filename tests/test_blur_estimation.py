@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blur_estimation import _cost, _gradients, _most_detailed, _reduce, estimate_blur
+from turbrestore.blur_estimation import _costs, _fit_scene, _gradients, _most_detailed, _reduce, estimate_blur
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.psf import GAUSSIAN, KOLMOGOROV, blur_otf
 from turbrestore.synthesis.scenes import SCENES
@@ -61,15 +61,43 @@ def test_colour_counts_as_luminance():
     )
 
 
-def test_the_cost_is_the_evidence_of_independent_gradients_where_there_is_no_blur():
-    # Without blur the gradients do not mix: γ = max(y² − λ, 0) in closed form, and L = mean of y²/(λ+γ) + log(λ+γ).
-    image = SCENES["camera"](64, 64)
-    gradients = _gradients(image)
+def test_without_blur_the_cost_is_the_evidence_of_independent_gradients():
+    # Gradients that do not mix have γ = max(y² − λ, 0) in closed form, and L = mean of y²/(λ+γ) + log(λ+γ).
+    gradients = _gradients(SCENES["camera"](64, 64))
     noise, y = 0.02, gradients.planes.astype(float)
     total = np.maximum(y**2, 2 * noise**2)
     exact = np.mean(y**2 / total + np.log(total))
-    # The updates approach the optimum slowly where γ → 0, from above.
-    assert exact <= _cost(gradients, 1e-3, GAUSSIAN, noise) < exact + 0.1
+    scene, prior = gradients.planes, np.full_like(gradients.planes, float(np.mean(y**2)))
+    costs = []
+    for _ in range(12):
+        scene, prior, cost = _fit_scene(gradients, scene, prior, blur=(1e-3, GAUSSIAN), noise=noise)
+        costs.append(cost)
+    assert np.all(np.diff(costs) < 1e-5)
+    # γ → 0 is approached slowly.
+    assert exact <= costs[-1] < exact + 0.05
+
+
+def test_the_scene_of_a_blur_solves_its_normal_equations():
+    gradients = _gradients(blurred("camera", 1.5, 0.01, size=48))
+    y, noise, prior = gradients.planes, 0.01, np.full_like(gradients.planes, 1e-3)
+    scene = y
+    otf = np.exp(-2 * (np.pi * 1.5 * gradients.frequency) ** 2)
+
+    def blur(v):
+        return np.fft.irfft2(otf * np.fft.rfft2(v), s=v.shape[1:])
+
+    before = prior
+    for _ in range(40):
+        before = prior
+        scene, prior, _ = _fit_scene(gradients, scene, prior, blur=(1.5, GAUSSIAN), noise=noise)
+    gradient = blur(y - blur(scene)) / (2 * noise**2) - scene / before
+    assert np.abs(gradient).max() < 0.02 * np.abs(blur(y) / (2 * noise**2)).max()
+
+
+def test_the_search_stops_once_the_cost_has_risen_three_times():
+    costs = _costs(_gradients(blurred("chart", 0, 0.002, size=96)), GAUSSIAN, 0.005)
+    assert 4 <= len(costs) < 12
+    assert np.all(np.diff(costs[-4:]) > 0)
 
 
 def test_a_reduction_averages_whole_blocks():
@@ -82,6 +110,7 @@ def test_the_most_detailed_part_holds_the_detail():
     image[200:280, 250:350] = np.random.default_rng(5).random((80, 100))
     part = _most_detailed(image)
     assert part.shape == (129, 129)
+    assert _most_detailed(image[:128, :70]).shape == (126, 65)
     assert part.sum() == pytest.approx(image.sum())
 
 

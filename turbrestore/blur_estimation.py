@@ -55,16 +55,17 @@ _SMALLEST_SIDE, _SMALLEST_IMAGE = 48, 16
 _WIDTHS = np.array([0.35, 0.45, 0.55, 0.65, 0.8, 0.95, 1.1, 1.3, 1.55, 1.85, 2.2, 2.6])
 # A blur of this many pixels of the reduced image is resolved, and needs no finer one.
 _RESOLVED = 0.6
-# By how much a blurred scene must be likelier than a sharp one, in units of L: in a reduced image, and in the image
-# itself, where photographs are a little soft.
-_EVIDENCE, _EVIDENCE_UNREDUCED = 0.05, 0.125
+# By how much a blurred scene must be likelier than a sharp one, in units of L; and by how much where the blur found is
+# no wider than photographs are soft, pixels.
+_EVIDENCE, _STRONG_EVIDENCE = 0.08, 0.2
+_SOFT = 0.8
 # Side of the part that is looked at, the one with most detail, and of its taper; pixels.
 _PART, _TAPER = 128, 8
 # n is this many times the noise, and this share of the contrast.
 _NOISE_FACTOR, _MISFIT = 1.5, 0.025
 _LEAST_NOISE = 1e-4
 # Updates of γ, and conjugate gradient steps in each.
-_UPDATES, _STEPS = 16, 8
+_UPDATES, _STEPS = 8, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,9 +154,11 @@ def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float 
         if factor > 1 and evidence >= _EVIDENCE and _lowest(costs) >= _RESOLVED:
             break
     less, more = (_widen(_lowest(_costs(part, exponent, share * level)), factor) for share in (0.5, 2.0))
-    certain = factor > 1 or evidence >= _EVIDENCE_UNREDUCED
-    sigma = width if certain else float(_WIDTHS[0])
-    return BlurEstimate(sigma, abs(more - less) / 2, exponent, level, factor, evidence, factor * _WIDTHS[: len(costs)], costs)
+    needed = _EVIDENCE if width >= _SOFT else _STRONG_EVIDENCE
+    sigma = width if evidence >= needed else float(_WIDTHS[0])
+    return BlurEstimate(
+        sigma, abs(more - less) / 2, exponent, level, factor, evidence, factor * _WIDTHS[: len(costs)], costs
+    )
 
 
 def _effective_noise(reduced: FloatArray, factor: int, noise: float | None) -> float:
@@ -167,8 +170,12 @@ def _effective_noise(reduced: FloatArray, factor: int, noise: float | None) -> f
 def _costs(gradients: _Gradients, exponent: float, noise: float) -> Float64Array:
     """L of widths from the smallest on, until it has risen three times: it has one minimum."""
     costs: list[float] = []
+    scene = gradients.planes
+    prior = np.full_like(scene, max(float(np.square(scene).mean()), 1e-10))
     for width in _WIDTHS:
-        costs.append(_cost(gradients, float(width), exponent, noise))
+        # A little more blur asks for a little other scene: from one to the next, fewer updates go further.
+        scene, prior, cost = _fit_scene(gradients, scene, prior, blur=(float(width), exponent), noise=noise)
+        costs.append(cost)
         if len(costs) > 3 and costs[-4] < costs[-3] < costs[-2] < costs[-1]:
             break
     return np.array(costs)
@@ -195,13 +202,17 @@ def _reduce(grey: FloatArray, factor: int) -> FloatArray:
 
 
 def _most_detailed(image: FloatArray) -> FloatArray:
-    """Square with the largest energy of the Laplacian."""
-    height, width = (min(_PART + 1, size) for size in image.shape)
+    """Part with the largest energy of the Laplacian, of a size whose gradients transform fast."""
+    height, width = (_fast_size(min(_PART, size - 1)) + 1 for size in image.shape)
     energy = np.square(cv2.Laplacian(cv2.GaussianBlur(image, (0, 0), 1.0), cv2.CV_32F))
     total = cv2.integral(energy)
     inside = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
     top, left = np.unravel_index(int(inside.argmax()), inside.shape)
     return image[top : top + height, left : left + width]
+
+
+def _fast_size(size: int) -> int:
+    return max(n for n in range(size // 2, size + 1) if fft.next_fast_len(n, real=True) == n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,22 +238,23 @@ def _taper(size: int) -> FloatArray:
     return np.minimum(np.minimum(steps, steps[::-1]) / (_TAPER + 1), 1)
 
 
-def _cost(gradients: _Gradients, width: float, exponent: float, noise: float) -> float:
-    """L of one width."""
-    y = gradients.planes
+def _fit_scene(
+    gradients: _Gradients, scene: FloatArray, prior: FloatArray, blur: tuple[float, float], noise: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Update x and γ for a blur of given width and exponent: both, and L."""
+    width, exponent = blur
     otf = np.exp(-np.log(2) * (gradients.frequency / half_frequency(width)) ** exponent).astype(np.float32)
-    transform = partial(fft.irfft2, s=y.shape[1:])
-    energy = np.float32(np.square(transform(otf)).sum())
-    variance = np.float32(2 * noise**2)
+    transform = partial(fft.irfft2, s=scene.shape[1:])
+    energy, variance = np.float32(np.square(transform(otf)).sum()), np.float32(2 * noise**2)
     power, right = otf**2 / variance, transform(otf * gradients.spectrum) / variance
-    x, prior = y, np.full_like(y, max(float(np.square(y).mean()), 1e-10))
     for _ in range(_UPDATES):
         precision = np.reciprocal(prior)
         posterior = np.reciprocal(energy / variance + precision)
-        x = _solve(power, precision, right, posterior, x)
-        prior = x**2 + posterior
-    misfit = np.square(y - transform(otf * fft.rfft2(x))).sum(dtype=np.float64) / variance
-    return float(misfit + np.sum(x**2 / prior + np.log(variance + prior * energy), dtype=np.float64)) / y.size
+        scene = _solve(power, precision, right, posterior, scene)
+        prior = scene**2 + posterior
+    misfit = np.square(gradients.planes - transform(otf * fft.rfft2(scene))).sum(dtype=np.float64) / variance
+    total = float(misfit + np.sum(scene**2 / prior + np.log(variance + prior * energy), dtype=np.float64))
+    return scene, prior, total / scene.size
 
 
 def _solve(
