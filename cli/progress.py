@@ -11,6 +11,7 @@ TITLES = {
     "centroid": "centroid",
     "filter": "alternating filter",
     "deconvolve": "deconvolution",
+    "synthesize": "frames",
 }
 
 

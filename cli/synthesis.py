@@ -6,7 +6,8 @@ import dataclasses
 import json as json_format
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,9 +17,10 @@ from cyclopts import Parameter
 
 from turbrestore import __version__
 from turbrestore.arrays import FloatArray
-from turbrestore.errors import ConfigurationError, require
+from turbrestore.errors import ConfigurationError, OutputError, require, require_between
 from turbrestore.images import check_output, read_image, write_image
-from turbrestore.pipeline import training_share
+from turbrestore.pipeline import Progress, stage_counter, training_share
+from turbrestore.pixels import MAX_PIXELS
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import DynamicTextureParams, synthesize_like
@@ -29,21 +31,23 @@ from turbrestore.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video
 
 from .options import Flag
 from .output import print_json
-from .progress import say
+from .progress import progress_bars, say
 
 # What is written beside the video, by the end of its name.
-TRUTH, DIFFRACTION, FLOW, PARAMETERS = ".truth.png", ".truth_diffraction.png", ".flow.npy", ".json"
+VIDEO, TRUTH, DIFFRACTION, FLOW, PARAMETERS = "", ".truth.png", ".truth_diffraction.png", ".flow.npy", ".json"
 CENTROID = "centroid"
+MOST_FRAMES = 1_000_000
 SIGN = "before blur truth(x, y) = frame(x + dx, y + dy), pixels; mean over the exposure"
 
 
 @dataclass(frozen=True, eq=False)
 class Synthesis:
-    """What is to be written: the truths, the frames to come, and what they were made with."""
+    """What is to be written: the truths, the frames to come, their number, and what they were made with."""
 
     truth: FloatArray
     diffraction: FloatArray | None
     frames: Iterator[SyntheticFrame]
+    count: int
     record: dict[str, Any]
 
 
@@ -73,7 +77,8 @@ def synthesize(
     Parameters
     ----------
     scene : str
-        Image file, or the name of a drawn scene: chart and others; ``centroid`` stands for that of ``--like``.
+        Image file; or a scene that comes along: chart, words, camera, brick, grass, gravel, coins, moon, page,
+        astronaut, cat, coffee, rocket; or ``centroid``, the clean image of the video that ``--like`` names.
     output : Path
         Video to write: .mkv, .mp4, .ser, .tif or .npy.
     model : {"phase-screen", "dynamic-texture"}
@@ -81,9 +86,9 @@ def synthesize(
     frames : int
         Number of frames.
     seed : int
-        Of the random numbers; the same seed gives the same frames.
+        Of the random numbers; the same seed gives the same bytes.
     size : str
-        Height and width of a drawn scene, as ``256x256``, the default.
+        Width and height of a scene that comes along, as ``256x256``, the default.
     strength : {"weak", "medium", "strong"}
         D/r0 of 1.2, 2.5 or 5, in place of ``--d-over-r0``, ``--r0`` or ``--cn2``.
     like : Path
@@ -95,7 +100,7 @@ def synthesize(
     json : bool
         Print all parameters, as JSON, on standard output.
     quiet : bool
-        No remarks.
+        No progress and no remarks.
     camera : CameraParams
         Timing and noise.
     path : PhaseScreenParams
@@ -103,59 +108,65 @@ def synthesize(
     dynamic_texture : DynamicTextureParams
         Settings of the dynamic texture.
     """
-    require(frames >= 1, f"--frames: expected at least 1, found {frames}")
+    require_between("--frames", frames, 1, MOST_FRAMES)
     require(seed >= 0, f"--seed: expected a whole number from 0, found {seed}")
     inputs = [item for item in (None if scene in (*SCENES, CENTROID) else Path(scene), like) if item is not None]
+    check_output(output, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
     outputs = _outputs(output, model == "phase-screen")
-    for name, suffixes in zip(outputs, (VIDEO_OUTPUT_SUFFIXES, *[None] * len(outputs)), strict=False):
-        check_output(name, inputs, overwrite, suffixes)
+    for name in outputs.values():
+        check_output(name, inputs, overwrite, suffixes=None)
     rng = np.random.default_rng(seed)
-    if model == "phase-screen":
-        require(like is None and train is None, "--like, --train: have no effect on phase screens; leave them out")
-        made = _through_screens(_scene(scene, size), frames, rng, _with_strength(path, strength), camera)
-    else:
-        require(strength is None, "--strength: has no effect with --model dynamic-texture; leave it out")
-        require(path == PhaseScreenParams(), "--model dynamic-texture: knows no path and no optics; leave them out")
-        if like is None:
-            raise ConfigurationError("--like: expected a video for --model dynamic-texture to learn from")
-        source = open_frames(like)
-        training = source.read(0, training_share(len(source), source.shape[1:], train))
-        truth = None if scene == CENTROID else _scene(scene, size)
-        made = _like_a_clip(training, truth, frames, rng, dynamic_texture, camera)
-    facts: dict[str, Any] = {
-        "turbrestore": __version__,
-        "scene": scene,
-        "model": model,
-        "like": None if like is None else str(like),
-        "seed": seed,
-        "frames": frames,
-        "size": [made.truth.shape[1], made.truth.shape[0]],
-        "flow": SIGN,
-        "camera": _record(camera),
-    }
-    flow_rms = _write(output, outputs, made, frames, camera, {**facts, **made.record}, overwrite)
+    with progress_bars(quiet) as progress:
+        if model == "phase-screen":
+            require(like is None and train is None, "--like, --train: have no effect on phase screens; leave them out")
+            idle = dynamic_texture == DynamicTextureParams()
+            require(idle, "--dynamic-texture: has no effect on phase screens; leave it out")
+            made = _through_screens(_scene(scene, size), frames, rng, _with_strength(path, strength), camera)
+        else:
+            require(strength is None, "--strength: has no effect with --model dynamic-texture; leave it out")
+            require(path == PhaseScreenParams(), "--model dynamic-texture: knows no path and no optics; leave them out")
+            truth = None if scene == CENTROID and size is None else _scene(scene, size)
+            made = _like_a_clip(_training_frames(like, train), truth, frames, rng, dynamic_texture, camera, progress)
+        request = {"scene": scene, "model": model, "like": None if like is None else str(like), "seed": seed}
+        facts = _write(outputs, made, camera, request, stage_counter(progress, "synthesize", frames))
+    if overwrite and DIFFRACTION not in outputs:
+        # What an earlier run left would not belong to this one.
+        output.with_name(output.stem + DIFFRACTION).unlink(missing_ok=True)
     if json:
-        print_json({**facts, **made.record, "flow_rms": flow_rms, "output": str(output)})
+        print_json({**facts, "output": str(output)})
     else:
-        say(f"{output}: {frames} frames, flow of {flow_rms[0]:.2f} and {flow_rms[1]:.2f} pixels along x and y", quiet)
+        along_x, along_y = facts["flow_rms"]
+        say(f"{output}: {frames} frames, flow of {along_x:.2f} and {along_y:.2f} pixels along x and y", quiet)
 
 
-def _outputs(output: Path, has_diffraction: bool) -> list[Path]:
+def _outputs(output: Path, has_diffraction: bool) -> dict[str, Path]:
+    """Files to write, by the end of their names; that of the video is its own."""
     endings = (TRUTH, *([DIFFRACTION] if has_diffraction else []), FLOW, PARAMETERS)
-    return [output, *(output.with_name(output.stem + ending) for ending in endings)]
+    return {VIDEO: output, **{ending: output.with_name(output.stem + ending) for ending in endings}}
 
 
 def _scene(scene: str, size: str | None) -> FloatArray:
     if scene not in SCENES:
+        require(size is None, f"--size: has no effect on {scene}, which has a size; leave it out")
         require(scene != CENTROID, "centroid: needs --model dynamic-texture and --like")
-        require(size is None, "--size: has no effect on an image file; leave it out")
         if not Path(scene).suffix:
             raise ConfigurationError(f"{scene}: expected an image file or one of {', '.join(sorted(SCENES))}")
-        return check_scene(read_image(scene).image)
+        return read_image(scene).image
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", "256x256" if size is None else size)
     if found is None:
-        raise ConfigurationError(f"--size: expected height and width as 256x256, found {size!r}")
-    return check_scene(SCENES[scene](int(found[1]), int(found[2])))
+        raise ConfigurationError(f"--size: expected width and height as 256x256, found {size!r}")
+    width, height = int(found[1]), int(found[2])
+    require(width * height <= MAX_PIXELS, f"--size: expected at most {MAX_PIXELS} pixels, found {width}×{height}")
+    return SCENES[scene](height, width)
+
+
+def _training_frames(like: Path | None, train: int | None) -> FloatArray:
+    if like is None:
+        raise ConfigurationError("--like: expected a video for --model dynamic-texture to learn from")
+    # Two flows have no dynamics.
+    require(train is None or train >= 3, f"--train: expected 3 frames or more, found {train}")
+    source = open_frames(like)
+    return source.read(0, training_share(len(source), source.shape[1:], train))
 
 
 def _with_strength(path: PhaseScreenParams, strength: str | None) -> PhaseScreenParams:
@@ -178,7 +189,7 @@ def _through_screens(
     }
     frames = phase_screen_frames(scene, count, rng, path, camera)
     facts = {"path": dataclasses.asdict(path), "derived": derived}
-    return Synthesis(scene, diffraction_limited(scene, path), iter(frames), facts)
+    return Synthesis(scene, diffraction_limited(scene, path), frames, count, facts)
 
 
 def _like_a_clip(
@@ -188,9 +199,11 @@ def _like_a_clip(
     rng: np.random.Generator,
     params: DynamicTextureParams,
     camera: CameraParams,
+    progress: Progress | None,
 ) -> Synthesis:
+    measured = stage_counter(progress, "centroid", len(training) * params.centroid.iterations)
     # One flow more than frames: the last exposure ends on it.
-    texture = synthesize_like(training, count + 1, rng, params, scene)
+    texture = synthesize_like(training, count + 1, rng, params, scene, measured)
     seeds = rng.integers(2**63, size=(count, 2))
 
     def frames() -> Iterator[SyntheticFrame]:
@@ -201,47 +214,70 @@ def _like_a_clip(
 
     derived = {"states": texture.dynamics.rank, "largest_eigenvalue": float(abs(texture.eigenvalues).max(initial=0.0))}
     facts = {"train": len(training), "dynamic_texture": dataclasses.asdict(params), "derived": derived}
-    return Synthesis(check_scene(np.clip(texture.scene, 0, 1)), None, frames(), facts)
+    return Synthesis(check_scene(np.clip(texture.scene, 0, 1)), None, frames(), count, facts)
 
 
 def _write(
-    output: Path,
-    outputs: list[Path],
+    outputs: dict[str, Path],
     made: Synthesis,
-    count: int,
     camera: CameraParams,
-    facts: dict[str, Any],
-    overwrite: bool,
-) -> list[float]:
-    """Write everything into a hidden folder first, so that a failure leaves nothing; root mean square of the flow."""
-    with tempfile.TemporaryDirectory(prefix=".synthesis-", dir=output.parent) as folder:
-        video, *_ = staged = [Path(folder) / name.name for name in outputs]
-        beside = {ending: name for name in staged for ending in (TRUTH, FLOW) if name.name.endswith(ending)}
-        squares = np.zeros(2)
-        with beside[FLOW].open("wb") as file:
-            shape = (count, *made.truth.shape[:2], 2)
-            header = {"descr": np.lib.format.dtype_to_descr(np.dtype("<f4")), "fortran_order": False, "shape": shape}
-            np.lib.format.write_array_header_1_0(file, header)
-
-            def images() -> Iterator[FloatArray]:
-                for frame in made.frames:
-                    file.write(frame.flow.astype("<f4").tobytes())
-                    squares[:] += np.mean(np.square(frame.flow, dtype=np.float64), axis=(0, 1))
-                    yield frame.image
-
-            write_video(video, images(), camera.frame_rate, camera.bit_depth)
-        rms = [float(value) for value in np.sqrt(squares / count)]
-        write_image(beside[TRUTH], made.truth, bit_depth=16)
+    request: dict[str, Any],
+    counter: Callable[[int], None] | None,
+) -> dict[str, Any]:
+    """Write everything into a hidden folder first, so that a failure leaves nothing; what the JSON file says."""
+    with _hidden_folder(outputs[VIDEO]) as folder:
+        staged = {ending: folder / path.name for ending, path in outputs.items()}
+        flow_rms = _write_frames(staged[VIDEO], staged[FLOW], made, camera, counter)
+        write_image(staged[TRUTH], made.truth, bit_depth=16)
         if made.diffraction is not None:
-            write_image(Path(folder) / (output.stem + DIFFRACTION), made.diffraction, bit_depth=16)
-        text = json_format.dumps({**facts, "flow_rms": rms}, indent=2, allow_nan=False)
-        (Path(folder) / (output.stem + PARAMETERS)).write_text(text + "\n", "utf-8")
-        for name, target in zip(staged, outputs, strict=True):
-            name.replace(target)
-    if overwrite and made.diffraction is None:
-        # What an earlier run left would not belong to this one.
-        output.with_name(output.stem + DIFFRACTION).unlink(missing_ok=True)
-    return rms
+            write_image(staged[DIFFRACTION], made.diffraction, bit_depth=16)
+        facts = {
+            "turbrestore": __version__,
+            **request,
+            "frames": made.count,
+            "size": [made.truth.shape[1], made.truth.shape[0]],
+            "flow": SIGN,
+            "camera": _record(camera),
+            **made.record,
+            "flow_rms": flow_rms,
+        }
+        staged[PARAMETERS].write_text(json_format.dumps(facts, indent=2, allow_nan=False) + "\n", "utf-8")
+        for ending, path in staged.items():
+            path.replace(outputs[ending])
+    return facts
+
+
+@contextmanager
+def _hidden_folder(output: Path) -> Iterator[Path]:
+    """Folder beside an output that is gone afterwards."""
+    try:
+        folder = tempfile.TemporaryDirectory(prefix=".synthesis-", dir=output.parent)
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be created ({error.strerror})") from error
+    with folder as name:
+        yield Path(name)
+
+
+def _write_frames(
+    video: Path, flow_file: Path, made: Synthesis, camera: CameraParams, counter: Callable[[int], None] | None
+) -> list[float]:
+    """Write frames and flows one by one as they are made; root mean square of the flow along x and y."""
+    squares = np.zeros(2)
+    with flow_file.open("wb") as file:
+        shape = (made.count, *made.truth.shape[:2], 2)
+        header = {"descr": np.lib.format.dtype_to_descr(np.dtype("<f4")), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
+
+        def images() -> Iterator[FloatArray]:
+            for frame in made.frames:
+                file.write(frame.flow.astype("<f4").tobytes())
+                squares[:] += np.mean(np.square(frame.flow, dtype=np.float64), axis=(0, 1))
+                yield frame.image
+                if counter is not None:
+                    counter(1)
+
+        write_video(video, images(), camera.frame_rate, camera.bit_depth)
+    return [float(value) for value in np.sqrt(squares / made.count)]
 
 
 def _record(camera: CameraParams) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """``turbrestore synthesize`` on real files: what it writes, what repeats, how it ends."""
 
 import json
+from contextlib import nullcontext
 
 import cv2
 import numpy as np
@@ -16,9 +17,10 @@ from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.video import open_frames, write_video
 from turbrestore.warp import warp
 from turbrestore_cli.__main__ import main
+from turbrestore_cli.progress import TITLES
 
 # Small and cheap to draw.
-QUICK = ["--size", "64x80", "--layers", "2", "--pupil-samples", "24", "--frames", "3", "--quiet"]
+QUICK = ["--size", "80x64", "--layers", "2", "--pupil-samples", "24", "--frames", "3", "--quiet"]
 
 
 @pytest.fixture
@@ -71,13 +73,14 @@ def test_phase_screens_write_video_truth_flow_and_parameters(run, tmp_path):
     assert printed == record
 
 
-def test_the_same_seed_writes_the_same_bytes(run, tmp_path):
+@pytest.mark.parametrize("suffix", ["npy", "mkv"])
+def test_the_same_seed_writes_the_same_bytes(run, tmp_path, suffix):
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):
-        assert run("chart", tmp_path / f"{name}.npy", *QUICK, "--seed", seed)[0] == 0
-    for ending in ("npy", "flow.npy", "truth_diffraction.png"):
+        assert run("chart", tmp_path / f"{name}.{suffix}", *QUICK, "--seed", seed)[0] == 0
+    for ending in (suffix, "flow.npy", "json", "truth.png", "truth_diffraction.png"):
         first, again, other = ((tmp_path / f"{name}.{ending}").read_bytes() for name in "abc")
         assert first == again
-        assert ending == "truth_diffraction.png" or first != other
+        assert (first == other) == ending.startswith("truth")
 
 
 def test_explicit_numbers_reach_the_path_and_the_camera(run, tmp_path):
@@ -123,7 +126,7 @@ def test_dynamic_texture_continues_a_clip(run, clip, tmp_path, exposure):
         "--dynamic-texture.fit",
         "mirror",
     ]
-    code, _, err = run("chart", tmp_path / "t.mkv", *words, "--size", "72x96", *exposure, "--read-noise", "0.002")
+    code, _, err = run("chart", tmp_path / "t.mkv", *words, "--size", "96x72", *exposure, "--read-noise", "0.002")
     assert code == 0, err
     assert names(tmp_path) == {"t.mkv", "t.truth.png", "t.flow.npy", "t.json"}
     video, flows = open_frames(tmp_path / "t.mkv").read(), load_flows(tmp_path / "t.flow.npy")
@@ -142,6 +145,29 @@ def test_dynamic_texture_of_the_centroid(run, clip, tmp_path):
     assert read_image(tmp_path / "a.truth.png").image.shape == (64, 64)
     for ending in ("npy", "flow.npy"):
         assert (tmp_path / f"a.{ending}").read_bytes() == (tmp_path / f"b.{ending}").read_bytes()
+
+
+def test_progress_counts_the_flows_of_the_clip_and_the_frames(run, clip, tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(
+        "turbrestore_cli.synthesis.progress_bars", lambda _: nullcontext(lambda *call: calls.append(call))
+    )
+    assert run("chart", tmp_path / "a.npy", *QUICK)[0] == 0
+    assert calls == [("synthesize", done, 3) for done in (1, 2, 3)]
+    calls.clear()
+    words = [
+        "--model",
+        "dynamic-texture",
+        "--like",
+        clip,
+        "--frames",
+        "2",
+        "--dynamic-texture.centroid.iterations",
+        "1",
+    ]
+    assert run("centroid", tmp_path / "b.npy", *words)[0] == 0
+    assert calls == [("centroid", k, 14) for k in range(1, 15)] + [("synthesize", k, 2) for k in (1, 2)]
+    assert {stage for stage, *_ in calls} <= set(TITLES)
 
 
 def test_overwriting_is_explicit_and_leaves_nothing_of_before(run, clip, tmp_path):
@@ -191,16 +217,21 @@ def pixel(folder):
         ("chart", ["--strength", "gale"], 2, "gale"),
         ("chart", ["--wind", "1", "--wind", "2"], 2, "wind: expected one value"),
         ("chart", ["--frames", "0"], 2, "--frames"),
+        ("chart", ["--frames", "1000000000"], 2, "--frames"),
         ("chart", ["--seed", "-1"], 2, "--seed"),
         ("chart", ["--size", "64"], 2, "--size"),
         ("chart", ["--size", "8x8"], 2, "at least 64"),
+        ("chart", ["--size", "99999x99999"], 2, "--size: expected at most"),
+        ("chart", ["--dynamic-texture.fit", "stretch"], 2, "--dynamic-texture: has no effect"),
         ("chart", ["--like", "clip.mkv"], 2, "--like, --train: have no effect"),
         ("chart", ["--model", "dynamic-texture"], 2, "--like: expected a video"),
         ("chart", ["--model", "dynamic-texture", "--like", "none.mkv"], 66, "none.mkv"),
         ("chart", ["--model", "dynamic-texture", "--like", "none.mkv", "--strength", "weak"], 2, "--strength"),
         ("chart", ["--model", "dynamic-texture", "--like", "none.mkv", "--wind", "3"], 2, "no path"),
         ("chart", ["--train", "5"], 2, "--train"),
+        ("chart", ["--model", "dynamic-texture", "--like", "none.mkv", "--train", "2"], 2, "--train: expected 3"),
         ("centroid", [], 2, "--like"),
+        ("centroid", ["--model", "dynamic-texture", "--like", "none.mkv", "--size", "64x64"], 2, "--size: has no"),
         ("chrat", [], 2, "chrat: expected an image file or one of"),
         ("none.png", [], 66, "none.png"),
         (plain, [], 65, "one colour"),
@@ -220,9 +251,22 @@ def test_bad_requests_are_one_line_and_leave_nothing(run, tmp_path, scene, words
     assert names(folder) == set()
 
 
-def test_outputs_that_cannot_be(run, tmp_path):
+def test_outputs_that_cannot_be(run, tmp_path, monkeypatch):
     assert run("chart", tmp_path / "a.xyz")[0] == 2
+    assert run("chart", "")[0] == 2
     assert run("chart", tmp_path / "none" / "a.mkv")[0] == 73
+    (tmp_path / "b.json").mkdir()
+    assert run("chart", tmp_path / "b.mkv", "--overwrite")[0] == 73
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    # A folder may be writable by its mode and still refuse, as read-only file systems do.
+    with monkeypatch.context() as patch:
+        patch.setattr("turbrestore_cli.synthesis.tempfile.TemporaryDirectory", refuse)
+        code, _, err = run("chart", tmp_path / "c.mkv", *QUICK)
+    assert (code, err.count("\n")) == (73, 1)
+    assert "c.mkv: cannot be created (Permission denied)" in err
     write_image(tmp_path / "a.truth.png", resolution_chart(64, 64), 16)
     code, _, err = run(tmp_path / "a.truth.png", tmp_path / "a.mkv", "--overwrite")
     assert code == 73

@@ -144,7 +144,7 @@ def test_stretched_flows_grow_with_the_scene(training):
 
 
 def test_colour_scenes_of_another_size_are_taken(clip):
-    scene = np.full((50, 90, 3), 0.5, np.float32)
+    scene = np.random.default_rng(4).random((50, 90, 3), dtype=np.float32)
     texture = synthesize_like(clip, 2, np.random.default_rng(0), QUICK, scene=scene)
     assert texture.scene.shape == (50, 90, 3)
     assert texture.flows[1].shape == (50, 90, 2)
@@ -176,5 +176,9 @@ def test_bad_parameters_are_refused(clip, training):
         continue_flows(training[:2], 5, rng)
     with pytest.raises(DataError, match="^scene: expected shape"):
         synthesize_like(clip, 5, rng, scene=np.zeros(3))
+    with pytest.raises(DataError, match="^scene: expected contrast, found one colour"):
+        synthesize_like(clip, 5, rng, scene=np.full((64, 64), 0.5))
+    with pytest.raises(DataError, match="^scene: expected at least 16×16 pixels, found 1×1"):
+        synthesize_like(clip, 5, rng, scene=np.ones((1, 1)))
     with pytest.raises(DataError, match="^frames: expected"):
         synthesize_like(clip[:1], 5, rng)

@@ -75,6 +75,20 @@ def test_structure_function_is_von_karmans(outer_scale):
     assert agrees(ratios, np.ones(len(separations)))
 
 
+def test_look_up_between_lattice_points_takes_a_little_of_the_finest_structure():
+    # Spacing and inner scale that the default path has at the aperture.
+    spacing, steps = 0.1 / 32, np.array([1, 4, 16])
+    rows = []
+    for seed in range(40):
+        screen = screen_of(seed, spacing=spacing, inner_scale=0.005, turn=0.6)
+        x, y = np.random.default_rng(seed).uniform(0, 100, (2, 400))
+        start = sample_path(screen, x, y)
+        rows.append([np.mean((sample_path(screen, x + s, y) - start) ** 2, dtype=np.float64) for s in spacing * steps])
+    expected = structure_function(spacing * steps, 0.05, 5.0, 0.005)
+    ratios = np.array(rows) * (2 * np.pi / WAVELENGTH) ** 2 / expected
+    assert agrees(ratios, np.array([0.86, 0.97, 1.0]), slack=0.01)
+
+
 def test_screen_is_isotropic():
     squares = []
     for seed in range(80):

@@ -522,6 +522,16 @@ class TestWriting:
         expected = np.stack(frames) if len(shape) == 3 else np.stack(frames)[..., None]
         assert np.mean(np.abs(found - expected)) < 0.02
 
+    @pytest.mark.parametrize("name", ["a.mkv", "a.mp4", "a.npy", "a.tif", "a.ser"])
+    @pytest.mark.parametrize("shape", [(5, 16, 20), (5, 16, 20, 3)])
+    def test_the_same_frames_give_the_same_bytes(self, tmp_path, name, shape):
+        stack = np.random.default_rng(0).random(shape, dtype=np.float32)
+        written = []
+        for frames in (stack, stack, 1 - stack):
+            write_video(tmp_path / name, frames, 25, overwrite=True)
+            written.append((tmp_path / name).read_bytes())
+        assert written[0] == written[1] != written[2]
+
     def test_a_source_can_be_written(self, tmp_path):
         write_video(tmp_path / "a.mkv", np.full((4, 5, 6), 0.2, np.float32), 25)
         source = open_frames(tmp_path / "a.mkv", frames=(1, 3))

@@ -25,8 +25,8 @@ which is no blurred scene, averages out.  The search starts at the strongest red
 resolved.  Reducing by r averages r×r pixels, whose variance (r² − 1) / 12 is taken out again.
 
 n is more than the noise of the image: no real blur follows the family of k exactly, and a scene of high contrast
-shows that more.  Below, it is the noise and a share of the contrast; the width found depends on it (math in
-``docs/decisions/blur.md``), which is what ``uncertainty`` measures.
+shows that more.  So n² is the noise and a share of the contrast, squared and added.  The width found depends on n,
+which is what ``uncertainty`` measures.
 
 A fused image is never sharper than its pixels and the interpolation in registration: the smallest width found is
 0.35 px, and that is also the answer where a wider blur is hardly more likely.

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 CONTAINER_SUFFIXES = (".mkv", ".mp4", ".m4v", ".mov", ".webm", ".avi", ".gif")
 # By content FFmpeg would also open playlists, which lead to other files.
 _OPEN_OPTIONS = {"format_whitelist": "matroska,webm,mov,mp4,avi,gif"}
+# The same frames give the same bytes: without this, Matroska numbers its segment and tracks at random.
+_WRITE_OPTIONS = {"fflags": "+bitexact"}
 # Every packet of these codecs decodes without the others.
 _INTRA_CODECS = {"ffv1", "mjpeg", "rawvideo", "png", "huffyuv", "ffvhuff", "utvideo", "prores", "dnxhd"}
 _GREY_DEPTHS = {8: "gray", 10: "gray10le", 12: "gray12le", 14: "gray14le", 16: "gray16le"}
@@ -148,7 +150,7 @@ def write_mkv(
     bit_depth: int = 8,
     overwrite: bool = False,
 ) -> None:
-    """Write frames without loss: FFV1 version 3 with checksums, in Matroska.
+    """Write frames without loss: FFV1 version 3 with checksums, in Matroska; the same frames give the same bytes.
 
     Parameters
     ----------
@@ -417,7 +419,8 @@ def _encode(
         first = next(iterator, None)
         if first is None:
             raise DataError(f"{path}: expected at least one frame, found none")
-        with av.open(f"file:{temporary}", "w", format=recipe.container) as output:
+        name = f"file:{temporary}"
+        with av.open(name, "w", format=recipe.container, container_options=dict(_WRITE_OPTIONS)) as output:
             pixel_format, options = recipe.settings(first.shape)
             stream = cast("av.VideoStream", output.add_stream(recipe.codec, rate=rate, options=options))
             stream.height, stream.width = first.shape[:2]

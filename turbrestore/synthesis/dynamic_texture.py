@@ -33,11 +33,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import FloatArray, check_flow, check_image
+from ..arrays import FloatArray, check_flow
 from ..centroid import CentroidParams, find_centroid
 from ..dynamics import DynamicsParams, FlowDynamics, identify, simulate, stable_system
 from ..errors import DataError, require
 from ..flow import FlowParams
+from .sequence import check_scene
 
 Float64Array = NDArray[np.float64]
 
@@ -178,7 +179,8 @@ def synthesize_like(
     Raises
     ------
     DataError
-        Too few frames, wrong shapes or values that are not finite.
+        Too few frames, wrong shapes, values that are not finite, or a scene that is small, of one colour or not in
+        [0, 1].
     ConfigurationError
         ``count`` is not positive.
 
@@ -189,13 +191,13 @@ def synthesize_like(
     >>> from turbrestore.synthesis.smooth_flow import distort, smooth_flows
     >>> rng = np.random.default_rng(0)
     >>> clip = distort(resolution_chart(64, 64), smooth_flows(12, 64, 64, rng), rng, blur=1.0)
-    >>> texture = synthesize_like(clip, 300, np.random.default_rng(1), scene=np.full((80, 96), 0.5))
+    >>> texture = synthesize_like(clip, 300, np.random.default_rng(1), scene=resolution_chart(80, 96))
     >>> len(texture.flows), texture.flows[299].shape
     (300, (80, 96, 2))
     """
     params = params or DynamicTextureParams()
     _check_count(count)
-    given = None if scene is None else check_image(scene, "scene")
+    given = None if scene is None else check_scene(scene)
     centroid = find_centroid(frames, params.centroid, params.flow, progress)
     image = centroid.image if given is None else given
     flows, dynamics = continue_flows(centroid.flows, count, rng, params, image.shape[:2])

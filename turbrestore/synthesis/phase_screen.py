@@ -13,6 +13,9 @@ that the expected structure function is exact and not only close, as it is for t
 frequencies (Lane, Glindemann and Dainty 1992).  The waves repeat nowhere; the lattice repeats after P, and its axes are
 turned against the wind so that what comes back, comes back elsewhere.
 
+The lattice is looked up bilinearly.  At the default path, whose lattice points lie γD/32 apart, this takes 14 % of the
+structure function over one such step, 3 % over four, and nothing over sixteen.
+
 The widely used ``ft_sh_phase_screen`` of aotools (1.0.8) seeds two generators with the same number, one for the
 lattice and one for the sub-harmonics, whenever a seed is given; the two parts then share their draws.  Here they follow
 each other in one generator.

@@ -1,0 +1,75 @@
+"""Shape of the blur of fused frames, where the truth is known.
+
+Run ``TURBRESTORE_DATA=DIR python benchmarks/blur_shape.py [NAME ...]``.  For each simulated clip it prints the transfer
+function from the truth to the filtered image, the cross-spectrum over the power of the truth, at some frequencies;
+and the highest PSNR that deconvolution reaches with blurs of several exponents, each at its best width.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from clips import find_clips
+from scipy import fft
+
+from turbrestore.arrays import FloatArray, luminance
+from turbrestore.deconvolution import DeconvolutionParams, deconvolve
+from turbrestore.errors import TurbrestoreError
+from turbrestore.metrics import align, compare
+from turbrestore.pipeline import RestoreParams, restore
+
+FREQUENCIES = (1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8)
+EXPONENTS = (1.2, 1.5, 5 / 3, 2.0)
+# Pixels, about a tenth apart.
+SIGMAS = (0.3, 0.35, 0.42, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.32, 1.46, 1.6, 1.8, 2.0)
+_RINGS = 32
+
+
+def main() -> int:
+    """Print the table."""
+    columns = [f"{frequency:g}" for frequency in FREQUENCIES] + [f"p = {exponent:.3g}" for exponent in EXPONENTS]
+    print(f"| clip | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
+    try:
+        for name, load in find_clips(sys.argv[1:] or ["ao_*", "purdue1_*", "quick_*"]).items():
+            clip = load()
+            if clip.truth is None:
+                continue
+            stages = restore(clip.frames, RestoreParams(until="filter"))
+            transfer = transfer_function(stages.image, clip.truth)
+            cells = [f"{transfer[round(frequency * _RINGS)]:.2f}" for frequency in FREQUENCIES]
+            for exponent in EXPONENTS:
+                sigma, figure = best_width(stages.image, clip.truth, stages.centroid.image, exponent)
+                cells.append(f"{figure:.2f} ({sigma:g})")
+            print(f"| {name} | {' | '.join(cells)} |", flush=True)
+    except TurbrestoreError as error:
+        print(f"blur_shape: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def transfer_function(image: FloatArray, truth: FloatArray) -> FloatArray:
+    """Share of the truth's amplitude that the image has, in rings 1/32 cycles per pixel apart."""
+    a, t = align(image, truth)
+    window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
+    first, second = (fft.fft2((one - one.mean()) * window) for one in (a, t))
+    radius = np.hypot(fft.fftfreq(a.shape[0])[:, None], fft.fftfreq(a.shape[1]))
+    ring = np.rint(radius * _RINGS).astype(int).ravel()
+    cross = np.bincount(ring, (first * second.conj()).real.ravel())
+    return (cross / np.bincount(ring, np.square(np.abs(second)).ravel())).astype(np.float32)
+
+
+def best_width(image: FloatArray, truth: FloatArray, guide: FloatArray, exponent: float) -> tuple[float, float]:
+    """Climb the widths until PSNR falls: the best and its PSNR."""
+    best = (0.0, compare(luminance(image), truth).psnr)
+    for sigma in SIGMAS:
+        result = deconvolve(image, sigma, DeconvolutionParams(exponent=exponent), guide=guide)
+        figure = compare(result.image, truth).psnr
+        if figure < best[1] - 0.3:
+            break
+        best = max(best, (sigma, figure), key=lambda pair: pair[1])
+    return best
+
+
+if __name__ == "__main__":
+    sys.exit(main())

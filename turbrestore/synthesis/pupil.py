@@ -1,0 +1,278 @@
+"""The pupil of the camera: the phase over it, and the point spread functions that it makes.
+
+Symbols
+-------
+D, λ, γ, z : as in :mod:`turbrestore.synthesis.atmosphere`.  S : phase screen, m.
+θ : field angle, rad.  ρ : position in the pupil, m.  v : wind of a layer, m/s.  t : time, s.
+φ_θ(ρ) = (2π/λ) Σ_layers S(γρ + zθ − vt) : phase over the pupil, for spherical waves.
+h_θ(u) : point spread function ``|∫ exp(iφ_θ − 2πi ρ·u/λ) dρ|²`` of the phase without its tilt; sums to 1.
+h_0, h_k : mean of the h_θ seen in some turbulence, and their principal components; the h_k sum to 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import FloatArray
+from .atmosphere import PhaseScreenParams
+from .phase_screen import Turbulence, sample_lattice
+
+Float64Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex64]
+
+# Waves bend little over the pupil; singular values of their bends below this share of the largest are left out.
+_BEND_TOLERANCE = 1e-3
+_SAMPLED_INSTANTS, _SAMPLED_POINTS = 16, 32
+_KEPT_VARIANCE, _MOST_COMPONENTS = 0.99, 32
+
+
+@dataclass(frozen=True, eq=False)
+class Pupil:
+    """Samples of a circular aperture, and how the plane waves of each screen bend over it.
+
+    Attributes
+    ----------
+    mask : ndarray, bool, shape (N, N)
+        Samples inside the aperture; there are P.
+    x, y : ndarray, float64, shape (P,)
+        Their positions ρ, m.
+    planes : ndarray, float32, shape (3, P)
+        Orthonormal basis of piston and tilts.
+    bends : tuple of (complex128 (m, r), float32 (r, P))
+        For each layer, ``exp(−2πi γ f·ρ)`` of each wave without its piston and tilt, as a product.
+    """
+
+    mask: NDArray[np.bool_]
+    x: Float64Array
+    y: Float64Array
+    planes: FloatArray
+    bends: tuple[tuple[NDArray[np.complex128], FloatArray], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PsfBasis:
+    """Low-rank basis of the point spread functions at one wavelength.
+
+    Attributes
+    ----------
+    mean : ndarray, float32, shape (K, K)
+        Sums to 1.
+    components : ndarray, float32, shape (r, K, K)
+        Orthonormal; each sums to 0.
+    kept : float
+        Share of the variance of the sampled functions that the components hold.
+    """
+
+    mean: FloatArray
+    components: FloatArray
+    kept: float
+
+
+def pupil_mask(params: PhaseScreenParams) -> NDArray[np.bool_]:
+    """Mark the samples of the grid over the pupil that lie inside the aperture.
+
+    Parameters
+    ----------
+    params : PhaseScreenParams
+
+    Returns
+    -------
+    ndarray, bool, shape (N, N)
+
+    Examples
+    --------
+    >>> round(float(pupil_mask(PhaseScreenParams()).mean()), 3)
+    0.793
+    """
+    axis = (np.arange(params.pupil_samples) + 0.5) / params.pupil_samples - 0.5
+    return np.hypot(axis[:, None], axis) <= 0.5
+
+
+def sample_pupil(turbulence: Turbulence) -> Pupil:
+    """Sample the aperture, and find how the plane waves of the screens bend over it.
+
+    Parameters
+    ----------
+    turbulence : Turbulence
+
+    Returns
+    -------
+    Pupil
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from turbrestore.synthesis.phase_screen import draw_turbulence
+    >>> pupil = sample_pupil(draw_turbulence(PhaseScreenParams(layers=2), (64, 64), np.random.default_rng(0)))
+    >>> pupil.planes.shape[0], len(pupil.bends)
+    (3, 2)
+    """
+    params = turbulence.params
+    mask = pupil_mask(params)
+    axis = ((np.arange(params.pupil_samples) + 0.5) / params.pupil_samples - 0.5) * params.aperture
+    x, y = (grid[mask] for grid in np.meshgrid(axis, axis))
+    planes = np.linalg.qr(np.stack([np.ones_like(x), x, y], axis=1))[0].T
+    bends = []
+    for layer, screen in zip(turbulence.layers, turbulence.screens, strict=True):
+        waves = np.exp(-2j * np.pi * layer.shrink * (screen.frequencies @ np.stack([x, y])))
+        waves -= (waves @ planes.T) @ planes
+        weighed = waves * np.abs(screen.waves)[:, None]
+        sizes, basis = _principal_directions(np.concatenate([weighed.real, weighed.imag]))
+        basis = basis[sizes > _BEND_TOLERANCE * sizes[0]]
+        bends.append((waves @ basis.T, basis.astype(np.float32)))
+    return Pupil(mask, x, y, planes.astype(np.float32), tuple(bends))
+
+
+def tilt_free_path(
+    turbulence: Turbulence, pupil: Pupil, x: Float64Array, y: Float64Array, drift: Float64Array
+) -> FloatArray:
+    """Difference of optical path over the pupil, less its piston and tilt, for several field points.
+
+    Parameters
+    ----------
+    turbulence : Turbulence
+    pupil : Pupil
+    x, y : ndarray, float64, shape (F,)
+        Field points, pixels from the line of sight.
+    drift : ndarray, float64, shape (layers, 2)
+        m.
+
+    Returns
+    -------
+    ndarray, float32, shape (F, P)
+        m.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from turbrestore.synthesis.phase_screen import draw_turbulence
+    >>> turbulence = draw_turbulence(PhaseScreenParams(layers=2), (64, 64), np.random.default_rng(0))
+    >>> pupil = sample_pupil(turbulence)
+    >>> path = tilt_free_path(turbulence, pupil, np.zeros(1), np.zeros(1), turbulence.drift(0.0))
+    >>> bool(abs(path @ pupil.planes.T).max() < 1e-4 * abs(path).max())
+    True
+    """
+    total = np.zeros((len(x), len(pupil.x)), np.float32)
+    for number, (layer, screen) in enumerate(zip(turbulence.layers, turbulence.screens, strict=True)):
+        scale = layer.distance * turbulence.params.pixel_angle
+        centres = np.stack([scale * x - drift[number, 0], scale * y - drift[number, 1]], axis=1)
+        at_x, at_y = (centres[:, :1] + layer.shrink * pupil.x, centres[:, 1:] + layer.shrink * pupil.y)
+        total += sample_lattice(screen, [screen.path], at_x, at_y)[0]
+        bends, basis = pupil.bends[number]
+        turned = np.exp(-2j * np.pi * (centres @ screen.frequencies.T)) * screen.waves
+        total += (turned @ bends).real.astype(np.float32) @ basis
+    return np.subtract(total, (total @ pupil.planes.T) @ pupil.planes, dtype=np.float32)
+
+
+def point_spread_functions(
+    path: FloatArray, mask: NDArray[np.bool_], wavelength: float, params: PhaseScreenParams
+) -> FloatArray:
+    """Point spread functions of differences of path over the pupil, at the pixels of the camera.
+
+    Where pixels are coarser than λ/2D the intensity is averaged over each of them.
+
+    Parameters
+    ----------
+    path : ndarray, float32, shape (F, P)
+        m.
+    mask : ndarray, bool, shape (N, N)
+        Of :func:`pupil_mask`, true P times.
+    wavelength : float
+        m.
+    params : PhaseScreenParams
+
+    Returns
+    -------
+    ndarray, float32, shape (F, K, K), K odd
+        Each sums to 1; what falls outside the window counts as inside.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> params = PhaseScreenParams(d_over_r0=1.0)
+    >>> mask = pupil_mask(params)
+    >>> sharp = point_spread_functions(np.zeros((1, mask.sum()), np.float32), mask, 550e-9, params)[0]
+    >>> sharp.shape, round(float(sharp.max()), 3)
+    ((27, 27), 0.203)
+    """
+    transform, parts = _transform(wavelength, params)
+    field = np.zeros((len(path), *mask.shape), np.complex64)
+    field[:, mask] = np.exp(path * np.complex64(2j * np.pi / wavelength))
+    spread = transform @ field @ transform.T
+    intensity = spread.real**2 + spread.imag**2
+    width = len(transform) // parts
+    if parts > 1:
+        intensity = intensity.reshape(-1, width, parts, width, parts).sum(axis=(2, 4))
+    return intensity / intensity.sum(axis=(1, 2), keepdims=True)
+
+
+def psf_basis(
+    turbulence: Turbulence, pupil: Pupil, wavelength: float, shape: tuple[int, ...], rng: np.random.Generator
+) -> PsfBasis:
+    """Principal components of point spread functions at random places of the screens.
+
+    Parameters
+    ----------
+    turbulence : Turbulence
+    pupil : Pupil
+    wavelength : float
+        m.
+    shape : (int, int)
+        Rows and columns of the field of view, pixels.
+    rng : numpy.random.Generator
+        Chooses the places.
+
+    Returns
+    -------
+    PsfBasis
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from turbrestore.synthesis.phase_screen import draw_turbulence
+    >>> turbulence = draw_turbulence(PhaseScreenParams(layers=2), (64, 64), np.random.default_rng(0))
+    >>> basis = psf_basis(turbulence, sample_pupil(turbulence), 550e-9, (64, 64), np.random.default_rng(1))
+    >>> basis.kept > 0.95, bool(abs(basis.mean.sum() - 1) < 1e-5)
+    (True, True)
+    """
+    half_height, half_width = (size / 2 for size in shape[:2])
+    samples = []
+    for _ in range(_SAMPLED_INSTANTS):
+        drift = rng.uniform(0, 1000, (len(turbulence.layers), 2))
+        x, y = rng.uniform(-1, 1, (2, _SAMPLED_POINTS)) * [[half_width], [half_height]]
+        path = tilt_free_path(turbulence, pupil, x, y, drift)
+        samples.append(point_spread_functions(path, pupil.mask, wavelength, turbulence.params))
+    stack = np.concatenate(samples).astype(np.float64)
+    mean = stack.mean(axis=0)
+    centred = (stack - mean).reshape(len(stack), -1)
+    sizes, components = _principal_directions(centred)
+    shares = np.cumsum(sizes**2) / max(np.sum(sizes**2), np.finfo(np.float64).tiny)
+    rank = min(int(np.searchsorted(shares, _KEPT_VARIANCE)) + 1, _MOST_COMPONENTS)
+    kept = components[:rank].reshape(rank, *mean.shape)
+    return PsfBasis(mean.astype(np.float32), kept.astype(np.float32), float(shares[rank - 1]))
+
+
+def _transform(wavelength: float, params: PhaseScreenParams) -> tuple[ComplexArray, int]:
+    """Matrix from the samples of the pupil to the window of the image, and its rows for each pixel."""
+    pixel = params.pixel_angle
+    widest = max(params.wavelength, *params.channel_wavelengths)
+    radius = max(int(np.ceil(params.psf_radius * widest / params.aperture / pixel)), 1)
+    # An odd number of parts keeps the middle of a pixel among them.
+    parts = 2 * int(np.ceil((pixel / (params.wavelength / (2 * params.aperture)) - 1 - 1e-9) / 2)) + 1
+    count = (2 * radius + 1) * parts
+    angles = (np.arange(count) - (count - 1) / 2) * (pixel / parts)
+    axis = ((np.arange(params.pupil_samples) + 0.5) / params.pupil_samples - 0.5) * params.aperture
+    return np.exp(-2j * np.pi / wavelength * np.outer(angles, axis)).astype(np.complex64), parts
+
+
+def _principal_directions(rows: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Singular values of a matrix, largest first, and its right singular vectors where the values are not nothing."""
+    wide = rows.shape[0] < rows.shape[1]
+    # The smaller Gram matrix is many times faster than the decomposition, and knows sizes to 1e-6 of the largest.
+    values, vectors = np.linalg.eigh(rows @ rows.T if wide else rows.T @ rows)
+    kept = np.flatnonzero(values > 1e-12 * max(values[-1], np.finfo(np.float64).tiny))[::-1]
+    sizes, vectors = np.sqrt(values[kept]), vectors[:, kept]
+    return sizes, (vectors / sizes).T @ rows if wide else vectors.T
