@@ -352,3 +352,10 @@ def test_two_writes_give_the_same_bytes(tmp_path):
         write_image(tmp_path / name, image)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
+
+
+def test_text_under_the_name_of_an_image_is_said_to_be_none(tmp_path):
+    path = tmp_path / "text.png"
+    path.write_text("no picture")
+    with pytest.raises(DataError, match=r"text\.png: not an image of a known format$"):
+        read_image(path)

@@ -366,6 +366,8 @@ def _pillow_size(path: Path, data: bytes) -> tuple[int, int]:
                 header.verify()
     except PIL.Image.DecompressionBombError as error:
         raise DataError(f"{path}: expected up to {MAX_PIXELS} pixels, found far more ({first_line(error)})") from error
+    except PIL.UnidentifiedImageError as error:
+        raise DataError(f"{path}: not an image of a known format") from error
     except Exception as error:  # Pillow raises SyntaxError, ValueError, struct.error, … by the format
         raise DataError(f"{path}: not an image, or damaged ({first_line(error)})") from error
     return size
