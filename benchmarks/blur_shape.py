@@ -28,7 +28,7 @@ _RINGS = 32
 
 def main() -> int:
     """Print the table."""
-    columns = [f"{frequency:g}" for frequency in FREQUENCIES] + [f"p = {exponent:.3g}" for exponent in EXPONENTS]
+    columns = [f"ν = {frequency:g}" for frequency in FREQUENCIES] + [f"p = {exponent:.3g}" for exponent in EXPONENTS]
     print(f"| clip | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
     try:
         for name, load in find_clips(sys.argv[1:] or ["ao_*", "purdue1_*", "quick_*"]).items():

@@ -47,6 +47,7 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
             "rank": restoration.dynamics.rank,
             "energy_share": restoration.dynamics.energy_share,
             "residual_variance": restoration.dynamics.R,
+            "motion_factor": float(restoration.dynamics.motion_factor.mean()),
             "largest_eigenvalue": float(abs(restoration.dynamics.eigenvalues).max(initial=0.0)),
             "notes": list(restoration.dynamics.notes),
         }
@@ -66,6 +67,8 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
     if restoration.blur is not None:
         names = ("sigma", "uncertainty", "exponent", "noise", "reduction", "evidence")
         record["blur"] = {name: getattr(restoration.blur, name) for name in names}
+    if restoration.blur_bounds is not None:
+        record["blur_bounds"] = dataclasses.asdict(restoration.blur_bounds)
     if truth is not None:
         stages = {name: dataclasses.asdict(compare(image, truth)) for name, image in stage_images(restoration).items()}
         record["stages"] = stages

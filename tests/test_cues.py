@@ -12,6 +12,7 @@ from turbrestore.blur_moments.cues import (
     CueParams,
     FrameBlur,
     TileGrid,
+    blur_against,
     displacement_variance,
     frame_blur,
     frame_noise_factor,
@@ -20,6 +21,8 @@ from turbrestore.blur_moments.cues import (
     fusion_rule,
     fusion_weights,
     laplacian_energy,
+    noise_factor,
+    refer_blur,
     relative_blur,
     tile_map,
 )
@@ -356,5 +359,42 @@ def test_bad_input_is_named():
         fusion_rule(blur, np.zeros((31, 32)), 0.1)
     with pytest.raises(DataError, match="frames"):
         fuse_frames(np.zeros((3, 32, 32)), fusion_rule(blur, image, 0.1))
+    with pytest.raises(DataError, match=r"frames: expected the size \(32, 32\) of the reference"):
+        blur_against(image[None, :, :31], refer_blur(np.stack([image, image]), 0.01)[0])
     with pytest.raises(ConfigurationError, match="largest"):
         frame_noise_factor(fusion_rule(blur, image, 0.1), 0, largest=0.5)
+
+
+def test_frames_one_by_one_against_their_reference_are_judged_as_together(varied):
+    _, frames, _ = varied
+    reference, together = refer_blur(frames, 0.01)
+    assert (together.extra == frame_blur(frames, 0.01).extra).all()
+    for index in (0, 7, 39):
+        alone = blur_against(frames[index : index + 1], reference)
+        for name in ("relative", "deviation", "extra"):
+            assert getattr(alone, name)[0] == pytest.approx(getattr(together, name)[index], abs=1e-5)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_frames_that_the_reference_has_not_seen_are_judged_by_their_blur(scene):
+    image, rng = SCENES[scene](144), np.random.default_rng(0)
+    reference, _ = refer_blur(np.stack([blurred(image, sigma, rng) for sigma in 4 * [0.8, 1.2, 1.6]]), 0.01)
+    for sigma, noise in ((1.0, 0.01), (1.4, 0.01), (1.8, 0.01), (1.4, 0.002), (1.4, 0.04)):
+        found = blur_against(blurred(image, sigma, rng, noise)[None], reference, noise)
+        seen = found.deviation < 0.3
+        assert seen.sum() > 5
+        # The error of a tile, and nothing that all tiles share beyond the sharpest frame being a little off.
+        assert np.median(found.extra[seen]) == pytest.approx(sigma**2 - 0.8**2, rel=0.1, abs=0.1)
+    assert blur_against(blurred(image, 0.6, rng)[None], reference).extra.min() == 0
+
+
+def test_a_blurry_newcomer_is_trusted_least(varied):
+    scene, frames, _ = varied
+    reference, blur = refer_blur(frames, 0.01)
+    rule = fusion_rule(blur, laplacian_energy(frames.mean(axis=0), 0.002), 0.01)
+    assert (noise_factor(rule, blur.extra[3]) == frame_noise_factor(rule, 3)).all()
+    newcomer = blurred(scene, 4.0, np.random.default_rng(1))
+    factor = noise_factor(rule, blur_against(newcomer[None], reference).extra[0], largest=50.0)
+    known = np.stack([frame_noise_factor(rule, index, largest=50.0) for index in range(len(frames))])
+    assert (factor >= np.median(known, axis=0)).mean() > 0.95
+    assert np.mean(factor == 50.0) > 0.5

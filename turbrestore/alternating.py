@@ -29,6 +29,8 @@ Departures from the paper, each with its reason:
 * Z may vary from pixel to pixel: it falls where a frame is locally sharper than usual, by ``exp(−β z)`` with z the
   standardised local sharpness, the gradient of the frame projected on that of the reference; and it rises where the
   flow folds, which a diffeomorphism does not.  β = 0 is the paper's scalar gain.
+  ``frame_noise="blur"`` takes the blur of the frame instead, as its spectra show it, and gives frames the shares of
+  :func:`turbrestore.blur_moments.cues.fusion_rule`.
 * The image starts from a diffuse prior (``prior_frames=0``) and takes the training frames in first; the paper starts
   from the centroid.
 """
@@ -54,6 +56,7 @@ from .parallel import map_ahead, one_thread_each
 from .warp import warp
 
 RESIDUALS = ("keep", "drop")
+FRAME_NOISES = ("sharpness", "blur")
 # Variance of an image nothing is known of: full scale, squared.
 _DIFFUSE = 1.0
 # Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
@@ -72,8 +75,12 @@ class FilterParams:
         Times that flow is measured, and image and flow updated, for each block of frames.
     block : int
         Frames whose flows are measured against the same image; 1 follows the paper, more run side by side.
+    frame_noise : {"sharpness", "blur"}
+        What tells good frames from bad ones: local sharpness, or the blur of tiles of 48 pixels that their spectra
+        show.
     sharpness : float
-        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.
+        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.  Without
+        effect where blur is what counts.
     sharpness_window : float
         Standard deviation of the window in which sharpness is measured, pixels.
     image_noise : float, optional
@@ -87,6 +94,7 @@ class FilterParams:
     residual: Literal["keep", "drop"] = "keep"
     inner_iterations: int = 2
     block: int = 8
+    frame_noise: Literal["sharpness", "blur"] = "sharpness"
     sharpness: float = 2.0
     sharpness_window: float = 3.0
     image_noise: float | None = None
@@ -97,6 +105,10 @@ class FilterParams:
         require(
             self.residual in RESIDUALS,
             f"residual: expected one of {', '.join(RESIDUALS)}, found {self.residual!r}",
+        )
+        require(
+            self.frame_noise in FRAME_NOISES,
+            f"frame_noise: expected one of {', '.join(FRAME_NOISES)}, found {self.frame_noise!r}",
         )
         require_between("inner_iterations", self.inner_iterations, 1, 100)
         require_between("block", self.block, 1, 10_000, "frames")
@@ -249,17 +261,7 @@ def filter_frames(
         raise DataError(f"frames: expected at least {wanted}, found {len(first)}")
     if flows is None:
         flows = np.stack([flow for _, flow in iterate_flows(image, first, flow_params)])
-    model = measure_frame_noise(
-        first,
-        flows,
-        image,
-        dynamics.residual_variance,
-        params.sharpness_window,
-        params.image_noise,
-        flow_params.threads,
-    )
-    if params.residual == "drop":
-        model = replace(model, motion_share=np.zeros_like(model.motion_share))
+    model = _noise_model(first, flows, image, dynamics, params, flow_params.threads)
     prior_variance = model.image_noise / params.prior_frames if params.prior_frames else _DIFFUSE
     state = FilterState(
         PixelGaussian(image, np.full(image.shape[:2], prior_variance, np.float32)),
@@ -288,6 +290,29 @@ def _checked(frames: Iterable[ArrayLike], shape: tuple[int, ...]) -> Iterator[Fl
         if image.shape != shape:
             raise DataError(f"frame {index}: expected shape {shape} as the reference has, found {image.shape}")
         yield image
+
+
+def _noise_model(
+    frames: list[FloatArray],
+    flows: FloatArray,
+    image: FloatArray,
+    dynamics: FlowDynamics,
+    params: FilterParams,
+    threads: int,
+) -> FrameNoise:
+    """Read off the first block what holds for all frames."""
+    model = measure_frame_noise(
+        frames,
+        flows,
+        image,
+        dynamics.residual_variance,
+        params.sharpness_window,
+        params.image_noise,
+        threads,
+        by_blur=params.frame_noise == "blur",
+    )
+    largest = np.float32(0) if params.residual == "drop" else dynamics.motion_factor
+    return replace(model, motion_share=np.minimum(model.motion_share, largest))
 
 
 def _filter_block(

@@ -24,8 +24,9 @@ Departures from the paper
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
@@ -39,6 +40,17 @@ Float64Array = NDArray[np.float64]
 # Size of the float64 strip of all flows that is in memory at once. Smaller strips would save little memory and
 # hand the linear algebra pieces too small to be worth a second thread.
 _STRIP_BYTES = 2**25
+# Standard deviation of the variance of measured flows about that of the motion, and error of a displacement variance
+# besides its deviation, as shares of each.
+_FLOW_ERROR, _CUE_ERROR = 0.3, 0.15
+# What moves by more than this in variance, squared pixels, leaves the tiles that a displacement variance is seen in.
+_LARGEST_VARIANCE = 20.0
+# Standard deviation of the square of a Hann window of 64 pixels, through which a displacement variance is seen; pixels.
+_TILE_WINDOW = 9.0
+# Variance of flows below which nothing moves, squared pixels.
+_LEAST_VARIANCE = 1e-12
+# A model without motion would never follow a frame.
+_LEAST_FACTOR = 0.05
 # Flows are float32, so singular values below this share of the norm of all flows are rounding.
 _ROUNDING = 1e-6
 
@@ -119,6 +131,9 @@ class FlowDynamics:
         eigenvalues are the τ-th roots of unity other than 1 (paper 3, Figure 7a), and Q is meaningless.
     notes : tuple of str
         What a person should know about this fit, one line each.
+    motion_factor : ndarray, float32, shape (H, W)
+        Variance of the motion over that of the measured flows; 1 unless :func:`with_displacement` found another. Q and
+        ``state_covariance`` hold its mean; states, singular values and R are those of the flows as measured.
     """
 
     A: Float64Array
@@ -132,6 +147,7 @@ class FlowDynamics:
     energy_share: float
     overfitted: bool
     notes: tuple[str, ...]
+    motion_factor: FloatArray
 
     @property
     def rank(self) -> int:
@@ -165,9 +181,20 @@ class FlowDynamics:
         return self.states[:, -1]
 
     @property
+    def flow_variance(self) -> FloatArray:
+        """Variance of the measured flows, mean of the two components, shape (H, W), squared pixels."""
+        free = self.frame_count - 1
+        states = self.singular_values[: self.rank] ** 2 / free
+        modelled = np.einsum("pi,pi,i->p", self.C, self.C, states.astype(np.float32))
+        # The residual has been divided by its own degrees of freedom.
+        residual = np.float32(max(free - self.rank, 1) / free) * self.residual_variance
+        return modelled.reshape(self.mean_flow.shape).mean(axis=-1) + residual
+
+    @property
     def state_covariance(self) -> Float64Array:
-        """Covariance of the states over the training flows, shape (n, n), diagonal."""
-        return np.diag(self.singular_values[: self.rank] ** 2 / (self.frame_count - 1))
+        """Covariance of the states over the training flows, times the mean motion factor; shape (n, n), diagonal."""
+        measured = self.singular_values[: self.rank] ** 2 / (self.frame_count - 1)
+        return np.diag(float(self.motion_factor.mean()) * measured)
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +280,63 @@ def identify(flows: FloatArray | Iterable[FloatArray], params: DynamicsParams | 
         energy_share=float(np.sum(singular_values[:n] ** 2)) / energy if energy else 1.0,
         overfitted=overfitted,
         notes=_notes(A, strips.count, n, present, overfitted, params),
+        motion_factor=np.ones(mean.shape[:2], np.float32),
     )
+
+
+def with_displacement(dynamics: FlowDynamics, variance: ArrayLike, deviation: ArrayLike) -> FlowDynamics:
+    """Draw the size of the motion towards a displacement variance that was found without the flows.
+
+    Measured flows hold noise besides motion, and smooth some of the motion away: their variance, seen through the
+    window of a tile, is taken to be that of the motion within 30 %.  The displacement variance is taken to be right
+    within its deviation and 15 %; and as structure leaves the tiles that large motion is seen in (of 34 squared pixels
+    a third to a half was missing, of 5 to 13 up to 30 %), the square of the larger variance over 20 squared pixels adds
+    to its error.
+
+    The mean of both, weighted by inverse variance, over the variance of the flows is ``motion_factor``.  Q and the
+    stationary covariance of the state change by its mean: noise and motion are thought to share the directions of the
+    flow alike.  A filter takes at most this share of what C leaves out to be motion.
+
+    Parameters
+    ----------
+    dynamics : FlowDynamics
+    variance : float or array_like, shape (H, W)
+        Variance of the displacement per axis, squared pixels, as of
+        :func:`turbrestore.blur_moments.cues.displacement_variance`.
+    deviation : float or array_like, shape (H, W)
+        Its standard deviation, squared pixels; infinite where nothing is known.
+
+    Returns
+    -------
+    FlowDynamics
+        With another ``motion_factor``, at least 0.05, and Q scaled by the change of its mean.
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> flows = np.zeros((6, 2, 2, 2), np.float32); flows[::2], flows[1::2] = 1, -1
+    >>> dynamics = identify(flows)
+    >>> with_displacement(dynamics, variance=0.6, deviation=0.0).motion_factor.round(2)[0]
+    array([0.55, 0.55], dtype=float32)
+    >>> with_displacement(dynamics, variance=0.6, deviation=np.inf).motion_factor[0]
+    array([1., 1.], dtype=float32)
+    """
+    cue, error = np.asarray(variance, np.float64), np.asarray(deviation, np.float64)
+    for name, given in (("variance", cue), ("deviation", error)):
+        if given.shape not in ((), dynamics.shape):
+            raise DataError(f"{name}: expected one number or shape {dynamics.shape}, found {given.shape}")
+    measured = np.maximum(cv2.GaussianBlur(dynamics.flow_variance, (0, 0), _TILE_WINDOW), _LEAST_VARIANCE)
+    lost = np.maximum(measured, cue) ** 2 / _LARGEST_VARIANCE
+    own, other = (_FLOW_ERROR * measured) ** -2, 1 / (error**2 + (_CUE_ERROR * cue) ** 2 + lost**2)
+    motion = (own * measured + other * cue) / (own + other)
+    factor = np.maximum(motion / measured, _LEAST_FACTOR).astype(np.float32)
+    change = float(factor.mean() / dynamics.motion_factor.mean())
+    return replace(dynamics, Q=dynamics.Q * change, motion_factor=factor)
 
 
 def project(dynamics: FlowDynamics, flow: ArrayLike) -> Float64Array:

@@ -4,11 +4,14 @@ Symbols
 -------
 Z : variance of a registered frame about the image (paper 3, eq. 15)
 z : sharpness of a frame at a pixel, standardised over the frames; β its weight, ``Z ∝ exp(−β z)``
+s : blur variance of a tile of a frame; w share of the frame in the image that follows, ``Z ∝ 1 / w``
 G : share of the flow outside the model's subspace that is motion and not noise
 R : variance of that flow
 
 The paper takes Z to be one number.  Here it falls where a frame is locally sharper than usual, which is the idea of
-lucky imaging inside the Kalman gain, and rises where the flow folds.
+lucky imaging inside the Kalman gain, and rises where the flow folds.  Which frames are sharp is read from their local
+gradients, or from the spectra of their tiles (:mod:`turbrestore.blur_moments.cues`); later frames are held against the
+spectra of the first ones, so that none of them has to be kept.
 """
 
 from __future__ import annotations
@@ -19,6 +22,15 @@ import cv2
 import numpy as np
 
 from .arrays import FloatArray, luminance
+from .blur_moments.cues import (
+    BlurReference,
+    FusionRule,
+    blur_against,
+    fusion_rule,
+    laplacian_energy,
+    noise_factor,
+    refer_blur,
+)
 from .parallel import map_ahead
 from .warp import warp
 
@@ -54,6 +66,9 @@ class FrameNoise:
         G, 0 to 1.
     window : float
         Standard deviation of the window in which sharpness is measured, pixels.
+    blur : tuple of BlurReference and FusionRule, or None
+        What the blur of a frame is measured against, and the shares of frames that follow from it; None where
+        sharpness is what counts.
     """
 
     image_noise: float
@@ -63,6 +78,7 @@ class FrameNoise:
     score_variance: FloatArray
     motion_share: FloatArray
     window: float
+    blur: tuple[BlurReference, FusionRule] | None = None
 
 
 def measure_frame_noise(
@@ -73,6 +89,7 @@ def measure_frame_noise(
     window: float = 3.0,
     image_noise: float | None = None,
     threads: int = 0,
+    by_blur: bool = False,
 ) -> FrameNoise:
     """Temporal statistics of frames registered by their flows.
 
@@ -91,6 +108,8 @@ def measure_frame_noise(
         Z, squared intensity; by default the mean temporal variance of the registered frames.
     threads : int
         Frames warped side by side; 0 means one per available core.
+    by_blur : bool
+        Judge frames by the blur that their spectra show; needs two frames, and 4 bytes a pixel of each for a while.
 
     Returns
     -------
@@ -117,11 +136,14 @@ def measure_frame_noise(
         return registered, _sharpness(registered, template, window)
 
     total, squares, sharp, sharp_squares = (np.zeros(image.shape[:2]) for _ in range(4))
+    kept: list[FloatArray] = []
     for _, (registered, sharpness) in map_ahead(measure, zip(frames, flows, strict=True), threads):
         total += registered
         squares += np.square(registered, dtype=np.float64)
         sharp += sharpness
         sharp_squares += np.square(sharpness, dtype=np.float64)
+        if by_blur:
+            kept.append(registered)
     count = len(frames)
     variance = np.maximum(squares / count - (total / count) ** 2, 0.0) * count / max(count - 1, 1)
     usual = sharp / count
@@ -138,6 +160,7 @@ def measure_frame_noise(
         score_variance=(scale**2 * spread).astype(np.float32),
         motion_share=_motion_share(energy, sensor_noise, residual_variance, window),
         window=window,
+        blur=_blur_rule(np.stack(kept), image, sensor_noise) if len(kept) > 1 else None,
     )
 
 
@@ -152,7 +175,8 @@ def noise_of_frame(registered: FloatArray, flow: FloatArray, model: FrameNoise, 
         The flow it was warped by, pixels.
     model : FrameNoise
     sharpness : float
-        β; 0 gives the same number for every frame and pixel, as in the paper.
+        β; 0 gives the same number for every frame and pixel, as in the paper.  Without effect where ``model.blur`` is
+        there.
 
     Returns
     -------
@@ -168,6 +192,10 @@ def noise_of_frame(registered: FloatArray, flow: FloatArray, model: FrameNoise, 
     >>> noise_of_frame(frames[0], still[0], model, sharpness=0.0) == model.image_noise
     True
     """
+    if model.blur is not None:
+        reference, rule = model.blur
+        extra = blur_against(registered[None], reference).extra[0]
+        return np.float32(model.image_noise) * noise_factor(rule, extra) * _distrust(flow)
     if sharpness == 0:
         return model.image_noise
     seen = _sharpness(luminance(registered), model.template, model.window)
@@ -175,6 +203,14 @@ def noise_of_frame(registered: FloatArray, flow: FloatArray, model: FrameNoise, 
     # For a normal score of variance s² the mean of exp(β z − β² s² / 2) is one: the information per frame stays 1/Z.
     exponent = 0.5 * sharpness**2 * model.score_variance - sharpness * score
     return np.float32(model.image_noise) * np.exp(exponent) * _distrust(flow)
+
+
+def _blur_rule(registered: FloatArray, image: FloatArray, sensor_noise: float) -> tuple[BlurReference, FusionRule]:
+    """Measure the blur of frames, and which shares of them make blur and noise of their average smallest."""
+    noise = float(np.sqrt(sensor_noise))
+    reference, blur = refer_blur(registered, noise)
+    energy = laplacian_energy(image, noise / np.sqrt(len(registered)))
+    return reference, fusion_rule(blur, energy, noise)
 
 
 def _distrust(flow: FloatArray) -> FloatArray:

@@ -357,9 +357,7 @@ def frame_blur(frames: ArrayLike, noise: float, params: CueParams | None = None)
     return refer_blur(frames, noise, params)[1]
 
 
-def refer_blur(
-    frames: ArrayLike, noise: float, params: CueParams | None = None
-) -> tuple[BlurReference, FrameBlur]:
+def refer_blur(frames: ArrayLike, noise: float, params: CueParams | None = None) -> tuple[BlurReference, FrameBlur]:
     """Blur of every frame, as :func:`frame_blur` gives it, and the reference that other frames are held against.
 
     Parameters
@@ -435,9 +433,9 @@ def blur_against(frames: ArrayLike, reference: BlurReference, noise: float | Non
     >>> scene = np.random.default_rng(0).normal(0.5, 0.1, (48, 48)).cumsum(0).cumsum(1).astype(np.float32) % 1
     >>> frames = np.stack([cv2.GaussianBlur(scene, (0, 0), sigma) for sigma in (1.0, 1.414, 1.0)])
     >>> reference, _ = refer_blur(frames, noise=1e-4)
-    >>> soft = cv2.GaussianBlur(scene, (0, 0), 1.6)
+    >>> soft = cv2.GaussianBlur(scene, (0, 0), 1.225)
     >>> blur_against(soft[None], reference).extra.ravel().astype(float).round(1).tolist()
-    [1.6]
+    [0.5]
     """
     stack = check_frames(frames)
     if stack.shape[1:3] != reference.shape:
@@ -446,9 +444,7 @@ def blur_against(frames: ArrayLike, reference: BlurReference, noise: float | Non
     spectra = _Spectra.of(reference.shape, reference.params)
     averaging, k2, counts = spectra.cells()
     power = _ring_power(stack, spectra, averaging)
-    s, gathered, _ = _score(
-        power, reference.spectrum, reference.misfit, floor, (k2, counts), spectra, reference.params
-    )
+    s, gathered, _ = _score(power, reference.spectrum, reference.misfit, floor, (k2, counts), spectra, reference.params)
     s = s - reference.offset
     deviation = _deviation(s, gathered, reference.size)
     estimate = _posterior(s, deviation, reference.spread)
@@ -661,7 +657,7 @@ def frame_noise_factor(rule: FusionRule, index: int, largest: float = 100.0) -> 
 
 
 def noise_factor(rule: FusionRule, extra: FloatArray, largest: float = 100.0) -> FloatArray:
-    """The same for a frame that the rule was not made from.
+    """Measurement noise of a frame that the rule was not made from, as :func:`frame_noise_factor` gives it.
 
     Parameters
     ----------
@@ -684,9 +680,10 @@ def noise_factor(rule: FusionRule, extra: FloatArray, largest: float = 100.0) ->
     --------
     >>> import numpy as np
     >>> frames = np.random.default_rng(0).normal(0.5, 0.1, (5, 48, 48)).astype(np.float32)
-    >>> rule = fusion_rule(frame_blur(frames, noise=0.1), np.ones((48, 48)), noise=0.1)
-    >>> bool((noise_factor(rule, np.full((1, 1), 9.0, np.float32), largest=50.0) == 50.0).all())
-    True
+    >>> reference, blur = refer_blur(frames, noise=0.1)
+    >>> rule = fusion_rule(blur, np.zeros((48, 48)), noise=0.1)
+    >>> round(float(noise_factor(rule, blur_against(frames[:1], reference).extra[0])[0, 0]), 2)
+    1.0
     """
     require(largest >= 1, f"largest: expected 1 or more, found {largest}")
     weight = rule.scale * np.maximum(rule.threshold - tile_map(extra, rule.blur.grid), 0)
@@ -934,7 +931,7 @@ def _score(
 
 
 def _deviation(s: Float64Array, gathered: Float64Array, size: Float64Array) -> Float64Array:
-    """Standard deviation of s from what rings say of it and the mean squared residual of each."""
+    """Combine what rings say of s, and the mean squared residual of each, to the standard deviation of s."""
     total = gathered.sum(axis=-1) + 1 / _PRIOR**2
     variance = (_CORRELATED * (gathered * np.maximum(size, 1.0)).sum(axis=-1) + 1 / _PRIOR**2) / total**2
     return np.hypot(np.sqrt(variance), _WINDOW_ERROR * s)
@@ -972,7 +969,8 @@ def _posterior(s: Float64Array, deviation: Float64Array, spread: Float64Array) -
 
 def _frame_blur(s: Float64Array, deviation: Float64Array, extra: Float64Array, grid: TileGrid) -> FrameBlur:
     shape = (len(s), len(grid.rows), len(grid.columns))
-    return FrameBlur(*(part.reshape(shape).astype(np.float32) for part in (s, deviation, extra)), grid)
+    relative, deviations, extras = (part.reshape(shape).astype(np.float32) for part in (s, deviation, extra))
+    return FrameBlur(relative, deviations, extras, grid)
 
 
 def _waterline(s: FloatArray, c: FloatArray, noise: float) -> tuple[FloatArray, FloatArray]:
