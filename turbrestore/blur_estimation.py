@@ -21,8 +21,8 @@ Bayesian blind deconvolution, JMLR 2014):
 x is found by conjugate gradients for γ given, and ``γ_i = x_i² + C_i`` with ``C_i = 1 / (‖k‖² / λ + 1 / γ_i)``.
 
 A wide blur is looked for in a reduced image, where it is about a pixel wide again and where the noise of compression,
-which is no blurred scene, averages out.  The search starts at the strongest reduction and ends where the blur is
-resolved.  Reducing by r averages r×r pixels, whose variance (r² − 1) / 12 is taken out again.
+which is no blurred scene, averages out.  Reducing by r averages r×r pixels, whose variance (r² − 1) / 12 is taken out
+again.  Of all reductions that resolve a blur, the one decides whose width depends least on the noise assumed.
 
 n is more than the noise of the image: no real blur follows the family of k exactly, and a scene of high contrast
 shows that more.  So n² is the noise and a share of the contrast, squared and added.  The width found depends on n,
@@ -34,7 +34,7 @@ A fused image is never sharper than its pixels and the interpolation in registra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -53,12 +53,14 @@ _REDUCTIONS = (8, 6, 4, 3, 2, 1)
 _SMALLEST_SIDE, _SMALLEST_IMAGE = 48, 16
 # Widths that are tried, pixels of the reduced image; the first is that of a sharp image.
 _WIDTHS = np.array([0.35, 0.45, 0.55, 0.65, 0.8, 0.95, 1.1, 1.3, 1.55, 1.85, 2.2, 2.6])
-# A blur of this many pixels of the reduced image is resolved, and needs no finer one.
+# A blur of this many pixels of the reduced image is resolved in it.
 _RESOLVED = 0.6
 # By how much a blurred scene must be likelier than a sharp one, in units of L; and by how much where the blur found is
 # no wider than photographs are soft, pixels.
 _EVIDENCE, _STRONG_EVIDENCE = 0.08, 0.2
 _SOFT = 0.8
+# Of the smallest width, pixels.
+_PIXEL_UNCERTAINTY = 0.1
 # Side of the part that is looked at, the one with most detail, and of its taper; pixels.
 _PART, _TAPER = 128, 8
 # n is this many times the noise, and this share of the contrast.
@@ -78,8 +80,8 @@ class BlurEstimate:
         Width of the blur, pixels: standard deviation of the Gaussian whose transfer function passes one half at the
         same frequency; 0 where the image says nothing.
     uncertainty : float
-        Half of the difference between the widths found with half and with twice the noise, pixels; infinite where
-        the image says nothing.
+        Half of the difference between the widths found with half and with twice the noise, pixels; 0.1 for a sharp
+        image, infinite where the image says nothing.
     exponent : float
         Shape of the blur, see :func:`turbrestore.psf.blur_otf`.
     noise : float
@@ -143,22 +145,27 @@ def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float 
     check_exponent(exponent)
     if min(grey.shape) < _SMALLEST_IMAGE or np.ptp(grey) <= _LEAST_NOISE:
         return BlurEstimate(0.0, float("inf"), exponent, noise or 0.0, 1, 0.0, np.zeros(0), np.zeros(0))
-    for factor in _REDUCTIONS:
-        if factor > 1 and min(grey.shape) < factor * _SMALLEST_SIDE:
-            continue
-        part = _gradients(_most_detailed(_reduce(grey, factor)))
-        level = _effective_noise(_reduce(grey, factor), factor, noise)
-        costs = _costs(part, exponent, level)
-        evidence = float(costs[0] - costs.min())
-        width = _widen(_lowest(costs), factor)
-        if factor > 1 and evidence >= _EVIDENCE and _lowest(costs) >= _RESOLVED:
-            break
-    less, more = (_widen(_lowest(_costs(part, exponent, share * level)), factor) for share in (0.5, 2.0))
-    needed = _EVIDENCE if width >= _SOFT else _STRONG_EVIDENCE
-    sigma = width if evidence >= needed else float(_WIDTHS[0])
-    return BlurEstimate(
-        sigma, abs(more - less) / 2, exponent, level, factor, evidence, factor * _WIDTHS[: len(costs)], costs
-    )
+    factors = [factor for factor in _REDUCTIONS if factor == 1 or min(grey.shape) >= factor * _SMALLEST_SIDE]
+    estimates = [_estimate_reduced(grey, factor, exponent, noise) for factor in factors]
+    convincing = [one for one in estimates if np.isfinite(one.uncertainty)]
+    if convincing:
+        return min(convincing, key=lambda one: one.uncertainty / one.sigma)
+    return replace(estimates[-1], sigma=float(_WIDTHS[0]), uncertainty=_PIXEL_UNCERTAINTY)
+
+
+def _estimate_reduced(grey: FloatArray, factor: int, exponent: float, noise: float | None) -> BlurEstimate:
+    """Estimate from one reduced image; the uncertainty is infinite where it does not convince."""
+    reduced = _reduce(grey, factor)
+    gradients, level = _gradients(_most_detailed(reduced)), _effective_noise(reduced, factor, noise)
+    costs = _costs(gradients, exponent, level)
+    evidence, lowest = float(costs[0] - costs.min()), _lowest(costs)
+    width, uncertainty = _widen(lowest, factor), float("inf")
+    resolved = lowest < _WIDTHS[-1] and (factor == 1 or lowest >= _RESOLVED)
+    if resolved and evidence >= (_EVIDENCE if width >= _SOFT else _STRONG_EVIDENCE):
+        less, more = (_widen(_lowest(_costs(gradients, exponent, share * level)), factor) for share in (0.5, 2.0))
+        uncertainty = abs(more - less) / 2
+    tried = factor * _WIDTHS[: len(costs)]
+    return BlurEstimate(width, uncertainty, exponent, level, factor, evidence, tried, costs)
 
 
 def _effective_noise(reduced: FloatArray, factor: int, noise: float | None) -> float:

@@ -14,7 +14,9 @@ from numpy.typing import ArrayLike
 from .alternating import Filtered, FilterParams, filter_frames
 from .arrays import FloatArray
 from .blur_estimation import BlurEstimate, estimate_blur
-from .blur_moments.cues import blur_against, displacement_variance, refer_blur, relative_blur, tile_map
+from .blur_moments.cues import displacement_variance, relative_blur
+from .blur_moments.frame_blur import blur_against, refer_blur
+from .blur_moments.tiles import tile_map
 from .centroid import Centroid, CentroidParams, find_centroid
 from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve
 from .dynamics import DynamicsParams, FlowDynamics, identify, with_displacement
@@ -37,6 +39,8 @@ _TILE_OVERLAP = 4
 _NOTHING_SEEN = 0.5
 # Widths of two images, estimated blindly, agree within this share: they depend on the scene in the same way.
 _WIDTH_ERROR = 0.1
+# Share of the uncertainty of an estimated width that is taken off it.
+_CAUTION = 0.5
 # Training frames and their flows stay in memory: 12 bytes a pixel for grey frames, up to this many bytes.
 _TRAINING_BYTES = 1.5e9
 
@@ -295,6 +299,8 @@ def blur_to_remove(
 ) -> tuple[float, DeconvolutionParams]:
     """Width of the blur, and settings that know its shape: those asked for, else those estimated.
 
+    Of an estimated width half of its uncertainty is taken off: too wide rings, too narrow leaves a little softness.
+
     Parameters
     ----------
     estimate : BlurEstimate or None
@@ -318,7 +324,11 @@ def blur_to_remove(
     """
     if deconvolution.sigma is not None or estimate is None:
         return deconvolution.sigma or 0.0, deconvolution
-    sigma = estimate.sigma if bounds is None else min(max(estimate.sigma, bounds.low), bounds.high)
+    if estimate.sigma == 0:
+        return 0.0, deconvolution
+    sigma = estimate.sigma - _CAUTION * estimate.uncertainty
+    if bounds is not None:
+        sigma = min(max(sigma, bounds.low), bounds.high)
     return sigma, replace(deconvolution, exponent=estimate.exponent)
 
 
