@@ -1,5 +1,7 @@
 from dataclasses import replace
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -152,7 +154,13 @@ def estimate_of(sigma):
     return BlurEstimate(sigma, 0.1, 5 / 3, 0.01, 1, 1.0, np.zeros(0), np.zeros(0))
 
 
-@pytest.mark.parametrize(("estimated", "removed"), [(0.4, 0.7), (1.0, 1.0), (3.0, 1.5)])
+def test_half_of_the_uncertainty_is_left_in_and_an_image_that_says_nothing_is_left_alone():
+    assert blur_to_remove(estimate_of(2.0), DeconvolutionParams())[0] == pytest.approx(1.95)
+    nothing = dataclasses.replace(estimate_of(0.0), uncertainty=np.inf)
+    assert blur_to_remove(nothing, DeconvolutionParams())[0] == 0
+
+
+@pytest.mark.parametrize(("estimated", "removed"), [(0.4, 0.7), (1.0, 0.95), (3.0, 1.5)])
 def test_an_estimated_width_is_kept_within_bounds_and_a_given_one_is_not(estimated, removed):
     bounds = BlurBounds(0.7, 1.5)
     width, settings = blur_to_remove(estimate_of(estimated), DeconvolutionParams(), bounds)
