@@ -15,17 +15,10 @@ import skimage.data
 from scipy.special import ndtr
 
 from turbrestore.arrays import FloatArray
-from turbrestore.blur_moments.cues import (
-    FrameBlur,
-    displacement_variance,
-    frame_blur,
-    fuse_frames,
-    fusion_rule,
-    fusion_weights,
-    laplacian_energy,
-    relative_blur,
-    tile_map,
-)
+from turbrestore.blur_moments.cues import displacement_variance, relative_blur
+from turbrestore.blur_moments.frame_blur import FrameBlur, frame_blur
+from turbrestore.blur_moments.fusion import fuse_frames, fusion_rule, fusion_weights, laplacian_energy
+from turbrestore.blur_moments.tiles import tile_map
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.flow import estimate_flow
 from turbrestore.metrics import psnr

@@ -84,8 +84,8 @@ def mirror(
     require_between("--deviation", deviation, 1e-3, 7, "dB")
     start = time.perf_counter()
     known = run_mirror(range(seeds))
-    _draw(plot, draw_mirror, known, overwrite)
     unknown = run_mirror(range(seeds), MirrorParams(deviation=deviation))
+    _draw(plot, draw_mirror, known, overwrite)
     record = {"experiment": "mirror", "seeds": seeds, "seconds": _rounded(time.perf_counter() - start)}
     if json:
         print_json(record | {"plant_known": describe(known), "plant_unknown": describe(unknown)})

@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from turbrestore.errors import DataError
 from turbrestore_cli.__main__ import main
 
 
@@ -84,6 +85,18 @@ class TestPlots:
         assert code == 2
         assert err == "turbrestore: plot: expected matplotlib, which is not installed; run pip install matplotlib\n"
 
+    def test_nothing_is_written_by_a_run_that_fails_later(self, run, tmp_path, monkeypatch):
+        def fails_unless_known(seeds, params=None):
+            if params is not None:
+                raise DataError("plant: expected this failure")
+
+        monkeypatch.setattr("turbrestore_cli.moments.new_figure", lambda: None)
+        monkeypatch.setattr("turbrestore_cli.moments.draw_mirror", lambda experiment: b"picture")
+        monkeypatch.setattr("turbrestore_cli.moments.run_mirror", fails_unless_known)
+        code, out, _ = run("mirror", "--seeds", 2, "--plot", tmp_path / "figures.png")
+        assert (code, out) == (65, "")
+        assert not list(tmp_path.iterdir())
+
 
 class TestRefusals:
     @pytest.mark.parametrize(
@@ -97,6 +110,9 @@ class TestRefusals:
             (["wavefront", "--plot", "/nowhere/figures.png"], 73, "/nowhere"),
             (["wavefront", "--params.frames", 5], 2, "frames"),
             (["wavefront", "--params.noise", 0], 2, "noise"),
+            (["wavefront", "--params.pixels", 2], 2, "pixels"),
+            (["wavefront", "--params.kernel-width", 1e-6], 2, "kernel_width"),
+            (["wavefront", "--params.amplitude", "inf"], 2, "amplitude"),
         ],
     )
     def test_one_line(self, run, words, code, part):

@@ -112,6 +112,8 @@ class TestKernelMoments:
         without, with_kernel = np.mean(path**2), np.mean(path**2) + 0.05**2
         assert measured - without == pytest.approx(0.05**2 + 0.08**2 / 12, rel=0.02)
         assert measured - with_kernel == pytest.approx(0.08**2 / 12, rel=0.1)
+        corrected = compose_moments(path_moments(path, 2), kernel_moments(gaussian_kernel(0.05), 2, wide))
+        assert measured == pytest.approx(corrected[2], abs=0.02 * 0.08**2)
 
     def test_erratum_4_the_border_cuts_moments(self):
         image = expose([0.9], gaussian_kernel(0.05), PIXELS)

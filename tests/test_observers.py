@@ -326,6 +326,21 @@ class TestRefusals:
         with pytest.raises(DataError, match="^input: expected [^\n]*$"):
             observer.step(MODEL, START, np.zeros(100), np.zeros(199))
 
+    @pytest.mark.parametrize("observer", [KALMAN, MomentFilter(), MomentFilter(method="unscented"), ImageFilter()])
+    def test_states_of_another_system(self, observer):
+        # Reshaped, four numbers would pass for two states of two.
+        with pytest.raises(DataError, match="^state: expected [^\n]*$"):
+            observer.step(MODEL, Gaussian(np.zeros(4), np.eye(4)), np.zeros(100), np.zeros(200))
+
+    def test_gain_of_another_system(self):
+        with pytest.raises(ConfigurationError, match="^gain: expected [^\n]*$"):
+            FixedGain(np.zeros(3)).step(MODEL, START, np.zeros(100), np.zeros(200))
+
+    def test_as_many_moments_as_pixels(self):
+        sensor = LineSensor(MODEL.sensor.kernel, PixelGrid(-1.0, 1.0, 4), noise=0.1)
+        with pytest.raises(ConfigurationError, match="^orders: expected below the number of pixels, 4, [^\n]*$"):
+            predicted_moments(BlurModel(MODEL.motion, sensor), np.zeros(2), np.zeros(200), (1, 2, 3, 4))
+
     def test_singular_covariance_of_the_state(self):
         with pytest.raises(DataError, match="^cov: [^\n]* singular"):
             ImageFilter().step(MODEL, Gaussian(np.zeros(2), np.diag([1.0, 0.0])), np.zeros(100), np.zeros(200))

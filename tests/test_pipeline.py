@@ -1,7 +1,5 @@
 from dataclasses import replace
 
-import dataclasses
-
 import cv2
 import numpy as np
 import pytest
@@ -156,7 +154,7 @@ def estimate_of(sigma):
 
 def test_half_of_the_uncertainty_is_left_in_and_an_image_that_says_nothing_is_left_alone():
     assert blur_to_remove(estimate_of(2.0), DeconvolutionParams())[0] == pytest.approx(1.95)
-    nothing = dataclasses.replace(estimate_of(0.0), uncertainty=np.inf)
+    nothing = replace(estimate_of(0.0), uncertainty=np.inf)
     assert blur_to_remove(nothing, DeconvolutionParams())[0] == 0
 
 

@@ -7,18 +7,10 @@ from scipy.linalg import expm
 from turbrestore.blur_moments.kernels import PixelGrid, gaussian_kernel
 from turbrestore.blur_moments.lifted import FastSystem, lift
 from turbrestore.blur_moments.observers import BlurModel, MomentFilter, predicted_moments, run_observer
+from turbrestore.blur_moments.plane_filter import PlaneModel, PlaneMomentFilter, PlaneSensor
 from turbrestore.blur_moments.sensor import ExposureTiming, LineSensor, expose_plane
-from turbrestore.blur_moments.tracking import (
-    ConstantVelocity,
-    Oscillation,
-    PlaneModel,
-    PlaneMomentFilter,
-    PlaneSensor,
-    RandomWalk,
-    TrackParams,
-    lift_motion,
-    track_blur,
-)
+from turbrestore.blur_moments.target_motion import ConstantVelocity, Oscillation, RandomWalk, lift_motion
+from turbrestore.blur_moments.tracking import TrackParams, track_blur
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.kalman import Gaussian
 
@@ -160,7 +152,7 @@ def test_innovations_and_errors_are_as_large_as_the_filter_says():
 @pytest.mark.parametrize("motion", [RandomWalk(0.3), ConstantVelocity(0.3), Oscillation(0.7, 0.2, 0.3, drift=0.1)])
 def test_random_force_over_a_frame_is_that_of_many_small_steps(motion):
     params = TrackParams(motion, SIGMA, frame_period=0.8)
-    lifted = lift_motion(params)
+    lifted = lift_motion(motion, params.timing())
     A, intensity = motion.dynamics()
     cov, step = np.zeros_like(A), 0.8 / 4000
     F = np.eye(len(A)) + step * A

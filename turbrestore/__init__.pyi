@@ -6,8 +6,8 @@ from .artifacts import save_artifact as save_artifact
 from .blur_estimation import BlurEstimate as BlurEstimate
 from .blur_estimation import estimate_blur as estimate_blur
 from .blur_moments.cues import displacement_variance as displacement_variance
-from .blur_moments.cues import frame_blur as frame_blur
 from .blur_moments.cues import relative_blur as relative_blur
+from .blur_moments.frame_blur import frame_blur as frame_blur
 from .blur_moments.tracking import TrackParams as TrackParams
 from .blur_moments.tracking import track_blur as track_blur
 from .centroid import Centroid as Centroid

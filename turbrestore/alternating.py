@@ -30,7 +30,7 @@ Departures from the paper, each with its reason:
   standardised local sharpness, the gradient of the frame projected on that of the reference; and it rises where the
   flow folds, which a diffeomorphism does not.  β = 0 is the paper's scalar gain.
   ``frame_noise="blur"`` takes the blur of the frame instead, as its spectra show it, and gives frames the shares of
-  :func:`turbrestore.blur_moments.cues.fusion_rule`.
+  :func:`turbrestore.blur_moments.fusion.fusion_rule`.
 * The image starts from a diffuse prior (``prior_frames=0``) and takes the training frames in first; the paper starts
   from the centroid.
 """

@@ -10,8 +10,8 @@ R : variance of that flow
 
 The paper takes Z to be one number.  Here it falls where a frame is locally sharper than usual, which is the idea of
 lucky imaging inside the Kalman gain, and rises where the flow folds.  Which frames are sharp is read from their local
-gradients, or from the spectra of their tiles (:mod:`turbrestore.blur_moments.cues`); later frames are held against the
-spectra of the first ones, so that none of them has to be kept.
+gradients, or from the spectra of their tiles (:mod:`turbrestore.blur_moments.frame_blur`); later frames are held
+against the spectra of the first ones, so that none of them has to be kept.
 """
 
 from __future__ import annotations
@@ -22,15 +22,8 @@ import cv2
 import numpy as np
 
 from .arrays import FloatArray, luminance
-from .blur_moments.cues import (
-    BlurReference,
-    FusionRule,
-    blur_against,
-    fusion_rule,
-    laplacian_energy,
-    noise_factor,
-    refer_blur,
-)
+from .blur_moments.frame_blur import BlurReference, blur_against, refer_blur
+from .blur_moments.fusion import FusionRule, fusion_rule, laplacian_energy, noise_factor
 from .parallel import map_ahead
 from .warp import warp
 

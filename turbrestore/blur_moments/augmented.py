@@ -45,7 +45,7 @@ class Oscillator:
     Raises
     ------
     ConfigurationError
-        A number is not above 0: without damping the system is unstable.
+        A number is not above 0.
 
     Examples
     --------

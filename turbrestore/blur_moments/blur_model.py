@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ..errors import require
 from ..kalman import Gaussian
 from .exposure_table import ExposureTable, tabulate
 from .kernels import Float64Array
@@ -107,6 +108,11 @@ def predicted_moments(
     H : ndarray, float64, shape (..., m, n)
     R : ndarray, float64, shape (m, m) or (..., m, m)
 
+    Raises
+    ------
+    ConfigurationError
+        As many moments as pixels: R would be singular.
+
     Examples
     --------
     >>> import numpy as np
@@ -121,6 +127,8 @@ def predicted_moments(
            [0.5 ]]))
     """
     sensor, order, chosen = model.sensor, max(orders), list(orders)
+    count = sensor.pixels.count
+    require(order < count, f"orders: expected below the number of pixels, {count}, found {order} (singular R)")
     path, slopes = model.motion.path_and_jacobian(mean, inputs)
     image = None
     if table is None:

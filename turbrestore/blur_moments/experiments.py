@@ -133,7 +133,8 @@ def mirror(seeds: Sequence[int], params: MirrorParams | None = None) -> Experime
     Experiment
         The error is the root mean square error of the output within the exposure. O1 is a Luenberger observer on the
         first moment with the Kalman gain, O2 uses moments 1 and 2, O3 predicts the image; ``augmented`` estimates gain,
-        frequency and damping as well. Bounds are for the known plant.
+        frequency and damping as well; of 200 runs with an unknown plant about three settle on a wrong one, which
+        their innovations show. Bounds are for the known plant.
 
     Raises
     ------

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import require
 from .kernels import Float64Array, line_response, line_slope
 from .sensor import LineSensor
 
@@ -20,6 +21,8 @@ _FINENESS = 6
 _REACH = 6
 # Pixels in one matrix product; fewer waste less on positions out of reach, more use the processor better.
 _BLOCK = 16
+# Entries beyond which a table takes more memory than it is worth: 160 MB.
+_LARGEST = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +129,7 @@ def tabulate(sensor: LineSensor) -> ExposureTable:
     Raises
     ------
     ConfigurationError
-        Delta kernel.
+        Delta kernel, or one so narrow that its table would not fit in memory.
 
     Examples
     --------
@@ -149,7 +152,12 @@ def tabulate(sensor: LineSensor) -> ExposureTable:
     if step == 0:
         # The slope names the cause.
         line_slope(kernel, np.zeros(1), pixels)
-    count = int(np.ceil((pixels.stop - low + pixels.width - first) / step)) + 2
+    span = (pixels.stop - low + pixels.width - first) / step
+    require(
+        span * pixels.count <= _LARGEST,
+        f"kernel: expected one wide enough for a table, found {span:.2g} positions for {pixels.count} pixels",
+    )
+    count = int(np.ceil(span)) + 2
     distance = pixels.centres - (first + step * np.arange(count))[:, None]
     response = sensor.total * line_response(kernel, distance, pixels)
     slope = -sensor.total * line_slope(kernel, distance, pixels)

@@ -91,8 +91,9 @@ def draw_mirror(experiment: Experiment) -> bytes:
     Returns
     -------
     bytes
-        PNG: overview with the exposures shaded; one slow step; error at the instants of correction; error over the
-        slow steps.
+        PNG: overview with the exposures shaded; the slow step in which the error of O1 is the median; error at the
+        start of the exposures; error over the slow steps. Estimates are those that know the frame of their own slow
+        step, which is there only after the readout.
 
     Raises
     ------
@@ -102,20 +103,21 @@ def draw_mirror(experiment: Experiment) -> bytes:
     figure, panels = _four_panels("Steered mirror: output y, first seed")
     t, steps, exposed = _times(experiment), experiment.timing.frame_steps, experiment.timing.exposure_steps
     shown = min(int(_OVERVIEW / experiment.timing.fast_period), t.size)
-    middle = len(experiment.truth) // 2
-    for panel, part in ((panels[0], slice(0, shown)), (panels[1], slice(middle * steps, (middle + 1) * steps))):
+    size = np.linalg.norm(experiment.estimates["O1"] - experiment.truth, axis=1)
+    typical = int(np.argsort(size)[len(size) // 2])
+    for panel, part in ((panels[0], slice(0, shown)), (panels[1], slice(typical * steps, (typical + 1) * steps))):
         panel.plot(t[part], experiment.truth.ravel()[part], "k", label="truth")
         for name in ("O1", "O2", "O3"):
             panel.plot(t[part], experiment.estimates[name].ravel()[part], **_style(name))
         for start in range(part.start, part.stop, steps):
             panel.axvspan(t[start], t[min(start + exposed, t.size - 1)], color="0.9", zorder=0)
     _label(panels[0], "Figure 4: overview, exposures shaded", "time, s", "y")
-    _label(panels[1], "Figure 5: one slow step", "time, s", "y")
+    _label(panels[1], f"Figure 5: slow step {typical}", "time, s", "y")
     for name in ("O1", "O2", "O3"):
         away = np.abs(experiment.estimates[name] - experiment.truth)
         panels[2].plot(away[:, 0], **_style(name))
         panels[3].plot(np.sqrt((away**2).sum(1)), **_style(name))
-    _label(panels[2], "Figure 6: error at the instants of correction", "frame", "|ŷ − y|")
+    _label(panels[2], "Figure 6: error at the start of the exposures", "frame", "|ŷ − y|")
     _label(panels[3], "Figure 7: error over the slow step", "frame", "‖ŷ − y‖₂")
     return _png(figure)
 
@@ -137,10 +139,11 @@ def _style(name: str) -> dict[str, Any]:
 
 
 def _label(panel: Any, title: str, x: str, y: str) -> None:
-    panel.set_title(title, fontsize=10)
+    panel.set_title(title, fontsize=10, loc="left")
     panel.set_xlabel(x)
     panel.set_ylabel(y)
-    panel.legend(fontsize=8, loc="upper right")
+    # Beside the title nothing is covered.
+    panel.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False, handlelength=1.5)
 
 
 def _png(figure: Any) -> bytes:

@@ -31,7 +31,7 @@ from ..kalman import Gaussian, Innovation, update_information
 from .blur_model import BlurModel
 from .exposure_table import ExposureTable
 from .kernels import Float64Array
-from .lifted import check_inputs
+from .lifted import check_inputs, check_state
 from .sensor import noise_variance
 
 NORMS = ("map", "two", "infinity")
@@ -126,6 +126,7 @@ class _Task:
     def __init__(self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike, norm: str) -> None:
         sensor = model.sensor
         n, pixels = model.motion.order, sensor.pixels.count
+        check_state(state, n)
         self.start = state.mean.reshape(-1, n)
         batch = len(self.start)
         self.cov = np.broadcast_to(state.cov, (*state.mean.shape, n)).reshape(-1, n, n)

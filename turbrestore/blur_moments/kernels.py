@@ -140,7 +140,7 @@ def gaussian_kernel(width: ArrayLike, offset: ArrayLike = 0.0) -> Kernel:
     Raises
     ------
     ConfigurationError
-        Negative or not finite width, or a matrix that is no covariance.
+        Negative or not finite width, a matrix that is no covariance, or an offset that does not go with it.
 
     Examples
     --------
@@ -161,8 +161,7 @@ def gaussian_kernel(width: ArrayLike, offset: ArrayLike = 0.0) -> Kernel:
         bool(np.allclose(cov, cov.T)) and bool((eigenvalues >= 0).all()),
         f"width: expected a symmetric covariance without negative eigenvalues, found {values.tolist()}",
     )
-    centre = np.broadcast_to(np.asarray(offset, np.float64), (len(cov),)).copy()
-    return Kernel(centre, cov)
+    return Kernel(_per_axis("offset", offset, len(cov)), cov)
 
 
 def sampled_kernel(values: ArrayLike, spacing: ArrayLike, first: ArrayLike) -> Kernel:
@@ -188,7 +187,7 @@ def sampled_kernel(values: ArrayLike, spacing: ArrayLike, first: ArrayLike) -> K
     DataError
         Not finite, or no light in the samples.
     ConfigurationError
-        A spacing is not positive.
+        A spacing is not positive, or spacing or position do not go with the samples.
 
     Examples
     --------
@@ -198,13 +197,14 @@ def sampled_kernel(values: ArrayLike, spacing: ArrayLike, first: ArrayLike) -> K
     samples = np.asarray(values, np.float64)
     if samples.ndim not in (1, 2) or samples.size == 0 or not np.isfinite(samples).all():
         raise DataError(f"values: expected finite samples of shape (n,) or (h, w), found shape {samples.shape}")
-    step = np.broadcast_to(np.asarray(spacing, np.float64), (samples.ndim,)).copy()
+    step = _per_axis("spacing", spacing, samples.ndim)
     require(bool((step > 0).all()), f"spacing: expected distances above 0, found {step.tolist()}")
     total = samples.sum() * step.prod()
     if total <= 0:
         raise DataError(f"values: expected a kernel with light, found a total intensity of {total:g}")
-    origin = np.broadcast_to(np.asarray(first, np.float64), (samples.ndim,)).copy()
-    return Kernel(origin, np.zeros((samples.ndim, samples.ndim)), samples / total, step)
+    return Kernel(
+        _per_axis("first", first, samples.ndim), np.zeros((samples.ndim, samples.ndim)), samples / total, step
+    )
 
 
 def kernel_from_still(
@@ -376,6 +376,16 @@ def check_kernel(kernel: Kernel, dimensions: int) -> None:
     """
     if kernel.dimensions != dimensions:
         raise ConfigurationError(f"kernel: expected one of {dimensions} dimensions, found {kernel.dimensions}")
+
+
+def _per_axis(name: str, values: ArrayLike, dimensions: int) -> Float64Array:
+    """One finite number for every axis; a single one goes for all."""
+    numbers = np.asarray(values, np.float64)
+    require(
+        numbers.shape in ((), (1,), (dimensions,)) and bool(np.isfinite(numbers).all()),
+        f"{name}: expected {dimensions} finite numbers, found {numbers.tolist()}",
+    )
+    return np.broadcast_to(numbers, (dimensions,)).copy()
 
 
 def _nodes(kernel: Kernel) -> Float64Array:

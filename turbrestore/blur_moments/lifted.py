@@ -73,11 +73,11 @@ class FastSystem:
         B, C = np.atleast_1d(B.squeeze()), np.atleast_1d(C.squeeze())
         n = len(B)
         require(
-            A.shape == (n, n) and C.shape == (n,),
-            f"system: expected shapes (n, n), (n,) and (n,), found {A.shape}, {B.shape} and {C.shape}",
+            n >= 1 and A.shape == (n, n) and C.shape == (n,),
+            f"system: expected shapes (n, n), (n,) and (n,), n of at least 1, found {A.shape}, {B.shape} and {C.shape}",
         )
         require(
-            bool(np.isfinite(A).all() and np.isfinite(B).all() and np.isfinite(C).all()),
+            all(bool(np.isfinite(matrix).all()) for matrix in (A, B, C, self.D)),
             "system: expected finite matrices, found NaN or infinite values",
         )
         radius = float(np.abs(np.linalg.eigvals(A)).max())
@@ -230,7 +230,7 @@ def discretise(A: ArrayLike, B: ArrayLike, period: float) -> tuple[Float64Array,
     Raises
     ------
     ConfigurationError
-        The period is not positive, or shapes do not agree.
+        The period is not positive, shapes do not agree, or values are not finite.
 
     Examples
     --------
@@ -239,10 +239,11 @@ def discretise(A: ArrayLike, B: ArrayLike, period: float) -> tuple[Float64Array,
     array([[ 1.    ,  0.001 ],
            [-0.0197,  0.9704]])
     """
-    A, B = np.asarray(A, np.float64), np.asarray(B, np.float64)
+    A, B = np.asarray(A, np.float64), np.atleast_1d(np.asarray(B, np.float64))
     require(0 < period < np.inf, f"period: expected a time above 0 s, found {period:g}")
     n = len(B)
     require(B.shape == (n,) and A.shape == (n, n), f"system: expected shapes (n, n), (n,), found {A.shape}, {B.shape}")
+    require(bool(np.isfinite(A).all() and np.isfinite(B).all()), "system: expected finite matrices, found others")
     joint = np.zeros((n + 1, n + 1))
     joint[:n, :n], joint[:n, n] = A, B
     held = expm(joint * period)
@@ -373,3 +374,26 @@ def check_inputs(inputs: ArrayLike, steps: int) -> Float64Array:
     if values.ndim < 1 or values.shape[-1] != steps or not np.isfinite(values).all():
         raise DataError(f"input: expected finite values of shape (..., {steps}), found shape {values.shape}")
     return values
+
+
+def check_state(state: Gaussian, order: int) -> None:
+    """Raise unless a state has as many components as the motion.
+
+    Parameters
+    ----------
+    state : Gaussian
+        Shape (..., n).
+    order : int
+        n.
+
+    Raises
+    ------
+    DataError
+        Another number of components.
+
+    Examples
+    --------
+    >>> check_state(Gaussian(np.zeros(2), np.eye(2)), 2)
+    """
+    if state.mean.shape[-1] != order:
+        raise DataError(f"state: expected a mean of shape (..., {order}), found {state.mean.shape}")

@@ -37,8 +37,8 @@ from ..kalman import Gaussian, Innovation, predict, update
 from .blur_model import BlurModel, predicted_moments
 from .exposure_table import ExposureTable
 from .kernels import Float64Array
-from .lifted import LiftedSystem, check_inputs
-from .moments import image_moments, moment_noise
+from .lifted import LiftedSystem, check_inputs, check_state
+from .moments import BASES, image_moments, moment_noise
 
 METHODS = ("extended", "iterated", "unscented")
 
@@ -97,7 +97,11 @@ class FixedGain:
         ------
         DataError
             Shapes do not agree or values are not finite.
+        ConfigurationError
+            The gain belongs to another system.
         """
+        order, size = model.motion.order, np.shape(self.gain)
+        require(size == (order,), f"gain: expected shape {(order,)}, found {size}")
         measured, expected, H, R = _moment_terms(model, state, frame, inputs, (1,), "monomial", None)
         # The covariances of the innovation are those of the Kalman update; only the gain differs.
         _, innovation = update(state, measured, H, R, expected)
@@ -145,9 +149,8 @@ class MomentFilter:
     def __post_init__(self) -> None:
         ascending = all(a < b for a, b in zip((0, *self.orders), self.orders, strict=False))
         require(bool(self.orders) and ascending, f"orders: expected ascending orders from 1, found {self.orders}")
-        require(self.basis in ("monomial", "legendre"), f"basis: expected monomial or legendre, found {self.basis!r}")
-        if self.method not in METHODS:
-            raise ConfigurationError(f"method: expected one of {', '.join(METHODS)}, found {self.method!r}")
+        require(self.basis in BASES, f"basis: expected one of {', '.join(BASES)}, found {self.basis!r}")
+        require(self.method in METHODS, f"method: expected one of {', '.join(METHODS)}, found {self.method!r}")
         require(self.iterations >= 1, f"iterations: expected at least 1, found {self.iterations}")
 
     def step(
@@ -347,6 +350,7 @@ def _moment_terms(
     table: ExposureTable | None,
 ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
     """Measured and expected moments, H and R at the prediction."""
+    check_state(state, model.motion.order)
     held = check_inputs(inputs, model.motion.timing.frame_steps)
     expected, H, R = predicted_moments(model, state.mean, held, orders, basis, table)
     return _measured(model, frame, orders, basis), expected, H, R
@@ -362,6 +366,7 @@ def _sigma_point_terms(
     table: ExposureTable | None,
 ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
     """Statistical linearisation: the regression of the moments on sigma points; what it leaves goes into R."""
+    check_state(state, model.motion.order)
     held = check_inputs(inputs, model.motion.timing.frame_steps)
     n = model.motion.order
     # n + κ = 3 fits the fourth moments of a Gaussian; κ stays non-negative, so that no weight is.

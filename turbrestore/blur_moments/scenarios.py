@@ -32,8 +32,14 @@ from .sensor import ExposureTiming, LineSensor
 from .trials import Recording, simulate
 
 
-def _check_lengths(frames: int, burn_in: int) -> None:
-    require(frames > burn_in >= 0, f"frames: expected more than the burn-in of {burn_in}, found {frames}")
+def _check_common(params: WavefrontParams | MirrorParams) -> None:
+    burn_in = params.burn_in
+    require(params.frames > burn_in >= 0, f"frames: expected more than the burn-in of {burn_in}, found {params.frames}")
+    # The covariance of the noise of orders 0 to 4 is singular with fewer.
+    require(params.pixels >= 5, f"pixels: expected at least 5, found {params.pixels}")
+    require_between("noise", params.noise, 1e-15, 1e6)
+    require_between("kernel_width", params.kernel_width, 1e-3, 1e3)
+    require_between("amplitude", params.amplitude, 0, 1e6)
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,9 @@ class WavefrontParams:
     high_tone: float = 0.35
 
     def __post_init__(self) -> None:
-        _check_lengths(self.frames, self.burn_in)
+        _check_common(self)
+        for name in ("low_tone", "high_tone"):
+            require_between(name, getattr(self, name), 0, 500, "Hz")
         for name in ("slope_disturbance", "rate_disturbance"):
             require_between(name, getattr(self, name), 1e-9, 1e3)
 
@@ -132,7 +140,7 @@ class MirrorParams:
     deviation: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_lengths(self.frames, self.burn_in)
+        _check_common(self)
         require_between("deviation", self.deviation, 0, 7, "dB")
         for name in ("output_disturbance", "rate_disturbance"):
             require_between(name, getattr(self, name), 1e-9, 1e6)

@@ -51,8 +51,8 @@ class ExposureTiming:
     Raises
     ------
     ConfigurationError
-        A time is not positive, the period is shorter than exposure and readout, or is no whole number of fast
-        steps.
+        A time is not positive, the period is shorter than exposure and readout, a time is no whole number of fast
+        steps, or the exposure is shorter than one.
 
     Examples
     --------
@@ -85,6 +85,10 @@ class ExposureTiming:
         object.__setattr__(self, "frame_steps", self._steps("frame_period"))
         object.__setattr__(self, "exposure_steps", self._steps("exposure"))
         object.__setattr__(self, "trigger_steps", self._steps("trigger"))
+        require(
+            self.exposure_steps >= 1,
+            f"exposure: expected at least one fast period of {self.fast_period:g} s, found {self.exposure:g} s",
+        )
 
     def _steps(self, name: str) -> int:
         """Whole number of fast steps in one of the times."""

@@ -3,27 +3,12 @@
 A moving target leaves a streak.  Its centroid says where it was on average, its second moments how far it moved
 during the exposure, and a model of the motion joins the two from frame to frame.
 
-Symbols (paper 1, sections III to V, for two outputs)
------------------------------------------------------
-x, y : outputs, columns and rows, pixels; pixel centres at whole numbers.
-z : state, that of x followed by that of y.
-f_i : derivative of an output with respect to the state at fast step i of the exposure.
-h(z) : moments of the frame, of the orders (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), Legendre or monomial.
-H, M : derivative of h, and second derivatives, ``M = 2/N_e Σ f_i f_iᵀ`` for the second moments.
-V, R : density of the pixel noise, covariance of the moments' noise.
-Σ_Ψ : second moments of the still target.
-
-Departures from the papers
---------------------------
-The papers use one axis; here the mixed moment (1, 1) joins two, which is what tells a streak along one diagonal from
-one along the other.  Paths are linear in the state and the moments of order 2 quadratic, so mean and variance of
-the predicted moments are exact: ``h(ẑ) + ½ tr M P`` and ``H P Hᵀ + ½ tr M P M P``.  The extended filter of the papers
-leaves the traces out, which matters as long as the velocity is unknown.
+The motions are in :mod:`.target_motion`, the filter on the moments of the plane in :mod:`.plane_filter`.  x counts
+columns and y rows, both in pixels, with pixel centres at whole numbers.
 """
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -33,15 +18,13 @@ from scipy.optimize import minimize_scalar
 
 from ..arrays import check_frames, luminance
 from ..errors import ConfigurationError, DataError, require, require_between
-from ..kalman import Gaussian, Innovation, update
-from .kernels import Float64Array, Kernel, PixelGrid, check_kernel, gaussian_kernel
-from .lifted import FastSystem, LiftedSystem, lift
-from .moment_algebra import compose_moments, plane_kernel_moments
-from .moments import BASES, basis_change, basis_functions, plane_moments, total_intensity
+from ..kalman import Gaussian, Innovation
+from .kernels import Float64Array, PixelGrid, gaussian_kernel
+from .moments import plane_moments, total_intensity
+from .plane_filter import PlaneModel, PlaneMomentFilter, PlaneSensor
 from .sensor import ExposureTiming
+from .target_motion import Oscillation, RandomWalk, TargetMotion, lift_motion
 
-# (p, q) of the moments, x^p y^q; the path has one more, that of order 0.
-_ORDERS = {1: ((1, 0), (0, 1)), 2: ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))}
 # Pixels along the border of the window that are taken to be background.
 _RIM = 2
 # Times the noise above which a pixel counts as light when the window is placed.
@@ -52,112 +35,6 @@ _FINENESS, _MOST_TRIED = 2.0, 400
 _PLACED, _PLACINGS, _SMALLEST = 1.0, 8, 2 * _RIM + 3
 # Smallest noise as a share of the brightest pixel.
 _LEAST_NOISE = 1e-5
-
-
-@dataclass(frozen=True)
-class RandomWalk:
-    """A target that wanders.
-
-    Parameters
-    ----------
-    diffusion : float
-        Growth of the variance of each coordinate, squared pixels per second.
-    """
-
-    diffusion: float
-
-    def __post_init__(self) -> None:
-        _check_positive("diffusion", self.diffusion)
-
-    def dynamics(self) -> tuple[Float64Array, Float64Array]:
-        """Position only."""
-        return np.zeros((1, 1)), np.array([[self.diffusion]])
-
-    def prior(self, step: float, frame_period: float) -> Float64Array:
-        """Around the first centroid."""
-        return np.array([[step**2]])
-
-    def smear(self, exposure: float) -> float:
-        """Return a sixth of the variance gained: that of a Brownian path about its own mean."""
-        return self.diffusion * exposure / 6
-
-
-@dataclass(frozen=True)
-class ConstantVelocity:
-    """A target that moves on, with small changes of its velocity.
-
-    Parameters
-    ----------
-    acceleration : float
-        Growth of the variance of each velocity, pixels² per second³.
-    """
-
-    acceleration: float
-
-    def __post_init__(self) -> None:
-        _check_positive("acceleration", self.acceleration)
-
-    def dynamics(self) -> tuple[Float64Array, Float64Array]:
-        """Position and velocity."""
-        return np.array([[0.0, 1.0], [0.0, 0.0]]), np.diag([0.0, self.acceleration])
-
-    def prior(self, step: float, frame_period: float) -> Float64Array:
-        """Any velocity that the displacements allow."""
-        return np.diag([step**2, (2 * step / frame_period) ** 2])
-
-    def smear(self, exposure: float) -> float:
-        """Return 0: nothing worth mentioning."""
-        return 0.0
-
-
-@dataclass(frozen=True)
-class Oscillation:
-    """A target that vibrates about a centre, which may drift.
-
-    Parameters
-    ----------
-    frequency : float
-        Hz; with ``highest`` the lower end of the range to search.
-    damping : float
-        Damping ratio, 0 to below 1.
-    drive : float
-        Growth of the variance of each velocity by the random force, pixels² per second³.
-    drift : float
-        Growth of the variance of the centre, squared pixels per second.
-    highest : float, optional
-        Upper end of the range: the most likely frequency in it is used. Above half the frame rate centroids repeat
-        themselves; the second moments tell the repetitions apart.
-    """
-
-    frequency: float
-    damping: float
-    drive: float
-    drift: float = 1e-4
-    highest: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_positive("frequency", self.frequency)
-        _check_positive("drive", self.drive)
-        _check_positive("drift", self.drift)
-        require(0 <= self.damping < 1, f"damping: expected 0 to below 1, found {self.damping}")
-        require(
-            self.highest is None or self.frequency < self.highest < np.inf,
-            f"highest: expected a frequency above {self.frequency:g} Hz, found {self.highest}",
-        )
-
-    def dynamics(self) -> tuple[Float64Array, Float64Array]:
-        """Position, velocity and centre."""
-        omega = 2 * np.pi * self.frequency
-        A = np.array([[0.0, 1.0, 0.0], [-(omega**2), -2 * self.damping * omega, omega**2], [0.0, 0.0, 0.0]])
-        return A, np.diag([0.0, self.drive, self.drift])
-
-    def prior(self, step: float, frame_period: float) -> Float64Array:
-        """Anywhere in an oscillation of the size of the displacements."""
-        return np.diag([step**2, (2 * np.pi * self.frequency * step) ** 2, step**2])
-
-    def smear(self, exposure: float) -> float:
-        """Return 0: nothing worth mentioning."""
-        return 0.0
 
 
 @dataclass(frozen=True)
@@ -188,11 +65,12 @@ class TrackParams:
 
     Examples
     --------
+    >>> from turbrestore.blur_moments.target_motion import ConstantVelocity
     >>> TrackParams(ConstantVelocity(0.1), sigma=1.2).timing().exposure_steps
     16
     """
 
-    motion: RandomWalk | ConstantVelocity | Oscillation
+    motion: TargetMotion
     sigma: float
     exposure: float = 1.0
     frame_period: float = 1.0
@@ -201,207 +79,16 @@ class TrackParams:
     basis: str = "legendre"
 
     def __post_init__(self) -> None:
-        _check_positive("frame_period", self.frame_period)
+        require(0 < self.frame_period < np.inf, f"frame_period: expected a number above 0, found {self.frame_period}")
         require_between("sigma", self.sigma, 0, 1000, "pixels")
         require_between("steps", self.steps, 2, 10000)
-        require(self.order in _ORDERS, f"order: expected 1 or 2, found {self.order}")
-        require(self.basis in BASES, f"basis: expected one of {', '.join(BASES)}, found {self.basis!r}")
+        PlaneMomentFilter(self.order, self.basis)
         self.timing()
 
     def timing(self) -> ExposureTiming:
         """Return the timing of the camera."""
         period = self.frame_period
         return ExposureTiming(period / self.steps, self.exposure * period, 0.0, period)
-
-
-@dataclass(frozen=True, eq=False)
-class PlaneSensor:
-    """Pixels in the plane that watch one target.
-
-    Parameters
-    ----------
-    kernel : Kernel
-        Of the plane.
-    columns, rows : PixelGrid
-    noise : float
-        V, density of the white noise, above 0.
-    total : float
-        Total intensity of an exposure, known.
-
-    Raises
-    ------
-    ConfigurationError
-        Kernel of a line; noise or total not above 0.
-
-    Examples
-    --------
-    >>> PlaneSensor(gaussian_kernel([1.0, 1.0]), PixelGrid(-8, 8, 16), PixelGrid(-8, 8, 16), noise=0.01).total
-    1.0
-    """
-
-    kernel: Kernel
-    columns: PixelGrid
-    rows: PixelGrid
-    noise: float
-    total: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_kernel(self.kernel, 2)
-        require(0 < self.noise < np.inf, f"noise: expected a density above 0, found {self.noise:g} (singular R)")
-        require(0 < self.total < np.inf, f"total: expected an intensity above 0, found {self.total:g}")
-
-
-@dataclass(frozen=True, eq=False)
-class PlaneModel:
-    """Two linear motions, one for each axis, and the sensor that watches them.
-
-    Parameters
-    ----------
-    along_x, along_y : LiftedSystem
-    sensor : PlaneSensor
-    centre : tuple of two floats
-        Where x = y = 0 of the sensor lies.
-    """
-
-    along_x: LiftedSystem
-    along_y: LiftedSystem
-    sensor: PlaneSensor
-    centre: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def motion(self) -> PlaneModel:
-        """Itself: what :func:`~turbrestore.blur_moments.observers.run_observer` asks for timing and advance."""
-        return self
-
-    @property
-    def timing(self) -> ExposureTiming:
-        """When the sensor looks."""
-        return self.along_x.timing
-
-    def advance(self, state: Gaussian, inputs: Float64Array | None = None) -> Gaussian:
-        """From the start of an exposure to the start of the next.
-
-        Parameters
-        ----------
-        state : Gaussian
-            Shape (n,).
-        inputs : None
-            Not used: noise alone drives targets.
-
-        Returns
-        -------
-        Gaussian
-        """
-        A = block_diag(self.along_x.A, self.along_y.A)
-        return Gaussian(A @ state.mean, A @ state.cov @ A.T + block_diag(self.along_x.Q, self.along_y.Q))
-
-    def outputs(self, steps: int) -> Float64Array:
-        """Differentiate (x, y) with respect to the state at the first fast steps.
-
-        Parameters
-        ----------
-        steps : int
-
-        Returns
-        -------
-        ndarray, float64, shape (steps, 2, n)
-        """
-        n = self.along_x.order
-        result = np.zeros((steps, 2, n + self.along_y.order))
-        result[:, 0, :n] = self.along_x.free[:steps]
-        result[:, 1, n:] = self.along_y.free[:steps]
-        return result
-
-
-@dataclass(frozen=True)
-class PlaneMomentFilter:
-    """Kalman filter on the moments of a frame of the plane, exact in the mean and variance of the moments.
-
-    Parameters
-    ----------
-    order : {1, 2}
-        Highest order: 1 is the linear Kalman filter on centroids.
-    basis : {"legendre", "monomial"}
-
-    Raises
-    ------
-    ConfigurationError
-        Unknown order or basis.
-
-    Examples
-    --------
-    >>> PlaneMomentFilter().order
-    2
-    """
-
-    order: int = 2
-    basis: str = "legendre"
-
-    def __post_init__(self) -> None:
-        require(self.order in _ORDERS, f"order: expected 1 or 2, found {self.order}")
-        require(self.basis in BASES, f"basis: expected one of {', '.join(BASES)}, found {self.basis!r}")
-
-    def step(
-        self, model: PlaneModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike | None = None
-    ) -> tuple[Gaussian, Innovation]:
-        """Correct the state at the start of an exposure by its frame.
-
-        Parameters
-        ----------
-        model : PlaneModel
-        state : Gaussian
-            Prediction, shape (n,).
-        frame : array_like, shape (rows, columns)
-            Without background.
-        inputs : None
-            Taken for the sake of the common interface: targets are driven by noise alone.
-
-        Returns
-        -------
-        state : Gaussian
-        innovation : Innovation
-
-        Raises
-        ------
-        DataError
-            Shapes do not agree or values are not finite.
-        """
-        measure, _, R = _moment_tables(model.sensor, self.order, self.basis)
-        image = np.asarray(frame, np.float64)
-        shape = (model.sensor.rows.count, model.sensor.columns.count)
-        if image.shape != shape or not np.isfinite(image).all():
-            raise DataError(f"frame: expected finite values of shape {shape}, found shape {image.shape}")
-        expected, H, spread = self.predicted(model, state)
-        return update(state, measure @ image.ravel(), H, R + spread, expected)
-
-    def predicted(self, model: PlaneModel, state: Gaussian) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Mean of the moments, their derivative, and the covariance that their curvature adds.
-
-        Parameters
-        ----------
-        model : PlaneModel
-        state : Gaussian
-            Shape (n,).
-
-        Returns
-        -------
-        mean : ndarray, float64, shape (m,)
-        H : ndarray, float64, shape (m, n)
-        spread : ndarray, float64, shape (m, m)
-        """
-        _, of_path, _ = _moment_tables(model.sensor, self.order, self.basis)
-        f = model.outputs(model.timing.exposure_steps)
-        x, y = (f @ state.mean - np.asarray(model.centre)).T
-        fx, fy = f[:, 0], f[:, 1]
-        steps, n = len(f), len(state.mean)
-        raw = np.array([1.0, x.mean(), y.mean(), x @ x / steps, x @ y / steps, y @ y / steps])
-        derivatives = [np.zeros(n), fx.sum(0), fy.sum(0), 2 * x @ fx, x @ fy + y @ fx, 2 * y @ fy]
-        slope = np.stack(derivatives) / steps
-        mixed = fx.T @ fy
-        MP = np.stack([2 * fx.T @ fx, mixed + mixed.T, 2 * fy.T @ fy]) / steps @ state.cov
-        raw[3:] += np.trace(MP, axis1=1, axis2=2) / 2
-        curved = of_path[:, 3:]
-        return of_path @ raw, of_path @ slope, curved @ (np.einsum("iab,jba->ij", MP, MP) / 2) @ curved.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -499,6 +186,7 @@ def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackP
     --------
     >>> import numpy as np
     >>> from turbrestore.blur_moments.sensor import expose_plane
+    >>> from turbrestore.blur_moments.target_motion import ConstantVelocity
     >>> pixels = PixelGrid(-0.5, 47.5, 48)
     >>> path = 10 + 2.0 * (np.arange(160) + 0.5).reshape(10, 16, 1) / 16 * np.ones(2)
     >>> rng = np.random.default_rng(0)
@@ -535,56 +223,6 @@ def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackP
     )
 
 
-def lift_motion(params: TrackParams) -> LiftedSystem:
-    """Motion of one axis at the rate of the frames.
-
-    The output is taken in the middle of the fast steps, and the random force of a frame period enters at its end,
-    with the covariance ``∫ expm(A t) q expm(Aᵀ t) dt`` (Van Loan 1978).
-
-    Parameters
-    ----------
-    params : TrackParams
-
-    Returns
-    -------
-    LiftedSystem
-
-    Raises
-    ------
-    ConfigurationError
-        The frames cannot show the state: an oscillation at a multiple of half the frame rate.
-
-    Examples
-    --------
-    >>> lift_motion(TrackParams(ConstantVelocity(3.0), sigma=1.0)).Q.round(6).tolist()
-    [[1.0, 1.5], [1.5, 3.0]]
-    """
-    timing = params.timing()
-    A, intensity = params.motion.dynamics()
-    n = len(A)
-    joint = expm(np.block([[-A, intensity], [np.zeros((n, n)), A.T]]) * timing.frame_period)
-    Q = joint[n:, n:].T @ joint[:n, n:]
-    fast = FastSystem(expm(A * timing.fast_period), np.zeros(n), expm(A * timing.fast_period / 2)[0])
-    return lift(fast, timing, 0.5 * (Q + Q.T))
-
-
-@functools.lru_cache(maxsize=8)
-def _moment_tables(sensor: PlaneSensor, order: int, basis: str) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Matrices from pixels to moments, from raw moments of the path to moments, and covariance R of their noise."""
-    grids = (sensor.columns, sensor.rows)
-    p, q = np.transpose(_ORDERS[order])
-    along_x, along_y = (basis_functions(grid, order, basis) for grid in grids)
-    cell = sensor.columns.width * sensor.rows.width
-    measure = (along_y.T[q][:, :, None] * along_x.T[p][:, None, :]).reshape(len(p), -1) * cell / sensor.total
-    raw = np.zeros((6, 3, 3))
-    for index, entry in enumerate(((0, 0), *_ORDERS[2])):
-        raw[index][entry] = 1.0
-    kernel = plane_kernel_moments(sensor.kernel, 2, *grids)
-    change = [basis_change(grid, 2, basis) for grid in grids]
-    of_path = (change[0] @ compose_moments(raw, kernel, dimensions=2) @ change[1].T)[:, p, q].T
-    return measure, of_path, sensor.noise / cell * measure @ measure.T
-
-
 def _run(windows: _Windows, params: TrackParams) -> tuple[tuple[Gaussian, ...], tuple[Innovation, ...]]:
     """States at the start of the exposures, after their frames."""
     # Where a random walk went within an exposure says nothing of where it was.
@@ -592,6 +230,7 @@ def _run(windows: _Windows, params: TrackParams) -> tuple[tuple[Gaussian, ...], 
     model, observer = _model(windows, params), PlaneMomentFilter(order, params.basis)
     state = _start(windows, params)
     states, innovations = [], []
+    # The window moves with the target, so that every frame has a model of its own.
     for image, centre in zip(windows.images, windows.centres, strict=True):
         state, innovation = observer.step(replace(model, centre=tuple(centre)), state, image)
         states.append(state)
@@ -601,7 +240,7 @@ def _run(windows: _Windows, params: TrackParams) -> tuple[tuple[Gaussian, ...], 
 
 
 def _model(windows: _Windows, params: TrackParams) -> PlaneModel:
-    motion = lift_motion(params)
+    motion = lift_motion(params.motion, params.timing())
     sigma = np.sqrt(params.sigma**2 + params.motion.smear(motion.timing.exposure))
     sensor = PlaneSensor(
         gaussian_kernel([sigma, sigma]), windows.columns, windows.rows, windows.noise**2, windows.total
@@ -716,7 +355,3 @@ def _check_roi(roi: tuple[int, int, int, int], shape: tuple[int, ...]) -> tuple[
     inside = 0 <= left <= shape[1] - width and 0 <= top <= shape[0] - height
     require(inside, f"roi: expected a window inside {shape[1]}×{shape[0]} pixels, found {tuple(roi)}")
     return left, top, width, height
-
-
-def _check_positive(name: str, value: float) -> None:
-    require(0 < value < np.inf, f"{name}: expected a number above 0, found {value}")

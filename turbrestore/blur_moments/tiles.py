@@ -1,0 +1,316 @@
+"""Power spectra of windowed tiles: where the tiles lie, what noise adds to the spectra, how the window smears them.
+
+Symbols
+-------
+P, n : power spectrum of a tile and its noise floor, squared intensity.
+k : frequency, radians per pixel; δ² : variance per axis by which the window smears a spectrum.
+D : difference of two blurs, squared pixels.
+β, v : what a smooth spectrum is taken to be, ``log P = a − β log k − v k²``.
+
+A ring holds the frequencies of about one length |k|, a cell is a ring or the part of it in a range of directions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
+
+from ..arrays import FloatArray
+from ..errors import DataError, require, require_between
+
+Float64Array = NDArray[np.float64]
+
+# Neighbouring values of the spectrum of a tile under a Hann window are correlated: power by 4/9 and 1/36 per axis.
+CORRELATED = 1 + 2 * (4 / 9 + 1 / 36)
+# Noise below this drowns in the rounding of float32, intensity.
+_LEAST_NOISE = 1e-6
+
+
+@dataclass(frozen=True)
+class CueParams:
+    """How spectra are compared.
+
+    Parameters
+    ----------
+    tile : int
+        Side of the square tiles, pixels; half of it is the distance between them.  Images smaller than a tile are
+        one tile.
+    lowest : float
+        Lowest frequency that is used, periods in a tile; below 1.5 the brightness of the tile leaks in.
+    highest : float
+        Highest frequency that is used, cycles per pixel.
+    misfit : float
+        Relative error of the spectrum of a tile besides noise: what a blur carries over its border.
+    departure : float
+        Error of an exponent as a share of its square: blur is a Gaussian at low frequency only.
+    """
+
+    tile: int = 48
+    lowest: float = 1.5
+    highest: float = 0.35
+    misfit: float = 0.2
+    departure: float = 0.1
+
+    def __post_init__(self) -> None:
+        require(int(self.tile) == self.tile, f"tile: expected a whole number of pixels, found {self.tile}")
+        require_between("tile", self.tile, 16, 4096, "pixels")
+        require_between("lowest", self.lowest, 1.5, 8, "periods in a tile")
+        require_between("highest", self.highest, 0.1, 0.5, "cycles per pixel")
+        require_between("misfit", self.misfit, 0.01, 1)
+        require_between("departure", self.departure, 0, 10)
+
+
+@dataclass(frozen=True, eq=False)
+class TileGrid:
+    """Where the tiles of an image lie.
+
+    Attributes
+    ----------
+    rows, columns : ndarray, int, shapes (m,) and (n,)
+        First row and first column of the tiles.
+    size : tuple of int
+        Height and width of a tile, pixels.
+    shape : tuple of int
+        Height and width of the image, pixels.
+    """
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    size: tuple[int, int]
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class TileSpectra:
+    """Power spectra of the windowed tiles of images of one size, at the frequencies that are used.
+
+    Attributes
+    ----------
+    grid : TileGrid
+    window : ndarray, float32, shape (h, w)
+        Hann window of the tiles, of unit energy.
+    used : ndarray, int, shape (f,)
+        Flat indices of the frequencies in the half-plane that a real transform gives.
+    kx, ky : ndarray, float64, shape (f,)
+        The frequencies, radians per pixel.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> noise = np.random.default_rng(0).normal(0.5, 1, (96, 96)).astype(np.float32)
+    >>> power = TileSpectra.of(noise.shape, CueParams()).power(noise)
+    >>> power.shape, round(float(power.mean()), 1)
+    ((9, 438), 1.0)
+    """
+
+    grid: TileGrid
+    window: FloatArray
+    used: NDArray[np.intp]
+    kx: Float64Array
+    ky: Float64Array
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], params: CueParams) -> TileSpectra:
+        """Lay tiles over images of a shape.
+
+        Parameters
+        ----------
+        shape : tuple of int
+            Height and width of the images, pixels.
+        params : CueParams
+
+        Returns
+        -------
+        TileSpectra
+
+        Raises
+        ------
+        DataError
+            A side is shorter than 16 pixels.
+        """
+        if min(shape) < 16:
+            raise DataError(f"image: expected at least 16 pixels a side, found shape {tuple(shape)}")
+        height, width = (min(int(params.tile), length) for length in shape)
+        rows, columns = (_starts(length, size) for length, size in zip(shape, (height, width), strict=True))
+        grid = TileGrid(rows, columns, (height, width), (shape[0], shape[1]))
+        window = np.outer(_hann(height), _hann(width))
+        window /= np.sqrt(np.sum(window**2))
+        ky, kx = np.meshgrid(fft.fftfreq(height), fft.rfftfreq(width), indexing="ij")
+        radius = np.hypot(kx, ky)
+        # Half of the plane says it all: the spectrum of an image is symmetric.
+        half = (kx > 0) | (ky > 0)
+        inside = half & (radius * min(height, width) >= params.lowest) & (radius <= params.highest)
+        used = np.flatnonzero(inside)
+        return cls(grid, window.astype(np.float32), used, 2 * np.pi * kx.flat[used], 2 * np.pi * ky.flat[used])
+
+    def power(self, image: FloatArray) -> FloatArray:
+        """Spectra of the tiles; white noise of variance 1 gives 1.
+
+        Parameters
+        ----------
+        image : ndarray, float32, shape (H, W)
+
+        Returns
+        -------
+        ndarray, float32, shape (tiles, f)
+            P, squared intensity.
+        """
+        # The brightness is taken out first: float32 keeps seven digits of it.
+        tiles = np.lib.stride_tricks.sliding_window_view(image - image.mean(), self.grid.size)
+        tiles = tiles[np.ix_(self.grid.rows, self.grid.columns)].reshape(-1, *self.grid.size)
+        spectrum = fft.rfft2(tiles * self.window).reshape(len(tiles), -1)[:, self.used]
+        return spectrum.real**2 + spectrum.imag**2
+
+    def cells(self, sectors: int = 1) -> tuple[FloatArray, Float64Array, Float64Array]:
+        """Rings of the spectrum, cut into sectors.
+
+        Parameters
+        ----------
+        sectors : int
+            How many directions are told apart.
+
+        Returns
+        -------
+        averaging : ndarray, float32, shape (f, cells)
+            Times a spectrum, the mean of every cell.
+        k2 : ndarray, float64, shape (cells,)
+            Mean of k².
+        counts : ndarray, float64, shape (cells,)
+            How many independent values each holds, at least 1.
+        """
+        k = np.hypot(self.kx, self.ky)
+        ring = np.rint(k / (2 * np.pi) * min(self.grid.size))
+        sector = np.floor(np.arctan2(self.ky, self.kx) / np.pi * sectors) % sectors
+        _, cell = np.unique(ring * sectors + sector, return_inverse=True)
+        counts = np.bincount(cell).astype(np.float64)
+        averaging = np.zeros((len(k), len(counts)), np.float32)
+        averaging[np.arange(len(k)), cell] = 1 / counts[cell]
+        return averaging, np.bincount(cell, k**2) / counts, np.maximum(counts / CORRELATED**2, 1.0)
+
+    @property
+    def smear(self) -> float:
+        """Variance per axis by which the window smears a spectrum, squared radians per pixel."""
+        return float(4 / 3 * np.pi**2 / (self.grid.size[0] * self.grid.size[1]))
+
+    def widening(self, powers: list[Float64Array], k2: Float64Array) -> Float64Array:
+        """Factor by which k² of an exponent is seen through the window.
+
+        A smear by a variance δ² per axis turns P into P + δ²/2 ΔP, and the logarithm of a ratio −D k² into
+        −D (k² + δ²/2 (4 + 2 k d/dk log P₁P₂)).
+
+        Parameters
+        ----------
+        powers : list of two ndarrays, float64, shape (rings,)
+            P₁ and P₂ above the noise.
+        k2 : ndarray, float64, shape (rings,)
+
+        Returns
+        -------
+        ndarray, float64, shape (rings,)
+            0.5 to 1.5.
+        """
+        slopes = sum(_log_slope(power, k2) for power in powers)
+        return np.clip(1 + self.smear * (2 + slopes) / k2, 0.5, 1.5)
+
+
+def tile_map(values: ArrayLike, grid: TileGrid) -> FloatArray:
+    """Values of the tiles at every pixel: bilinear between the centres of the tiles, constant beyond.
+
+    Parameters
+    ----------
+    values : array_like, shape (m, n)
+    grid : TileGrid
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> grid = TileGrid(np.array([0]), np.array([0, 2]), (2, 2), (2, 4))
+    >>> tile_map([[0.0, 1.0]], grid)[0]
+    array([0.  , 0.25, 0.75, 1.  ], dtype=float32)
+    """
+    tiles = np.asarray(values, np.float32)
+    positions = []
+    for first, size, length in zip((grid.rows, grid.columns), grid.size, grid.shape, strict=True):
+        centres = first + (size - 1) / 2
+        positions.append(np.interp(np.arange(length), centres, np.arange(len(first))).astype(np.float32))
+    map_y, map_x = np.meshgrid(*positions, indexing="ij")
+    return cv2.remap(tiles, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def noise_floor(noise: float) -> float:
+    """Power that white noise adds to a spectrum.
+
+    Parameters
+    ----------
+    noise : float
+        Standard deviation of the noise, intensity.
+
+    Returns
+    -------
+    float
+        n, squared intensity; above 0 also where there is no noise.
+
+    Raises
+    ------
+    ConfigurationError
+        The noise is negative or not finite.
+
+    Examples
+    --------
+    >>> noise_floor(0.5)
+    0.25
+    """
+    check_noise(noise)
+    return max(noise, _LEAST_NOISE) ** 2
+
+
+def check_noise(noise: float) -> None:
+    """Refuse a noise that is none.
+
+    Parameters
+    ----------
+    noise : float
+        Standard deviation, intensity.
+
+    Raises
+    ------
+    ConfigurationError
+        The noise is negative or not finite.
+
+    Examples
+    --------
+    >>> check_noise(-1.0)
+    Traceback (most recent call last):
+    turbrestore.errors.ConfigurationError: noise: expected a finite number of 0 or more, found -1.0
+    """
+    require(np.isfinite(noise) and noise >= 0, f"noise: expected a finite number of 0 or more, found {noise}")
+
+
+def _log_slope(power: Float64Array, k2: Float64Array) -> Float64Array:
+    """Logarithmic slope k d/dk of ``log P = a − β log k − v k²``, fitted up to where the signal ends; 0 if nowhere."""
+    weak = np.flatnonzero(power <= 1e-4 * power.max(initial=0.0))
+    end = weak[0] if len(weak) else len(power)
+    if end < 4:
+        return np.zeros_like(k2)
+    terms = np.stack([np.ones_like(k2), -0.5 * np.log(k2), -k2], axis=1)[:end]
+    # Rings hold values in proportion to k.
+    weights = k2[:end] ** 0.25
+    solution = np.linalg.lstsq(terms * weights[:, None], np.log(power[:end]) * weights, rcond=None)[0]
+    return -solution[1] - 2 * solution[2] * k2
+
+
+def _hann(size: int) -> Float64Array:
+    return 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size)
+
+
+def _starts(length: int, size: int) -> NDArray[np.intp]:
+    count = 1 + int(np.ceil((length - size) / (size / 2)))
+    return np.linspace(0, length - size, count).round().astype(np.intp)
