@@ -9,6 +9,7 @@ from scipy import fft, optimize
 from skimage import data
 
 from turbrestore import deconvolution
+from turbrestore.blur_estimation import BlurEstimate
 from turbrestore.deconvolution import (
     BOUNDARIES,
     METHODS,
@@ -424,3 +425,14 @@ def test_unusable_inputs_are_refused():
         deconvolve(image, 1.0, guide=np.zeros((8, 9)))
     with pytest.raises(DataError, match="image"):
         deconvolve(np.full((8, 8), np.nan), 1.0)
+
+
+def test_an_estimate_stands_for_its_removable_width_and_its_shape():
+    image = np.random.default_rng(20).random((48, 48)).astype(np.float32)
+    nothing = np.zeros(0)
+    estimate = BlurEstimate(1.2, 0.4, 5 / 3, 0.01, 1, 1.0, nothing, nothing)
+    by_estimate = deconvolve(image, estimate, DeconvolutionParams(iterations=5))
+    by_width = deconvolve(image, 1.0, DeconvolutionParams(iterations=5, exponent=5 / 3))
+    assert np.array_equal(by_estimate.image, by_width.image)
+    gaussian = DeconvolutionParams(iterations=5, exponent=2.0)
+    assert np.array_equal(deconvolve(image, estimate, gaussian).image, deconvolve(image, 1.0, gaussian).image)

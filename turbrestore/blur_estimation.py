@@ -66,6 +66,8 @@ _PART, _TAPER = 128, 8
 # n is this many times the noise, and this share of the contrast.
 _NOISE_FACTOR, _MISFIT = 1.5, 0.025
 _LEAST_NOISE = 1e-4
+# Share of the uncertainty that is not removed.
+_CAUTION = 0.5
 # Updates of γ, and conjugate gradient steps in each.
 _UPDATES, _STEPS = 8, 8
 
@@ -104,6 +106,11 @@ class BlurEstimate:
     evidence: float
     widths: Float64Array
     costs: Float64Array
+
+    @property
+    def removable(self) -> float:
+        """Width to remove, pixels: less by half of the uncertainty, for too wide rings and too narrow is only soft."""
+        return max(self.sigma - _CAUTION * self.uncertainty, 0.0) if self.sigma > 0 else 0.0
 
 
 def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV) -> BlurEstimate:

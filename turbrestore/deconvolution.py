@@ -50,6 +50,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from .arrays import FloatArray, check_image, luminance
+from .blur_estimation import BlurEstimate
 from .errors import DataError, require, require_between
 from .nonlocal_tv import (
     NonlocalParams,
@@ -326,7 +327,7 @@ class ConjugateGradients:
 
 def deconvolve(
     image: ArrayLike,
-    sigma_or_psf: float | ArrayLike,
+    sigma_or_psf: float | BlurEstimate | ArrayLike,
     params: DeconvolutionParams | None = None,
     guide: ArrayLike | None = None,
     progress: Callable[[int], None] | None = None,
@@ -337,8 +338,9 @@ def deconvolve(
     ----------
     image : array_like, shape (H, W) or (H, W, 3)
         f.
-    sigma_or_psf : float, or array_like of shape (h, w) with odd sizes
-        Width of a blur of shape ``params.exponent``, pixels, or a sampled point spread function. Without blur (0, or a
+    sigma_or_psf : float, BlurEstimate, or array_like of shape (h, w) with odd sizes
+        Width of a blur of shape ``params.exponent``, pixels; an estimate, of which the removable width and, unless
+        ``params.exponent`` is given, the shape are taken; or a sampled point spread function. Without blur (0, or a
         single pixel) the image comes back as it is: an image that is not blurred is best left alone.
     params : DeconvolutionParams, optional
         Method and settings. ``params.sigma`` is not used here.
@@ -370,6 +372,9 @@ def deconvolve(
     """
     params = params or DeconvolutionParams()
     pixels = check_image(image)
+    if isinstance(sigma_or_psf, BlurEstimate):
+        params = dataclasses.replace(params, exponent=params.exponent or sigma_or_psf.exponent)
+        sigma_or_psf = sigma_or_psf.removable
     psf, sigma, margin = _read_blur(sigma_or_psf)
     planes = _planes(pixels, params.channels)
     noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))

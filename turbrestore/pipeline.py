@@ -39,8 +39,6 @@ _TILE_OVERLAP = 4
 _NOTHING_SEEN = 0.5
 # Widths of two images, estimated blindly, agree within this share: they depend on the scene in the same way.
 _WIDTH_ERROR = 0.1
-# Share of the uncertainty of an estimated width that is taken off it.
-_CAUTION = 0.5
 # Training frames and their flows stay in memory: 12 bytes a pixel for grey frames, up to this many bytes.
 _TRAINING_BYTES = 1.5e9
 
@@ -299,8 +297,6 @@ def blur_to_remove(
 ) -> tuple[float, DeconvolutionParams]:
     """Width of the blur, and settings that know its shape: those asked for, else those estimated.
 
-    Of an estimated width half of its uncertainty is taken off: too wide rings, too narrow leaves a little softness.
-
     Parameters
     ----------
     estimate : BlurEstimate or None
@@ -324,10 +320,8 @@ def blur_to_remove(
     """
     if deconvolution.sigma is not None or estimate is None:
         return deconvolution.sigma or 0.0, deconvolution
-    if estimate.sigma == 0:
-        return 0.0, deconvolution
-    sigma = estimate.sigma - _CAUTION * estimate.uncertainty
-    if bounds is not None:
+    sigma = estimate.removable
+    if bounds is not None and sigma > 0:
         sigma = min(max(sigma, bounds.low), bounds.high)
     return sigma, replace(deconvolution, exponent=estimate.exponent)
 

@@ -37,7 +37,7 @@ def new_figure() -> Any:
         return importlib.import_module("matplotlib.figure").Figure(figsize=(12, 8), layout="constrained")
     except ImportError as error:
         raise ConfigurationError(
-            "plot: expected matplotlib, which is not installed; run pip install matplotlib"
+            "plot: expected matplotlib, which is not installed; run pip install 'turbrestore[plot]'"
         ) from error
 
 
