@@ -22,7 +22,8 @@ x is found by conjugate gradients for γ given, and ``γ_i = x_i² + C_i`` with 
 
 A wide blur is looked for in a reduced image, where it is about a pixel wide again and where the noise of compression,
 which is no blurred scene, averages out.  Reducing by r averages r×r pixels, whose variance (r² − 1) / 12 is taken out
-again.  Of all reductions that resolve a blur, the one decides whose width depends least on the noise assumed.
+again.  Of all reductions that resolve a blur, the one decides whose width depends least on the noise assumed; the image
+itself is preferred where the difference is small, for a soft scene such as the Moon looks blurred at every reduction.
 
 n is more than the noise of the image: no real blur follows the family of k exactly, and a scene of high contrast
 shows that more.  So n² is the noise and a share of the contrast, squared and added.  The width found depends on n,
@@ -66,6 +67,8 @@ _PART, _TAPER = 128, 8
 # n is this many times the noise, and this share of the contrast.
 _NOISE_FACTOR, _MISFIT = 1.5, 0.025
 _LEAST_NOISE = 1e-4
+# A reduced image has to be surer than the image itself by this factor.
+_PREFERENCE = 0.8
 # Share of the uncertainty that is not removed.
 _CAUTION = 0.5
 # Updates of γ, and conjugate gradient steps in each.
@@ -156,8 +159,13 @@ def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float 
     estimates = [_estimate_reduced(grey, factor, exponent, noise) for factor in factors]
     convincing = [one for one in estimates if np.isfinite(one.uncertainty)]
     if convincing:
-        return min(convincing, key=lambda one: one.uncertainty / one.sigma)
+        return min(convincing, key=_doubt)
     return replace(estimates[-1], sigma=float(_WIDTHS[0]), uncertainty=_PIXEL_UNCERTAINTY)
+
+
+def _doubt(estimate: BlurEstimate) -> float:
+    """How much the width depends on the noise; less for the image itself, which has lost nothing."""
+    return (_PREFERENCE if estimate.reduction == 1 else 1.0) * estimate.uncertainty / estimate.sigma
 
 
 def _estimate_reduced(grey: FloatArray, factor: int, exponent: float, noise: float | None) -> BlurEstimate:
