@@ -15,20 +15,14 @@ from clips import Clip, data_folder, find_clips
 
 from turbrestore.alternating import FilterParams, filter_frames
 from turbrestore.arrays import FloatArray
+from turbrestore.blur_cues import BlurBounds, bound_blur, displacement_maps, typical_noise
 from turbrestore.blur_estimation import BlurEstimate, estimate_blur
 from turbrestore.blur_moments.cues import RelativeBlur, displacement_variance
 from turbrestore.centroid import find_centroid
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.dynamics import FlowDynamics, identify, with_displacement
 from turbrestore.metrics import compare
-from turbrestore.pipeline import (
-    BlurBounds,
-    blur_to_remove,
-    bound_blur,
-    displacement_maps,
-    training_share,
-    typical_noise,
-)
+from turbrestore.pipeline import blur_to_remove, training_share
 from turbrestore.psf import KOLMOGOROV
 
 SETTINGS = DeconvolutionParams()

@@ -6,13 +6,14 @@ import pytest
 
 from conftest import SCENES, make_sequence
 from turbrestore.alternating import FilterParams
+from turbrestore.blur_cues import BlurBounds, bound_blur
 from turbrestore.blur_estimation import BlurEstimate
 from turbrestore.centroid import CentroidParams
 from turbrestore.deconvolution import DeconvolutionParams
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.frame_source import FrameSource
 from turbrestore.metrics import compare
-from turbrestore.pipeline import BlurBounds, RestoreParams, blur_to_remove, bound_blur, restore, training_share
+from turbrestore.pipeline import RestoreParams, blur_to_remove, restore, training_share
 
 QUICK = RestoreParams(centroid=CentroidParams(iterations=2))
 

@@ -13,17 +13,15 @@ from numpy.typing import ArrayLike
 
 from .alternating import Filtered, FilterParams, filter_frames
 from .arrays import FloatArray
+from .blur_cues import BlurBounds, bound_blur, displacement_maps
 from .blur_estimation import BlurEstimate, estimate_blur
-from .blur_moments.cues import displacement_variance, relative_blur
-from .blur_moments.frame_blur import blur_against, refer_blur
-from .blur_moments.tiles import tile_map
 from .centroid import Centroid, CentroidParams, find_centroid
 from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve
 from .dynamics import DynamicsParams, FlowDynamics, identify, with_displacement
 from .errors import DataError, require
 from .flow import MIN_SIDE, FlowParams
 from .frame_source import FrameSource
-from .psf import KOLMOGOROV, estimate_noise
+from .psf import KOLMOGOROV
 
 STAGES = ("centroid", "identify", "filter", "deconvolve")
 # Contrast below one grey level of an 8-bit camera is no scene.
@@ -31,14 +29,6 @@ _LEAST_CONTRAST = 1 / 255
 _FEWEST_TRAINED, _MOST_TRAINED = 40, 100
 # A blur wider than this share of the image leaves nothing to restore.
 _SIGMAS_A_SIDE = 8
-# Frames that the noise of a frame is measured on.
-_NOISE_FRAMES = 8
-# Tiles overlap by half along both axes: of four, one is independent.
-_TILE_OVERLAP = 4
-# Standard deviation of tiles from which on they say nothing of the blur, squared pixels.
-_NOTHING_SEEN = 0.5
-# Widths of two images, estimated blindly, agree within this share: they depend on the scene in the same way.
-_WIDTH_ERROR = 0.1
 # Training frames and their flows stay in memory: 12 bytes a pixel for grey frames, up to this many bytes.
 _TRAINING_BYTES = 1.5e9
 
@@ -94,20 +84,6 @@ class RestoreParams:
             not self.blur_bounds or (self.until == STAGES[-1] and self.deconvolution.sigma is None),
             "blur_bounds: has an effect only where the width of the blur is estimated; leave it out",
         )
-
-
-@dataclass(frozen=True)
-class BlurBounds:
-    """What the width of a blur may be.
-
-    Attributes
-    ----------
-    low, high : float
-        Pixels.
-    """
-
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -235,63 +211,6 @@ def restore(
     )
 
 
-def bound_blur(
-    fused: ArrayLike, mean: ArrayLike, training: FloatArray, count: int, exponent: float = KOLMOGOROV
-) -> BlurBounds:
-    """Bounds on the width of the blur of a fused image, from images of the same scene.
-
-    Second moments of blur add, so the difference of two is known without knowing the scene.  The fused image is at
-    least as blurred as it is more so than the sharpest frames; and the blur of the temporal mean, estimated blindly,
-    less what the mean is wider, is what the fused image has at most.  Both bounds are moved outwards by two standard
-    deviations, of which the estimated width has at least 10 %.
-
-    Parameters
-    ----------
-    fused : array_like, shape (H, W) or (H, W, 3)
-        Registered and averaged frames.
-    mean : array_like, shape of ``fused``
-        Temporal mean of ``count`` frames as they are.
-    training : ndarray, float32, shape (T, H, W) or (T, H, W, 3), at least two
-        Some of the frames.
-    count : int
-        Number of frames that the mean is one of.
-    exponent : float
-        Shape of the blur, see :func:`turbrestore.psf.blur_otf`.
-
-    Returns
-    -------
-    BlurBounds
-        Zero and infinity where the bounds found contradict each other.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree.
-
-    Examples
-    --------
-    >>> import cv2, numpy as np
-    >>> from turbrestore.synthesis.scenes import SCENES
-    >>> fused, soft = (cv2.GaussianBlur(SCENES["camera"](128, 128), (0, 0), sigma) for sigma in (1.2, 2.0))
-    >>> bounds = bound_blur(fused, soft, np.stack([soft, soft]), count=2)
-    >>> bool(bounds.low < 1.2 < bounds.high < 2.5)
-    True
-    """
-    noise, own_noise = typical_noise(training), estimate_noise(fused)
-    sharpest, _ = refer_blur(training, noise)
-    above = blur_against(np.asarray(fused)[None], sharpest, own_noise)
-    seen = above.deviation < _NOTHING_SEEN
-    precision = np.sum(above.deviation[seen] ** -2.0)
-    low = np.sum(above.extra[seen] / above.deviation[seen] ** 2) / precision if seen.any() else 0.0
-    low -= 2 * np.sqrt(_TILE_OVERLAP / precision) if seen.any() else 0.0
-    wider = relative_blur(mean, fused, (noise / np.sqrt(count), own_noise))
-    widest = estimate_blur(mean, exponent=exponent)
-    error = max(widest.uncertainty, _WIDTH_ERROR * widest.sigma)
-    high = (widest.sigma + 2 * error) ** 2 - (wider.variance - 2 * wider.deviation)
-    low, high = (float(np.sqrt(max(bound, 0.0))) for bound in (low, high))
-    return BlurBounds(low, high) if low <= high else BlurBounds(0.0, float("inf"))
-
-
 def blur_to_remove(
     estimate: BlurEstimate | None, deconvolution: DeconvolutionParams, bounds: BlurBounds | None = None
 ) -> tuple[float, DeconvolutionParams]:
@@ -324,57 +243,6 @@ def blur_to_remove(
     if bounds is not None and sigma > 0:
         sigma = min(max(sigma, bounds.low), bounds.high)
     return sigma, replace(deconvolution, exponent=estimate.exponent)
-
-
-def displacement_maps(training: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Displacement variance at every pixel, from the blur of the mean of frames, and its standard deviation.
-
-    Parameters
-    ----------
-    training : ndarray, float32, shape (T, H, W) or (T, H, W, 3), at least two
-
-    Returns
-    -------
-    variance, deviation : ndarray, float32, shape (H, W)
-        Squared pixels, mean of both axes; the deviation is infinite where nothing is to be seen.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> variance, deviation = displacement_maps(np.full((2, 32, 32), 0.5, np.float32))
-    >>> bool(np.isinf(deviation).all())
-    True
-    """
-    cue = displacement_variance(training, typical_noise(training))
-    precision = tile_map(cue.tile_deviation**-2.0, cue.grid)
-    weighted = tile_map(cue.tile_variance * cue.tile_deviation**-2.0, cue.grid)
-    seen = precision > 0
-    variance = np.divide(weighted, precision, out=np.zeros_like(weighted), where=seen)
-    deviation = np.full_like(variance, np.inf)
-    deviation[seen] = precision[seen] ** -0.5
-    return variance, deviation
-
-
-def typical_noise(frames: FloatArray) -> float:
-    """Measure the noise of a frame: standard deviation, median over a few frames.
-
-    Parameters
-    ----------
-    frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
-
-    Returns
-    -------
-    float
-        Intensity.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> round(typical_noise(np.random.default_rng(0).normal(0.5, 0.01, (9, 64, 64)).astype(np.float32)), 3)
-    0.01
-    """
-    step = max(len(frames) // _NOISE_FRAMES, 1)
-    return float(np.median([estimate_noise(frame) for frame in frames[::step]]))
 
 
 def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int | None = None) -> int:
