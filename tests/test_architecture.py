@@ -10,9 +10,10 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "turbrestore"
 # A module imports only from those before it.
 ORDER = [
-    "errors", "arrays", "parallel", "pixels", "images", "frame_source", "integrity", "ser", "tiff", "container",
-    "video", "warp", "flow", "centroid", "dynamics", "kalman", "blur_moments", "frame_noise", "alternating", "psf",
-    "blur_estimation", "blur_cues", "nonlocal_tv", "deconvolution", "synthesis", "metrics", "pipeline", "artifacts",
+    "errors", "arrays", "decision", "parallel", "pixels", "images", "frame_source", "integrity", "ser", "tiff",
+    "container", "video", "warp", "flow", "centroid", "dynamics", "kalman", "blur_moments", "frame_noise",
+    "alternating", "psf", "blur_estimation", "blur_cues", "nonlocal_tv", "deconvolution", "synthesis", "metrics",
+    "pipeline", "artifacts",
 ]  # fmt: skip
 HEAVY = {"torch", "kornia", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")

@@ -13,6 +13,7 @@ from .blur_moments.tracking import track_blur as track_blur
 from .centroid import Centroid as Centroid
 from .centroid import CentroidParams as CentroidParams
 from .centroid import find_centroid as find_centroid
+from .decision import Decision as Decision
 from .deconvolution import Deconvolution as Deconvolution
 from .deconvolution import DeconvolutionParams as DeconvolutionParams
 from .deconvolution import deconvolve as deconvolve

@@ -50,7 +50,7 @@ from .arrays import FloatArray, check_flow, check_image
 from .dynamics import FlowDynamics, flow_of
 from .errors import DataError, require, require_between
 from .flow import FlowParams, iterate_flows
-from .frame_noise import FrameNoise, measure_frame_noise, noise_of_frame
+from .frame_noise import FrameNoise, measure_frame_noise, noise_of_frame, relative_sharpness
 from .kalman import Gaussian, PixelGaussian, predict, predict_pixels, update_information, update_pixels
 from .parallel import map_ahead, one_thread_each
 from .warp import warp
@@ -152,6 +152,11 @@ class Filtered:
         L of each frame, mean over the pixels.
     innovations : ndarray, float64, shape (N,)
         Root mean square of W^meas − W̄ − C A ξ̂ for each frame, pixels: what the prediction did not foresee.
+    sharpness : ndarray, float64, shape (N,)
+        Gradient of each registered frame, projected on that of the image that the filter started from; 1 if they are
+        equal.
+    shares : ndarray, float64, shape (N,)
+        Share of the information that each frame brought, mean over the pixels; they sum to 1.
     image_noise : float
         Z, squared intensity.
     motion_share : float
@@ -163,6 +168,8 @@ class Filtered:
     flow_states: np.ndarray
     gains: np.ndarray
     innovations: np.ndarray
+    sharpness: np.ndarray
+    shares: np.ndarray
     image_noise: float
     motion_share: float
 
@@ -193,6 +200,8 @@ class _Record:
     flow_state: np.ndarray
     gain: float
     innovation: float
+    sharpness: float
+    information: float
 
 
 def filter_frames(
@@ -273,12 +282,15 @@ def filter_frames(
         while block := list(islice(stream, params.block)):
             state, done = _filter_block(state, block, None, setting)
             records += done
+    information = np.array([record.information for record in records])
     return Filtered(
         image=state.image.mean.astype(np.float32),
         variance=state.image.variance.astype(np.float32),
         flow_states=np.array([record.flow_state for record in records]),
         gains=np.array([record.gain for record in records]),
         innovations=np.array([record.innovation for record in records]),
+        sharpness=np.array([record.sharpness for record in records]),
+        shares=information / information.sum(),
         image_noise=model.image_noise,
         motion_share=float(model.motion_share.mean()),
     )
@@ -335,10 +347,12 @@ def _filter_pass(
     image, flow, drift = prior.image, prior.flow, setting.params.image_drift
     records: list[_Record] = []
     motions = _update_motion(prior.flow, pairs, setting.dynamics)
-    for motion, (registered, noise) in map_ahead(partial(_register, setting), motions, setting.flow_params.threads):
+    registering = map_ahead(partial(_register, setting), motions, setting.flow_params.threads)
+    for motion, (registered, noise, sharpness) in registering:
         flow = motion.state
         image, gain = update_pixels(predict_pixels(image, drift) if drift else image, registered, noise)
-        records.append(_Record(flow.mean, float(gain.mean()), motion.innovation))
+        information = float(np.mean(1 / np.asarray(noise)))
+        records.append(_Record(flow.mean, float(gain.mean()), motion.innovation, sharpness, information))
     return FilterState(image, flow), records
 
 
@@ -365,10 +379,11 @@ def _update_motion(
         yield _Motion(frame, measured, state, float(np.sqrt(np.mean(np.square(unforeseen)))))
 
 
-def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, float | FloatArray]:
-    """Frame on the image by Ŵ, and its noise Z (eq. 15)."""
+def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, float | FloatArray, float]:
+    """Frame on the image by Ŵ, its noise Z (eq. 15) and its sharpness."""
     modelled = flow_of(setting.dynamics, motion.state.mean)
     share = setting.model.motion_share[..., None]
     estimate = modelled + share * (motion.measured - modelled)
     registered = warp(motion.frame, estimate)
-    return registered, noise_of_frame(registered, estimate, setting.model, setting.params.sharpness)
+    noise = noise_of_frame(registered, estimate, setting.model, setting.params.sharpness)
+    return registered, noise, relative_sharpness(registered, setting.model)

@@ -198,6 +198,35 @@ def noise_of_frame(registered: FloatArray, flow: FloatArray, model: FrameNoise, 
     return np.float32(model.image_noise) * np.exp(exponent) * _distrust(flow)
 
 
+def relative_sharpness(registered: FloatArray, model: FrameNoise) -> float:
+    """Gradient of a registered frame projected on that of the image the model was measured with.
+
+    Parameters
+    ----------
+    registered : ndarray, float32, shape (H, W) or (H, W, 3)
+        The frame, warped onto the image.
+    model : FrameNoise
+
+    Returns
+    -------
+    float
+        1 for the image itself, less for a blurred, torn or misregistered frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> image = np.tile(np.sin(np.arange(16.0)), (16, 1)).astype(np.float32)
+    >>> still = np.zeros((2, 16, 16, 2), np.float32)
+    >>> model = measure_frame_noise([image, image], still, image, np.ones((16, 16), np.float32))
+    >>> round(relative_sharpness(0.5 * image, model), 3)
+    0.5
+    """
+    dx, dy = _gradient(luminance(registered))
+    along, across = model.template
+    energy = float(np.sum(np.square(along) + np.square(across)))
+    return float(np.sum(dx * along + dy * across)) / max(energy, 1e-12)
+
+
 def _blur_rule(registered: FloatArray, image: FloatArray, sensor_noise: float) -> tuple[BlurReference, FusionRule]:
     """Measure the blur of frames, and which shares of them make blur and noise of their average smallest."""
     noise = float(np.sqrt(sensor_noise))

@@ -16,6 +16,7 @@ from .arrays import FloatArray
 from .blur_cues import BlurBounds, bound_blur, displacement_maps
 from .blur_estimation import BlurEstimate, estimate_blur
 from .centroid import Centroid, CentroidParams, find_centroid
+from .decision import Decision
 from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve
 from .dynamics import DynamicsParams, FlowDynamics, identify, with_displacement
 from .errors import DataError, require
@@ -104,6 +105,8 @@ class Restoration:
     blur_bounds : BlurBounds or None
         Bounds that the estimated width was kept within; None where they were not asked for.
     deconvolution : Deconvolution or None
+    decisions : tuple of Decision
+        What was chosen from the data, and why, in the order of the stages.
     train : int
         Number of training frames.
     frame_count : int
@@ -120,6 +123,7 @@ class Restoration:
     blur: BlurEstimate | None
     blur_bounds: BlurBounds | None
     deconvolution: Deconvolution | None
+    decisions: tuple[Decision, ...]
     train: int
     frame_count: int
     seconds: dict[str, float]
@@ -207,7 +211,7 @@ def restore(
         clock.lap("deconvolve")
     count = len(source) if filtered is not None else train
     return Restoration(
-        image, mean, centroid, dynamics, filtered, blur, bounds, deconvolution, train, count, clock.seconds
+        image, mean, centroid, dynamics, filtered, blur, bounds, deconvolution, (), train, count, clock.seconds
     )
 
 

@@ -1,0 +1,30 @@
+"""What was decided on the way to a result, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One choice that was made from the data.
+
+    Attributes
+    ----------
+    subject : str
+        What it is about, a word or two: ``"blur"``, ``"overshoot"``, ``"border"``.
+    choice : str
+        What was done, one line.
+    reason : str
+        The figures that led to it, one line.
+
+    Examples
+    --------
+    >>> decision = Decision("blur", "none removed", "width 0.42 ± 0.30 px is no more than that of a sharp image")
+    >>> decision.subject, decision.choice
+    ('blur', 'none removed')
+    """
+
+    subject: str
+    choice: str
+    reason: str

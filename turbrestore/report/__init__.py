@@ -1,0 +1,1 @@
+"""A restoration as one HTML file."""
