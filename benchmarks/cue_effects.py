@@ -15,6 +15,7 @@ from clips import Clip, data_folder, find_clips
 
 from turbrestore.alternating import FilterParams, filter_frames
 from turbrestore.arrays import FloatArray
+from turbrestore.blind import blur_to_remove
 from turbrestore.blur_cues import BlurBounds, bound_blur, displacement_maps, typical_noise
 from turbrestore.blur_estimation import BlurEstimate, estimate_blur
 from turbrestore.blur_moments.cues import RelativeBlur, displacement_variance
@@ -22,7 +23,7 @@ from turbrestore.centroid import find_centroid
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.dynamics import FlowDynamics, identify, with_displacement
 from turbrestore.metrics import compare
-from turbrestore.pipeline import blur_to_remove, training_share
+from turbrestore.pipeline import training_share
 from turbrestore.psf import KOLMOGOROV
 
 SETTINGS = DeconvolutionParams()

@@ -6,57 +6,36 @@ import io
 import logging
 import os
 import sys
-import tomllib
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from cyclopts import App, CycloptsError
-from cyclopts.config import Dict
+from cyclopts import App, CycloptsError, UnusedCliTokensError
 
 from turbrestore import __version__
-from turbrestore.errors import ConfigurationError, InputNotFoundError, StorageError, TurbrestoreError
+from turbrestore.errors import ConfigurationError, StorageError, TurbrestoreError
 
-if TYPE_CHECKING:
-    from cyclopts.argument import Argument, ArgumentCollection
+from .examples import EXAMPLES, FIRST_STEPS, epilogue
+from .settings import settings_file
+
+# Where each command lives, and what it says in one line.
+COMMANDS = {
+    "restore": ("restore:restore", "Restore a video: the whole chain, input first, output last."),
+    "report": ("report:report", "Write the report of a run that restore --keep has kept."),
+    "centroid": ("stages:centroid", "Find the centroid of a video."),
+    "flow": ("stages:flow", "Measure the flow from one image to every frame of a video."),
+    "identify": ("stages:identify", "Identify the dynamics of flows."),
+    "filter": ("stages:filter_", "Filter a video with known centroid and dynamics."),
+    "deconvolve": ("stages:deconvolve", "Deblur an image."),
+    "synthesize": ("synthesis:synthesize", "Make a turbulent video with known truth and flow."),
+    "info": ("inspection:info", "Say what a video is."),
+    "evaluate": ("inspection:evaluate", "Compare a result with the truth."),
+    "config": ("config:config", "Write a settings file with every setting explained, or check one."),
+    "doctor": ("doctor:doctor", "Check what this installation can do."),
+    "moments wavefront": ("moments:wavefront", "A wavefront sensor that is exposed all the time."),
+    "moments mirror": ("moments:mirror", "A steered mirror seen by a slow camera."),
+    "--install-completion": ("completion:install_completion", "Install completion for bash, zsh or fish."),
+}
 
 INTERRUPTED = 130
 BUG = 1
-# What a settings file must not decide behind the user's back.
-NOT_SETTINGS = {"config", "overwrite", "keep", "truth", "json", "quiet"}
-
-
-def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
-    """Fill what no flag has set from the TOML file named by ``--config``, and check whole numbers."""
-    for argument in arguments:
-        if "--config" in argument.names and argument.tokens:
-            path = Path(argument.tokens[0].value)
-            # Sections are named after stages, and so are commands: under the command's name the two cannot be confused.
-            record: dict[str, Any] = _read_toml(path)
-            for command in reversed(commands):
-                record = {command: record}
-            Dict(record, source=str(path))(app, commands, arguments)
-    for argument in arguments:
-        if argument.hint in (int, int | None):
-            _refuse_fractions(argument)
-
-
-def _refuse_fractions(argument: Argument) -> None:
-    """Whole numbers must be written as such: conversion alone would round 3.5 frames to 4."""
-    for token in argument.tokens:
-        if token.value and not token.value.lstrip("+-").isdecimal():
-            raise ConfigurationError(f"{argument.name}: expected a whole number, found {token.value!r}")
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise InputNotFoundError(f"{path}: no such settings file")
-    try:
-        record = tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path}: expected settings as TOML, found {error}") from error
-    for name in NOT_SETTINGS & {key.replace("-", "_") for key in record}:
-        raise ConfigurationError(f"{path}: {name} belongs on the command line, not in a settings file")
-    return record
 
 
 def build() -> App:
@@ -64,26 +43,25 @@ def build() -> App:
     app = App(
         name="turbrestore",
         help="Restore one sharp image from a video of a static scene seen through atmospheric turbulence.",
-        help_epilogue="Example: turbrestore restore haze.mp4 sharp.png",
+        help_epilogue=epilogue(FIRST_STEPS),
         version=__version__,
         config=settings_file,
         result_action="return_value",
         suppress_keyboard_interrupt=False,
     )
+    groups = {
+        "": app,
+        "moments": App(
+            name="moments",
+            help="Compare estimators for slow sensors of fast motion, on simulated frames.",
+            help_epilogue=epilogue(EXAMPLES["moments wavefront"] + EXAMPLES["moments mirror"]),
+        ),
+    }
+    app.command(groups["moments"])
     package = __package__ or "turbrestore_cli"
-    app.command(f"{package}.restore:restore", help="Restore a video: the whole chain, input first, output last.")
-    app.command(f"{package}.stages:centroid", help="Find the centroid of a video.")
-    app.command(f"{package}.stages:flow", help="Measure the flow from one image to every frame of a video.")
-    app.command(f"{package}.stages:identify", help="Identify the dynamics of flows.")
-    app.command(f"{package}.stages:filter_", name="filter", help="Filter a video with known centroid and dynamics.")
-    app.command(f"{package}.stages:deconvolve", help="Deblur an image.")
-    app.command(f"{package}.synthesis:synthesize", help="Make a turbulent video with known truth and flow.")
-    app.command(f"{package}.inspection:info", help="Say what a video is.")
-    app.command(f"{package}.inspection:evaluate", help="Compare a result with the truth.")
-    moments = App(name="moments", help="Compare estimators for slow sensors of fast motion, on simulated frames.")
-    moments.command(f"{package}.moments:wavefront", help="A wavefront sensor that is exposed all the time.")
-    moments.command(f"{package}.moments:mirror", help="A steered mirror seen by a slow camera.")
-    app.command(moments)
+    for words, (place, summary) in COMMANDS.items():
+        group, _, name = words.rpartition(" ")
+        groups[group].command(f"{package}.{place}", name=name, help=summary, help_epilogue=epilogue(EXAMPLES[words]))
     return app
 
 
@@ -124,6 +102,9 @@ def _explain(error: BaseException) -> tuple[str, int]:
     """One line and an exit code for a failure that is no bug."""
     if isinstance(error, TurbrestoreError):
         return str(error), error.exit_code
+    if isinstance(error, UnusedCliTokensError):
+        words = " ".join(error.unused_tokens or [])
+        return f"{words}: one word too many; --help says what is expected", ConfigurationError.exit_code
     if isinstance(error, CycloptsError):
         return str(error), ConfigurationError.exit_code
     if isinstance(error, OSError):

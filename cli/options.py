@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from turbrestore.deconvolution import DeconvolutionParams
 from turbrestore.errors import ConfigurationError
-from turbrestore.frame_source import FrameRange, Roi
+
+if TYPE_CHECKING:
+    from turbrestore.deconvolution import DeconvolutionParams
+    from turbrestore.frame_source import FrameRange, Roi
 
 # A switch without a "--no-" twin.
 Flag = Annotated[bool, Parameter(negative="")]

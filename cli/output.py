@@ -6,23 +6,24 @@ import dataclasses
 import json
 import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
 
 from turbrestore import __version__
 from turbrestore.arrays import FloatArray
-from turbrestore.artifacts import save_artifact
 from turbrestore.errors import OutputError
 from turbrestore.images import atomic_write, check_output, write_image
 from turbrestore.metrics import compare
 from turbrestore.pipeline import Restoration, RestoreParams
+from turbrestore.run_record import RUN_FILES, RunRecord, save_run
 
 from .options import Selection
 
-_ARTIFACTS = ("centroid", "dynamics", "filtered", "deconvolution")
-_IMAGES = ("mean", "centroid", "filtered", "deconvolved")
+_IMAGES = ("frame", "mean", "centroid", "filtered", "deconvolved")
 
 
 def print_json(record: dict[str, Any]) -> None:
@@ -55,7 +56,7 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
         record["filter"] = {
             "image_noise": restoration.filtered.image_noise,
             "motion_share": restoration.filtered.motion_share,
-            "mean_innovation": float(restoration.filtered.innovations.mean()),
+            "mean_innovation": float(np.nanmean(restoration.filtered.innovations)),
         }
     if restoration.deconvolution is not None:
         record["deconvolution"] = {
@@ -69,6 +70,9 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
         record["blur"] = {name: getattr(restoration.blur, name) for name in names}
     if restoration.blur_bounds is not None:
         record["blur_bounds"] = dataclasses.asdict(restoration.blur_bounds)
+    record["guards"] = [dataclasses.asdict(reading) for reading in restoration.guard_readings]
+    record["crop"] = list(restoration.crop)
+    record["decisions"] = [dataclasses.asdict(decision) for decision in restoration.decisions]
     if truth is not None:
         stages = {name: dataclasses.asdict(compare(image, truth)) for name, image in stage_images(restoration).items()}
         record["stages"] = stages
@@ -111,36 +115,51 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool) -> None:
         raise OutputError(f"{folder}: is a file; name a folder to keep the stages in")
     if not overwrite and any(folder.iterdir()):
         raise OutputError(f"{folder}: is not empty; choose another folder or allow overwriting")
-    for name in (*(f"{stage}.npz" for stage in _ARTIFACTS), *(f"{image}.png" for image in _IMAGES)):
+    for name in (*RUN_FILES, *(f"{image}.png" for image in _IMAGES)):
         check_output(folder / name, overwrite=True, suffixes=None)
 
 
-def save_stages(folder: Path, restoration: Restoration, bit_depth: int) -> None:
-    """Keep every stage: artifacts for the stage commands, images to look at."""
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created ({error.strerror})") from error
-    images = stage_images(restoration)
-    for name in _ARTIFACTS:
-        result = getattr(restoration, name)
-        if result is None:
-            # What an earlier run left would not belong to this one.
-            (folder / f"{name}.npz").unlink(missing_ok=True)
-        else:
-            save_artifact(folder / f"{name}.npz", result, overwrite=True)
+def save_stages(folder: Path, restoration: Restoration, run: RunRecord, bit_depth: int) -> None:
+    """Keep every stage: artifacts for the stage commands and the report, images to look at."""
+    save_run(folder, restoration, run)
+    images = {"frame": run.frame, **stage_images(restoration)}
     for name in _IMAGES:
         if name in images:
             write_image(folder / f"{name}.png", images[name], bit_depth, overwrite=True)
         else:
+            # What an earlier run left would not belong to this one.
             (folder / f"{name}.png").unlink(missing_ok=True)
 
 
-def write_settings(path: Path, params: RestoreParams, selection: Selection, bit_depth: int | None) -> None:
+def settings_record(params: RestoreParams, selection: Selection, bit_depth: int | None) -> dict[str, Any]:
+    """All settings of a run, nested as in a settings file; None where they are left to be measured."""
+    return {"bit_depth": bit_depth, **dataclasses.asdict(selection), **dataclasses.asdict(params)}
+
+
+def write_settings(path: Path, record: dict[str, Any]) -> None:
     """Write settings as TOML that ``--config`` reads; those left to be measured are left out."""
     head = f"# Settings of a run of turbrestore {__version__}; --config with this file repeats it.\n"
-    record = {"bit_depth": bit_depth, **dataclasses.asdict(selection), **dataclasses.asdict(params)}
     atomic_write(path, (head + tomli_w.dumps(_without_none(record))).encode(), overwrite=True)
+
+
+def repeating_command(input: Path, output: Path, record: dict[str, Any]) -> tuple[str, ...]:
+    """Words of a command that repeats a run without its settings file: what differs from the defaults as flags."""
+    paths = (str(path) if not str(path).startswith("-") else f"./{path}" for path in (input, output))
+    usual = settings_record(RestoreParams(), Selection(), None)
+    return ("turbrestore", "restore", *paths, *_flags(record, usual, ""))
+
+
+def _flags(record: dict[str, Any], usual: dict[str, Any], prefix: str) -> Iterator[str]:
+    for name, value in record.items():
+        flag = name.replace("_", "-")
+        if isinstance(value, dict):
+            yield from _flags(value, usual[name], f"{prefix}{flag}.")
+        elif value == usual[name]:
+            continue
+        elif isinstance(value, bool):
+            yield f"--{prefix}{flag if value else f'no-{flag}'}"
+        else:
+            yield f"--{prefix}{flag}={value}"
 
 
 def _without_none(record: dict[str, Any]) -> dict[str, Any]:

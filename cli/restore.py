@@ -13,10 +13,21 @@ from turbrestore.metrics import comparable
 from turbrestore.pipeline import RestoreParams
 from turbrestore.pipeline import restore as run_pipeline
 from turbrestore.pixels import check_depth
+from turbrestore.report import check_report, write_report
+from turbrestore.run_record import describe_run
 from turbrestore.video import open_frames
 
 from .options import Flag, Selection, known_sigma
-from .output import check_keep, describe, print_json, save_stages, summary, write_settings
+from .output import (
+    check_keep,
+    describe,
+    print_json,
+    repeating_command,
+    save_stages,
+    settings_record,
+    summary,
+    write_settings,
+)
 from .progress import progress_bars, say
 
 
@@ -29,6 +40,7 @@ def restore(
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
     config: Path | None = None,
     keep: Path | None = None,
+    report: Path | None = None,
     truth: Path | None = None,
     bit_depth: int | None = None,
     overwrite: Flag = False,
@@ -51,6 +63,8 @@ def restore(
         TOML file with settings; flags win over it.
     keep : Path
         Folder for the result of every stage.
+    report : Path
+        HTML file to write, .html: images to compare, what was decided and why, plots.
     truth : Path
         Image of the true scene: every stage is compared with it.
     bit_depth : int
@@ -68,7 +82,9 @@ def restore(
     check_output(output, [path for path in (input, config, truth) if path is not None], overwrite)
     settings_path = output.with_name(output.name + ".toml")
     check_output(settings_path, [input], overwrite or config == settings_path, suffixes=None)
-    check_keep(keep, [input, output, settings_path], overwrite)
+    if report is not None:
+        check_report(report, [path for path in (input, config, truth) if path is not None], overwrite)
+    check_keep(keep, [path for path in (input, output, settings_path, report) if path is not None], overwrite)
     scene = None if truth is None else comparable(read_image(truth).image, "truth")
     source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
     for warning in source.warnings:
@@ -78,12 +94,16 @@ def restore(
     with progress_bars(quiet) as progress:
         restoration = run_pipeline(source, settings, progress)
     depth = source.bit_depth if bit_depth is None else bit_depth
-    report = describe(restoration, scene)
-    if keep is not None:
-        save_stages(keep, restoration, depth)
+    facts = describe(restoration, scene)
+    record = settings_record(settings, selection, bit_depth)
+    run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
+    if keep is not None and run is not None:
+        save_stages(keep, restoration, run, depth)
     write_image(output, restoration.image, depth, overwrite)
-    write_settings(settings_path, settings, selection, bit_depth)
+    write_settings(settings_path, record)
+    if report is not None and run is not None:
+        write_report(report, restoration, run, overwrite)
     if json:
-        print_json({"input": str(input), "output": str(output), "settings": str(settings_path), **report})
+        print_json({"input": str(input), "output": str(output), "settings": str(settings_path), **facts})
     else:
         say(summary(output, restoration), quiet)

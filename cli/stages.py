@@ -10,18 +10,17 @@ from cyclopts import Parameter
 
 from turbrestore.alternating import Filtered, FilterParams, filter_frames
 from turbrestore.artifacts import load_artifact, load_flows, load_stage_image, save_artifact, save_flows
-from turbrestore.blur_estimation import estimate_blur
+from turbrestore.blind import remove_blur
 from turbrestore.centroid import Centroid, CentroidParams, find_centroid
 from turbrestore.deconvolution import Deconvolution, DeconvolutionParams
-from turbrestore.deconvolution import deconvolve as deconvolve_image
 from turbrestore.dynamics import DynamicsParams, FlowDynamics
 from turbrestore.dynamics import identify as identify_flows
 from turbrestore.errors import require
 from turbrestore.flow import FlowParams, estimate_flow
+from turbrestore.guards import GuardParams
 from turbrestore.images import IMAGE_OUTPUT_SUFFIXES, check_output, read_image, write_image
-from turbrestore.pipeline import blur_to_remove, stage_counter, training_share
+from turbrestore.pipeline import stage_counter, training_share
 from turbrestore.pixels import check_depth
-from turbrestore.psf import KOLMOGOROV
 from turbrestore.video import open_frames
 
 from .options import Flag, Selection, known_sigma
@@ -196,6 +195,7 @@ def deconvolve(
     sigma: float | None = None,
     guide: Path | None = None,
     deconvolution: DeconvolutionParams = DeconvolutionParams(),
+    guards: GuardParams = GuardParams(),
     bit_depth: int | None = None,
     overwrite: Flag = False,
     quiet: Flag = False,
@@ -214,6 +214,8 @@ def deconvolve(
         Image or artifact that the nonlocal weights are taken from; the input by default, the centroid in the paper.
     deconvolution : DeconvolutionParams
         Method and its settings.
+    guards : GuardParams
+        What the result must not exceed where the width is estimated.
     bit_depth : int
         Bits per channel of an image that is written: 8, 16 or 32; by default those of the input, 16 for artifacts.
     overwrite : bool
@@ -229,17 +231,14 @@ def deconvolve(
     check_output(output, inputs, overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
     image = load_stage_image(input)
     guide_image = image if guide is None else load_stage_image(guide)
-    estimate = None
-    if deconvolution.sigma is None:
-        estimate = estimate_blur(image, exponent=deconvolution.exponent or KOLMOGOROV)
-    width, settings = blur_to_remove(estimate, deconvolution)
     with progress_bars(quiet) as progress:
         counter = stage_counter(progress, "deconvolve", deconvolution.iterations)
-        result = deconvolve_image(image, width, settings, guide=guide_image, progress=counter)
+        deblurred = remove_blur(image, guide_image, deconvolution, guards, progress=counter)
     if bit_depth is None:
         bit_depth = 16 if input.suffix.lower() in ARTIFACT else read_image(input).bit_depth
-    _write(output, result, bit_depth, overwrite)
-    say(f"{output}: blur of {width:.2f} pixels removed" if width > 0 else f"{output}: no blur removed", quiet)
+    _write(output, deblurred.deconvolution, bit_depth, overwrite)
+    for decision in deblurred.decisions:
+        say(f"{output}: {decision.subject}: {decision.choice} ({decision.reason})", quiet)
 
 
 def _write(output: Path, result: Filtered | Deconvolution, bit_depth: int, overwrite: bool) -> None:

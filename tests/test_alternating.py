@@ -301,3 +301,86 @@ def test_no_more_of_the_residual_is_kept_than_the_model_says_is_motion(sequence)
     )
     assert plain.motion_share > 0.5
     assert capped.motion_share == pytest.approx(0.25, abs=0.01)
+
+
+def spoil(frames):
+    """A bird that crosses, two flashes, a glint and a frame that slipped."""
+    spoilt = frames.copy()
+    for step, index in enumerate(range(4, 12)):
+        cv2.circle(spoilt[index], (10 + 14 * step, 60), 7, 0.05, -1)
+    spoilt[13] = np.clip(spoilt[13] + 0.35, 0, 1)
+    spoilt[14] = np.clip(1.5 * spoilt[14], 0, 1)
+    cv2.circle(spoilt[16], (80, 40), 12, 1.0, -1)
+    return spoilt
+
+
+@pytest.mark.parametrize("scene", ["chart", "camera"])
+def test_what_only_a_few_frames_show_leaves_no_trace(scene):
+    sequence = make_sequence(scene=scene, seed=21, count=40)
+    filtered = {}
+    for name, frames in (("clean", sequence.frames), ("spoilt", spoil(sequence.frames))):
+        centroid = find_centroid(frames)
+        filtered[name] = filter_frames(frames, centroid.image, identify(centroid.flows), known_flows=centroid.flows)
+    clean, spoilt = (10 ** (-quality(filtered[name].image, sequence) / 20) for name in ("clean", "spoilt"))
+    assert spoilt < clean + 1 / 255
+    # A flash covers all of its frame, the bird a part of the frames it crosses.
+    assert filtered["spoilt"].shares[13:15].max() < 0.1 / 40
+    assert filtered["spoilt"].shares[20:].min() > 0.2 / 40
+
+
+def test_sharper_frames_count_more():
+    sequence = make_sequence(scene="camera", seed=22, count=20)
+    frames = sequence.frames.copy()
+    frames[::2] = [cv2.GaussianBlur(frame, (0, 0), 1.5) for frame in frames[::2]]
+    centroid = find_centroid(frames)
+    dynamics = identify(centroid.flows)
+    filtered = filter_frames(frames, centroid.image, dynamics, known_flows=centroid.flows)
+    assert filtered.sharpness[1::2].min() > filtered.sharpness[::2].max()
+    assert filtered.shares[1::2].min() > filtered.shares[::2].max()
+    assert filtered.shares.sum() == pytest.approx(1)
+
+
+def test_frames_that_do_not_count_change_the_flow_state_only():
+    sequence = make_sequence(seed=23, count=16)
+    centroid, dynamics = start(sequence, 8)
+    counted = np.ones(16, bool)
+    counted[[3, 9, 10, 15]] = False
+    garbage = sequence.frames.copy()
+    garbage[~counted] = np.random.default_rng(0).uniform(size=garbage[~counted].shape)
+    options = {"params": FilterParams(image_noise=1e-3), "counted": counted}
+    first, second = (
+        filter_frames(frames, centroid.image, dynamics, known_flows=centroid.flows, **options)
+        for frames in (sequence.frames, garbage)
+    )
+    assert np.isnan(first.innovations[~counted]).all()
+    assert np.isfinite(first.innovations[counted]).all()
+    assert (first.gains[~counted] == 0).all()
+    assert (first.shares[~counted] == 0).all()
+    assert np.allclose(first.flow_states[9], dynamics.A @ first.flow_states[8])
+    # The noise model is read off all training frames, so frame 3 is not quite without effect.
+    assert np.abs(first.image - second.image).mean() < 0.01
+
+
+def test_marks_that_do_not_fit_are_refused():
+    sequence = make_sequence(seed=24, count=12, size=64)
+    centroid, dynamics = start(sequence, 4)
+    for marks, message in (([False] * 12, "at least one"), ([True] * 10, "found 10 marks"), ([True] * 13, "13 marks")):
+        with pytest.raises(DataError, match=message):
+            filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows, counted=marks)
+
+
+def test_a_border_that_was_not_seen_is_not_made_of_its_repetition():
+    sequence = make_sequence(scene="camera", seed=25, count=16, blur=0.0, noise=0.005)
+    shifts = np.linspace(-4, 4, 16)
+    frames = np.stack(
+        [
+            warp(f, np.broadcast_to(np.float32([s, 0]), (*f.shape, 2)))
+            for f, s in zip(sequence.frames, shifts, strict=True)
+        ]
+    )
+    frames = frames[:, 8:-8, 8:-8]
+    truth = sequence.scene[8:-8, 8:-8]
+    centroid = find_centroid(frames)
+    filtered = filter_frames(frames, centroid.image, identify(centroid.flows), known_flows=centroid.flows)
+    error = np.abs(filtered.image - truth)
+    assert np.median(error[:, :2]) < 3 * np.median(error[:, 20:-20])

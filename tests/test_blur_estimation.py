@@ -4,7 +4,16 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blur_estimation import _costs, _fit_scene, _gradients, _most_detailed, _reduce, estimate_blur
+from turbrestore.blur_estimation import (
+    BlurEstimate,
+    _costs,
+    _doubt,
+    _fit_scene,
+    _gradients,
+    _most_detailed,
+    _reduce,
+    estimate_blur,
+)
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.psf import GAUSSIAN, KOLMOGOROV, blur_otf
 from turbrestore.synthesis.scenes import SCENES
@@ -98,6 +107,17 @@ def test_the_search_stops_once_the_cost_has_risen_three_times():
     costs = _costs(_gradients(blurred("chart", 0, 0.002, size=96)), GAUSSIAN, 0.005)
     assert 4 <= len(costs) < 12
     assert np.all(np.diff(costs[-4:]) > 0)
+
+
+@pytest.mark.parametrize(
+    ("reductions", "uncertainties", "believed"),
+    [((2, 8), (0.27, 0.27), 8), ((2, 8), (0.2, 0.27), 2), ((1, 2), (0.27, 0.25), 1), ((1, 2), (0.4, 0.25), 2)],
+)
+def test_of_images_about_as_sure_the_whole_comes_first_and_then_the_smallest(reductions, uncertainties, believed):
+    pairs = zip(reductions, uncertainties, strict=True)
+    none = np.zeros(0)
+    estimates = [BlurEstimate(1.0, doubt, 5 / 3, 0.01, reduction, 1.0, none, none) for reduction, doubt in pairs]
+    assert min(estimates, key=_doubt).reduction == believed
 
 
 def test_a_reduction_averages_whole_blocks():

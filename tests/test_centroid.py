@@ -1,9 +1,12 @@
 import numpy as np
 import pytest
 
+from conftest import natural_scene
 from turbrestore.centroid import CentroidParams, find_centroid, mean_registered
 from turbrestore.errors import ConfigurationError, DataError
+from turbrestore.flow import FlowParams
 from turbrestore.metrics import psnr
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 from turbrestore.warp import warp
 
 INSIDE = (slice(12, -12), slice(12, -12))
@@ -74,6 +77,39 @@ def test_frames_are_not_changed_and_colour_is_kept(sequence):
 def test_mean_registered_of_still_frames_is_the_mean():
     frames = np.random.default_rng(0).random((3, 8, 8)).astype(np.float32)
     assert np.allclose(mean_registered(frames, np.zeros((3, 8, 8, 2), np.float32)), frames.mean(axis=0), atol=1e-6)
+
+
+@pytest.mark.parametrize(("jitter", "drift"), [(8.0, 0.0), (0.0, 50.0)])
+def test_a_moving_camera_costs_nothing(jitter, drift):
+    rng = np.random.default_rng(3)
+    scene = natural_scene(192)
+    half = np.rint(rng.normal(0, jitter, (6, 2)) + np.linspace(0.5, 0.1, 6)[:, None] * (drift, 0)).astype(int)
+    # The scene itself is the mean position.
+    places = np.concatenate([half, -half[::-1]])
+    flows = smooth_flows(12, 192, 192, rng, SmoothFlowParams(rms=1.0))
+    frames = distort(scene, flows - flows.mean(axis=0), rng, noise=0.01)
+    cuts = np.stack([f[48 - y : 144 - y, 48 - x : 144 - x] for f, (x, y) in zip(frames, places, strict=True)])
+    still = np.stack([f[48:144, 48:144] for f in frames])
+    truth = scene[48:144, 48:144]
+    # Nearer to the border fewer frames show the scene.
+    seen = slice(32, -32), slice(32, -32)
+    moving, standing, lost = (
+        psnr(find_centroid(stack, flow_params=params).image[seen], truth[seen])
+        for stack, params in ((cuts, None), (still, None), (cuts, FlowParams(global_shift=False)))
+    )
+    assert moving == pytest.approx(standing, abs=0.3)
+    assert lost < standing - 0.5
+
+
+def test_pixels_that_a_frame_did_not_see_do_not_count():
+    frames = np.stack([np.full((8, 8), 0.2), np.tile(np.linspace(0.5, 0.9, 8), (8, 1))]).astype(np.float32)
+    flows = np.zeros((2, 8, 8, 2), np.float32)
+    flows[1, :, :, 0] = 5
+    mean = mean_registered(frames, flows)
+    assert np.abs(mean[:, 3:] - 0.2).max() < 1e-3
+    assert np.abs(mean[:, :2] - (0.2 + np.linspace(0.5, 0.9, 8)[5:7]) / 2).max() < 1e-3
+    # Where no frame shows anything the repeated borders of all count alike.
+    assert mean_registered(frames, flows + np.float32([9, 0])) == pytest.approx(np.full((8, 8), 0.55), abs=1e-6)
 
 
 def test_bad_input_is_refused(sequence):

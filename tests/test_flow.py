@@ -55,6 +55,55 @@ def test_flat_images_give_finite_flow(method):
     assert np.isfinite(estimate_flow(flat, flat[None], FlowParams(method=method))).all()
 
 
+def cut(scene, dx, dy, side=128):
+    """Frame that a reference cut at (64, 64) is shifted against by (dx, dy)."""
+    return scene[64 - dy : 64 - dy + side, 64 - dx : 64 - dx + side]
+
+
+@pytest.mark.parametrize("shift", [(24, 10), (-30, 0), (6, -40)])
+def test_large_shifts_are_taken_out_first(shift):
+    scene, rng = texture(5, 256), np.random.default_rng(5)
+    turbulence = smooth_flows(1, 128, 128, rng, SmoothFlowParams(rms=1.0))[0]
+    frame = (cut(scene, *shift) + rng.normal(0, 0.01, (128, 128))).astype(np.float32)
+    # warp(cut(0, 0), turbulence) lies on the frame once the frame is moved back by the shift.
+    reference = warp(cut(scene, 0, 0), turbulence)
+    both_see = slice(44, -44), slice(44, -44)
+    truth = turbulence + np.float32(shift)
+    with_shift, without = (
+        estimate_flow(reference, frame[None], FlowParams(global_shift=on))[0][both_see] for on in (True, False)
+    )
+    assert endpoint_error(with_shift, truth[both_see]) < 0.25
+    assert endpoint_error(without, truth[both_see]) > 3
+
+
+def test_what_a_shifted_frame_does_not_show_moves_with_it():
+    scene = texture(6, 256)
+    flow = estimate_flow(cut(scene, 0, 0), cut(scene, -40, 0)[None])[0]
+    # The frame starts where column 40 of the reference is.
+    assert np.abs(flow[8:-8, :30] - (-40, 0)).max() < 0.5
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (1, 0), (-1, 2)])
+def test_small_shifts_are_left_to_the_method(shift):
+    scene = texture(7, 256)
+    frames = cut(scene, *shift)[None]
+    on, off = (estimate_flow(cut(scene, 0, 0), frames, FlowParams(global_shift=g)) for g in (True, False))
+    assert (on == off).all()
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.03])
+def test_flat_regions_invent_no_motion(noise):
+    rng = np.random.default_rng(8)
+    still = texture(8)
+    still[:, 48:] = 0.5
+    reference, frame = (still + rng.normal(0, n, still.shape).astype(np.float32) for n in (noise / 5, noise))
+    trusting, cautious = (
+        estimate_flow(reference, frame[None], FlowParams(confidence=on))[0][8:-8, 60:-8] for on in (False, True)
+    )
+    assert np.sqrt(np.mean(trusting**2)) > 1
+    assert np.sqrt(np.mean(cautious**2)) < 0.4
+
+
 def test_classic_tvl1_finds_the_motion():
     reference, frame, truth = pair(3)
     found = estimate_flow(reference, frame[None], FlowParams(method="tvl1", tvl1=TvL1Params.classic()))[0]

@@ -6,14 +6,16 @@ import pytest
 
 from conftest import SCENES, make_sequence
 from turbrestore.alternating import FilterParams
+from turbrestore.blind import blur_to_remove
 from turbrestore.blur_cues import BlurBounds, bound_blur
 from turbrestore.blur_estimation import BlurEstimate
 from turbrestore.centroid import CentroidParams
 from turbrestore.deconvolution import DeconvolutionParams
 from turbrestore.errors import ConfigurationError, DataError
+from turbrestore.flow import FlowParams
 from turbrestore.frame_source import FrameSource
 from turbrestore.metrics import compare
-from turbrestore.pipeline import RestoreParams, blur_to_remove, restore, training_share
+from turbrestore.pipeline import RestoreParams, restore, training_share
 
 QUICK = RestoreParams(centroid=CentroidParams(iterations=2))
 
@@ -198,7 +200,9 @@ def test_cues_are_reported_when_on(blurred):
 def test_where_noise_moves_flows_the_displacement_cue_knows_better(scene):
     noisy = make_sequence(seed=13, count=30, size=128, scene=scene, noise=0.05, blur=1.2, rms=0.4)
     true = float(noisy.flows.var(axis=0, ddof=1).mean())
-    dynamics = restore(noisy.frames, replace(QUICK, until="identify", displacement_cue=True)).dynamics
+    # Flow as it is measured: where it is drawn to its surroundings, noise moves it little.
+    settings = replace(QUICK, until="identify", displacement_cue=True, flow=FlowParams(confidence=False))
+    dynamics = restore(noisy.frames, settings).dynamics
     found = float(dynamics.flow_variance.mean())
     motion = float((dynamics.motion_factor * dynamics.flow_variance).mean())
     assert found > 1.3 * true
@@ -209,3 +213,49 @@ def test_bounds_that_would_have_no_effect_are_refused():
     for other in ({"until": "filter"}, {"deconvolution": DeconvolutionParams(sigma=1.0)}):
         with pytest.raises(ConfigurationError, match="^blur_bounds: has an effect only where"):
             RestoreParams(blur_bounds=True, **other)
+
+
+def test_lucky_imaging_takes_the_sharpest_frames_only():
+    sequence = make_sequence(seed=31, count=20, size=96, blur=0.8)
+    frames = sequence.frames.copy()
+    poor = np.arange(20) % 5 != 0
+    frames[poor] = [cv2.GaussianBlur(frame, (0, 0), 2.0) for frame in frames[poor]]
+    lucky = restore(frames, replace(QUICK, keep_best=0.2, until="filter"))
+    assert np.array_equal(lucky.filtered.shares > 0, ~poor)
+    assert any(decision.choice == "4 of 20 frames count" for decision in lucky.decisions)
+    everything = restore(frames, replace(QUICK, until="filter", filter=FilterParams(sharpness=0.0)))
+    assert compare(lucky.image, sequence.scene).psnr > compare(everything.image, sequence.scene).psnr + 1
+
+
+def test_a_cropped_border_is_what_the_frames_show(blurred):
+    jitter = np.random.default_rng(0).integers(-5, 6, (24, 2))
+    frames = np.stack(
+        [frame[8 + dy : 120 + dy, 8 + dx : 120 + dx] for frame, (dx, dy) in zip(blurred.frames, jitter, strict=True)]
+    )
+    settings = replace(QUICK, train=14, deconvolution=DeconvolutionParams(sigma=1.0, method="wiener"))
+    whole, cropped = (restore(frames, replace(settings, border=border)) for border in ("keep", "crop"))
+    x, y, width, height = cropped.crop
+    assert whole.crop == (0, 0, 112, 112)
+    assert 90 <= width < 112
+    assert 90 <= height < 112
+    assert np.array_equal(cropped.image, whole.image[y : y + height, x : x + width])
+    assert whole.decisions[-1].choice == "kept"
+    assert cropped.decisions[-1].choice == f"cropped to {width}×{height} pixels from ({x}, {y})"
+
+
+def test_every_stage_says_what_it_decided(blurred):
+    subjects = [decision.subject for decision in restore(blurred.frames, replace(QUICK, train=14)).decisions]
+    assert list(dict.fromkeys(subjects)) == ["training", "centroid", "flow model", "frames", "blur", "guards", "border"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"keep_best": 0.0}, "^keep_best: expected a share"),
+        ({"keep_best": 0.5, "until": "centroid"}, "^keep_best: has no effect"),
+        ({"border": "mirror"}, "^border: expected one of keep, crop, found 'mirror'"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, message):
+    with pytest.raises(ConfigurationError, match=message):
+        RestoreParams(**settings)

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
-from turbrestore.warp import compose_flows, invert_flow, warp, warp_adjoint
+from turbrestore.warp import compose_flows, inside, invert_flow, warp, warp_adjoint
 
 
 def smooth_flow(rng, size=48, rms=1.5):
@@ -77,10 +77,10 @@ def test_warp_follows_the_sign_rule():
 def test_inverse_composed_with_the_flow_is_the_identity(seed):
     flow = smooth_flow(np.random.default_rng(seed))
     inverse = invert_flow(flow, iterations=50, tolerance=1e-5)
-    inside = (slice(6, -6), slice(6, -6))
+    interior = (slice(6, -6), slice(6, -6))
     assert np.abs(compose_flows(flow, inverse)).max() < 1e-4
     # The other way round, the inverse is interpolated between the points where it was found.
-    assert np.abs(compose_flows(inverse, flow)[inside]).max() < 0.05
+    assert np.abs(compose_flows(inverse, flow)[interior]).max() < 0.05
 
 
 def test_composition_warps_as_two_warps_do():
@@ -91,6 +91,16 @@ def test_composition_warps_as_two_warps_do():
     twice = warp(warp(image, outer), inner)
     once = warp(image, compose_flows(outer, inner))
     assert np.abs(twice - once)[6:-6, 6:-6].max() < 2e-3
+
+
+def test_inside_is_what_a_linear_warp_of_ones_between_zeros_gives():
+    from scipy.ndimage import map_coordinates
+
+    flow = np.random.default_rng(4).normal(0, 6, (14, 18, 2)).astype(np.float32)
+    y, x = np.mgrid[:14, :18]
+    expected = map_coordinates(np.ones((14, 18)), [y + flow[..., 1], x + flow[..., 0]], order=1, mode="grid-constant")
+    assert 0.2 < expected.mean() < 0.9
+    assert np.abs(inside(flow) - expected).max() < 1e-5
 
 
 def test_arguments_are_not_changed():
@@ -110,6 +120,8 @@ def test_wrong_shapes_and_names_are_refused():
         warp_adjoint(image, flow)
     with pytest.raises(ConfigurationError, match="linear, cubic"):
         warp(image, np.zeros((4, 4, 2)), "lanczos")
+    with pytest.raises(DataError):
+        inside(np.zeros((2, 4, 4, 2)))
     with pytest.raises(DataError):
         invert_flow(np.zeros((2, 4, 4, 2)))
     with pytest.raises(DataError):

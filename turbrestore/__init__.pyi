@@ -34,6 +34,12 @@ from .metrics import compare_flows as compare_flows
 from .pipeline import Restoration as Restoration
 from .pipeline import RestoreParams as RestoreParams
 from .pipeline import restore as restore
+from .report import write_report as write_report
+from .run_record import RunRecord as RunRecord
+from .run_record import describe_run as describe_run
+from .run_record import load_run as load_run
+from .run_record import save_run as save_run
+from .stabilisation import global_shifts as global_shifts
 from .synthesis.anisoplanatic import diffraction_limited as diffraction_limited
 from .synthesis.anisoplanatic import phase_screen_frames as phase_screen_frames
 from .synthesis.atmosphere import PhaseScreenParams as PhaseScreenParams

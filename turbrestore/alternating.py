@@ -28,7 +28,8 @@ Departures from the paper, each with its reason:
   model the iteration then changes nothing.
 * Z may vary from pixel to pixel: it falls where a frame is locally sharper than usual, by ``exp(−β z)`` with z the
   standardised local sharpness, the gradient of the frame projected on that of the reference; and it rises where the
-  flow folds, which a diffeomorphism does not.  β = 0 is the paper's scalar gain.
+  frame shows what the others do not (a bird, a flash), where it was not seen, and where the flow folds, which a
+  diffeomorphism does not.  β = 0 is the paper's scalar gain.
   ``frame_noise="blur"`` takes the blur of the frame instead, as its spectra show it, and gives frames the shares of
   :func:`turbrestore.blur_moments.fusion.fusion_rule`.
 * The image starts from a diffuse prior (``prior_frames=0``) and takes the training frames in first; the paper starts
@@ -41,7 +42,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,7 +54,12 @@ from .flow import FlowParams, iterate_flows
 from .frame_noise import FrameNoise, measure_frame_noise, noise_of_frame, relative_sharpness
 from .kalman import Gaussian, PixelGaussian, predict, predict_pixels, update_information, update_pixels
 from .parallel import map_ahead, one_thread_each
+from .plots import plot_frames
+from .preview import preview
 from .warp import warp
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 RESIDUALS = ("keep", "drop")
 FRAME_NOISES = ("sharpness", "blur")
@@ -151,10 +157,11 @@ class Filtered:
     gains : ndarray, float64, shape (N,)
         L of each frame, mean over the pixels.
     innovations : ndarray, float64, shape (N,)
-        Root mean square of W^meas − W̄ − C A ξ̂ for each frame, pixels: what the prediction did not foresee.
+        Root mean square of W^meas − W̄ − C A ξ̂ for each frame, pixels: what the prediction did not foresee; NaN where
+        the frame does not count.
     sharpness : ndarray, float64, shape (N,)
         Gradient of each registered frame, projected on that of the image that the filter started from; 1 if they are
-        equal.
+        equal, NaN where the frame does not count.
     shares : ndarray, float64, shape (N,)
         Share of the information that each frame brought, mean over the pixels; they sum to 1.
     image_noise : float
@@ -173,6 +180,33 @@ class Filtered:
     image_noise: float
     motion_share: float
 
+    def plot(self) -> Figure:
+        """Draw how sharp each frame is and how much it counts.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ConfigurationError
+            Matplotlib is not installed.
+        """
+        return plot_frames(self.sharpness, self.shares)
+
+    def _repr_html_(self) -> str:
+        facts = [
+            ("frames", str(self.gains.size)),
+            ("innovation", f"{np.nanmean(self.innovations):.2f} pixels"),
+            ("noise of a frame", f"{100 * self.image_noise**0.5:.2f} % of full scale"),
+        ]
+        return preview("Filtered image", facts, self.image)
+
+
+# Frames of a block, and frames with their flows; None for those that do not count.
+Block = list[FloatArray | None]
+Pair = tuple[FloatArray | None, FloatArray | None]
+
 
 @dataclass(frozen=True)
 class _Setting:
@@ -187,10 +221,10 @@ class _Setting:
 
 @dataclass(frozen=True)
 class _Motion:
-    """One frame with its measured flow, the flow state after it, and the innovation."""
+    """One frame with its measured flow (None if it does not count), the flow state after it, and the innovation."""
 
-    frame: FloatArray
-    measured: FloatArray
+    frame: FloatArray | None
+    measured: FloatArray | None
     state: Gaussian
     innovation: float
 
@@ -212,6 +246,7 @@ def filter_frames(
     flow_params: FlowParams | None = None,
     known_flows: ArrayLike | None = None,
     progress: Callable[[int], None] | None = None,
+    counted: ArrayLike | None = None,
 ) -> Filtered:
     """Run the alternating-estimation filter over ``frames``.
 
@@ -234,6 +269,9 @@ def filter_frames(
         Flows already measured from ``reference`` to the first K frames, pixels; they form the first block.
     progress : callable, optional
         Called with 1 after each measured flow.
+    counted : array_like, bool, shape (N,), optional
+        Frames that the image is made of; from the others nothing is measured, and the flow state is predicted through
+        them.  By default all.
 
     Returns
     -------
@@ -263,6 +301,9 @@ def filter_frames(
     flows = None if known_flows is None else check_flow(known_flows, "known_flows")
     if flows is not None and (flows.ndim != 4 or flows.shape[1:3] != dynamics.shape):
         raise DataError(f"known_flows: expected shape (K, {image.shape[0]}, {image.shape[1]}, 2), found {flows.shape}")
+    marks = None if counted is None else np.asarray(counted, bool)
+    if marks is not None and not marks.any():
+        raise DataError("counted: expected at least one frame to count, found none")
     stream = _checked(frames, image.shape)
     first = list(islice(stream, params.block if flows is None else len(flows)))
     if not first or (flows is not None and len(first) < len(flows)):
@@ -278,10 +319,12 @@ def filter_frames(
     )
     setting = _Setting(dynamics, model, params, flow_params, progress)
     with one_thread_each():
-        state, records = _filter_block(state, first, flows, setting)
+        state, records = _filter_block(state, _left_out(first, marks, 0), flows, setting)
         while block := list(islice(stream, params.block)):
-            state, done = _filter_block(state, block, None, setting)
+            state, done = _filter_block(state, _left_out(block, marks, len(records)), None, setting)
             records += done
+    if marks is not None and marks.size != len(records):
+        raise DataError(f"counted: expected one mark for each frame, found {marks.size} marks, {len(records)} frames")
     information = np.array([record.information for record in records])
     return Filtered(
         image=state.image.mean.astype(np.float32),
@@ -302,6 +345,16 @@ def _checked(frames: Iterable[ArrayLike], shape: tuple[int, ...]) -> Iterator[Fl
         if image.shape != shape:
             raise DataError(f"frame {index}: expected shape {shape} as the reference has, found {image.shape}")
         yield image
+
+
+def _left_out(frames: list[FloatArray], marks: np.ndarray | None, start: int) -> Block:
+    """Put None for the frames that do not count."""
+    if marks is None:
+        return list(frames)
+    of_block = marks[start : start + len(frames)]
+    if of_block.size < len(frames):
+        raise DataError(f"counted: expected one mark for each frame, found {marks.size} marks and more frames")
+    return [frame if mark else None for frame, mark in zip(frames, of_block, strict=True)]
 
 
 def _noise_model(
@@ -328,7 +381,7 @@ def _noise_model(
 
 
 def _filter_block(
-    prior: FilterState, frames: list[FloatArray], known: FloatArray | None, setting: _Setting
+    prior: FilterState, frames: Block, known: FloatArray | None, setting: _Setting
 ) -> tuple[FilterState, list[_Record]]:
     """Inner iterations over one block, each from the same prior with flows measured from the newest image."""
     state, records = prior, list[_Record]()
@@ -340,9 +393,7 @@ def _filter_block(
     return state, records
 
 
-def _filter_pass(
-    prior: FilterState, pairs: Iterable[tuple[FloatArray, FloatArray]], setting: _Setting
-) -> tuple[FilterState, list[_Record]]:
+def _filter_pass(prior: FilterState, pairs: Iterable[Pair], setting: _Setting) -> tuple[FilterState, list[_Record]]:
     """Update the flow state and the image by each frame and its flow (eqs. 14 to 19)."""
     image, flow, drift = prior.image, prior.flow, setting.params.image_drift
     records: list[_Record] = []
@@ -350,22 +401,24 @@ def _filter_pass(
     registering = map_ahead(partial(_register, setting), motions, setting.flow_params.threads)
     for motion, (registered, noise, sharpness) in registering:
         flow = motion.state
+        if motion.frame is None:
+            records.append(_Record(flow.mean, 0.0, np.nan, np.nan, 0.0))
+            continue
         image, gain = update_pixels(predict_pixels(image, drift) if drift else image, registered, noise)
         information = float(np.mean(1 / np.asarray(noise)))
         records.append(_Record(flow.mean, float(gain.mean()), motion.innovation, sharpness, information))
     return FilterState(image, flow), records
 
 
-def _measure(image: np.ndarray, frames: list[FloatArray], setting: _Setting) -> Iterator[tuple[FloatArray, FloatArray]]:
-    for pair in iterate_flows(image, frames, setting.flow_params):
+def _measure(image: np.ndarray, frames: Block, setting: _Setting) -> Iterator[Pair]:
+    pairs = iterate_flows(image, (frame for frame in frames if frame is not None), setting.flow_params)
+    for frame in frames:
         if setting.progress is not None:
             setting.progress(1)
-        yield pair
+        yield (None, None) if frame is None else next(pairs)
 
 
-def _update_motion(
-    prior: Gaussian, pairs: Iterable[tuple[FloatArray, FloatArray]], dynamics: FlowDynamics
-) -> Iterator[_Motion]:
+def _update_motion(prior: Gaussian, pairs: Iterable[Pair], dynamics: FlowDynamics) -> Iterator[_Motion]:
     """Prediction and update of ξ for each frame (eqs. 14b, 14d, 17, 19).
 
     It needs no image, so that frames can be warped side by side afterwards.
@@ -373,6 +426,10 @@ def _update_motion(
     state, noise = prior, max(dynamics.R, _FLOW_NOISE_FLOOR)
     for frame, measured in pairs:
         prediction = predict(state, dynamics.A, dynamics.Q)
+        if frame is None or measured is None:
+            state = prediction
+            yield _Motion(None, None, state, np.nan)
+            continue
         deviation = (measured - dynamics.mean_flow).reshape(-1)
         state, _ = update_information(prediction, deviation, dynamics.C, noise, orthonormal=True)
         unforeseen = measured - flow_of(dynamics, prediction.mean)
@@ -381,6 +438,8 @@ def _update_motion(
 
 def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, float | FloatArray, float]:
     """Frame on the image by Ŵ, its noise Z (eq. 15) and its sharpness."""
+    if motion.frame is None or motion.measured is None:
+        return np.full_like(setting.model.usual, np.nan), np.inf, np.nan
     modelled = flow_of(setting.dynamics, motion.state.mean)
     share = setting.model.motion_share[..., None]
     estimate = modelled + share * (motion.measured - modelled)

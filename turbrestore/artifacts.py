@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike
 
 from .alternating import Filtered
 from .arrays import FloatArray, check_flow, check_image
+from .blur_cues import BlurBounds
+from .blur_estimation import BlurEstimate
 from .centroid import Centroid
 from .deconvolution import Deconvolution
 from .dynamics import FlowDynamics
@@ -33,6 +35,8 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "dynamics": FlowDynamics,
     "filtered": Filtered,
     "deconvolution": Deconvolution,
+    "blur": BlurEstimate,
+    "blur_bounds": BlurBounds,
 }
 _HEADER = "header"
 _SCALARS: dict[str, Any] = {"float": (int, float), "int": int, "bool": bool, "tuple[str, ...]": list}
@@ -47,7 +51,7 @@ def save_artifact(path: str | os.PathLike[str], result: DataclassInstance, overw
     ----------
     path : path
         Must end in ``.npz``.
-    result : Centroid, FlowDynamics, Filtered or Deconvolution
+    result : Centroid, FlowDynamics, Filtered, Deconvolution, BlurEstimate or BlurBounds
     overwrite : bool
         Replace an existing file.
 

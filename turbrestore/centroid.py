@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,11 +25,19 @@ from .arrays import FloatArray, check_frames
 from .errors import require, require_between
 from .flow import FlowParams, estimate_flow
 from .parallel import map_ahead
-from .warp import compose_flows, invert_flow, warp
+from .plots import plot_displacements
+from .preview import preview
+from .stabilisation import mean_stabilised
+from .warp import compose_flows, inside, invert_flow, warp
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MODES = ("fused", "single")
 # A mean flow that keeps this share of its length from one iteration to the next is the bias of the flow method.
 _STALLED = 0.8
+# Weight of the repeated border beside that of a pixel that was seen.
+_UNSEEN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -46,12 +54,13 @@ class CentroidParams:
         Stop when the mean flow is shorter than this, pixels (mean over the image), or shrinks by less than a fifth.
         What is left is the bias of the flow method; it is not corrected, which would bend the image.
     start : int
-        Frame that ``single`` warps; ``fused`` starts from the temporal mean.
+        Frame that ``single`` warps; ``fused`` starts from the temporal mean, of stabilised frames if flow takes shifts
+        of whole frames out.
     """
 
     mode: Literal["fused", "single"] = "fused"
     iterations: int = 5
-    tolerance: float = 0.2
+    tolerance: float = 0.15
     start: int = 0
 
     def __post_init__(self) -> None:
@@ -82,6 +91,28 @@ class Centroid:
     flows: FloatArray
     mean_flow_sizes: np.ndarray
     converged: bool
+
+    def plot(self) -> Figure:
+        """Draw how far every pixel moves over the frames.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ConfigurationError
+            Matplotlib is not installed.
+        """
+        return plot_displacements(self.flows, self.image)
+
+    def _repr_html_(self) -> str:
+        facts = [
+            ("frames", str(len(self.flows))),
+            ("mean flow left", f"{self.mean_flow_sizes[-1]:.2f} pixels"),
+            ("iterations", f"{self.mean_flow_sizes.size}, {'' if self.converged else 'not '}converged"),
+        ]
+        return preview("Centroid", facts, self.image)
 
 
 def find_centroid(
@@ -126,7 +157,7 @@ def find_centroid(
     params, flow_params = params or CentroidParams(), flow_params or FlowParams()
     stack = check_frames(frames, at_least=2)
     require(params.start < len(stack), f"start: expected a frame below {len(stack)}, found {params.start}")
-    image = stack.mean(axis=0, dtype=np.float32) if params.mode == "fused" else stack[params.start]
+    image = _start(stack, params, flow_params)
     total = np.zeros((*stack.shape[1:3], 2), np.float32)
     sizes: list[float] = []
     while True:
@@ -149,8 +180,16 @@ def find_centroid(
             return Centroid(image, flows, np.array(sizes), converged)
 
 
+def _start(stack: FloatArray, params: CentroidParams, flow_params: FlowParams) -> FloatArray:
+    if params.mode == "single":
+        return stack[params.start]
+    return mean_stabilised(stack) if flow_params.global_shift else stack.mean(axis=0, dtype=np.float32)
+
+
 def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0) -> FloatArray:
     """Average of frames warped onto the reference that their flows start from.
+
+    At each pixel those frames count that show it; where none does, all of them, with their borders repeated.
 
     Parameters
     ----------
@@ -170,7 +209,13 @@ def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0) -> 
     >>> mean_registered(np.ones((2, 4, 4), np.float32), np.zeros((2, 4, 4, 2), np.float32))[0]
     array([1., 1., 1., 1.], dtype=float32)
     """
-    total = np.zeros(frames.shape[1:], np.float64)
-    for _, registered in map_ahead(lambda pair: warp(*pair), zip(frames, flows, strict=True), threads):
+
+    def register(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+        seen = np.maximum(inside(pair[1]), _UNSEEN)
+        return (warp(*pair).T * seen.T).T, seen
+
+    total, weight = np.zeros(frames.shape[1:]), np.zeros(frames.shape[1:3])
+    for _, (registered, seen) in map_ahead(register, zip(frames, flows, strict=True), threads):
         total += registered
-    return (total / len(frames)).astype(np.float32)
+        weight += seen
+    return (total.T / weight.T).T.astype(np.float32)

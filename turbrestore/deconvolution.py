@@ -43,7 +43,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,6 +60,8 @@ from .nonlocal_tv import (
     nonlocal_weights,
     project_to_unit,
 )
+from .plots import plot_objective
+from .preview import preview
 from .psf import (
     GAUSSIAN,
     Spectrum,
@@ -71,6 +73,9 @@ from .psf import (
     psf_to_otf,
     wiener_fidelity,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 METHODS = ("nltv", "tv", "wiener", "tikhonov")
 BOUNDARIES = ("unknown", "periodic")
@@ -98,9 +103,9 @@ class DeconvolutionParams:
         Width of the blur, pixels, for callers that ask here; by default it is to be estimated.
     exponent : float, optional
         Shape of a blur that is known by its width: 2 is a Gaussian, 5/3 turbulence; see
-        :func:`turbrestore.psf.blur_otf`.  By default 2 for a given width, and 5/3 for one that is estimated.
+        ``turbrestore.psf.blur_otf``.  By default 2 for a given width, and 5/3 for one that is estimated.
     fidelity : float, optional
-        λ: more is sharper and noisier; by default from the noise of the image, see :func:`automatic_fidelity`.
+        λ: more is sharper and noisier; by default from the noise of the image, see ``automatic_fidelity``.
     iterations : int
         Largest number of iterations.
     tolerance : float
@@ -179,6 +184,28 @@ class Deconvolution:
     recorded: NDArray[np.int64]
     objective: NDArray[np.float64]
     changes: NDArray[np.float64]
+
+    def plot(self) -> Figure:
+        """Draw the energy over the iterations.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ConfigurationError
+            Matplotlib is not installed.
+        """
+        return plot_objective(self.recorded, self.objective)
+
+    def _repr_html_(self) -> str:
+        facts = [
+            ("blur removed", f"{self.sigma:.2f} pixels" if self.sigma > 0 else "none"),
+            ("noise before", f"{100 * self.noise:.2f} % of full scale"),
+            ("iterations", f"{self.iterations}, {'' if self.converged else 'not '}converged"),
+        ]
+        return preview("Deblurred image", facts, self.image)
 
 
 @dataclass(frozen=True, eq=False)

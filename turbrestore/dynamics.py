@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -34,6 +35,11 @@ from scipy import linalg
 from .arrays import FloatArray, check_flow
 from .errors import ConfigurationError, DataError, require_between
 from .parallel import one_thread_each
+from .plots import plot_dynamics
+from .preview import preview
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Float64Array = NDArray[np.float64]
 
@@ -148,6 +154,30 @@ class FlowDynamics:
     overfitted: bool
     notes: tuple[str, ...]
     motion_factor: FloatArray
+
+    def plot(self) -> Figure:
+        """Draw the singular values of the flows and the eigenvalues of A.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ConfigurationError
+            Matplotlib is not installed.
+        """
+        return plot_dynamics(self.singular_values, self.eigenvalues)
+
+    def _repr_html_(self) -> str:
+        spread = np.sqrt(self.flow_variance).astype(np.float32)
+        facts = [
+            ("states", f"{self.rank}, from {self.frame_count} flows"),
+            ("share of the motion", f"{100 * self.energy_share:.1f} %"),
+            ("largest eigenvalue", f"{np.abs(self.eigenvalues).max(initial=0.0):.3f}"),
+            ("motion", f"{spread.mean():.2f} pixels a component, brightest {spread.max():.2f}"),
+        ]
+        return preview("Flow dynamics", facts, spread / max(float(spread.max()), 1e-6))
 
     @property
     def rank(self) -> int:

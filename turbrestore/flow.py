@@ -9,6 +9,13 @@ Black–Anandan flow, which these supersede.
 
 Local contrast is normalised first (zero mean, unit deviation in a Gaussian window), so that dark and low-contrast
 regions register as well as bright ones; ``contrast_floor`` keeps noise in flat regions from being blown up.
+
+A shift of the whole frame beyond two pixels is measured first (:mod:`turbrestore.stabilisation`) and taken out by whole
+pixels, which interpolates nothing: the flow is that shift plus the flow of the shifted frame.  Beyond the edge of the
+shifted frame the reference stands in, so that what nobody saw moves with the shift.
+
+Where the texture of the reference tells little of the motion, the flow is drawn towards its neighbourhood
+(:mod:`turbrestore.confidence`); flat regions move as what surrounds them.
 """
 
 from __future__ import annotations
@@ -22,8 +29,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, check_frames, check_image, luminance
+from .confidence import flow_confidence, regularise_flow
 from .errors import DataError, require, require_between
 from .parallel import map_ahead
+from .psf import estimate_noise
+from .stabilisation import DEAD_ZONE, ShiftReference, overlap, refer_shift, shift_against
 
 MIN_SIDE = 16
 # Grey levels per local standard deviation in the 8-bit image that the solvers see: ±4 deviations fit.
@@ -148,6 +158,10 @@ class FlowParams:
         normalisation off.
     contrast_floor : float
         Intensity deviation (0 to 1) below which a region counts as flat.
+    global_shift : bool
+        Take large shifts of whole frames out first.
+    confidence : bool
+        Draw the flow of flat regions, and along edges, towards its neighbourhood.
     threads : int
         Frames solved side by side; 0 means one per available core.
     dis : DisParams
@@ -161,6 +175,8 @@ class FlowParams:
     method: Literal["dis", "tvl1", "farneback"] = "dis"
     contrast_window: float = 10.0
     contrast_floor: float = 0.01
+    global_shift: bool = True
+    confidence: bool = True
     threads: int = 0
     dis: DisParams = field(default_factory=DisParams)
     tvl1: TvL1Params = field(default_factory=TvL1Params)
@@ -268,11 +284,15 @@ def iterate_flows(
             f"{target.shape[1]}×{target.shape[0]}"
         )
     prepared = _prepare(target, params)
+    position = refer_shift(target) if params.global_shift else None
+    confidence = flow_confidence(target) if params.confidence else None
 
     def solve(frame: FloatArray) -> FloatArray:
         # A solver object keeps buffers that must not be shared between threads, and is cheap beside a flow.
         solver = FLOW_METHODS[params.method](params)
-        return solver(prepared, _prepare(frame, params))
+        shift = np.zeros(2, np.float32) if position is None else _whole_shift(frame, position)
+        flow = solver(prepared, _shifted(_prepare(frame, params), shift, prepared))
+        return shift + (flow if confidence is None else regularise_flow(flow, confidence, estimate_noise(frame)))
 
     def checked() -> Iterator[FloatArray]:
         for index, frame in enumerate(frames):
@@ -322,6 +342,24 @@ def _prepare(image: FloatArray, params: FlowParams) -> GreyBytes:
     else:
         levels = luminance(image) * 255.0
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+
+
+def _whole_shift(frame: FloatArray, position: ShiftReference) -> FloatArray:
+    """Shift of the frame in whole pixels, zero where dense flow needs no help."""
+    shift = shift_against(frame, position)
+    if shift is None or np.abs(shift).max() <= DEAD_ZONE:
+        return np.zeros(2, np.float32)
+    return np.rint(shift).astype(np.float32)
+
+
+def _shifted(frame: GreyBytes, shift: FloatArray, outside: GreyBytes) -> GreyBytes:
+    """Frame on the grid of the reference, which shows where the frame does not reach."""
+    if not shift.any():
+        return frame
+    to, origin = overlap(frame.shape, shift)
+    result = outside.copy()
+    result[to] = frame[origin]
+    return result
 
 
 def _dis(params: FlowParams) -> Solver:

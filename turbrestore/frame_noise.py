@@ -9,7 +9,8 @@ G : share of the flow outside the model's subspace that is motion and not noise
 R : variance of that flow
 
 The paper takes Z to be one number.  Here it falls where a frame is locally sharper than usual, which is the idea of
-lucky imaging inside the Kalman gain, and rises where the flow folds.  Which frames are sharp is read from their local
+lucky imaging inside the Kalman gain, and rises where a frame shows something that the others do not, and where its
+flow folds or leaves the frame.  Which frames are sharp is read from their local
 gradients, or from the spectra of their tiles (:mod:`turbrestore.blur_moments.frame_blur`); later frames are held
 against the spectra of the first ones, so that none of them has to be kept.
 """
@@ -20,12 +21,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from .arrays import FloatArray, luminance
 from .blur_moments.frame_blur import BlurReference, blur_against, refer_blur
 from .blur_moments.fusion import FusionRule, fusion_rule, laplacian_energy, noise_factor
 from .parallel import map_ahead
-from .warp import warp
+from .warp import inside, warp
 
 # Smallest variance, so that noise-free synthetic data keep every gain defined: (1/4096 of full scale)².
 _IMAGE_NOISE_FLOOR = 6e-8
@@ -35,6 +37,12 @@ _LARGEST_SCORE = 3.0
 _LEAST_SPREAD = 0.03
 # Z is so many times larger where a map folds.
 _DISTRUST = 1e3
+# A frame that deviates from the usual by more than this many variances shows something that is not the scene.
+_OUTLIER, _OUTLIER_WINDOW = 6.0, 3.0
+# Z grows with that power of the excess.
+_REJECTION = 3
+# Share of the mean variance that every pixel varies by at least.
+_LEAST_DEVIATION = 0.1
 # Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels it correlates over.
 _SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
 
@@ -59,6 +67,10 @@ class FrameNoise:
         G, 0 to 1.
     window : float
         Standard deviation of the window in which sharpness is measured, pixels.
+    usual_frame : ndarray, float32, shape (H, W)
+        Mean of the registered frames, without what deviates from the rest.
+    deviation : ndarray, float32, shape (H, W)
+        Variance of the registered frames about it, locally averaged, squared intensity.
     blur : tuple of BlurReference and FusionRule, or None
         What the blur of a frame is measured against, and the shares of frames that follow from it; None where
         sharpness is what counts.
@@ -71,6 +83,8 @@ class FrameNoise:
     score_variance: FloatArray
     motion_share: FloatArray
     window: float
+    usual_frame: FloatArray
+    deviation: FloatArray
     blur: tuple[BlurReference, FusionRule] | None = None
 
 
@@ -143,6 +157,7 @@ def measure_frame_noise(
     spread = np.maximum(sharp_squares / count - usual**2, 0.0)
     # The flattest fifth of the image varies by sensor noise alone; elsewhere blur and misregistration add to it.
     energy = _smooth(template[0] ** 2 + template[1] ** 2, window)
+    usual_frame, deviation = _without_outliers(frames, flows, total / count, variance, threads)
     sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
     scale = _score_scale(usual, spread, energy * _SOBEL_NOISE * sensor_noise, window)
     return FrameNoise(
@@ -153,12 +168,17 @@ def measure_frame_noise(
         score_variance=(scale**2 * spread).astype(np.float32),
         motion_share=_motion_share(energy, sensor_noise, residual_variance, window),
         window=window,
+        usual_frame=usual_frame,
+        deviation=deviation,
         blur=_blur_rule(np.stack(kept), image, sensor_noise) if len(kept) > 1 else None,
     )
 
 
 def noise_of_frame(registered: FloatArray, flow: FloatArray, model: FrameNoise, sharpness: float) -> float | FloatArray:
-    """Z of one frame: lower where it is sharper than usual, much higher where its flow folds.
+    """Z of one frame: lower where it is sharper than usual, higher where it shows something else or its flow errs.
+
+    A frame shows something else, a bird or a flash, where it deviates from the usual by far more than frames do; its
+    flow errs where it folds or leaves the frame.
 
     Parameters
     ----------
@@ -185,17 +205,21 @@ def noise_of_frame(registered: FloatArray, flow: FloatArray, model: FrameNoise, 
     >>> noise_of_frame(frames[0], still[0], model, sharpness=0.0) == model.image_noise
     True
     """
+    if model.blur is None and sharpness == 0:
+        return model.image_noise
+    grey = luminance(registered)
+    excess = np.maximum(_deviates(grey, model.usual_frame, model.deviation) / _OUTLIER, 1)
+    distrust = np.float32(model.image_noise) * np.power(excess, _REJECTION) * _distrust(flow)
     if model.blur is not None:
         reference, rule = model.blur
-        extra = blur_against(registered[None], reference).extra[0]
-        return np.float32(model.image_noise) * noise_factor(rule, extra) * _distrust(flow)
-    if sharpness == 0:
-        return model.image_noise
-    seen = _sharpness(luminance(registered), model.template, model.window)
+        return noise_factor(rule, blur_against(registered[None], reference).extra[0]) * distrust
+    seen = _sharpness(grey, model.template, model.window)
     score = np.clip(model.score_scale * (seen - model.usual), -_LARGEST_SCORE, _LARGEST_SCORE)
+    # What is not the scene may well have more contrast than the scene.
+    score = np.where(score > 0, score / np.square(excess), score)
     # For a normal score of variance s² the mean of exp(β z − β² s² / 2) is one: the information per frame stays 1/Z.
     exponent = 0.5 * sharpness**2 * model.score_variance - sharpness * score
-    return np.float32(model.image_noise) * np.exp(exponent) * _distrust(flow)
+    return np.exp(exponent) * distrust
 
 
 def relative_sharpness(registered: FloatArray, model: FrameNoise) -> float:
@@ -235,11 +259,42 @@ def _blur_rule(registered: FloatArray, image: FloatArray, sensor_noise: float) -
     return reference, fusion_rule(blur, energy, noise)
 
 
-def _distrust(flow: FloatArray) -> FloatArray:
-    """Factor on Z: large where the map id + Ŵ folds.
+def _without_outliers(
+    frames: list[FloatArray], flows: FloatArray, mean: np.ndarray, variance: np.ndarray, threads: int
+) -> tuple[FloatArray, FloatArray]:
+    """Mean of the registered frames and their variance about it, once what deviates from all of them is left out."""
 
-    Paper 3 takes the maps to be diffeomorphisms.  Where the estimate is none, the flow has lost its way, and what it
-    brings there may have more contrast than the scene.
+    def trim(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, NDArray[np.bool_]]:
+        registered = luminance(warp(*pair))
+        return registered, _deviates(registered, centre, spread) <= _OUTLIER
+
+    centre, spread = mean.astype(np.float32), _deviation(variance)
+    counted, total, squares = (np.zeros(mean.shape) for _ in range(3))
+    for _, (registered, kept) in map_ahead(trim, zip(frames, flows, strict=True), threads):
+        counted += kept
+        total += registered * kept
+        squares += np.square(registered - centre, dtype=np.float64) * kept
+    trimmed = np.where(counted > 0, total / np.maximum(counted, 1), mean)
+    counted = np.maximum(counted, 1)
+    return trimmed.astype(np.float32), _deviation(np.maximum(squares / counted - (trimmed - centre) ** 2, 0.0))
+
+
+def _deviation(variance: np.ndarray) -> FloatArray:
+    floor = max(_LEAST_DEVIATION * float(variance.mean()), _IMAGE_NOISE_FLOOR)
+    return _smooth(variance.astype(np.float32), _OUTLIER_WINDOW) + np.float32(floor)
+
+
+def _deviates(registered: FloatArray, usual: FloatArray, deviation: FloatArray) -> FloatArray:
+    """Squared deviation of a frame in units of the usual one; about 1 for most."""
+    return _smooth(np.square(registered - usual), _OUTLIER_WINDOW) / deviation
+
+
+def _distrust(flow: FloatArray) -> FloatArray:
+    """Factor on Z: large where the map id + Ŵ folds, and where it leaves the frame.
+
+    Beyond the frame its border is repeated, which is no measurement.  Paper 3 takes the maps to be diffeomorphisms:
+    where the estimate is none, the flow has lost its way, and what it brings there may have more contrast than the
+    scene.
     """
     (ux, uy), (vx, vy) = (
         (cv2.Sobel(part, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(part, cv2.CV_32F, 0, 1, scale=1 / 8))
@@ -248,7 +303,8 @@ def _distrust(flow: FloatArray) -> FloatArray:
     stretch = (1 + ux) * (1 + vy) - uy * vx
     folded = (stretch <= 0).astype(np.float32)
     # Faded out: an abrupt change of weights would show as an edge.
-    return np.power(np.float32(_DISTRUST), _smooth(cv2.dilate(folded, np.ones((7, 7), np.uint8)), 2.0))
+    lost = np.maximum(_smooth(cv2.dilate(folded, np.ones((7, 7), np.uint8)), 2.0), 1 - inside(flow))
+    return np.power(np.float32(_DISTRUST), lost)
 
 
 def _score_scale(usual: np.ndarray, spread: np.ndarray, noise: np.ndarray, window: float) -> FloatArray:

@@ -51,7 +51,7 @@ class NonlocalParams:
         Adjacent pixels that are neighbours whatever their patches.
     h : float, optional
         Filtering parameter, intensity; by default from the contrast and the noise of the guide, see
-        :func:`nonlocal_weights`.
+        ``nonlocal_weights``.
     """
 
     patch: int = 5

@@ -4,27 +4,41 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .alternating import Filtered, FilterParams, filter_frames
 from .arrays import FloatArray
+from .blind import Deblurred, remove_blur
 from .blur_cues import BlurBounds, bound_blur, displacement_maps
-from .blur_estimation import BlurEstimate, estimate_blur
+from .blur_estimation import BlurEstimate
+from .border import Rectangle, coverage, well_seen
 from .centroid import Centroid, CentroidParams, find_centroid
 from .decision import Decision
-from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve
+from .deconvolution import Deconvolution, DeconvolutionParams
 from .dynamics import DynamicsParams, FlowDynamics, identify, with_displacement
 from .errors import DataError, require
+from .explanation import explain_border, explain_centroid, explain_dynamics, explain_frames, explain_training
 from .flow import MIN_SIDE, FlowParams
+from .frame_selection import Share, best_frames, check_share, frame_quality
 from .frame_source import FrameSource
+from .guards import GuardParams, GuardReading
+from .plots import plot_images
+from .preview import preview
 from .psf import KOLMOGOROV
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 STAGES = ("centroid", "identify", "filter", "deconvolve")
+BORDERS = ("keep", "crop")
+# Share of the training frames that show every pixel of a cropped image.
+_SEEN = 0.9
+_ALL = Share(1)
 # Contrast below one grey level of an 8-bit camera is no scene.
 _LEAST_CONTRAST = 1 / 255
 _FEWEST_TRAINED, _MOST_TRAINED = 40, 100
@@ -47,6 +61,10 @@ class RestoreParams:
         half of them, at most 100.
     until : {"centroid", "identify", "filter", "deconvolve"}
         Last stage to run.
+    keep_best : float
+        Lucky imaging: share of the frames, the sharpest, that the image is made of; such as 0.3 or 30%.
+    border : {"keep", "crop"}
+        Keep the border, where fewer frames show the scene, or crop it to what nine frames in ten show.
     displacement_cue : bool
         Draw the size of the motion in the flow model towards what the blur of the mean of the training frames says.
     blur_bounds : bool
@@ -62,10 +80,14 @@ class RestoreParams:
         Alternating-estimation Kalman filter.
     deconvolution : DeconvolutionParams
         Deconvolution.
+    guards : GuardParams
+        What the deconvolved image must not exceed.
     """
 
     train: int | None = None
     until: Literal["centroid", "identify", "filter", "deconvolve"] = "deconvolve"
+    keep_best: Share = _ALL
+    border: Literal["keep", "crop"] = "keep"
     displacement_cue: bool = False
     blur_bounds: bool = False
     flow: FlowParams = field(default_factory=FlowParams)
@@ -73,12 +95,19 @@ class RestoreParams:
     dynamics: DynamicsParams = field(default_factory=DynamicsParams)
     filter: FilterParams = field(default_factory=FilterParams)
     deconvolution: DeconvolutionParams = field(default_factory=DeconvolutionParams)
+    guards: GuardParams = field(default_factory=GuardParams)
 
     def __post_init__(self) -> None:
         require(self.train is None or self.train >= 2, f"train: expected 2 frames or more, found {self.train}")
         require(
             self.until == STAGES[-1] or self.deconvolution.sigma is None,
             f"deconvolution.sigma: has no effect with until = {self.until}; leave one of them out",
+        )
+        require(self.border in BORDERS, f"border: expected one of {', '.join(BORDERS)}, found {self.border!r}")
+        check_share(self.keep_best)
+        require(
+            self.keep_best == 1 or self.until in STAGES[2:],
+            f"keep_best: has no effect with until = {self.until}; leave one of them out",
         )
         require(self.until in STAGES, f"until: expected one of {', '.join(STAGES)}, found {self.until!r}")
         require(
@@ -94,7 +123,9 @@ class Restoration:
     Attributes
     ----------
     image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Result of the last stage that ran.
+        Result of the last stage that ran; smaller than those of the stages where its border is cropped.
+    crop : tuple of int
+        x, y, width and height of the image within the frames, pixels.
     mean : ndarray, float32, shape of ``image``
         Temporal mean of the frames that were read: all of them once the filter has run, else the training frames.
     centroid : Centroid
@@ -105,6 +136,8 @@ class Restoration:
     blur_bounds : BlurBounds or None
         Bounds that the estimated width was kept within; None where they were not asked for.
     deconvolution : Deconvolution or None
+    guard_readings : tuple of GuardReading
+        What the guards saw of every width of the blur that was tried.
     decisions : tuple of Decision
         What was chosen from the data, and why, in the order of the stages.
     train : int
@@ -116,6 +149,7 @@ class Restoration:
     """
 
     image: FloatArray
+    crop: Rectangle
     mean: FloatArray
     centroid: Centroid
     dynamics: FlowDynamics | None
@@ -123,10 +157,35 @@ class Restoration:
     blur: BlurEstimate | None
     blur_bounds: BlurBounds | None
     deconvolution: Deconvolution | None
+    guard_readings: tuple[GuardReading, ...]
     decisions: tuple[Decision, ...]
     train: int
     frame_count: int
     seconds: dict[str, float]
+
+    def plot(self) -> Figure:
+        """Draw the temporal mean beside the result.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ConfigurationError
+            Matplotlib is not installed.
+        """
+        return plot_images({"mean": self.mean, "result": self.image})
+
+    def _repr_html_(self) -> str:
+        sigma = 0.0 if self.deconvolution is None else self.deconvolution.sigma
+        facts = [
+            ("frames", f"{self.frame_count}, {self.train} to train"),
+            ("blur removed", f"{sigma:.2f} pixels" if sigma > 0 else "none"),
+            ("time", f"{sum(self.seconds.values()):.1f} s"),
+            *((decision.subject, decision.choice) for decision in self.decisions),
+        ]
+        return preview("Restoration", facts, self.image)
 
 
 def restore(
@@ -134,7 +193,8 @@ def restore(
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
-    The frames are read once, from the first to the last; only the training frames stay in memory.
+    The frames are read from the first to the last, once (twice where only the best are kept); only the training frames
+    stay in memory.
 
     Parameters
     ----------
@@ -173,6 +233,7 @@ def restore(
     _check_sigma(params.deconvolution.sigma, source.shape)
     stages = STAGES[: STAGES.index(params.until) + 1]
     clock = _Clock()
+    counted = None if params.keep_best == 1 else best_frames(frame_quality(source), params.keep_best)
     stream = iter(source)
     training = _read_training(stream, train)
     clock.lap("read")
@@ -181,13 +242,14 @@ def restore(
     )
     clock.lap("centroid")
     image, mean = centroid.image, training.mean(axis=0, dtype=np.float32)
-    dynamics = filtered = deconvolution = blur = bounds = None
+    dynamics = filtered = deblurred = bounds = None
+    decisions = [explain_training(train, len(source), params.train), explain_centroid(centroid)]
     if "identify" in stages:
         dynamics = _identify(centroid.flows, training, params)
+        decisions += explain_dynamics(dynamics)
         clock.lap("identify")
     if "filter" in stages and dynamics is not None:
         summed = _Sum(training, stream)
-        total = len(source) * params.filter.inner_iterations - train
         filtered = filter_frames(
             summed,
             centroid.image,
@@ -195,58 +257,39 @@ def restore(
             params.filter,
             params.flow,
             centroid.flows,
-            stage_counter(progress, "filter", total),
+            stage_counter(progress, "filter", len(source) * params.filter.inner_iterations - train),
+            counted,
         )
         image, mean = filtered.image, summed.mean()
+        decisions.append(explain_frames(filtered, None if counted is None else int(counted.sum())))
         clock.lap("filter")
     if "deconvolve" in stages:
-        exponent = params.deconvolution.exponent or KOLMOGOROV
-        blur = estimate_blur(image, exponent=exponent) if params.deconvolution.sigma is None else None
-        bounds = bound_blur(image, mean, training, len(source), exponent) if params.blur_bounds else None
+        if params.blur_bounds:
+            exponent = params.deconvolution.exponent or KOLMOGOROV
+            bounds = bound_blur(image, mean, training, len(source), exponent)
         counter = stage_counter(progress, "deconvolve", params.deconvolution.iterations)
-        deconvolution = deconvolve(
-            image, *blur_to_remove(blur, params.deconvolution, bounds), guide=centroid.image, progress=counter
-        )
-        image = deconvolution.image
+        deblurred = remove_blur(image, centroid.image, params.deconvolution, params.guards, bounds, counter)
+        image = deblurred.deconvolution.image
+        decisions += deblurred.decisions
         clock.lap("deconvolve")
-    count = len(source) if filtered is not None else train
+    crop, on_border = _crop(image, centroid.flows, params.border, deblurred)
+    x, y, width, height = crop
     return Restoration(
-        image, mean, centroid, dynamics, filtered, blur, bounds, deconvolution, (), train, count, clock.seconds
+        image=image if params.border == "keep" else image[y : y + height, x : x + width],
+        crop=crop,
+        mean=mean,
+        centroid=centroid,
+        dynamics=dynamics,
+        filtered=filtered,
+        blur=None if deblurred is None else deblurred.blur,
+        blur_bounds=bounds,
+        deconvolution=None if deblurred is None else deblurred.deconvolution,
+        guard_readings=() if deblurred is None else deblurred.readings,
+        decisions=(*decisions, on_border),
+        train=train,
+        frame_count=len(source) if filtered is not None else train,
+        seconds=clock.seconds,
     )
-
-
-def blur_to_remove(
-    estimate: BlurEstimate | None, deconvolution: DeconvolutionParams, bounds: BlurBounds | None = None
-) -> tuple[float, DeconvolutionParams]:
-    """Width of the blur, and settings that know its shape: those asked for, else those estimated.
-
-    Parameters
-    ----------
-    estimate : BlurEstimate or None
-        Needed where ``deconvolution.sigma`` is None.
-    deconvolution : DeconvolutionParams
-        Settings.
-    bounds : BlurBounds, optional
-        What an estimated width is kept within.
-
-    Returns
-    -------
-    sigma : float
-        Pixels.
-    deconvolution : DeconvolutionParams
-
-    Examples
-    --------
-    >>> sigma, params = blur_to_remove(None, DeconvolutionParams(sigma=1.5))
-    >>> sigma, params.exponent
-    (1.5, None)
-    """
-    if deconvolution.sigma is not None or estimate is None:
-        return deconvolution.sigma or 0.0, deconvolution
-    sigma = estimate.removable
-    if bounds is not None and sigma > 0:
-        sigma = min(max(sigma, bounds.low), bounds.high)
-    return sigma, replace(deconvolution, exponent=estimate.exponent)
 
 
 def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int | None = None) -> int:
@@ -364,6 +407,18 @@ def _identify(flows: FloatArray, training: FloatArray, params: RestoreParams) ->
     if not params.displacement_cue:
         return dynamics
     return with_displacement(dynamics, *displacement_maps(training))
+
+
+def _crop(image: FloatArray, flows: FloatArray, border: str, deblurred: Deblurred | None) -> tuple[Rectangle, Decision]:
+    """Rectangle of the image that is the result."""
+    seen = coverage(flows)
+    whole = (0, 0, image.shape[1], image.shape[0])
+    if border == "keep":
+        return whole, explain_border(float(seen.min()), None)
+    # Pixels within a width of the border are deblurred from light that fell beyond it.
+    sigma = 0.0 if deblurred is None else deblurred.deconvolution.sigma
+    crop = well_seen(seen, _SEEN, int(np.ceil(sigma)), MIN_SIDE)
+    return crop, explain_border(float(seen.min()), crop)
 
 
 def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:

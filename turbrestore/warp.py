@@ -181,6 +181,43 @@ def compose_flows(outer: ArrayLike, inner: ArrayLike) -> FloatArray:
     return inner + _linear(outer, inner)
 
 
+def inside(flow: ArrayLike) -> FloatArray:
+    """How far a warp samples the image and not the repetition of its border.
+
+    Parameters
+    ----------
+    flow : array_like, shape (H, W, 2)
+        Displacements (dx, dy) in pixels.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W)
+        1 where the sample lies within the image, falling to 0 over one pixel beyond the centres of its border pixels.
+
+    Raises
+    ------
+    DataError
+        Wrong shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> shift = np.zeros((3, 5, 2), np.float32); shift[..., 0] = 1.25
+    >>> inside(shift)[0]
+    array([1.  , 1.  , 1.  , 0.75, 0.  ], dtype=float32)
+    """
+    flow = check_flow(flow)
+    if flow.ndim != 3:
+        raise DataError(f"flow: expected shape (H, W, 2), found {flow.shape}")
+    height, width = flow.shape[:2]
+    x, y = _pixel_grid(height, width)
+    return _inside_axis(x + flow[..., 0], width) * _inside_axis(y + flow[..., 1], height)
+
+
+def _inside_axis(position: FloatArray, length: int) -> FloatArray:
+    return np.clip(1 - np.maximum(-position, position - (length - 1)), 0, 1)
+
+
 @functools.lru_cache(maxsize=4)
 def _pixel_grid(height: int, width: int) -> tuple[FloatArray, FloatArray]:
     y, x = np.mgrid[:height, :width].astype(np.float32)

@@ -1,0 +1,218 @@
+"""``turbrestore doctor``: what this installation can do, and what to do about what it cannot.
+
+Nothing but the standard library is imported at the top: a broken library is a finding, not a crash.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json as json_format
+import os
+import platform
+import re
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from types import ModuleType
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from turbrestore import __version__
+from turbrestore.errors import TurbrestoreError
+
+# Module and distribution of what every run needs, and of what extras add.
+REQUIRED = {
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "cv2": "opencv-contrib-python-headless",
+    "skimage": "scikit-image",
+    "PIL": "pillow",
+    "av": "av",
+    "tifffile": "tifffile",
+    "threadpoolctl": "threadpoolctl",
+}
+EXTRAS = {"torch": "torch", "kornia": "torch", "matplotlib": "report", "jinja2": "report"}
+READ = ("h264", "ffv1", "hevc", "vp9", "mjpeg", "gif")
+WRITTEN = ("ffv1", "libx264")
+OLDEST_PYTHON = (3, 11)
+
+State = Literal["ok", "missing", "warning", "broken"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found out about one part, and what to do about it."""
+
+    name: str
+    state: State
+    found: str
+    advice: str = ""
+
+
+def doctor(*, json: Annotated[bool, Parameter(negative="")] = False) -> None:
+    """Check what this installation can do: libraries, video codecs, cores, GPU and extras.
+
+    Ends with 1 if something that every run needs is broken; what is missing from the extras is no failure.
+
+    Parameters
+    ----------
+    json : bool
+        Print JSON.
+    """
+    findings = [finding for check in CHECKS for finding in check()]
+    if json:
+        record = {"turbrestore": __version__, "findings": [asdict(finding) for finding in findings]}
+        sys.stdout.write(json_format.dumps(record, indent=2) + "\n")
+    else:
+        for item in findings:
+            sys.stdout.write(f"{item.state:<8} {item.name:<14} {item.found}\n")
+            if item.advice:
+                sys.stdout.write(f"{'':<23} → {item.advice}\n")
+    broken = [finding.name for finding in findings if finding.state == "broken"]
+    if broken:
+        raise TurbrestoreError(f"doctor: {', '.join(broken)} must work and does not; the report says what to do")
+
+
+def check_python() -> Iterator[Finding]:
+    """Versions of turbrestore and Python."""
+    yield Finding("turbrestore", "ok", __version__)
+    enough = sys.version_info[:2] >= OLDEST_PYTHON
+    advice = "" if enough else "use Python 3.11 or newer"
+    yield Finding("Python", "ok" if enough else "broken", f"{platform.python_version()} on {platform.system()}", advice)
+
+
+def check_libraries() -> Iterator[Finding]:
+    """Whether the libraries that every run needs load, in a version that will do."""
+    for module, distribution in REQUIRED.items():
+        yield check_library(module, distribution)
+
+
+def check_library(module: str, distribution: str) -> Finding:
+    """Load one module that every run needs, and compare its version with what turbrestore asks for."""
+    bounds = required_versions(distribution)
+    install = f"pip install '{distribution}{bounds}'"
+    try:
+        version = str(getattr(importlib.import_module(module), "__version__", "")) or metadata.version(distribution)
+    except ModuleNotFoundError as error:
+        return Finding(module, "broken", f"not installed ({error.name})", install)
+    except Exception as error:  # a library that is damaged may raise anything
+        return Finding(module, "broken", f"does not load: {_line(error)}", f"{install} --force-reinstall")
+    state: State = "ok" if _fits(version, bounds) else "broken"
+    return Finding(module, state, version, "" if state == "ok" else install)
+
+
+def check_opencv() -> Iterator[Finding]:
+    """Which packages bring cv2, and whether it has what is needed of it."""
+    brought = sorted(set(metadata.packages_distributions().get("cv2", [])))
+    wanted = REQUIRED["cv2"]
+    repair = f"pip uninstall -y {' '.join(brought)} && pip install '{wanted}{required_versions(wanted)}'"
+    if len(brought) > 1:
+        yield Finding("cv2 package", "warning", f"{', '.join(brought)} overwrite each other's files", repair)
+    elif brought:
+        state: State = "ok" if brought == [wanted] else "warning"
+        yield Finding("cv2 package", state, brought[0], "" if state == "ok" else repair)
+    try:
+        cv2 = importlib.import_module("cv2")
+    except Exception:  # reported with the libraries
+        return
+    if not hasattr(getattr(cv2, "optflow", None), "DualTVL1OpticalFlow_create"):
+        yield Finding("cv2.optflow", "warning", "missing: --flow.method tvl1 will fail", repair)
+
+
+def check_codecs() -> Iterator[Finding]:
+    """Which videos can be read and written."""
+    try:
+        codec = importlib.import_module("av.codec")
+    except Exception:  # reported with the libraries
+        return
+    for mode, names in (("read", READ), ("write", WRITTEN)):
+        for name in names:
+            known = _has_codec(codec, name, mode[0])
+            advice = "" if known else "pip install --force-reinstall av  (its own wheels bring all codecs)"
+            yield Finding(f"{mode} {name}", "ok" if known else "warning", "yes" if known else "no", advice)
+
+
+def check_cores() -> Iterator[Finding]:
+    """How many frames are worked on side by side."""
+    there = os.cpu_count() or 1
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else there
+    yield Finding("cores", "ok", f"{usable} usable of {there}; as many threads, unless --flow.threads says otherwise")
+    limits = [
+        f"{name}={os.environ[name]}" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS") if name in os.environ
+    ]
+    if limits:
+        yield Finding("thread limits", "ok", ", ".join(limits))
+
+
+def check_extras() -> Iterator[Finding]:
+    """Libraries that add something and may be missing."""
+    for module, extra in EXTRAS.items():
+        install = f"pip install 'turbrestore[{extra}]'"
+        try:
+            library = importlib.import_module(module)
+        except ModuleNotFoundError:
+            yield Finding(module, "missing", "optional", install)
+        except Exception as error:  # a library that is damaged may raise anything
+            yield Finding(module, "warning", f"does not load: {_line(error)}", f"{install} --force-reinstall")
+        else:
+            yield Finding(module, "ok", str(getattr(library, "__version__", "")))
+            if module == "torch":
+                yield _gpu(library)
+
+
+def required_versions(distribution: str) -> str:
+    """Bounds that turbrestore sets on a package, as ``>=2.0``; empty where it is not installed itself.
+
+    Examples
+    --------
+    >>> required_versions("no-such-package")
+    ''
+    """
+    try:
+        lines = metadata.requires("turbrestore") or []
+    except metadata.PackageNotFoundError:
+        return ""
+    found = (re.fullmatch(r"([\w.-]+)\s*([<>=!~\d.,\s]*)(;.*)?", line) for line in lines)
+    return next((match[2].strip() for match in found if match and match[1] == distribution), "")
+
+
+def _fits(version: str, bounds: str) -> bool:
+    """Whether a version lies within bounds such as ``<6,>=5``."""
+    return all(
+        (_numbers(version) >= _numbers(bound)) if sign == ">=" else (_numbers(version) < _numbers(bound))
+        for sign, bound in re.findall(r"(>=|<)\s*([\d.]+)", bounds)
+    )
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(part) for part in re.findall(r"\d+", version)[:3]]
+
+
+def _has_codec(codec: ModuleType, name: str, mode: str) -> bool:
+    try:
+        codec.Codec(name, mode)
+    except ValueError:
+        return False
+    return True
+
+
+def _gpu(torch: ModuleType) -> Finding:
+    if torch.cuda.is_available():
+        return Finding("GPU", "ok", torch.cuda.get_device_name(0))
+    return Finding("GPU", "missing", "optional; torch sees none and computes on the processor")
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:120]
+
+
+CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
+    check_python,
+    check_libraries,
+    check_opencv,
+    check_codecs,
+    check_cores,
+    check_extras,
+)

@@ -1,0 +1,47 @@
+"""Examples that ``--help`` and the documentation show; the tests run them, in this order, in one folder."""
+
+EXAMPLES: dict[str, tuple[str, ...]] = {
+    "info": ("turbrestore info sample_data/chart.mkv", "turbrestore info sample_data/chart.mkv --json"),
+    "config": ("turbrestore config --init run.toml", "turbrestore config --check run.toml"),
+    "restore": (
+        "turbrestore restore sample_data/chart.mkv sharp.png",
+        "turbrestore restore sample_data/chart.mkv part.png --frames 0:24 --roi 64,32,96,96 --sigma 1.2",
+        "turbrestore restore sample_data/chart.mkv again.png --config sharp.png.toml",
+        "turbrestore restore sample_data/chart.mkv all.png --keep stages --truth sample_data/chart_truth.png --json",
+    ),
+    "report": ("turbrestore report stages", "turbrestore report stages report.html"),
+    "centroid": ("turbrestore centroid sample_data/chart.mkv centroid.npz --train 40",),
+    "flow": ("turbrestore flow centroid.npz sample_data/chart.mkv flows.npy --flow.method farneback",),
+    "identify": ("turbrestore identify centroid.npz dynamics.npz",),
+    "filter": ("turbrestore filter sample_data/chart.mkv centroid.npz dynamics.npz filtered.npz",),
+    "deconvolve": (
+        "turbrestore deconvolve filtered.npz deblurred.png --guide centroid.npz",
+        "turbrestore deconvolve filtered.npz tv.png --sigma 1.2 --deconvolution.method tv",
+    ),
+    "evaluate": (
+        "turbrestore evaluate sharp.png sample_data/chart_truth.png",
+        "turbrestore evaluate sharp.png --reference stages/mean.png --json",
+    ),
+    "synthesize": (
+        "turbrestore synthesize chart haze.mkv --strength medium --frames 120 --seed 1",
+        "turbrestore synthesize camera more.mkv --model dynamic-texture --like sample_data/chart.mkv --frames 300",
+    ),
+    "moments wavefront": ("turbrestore moments wavefront --seeds 20",),
+    "moments mirror": ("turbrestore moments mirror --seeds 20 --deviation 3 --json",),
+    "doctor": ("turbrestore doctor", "turbrestore doctor --json"),
+    "--install-completion": (
+        "turbrestore --install-completion",
+        "turbrestore --install-completion --shell bash --output turbrestore.bash",
+    ),
+}
+FIRST_STEPS = (
+    "turbrestore restore haze.mp4 sharp.png",
+    "turbrestore restore --help",
+    "turbrestore synthesize chart haze.mkv --strength medium",
+    "turbrestore doctor",
+)
+
+
+def epilogue(commands: tuple[str, ...]) -> str:
+    """Commands as a block at the end of a help page."""
+    return "\n".join(["Examples:", "```", *commands, "```"])

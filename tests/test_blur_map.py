@@ -1,0 +1,74 @@
+"""Blur that differs over the image: found by tiles where it does, not where it does not."""
+
+import cv2
+import numpy as np
+import pytest
+
+from turbrestore.arrays import luminance
+from turbrestore.blind import remove_blur
+from turbrestore.blur_map import deconvolve_varying, estimate_blur_map, sigma_map
+from turbrestore.deconvolution import DeconvolutionParams, deconvolve
+from turbrestore.metrics import psnr
+from turbrestore.synthesis.scenes import SCENES
+
+SIDE = 384
+WIENER = DeconvolutionParams(method="wiener", exponent=2.0)
+
+
+def blurred(name, left, right):
+    """Scene, image and true widths: ``left`` up to a quarter, then linearly to ``right`` at three quarters."""
+    scene = luminance(SCENES[name](SIDE, SIDE))
+    widths = np.interp(np.arange(SIDE), [SIDE / 4, 3 * SIDE / 4], [left, right]) * np.ones((SIDE, 1))
+    steps = np.linspace(min(left, right), max(left, right), 15) if left != right else np.array([left])
+    image = np.zeros_like(scene)
+    for index, step in enumerate(steps):
+        share = np.interp(widths, steps, np.eye(len(steps))[index]) if left != right else 1.0
+        image += (cv2.GaussianBlur(scene, (0, 0), step) * share).astype(np.float32)
+    noise = np.random.default_rng(0).normal(0, 0.003, scene.shape)
+    return scene, (image + noise).astype(np.float32), widths.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def brick():
+    return blurred("brick", 0.8, 2.2)
+
+
+def test_a_blur_that_grows_to_the_right_is_found_and_removed(brick):
+    scene, image, widths = brick
+    found = estimate_blur_map(image, 2.0)
+    assert found.varies
+    assert (found.sigmas[:, 1] > 1.4 * found.sigmas[:, 0]).all()
+    assert (found.sigmas[:, 1] < 1.3 * 2.2).all()
+    result = remove_blur(image, image, WIENER)
+    assert result.tiles.varies
+    assert "a width for every pixel" in [decision.choice for decision in result.decisions]
+    single = deconvolve(image, result.blur.removable, WIENER).image
+    assert psnr(result.deconvolution.image, scene) > psnr(single, scene) + 0.5
+    assert result.deconvolution.sigma == pytest.approx(float(widths.mean()), rel=0.35)
+
+
+@pytest.mark.parametrize("name", ["chart", "camera"])
+def test_a_blur_that_is_the_same_everywhere_is_taken_as_one(name):
+    _, image, _ = blurred(name, 1.4, 1.4)
+    assert not estimate_blur_map(image, 2.0).varies
+
+
+def test_true_widths_beat_every_single_width(brick):
+    scene, image, widths = brick
+    by_pixel = deconvolve_varying(lambda width: deconvolve(image, width, WIENER), widths)
+    singles = [deconvolve(image, width, WIENER).image for width in (0.8, 1.2, 1.5, 1.8, 2.2)]
+    assert psnr(by_pixel.image, scene) > max(psnr(single, scene) for single in singles) + 1
+    assert by_pixel.sigma == pytest.approx(1.5, abs=0.02)
+
+
+def test_interpolation_keeps_plateaus_and_is_monotone():
+    widths = sigma_map([[1.0, 2.0, 4.0]] * 2, (500, 760))
+    assert widths.shape == (500, 760)
+    assert widths[0, 0] == 1.0
+    assert widths[0, -1] == 4.0
+    assert (np.diff(widths, axis=1) >= 0).all()
+    assert np.ptp(widths, axis=0).max() == 0
+
+
+def test_small_images_have_no_tiles():
+    assert estimate_blur_map(np.zeros((600, 300), np.float32)) is None

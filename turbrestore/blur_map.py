@@ -1,0 +1,174 @@
+"""Blur that differs from one part of an image to another: widths of tiles, and deconvolution by a width per pixel.
+
+A scene in depth, or air that is rougher near the ground, blurs parts of an image differently.  Widths of single tiles
+are less sure than that of the whole, so they are used only where they differ by more than their uncertainties allow.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arrays import FloatArray, check_image, luminance
+from .blur_estimation import estimate_blur
+from .deconvolution import Deconvolution
+from .psf import KOLMOGOROV
+
+# Tiles of fewer pixels a side say too little.
+_LEAST_TILE, _MOST_TILES = 240, 3
+# Tiles overlap by this share of their distance.
+_OVERLAP = 0.25
+# Widths vary clearly if the largest exceeds the smallest by this factor, and by so many standard deviations.
+_CLEAR_FACTOR, _CLEAR_DEVIATIONS = 1.5, 3.0
+# Neighbouring widths that images are interpolated between differ by at most this factor.
+_STEP = 1.35
+
+
+@dataclass(frozen=True)
+class BlurMap:
+    """Width of the blur by tiles.
+
+    Attributes
+    ----------
+    sigmas : ndarray, float64, shape (rows, columns)
+        Width found in each tile, pixels.
+    uncertainties : ndarray, float64, shape (rows, columns)
+        Their standard deviations, pixels.
+    varies : bool
+        Whether the widths differ clearly.
+    """
+
+    sigmas: np.ndarray
+    uncertainties: np.ndarray
+    varies: bool
+
+    @property
+    def removable(self) -> np.ndarray:
+        """Widths that are safe to remove: half of the uncertainty is left in."""
+        return np.maximum(self.sigmas - 0.5 * self.uncertainties, 0.0)
+
+
+def estimate_blur_map(image: ArrayLike, exponent: float = KOLMOGOROV) -> BlurMap | None:
+    """Estimate the blur of overlapping tiles, two or three along each side.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W) or (H, W, 3)
+        Blurred image.
+    exponent : float
+        Shape of the blur, see :func:`turbrestore.psf.blur_otf`.
+
+    Returns
+    -------
+    BlurMap or None
+        None if the image is too small for tiles of 240 pixels.
+
+    Raises
+    ------
+    DataError
+        Wrong shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> estimate_blur_map(np.zeros((256, 256))) is None
+    True
+    """
+    grey = luminance(check_image(image))
+    tiles = [[grey[rows, columns] for columns in _spans(grey.shape[1])] for rows in _spans(grey.shape[0])]
+    if len(tiles) == 1 or len(tiles[0]) == 1:
+        return None
+    found = [[estimate_blur(np.ascontiguousarray(tile), exponent=exponent) for tile in row] for row in tiles]
+    sigmas, uncertainties = (
+        np.array([[getattr(estimate, name) for estimate in row] for row in found]) for name in ("sigma", "uncertainty")
+    )
+    return BlurMap(sigmas, uncertainties, _clearly_differ(sigmas, uncertainties))
+
+
+def sigma_map(tiles: ArrayLike, shape: tuple[int, int]) -> FloatArray:
+    """Width for every pixel, interpolated between the centres of the tiles.
+
+    Parameters
+    ----------
+    tiles : array_like, shape (rows, columns)
+        Width of each tile, pixels.
+    shape : tuple of int
+        (H, W).
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W)
+        Pixels.
+
+    Examples
+    --------
+    >>> sigma_map([[1.0, 2.0], [1.0, 2.0]], (480, 480))[0, [0, 240, 479]].round(2).tolist()
+    [1.0, 1.5, 2.0]
+    """
+    values = np.asarray(tiles, np.float32)
+    axes = []
+    for length, count in zip(shape, values.shape, strict=True):
+        centres = [(span.start + span.stop - 1) / 2 for span in _spans(length)]
+        axes.append(np.interp(np.arange(length), centres, np.arange(count)).astype(np.float32))
+    y, x = np.meshgrid(*axes, indexing="ij")
+    return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def deconvolve_varying(attempt: Callable[[float], Deconvolution], sigmas: FloatArray) -> Deconvolution:
+    """Deconvolve by a width per pixel: by a few widths, and interpolate between their images.
+
+    Parameters
+    ----------
+    attempt : callable
+        Deconvolves the whole image by one width in pixels.
+    sigmas : ndarray, float32, shape (H, W)
+        Width for every pixel.
+
+    Returns
+    -------
+    Deconvolution
+        Its ``sigma`` is the mean width; the record of the run is that of the widest.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from turbrestore.deconvolution import DeconvolutionParams, deconvolve
+    >>> image = np.random.default_rng(0).uniform(size=(32, 32)).astype(np.float32)
+    >>> wiener = DeconvolutionParams(method="wiener")
+    >>> result = deconvolve_varying(lambda s: deconvolve(image, s, wiener), np.full((32, 32), 1.0, np.float32))
+    >>> bool((result.image == deconvolve(image, 1.0, wiener).image).all())
+    True
+    """
+    low, high = float(sigmas.min()), float(sigmas.max())
+    steps = int(np.ceil(np.log(max(high, 1e-6) / max(low, 1e-6)) / np.log(_STEP) - 1e-6))
+    widths = np.geomspace(low, high, min(steps, 4) + 1) if low > 0 else np.linspace(low, high, 4)
+    widths = np.unique(widths) if high > low else np.array([high])
+    results = [attempt(float(width)) for width in widths]
+    image = np.zeros_like(results[-1].image)
+    for index, result in enumerate(results):
+        # Hat functions: one at their width, zero at its neighbours'.
+        share = np.interp(sigmas, widths, np.eye(len(widths))[index]).astype(np.float32)
+        image += result.image * (share if image.ndim == 2 else share[..., None])
+    return dataclasses.replace(results[-1], image=image, sigma=float(sigmas.mean()))
+
+
+def _spans(length: int) -> list[slice]:
+    """Overlapping stretches of equal length that cover a side."""
+    count = min(_MOST_TILES, max(1, int(length / (_LEAST_TILE / (1 + _OVERLAP)))))
+    size = min(length, round(length / count * (1 + _OVERLAP)))
+    starts = np.linspace(0, length - size, count).round().astype(int)
+    return [slice(int(start), int(start) + size) for start in starts]
+
+
+def _clearly_differ(sigmas: np.ndarray, uncertainties: np.ndarray) -> bool:
+    most, least = np.unravel_index(sigmas.argmax(), sigmas.shape), np.unravel_index(sigmas.argmin(), sigmas.shape)
+    if not np.isfinite(uncertainties).all() or sigmas[least] <= 0:
+        return False
+    difference = sigmas[most] - sigmas[least]
+    deviation = np.hypot(uncertainties[most], uncertainties[least])
+    return bool(sigmas[most] > _CLEAR_FACTOR * sigmas[least] and difference > _CLEAR_DEVIATIONS * deviation)

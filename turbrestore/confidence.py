@@ -1,0 +1,167 @@
+"""How far a measured flow can be believed, and what stands in where it cannot: flat regions and single edges.
+
+Symbols
+-------
+g : gradient of the reference, intensity per pixel
+J : structure tensor, ``g gᵀ`` averaged over a window of area A
+σ : noise of a frame, intensity
+W : measured flow; W̄ what is expected before it is measured; τ deviation of W from W̄
+
+From a window the displacement is known at best to the covariance ``σ² (A J)⁻¹`` (the Cramér–Rao bound; Robinson and
+Milanfar 2004): well across an edge, not at all along it, and not at all where nothing is seen.  Flow methods give a
+number all the same.  In flat regions dense inverse search matches noise with noise, over 5 px and more.
+
+With W̄ known to τ the posterior mean is ``Ŵ = (J + ε)⁻¹ (J W + ε W̄)``, ``ε = σ² / (A τ²)``, where J and J W are
+averages over the window.  W̄ is the same in a window twice as wide, and so on until the window is the image, for which
+it is zero: this is normalised convolution (Knutsson and Westin 1993) with tensors and growing windows.  Texture keeps
+its flow, an edge takes the component along it from its neighbourhood, and a flat region takes both.
+
+J holds the noise of the reference as well, which must not pass for texture: the eigenvalues are lowered by it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arrays import FloatArray, check_flow, check_image, luminance
+from .errors import DataError, require
+from .psf import estimate_noise
+
+# Standard deviations of the windows of the gradient and of the tensor, pixels.
+_GRADIENT_WINDOW, _TENSOR_WINDOW = 1.0, 2.0
+_AREA = 4 * np.pi * _TENSOR_WINDOW**2
+# Variance of a derivative in that window of white noise of unit variance; three times it bounds what noise looks like.
+_GRADIENT_NOISE = 1 / (8 * np.pi * _GRADIENT_WINDOW**4)
+_NOISE_MARGIN = 3.0
+# τ, pixels.
+_DEVIATION = 0.5
+# Smallest noise, so that every tensor has an inverse: 1/4096 of full scale.
+_LEAST_NOISE = 1 / 4096
+
+
+@dataclass(frozen=True)
+class FlowConfidence:
+    """What the texture of a reference tells of displacements.
+
+    Attributes
+    ----------
+    tensors : tuple of ndarray, float32, shape (h, w, 3)
+        J as (xx, xy, yy), squared intensity per squared pixel: of the image, then of windows and grids twice as wide
+        each.
+    """
+
+    tensors: tuple[FloatArray, ...]
+
+
+def flow_confidence(reference: ArrayLike) -> FlowConfidence:
+    """Structure tensors of the image that flows start from.
+
+    Parameters
+    ----------
+    reference : array_like, shape (H, W) or (H, W, 3)
+        Intensities; colour is reduced to luminance.
+
+    Returns
+    -------
+    FlowConfidence
+
+    Raises
+    ------
+    DataError
+        Wrong shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> edges = np.tile(np.arange(32) // 8 % 2, (32, 1)).astype(np.float32)
+    >>> along_x, _, along_y = flow_confidence(edges).tensors[0][16, 16]
+    >>> bool(along_x > 0.01), bool(along_y < 1e-6)
+    (True, True)
+    """
+    image = luminance(check_image(reference, "reference"))
+    smooth = cv2.GaussianBlur(image, (0, 0), _GRADIENT_WINDOW)
+    dx, dy = cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32
+    tensor = cv2.GaussianBlur(np.dstack([dx * dx, dx * dy, dy * dy]), (0, 0), _TENSOR_WINDOW)
+    tensors = [_without_noise(tensor, _NOISE_MARGIN * _GRADIENT_NOISE * estimate_noise(image) ** 2)]
+    while min(tensors[-1].shape[:2]) > 1:
+        tensors.append(cv2.pyrDown(tensors[-1]))
+    return FlowConfidence(tuple(tensors))
+
+
+def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -> FloatArray:
+    """Draw a flow towards its neighbourhood where the texture tells little.
+
+    Parameters
+    ----------
+    flow : array_like, shape (H, W, 2)
+        Measured displacements (dx, dy), pixels.
+    confidence : FlowConfidence
+        Of the reference that the flow starts from.
+    noise : float
+        σ of the frame that it leads to, intensity.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W, 2)
+        Pixels; zero where the whole image is flat.
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, or values are not finite.
+    ConfigurationError
+        ``noise`` is negative or not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> flat = flow_confidence(np.full((32, 32), 0.5))
+    >>> float(np.abs(regularise_flow(np.full((32, 32, 2), 3.0), flat, 0.01)).max())
+    0.0
+    """
+    measured = check_flow(flow)
+    require(0 <= noise < np.inf, f"noise: expected a finite number of 0 or more, found {noise}")
+    tensors = confidence.tensors
+    if measured.ndim != 3 or measured.shape[:2] != tensors[0].shape[:2]:
+        raise DataError(f"flow: expected shape {(*tensors[0].shape[:2], 2)}, found {measured.shape}")
+    weighted = [_apply(tensors[0], measured)]
+    for _ in tensors[1:]:
+        weighted.append(cv2.pyrDown(weighted[-1]))
+    prior = max(noise, _LEAST_NOISE) ** 2 / (_AREA * _DEVIATION**2)
+    expected = np.zeros_like(weighted[-1])
+    for level in range(len(tensors) - 1, -1, -1):
+        height, width = tensors[level].shape[:2]
+        if expected.shape[:2] != (height, width):
+            expected = cv2.pyrUp(expected, dstsize=(width, height))
+        # A window twice as wide holds four times the pixels.
+        expected = _solve(tensors[level], weighted[level], expected, np.float32(prior / 4**level))
+    return expected
+
+
+def _without_noise(tensor: FloatArray, noise: float) -> FloatArray:
+    """Lower both eigenvalues by ``noise``, to zero at most."""
+    half, tilt, cross = (tensor[..., 0] + tensor[..., 2]) / 2, (tensor[..., 0] - tensor[..., 2]) / 2, tensor[..., 1]
+    spread = np.hypot(tilt, cross)
+    larger, smaller = np.maximum(half + spread - noise, 0), np.maximum(half - spread - noise, 0)
+    kept = (larger - smaller) / np.maximum(2 * spread, np.finfo(np.float32).tiny)
+    mean = (larger + smaller) / 2
+    return np.dstack([mean + kept * tilt, kept * cross, mean - kept * tilt])
+
+
+def _apply(tensor: FloatArray, flow: FloatArray) -> FloatArray:
+    xx, xy, yy = cv2.split(tensor)
+    dx, dy = cv2.split(flow)
+    return cv2.merge([xx * dx + xy * dy, xy * dx + yy * dy])
+
+
+def _solve(tensor: FloatArray, weighted: FloatArray, expected: FloatArray, prior: np.float32) -> FloatArray:
+    """``(J + ε)⁻¹ (J W + ε W̄)`` of each pixel."""
+    xx, xy, yy = cv2.split(tensor)
+    xx, yy = xx + prior, yy + prior
+    u, v = cv2.split(weighted + prior * expected)
+    determinant = xx * yy - xy * xy
+    return cv2.merge([(yy * u - xy * v) / determinant, (xx * v - xy * u) / determinant])

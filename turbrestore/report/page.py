@@ -1,0 +1,174 @@
+"""The page: a template filled with pictures, plots and facts.
+
+Nothing in it comes from elsewhere.  Its content security policy allows images in data URIs and the one style sheet and
+the one script that it carries, by their hashes; file names and remarks are text, never markup.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import shlex
+from collections.abc import Iterable
+from importlib.resources import files
+from typing import TYPE_CHECKING
+
+from ..errors import ConfigurationError
+from ..images import atomic_write, check_output
+from ..pipeline import Restoration
+from ..plots import new_figure
+from ..run_record import RunRecord
+from .facts import findings, headline, laps, remarks, settings
+from .panels import draw_panels
+from .pictures import encode_gallery, stages
+
+if TYPE_CHECKING:
+    import jinja2
+
+_SUFFIXES = (".html", ".htm")
+
+
+def check_report(
+    path: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = (), overwrite: bool = False
+) -> None:
+    """Refuse a report that could not be written, before any work begins.
+
+    Parameters
+    ----------
+    path : path
+        File to be written.
+    inputs : iterable of path
+        Files that are read.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    ConfigurationError
+        Another suffix than .html, or a package is not installed.
+    OutputError
+        The file exists, is an input, or its folder does not exist.
+
+    Examples
+    --------
+    >>> check_report("report.txt")
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.ConfigurationError: report.txt: expected a name that ends in .html or .htm, found .txt
+    """
+    check_output(path, inputs, overwrite, _SUFFIXES)
+    new_figure()
+    _environment()
+
+
+def write_report(
+    path: str | os.PathLike[str], restoration: Restoration, run: RunRecord, overwrite: bool = False
+) -> None:
+    """Write a restoration as one HTML file.
+
+    Parameters
+    ----------
+    path : path
+        Ends in .html or .htm.
+    restoration : Restoration
+        Whole or in part.
+    run : RunRecord
+        Where it comes from, see :func:`turbrestore.run_record.describe_run`.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    ConfigurationError
+        Another suffix, or a package is not installed.
+    OutputError
+        The file exists, or its folder does not.
+    StorageError
+        Writing failed; nothing is left behind.
+
+    Examples
+    --------
+    >>> import numpy as np, pathlib, tempfile
+    >>> from turbrestore.pipeline import RestoreParams, restore
+    >>> frames = np.random.default_rng(0).uniform(size=(4, 32, 32)).astype(np.float32)
+    >>> restoration = restore(frames, RestoreParams(until="centroid"))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_report(folder + "/report.html", restoration, RunRecord("noise", frames[2]))
+    ...     pathlib.Path(folder, "report.html").read_text("utf-8")[:15]
+    '<!doctype html>'
+    """
+    check_report(path, overwrite=overwrite)
+    atomic_write(path, render_report(restoration, run).encode(), overwrite)
+
+
+def render_report(restoration: Restoration, run: RunRecord) -> str:
+    """HTML of a restoration.
+
+    Parameters
+    ----------
+    restoration : Restoration
+        Whole or in part.
+    run : RunRecord
+        Where it comes from.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from turbrestore.pipeline import RestoreParams, restore
+    >>> frames = np.random.default_rng(0).uniform(size=(4, 32, 32)).astype(np.float32)
+    >>> page = render_report(restore(frames, RestoreParams(until="centroid")), RunRecord("<b>.mkv", frames[2]))
+    >>> "<b>" in page, "&lt;b&gt;.mkv" in page
+    (False, True)
+    """
+    environment = _environment()
+    from markupsafe import Markup
+
+    style, script = (files(__package__).joinpath(name).read_text("utf-8") for name in ("style.css", "script.js"))
+    template = environment.from_string(files(__package__).joinpath("template.html").read_text("utf-8"))
+    gallery = encode_gallery(stages(restoration, run.frame), run.frame_number)
+    panels = [(Markup(panel.svg), panel.caption) for panel in draw_panels(restoration, run)]
+    return template.render(
+        run=run,
+        restoration=restoration,
+        policy=_policy(style, script),
+        style=Markup(style),
+        script=Markup(script),
+        gallery=gallery,
+        panels=panels,
+        headline=headline(restoration),
+        findings=findings(restoration),
+        remarks=remarks(restoration, run),
+        settings=settings(run),
+        laps=laps(restoration),
+        command=shlex.join(run.command),
+    )
+
+
+def _environment() -> jinja2.Environment:
+    try:
+        import jinja2
+    except ImportError as error:
+        raise ConfigurationError(
+            "report: expected jinja2, which is not installed; run pip install 'turbrestore[report]'"
+        ) from error
+    return jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+
+
+def _policy(style: str, script: str) -> str:
+    """Content security policy that allows what the page carries and nothing else."""
+    hashes = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script))
+    style_hash, script_hash = hashes
+    return (
+        f"default-src 'none'; img-src data:; style-src 'sha256-{style_hash}'; script-src 'sha256-{script_hash}'; "
+        "base-uri 'none'; form-action 'none'"
+    )

@@ -1,0 +1,106 @@
+"""Plots of the report: which there are, what they are called, and what they show, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from ..alternating import Filtered
+from ..deconvolution import Deconvolution
+from ..dynamics import FlowDynamics
+from ..pipeline import Restoration
+from ..plots import (
+    plot_blur,
+    plot_convergence,
+    plot_displacements,
+    plot_eigenvalues,
+    plot_filter,
+    plot_flow,
+    plot_frames,
+    plot_objective,
+    plot_singular_values,
+)
+from ..run_record import RunRecord
+from .vector import inline_svg
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One plot.
+
+    Attributes
+    ----------
+    svg : str
+        Element.
+    caption : str
+        What to look for.
+    """
+
+    svg: str
+    caption: str
+
+
+def draw_panels(restoration: Restoration, run: RunRecord) -> list[Panel]:
+    """Draw whatever the stages that ran have to show.
+
+    Parameters
+    ----------
+    restoration : Restoration
+    run : RunRecord
+
+    Returns
+    -------
+    list of Panel
+    """
+    panels = [*_motion(restoration, run)]
+    if restoration.dynamics is not None:
+        panels += _dynamics(restoration.dynamics)
+    if restoration.filtered is not None:
+        panels += _filter(restoration.filtered)
+    if restoration.blur is not None:
+        blur = restoration.blur
+        caption = "The lowest point is the width of the blur; the band is its uncertainty."
+        figure = plot_blur(blur.widths, blur.costs, blur.sigma, blur.uncertainty)
+        panels.append(Panel(inline_svg(figure, "blur", "Cost of every width of the blur"), caption))
+    if restoration.deconvolution is not None and restoration.deconvolution.recorded.size:
+        panels += _deconvolution(restoration.deconvolution)
+    return panels
+
+
+def _motion(restoration: Restoration, run: RunRecord) -> Iterator[Panel]:
+    centroid = restoration.centroid
+    number = len(centroid.flows) // 2
+    figure = plot_flow(centroid.flows[number], centroid.image, f"Displacement of training frame {number}")
+    caption = "From the centroid to one frame. The image shows through."
+    yield Panel(inline_svg(figure, "flow", "Map of the displacement of one frame"), caption)
+    figure = plot_displacements(centroid.flows, centroid.image)
+    caption = "Over the training frames. Strokes lie along the axis that moves most."
+    yield Panel(inline_svg(figure, "spread", "Map of the standard deviation of the displacement"), caption)
+    tolerance = run.settings.get("centroid", {}).get("tolerance")
+    figure = plot_convergence(centroid.mean_flow_sizes, tolerance)
+    caption = "At the centre of the motion the mean flow vanishes; what is left is the bias of the flow method."
+    yield Panel(inline_svg(figure, "convergence", "Mean flow in each iteration of the centroid"), caption)
+
+
+def _dynamics(dynamics: FlowDynamics) -> Iterator[Panel]:
+    figure = plot_singular_values(dynamics.singular_values, dynamics.rank)
+    caption = f"Coloured: the states of the flow model, {100 * dynamics.energy_share:.0f} % of the variance."
+    yield Panel(inline_svg(figure, "singular", "Singular values of the flows"), caption)
+    figure = plot_eigenvalues(dynamics.eigenvalues)
+    caption = "Inside the circle the motion forgets. All on the circle: the model only repeats the training flows."
+    yield Panel(inline_svg(figure, "eigen", "Eigenvalues of the transition and the unit circle"), caption)
+
+
+def _filter(filtered: Filtered) -> Iterator[Panel]:
+    figure = plot_filter(filtered.gains, filtered.innovations)
+    caption = "How much each frame changed the image, and the motion that the model had not foreseen."
+    yield Panel(inline_svg(figure, "filter", "Gain and innovation of each frame"), caption)
+    figure = plot_frames(filtered.sharpness, filtered.shares)
+    caption = "Sharp frames count more. Dashed: as sharp as the centroid, and an equal share."
+    yield Panel(inline_svg(figure, "frames", "Sharpness and share of each frame"), caption)
+
+
+def _deconvolution(deconvolution: Deconvolution) -> Iterator[Panel]:
+    figure = plot_objective(deconvolution.recorded, deconvolution.objective)
+    caption = "The energy that the deconvolution minimises."
+    yield Panel(inline_svg(figure, "objective", "Energy of the deconvolution in each iteration"), caption)
