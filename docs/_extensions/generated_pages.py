@@ -1,0 +1,175 @@
+"""Sphinx extension: parts of pages that are made while they are read, so that they cannot go stale.
+
+``<!-- command-line -->`` becomes a section for every command, from the application itself; ``<!-- gallery -->`` becomes
+a list of the notebooks in ``examples/``, with the first sentences of each; ``<!-- api: centroid flow -->`` becomes the
+reference of all public names that these modules define, and ``<!-- api-table -->`` a table of all of them.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from types import NoneType
+from typing import TYPE_CHECKING, Any, get_args
+
+import turbrestore
+from turbrestore_cli.__main__ import COMMANDS, build
+from turbrestore_cli.examples import EXAMPLES
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+DOCS = Path(__file__).parents[1]
+EXAMPLES_FOLDER = DOCS / "examples"
+API_MARK = re.compile(r"<!-- api: ([\w ]+) -->")
+KINDS = {bool: "", int: "INT", float: "NUMBER", str: "TEXT", Path: "PATH"}
+
+
+def fill(app: Sphinx, name: str, source: list[str]) -> None:
+    """Replace the marks of a page that is read."""
+    source[0] = filled(source[0])
+
+
+def filled(text: str) -> str:
+    """Replace marks by what they stand for."""
+    for mark, make in (
+        ("<!-- command-line -->", command_line),
+        ("<!-- gallery -->", gallery),
+        ("<!-- api-table -->", api_table),
+    ):
+        if mark in text:
+            text = text.replace(mark, make())
+    return API_MARK.sub(lambda found: reference(found[1].split()), text)
+
+
+def command_line() -> str:
+    """Every command as Markdown: what it does, how it is called, examples, and all options."""
+    app = build()
+    return "\n".join(line for words in COMMANDS for line in _command(app, words))
+
+
+def _command(app: Any, words: str) -> Iterator[str]:
+    command = app
+    for word in words.split():
+        command = command[word]
+    arguments = [item for item in command.assemble_argument_collection(parse_docstring=True) if item.show]
+    places = [item for item in arguments if not item.name.startswith("-")]
+    options = [item for item in arguments if item.name.startswith("-")]
+    yield f"## {words}\n" if words[0].isalpha() else f"## `{words}`\n"
+    yield _description(command.default_command.__doc__)
+    usage = " ".join(["turbrestore", words, *(_place(item) for item in places), "[OPTIONS]"])
+    yield f"```text\n{usage}\n```\n"
+    yield f"Examples:\n\n```bash\n{chr(10).join(EXAMPLES[words])}\n```\n"
+    yield from _table("argument", places)
+    sections: dict[str, list[Any]] = {}
+    for item in options:
+        sections.setdefault(item.name.rpartition(".")[0], []).append(item)
+    for section, items in sections.items():
+        yield from _table(f"`{section}.…`" if section else "option", items)
+
+
+def _table(head: str, arguments: list[Any]) -> Iterator[str]:
+    if not arguments:
+        return
+    yield f"| {head} | meaning | default |\n|---|---|---|"
+    for item in arguments:
+        names = "<br>".join(f"`{name}`" for name in item.names)
+        choices = " ".join(f"`{choice}`" for choice in item.get_choices() or ())
+        kind = choices or "".join(f"`{name}`" for name in _kinds(item))
+        yield f"| {names} {kind} | {_cell(item.parameter.help or '')} | {_default(item)} |"
+    yield ""
+
+
+def _kinds(item: Any) -> list[str]:
+    """Name what an option takes; types of their own are named after those that they extend."""
+    kinds = [kind for kind in get_args(item.hint) or (item.hint,) if isinstance(kind, type) and kind is not NoneType]
+    names = [next((KINDS[known] for known in KINDS if issubclass(kind, known)), "") for kind in kinds]
+    return [name for name in names if name]
+
+
+def _place(item: Any) -> str:
+    return item.name if item.required else f"[{item.name}]"
+
+
+def _default(item: Any) -> str:
+    value = item.field_info.default
+    if item.required:
+        return "required"
+    return "" if value is None or value is False else f"`{str(value).lower() if value is True else value}`"
+
+
+def _description(docstring: str) -> str:
+    """Cut a docstring where its sections begin, and take the marks of roles out."""
+    lines = re.split(r"\n\s*Parameters\n", docstring)[0].splitlines()
+    return _plain("\n".join(line.strip() for line in lines)) + "\n"
+
+
+def _cell(text: str) -> str:
+    return _plain(" ".join(text.split())).replace("|", "\\|").replace("$", "\\$")
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"``([^`]*)``", r"`\1`", re.sub(r":\w+:`~?([^`]*)`", r"`\1`", text))
+
+
+def public_names(modules: list[str]) -> list[str]:
+    """Public names that modules or folders of the package define, functions first, in the order of the package."""
+    named = [(name, getattr(turbrestore, name)) for name in turbrestore.__all__]
+    here = [(name, item) for name, item in named if item.__module__.split(".")[1] in modules]
+    return [
+        name for name, _ in sorted(here, key=lambda pair: (inspect.isclass(pair[1]), modules.index(_module(pair[1]))))
+    ]
+
+
+def _module(item: Any) -> str:
+    return item.__module__.split(".")[1]
+
+
+def reference(modules: list[str]) -> str:
+    """Write the reference of the public names of some modules."""
+    blocks = []
+    for name in public_names(modules):
+        is_class = inspect.isclass(getattr(turbrestore, name))
+        directive = (
+            f".. autoclass:: turbrestore.{name}\n   :members:" if is_class else f".. autofunction:: turbrestore.{name}"
+        )
+        blocks.append(f"## {name}\n\n```{{eval-rst}}\n{directive}\n```\n")
+    return "\n".join(blocks)
+
+
+def api_pages() -> dict[Path, list[str]]:
+    """Pages of the reference in their order, each with the names that it shows."""
+    order = re.findall(r"(?m)^\w+$", (DOCS / "api" / "index.md").read_text("utf-8").split("toctree")[1])
+    pages = [DOCS / "api" / f"{name}.md" for name in order]
+    return {page: public_names(API_MARK.search(page.read_text("utf-8"))[1].split()) for page in pages}
+
+
+def api_table() -> str:
+    """Pages of the reference with what they hold."""
+    rows = []
+    for page, names in api_pages().items():
+        title = page.read_text("utf-8").splitlines()[0].lstrip("# ")
+        links = ", ".join(f"[{name}]({page.name}#{name.lower()})" for name in names)
+        rows.append(f"| [{title}]({page.name}) | {links} |")
+    return "\n".join(["| page | names |", "|---|---|", *rows])
+
+
+def gallery() -> str:
+    """List the notebooks by number, each with its title as a link and its first paragraph."""
+    found = sorted(path for path in EXAMPLES_FOLDER.glob("*.py") if path.name[:2].isdigit())
+    items = []
+    for path in found:
+        cell = re.search(r"# %% \[markdown\]\n((?:#.*\n)+)", path.read_text("utf-8"))
+        paragraphs = re.sub(r"(?m)^# ?", "", cell[1] if cell else "").strip().split("\n\n")
+        title, about = paragraphs[0].lstrip("# "), " ".join(paragraphs[1].split()) if len(paragraphs) > 1 else ""
+        items.append(f"**[{title}](examples/{path.name})**\n: {about}\n")
+    tree = "\n".join(f"examples/{path.stem}" for path in found)
+    return "\n".join(items) + f"\n```{{toctree}}\n:hidden:\n\n{tree}\n```\n"
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Fill the pages as they are read."""
+    app.connect("source-read", fill)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

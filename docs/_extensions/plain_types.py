@@ -1,0 +1,23 @@
+"""Sphinx extension: in the types of docstrings only names of classes are links.
+
+Types are words, such as ``ndarray, float32, shape (H, W)``; Sphinx takes each word for a reference, and ``shape`` for
+an attribute of whichever class has one.
+"""
+
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+
+
+def unlink_words(app: Sphinx, document: nodes.document) -> None:
+    """Turn references to words in small letters back into words."""
+    for reference in list(document.findall(addnodes.pending_xref)):
+        target = reference.get("reftarget", "").rsplit(".", 1)[-1]
+        if reference.get("refdomain") == "py" and reference.get("reftype") == "class" and not target[:1].isupper():
+            reference.replace_self(reference.children)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Look at every page once it is read."""
+    app.connect("doctree-read", unlink_words)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,76 @@
+"""Build of the documentation: ``python -m sphinx -W --keep-going -b html docs docs/_build``; it needs no network."""
+
+import sys
+from pathlib import Path
+
+import turbrestore
+
+sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
+
+project = "turbrestore"
+author = "The turbrestore developers"
+copyright = f"2026, {author}"
+version = release = turbrestore.__version__
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "generated_pages",
+    "mathml",
+    "plain_types",
+]
+exclude_patterns = [
+    "_build",
+    "_extensions",
+    "jupyter_execute",
+    "conf.py",
+    "make_figures.py",
+    "README.md",
+    "**/.ipynb_checkpoints",
+]
+source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
+
+# Notebooks are percent scripts, run anew for every build; `-D nb_execution_mode=off` leaves them out.
+nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
+nb_execution_mode = "force"
+nb_execution_timeout = 180
+nb_execution_raise_on_error = True
+nb_execution_show_tb = True
+nb_merge_streams = True
+
+myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
+myst_heading_anchors = 3
+# `$` of shell prompts is rare here, mathematics is not.
+myst_dmath_double_inline = True
+
+# Dashes only; quotation marks stay as they are written.
+smartquotes_action = "D"
+toc_object_entries = False
+
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+napoleon_google_docstring = False
+napoleon_use_ivar = True
+napoleon_use_rtype = False
+
+# Formulas become MathML while the pages are built: no script, no font to load.
+html_math_renderer = "mathml"
+html_theme = "pydata_sphinx_theme"
+html_static_path = ["_static"]
+html_css_files = ["turbrestore.css"]
+html_title = "turbrestore"
+html_show_sourcelink = False
+# Pages without pages below them need no list of those.
+html_sidebars = {name: [] for name in ("index", "getting_started", "command_line", "report", "limits")}
+html_theme_options = {
+    "navbar_align": "left",
+    "header_links_before_dropdown": 8,
+    "show_toc_level": 2,
+    "navigation_with_keys": False,
+    "footer_start": ["copyright"],
+    "footer_end": [],
+    "pygments_light_style": "a11y-high-contrast-light",
+    "pygments_dark_style": "a11y-high-contrast-dark",
+}
