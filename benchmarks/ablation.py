@@ -118,7 +118,7 @@ def document(rows: dict[str, Row]) -> str:
         "`benchmarks/quality.py` that have a truth.\n",
         "## What each choice buys\n",
         "PSNR, dB, of the default, and what is added to it when one choice is changed: negative where the choice is "
-        "worth having.  TV and Wiener use the width that the default removes;  "
+        "worth having.  TV and Wiener use the width that the default removes; "
         "'Gaussian blur' estimates and removes a Gaussian.\n",
         f"| clip | {' | '.join(variants)} |",
         f"|---|{'---:|' * len(variants)}",

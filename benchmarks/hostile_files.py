@@ -1,0 +1,347 @@
+"""Files that are malformed, damaged, lying or of odd content, from scratch and the same in every run."""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from turbrestore.arrays import FloatArray
+from turbrestore.synthesis.scenes import resolution_chart
+from turbrestore.synthesis.smooth_flow import distort, smooth_flows
+from turbrestore.video import write_video
+
+FORMATS = (".mkv", ".mp4", ".avi", ".mov", ".gif", ".ser", ".tif", ".npy")
+FLIPPED = {"FFV1 with checksums": ".mkv", "H.264": ".mp4", "SER": ".ser", "TIFF": ".tif", "npy": ".npy"}
+CUTS = (0.01, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.75, 0.9, 0.995)
+_HEIGHT, _WIDTH, _COUNT = 48, 64, 12
+_HUGE = 60_000
+
+
+@dataclass(frozen=True)
+class Bomb:
+    """A file that must not be believed, and the command that meets it."""
+
+    write: Callable[[Path], object]
+    command: tuple[str, ...] = ("restore", "{input}", "{output}")
+
+
+@dataclass(frozen=True)
+class Content:
+    """A video of odd content, and what the command line has to say about it."""
+
+    name: str
+    write: Callable[[Path], object]
+    word: str
+    refused: bool = False
+    options: tuple[str, ...] = ()
+
+
+def clip(count: int = _COUNT, height: int = _HEIGHT, width: int = _WIDTH, seed: int = 0) -> FloatArray:
+    """Turbulent frames of a chart."""
+    rng = np.random.default_rng(seed)
+    frames = distort(0.1 + 0.8 * resolution_chart(64, 64), smooth_flows(count, 64, 64, rng), rng, blur=0.8, noise=0.01)
+    return np.clip(frames[:, :height, :width], 0, 1).astype(np.float32)
+
+
+def other_clip(count: int) -> FloatArray:
+    """Turbulent frames of something else."""
+    rng = np.random.default_rng(7)
+    y, x = np.mgrid[:_HEIGHT, :_WIDTH]
+    blobs = sum(np.exp(-((x - rng.uniform(0, 64)) ** 2 + (y - rng.uniform(0, 48)) ** 2) / 18) for _ in range(14))
+    scene = (0.1 + 0.8 * blobs / blobs.max()).astype(np.float32)
+    return np.clip(distort(scene, smooth_flows(count, _HEIGHT, _WIDTH, rng), rng, noise=0.01), 0, 1).astype(np.float32)
+
+
+def write_clip(path: Path, kind: str = "") -> None:
+    """Write a whole video in the format of the suffix."""
+    if path.suffix in (".mkv", ".ser", ".tif", ".npy", ".mp4") and kind != "H.264":
+        write_video(path, clip(), 25, 8)
+    elif path.suffix == ".gif":
+        import PIL.Image
+
+        images = [PIL.Image.fromarray(np.uint8(255 * frame)) for frame in clip()]
+        images[0].save(path, save_all=True, append_images=images[1:], duration=40)
+    else:
+        codec = {".mp4": ("libx264", "yuv420p"), ".mov": ("mpeg4", "yuv420p"), ".avi": ("mjpeg", "yuvj420p")}
+        encode(path, clip(), *codec[path.suffix])
+
+
+def encode(path: Path, frames: FloatArray, codec: str, pixel_format: str, stamps: list[int] | None = None) -> None:
+    """Encode grey frames by PyAV."""
+    import av
+
+    with av.open(str(path), "w") as output:
+        stream = output.add_stream(codec, rate=25)
+        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixel_format
+        for stamp, frame in zip(stamps or range(len(frames)), frames, strict=True):
+            picture = av.VideoFrame.from_ndarray(np.uint8(np.rint(255 * frame)), format="gray")
+            picture = picture.reformat(format=pixel_format)
+            picture.pts = stamp
+            output.mux(stream.encode(picture))
+        output.mux(stream.encode(None))
+
+
+def malformed(whole: bytes, suffix: str) -> dict[str, bytes]:
+    """Contents that are no video of that format."""
+    rng = np.random.default_rng(0)
+    magic = b"%PDF-1.7\n%\xe2\xe3\xcf\xd3\n"
+    cuts = {f"cut{1000 * share:03.0f}": whole[: int(share * len(whole))] for share in CUTS}
+    return {
+        "empty": b"",
+        "text": b"This is a text and no video.\n" * 50,
+        "magic": magic + whole[len(magic) :],
+        "random": rng.integers(0, 256, 5000, np.uint8).tobytes(),
+        **cuts,
+    }
+
+
+def flipped(path: Path, kind: str, count: int) -> Iterator[bytes]:
+    """Copy with one byte changed; of FFV1 within the coded frames, where the checksums are."""
+    whole = path.read_bytes()
+    rng = np.random.default_rng(1)
+    spans = [(0, len(whole))]
+    if kind.startswith("FFV1"):
+        import av
+
+        with av.open(str(path)) as container:
+            packets = [bytes(packet) for packet in container.demux() if packet.size]
+        starts = [whole.index(packet) for packet in packets]
+        spans = [(start, start + len(packet)) for start, packet in zip(starts, packets, strict=True)]
+    for _ in range(count):
+        start, stop = spans[rng.integers(len(spans))]
+        data = bytearray(whole)
+        data[rng.integers(start, stop)] ^= int(rng.integers(1, 256))
+        yield bytes(data)
+
+
+def _png(path: Path, side: int, bits: int = 8, colour: int = 0, extra: bytes = b"") -> None:
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, bits, colour, 0, 0, 0))
+    packed = chunk(b"zTXt", b"Comment\0\0" + extra) if extra else b""
+    pixels = chunk(b"IDAT", zlib.compress(bytes(2000)))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + packed + pixels + chunk(b"IEND", b""))
+
+
+def _folder_of_png(path: Path) -> None:
+    path.mkdir()
+    _png(path / "1.png", _HUGE)
+
+
+def _jpeg(path: Path) -> None:
+    import cv2
+
+    data = bytearray(cv2.imencode(".jpg", np.zeros((16, 16), np.uint8))[1].tobytes())
+    place = data.index(b"\xff\xc0") + 5
+    data[place : place + 4] = struct.pack(">HH", 65_500, 65_500)
+    path.write_bytes(data)
+
+
+def _tiff(path: Path, tags: dict[int, int]) -> None:
+    """Write a small page whose tags are changed."""
+    import tifffile
+
+    tifffile.imwrite(path, np.zeros((40, 60, 3), np.uint8), photometric="rgb", metadata=None, rowsperstrip=40)
+    data = bytearray(path.read_bytes())
+    for tag, value in tags.items():
+        place = data.index(struct.pack("<H", tag), 8)
+        data[place + 2 : place + 12] = struct.pack("<HII", 4, 1, value)
+    path.write_bytes(data)
+
+
+def _inflating_tiff(path: Path) -> None:
+    import tifffile
+
+    packed = zlib.compress(bytes(5 * 10**8), 1)
+    tifffile.imwrite(path, iter([packed]), shape=(100, 100), dtype=np.uint8, compression="zlib", metadata=None)
+
+
+def _npy_header(shape: tuple[int, ...], descr: str = "<f4") -> bytes:
+    text = repr({"descr": descr, "fortran_order": False, "shape": shape}).encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+
+
+def _npz(path: Path, members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> None:
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, data in members.items():
+            archive.writestr(f"{name}.npy", data)
+
+
+def _ser(path: Path, width: int, height: int, frames: int) -> None:
+    fields = struct.pack("<7i", 0, 0, 0, width, height, 8, frames)
+    path.write_bytes((b"LUCAM-RECORDER" + fields).ljust(178, b"\0") + bytes(5000))
+
+
+def _avi_header(path: Path) -> None:
+    encode(path, clip(), "rawvideo", "bgr24")
+    data = bytearray(path.read_bytes())
+    place = data.index(b"strf") + 12
+    data[place : place + 8] = struct.pack("<ii", 16_000, 16_000)
+    path.write_bytes(data)
+
+
+def _mjpeg_frames(path: Path) -> None:
+    encode(path, clip(), "mjpeg", "yuvj420p")
+    data = bytearray(path.read_bytes())
+    place = data.find(b"\xff\xc0\x00\x11\x08")
+    while place >= 0:
+        data[place + 5 : place + 9] = struct.pack(">HH", 16_000, 16_000)
+        place = data.find(b"\xff\xc0\x00\x11\x08", place + 9)
+    path.write_bytes(data)
+
+
+def _mkv_header(path: Path) -> None:
+    write_video(path, np.zeros((2, 320, 320), np.float32), 25, 8)
+    data = path.read_bytes()
+    for element in (b"\xb0\x82", b"\xba\x82"):  # pixel width and height, of two bytes
+        data = data.replace(element + struct.pack(">H", 320), element + b"\xff\xff", 1)
+    path.write_bytes(data)
+
+
+def _gif(path: Path) -> None:
+    write_clip(path)
+    data = bytearray(path.read_bytes())
+    data[6:10] = struct.pack("<HH", 65_535, 65_535)
+    path.write_bytes(data)
+
+
+_EVALUATE = ("evaluate", "{input}", "{truth}")
+_DEBLUR = ("deconvolve", "{input}", "{output}")
+BOMBS = {
+    "huge.png": Bomb(lambda path: _png(path, _HUGE), _EVALUATE),
+    "absurd.png": Bomb(lambda path: _png(path, 2**31 - 1), _DEBLUR),
+    "short.png": Bomb(lambda path: _png(path, 8000, 16, 6), _EVALUATE),
+    "comment.png": Bomb(lambda path: _png(path, 32, extra=zlib.compress(bytes(5 * 10**8), 1)), _DEBLUR),
+    "frames of png": Bomb(_folder_of_png),
+    "huge.jpg": Bomb(_jpeg, _EVALUATE),
+    "huge.tif": Bomb(lambda path: _tiff(path, {256: _HUGE, 257: _HUGE, 278: _HUGE}), _EVALUATE),
+    "stack.tif": Bomb(lambda path: _tiff(path, {256: _HUGE, 257: _HUGE, 278: _HUGE})),
+    "short.tif": Bomb(lambda path: _tiff(path, {256: 8000, 257: 8000, 278: 8000})),
+    "inflating.tif": Bomb(_inflating_tiff),
+    "many.npy": Bomb(lambda path: path.write_bytes(_npy_header((2**31, 4, 4), "|u1") + bytes(5000))),
+    "huge.npy": Bomb(lambda path: path.write_bytes(_npy_header((9, 10**6, 10**6)) + bytes(5000))),
+    "overflow.npy": Bomb(lambda path: path.write_bytes(_npy_header((2**32, 2**32, 2**32)) + bytes(5000))),
+    "objects.npy": Bomb(lambda path: path.write_bytes(_npy_header((2, 8, 8), "|O") + b"cos\nsystem\n(S'false'\ntR.")),
+    "inflating.npz": Bomb(
+        lambda path: _npz(path, {"image": _npy_header((10**4, 10**4)) + bytes(4 * 10**8)}, zipfile.ZIP_DEFLATED),
+        _DEBLUR,
+    ),
+    "lying.npz": Bomb(lambda path: _npz(path, {"image": _npy_header((10**6, 10**6)) + bytes(500)}), _DEBLUR),
+    "objects.npz": Bomb(lambda path: _npz(path, {"header": _npy_header((), "|O") + b"cos\nsystem\n."}), _DEBLUR),
+    "huge.ser": Bomb(lambda path: _ser(path, 30_000, 30_000, 5)),
+    "many.ser": Bomb(lambda path: _ser(path, 40, 40, 2**31 - 1)),
+    "header.avi": Bomb(_avi_header),
+    "frames.avi": Bomb(_mjpeg_frames),
+    "header.mkv": Bomb(_mkv_header),
+    "screen.gif": Bomb(_gif),
+}
+
+
+def _with(value: float, *places: tuple[slice | int, ...]) -> FloatArray:
+    changed = clip()
+    for place in places:
+        changed[place] = value
+    return changed
+
+
+def _npy(frames: Callable[[], FloatArray]) -> Callable[[Path], object]:
+    return lambda path: np.save(path, frames())
+
+
+def _video(frames: Callable[[], FloatArray]) -> Callable[[Path], object]:
+    return lambda path: write_video(path, frames(), 25, 8, overwrite=True)
+
+
+def _tiff_of_nan(path: Path) -> None:
+    import tifffile
+
+    tifffile.imwrite(path, _with(np.nan, (3, 10, 10), (4, 5, 5)), photometric="minisblack")
+
+
+def _images(sizes: list[tuple[int, int]]) -> Callable[[Path], object]:
+    def write(path: Path) -> None:
+        import cv2
+
+        path.mkdir()
+        for number, (height, width) in enumerate(sizes):
+            cv2.imwrite(str(path / f"{number}.png"), np.uint8(255 * clip(1, height, width)[0]))
+
+    return write
+
+
+def _pages_of_two_sizes(path: Path) -> None:
+    import tifffile
+
+    with tifffile.TiffWriter(path) as tiff:
+        for height in (48, 48, 40):
+            tiff.write(np.uint8(255 * clip(1, height)[0]), metadata=None)
+
+
+def _two_scenes() -> FloatArray:
+    return np.concatenate([clip(14), other_clip(10)])
+
+
+def _scene_that_comes_back() -> FloatArray:
+    return np.concatenate([clip(16)[:8], other_clip(4), clip(16)[8:]])
+
+
+def _repeated(*places: int) -> FloatArray:
+    changed = clip()
+    for place in places:
+        changed[place] = changed[place - 1]
+    return changed
+
+
+_STRICT = ("--strict",)
+CONTENT = (
+    Content("nan.npy", _npy(lambda: _with(np.nan, (3, 10, 12), (3, 10, 13), (8, 40, 60))), "3 NaN or infinite values"),
+    Content("nan.npy", _npy(lambda: _with(np.nan, (3, 10, 12), (3, 10, 13), (8, 40, 60))), "NaN", True, _STRICT),
+    Content("nan_first.npy", _npy(lambda: _with(np.nan, (0, 0, 0))), "1 NaN or infinite value in frame 0"),
+    Content("inf.npy", _npy(lambda: _with(np.inf, (5, 20, 20))), "1 NaN or infinite value in frame 5"),
+    Content("inf_minus.npy", _npy(lambda: _with(-np.inf, (5, 20, 20))), "1 NaN or infinite value in frame 5"),
+    Content(
+        "nan_block.npy", _npy(lambda: _with(np.nan, (slice(None), slice(4, 9), slice(4, 9)))), "300 NaN or infinite"
+    ),
+    Content("nan_frame.npy", _npy(lambda: _with(np.nan, (4,))), "3072 of 3072 NaN", True),
+    Content("nan_rows.npy", _npy(lambda: _with(np.nan, (4, slice(0, 10)))), "640 of 3072 NaN", True),
+    Content("nan_all.npy", _npy(lambda: np.full((12, 48, 64), np.nan, np.float32)), "NaN", True),
+    Content("nan.tif", _tiff_of_nan, "2 NaN or infinite values in frames 3, 4"),
+    Content("scale.npy", _npy(lambda: clip() * 255), "divide them by full scale", True),
+    Content("negative.npy", _npy(lambda: clip() - 0.5), "divide them by full scale", True),
+    Content("black.mkv", _video(lambda: np.zeros_like(clip())), "contrast", True),
+    Content("white.mkv", _video(lambda: np.ones_like(clip())), "contrast", True),
+    Content("grey.npy", _npy(lambda: np.full_like(clip(), 0.5)), "contrast", True),
+    Content("one.npy", _npy(lambda: clip()[:1]), "at least 2", True),
+    Content("two.npy", _npy(lambda: clip()[:2]), "2 frames in"),
+    Content("three.npy", _npy(lambda: clip()[:3]), "3 frames in"),
+    Content("four.npy", _npy(lambda: clip()[:4]), "4 frames in"),
+    Content("sizes", _images([(48, 64), (48, 64), (40, 64)]), "expected 64×48", True),
+    Content("pages.tif", _pages_of_two_sizes, "expected 64×48", True),
+    Content("pixel.npy", _npy(lambda: clip()[:, :1, :1]), "contrast", True),
+    Content("tiny.npy", _npy(lambda: clip()[:, :8, :8]), "at least 16×16", True),
+    Content("line.npy", _npy(lambda: clip()[:, :2, :]), "at least 16×16", True),
+    Content("small.npy", _npy(lambda: clip()[:, :16, :16]), "12 frames in"),
+    Content("narrow.npy", _npy(lambda: clip()[:, :, :16]), "12 frames in"),
+    Content("saturated.mkv", _video(lambda: np.clip(3 * clip(), 0, 1)), "at white"),
+    Content("two_scenes.mkv", _video(_two_scenes), "2 scenes: only the longest is used, 14 frames from 0 to 13"),
+    Content("two_scenes.mkv", _video(_two_scenes), "2 scenes", True, _STRICT),
+    Content("two_scenes.mkv", _video(_two_scenes), "10 frames in", False, ("--frames", "14:24")),
+    Content("come_back.mkv", _video(_scene_that_comes_back), "2 scenes: only the longest is used, 16 frames"),
+    Content("black_frames.mkv", _video(lambda: _with(0, (0,), (6,))), "2 blank: frames 0, 6 left out"),
+    Content("black_frames.mkv", _video(lambda: _with(0, (0,), (6,))), "2 blank", True, _STRICT),
+    Content("white_frame.mkv", _video(lambda: _with(1, (7,))), "1 blank: frame 7 left out"),
+    Content("duplicated.mkv", _video(lambda: _repeated(3, 4, 9)), "3 duplicated: frames 3, 4, 9 left out"),
+    Content("duplicated.mkv", _video(lambda: _repeated(3, 4, 9)), "3 duplicated", True, _STRICT),
+    Content("still.mkv", _video(lambda: np.repeat(clip()[:1], 12, 0)), "all frames are the same"),
+    Content("hot.mkv", _video(lambda: _with(1, (slice(None), 20, 30))), "1 stuck pixels (x 30, y 20)"),
+    Content("dead.mkv", _video(lambda: _with(0, (slice(None), 12, 40))), "1 stuck pixels (x 40, y 12)"),
+    Content("hot.mkv", _video(lambda: _with(1, (slice(None), 20, 30))), "1 stuck pixels", True, _STRICT),
+    Content("times.mkv", lambda path: encode(path, clip(), "ffv1", "gray", [*range(8), 20, 21, 30, 50]), "variable"),
+)
