@@ -6,6 +6,7 @@ import pytest
 
 from turbrestore.arrays import luminance
 from turbrestore.blind import remove_blur
+from turbrestore.blur_estimation import estimate_blur
 from turbrestore.blur_map import deconvolve_varying, estimate_blur_map, sigma_map
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.metrics import psnr
@@ -35,7 +36,7 @@ def brick():
 
 def test_a_blur_that_grows_to_the_right_is_found_and_removed(brick):
     scene, image, widths = brick
-    found = estimate_blur_map(image, 2.0)
+    found = estimate_blur_map(image, estimate_blur(image, exponent=2.0))
     assert found.varies
     assert (found.sigmas[:, 1] > 1.4 * found.sigmas[:, 0]).all()
     assert (found.sigmas[:, 1] < 1.3 * 2.2).all()
@@ -50,7 +51,7 @@ def test_a_blur_that_grows_to_the_right_is_found_and_removed(brick):
 @pytest.mark.parametrize("name", ["chart", "camera"])
 def test_a_blur_that_is_the_same_everywhere_is_taken_as_one(name):
     _, image, _ = blurred(name, 1.4, 1.4)
-    assert not estimate_blur_map(image, 2.0).varies
+    assert not estimate_blur_map(image, estimate_blur(image, exponent=2.0)).varies
 
 
 def test_true_widths_beat_every_single_width(brick):
@@ -70,5 +71,28 @@ def test_interpolation_keeps_plateaus_and_is_monotone():
     assert np.ptp(widths, axis=0).max() == 0
 
 
+@pytest.mark.parametrize("above", ["flat", "ramp"])
+def test_a_tile_without_texture_is_not_taken_for_sharp(above):
+    scene = SCENES["chart"](480, 480)
+    scene[:310] = 0.88 if above == "flat" else np.linspace(0.3, 0.8, 480)
+    noise = np.random.default_rng(0).normal(0, 0.003, scene.shape)
+    image = (cv2.GaussianBlur(scene, (0, 0), 1.5) + noise).astype(np.float32)
+    whole = estimate_blur(image, exponent=2.0)
+    found = estimate_blur_map(image, whole)
+    assert not found.varies
+    assert (found.sigmas[0] == whole.sigma).all()
+
+
+def test_a_sharp_part_beside_a_blurred_one_stays_sharp():
+    scene = SCENES["brick"](480, 480)
+    blurred = cv2.GaussianBlur(scene, (0, 0), 2.0)
+    image = np.where(np.arange(480) < 240, scene, blurred) + np.random.default_rng(0).normal(0, 0.003, scene.shape)
+    found = estimate_blur_map(image, estimate_blur(image, exponent=2.0))
+    assert found.varies
+    assert found.sigmas[:, 0].max() < 0.9
+    assert found.sigmas[:, 1].min() > 1.2
+
+
 def test_small_images_have_no_tiles():
-    assert estimate_blur_map(np.zeros((600, 300), np.float32)) is None
+    small = np.random.default_rng(0).random((600, 300)).astype(np.float32)
+    assert estimate_blur_map(small, estimate_blur(small)) is None

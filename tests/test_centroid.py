@@ -57,6 +57,21 @@ def test_flows_start_from_the_centroid_and_average_out(sequence, mode):
     assert np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean() <= CentroidParams().tolerance
 
 
+@pytest.mark.parametrize(
+    ("sizes", "converged"), [([2.0, 1.0, 0.9], True), ([2.0, 1.0, 1.1], True), ([1.0, 2.0], False)]
+)
+def test_a_mean_flow_that_stalls_has_converged_and_one_that_grows_has_not(monkeypatch, sizes, converged):
+    found = iter(sizes)
+
+    def flows(image, stack, *_):
+        return np.full((*stack.shape[:3], 2), (next(found), 0.0), np.float32)
+
+    monkeypatch.setattr("turbrestore.centroid.estimate_flow", flows)
+    centroid = find_centroid(np.zeros((2, 16, 16)))
+    assert centroid.converged == converged
+    assert centroid.mean_flow_sizes == pytest.approx(sizes)
+
+
 def test_opposite_shifts_meet_in_the_middle(sequence):
     from scipy.ndimage import shift
 

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from turbrestore.arrays import luminance
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.guards import GuardParams, deconvolve_guarded, judge
@@ -56,10 +57,19 @@ def test_noise_that_was_amplified_is_found():
     assert not reading.passed
 
 
-def test_colour_is_judged_by_luminance():
+def test_grey_as_colour_reads_the_same():
     _, image = blurred("camera", 1.0)
     colour = np.repeat(image[..., None], 3, axis=2)
     assert judge(colour, colour, 1.0) == judge(image, image, 1.0)
+
+
+def test_rings_of_colour_without_luminance_are_found():
+    before = np.full((64, 64, 3), 0.5, np.float32)
+    before[:, 32:] = 0.6
+    after = before.copy()
+    after[:, 24:32] += np.float32([0.587, -0.299, 0.0]) * 0.8
+    assert judge(luminance(after), luminance(before), 1.0).overshoot < 0.01
+    assert not judge(after, before, 1.0).passed
 
 
 @given(gain=st.floats(0.1, 1.0), offset=st.floats(-0.2, 0.2))

@@ -124,3 +124,18 @@ def test_other_sizes_are_refused():
         shift_against(np.zeros((32, 32)), refer_shift(np.zeros((32, 40))))
     with pytest.raises(DataError, match="frames: expected shape"):
         global_shifts(np.zeros((32, 32)))
+
+
+@pytest.mark.parametrize("odd", [[20], [20, 21], [20, 21, 22], [15], [14, 15, 16], [0, 1], [28, 29]])
+@pytest.mark.parametrize("what", ["black", "noise"])
+def test_frames_of_something_else_mislead_no_other(odd, what):
+    rng, steps = np.random.default_rng(8), 6 * np.arange(30)
+    scene = cv2.GaussianBlur(rng.random((128, 340)).astype(np.float32), (0, 0), 2)
+    frames = np.stack([scene[:, step : step + 128] for step in steps])
+    frames[odd] = 0.0 if what == "black" else rng.random((len(odd), 128, 128))
+    kept = np.setdiff1d(np.arange(30), odd)
+    found = global_shifts(frames)[kept, 0]
+    assert np.ptp(found + steps[kept]) < 1.0
+    centre = round(float((steps[kept] + found).mean()))
+    error = mean_stabilised(frames) - scene[:, centre : centre + 128]
+    assert np.abs(error).mean() < 0.25 * scene.std()

@@ -90,7 +90,7 @@ def remove_blur(
     blind = deconvolution.sigma is None
     blur = estimate_blur(image, exponent=deconvolution.exponent or KOLMOGOROV) if blind else None
     sigma, settings = blur_to_remove(blur, deconvolution, bounds)
-    tiles = estimate_blur_map(image, blur.exponent) if blur is not None and sigma > 0 and bounds is None else None
+    tiles = estimate_blur_map(image, blur) if blur is not None and blur.blurred and bounds is None else None
     if tiles is not None and tiles.varies:
         widths = sigma_map(tiles.removable, image.shape[:2])
         sigma = float(widths.max())
@@ -105,7 +105,7 @@ def remove_blur(
     else:
         result = attempt(sigma)
         readings = (judge(result.image, image, sigma, guards),) if sigma > 0 else ()
-    decisions = (_on_blur(blur, sigma), *_on_tiles(tiles), *_on_guards(result, readings, guards))
+    decisions = (_on_blur(blur, sigma, tiles), *_on_tiles(tiles), *_on_guards(result, readings, guards))
     return Deblurred(result, blur, tiles, readings, decisions)
 
 
@@ -143,12 +143,14 @@ def blur_to_remove(
     return sigma, replace(deconvolution, exponent=estimate.exponent)
 
 
-def _on_blur(blur: BlurEstimate | None, sigma: float) -> Decision:
+def _on_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None) -> Decision:
     choice = f"{sigma:.2f} pixels removed" if sigma > 0 else "none removed"
     if blur is None:
         return Decision("blur", choice, "asked for")
-    found = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels found"
-    where = "" if blur.reduction == 1 else f" in the image reduced by {blur.reduction}"
+    if tiles is not None and tiles.varies:
+        choice = f"{tiles.removable.min():.2f} to {tiles.removable.max():.2f} pixels removed"
+    found = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels found in the whole image"
+    where = "" if blur.reduction == 1 else f", reduced by {blur.reduction}"
     left = ", half of the uncertainty is left in" if sigma > 0 else ", no more than a sharp image has"
     return Decision("blur", choice, found + where + left)
 

@@ -143,6 +143,11 @@ class BlurEstimate:
         return preview("Blur", facts)
 
     @property
+    def blurred(self) -> bool:
+        """Whether a blur was found, and not only the pixels of a sharp image or nothing at all."""
+        return self.sigma > _WIDTHS[0]
+
+    @property
     def removable(self) -> float:
         """Width to remove, pixels: less by half of the uncertainty, for too wide rings and too narrow is only soft."""
         return max(self.sigma - _CAUTION * self.uncertainty, 0.0) if self.sigma > 0 else 0.0

@@ -2,6 +2,7 @@
 
 A scene in depth, or air that is rougher near the ground, blurs parts of an image differently.  Widths of single tiles
 are less sure than that of the whole, so they are used only where they differ by more than their uncertainties allow.
+A tile without texture says nothing, and has the width of the whole.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_image, luminance
-from .blur_estimation import estimate_blur
+from .blur_estimation import BlurEstimate, estimate_blur
 from .deconvolution import Deconvolution
-from .psf import KOLMOGOROV
+from .psf import estimate_noise
 
 # Tiles of fewer pixels a side say too little.
 _LEAST_TILE, _MOST_TILES = 240, 3
@@ -25,8 +26,10 @@ _LEAST_TILE, _MOST_TILES = 240, 3
 _OVERLAP = 0.25
 # Widths vary clearly if the largest exceeds the smallest by this factor, and by so many standard deviations.
 _CLEAR_FACTOR, _CLEAR_DEVIATIONS = 1.5, 3.0
-# Neighbouring widths that images are interpolated between differ by at most this factor.
-_STEP = 1.35
+# Fine detail of a tile exceeds its noise by this factor, or a width that finds no blur means nothing.
+_DETAIL = 2.0
+# Neighbouring widths that images are interpolated between differ by this factor, or more where there would be too many.
+_STEP, _MOST_WIDTHS = 1.35, 5
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class BlurMap:
     Attributes
     ----------
     sigmas : ndarray, float64, shape (rows, columns)
-        Width found in each tile, pixels.
+        Width found in each tile, pixels; that of the whole image where the tile says nothing.
     uncertainties : ndarray, float64, shape (rows, columns)
         Their standard deviations, pixels.
     varies : bool
@@ -53,15 +56,15 @@ class BlurMap:
         return np.maximum(self.sigmas - 0.5 * self.uncertainties, 0.0)
 
 
-def estimate_blur_map(image: ArrayLike, exponent: float = KOLMOGOROV) -> BlurMap | None:
+def estimate_blur_map(image: ArrayLike, whole: BlurEstimate) -> BlurMap | None:
     """Estimate the blur of overlapping tiles, two or three along each side.
 
     Parameters
     ----------
     image : array_like, shape (H, W) or (H, W, 3)
         Blurred image.
-    exponent : float
-        Shape of the blur, see :func:`turbrestore.psf.blur_otf`.
+    whole : BlurEstimate
+        Of the whole image.
 
     Returns
     -------
@@ -76,18 +79,24 @@ def estimate_blur_map(image: ArrayLike, exponent: float = KOLMOGOROV) -> BlurMap
     Examples
     --------
     >>> import numpy as np
-    >>> estimate_blur_map(np.zeros((256, 256))) is None
+    >>> from turbrestore.blur_estimation import estimate_blur
+    >>> small = np.zeros((256, 256))
+    >>> estimate_blur_map(small, estimate_blur(small)) is None
     True
     """
     grey = luminance(check_image(image))
-    tiles = [[grey[rows, columns] for columns in _spans(grey.shape[1])] for rows in _spans(grey.shape[0])]
-    if len(tiles) == 1 or len(tiles[0]) == 1:
+    rows, columns = _spans(grey.shape[0]), _spans(grey.shape[1])
+    if len(rows) == 1 or len(columns) == 1:
         return None
-    found = [[estimate_blur(np.ascontiguousarray(tile), exponent=exponent) for tile in row] for row in tiles]
-    sigmas, uncertainties = (
-        np.array([[getattr(estimate, name) for estimate in row] for row in found]) for name in ("sigma", "uncertainty")
-    )
-    return BlurMap(sigmas, uncertainties, _clearly_differ(sigmas, uncertainties))
+    noise, shape = estimate_noise(grey), (len(rows), len(columns))
+    sigmas, uncertainties = np.full(shape, whole.sigma), np.full(shape, whole.uncertainty)
+    spoken = np.zeros(shape, bool)
+    for place in np.ndindex(shape):
+        tile = np.ascontiguousarray(grey[rows[place[0]], columns[place[1]]])
+        estimate = estimate_blur(tile, exponent=whole.exponent)
+        if np.isfinite(estimate.uncertainty) and (estimate.blurred or _fine_detail(tile) > _DETAIL * noise):
+            sigmas[place], uncertainties[place], spoken[place] = estimate.sigma, estimate.uncertainty, True
+    return BlurMap(sigmas, uncertainties, _clearly_differ(sigmas[spoken], uncertainties[spoken]))
 
 
 def sigma_map(tiles: ArrayLike, shape: tuple[int, int]) -> FloatArray:
@@ -146,7 +155,8 @@ def deconvolve_varying(attempt: Callable[[float], Deconvolution], sigmas: FloatA
     """
     low, high = float(sigmas.min()), float(sigmas.max())
     steps = int(np.ceil(np.log(max(high, 1e-6) / max(low, 1e-6)) / np.log(_STEP) - 1e-6))
-    widths = np.geomspace(low, high, min(steps, 4) + 1) if low > 0 else np.linspace(low, high, 4)
+    count = min(steps + 1, _MOST_WIDTHS)
+    widths = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, _MOST_WIDTHS)
     widths = np.unique(widths) if high > low else np.array([high])
     results = [attempt(float(width)) for width in widths]
     image = np.zeros_like(results[-1].image)
@@ -165,10 +175,16 @@ def _spans(length: int) -> list[slice]:
     return [slice(int(start), int(start) + size) for start in starts]
 
 
+def _fine_detail(tile: FloatArray) -> float:
+    """Deviation of what the mask of the noise estimate lets through; that of the noise where there is nothing else."""
+    second = np.array([1, -2, 1], np.float32)
+    return float(cv2.sepFilter2D(tile, cv2.CV_32F, second, second).std()) / 6
+
+
 def _clearly_differ(sigmas: np.ndarray, uncertainties: np.ndarray) -> bool:
-    most, least = np.unravel_index(sigmas.argmax(), sigmas.shape), np.unravel_index(sigmas.argmin(), sigmas.shape)
-    if not np.isfinite(uncertainties).all() or sigmas[least] <= 0:
+    if sigmas.size < 2:
         return False
+    most, least = int(sigmas.argmax()), int(sigmas.argmin())
     difference = sigmas[most] - sigmas[least]
     deviation = np.hypot(uncertainties[most], uncertainties[least])
     return bool(sigmas[most] > _CLEAR_FACTOR * sigmas[least] and difference > _CLEAR_DEVIATIONS * deviation)

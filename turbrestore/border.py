@@ -46,7 +46,8 @@ def coverage(flows: ArrayLike) -> FloatArray:
 def well_seen(seen: ArrayLike, least: float = 0.9, margin: int = 0, smallest: int = 16) -> Rectangle:
     """Rectangle that enough frames show.
 
-    The side with the worst pixel is trimmed until no pixel of the border is below ``least``.
+    The side with the worst pixel is trimmed until no pixel of the border is below ``least``; what lies within is not
+    looked at.  Where nothing of the smallest size is left, nothing is trimmed.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ def well_seen(seen: ArrayLike, least: float = 0.9, margin: int = 0, smallest: in
     margin : int
         Pixels to leave out beyond that on every side.
     smallest : int
-        Side below which nothing is trimmed any more, pixels.
+        Shortest side that may be left, pixels.
 
     Returns
     -------
@@ -80,12 +81,14 @@ def well_seen(seen: ArrayLike, least: float = 0.9, margin: int = 0, smallest: in
     require_between("margin", margin, 0, 10_000, "pixels")
     share = np.asarray(seen)
     top, left, (bottom, right) = 0, 0, share.shape
-    while bottom - top > smallest and right - left > smallest:
+    while bottom - top >= smallest and right - left >= smallest:
         view = share[top:bottom, left:right]
         sides = (view[0], view[-1], view[:, 0], view[:, -1])
         worst = min(range(4), key=lambda side: (sides[side].min(), sides[side].mean()))
         if sides[worst].min() >= least:
             break
         top, bottom, left, right = top + (worst == 0), bottom - (worst == 1), left + (worst == 2), right - (worst == 3)
+    else:
+        return 0, 0, share.shape[1], share.shape[0]
     spare = min(margin, max(0, (min(bottom - top, right - left) - smallest) // 2))
     return left + spare, top + spare, right - left - 2 * spare, bottom - top - 2 * spare

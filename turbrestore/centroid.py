@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 MODES = ("fused", "single")
 # A mean flow that keeps this share of its length from one iteration to the next is the bias of the flow method.
 _STALLED = 0.8
+# One that grows by more than this has lost the frames.
+_DIVERGED = 1.25
 # Weight of the repeated border beside that of a pixel that was seen.
 _UNSEEN = 1e-3
 
@@ -51,7 +53,8 @@ class CentroidParams:
     iterations : int
         Largest number of iterations; each costs one flow per frame.  The paper runs 10.
     tolerance : float
-        Stop when the mean flow is shorter than this, pixels (mean over the image), or shrinks by less than a fifth.
+        Stop when the mean flow is shorter than this, pixels (mean over the image), or shrinks by less than a fifth;
+        stop without convergence when it grows by more than a quarter.
         What is left is the bias of the flow method; it is not corrected, which would bend the image.
     start : int
         Frame that ``single`` warps; ``fused`` starts from the temporal mean, of stabilised frames if flow takes shifts
@@ -84,7 +87,7 @@ class Centroid:
         Mean length of W̄ found in each iteration, pixels.  All but the last have been corrected, and the last too if
         the iteration has not converged.
     converged : bool
-        Whether the last of them is below the tolerance or no longer shrinks.
+        Whether the last of them is below the tolerance, or no longer shrinks without growing either.
     """
 
     image: FloatArray
@@ -164,8 +167,8 @@ def find_centroid(
         flows = estimate_flow(image, stack, flow_params, progress)
         mean_flow = flows.mean(axis=0, dtype=np.float32)
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
-        stalled = len(sizes) > 1 and sizes[-1] > _STALLED * sizes[-2]
-        converged = sizes[-1] <= params.tolerance or stalled
+        change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
+        converged = sizes[-1] <= params.tolerance or _STALLED < change <= _DIVERGED
         if not converged:
             recentre = invert_flow(mean_flow)
             total = compose_flows(total, recentre)
@@ -176,7 +179,7 @@ def find_centroid(
             if params.mode == "fused"
             else warp(stack[params.start], total)
         )
-        if converged or len(sizes) == params.iterations:
+        if converged or change > _DIVERGED or len(sizes) == params.iterations:
             return Centroid(image, flows, np.array(sizes), converged)
 
 

@@ -11,10 +11,15 @@ From a window the displacement is known at best to the covariance ``σ² (A J)�
 Milanfar 2004): well across an edge, not at all along it, and not at all where nothing is seen.  Flow methods give a
 number all the same.  In flat regions dense inverse search matches noise with noise, over 5 px and more.
 
-With W̄ known to τ the posterior mean is ``Ŵ = (J + ε)⁻¹ (J W + ε W̄)``, ``ε = σ² / (A τ²)``, where J and J W are
-averages over the window.  W̄ is the same in a window twice as wide, and so on until the window is the image, for which
-it is zero: this is normalised convolution (Knutsson and Westin 1993) with tensors and growing windows.  Texture keeps
-its flow, an edge takes the component along it from its neighbourhood, and a flat region takes both.
+With W̄ known to τ the posterior mean is ``Ŵ = (J + ε)⁻¹ (J W + ε W̄)``, ``ε = m σ² / (A τ²) + κ tr(J) / 2``, where J and
+J W are averages over the window.  W̄ is the same in a window twice as wide, and so on until the window is the image, for
+which it is zero: this is normalised convolution (Knutsson and Westin 1993) with tensors and growing windows.  Texture
+keeps its flow, an edge takes the component along it from its neighbourhood, and a flat region takes both.
+
+Three things keep it from believing too much.  A flow method errs by more than noise explains, by a factor m in
+variance.  Its errors at neighbouring pixels have one origin, so ε is the same for every window.  And the direction of
+an edge is known to a few degrees only: without κ the tilt of the tensor from one pixel to the next would pass for a
+measurement of what lies along the edge.  What comes out lies within the range of what went in.
 
 J holds the noise of the reference as well, which must not pass for texture: the eigenvalues are lowered by it.
 """
@@ -37,8 +42,10 @@ _AREA = 4 * np.pi * _TENSOR_WINDOW**2
 # Variance of a derivative in that window of white noise of unit variance; three times it bounds what noise looks like.
 _GRADIENT_NOISE = 1 / (8 * np.pi * _GRADIENT_WINDOW**4)
 _NOISE_MARGIN = 3.0
-# τ, pixels.
+# τ, pixels; m and κ.
 _DEVIATION = 0.5
+_METHOD_ERROR = 10.0
+_TILT = 0.01
 # Smallest noise, so that every tensor has an inverse: 1/4096 of full scale.
 _LEAST_NOISE = 1 / 4096
 
@@ -107,7 +114,7 @@ def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -
     Returns
     -------
     ndarray, float32, shape (H, W, 2)
-        Pixels; zero where the whole image is flat.
+        Pixels, within the range of ``flow`` and zero; zero where the whole image is flat.
 
     Raises
     ------
@@ -131,15 +138,15 @@ def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -
     weighted = [_apply(tensors[0], measured)]
     for _ in tensors[1:]:
         weighted.append(cv2.pyrDown(weighted[-1]))
-    prior = max(noise, _LEAST_NOISE) ** 2 / (_AREA * _DEVIATION**2)
+    prior = _METHOD_ERROR * max(noise, _LEAST_NOISE) ** 2 / (_AREA * _DEVIATION**2)
     expected = np.zeros_like(weighted[-1])
     for level in range(len(tensors) - 1, -1, -1):
         height, width = tensors[level].shape[:2]
         if expected.shape[:2] != (height, width):
             expected = cv2.pyrUp(expected, dstsize=(width, height))
-        # A window twice as wide holds four times the pixels.
-        expected = _solve(tensors[level], weighted[level], expected, np.float32(prior / 4**level))
-    return expected
+        expected = _solve(tensors[level], weighted[level], expected, prior)
+    low, high = np.minimum(measured.min(axis=(0, 1)), 0), np.maximum(measured.max(axis=(0, 1)), 0)
+    return np.clip(expected, low, high)
 
 
 def _without_noise(tensor: FloatArray, noise: float) -> FloatArray:
@@ -158,10 +165,14 @@ def _apply(tensor: FloatArray, flow: FloatArray) -> FloatArray:
     return cv2.merge([xx * dx + xy * dy, xy * dx + yy * dy])
 
 
-def _solve(tensor: FloatArray, weighted: FloatArray, expected: FloatArray, prior: np.float32) -> FloatArray:
-    """``(J + ε)⁻¹ (J W + ε W̄)`` of each pixel."""
-    xx, xy, yy = cv2.split(tensor)
+def _solve(tensor: FloatArray, weighted: FloatArray, expected: FloatArray, noise: float) -> FloatArray:
+    """``(J + ε)⁻¹ (J W + ε W̄)`` of each pixel.
+
+    In double precision: where J is singular, along an edge, its determinant is what cancellation leaves.
+    """
+    xx, xy, yy = (part.astype(np.float64) for part in cv2.split(tensor))
+    prior = noise + _TILT * (xx + yy) / 2
+    u, v = cv2.split(weighted + prior[..., None] * expected)
     xx, yy = xx + prior, yy + prior
-    u, v = cv2.split(weighted + prior * expected)
     determinant = xx * yy - xy * xy
-    return cv2.merge([(yy * u - xy * v) / determinant, (xx * v - xy * u) / determinant])
+    return np.dstack([(yy * u - xy * v) / determinant, (xx * v - xy * u) / determinant]).astype(np.float32)

@@ -80,7 +80,7 @@ class GuardReading:
 
 
 def judge(result: ArrayLike, blurred: ArrayLike, sigma: float, params: GuardParams | None = None) -> GuardReading:
-    """Hold a deconvolved image against the image it was deconvolved from.
+    """Hold a deconvolved image against the image it was deconvolved from; of colour, luminance and every channel.
 
     Parameters
     ----------
@@ -113,11 +113,15 @@ def judge(result: ArrayLike, blurred: ArrayLike, sigma: float, params: GuardPara
     False
     """
     params = params or GuardParams()
-    after, before = luminance(check_image(result, "result")), luminance(check_image(blurred, "blurred"))
+    after, before = check_image(result, "result"), check_image(blurred, "blurred")
     if after.shape != before.shape:
         raise DataError(f"result: expected the shape {before.shape} of the blurred image, found {after.shape}")
-    overshoot, gain = _overshoot(after, before, sigma), _noise_gain(after, before)
-    return GuardReading(sigma, overshoot, gain, overshoot <= params.overshoot and gain <= params.noise_gain)
+    pairs = [(luminance(after), luminance(before))]
+    if after.ndim == 3:
+        pairs += [(after[..., channel].copy(), before[..., channel].copy()) for channel in range(3)]
+    overshoot = max(_overshoot(*pair, sigma) for pair in pairs)
+    gain = max(_noise_gain(*pair) for pair in pairs)
+    return GuardReading(float(sigma), overshoot, gain, overshoot <= params.overshoot and gain <= params.noise_gain)
 
 
 def deconvolve_guarded(

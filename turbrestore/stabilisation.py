@@ -139,6 +139,7 @@ def global_shifts(frames: ArrayLike) -> Shift:
     """Shift of each frame against the mean position of all.
 
     Frames are held against the middle one, and where that is too far away, against the last one whose shift is known.
+    A frame that is like neither, black or of something else, is taken to lie between its neighbours.
 
     Parameters
     ----------
@@ -162,18 +163,14 @@ def global_shifts(frames: ArrayLike) -> Shift:
     >>> global_shifts(np.stack([scene[:, k : k + 64] for k in (0, 10, 20)])).round()[:, 0]
     array([ 10.,   0., -10.])
     """
-    stack = check_frames(frames)
-    middle = len(stack) // 2
-    shifts = np.zeros((len(stack), 2))
-    for order in (range(middle + 1, len(stack)), range(middle - 1, -1, -1)):
-        _walk(stack, middle, order, shifts)
-    return shifts - shifts.mean(axis=0)
+    return _known_shifts(check_frames(frames))[0]
 
 
 def mean_stabilised(frames: ArrayLike) -> FloatArray:
     """Temporal mean of the frames, each moved by whole pixels to the mean position.
 
-    Where all frames lie within two pixels of it they are averaged as they are.
+    Where all frames lie within two pixels of it they are averaged as they are; else frames that cannot be placed are
+    left out.
 
     Parameters
     ----------
@@ -199,12 +196,12 @@ def mean_stabilised(frames: ArrayLike) -> FloatArray:
     """
     stack = check_frames(frames)
     mean = stack.mean(axis=0, dtype=np.float32)
-    shifts = global_shifts(stack)
+    shifts, known = _known_shifts(stack)
     if np.abs(shifts).max() <= DEAD_ZONE:
         return mean
     total = np.zeros(mean.shape)
     count = np.zeros(mean.shape[:2])
-    for frame, shift in zip(stack, np.rint(shifts), strict=True):
+    for frame, shift in zip(stack[known], np.rint(shifts[known]), strict=True):
         to, origin = overlap(count.shape, shift)
         total[to] += frame[origin]
         count[to] += 1
@@ -243,16 +240,32 @@ def _overlap_of_axis(length: int, step: int) -> Slices:
     return slice(max(-step, 0), length - max(step, 0)), slice(max(step, 0), length - max(-step, 0))
 
 
-def _walk(stack: FloatArray, middle: int, order: Iterable[int], shifts: Shift) -> None:
-    """Fill in the shifts of frames on one side of the middle, from near to far."""
-    key, previous = (refer_shift(stack[middle]), shifts[middle]), middle
+def _known_shifts(stack: FloatArray) -> tuple[Shift, NDArray[np.bool_]]:
+    """Shifts of all frames, and which of them were found."""
+    numbers = np.arange(len(stack))
+    # The middle frame may itself be the odd one out.
+    for anchor in (len(stack) // 2, len(stack) // 4, 3 * len(stack) // 4):
+        shifts, known = np.zeros((len(stack), 2)), numbers == anchor
+        for order in (numbers[anchor + 1 :], numbers[:anchor][::-1]):
+            _walk(stack, anchor, order, shifts, known)
+        if 2 * known.sum() > len(stack):
+            break
+    shifts = np.column_stack([np.interp(numbers, numbers[known], axis) for axis in shifts[known].T])
+    return shifts - shifts.mean(axis=0), known
+
+
+def _walk(stack: FloatArray, anchor: int, order: Iterable[int], shifts: Shift, known: NDArray[np.bool_]) -> None:
+    """Fill in the shifts of frames on one side of the anchor, from near to far."""
+    key, key_shift, last = refer_shift(stack[anchor]), shifts[anchor], anchor
     for index in order:
-        found = shift_against(stack[index], key[0])
+        found = shift_against(stack[index], key)
         if found is None:
-            key = refer_shift(stack[previous]), shifts[previous]
-            found = shift_against(stack[index], key[0])
-        shifts[index] = key[1] + (0.0 if found is None else found)
-        previous = index
+            nearer = refer_shift(stack[last])
+            found = shift_against(stack[index], nearer)
+            if found is not None:
+                key, key_shift = nearer, shifts[last]
+        if found is not None:
+            shifts[index], known[index], last = key_shift + found, True, index
 
 
 def _reduce(image: FloatArray) -> FloatArray:
