@@ -20,6 +20,7 @@ from turbrestore.metrics import align, compare
 from turbrestore.pipeline import RestoreParams, restore
 
 FREQUENCIES = (1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8)
+DIRECTIONS = (0, 45, 90, 135)
 EXPONENTS = (1.2, 1.5, 5 / 3, 2.0)
 # Pixels, about a tenth apart.
 SIGMAS = (0.3, 0.35, 0.42, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.32, 1.46, 1.6, 1.8, 2.0)
@@ -28,7 +29,8 @@ _RINGS = 32
 
 def main() -> int:
     """Print the table."""
-    columns = [f"ν = {frequency:g}" for frequency in FREQUENCIES] + [f"p = {exponent:.3g}" for exponent in EXPONENTS]
+    columns = [f"ν = {frequency:g}" for frequency in FREQUENCIES]
+    columns += [f"1/8 at {degrees}°" for degrees in DIRECTIONS] + [f"p = {exponent:.3g}" for exponent in EXPONENTS]
     print(f"| clip | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
     try:
         for name, load in find_clips(sys.argv[1:] or ["ao_*", "purdue1_*", "quick_*"]).items():
@@ -38,6 +40,7 @@ def main() -> int:
             stages = restore(clip.frames, RestoreParams(until="filter"))
             transfer = transfer_function(stages.image, clip.truth)
             cells = [f"{transfer[round(frequency * _RINGS)]:.2f}" for frequency in FREQUENCIES]
+            cells += [f"{share:.2f}" for share in by_direction(stages.image, clip.truth)]
             for exponent in EXPONENTS:
                 sigma, figure = best_width(stages.image, clip.truth, stages.centroid.image, exponent)
                 cells.append(f"{figure:.2f} ({sigma:g})")
@@ -50,13 +53,30 @@ def main() -> int:
 
 def transfer_function(image: FloatArray, truth: FloatArray) -> FloatArray:
     """Share of the truth's amplitude that the image has, in rings 1/32 cycles per pixel apart."""
+    first, second, fy, fx = _spectra(image, truth)
+    ring = np.rint(np.hypot(fy, fx) * _RINGS).astype(int).ravel()
+    cross = np.bincount(ring, (first * second.conj()).real.ravel())
+    return (cross / np.bincount(ring, np.square(np.abs(second)).ravel())).astype(np.float32)
+
+
+def by_direction(image: FloatArray, truth: FloatArray) -> list[float]:
+    """Share of the truth's amplitude around ν = 1/8, for waves along 0°, 45°, 90° and 135°."""
+    first, second, fy, fx = _spectra(image, truth)
+    radius, angle = np.hypot(fy, fx), np.degrees(np.arctan2(fy, fx)) % 180
+    near, shares = np.abs(radius - 1 / 8) < 1 / 32, []
+    for direction in DIRECTIONS:
+        sector = near & (np.abs((angle - direction + 90) % 180 - 90) <= 22.5)
+        cross, power = (first * second.conj()).real[sector].sum(), np.square(np.abs(second[sector])).sum()
+        shares.append(float(cross / power))
+    return shares
+
+
+def _spectra(image: FloatArray, truth: FloatArray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Windowed spectra of both, aligned, and their frequencies."""
     a, t = align(image, truth)
     window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
     first, second = (fft.fft2((one - one.mean()) * window) for one in (a, t))
-    radius = np.hypot(fft.fftfreq(a.shape[0])[:, None], fft.fftfreq(a.shape[1]))
-    ring = np.rint(radius * _RINGS).astype(int).ravel()
-    cross = np.bincount(ring, (first * second.conj()).real.ravel())
-    return (cross / np.bincount(ring, np.square(np.abs(second)).ravel())).astype(np.float32)
+    return first, second, fft.fftfreq(a.shape[0])[:, None], fft.fftfreq(a.shape[1])[None]
 
 
 def best_width(image: FloatArray, truth: FloatArray, guide: FloatArray, exponent: float) -> tuple[float, float]:

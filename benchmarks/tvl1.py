@@ -1,6 +1,6 @@
 """TV-L1 flow against OpenCV's DualTVL1 with its defaults: time and error where the motion is known.
 
-Run ``python benchmarks/tvl1.py``; it takes about two minutes, ``--quick`` less.  Three sets of frames with known flow:
+Run ``python benchmarks/tvl1.py``; it takes some minutes, ``--quick`` one.  Three sets of frames with known flow:
 phase screens, smooth random flows, and a dynamic texture learned from a clip.  All methods see the same prepared images
 and end where they end: no shift is taken out and no flow regularised.  Errors are mean end-point errors over all pixels
 and over the half with the larger gradients.
@@ -121,9 +121,9 @@ def measure(motion: KnownMotion, runs: int) -> dict[str, Score]:
 def main() -> int:
     """Measure, print, and judge."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a third of the frames, one run")
+    parser.add_argument("--quick", action="store_true", help="half of the frames, one run")
     options = parser.parse_args()
-    count, runs = (4, 1) if options.quick else (12, 3)
+    count, runs = (4, 1) if options.quick else (8, 3)
     good = True
     for name, make in (
         ("Phase screens", phase_screens),

@@ -14,6 +14,7 @@ from turbrestore.errors import ConfigurationError, StorageError, TurbrestoreErro
 
 from .examples import EXAMPLES, FIRST_STEPS, epilogue
 from .settings import settings_file
+from .signals import termination_raises
 
 # Where each command lives, and what it says in one line.
 COMMANDS = {
@@ -77,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     -------
     int
         Exit code: 0 done, 2 usage, 65 bad data, 66 no such input, 73 cannot create the output, 74 I/O error,
-        130 interrupted, 1 a bug.
+        130 interrupted, 143 terminated, 1 a bug.
     """
     words = sys.argv[1:] if arguments is None else arguments
     for stream in (sys.stdout, sys.stderr):
@@ -87,7 +88,8 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     try:
-        build()(words, exit_on_error=False, print_error=False)
+        with termination_raises():
+            build()(words, exit_on_error=False, print_error=False)
     except BrokenPipeError:
         # The reader has seen enough; a second complaint at exit would be about the same.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -111,7 +113,7 @@ def _explain(error: BaseException) -> tuple[str, int]:
         return f"{error.filename or 'system'}: {error.strerror or error}", StorageError.exit_code
     if isinstance(error, MemoryError):
         return "out of memory; use --roi, fewer --train frames or a smaller video", BUG
-    return "interrupted", INTERRUPTED
+    return str(error) or "interrupted", getattr(error, "exit_code", INTERRUPTED)
 
 
 if __name__ == "__main__":

@@ -104,7 +104,7 @@ def check_library(module: str, distribution: str) -> Finding:
 
 
 def check_opencv() -> Iterator[Finding]:
-    """Which packages bring cv2, and whether it has what is needed of it."""
+    """Which packages bring cv2."""
     brought = sorted(set(metadata.packages_distributions().get("cv2", [])))
     wanted = REQUIRED["cv2"]
     repair = f"pip uninstall -y {' '.join(brought)} && pip install '{wanted}{required_versions(wanted)}'"
@@ -113,12 +113,6 @@ def check_opencv() -> Iterator[Finding]:
     elif brought:
         state: State = "ok" if brought == [wanted] else "warning"
         yield Finding("cv2 package", state, brought[0], "" if state == "ok" else repair)
-    try:
-        cv2 = importlib.import_module("cv2")
-    except Exception:  # reported with the libraries
-        return
-    if not hasattr(getattr(cv2, "optflow", None), "DualTVL1OpticalFlow_create"):
-        yield Finding("cv2.optflow", "warning", "missing: --flow.method tvl1 will fail", repair)
 
 
 def check_codecs() -> Iterator[Finding]:

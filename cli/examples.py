@@ -8,6 +8,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore restore sample_data/chart.mkv part.png --frames 0:24 --roi 64,32,96,96 --sigma 1.2",
         "turbrestore restore sample_data/chart.mkv again.png --config sharp.png.toml",
         "turbrestore restore sample_data/chart.mkv all.png --keep stages --truth sample_data/chart_truth.png --json",
+        "turbrestore restore sample_data/chart.mkv later.png --keep kept --resume",
     ),
     "report": ("turbrestore report stages", "turbrestore report stages report.html"),
     "centroid": ("turbrestore centroid sample_data/chart.mkv centroid.npz --train 40",),

@@ -12,14 +12,16 @@ import numpy as np
 from cyclopts import Parameter
 
 from turbrestore.arrays import FloatArray, check_flow
-from turbrestore.artifacts import load_flows, load_stage_image
+from turbrestore.artifacts import load_flows
+from turbrestore.content import clean_source
 from turbrestore.errors import DataError, require
 from turbrestore.images import input_errors, read_image
+from turbrestore.limits import DEFAULT_LIMITS
 from turbrestore.metrics import appearance, compare, compare_flows
 from turbrestore.pipeline import training_share
-from turbrestore.video import open_frames
 
-from .options import Flag, Selection
+from .inputs import open_checked, read_input_image
+from .options import Flag, Selection, limits_of
 from .output import print_json
 
 FLOW_SUFFIXES = (".npy", ".npz", ".flo")
@@ -34,7 +36,7 @@ def info(
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
     json: Flag = False,
 ) -> None:
-    """Say what a video is: size, frames, rate, bit depth, and how many frames train by default.
+    """Say what a video is: size, frames, rate, bit depth, what is wrong with it, and how many frames train by default.
 
     Parameters
     ----------
@@ -43,18 +45,26 @@ def info(
     json : bool
         Print JSON.
     """
-    source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
+    source, content = open_checked(input, selection)
+    source = clean_source(source, content)
     count, height, width = source.shape[:3]
     record = {
         "input": str(input),
         "format": source.format,
-        "frames": count,
+        "frames": len(content.numbers),
+        "usable_frames": count,
         "width": width,
         "height": height,
         "channels": 3 if len(source.shape) == 4 else 1,
         "bit_depth": source.bit_depth,
         "frames_per_second": source.fps,
         "train": training_share(count, source.shape[1:]) if count >= 2 else None,
+        "filled_values": content.filled_values,
+        "stuck_pixels": len(content.stuck),
+        "duplicated_frames": len(content.duplicated),
+        "blank_frames": len(content.blank),
+        "scenes": [f"{scene.first}:{scene.last + 1}" for scene in content.scenes],
+        "saturated": round(content.saturated, 4),
         "warnings": list(source.warnings),
     }
     _report(record, json)
@@ -66,6 +76,7 @@ def evaluate(
     /,
     *,
     reference: Path | None = None,
+    max_pixels: int | None = None,
     json: Flag = False,
 ) -> None:
     """Compare a result with the truth, after taking out crop and global shift.
@@ -81,20 +92,23 @@ def evaluate(
         Image of the true scene, or true flows.
     reference : Path
         Image of the same size, such as a frame or the temporal mean: sharpness and overshoot are measured against it.
+    max_pixels : int
+        Largest image to read, pixels; by default 67 million.
     json : bool
         Print JSON.
     """
     figures: dict[str, float] = {}
+    limits = limits_of(max_pixels)
     if truth is not None and truth.suffix.lower() in FLOW_SUFFIXES:
         require(reference is None, "--reference: has no effect on flows; leave it out")
         figures |= dataclasses.asdict(compare_flows(_read_flows(result), _read_flows(truth)))
     else:
         require(truth is not None or reference is not None, "evaluate: expected a truth or --reference, found neither")
-        image = load_stage_image(result)
+        image = read_input_image(result, limits)
         if truth is not None:
-            figures |= dataclasses.asdict(compare(image, read_image(truth).image))
+            figures |= dataclasses.asdict(compare(image, read_image(truth, limits).image))
         if reference is not None:
-            figures |= dataclasses.asdict(appearance(image, read_image(reference).image))
+            figures |= dataclasses.asdict(appearance(image, read_image(reference, limits).image))
     _report({name: _rounded(value) for name, value in figures.items()}, json)
 
 
@@ -103,6 +117,7 @@ def _read_flows(path: Path) -> FloatArray:
     if path.suffix.lower() != ".flo":
         return load_flows(path)
     with input_errors(path):
+        DEFAULT_LIMITS.check_bytes(path.stat().st_size, str(path))
         data = path.read_bytes()
     header = np.frombuffer(data[:12].ljust(12, b"\0"), "<i4")
     width, height = int(header[1]), int(header[2])

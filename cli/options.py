@@ -12,6 +12,7 @@ from turbrestore.errors import ConfigurationError
 if TYPE_CHECKING:
     from turbrestore.deconvolution import DeconvolutionParams
     from turbrestore.frame_source import FrameRange, Roi
+    from turbrestore.limits import Limits
 
 # A switch without a "--no-" twin.
 Flag = Annotated[bool, Parameter(negative="")]
@@ -27,10 +28,19 @@ class Selection:
         Range of frames, ``start:stop`` or ``start:stop:step``, as ``0:200``; either end may be left out.
     roi : str, optional
         Region ``x,y,width,height`` in pixels.
+    strict : bool
+        Refuse what is otherwise repaired or left out: NaN, stuck pixels, duplicated and blank frames, cuts.
+    skip_damaged : bool
+        Read a file that is cut short or damaged as far as possible, instead of refusing it.
+    max_pixels : int, optional
+        Largest frame or image to read, pixels; by default 67 million.
     """
 
     frames: str | None = None
     roi: str | None = None
+    strict: Flag = False
+    skip_damaged: Flag = False
+    max_pixels: int | None = None
 
     def frame_range(self) -> FrameRange | None:
         """Return (start, stop, step), None where left out."""
@@ -51,6 +61,17 @@ class Selection:
             raise ConfigurationError(f"--roi: expected x,y,width,height, found {self.roi!r}")
         x, y, width, height = (_whole_number("--roi", part) for part in parts)
         return x, y, width, height
+
+    def limits(self) -> Limits:
+        """Return how large an input may be."""
+        return limits_of(self.max_pixels)
+
+
+def limits_of(max_pixels: int | None) -> Limits:
+    """Turn ``--max-pixels`` into limits."""
+    from turbrestore.limits import DEFAULT_LIMITS
+
+    return DEFAULT_LIMITS if max_pixels is None else replace(DEFAULT_LIMITS, max_pixels=max_pixels)
 
 
 def known_sigma(sigma: float | None, deconvolution: DeconvolutionParams) -> DeconvolutionParams:

@@ -16,9 +16,11 @@ import tomli_w
 from turbrestore import __version__
 from turbrestore.arrays import FloatArray
 from turbrestore.errors import OutputError
+from turbrestore.folder_lock import LOCK
 from turbrestore.images import atomic_write, check_output, write_image
 from turbrestore.metrics import compare
 from turbrestore.pipeline import Restoration, RestoreParams
+from turbrestore.resumption import STAGE_FILES, KeptStages, read_stages
 from turbrestore.run_record import RUN_FILES, RunRecord, save_run
 
 from .options import Selection
@@ -99,10 +101,11 @@ def summary(output: Path, restoration: Restoration) -> str:
     return ", ".join(words)
 
 
-def check_keep(folder: Path | None, taken: list[Path], overwrite: bool) -> None:
+def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: bool) -> None:
     """Refuse a folder for the stages that cannot be used, before any work begins.
 
-    It is new or empty, unless overwriting is allowed, and none of the paths ``taken`` by inputs and outputs.
+    It is new or empty, unless overwriting is allowed or a run in it is to go on, and none of the paths ``taken`` by
+    inputs and outputs.
     """
     if folder is None:
         return
@@ -113,15 +116,21 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool) -> None:
         return
     if not folder.is_dir():
         raise OutputError(f"{folder}: is a file; name a folder to keep the stages in")
-    if not overwrite and any(folder.iterdir()):
-        raise OutputError(f"{folder}: is not empty; choose another folder or allow overwriting")
-    for name in (*RUN_FILES, *(f"{image}.png" for image in _IMAGES)):
-        check_output(folder / name, overwrite=True, suffixes=None)
+    known = resume and read_stages(folder) is not None
+    if not overwrite and not known and any(path.name != LOCK for path in folder.iterdir()):
+        if resume:
+            raise OutputError(f"{folder}: holds no run to go on with; choose another folder or allow overwriting")
+        raise OutputError(f"{folder}: is not empty; choose another folder, allow overwriting, or resume the run in it")
+    for name in (*RUN_FILES, *STAGE_FILES, *(f"{image}.png" for image in _IMAGES)):
+        if (folder / name).resolve() in {path.resolve() for path in taken}:
+            raise OutputError(f"{folder / name}: is an input or output already; name another folder")
+        check_output(folder / name, taken, overwrite=True, suffixes=None)
 
 
-def save_stages(folder: Path, restoration: Restoration, run: RunRecord, bit_depth: int) -> None:
-    """Keep every stage: artifacts for the stage commands and the report, images to look at."""
-    save_run(folder, restoration, run)
+def save_stages(stages: KeptStages, restoration: Restoration, run: RunRecord, bit_depth: int) -> None:
+    """Complete a kept run: what a report needs, and images to look at."""
+    folder = stages.folder
+    save_run(folder, restoration, run, stages.stored)
     images = {"frame": run.frame, **stage_images(restoration)}
     for name in _IMAGES:
         if name in images:

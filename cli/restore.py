@@ -8,15 +8,17 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from turbrestore.images import check_output, read_image, write_image
+from turbrestore.errors import require
+from turbrestore.images import check_output, write_image
 from turbrestore.metrics import comparable
 from turbrestore.pipeline import RestoreParams
 from turbrestore.pipeline import restore as run_pipeline
 from turbrestore.pixels import check_depth
 from turbrestore.report import check_report, write_report
 from turbrestore.run_record import describe_run
-from turbrestore.video import open_frames
 
+from .inputs import open_input, read_input_image
+from .kept import check_room, kept_stages, own_outputs
 from .options import Flag, Selection, known_sigma
 from .output import (
     check_keep,
@@ -40,6 +42,8 @@ def restore(
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
     config: Path | None = None,
     keep: Path | None = None,
+    resume: Flag = False,
+    checkpoint_every: int = 50,
     report: Path | None = None,
     truth: Path | None = None,
     bit_depth: int | None = None,
@@ -62,7 +66,12 @@ def restore(
     config : Path
         TOML file with settings; flags win over it.
     keep : Path
-        Folder for the result of every stage.
+        Folder for the result of every stage, written as it is done.
+    resume : bool
+        Go on where an interrupted run with this ``--keep`` folder stopped.  What a changed input or setting concerns is
+        done again.
+    checkpoint_every : int
+        Frames between two checkpoints of the filter in the ``--keep`` folder.
     report : Path
         HTML file to write, .html: images to compare, what was decided and why, plots.
     truth : Path
@@ -79,31 +88,41 @@ def restore(
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
     if bit_depth is not None:
         check_depth(bit_depth)
-    check_output(output, [path for path in (input, config, truth) if path is not None], overwrite)
+    require(keep is not None or not resume, "--resume: expected --keep with the folder of the run to go on with")
+    inputs = [path for path in (input, config, truth) if path is not None]
+    left = own_outputs(keep) if resume and keep is not None else set()
+    check_output(output, inputs, overwrite or output.absolute() in left)
     settings_path = output.with_name(output.name + ".toml")
-    check_output(settings_path, [input], overwrite or config == settings_path, suffixes=None)
+    of_before = config == settings_path or settings_path.absolute() in left
+    check_output(settings_path, [input], overwrite or of_before, suffixes=None)
     if report is not None:
-        check_report(report, [path for path in (input, config, truth) if path is not None], overwrite)
-    check_keep(keep, [path for path in (input, output, settings_path, report) if path is not None], overwrite)
-    scene = None if truth is None else comparable(read_image(truth).image, "truth")
-    source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
-    for warning in source.warnings:
-        say(f"{source.name}: {warning}", quiet)
+        check_report(report, inputs, overwrite or report.absolute() in left)
+    outputs = [path for path in (output, settings_path, report) if path is not None]
+    check_keep(keep, [input, *outputs], overwrite, resume)
+    scene = None if truth is None else comparable(read_input_image(truth, selection.limits()), "truth")
+    source = open_input(input, selection, quiet)
     if scene is not None:
         comparable(source.read(0, 1)[0], source.name)
-    with progress_bars(quiet) as progress:
-        restoration = run_pipeline(source, settings, progress)
-    depth = source.bit_depth if bit_depth is None else bit_depth
-    facts = describe(restoration, scene)
-    record = settings_record(settings, selection, bit_depth)
-    run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
-    if keep is not None and run is not None:
-        save_stages(keep, restoration, run, depth)
-    write_image(output, restoration.image, depth, overwrite)
-    write_settings(settings_path, record)
-    if report is not None and run is not None:
-        write_report(report, restoration, run, overwrite)
+    check_room(source, settings, output, keep)
+    with kept_stages(keep, source, settings, resume, checkpoint_every, quiet) as stages:
+        with progress_bars(quiet) as progress:
+            done, on_result = (None, None) if stages is None else (stages.done, stages.keep)
+            restoration = run_pipeline(source, settings, progress, done, on_result)
+        record = settings_record(settings, selection, bit_depth)
+        run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
+        depth = source.bit_depth if bit_depth is None else bit_depth
+        if stages is not None and run is not None:
+            save_stages(stages, restoration, run, depth)
+            stages.expect(*outputs)
+        # Whatever else is there has been refused above.
+        write_image(output, restoration.image, depth, overwrite=overwrite or output.absolute() in left)
+        write_settings(settings_path, record)
+        if report is not None and run is not None:
+            write_report(report, restoration, run, overwrite=overwrite or report.absolute() in left)
+        if stages is not None:
+            stages.expect()
     if json:
+        facts = describe(restoration, scene)
         print_json({"input": str(input), "output": str(output), "settings": str(settings_path), **facts})
     else:
         say(summary(output, restoration), quiet)

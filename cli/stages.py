@@ -9,7 +9,7 @@ import numpy as np
 from cyclopts import Parameter
 
 from turbrestore.alternating import Filtered, FilterParams, filter_frames
-from turbrestore.artifacts import load_artifact, load_flows, load_stage_image, save_artifact, save_flows
+from turbrestore.artifacts import load_artifact, load_flows, save_artifact, save_flows
 from turbrestore.blind import remove_blur
 from turbrestore.centroid import Centroid, CentroidParams, find_centroid
 from turbrestore.deconvolution import Deconvolution, DeconvolutionParams
@@ -21,9 +21,9 @@ from turbrestore.guards import GuardParams
 from turbrestore.images import IMAGE_OUTPUT_SUFFIXES, check_output, read_image, write_image
 from turbrestore.pipeline import stage_counter, training_share
 from turbrestore.pixels import check_depth
-from turbrestore.video import open_frames
 
-from .options import Flag, Selection, known_sigma
+from .inputs import open_input, read_input_image
+from .options import Flag, Selection, known_sigma, limits_of
 from .progress import progress_bars, say
 
 ARTIFACT = (".npz",)
@@ -61,7 +61,7 @@ def centroid(
         No progress and no remarks.
     """
     check_output(output, [input], overwrite, ARTIFACT)
-    source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
+    source = open_input(input, selection, quiet)
     count = training_share(len(source), source.shape[1:], train)
     with progress_bars(quiet) as progress:
         found = find_centroid(
@@ -101,8 +101,8 @@ def flow(
         No progress and no remarks.
     """
     check_output(output, [reference, input], overwrite, (".npy",))
-    image = load_stage_image(reference)
-    source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
+    image = read_input_image(reference, selection.limits())
+    source = open_input(input, selection, quiet)
     with progress_bars(quiet) as progress:
         flows = estimate_flow(image, source.read(), flow, stage_counter(progress, "flow", len(source)))
     save_flows(output, flows, overwrite)
@@ -177,7 +177,7 @@ def filter_(
     """
     check_output(output, [input, centroid, dynamics], overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
     start, model = load_artifact(centroid, Centroid), load_artifact(dynamics, FlowDynamics)
-    source = open_frames(input, frames=selection.frame_range(), roi=selection.region())
+    source = open_input(input, selection, quiet)
     total = len(source) * filter.inner_iterations - len(start.flows)
     with progress_bars(quiet) as progress:
         filtered = filter_frames(
@@ -197,6 +197,7 @@ def deconvolve(
     deconvolution: DeconvolutionParams = DeconvolutionParams(),
     guards: GuardParams = GuardParams(),
     bit_depth: int | None = None,
+    max_pixels: int | None = None,
     overwrite: Flag = False,
     quiet: Flag = False,
 ) -> None:
@@ -218,6 +219,8 @@ def deconvolve(
         What the result must not exceed where the width is estimated.
     bit_depth : int
         Bits per channel of an image that is written: 8, 16 or 32; by default those of the input, 16 for artifacts.
+    max_pixels : int
+        Largest image to read, pixels; by default 67 million.
     overwrite : bool
         Replace an existing output.
     quiet : bool
@@ -229,13 +232,14 @@ def deconvolve(
         require(output.suffix.lower() not in ARTIFACT, "--bit-depth: has no effect on an artifact; leave it out")
     inputs = [path for path in (input, guide) if path is not None]
     check_output(output, inputs, overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
-    image = load_stage_image(input)
-    guide_image = image if guide is None else load_stage_image(guide)
+    limits = limits_of(max_pixels)
+    image = read_input_image(input, limits)
+    guide_image = image if guide is None else read_input_image(guide, limits)
     with progress_bars(quiet) as progress:
         counter = stage_counter(progress, "deconvolve", deconvolution.iterations)
         deblurred = remove_blur(image, guide_image, deconvolution, guards, progress=counter)
     if bit_depth is None:
-        bit_depth = 16 if input.suffix.lower() in ARTIFACT else read_image(input).bit_depth
+        bit_depth = 16 if input.suffix.lower() in ARTIFACT else read_image(input, limits).bit_depth
     _write(output, deblurred.deconvolution, bit_depth, overwrite)
     for decision in deblurred.decisions:
         say(f"{output}: {decision.subject}: {decision.choice} ({decision.reason})", quiet)

@@ -11,11 +11,12 @@ PACKAGE = Path(__file__).parents[1] / "turbrestore"
 # A module imports only from those before it.
 ORDER = [
     "errors", "arrays", "decision", "plots", "preview",
-    "parallel", "pixels", "images", "frame_source", "integrity", "ser", "tiff",
-    "container", "video", "warp", "psf", "stabilisation", "confidence", "flow", "centroid", "dynamics", "kalman",
+    "parallel", "pixels", "limits", "images", "npy", "frame_source", "content", "integrity", "ser", "tiff",
+    "container", "video", "warp", "psf", "stabilisation", "confidence", "image_stacks", "tvl1_sweeps", "tvl1", "flow",
+    "centroid", "dynamics", "kalman",
     "blur_moments", "frame_noise", "alternating", "blur_estimation", "blur_cues", "nonlocal_tv", "deconvolution",
     "blur_map", "guards", "blind", "border", "frame_selection", "explanation", "synthesis", "metrics", "pipeline",
-    "artifacts", "run_record", "report",
+    "artifacts", "run_record", "checkpoint", "folder_lock", "resumption", "report",
 ]  # fmt: skip
 HEAVY = {"torch", "kornia", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")

@@ -40,7 +40,9 @@ def test_mean_flow_shrinks(sequence):
 def test_stops_on_the_size_of_the_mean_flow(sequence):
     loose = find_centroid(sequence.frames, CentroidParams(tolerance=5.0))
     assert loose.converged
-    assert len(loose.mean_flow_sizes) == 1
+    # The temporal mean is too blurred a reference to stop at.
+    assert len(loose.mean_flow_sizes) == 2
+    assert len(find_centroid(sequence.frames, CentroidParams(mode="single", tolerance=5.0)).mean_flow_sizes) == 1
     strict = find_centroid(sequence.frames, CentroidParams(tolerance=0.0, iterations=1))
     assert not strict.converged
 

@@ -20,6 +20,7 @@ from turbrestore.video import open_frames, write_video
 from turbrestore_cli import doctor
 from turbrestore_cli.__main__ import COMMANDS, build, main
 from turbrestore_cli.examples import EXAMPLES, FIRST_STEPS
+from turbrestore_cli.options import Selection
 
 ROOT = Path(__file__).parents[1]
 STEPS = ["--deconvolution.iterations", "3", "--quiet"]
@@ -192,7 +193,7 @@ class TestSettings:
                 table = line[1:-1] + "."
             elif " =" in line and line.removeprefix("# ").split(" =")[0].isidentifier():
                 found[table + line.removeprefix("# ").split(" =")[0]] = before
-        assert set(found) == {*names(RestoreParams()), "sigma", "frames", "roi", "bit_depth"}
+        assert set(found) == {*names(RestoreParams()), *names(Selection()), "sigma", "bit_depth"}
         assert all(comment.startswith("# ") and len(comment) > 4 for comment in found.values())
         text = "\n".join(lines)
         assert "(dis | tvl1 | farneback)" in text
@@ -276,7 +277,6 @@ class TestDoctor:
         finding = doctor.check_library("cv2", "opencv-contrib-python-headless")
         assert finding.state == "broken"
         assert "opencv-contrib-python-headless<6,>=5" in finding.advice
-        assert "tvl1" in next(item.found for item in doctor.check_opencv() if item.name == "cv2.optflow")
 
     def test_two_opencvs_are_a_warning(self, monkeypatch):
         both = ["opencv-python", "opencv-contrib-python-headless"]

@@ -9,7 +9,6 @@ from turbrestore.flow import (
     DisParams,
     FarnebackParams,
     FlowParams,
-    TvL1Params,
     estimate_flow,
     iterate_flows,
     normalise_contrast,
@@ -104,12 +103,6 @@ def test_flat_regions_invent_no_motion(noise):
     assert np.sqrt(np.mean(cautious**2)) < 0.4
 
 
-def test_classic_tvl1_finds_the_motion():
-    reference, frame, truth = pair(3)
-    found = estimate_flow(reference, frame[None], FlowParams(method="tvl1", tvl1=TvL1Params.classic()))[0]
-    assert endpoint_error(found[8:-8, 8:-8], truth[8:-8, 8:-8]) < 0.2
-
-
 def test_threads_do_not_change_the_result():
     frames = np.stack([pair(seed)[1] for seed in range(5)])
     one, three = (estimate_flow(texture(), frames, FlowParams(threads=n)) for n in (1, 3))
@@ -180,8 +173,6 @@ def test_frames_of_another_size_are_refused():
         (lambda: FlowParams(threads=-1), "threads"),
         (lambda: DisParams(patch_stride=9), "patch_stride"),
         (lambda: DisParams(finest_scale=9), "finest_scale"),
-        (lambda: TvL1Params(median=2), "median"),
-        (lambda: TvL1Params(warps=0), "warps"),
         (lambda: FarnebackParams(neighbourhood=6), "neighbourhood"),
     ],
 )

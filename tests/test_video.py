@@ -25,7 +25,9 @@ from turbrestore.errors import (
     StorageError,
 )
 from turbrestore.frame_source import FrameSource
+from turbrestore.images import write_image
 from turbrestore.integrity import ffv1_slices_intact, is_cut_short
+from turbrestore.limits import Limits
 from turbrestore.video import open_frames, write_video
 
 RATE = Fraction(30)
@@ -646,6 +648,16 @@ class TestRefusals:
                     output.mux(packet)
         refused(tmp_path / name, DataError, "frame 3", "64×48", "32×24")
 
+    def test_a_frame_in_the_middle_that_claims_to_be_huge_is_not_decoded(self, tmp_path):
+        path = encode(tmp_path / "a.avi", scene(), "mjpeg", "yuvj420p", "rgb24")
+        data, place = bytearray(path.read_bytes()), 0
+        for _ in range(5):
+            place = data.index(b"\xff\xc0\x00\x11\x08", place + 1)
+        data[place + 5 : place + 9] = np.array([96, 128], ">u2").tobytes()
+        path.write_bytes(data)
+        refused(path, DataError, "frame 4", "cannot be decoded", limits=Limits(max_pixels=64 * 48))
+        refused(path, DataError, "frame 4", limits=Limits(max_pixels=128 * 96))
+
     @pytest.mark.parametrize("other", ["size", "depth", "colour"])
     def test_folder_of_two_kinds(self, tmp_path, other):
         cv2.imwrite(str(tmp_path / "1.png"), np.zeros((4, 5), np.uint8))
@@ -721,12 +733,30 @@ class TestRefusals:
         sizes = data.index(b"strf") + 12
         data[sizes : sizes + 8] = np.array([16500, 16500], "<i4").tobytes()
         path.write_bytes(data)
-        refused(path, DataError, "pixels a frame")
+        refused(path, DataError, "pixels")
 
-    def test_frame_size_beyond_the_limit(self, tmp_path, monkeypatch):
-        path = grey_ffv1(tmp_path / "a.mkv")
-        monkeypatch.setattr("turbrestore.pixels.MAX_PIXELS", 64 * 48 - 1)
-        refused(path, DataError, "64×48")
+    @pytest.mark.parametrize("name", ["a.mkv", "a.ser", "a.npy", "a.tif", "folder"])
+    def test_sizes_and_counts_beyond_the_limits(self, tmp_path, name):
+        path = tmp_path / name
+        frames = np.stack([frame[..., 0] for frame in scene(3)]) / np.float32(255)
+        if name == "folder":
+            path.mkdir()
+            for number, frame in enumerate(frames):
+                write_image(path / f"{number}.png", frame, 8)
+        else:
+            write_video(path, frames, 25)
+        assert len(open_frames(path, limits=Limits(64 * 48, 3))) == 3
+        assert refused(path, DataError, "64×48", limits=Limits(max_pixels=64 * 48 - 1)) == 65
+        assert refused(path, DataError, "up to 2 frames", limits=Limits(max_frames=2)) == 65
+
+    def test_stream_that_states_another_size_than_its_container(self, tmp_path):
+        path = encode(tmp_path / "a.avi", scene(), "mpeg4", "yuv420p", "rgb24")
+        data = bytearray(path.read_bytes())
+        sizes = data.index(b"strf") + 12
+        data[sizes : sizes + 8] = np.array([16, 16], "<i4").tobytes()
+        path.write_bytes(data)
+        assert open_frames(path).shape[1:3] == (48, 64)
+        refused(path, DataError, limits=Limits(max_pixels=64 * 48 - 1))
 
 
 def denied(self, *arguments):

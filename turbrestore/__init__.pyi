@@ -13,6 +13,11 @@ from .blur_moments.tracking import track_blur as track_blur
 from .centroid import Centroid as Centroid
 from .centroid import CentroidParams as CentroidParams
 from .centroid import find_centroid as find_centroid
+from .content import ContentParams as ContentParams
+from .content import ContentReport as ContentReport
+from .content import Scene as Scene
+from .content import check_content as check_content
+from .content import clean_source as clean_source
 from .decision import Decision as Decision
 from .deconvolution import Deconvolution as Deconvolution
 from .deconvolution import DeconvolutionParams as DeconvolutionParams
@@ -28,6 +33,7 @@ from .flow import estimate_flow as estimate_flow
 from .frame_source import FrameSource as FrameSource
 from .images import read_image as read_image
 from .images import write_image as write_image
+from .limits import Limits as Limits
 from .metrics import appearance as appearance
 from .metrics import compare as compare
 from .metrics import compare_flows as compare_flows

@@ -143,6 +143,40 @@ class FilterState:
 
 
 @dataclass(frozen=True)
+class FrameRecord:
+    """What the filter notes of one frame; :class:`Filtered` says what each figure means.
+
+    Attributes
+    ----------
+    flow_state : ndarray, float64, shape (n,)
+    gain, innovation, sharpness : float
+    information : float
+        Mean of 1 / Z over the pixels, before it becomes a share.
+    """
+
+    flow_state: np.ndarray
+    gain: float
+    innovation: float
+    sharpness: float
+    information: float
+
+
+@dataclass(frozen=True)
+class FilterCheckpoint:
+    """Where the filter stands between two blocks of frames; with the same frames it can go on from there.
+
+    Attributes
+    ----------
+    state : FilterState
+    records : tuple of FrameRecord
+        One for each frame that has been filtered.
+    """
+
+    state: FilterState
+    records: tuple[FrameRecord, ...]
+
+
+@dataclass(frozen=True)
 class Filtered:
     """The filtered image and the record of the run.
 
@@ -229,15 +263,6 @@ class _Motion:
     innovation: float
 
 
-@dataclass(frozen=True)
-class _Record:
-    flow_state: np.ndarray
-    gain: float
-    innovation: float
-    sharpness: float
-    information: float
-
-
 def filter_frames(
     frames: Iterable[ArrayLike],
     reference: ArrayLike,
@@ -247,6 +272,8 @@ def filter_frames(
     known_flows: ArrayLike | None = None,
     progress: Callable[[int], None] | None = None,
     counted: ArrayLike | None = None,
+    start: FilterCheckpoint | None = None,
+    on_checkpoint: Callable[[FilterCheckpoint], None] | None = None,
 ) -> Filtered:
     """Run the alternating-estimation filter over ``frames``.
 
@@ -272,6 +299,11 @@ def filter_frames(
     counted : array_like, bool, shape (N,), optional
         Frames that the image is made of; from the others nothing is measured, and the flow state is predicted through
         them.  By default all.
+    start : FilterCheckpoint, optional
+        Where an earlier run with the same arguments stood.  The frames filtered before it are read and passed over, and
+        the result is that of one run, bit for bit.
+    on_checkpoint : callable, optional
+        Called with a FilterCheckpoint after each block of frames.
 
     Returns
     -------
@@ -296,35 +328,79 @@ def filter_frames(
     """
     params, flow_params = params or FilterParams(), flow_params or FlowParams()
     image = check_image(reference, "reference")
+    flows = _check_flows(image, dynamics, known_flows)
+    marks = None if counted is None else np.asarray(counted, bool)
+    if marks is not None and not marks.any():
+        raise DataError("counted: expected at least one frame to count, found none")
+    stream = _checked(frames, image.shape)
+    first = _first_block(stream, params.block, flows)
+    if flows is None:
+        flows = np.stack([flow for _, flow in iterate_flows(image, first, flow_params)])
+    model = _noise_model(first, flows, image, dynamics, params, flow_params.threads)
+    setting = _Setting(dynamics, model, params, flow_params, progress)
+    with one_thread_each():
+        if start is None:
+            prior = _prior(image, setting)
+            state, records = _filter_block(prior, _left_out(first, marks, 0), flows, setting)
+        else:
+            state, records = _pass_over(start, stream, len(first), setting)
+        while True:
+            if on_checkpoint is not None:
+                on_checkpoint(FilterCheckpoint(state, tuple(records)))
+            block = list(islice(stream, params.block))
+            if not block:
+                break
+            state, done = _filter_block(state, _left_out(block, marks, len(records)), None, setting)
+            records += done
+    if marks is not None and marks.size != len(records):
+        raise DataError(f"counted: expected one mark for each frame, found {marks.size} marks, {len(records)} frames")
+    return _filtered(state, records, model)
+
+
+def _check_flows(image: FloatArray, dynamics: FlowDynamics, known_flows: ArrayLike | None) -> FloatArray | None:
     if image.shape[:2] != dynamics.shape:
         raise DataError(f"dynamics: expected flows of {image.shape[:2]} pixels, found {dynamics.shape}")
     flows = None if known_flows is None else check_flow(known_flows, "known_flows")
     if flows is not None and (flows.ndim != 4 or flows.shape[1:3] != dynamics.shape):
         raise DataError(f"known_flows: expected shape (K, {image.shape[0]}, {image.shape[1]}, 2), found {flows.shape}")
-    marks = None if counted is None else np.asarray(counted, bool)
-    if marks is not None and not marks.any():
-        raise DataError("counted: expected at least one frame to count, found none")
-    stream = _checked(frames, image.shape)
-    first = list(islice(stream, params.block if flows is None else len(flows)))
+    return flows
+
+
+def _first_block(stream: Iterator[FloatArray], block: int, flows: FloatArray | None) -> list[FloatArray]:
+    """Frames with known flows, else as many as any block has."""
+    first = list(islice(stream, block if flows is None else len(flows)))
     if not first or (flows is not None and len(first) < len(flows)):
         wanted = 1 if flows is None else len(flows)
         raise DataError(f"frames: expected at least {wanted}, found {len(first)}")
-    if flows is None:
-        flows = np.stack([flow for _, flow in iterate_flows(image, first, flow_params)])
-    model = _noise_model(first, flows, image, dynamics, params, flow_params.threads)
-    prior_variance = model.image_noise / params.prior_frames if params.prior_frames else _DIFFUSE
-    state = FilterState(
-        PixelGaussian(image, np.full(image.shape[:2], prior_variance, np.float32)),
+    return first
+
+
+def _prior(image: FloatArray, setting: _Setting) -> FilterState:
+    """State before the first frame."""
+    frames, dynamics = setting.params.prior_frames, setting.dynamics
+    variance = setting.model.image_noise / frames if frames else _DIFFUSE
+    return FilterState(
+        PixelGaussian(image, np.full(image.shape[:2], variance, np.float32)),
         Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance),
     )
-    setting = _Setting(dynamics, model, params, flow_params, progress)
-    with one_thread_each():
-        state, records = _filter_block(state, _left_out(first, marks, 0), flows, setting)
-        while block := list(islice(stream, params.block)):
-            state, done = _filter_block(state, _left_out(block, marks, len(records)), None, setting)
-            records += done
-    if marks is not None and marks.size != len(records):
-        raise DataError(f"counted: expected one mark for each frame, found {marks.size} marks, {len(records)} frames")
+
+
+def _pass_over(
+    start: FilterCheckpoint, stream: Iterator[FloatArray], read: int, setting: _Setting
+) -> tuple[FilterState, list[FrameRecord]]:
+    """Read the frames up to a checkpoint, of which the first ``read`` have been."""
+    done = len(start.records)
+    shapes = start.state.image.variance.shape, start.state.flow.mean.shape
+    if done < read or shapes != (setting.dynamics.shape, (setting.dynamics.rank,)):
+        raise DataError(f"start: expected a checkpoint of these frames, found one of {done} frames and shapes {shapes}")
+    for _ in islice(stream, done - read):
+        pass
+    if setting.progress is not None:
+        setting.progress(done * setting.params.inner_iterations - read)
+    return start.state, list(start.records)
+
+
+def _filtered(state: FilterState, records: list[FrameRecord], model: FrameNoise) -> Filtered:
     information = np.array([record.information for record in records])
     return Filtered(
         image=state.image.mean.astype(np.float32),
@@ -382,9 +458,9 @@ def _noise_model(
 
 def _filter_block(
     prior: FilterState, frames: Block, known: FloatArray | None, setting: _Setting
-) -> tuple[FilterState, list[_Record]]:
+) -> tuple[FilterState, list[FrameRecord]]:
     """Inner iterations over one block, each from the same prior with flows measured from the newest image."""
-    state, records = prior, list[_Record]()
+    state, records = prior, list[FrameRecord]()
     for iteration in range(setting.params.inner_iterations):
         if iteration == 0 and known is not None:
             state, records = _filter_pass(prior, zip(frames, known, strict=True), setting)
@@ -393,20 +469,20 @@ def _filter_block(
     return state, records
 
 
-def _filter_pass(prior: FilterState, pairs: Iterable[Pair], setting: _Setting) -> tuple[FilterState, list[_Record]]:
+def _filter_pass(prior: FilterState, pairs: Iterable[Pair], setting: _Setting) -> tuple[FilterState, list[FrameRecord]]:
     """Update the flow state and the image by each frame and its flow (eqs. 14 to 19)."""
     image, flow, drift = prior.image, prior.flow, setting.params.image_drift
-    records: list[_Record] = []
+    records: list[FrameRecord] = []
     motions = _update_motion(prior.flow, pairs, setting.dynamics)
     registering = map_ahead(partial(_register, setting), motions, setting.flow_params.threads)
     for motion, (registered, noise, sharpness) in registering:
         flow = motion.state
         if motion.frame is None:
-            records.append(_Record(flow.mean, 0.0, np.nan, np.nan, 0.0))
+            records.append(FrameRecord(flow.mean, 0.0, np.nan, np.nan, 0.0))
             continue
         image, gain = update_pixels(predict_pixels(image, drift) if drift else image, registered, noise)
         information = float(np.mean(1 / np.asarray(noise)))
-        records.append(_Record(flow.mean, float(gain.mean()), motion.innovation, sharpness, information))
+        records.append(FrameRecord(flow.mean, float(gain.mean()), motion.innovation, sharpness, information))
     return FilterState(image, flow), records
 
 

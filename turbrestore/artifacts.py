@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -25,6 +24,7 @@ from .deconvolution import Deconvolution
 from .dynamics import FlowDynamics
 from .errors import DataError, InputNotFoundError
 from .images import atomic_output, check_output, read_image
+from .npy import map_npy, read_npz
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -222,8 +222,8 @@ def load_flows(path: str | os.PathLike[str]) -> FloatArray:
     if not source.is_file():
         raise InputNotFoundError(f"{source}: no such file")
     try:
-        flows = np.load(source, mmap_mode="r", allow_pickle=False)
-    except (OSError, EOFError, ValueError) as error:
+        flows = map_npy(source)
+    except DataError as error:
         raise DataError(f"{source}: expected flows in a .npy file, found something else") from error
     if flows.ndim != 4:
         raise DataError(f"{source}: expected flows of shape (T, H, W, 2), found {flows.shape}")
@@ -235,12 +235,10 @@ def _read(source: Path) -> tuple[str, dict[str, Any]]:
     if not source.is_file():
         raise InputNotFoundError(f"{source}: no such file")
     try:
-        # Opened here because np.load leaves the file open when it is no archive.
-        with source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
+        arrays = read_npz(source)
         header: dict[str, Any] = json.loads(str(arrays.pop(_HEADER)))
         kind, schema, fields = str(header["kind"]), header["schema"], {**header["fields"], **arrays}
-    except (OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+    except (DataError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{source}: expected an artifact of turbrestore, found something else or damage") from error
     if schema != SCHEMA or kind not in KINDS:
         raise DataError(f"{source}: expected an artifact of layout {SCHEMA}, found a {kind} of layout {schema}")

@@ -54,7 +54,8 @@ class CentroidParams:
         Largest number of iterations; each costs one flow per frame.  The paper runs 10.
     tolerance : float
         Stop when the mean flow is shorter than this, pixels (mean over the image), or shrinks by less than a fifth;
-        stop without convergence when it grows by more than a quarter.
+        stop without convergence when it grows by more than a quarter.  ``fused`` does two iterations at least, for the
+        temporal mean that it starts from is a blurred reference.
         What is left is the bias of the flow method; it is not corrected, which would bend the image.
     start : int
         Frame that ``single`` warps; ``fused`` starts from the temporal mean, of stabilised frames if flow takes shifts
@@ -168,7 +169,9 @@ def find_centroid(
         mean_flow = flows.mean(axis=0, dtype=np.float32)
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
         change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
-        converged = sizes[-1] <= params.tolerance or _STALLED < change <= _DIVERGED
+        # The temporal mean is a blurred reference: flow from the first registered mean is better, wherever it lies.
+        settled = len(sizes) > 1 or params.mode == "single" or params.iterations == 1
+        converged = (sizes[-1] <= params.tolerance and settled) or _STALLED < change <= _DIVERGED
         if not converged:
             recentre = invert_flow(mean_flow)
             total = compose_flows(total, recentre)

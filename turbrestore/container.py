@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
@@ -25,10 +25,18 @@ from numpy.typing import NDArray
 
 from .arrays import FloatArray, from_unit
 from .errors import DataError, StorageError, require
-from .frame_source import FrameRange, FrameSource, check_frame_range, cut_short_text, size_text
+from .frame_source import (
+    FrameRange,
+    FrameSource,
+    check_frame_range,
+    cut_short_text,
+    size_text,
+    skipped_end_text,
+)
 from .images import atomic_output, input_errors
 from .integrity import ffv1_slices_intact, is_cut_short
-from .pixels import PixelArray, check_depth, check_pixel_count
+from .limits import DEFAULT_LIMITS, Limits
+from .pixels import PixelArray, check_depth
 
 if TYPE_CHECKING:
     import av
@@ -78,7 +86,12 @@ class _Scan:
     last: float
 
 
-def open_container(path: str | os.PathLike[str], frames: FrameRange | None = None) -> FrameSource:
+def open_container(
+    path: str | os.PathLike[str],
+    frames: FrameRange | None = None,
+    limits: Limits = DEFAULT_LIMITS,
+    skip_damaged: bool = False,
+) -> FrameSource:
     """Open a video file.
 
     Parameters
@@ -87,6 +100,11 @@ def open_container(path: str | os.PathLike[str], frames: FrameRange | None = Non
         MP4, MOV, Matroska, WebM, AVI or GIF file.
     frames : tuple, optional
         The frames that will be selected; damage elsewhere is no error then. The source has all frames all the same.
+    limits : Limits
+        Largest video that is read.
+    skip_damaged : bool
+        Read what is whole of a file that is cut short, and only name frames that are damaged and that no others
+        depend on (``FrameSource.damaged``).
 
     Returns
     -------
@@ -113,7 +131,7 @@ def open_container(path: str | os.PathLike[str], frames: FrameRange | None = Non
         cut = is_cut_short(path)
     with input_errors(path), _decoding(path, "it is cut short" if cut else "not a video, or damaged"):
         with _open(path) as container:
-            stream = _video_stream(path, container)
+            stream = _video_stream(path, container, limits)
             codec, rate = stream.codec_context.name, stream.average_rate or stream.guessed_rate
             duration = _declared_duration(stream)
             frame = next(container.decode(stream), None)
@@ -121,25 +139,28 @@ def open_container(path: str | os.PathLike[str], frames: FrameRange | None = Non
                 raise DataError(f"{path}: expected at least one frame, found none")
             layout = _pixel_format(path, frame.format)
             notes = _notes(frame, layout, codec)
-        scan = _scan(path, cut)
+        scan = _scan(path, cut, limits)
     cut = cut or scan.intact < scan.count or (duration is not None and _ends_early(scan, duration))
     intra = codec in _INTRA_CODECS and scan.keyframes == scan.count
-    _check_damage(path, scan, cut, frames, intra)
+    damaged = _check_damage(path, scan, cut, frames, intra, skip_damaged)
     varies = scan.times is not None and _varies(scan.times, scan.tick)
     fps = float(rate) if rate else None
     if varies and scan.times is not None:
         fps, notes = (len(scan.times) - 1) / float(scan.times[-1]), (*notes, "variable frame rate")
+    if cut and skip_damaged:
+        notes = (*notes, skipped_end_text(scan.intact))
     return FrameSource(
         name=path.name,
         format=f"{codec}/{layout.name}",
         file_shape=(scan.intact, frame.height, frame.width, *layout.channels),
         full_scale=layout.full_scale,
         bit_depth=layout.bit_depth,
-        pixels=lambda chosen: _frames(path, layout, chosen, intra),
+        pixels=lambda chosen: _frames(path, layout, chosen, intra, limits),
         path=path,
         fps=fps,
         timestamps=scan.times,
         warnings=notes,
+        damaged=damaged,
     )
 
 
@@ -243,13 +264,15 @@ def _open(path: Path) -> av.container.InputContainer:
     return av.open(f"file:{path}", options=dict(_OPEN_OPTIONS), metadata_errors="replace")
 
 
-def _video_stream(path: Path, container: av.container.InputContainer) -> av.VideoStream:
+def _video_stream(path: Path, container: av.container.InputContainer, limits: Limits) -> av.VideoStream:
     import av
 
     stream = container.streams.best("video")
     if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
         raise DataError(f"{path}: holds no video stream that can be decoded")
-    check_pixel_count(stream.width, stream.height, str(path))
+    limits.check_size(stream.width, stream.height, str(path))
+    # The stream can state another size than the container.
+    stream.codec_context.options = {"max_pixels": str(min(limits.max_pixels, 2**31 - 1))}
     return stream
 
 
@@ -285,14 +308,14 @@ def _notes(frame: av.VideoFrame, layout: _PixelFormat, codec: str) -> tuple[str,
     return tuple(notes)
 
 
-def _scan(path: Path, cut: bool) -> _Scan:
+def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
     """Read all packets once, decoding none."""
     stamps: list[int | None] = []
     damaged: list[int] = []
     unchecked: list[int] = []
     keyframes, last, intact = 0, 0.0, None
     with _open(path) as container:
-        stream = _video_stream(path, container)
+        stream = _video_stream(path, container, limits)
         codec = stream.codec_context.name
         tick = float(stream.time_base or 0)
         for packet in container.demux(stream):
@@ -307,6 +330,7 @@ def _scan(path: Path, cut: bool) -> _Scan:
                 (unchecked if verdict is None else damaged if not verdict else []).append(len(stamps))
             keyframes += packet.is_keyframe
             stamps.append(packet.dts if packet.pts is None else packet.pts)
+            limits.check_count(len(stamps), str(path))
             if stamps[-1] is not None:
                 last = max(last, stamps[-1] * tick)
     if not stamps:
@@ -325,17 +349,21 @@ def _scan(path: Path, cut: bool) -> _Scan:
     return _Scan(count, intact, keyframes, tuple(damaged), None if times is None else times[:intact], tick, last)
 
 
-def _check_damage(path: Path, scan: _Scan, cut: bool, frames: FrameRange | None, intra: bool) -> None:
+def _check_damage(
+    path: Path, scan: _Scan, cut: bool, frames: FrameRange | None, intra: bool, skip: bool
+) -> tuple[int, ...]:
+    """Refuse damage in what was asked for; return the numbers of damaged frames that can be skipped."""
     wanted = check_frame_range(frames)
-    if cut and (wanted.stop is None or wanted.stop > scan.intact):
+    if cut and not (skip and scan.intact) and (wanted.stop is None or wanted.stop > scan.intact):
         raise DataError(f"{path}: {cut_short_text(scan.intact)}")
     needed = range(scan.intact)[wanted]
     if needed and not intra:
         needed = range(needed[-1] + 1)
     bad = [number for number in scan.damaged if number in needed]
-    if bad:
+    if bad and not (skip and intra):
         more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
         raise DataError(f"{path}: frame {bad[0]}{more}: checksum fails; copy the file again or select other frames")
+    return tuple(bad)
 
 
 def _declared_duration(stream: av.VideoStream) -> float | None:
@@ -364,23 +392,26 @@ def _varies(times: NDArray[np.float64], tick: float) -> bool:
     return bool(np.ptp(intervals) > max(2.5 * tick, 0.05 * float(np.median(intervals))))
 
 
-def _frames(path: Path, layout: _PixelFormat, chosen: range, intra: bool) -> Iterator[PixelArray]:
+def _frames(
+    path: Path, layout: _PixelFormat, chosen: Sequence[int], intra: bool, limits: Limits
+) -> Iterator[PixelArray]:
     import av
 
     number = chosen[0] - 1 if intra else -1
+    wanted = chosen if isinstance(chosen, range) else frozenset(chosen)
     try:
         with input_errors(path), _open(path) as container:
-            stream = _video_stream(path, container)
+            stream = _video_stream(path, container, limits)
             packets = (packet for packet in container.demux(stream) if packet.size > 0 or packet.dts is None)
             numbers: Iterator[int] = itertools.count()
             if intra:
                 # Without this a range or a step would pay for the frames that it leaves out.
                 numbers = iter(chosen)
-                packets = (packet for index, packet in enumerate(packets) if packet.size == 0 or index in chosen)
+                packets = (packet for index, packet in enumerate(packets) if packet.size == 0 or index in wanted)
             for packet in packets:
                 for frame in packet.decode():
                     number = next(numbers)
-                    if number in chosen:
+                    if number in wanted:
                         yield _pixels(path, frame, layout, number)
                     if number >= chosen[-1]:
                         return

@@ -5,13 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from .alternating import Filtered
+from .arrays import FloatArray, luminance
 from .border import Rectangle
 from .centroid import Centroid
 from .decision import Decision
 from .dynamics import FlowDynamics
+from .stabilisation import DEAD_ZONE
 
 # A frame that counts for less than this share of the average hardly counts.
 _HARDLY = 0.2
+# Half a grey level of an 8-bit camera below full scale; a share of such pixels that is worth a word.
+_FULL, _MUCH = 1 - 0.5 / 255, 0.01
+# A frame of less than this share of the contrast of the best one has none.
+_FAINT = 0.1
+# Motion of this share of the shorter side is more than flow follows everywhere.
+_FAR = 1 / 12
 
 
 def explain_training(train: int, frame_count: int, wanted: int | None) -> Decision:
@@ -33,11 +41,106 @@ def explain_training(train: int, frame_count: int, wanted: int | None) -> Decisi
     >>> explain_training(60, 120, None)
     Decision(subject='training', choice='first 60 of 120 frames', reason='half of the clip')
     """
-    share = train / frame_count
-    reason = "asked for" if wanted is not None else "the whole clip" if share == 1 else "half of the clip"
-    if wanted is None and abs(share - 0.5) > 0.01 and share < 1:
-        reason = "enough for both, and all of them fit into memory"
+    half = frame_count // 2
+    if wanted is not None:
+        reason = "asked for"
+    elif train == frame_count:
+        reason = "the whole clip"
+    elif train == half:
+        reason = "half of the clip"
+    else:
+        reason = "more than half of a short clip" if train > half else "enough of a long clip, or all that memory holds"
     return Decision("training", f"first {train} of {frame_count} frames", reason)
+
+
+def explain_input(training: FloatArray) -> tuple[Decision, ...]:
+    """Say what of the frames tells little: saturated pixels, frames without texture.
+
+    Parameters
+    ----------
+    training : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
+
+    Returns
+    -------
+    tuple of Decision
+        Empty where there is nothing to say.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frames = np.random.default_rng(0).uniform(0.2, 0.8, (4, 16, 16)).astype(np.float32)
+    >>> frames[2] = 0.5; frames[:, :4] = 1
+    >>> [(decision.subject, decision.choice) for decision in explain_input(frames)]
+    [('saturation', 'left as it is'), ('flat frames', '1 of 4, kept')]
+    """
+    said = []
+    saturated = float(np.mean(training >= _FULL))
+    if saturated > _MUCH:
+        reason = f"{saturated:.0%} of the training frames is at full scale: detail is lost there, and edges may ring"
+        said.append(Decision("saturation", "left as it is", reason))
+    grey = luminance(training)
+    # A saturated part is no texture.
+    contrast = np.array([float(frame[frame < _FULL].std()) if (frame < _FULL).any() else 0.0 for frame in grey])
+    faint = int(np.sum(contrast < _FAINT * contrast.max()))
+    if faint:
+        reason = "hardly any contrast: their flow follows noise, and their weight is what their sharpness gives them"
+        said.append(Decision("flat frames", f"{faint} of {len(grey)}, kept", reason))
+    return tuple(said)
+
+
+def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
+    """Say that the motion is larger than flow follows well, if it is.
+
+    Parameters
+    ----------
+    flows : ndarray, float32, shape (T, H, W, 2)
+        From the centroid to the frames, pixels.
+
+    Returns
+    -------
+    tuple of Decision
+        Empty where there is nothing to say.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> explain_motion(np.full((2, 24, 24, 2), 3.0, np.float32))[0].choice
+    'taken as measured'
+    """
+    size = float(np.sqrt(2 * np.mean(np.square(flows, dtype=np.float64))))
+    side = min(flows.shape[1:3])
+    if size < _FAR * side:
+        return ()
+    reason = f"{size:.1f} pixels on {side} is more than flow follows everywhere; the result may be doubled"
+    return (Decision("motion", "taken as measured", reason),)
+
+
+def explain_camera(flows: FloatArray) -> tuple[Decision, ...]:
+    """Say how far the camera moved, if it did.
+
+    Parameters
+    ----------
+    flows : ndarray, float32, shape (T, H, W, 2)
+        From the centroid to each training frame, pixels.
+
+    Returns
+    -------
+    tuple of Decision
+        None where frames are shifted by two pixels at most.
+
+    Examples
+    --------
+    >>> still = np.zeros((3, 16, 16, 2), np.float32)
+    >>> explain_camera(still)
+    ()
+    >>> explain_camera(still + np.float32([6, -8]))[0].choice
+    'followed over 10.0 pixels'
+    """
+    shifts = np.median(flows[:, ::4, ::4].reshape(len(flows), -1, 2), axis=1)
+    largest = float(np.hypot(shifts[:, 0], shifts[:, 1]).max())
+    if largest <= DEAD_ZONE:
+        return ()
+    return (Decision("camera", f"followed over {largest:.1f} pixels", "the largest shift of a whole training frame"),)
 
 
 def explain_centroid(centroid: Centroid) -> Decision:

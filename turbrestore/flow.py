@@ -4,7 +4,7 @@ The contract of every method: ``reference(x, y) ≈ frame(x + dx, y + dy)``, flo
 so that ``warp(frame, flow)`` lies on the reference (W_k of paper 3, eq. 6: ``I_k ∘ w_k = Kρ``).
 
 Three methods share one driver: ``dis`` (dense inverse search with variational refinement, Kroeger et al. 2016, the
-default), ``tvl1`` (Zach, Pock and Bischof 2007, in OpenCV's DualTVL1) and ``farneback`` (2003).  Paper 3 uses
+default), ``tvl1`` (Zach, Pock and Bischof 2007, in :mod:`turbrestore.tvl1`) and ``farneback`` (2003).  Paper 3 uses
 Black–Anandan flow, which these supersede.
 
 Local contrast is normalised first (zero mean, unit deviation in a Gaussian window), so that dark and low-contrast
@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Literal
 
 import cv2
@@ -34,13 +35,15 @@ from .errors import DataError, require, require_between
 from .parallel import map_ahead
 from .psf import estimate_noise
 from .stabilisation import DEAD_ZONE, ShiftReference, overlap, refer_shift, shift_against
+from .tvl1 import TvL1Params, refer_tvl1, tvl1_flows
 
 MIN_SIDE = 16
 # Grey levels per local standard deviation in the 8-bit image that the solvers see: ±4 deviations fit.
 _LEVELS_PER_DEVIATION = 32.0
 
 GreyBytes = NDArray[np.uint8]
-Solver = Callable[[GreyBytes, GreyBytes], FloatArray]
+# From frames (B, H, W) to flows (B, H, W, 2); threads share it.
+Solver = Callable[[GreyBytes], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -76,45 +79,6 @@ class DisParams:
         )
         require_between("refinements", self.refinements, 0, 1000)
         require_between("smoothness", self.smoothness, 1e-3, 1e4)
-
-
-@dataclass(frozen=True)
-class TvL1Params:
-    """Settings of TV-L1 flow.  The defaults are tuned for speed; :meth:`classic` gives OpenCV's own.
-
-    Parameters
-    ----------
-    attachment : float
-        Weight of the data term (λ of Zach et al.): smaller is smoother.
-    warps : int
-        Warpings per pyramid level.
-    outer_iterations : int
-        Iterations per warping; the median filter runs after each.
-    inner_iterations : int
-        Steps of the dual variable per outer iteration.
-    median : int
-        Side of the median filter between outer iterations; 1 switches it off, else 3 or 5.
-    scales : int
-        Pyramid levels.
-    """
-
-    attachment: float = 0.15
-    warps: int = 3
-    outer_iterations: int = 2
-    inner_iterations: int = 10
-    median: int = 1
-    scales: int = 5
-
-    def __post_init__(self) -> None:
-        require_between("attachment", self.attachment, 1e-4, 1e3)
-        for name in ("warps", "outer_iterations", "inner_iterations", "scales"):
-            require_between(name, getattr(self, name), 1, 1000)
-        require(self.median in (1, 3, 5), f"median: expected 1 (off), 3 or 5, found {self.median}")
-
-    @classmethod
-    def classic(cls) -> TvL1Params:
-        """Return the defaults of OpenCV's DualTVL1: 5 warps, 10 outer and 30 inner iterations, 5×5 median."""
-        return cls(warps=5, outer_iterations=10, inner_iterations=30, median=5)
 
 
 @dataclass(frozen=True)
@@ -287,12 +251,19 @@ def iterate_flows(
     position = refer_shift(target) if params.global_shift else None
     confidence = flow_confidence(target) if params.confidence else None
 
-    def solve(frame: FloatArray) -> FloatArray:
-        # A solver object keeps buffers that must not be shared between threads, and is cheap beside a flow.
-        solver = FLOW_METHODS[params.method](params)
-        shift = np.zeros(2, np.float32) if position is None else _whole_shift(frame, position)
-        flow = solver(prepared, _shifted(_prepare(frame, params), shift, prepared))
-        return shift + (flow if confidence is None else regularise_flow(flow, confidence, estimate_noise(frame)))
+    solver = FLOW_METHODS[params.method](params, prepared)
+
+    def shift_of(frame: FloatArray) -> FloatArray:
+        return np.zeros(2, np.float32) if position is None else _whole_shift(frame, position)
+
+    def solve(batch: list[FloatArray]) -> list[FloatArray]:
+        shifts = [shift_of(frame) for frame in batch]
+        levels = [_shifted(_prepare(frame, params), s, prepared) for frame, s in zip(batch, shifts, strict=True)]
+        flows = list(solver(np.stack(levels)))
+        if confidence is not None:
+            noises = map(estimate_noise, batch)
+            flows = [regularise_flow(flow, confidence, n) for flow, n in zip(flows, noises, strict=True)]
+        return [shift + flow for shift, flow in zip(shifts, flows, strict=True)]
 
     def checked() -> Iterator[FloatArray]:
         for index, frame in enumerate(frames):
@@ -301,7 +272,9 @@ def iterate_flows(
                 raise DataError(f"frame {index}: expected {target.shape[:2]} pixels, found {image.shape[:2]}")
             yield image
 
-    yield from map_ahead(solve, checked(), params.threads)
+    stream, size = checked(), params.tvl1.batch if params.method == "tvl1" else 1
+    for batch, flows in map_ahead(solve, iter(lambda: list(islice(stream, size)), []), params.threads):
+        yield from zip(batch, flows, strict=True)
 
 
 def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> FloatArray:
@@ -362,43 +335,48 @@ def _shifted(frame: GreyBytes, shift: FloatArray, outside: GreyBytes) -> GreyByt
     return result
 
 
-def _dis(params: FlowParams) -> Solver:
-    solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    solver.setFinestScale(params.dis.finest_scale)
-    solver.setPatchSize(params.dis.patch_size)
-    solver.setPatchStride(params.dis.patch_stride)
-    solver.setVariationalRefinementIterations(params.dis.refinements)
-    solver.setVariationalRefinementAlpha(params.dis.smoothness)
-    return lambda reference, frame: solver.calc(reference, frame, None)
+def _dis(params: FlowParams, reference: GreyBytes) -> Solver:
+    def solve(frame: GreyBytes) -> FloatArray:
+        # A solver object keeps buffers that must not be shared between threads, and is cheap beside a flow.
+        solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        solver.setFinestScale(params.dis.finest_scale)
+        solver.setPatchSize(params.dis.patch_size)
+        solver.setPatchStride(params.dis.patch_stride)
+        solver.setVariationalRefinementIterations(params.dis.refinements)
+        solver.setVariationalRefinementAlpha(params.dis.smoothness)
+        return solver.calc(reference, frame, None)
+
+    return lambda frames: np.stack([solve(frame) for frame in frames])
 
 
-def _tvl1(params: FlowParams) -> Solver:
-    settings = params.tvl1
-    solver = cv2.optflow.DualTVL1OpticalFlow.create()
-    solver.setLambda(settings.attachment)
-    solver.setScalesNumber(settings.scales)
-    solver.setWarpingsNumber(settings.warps)
-    solver.setOuterIterations(settings.outer_iterations)
-    solver.setInnerIterations(settings.inner_iterations)
-    solver.setMedianFiltering(settings.median)
-    return lambda reference, frame: solver.calc(reference, frame, None)
+def _tvl1(params: FlowParams, reference: GreyBytes) -> Solver:
+    referred = refer_tvl1(reference.astype(np.float32), params.tvl1)
+    return lambda frames: tvl1_flows(frames.astype(np.float32), referred).flows
 
 
-def _farneback(params: FlowParams) -> Solver:
+def _farneback(params: FlowParams, reference: GreyBytes) -> Solver:
     settings = params.farneback
     spread = {5: 1.1, 7: 1.5}[settings.neighbourhood]
-    return lambda reference, frame: cv2.calcOpticalFlowFarneback(
-        reference,
-        frame,
-        None,
-        0.5,
-        settings.levels,
-        settings.window,
-        settings.iterations,
-        settings.neighbourhood,
-        spread,
-        cv2.OPTFLOW_FARNEBACK_GAUSSIAN,
-    )
+
+    def solve(frame: GreyBytes) -> FloatArray:
+        return cv2.calcOpticalFlowFarneback(
+            reference,
+            frame,
+            None,
+            0.5,
+            settings.levels,
+            settings.window,
+            settings.iterations,
+            settings.neighbourhood,
+            spread,
+            cv2.OPTFLOW_FARNEBACK_GAUSSIAN,
+        )
+
+    return lambda frames: np.stack([solve(frame) for frame in frames])
 
 
-FLOW_METHODS: dict[str, Callable[[FlowParams], Solver]] = {"dis": _dis, "tvl1": _tvl1, "farneback": _farneback}
+FLOW_METHODS: dict[str, Callable[[FlowParams, GreyBytes], Solver]] = {
+    "dis": _dis,
+    "tvl1": _tvl1,
+    "farneback": _farneback,
+}

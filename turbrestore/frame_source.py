@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arrays import CHANNELS, FloatArray
 from .errors import ConfigurationError, DataError, require
-from .pixels import PixelArray, check_pixel_count, depth_of, full_scale_of, to_unit
+from .pixels import PixelArray, depth_of, full_scale_of, to_unit
 
 FrameRange = tuple[int | None, int | None] | tuple[int | None, int | None, int | None]
 Roi = tuple[int, int, int, int]
+# Frames that a message names before it only counts them.
+_NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +44,7 @@ class FrameSource:
     bit_depth : int
         Bits per channel of the file; 32 for floating point.
     pixels : callable
-        Given a range of frame numbers of the file, yields their native pixels in that order.
+        Given ascending frame numbers of the file, yields their native pixels in that order.
     path : Path or None
         The file or folder; None for an array.
     fps : float or None
@@ -50,8 +53,12 @@ class FrameSource:
         Seconds since the first frame of the file, after the selection.
     warnings : tuple of str
         What was left out or looks odd.
-    numbers : range
-        Numbers, in the file, of the frames selected; by default all.
+    damaged : tuple of int
+        Numbers, in the file, of frames that are known to be damaged.
+    repair : callable or None
+        Applied to the native pixels of every frame of the file before anything looks at them.
+    numbers : range or tuple of int
+        Numbers, in the file, of the frames selected, ascending; by default all.
     window : tuple of slice
         Rows and columns selected; by default all.
 
@@ -71,12 +78,14 @@ class FrameSource:
     file_shape: tuple[int, ...]
     full_scale: int
     bit_depth: int
-    pixels: Callable[[range], Iterator[PixelArray]] = field(repr=False)
+    pixels: Callable[[Sequence[int]], Iterator[PixelArray]] = field(repr=False)
     path: Path | None = None
     fps: float | None = None
     timestamps: NDArray[np.float64] | None = field(default=None, repr=False)
     warnings: tuple[str, ...] = ()
-    numbers: range = range(0)
+    damaged: tuple[int, ...] = ()
+    repair: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
+    numbers: range | tuple[int, ...] = range(0)
     window: tuple[slice, slice] = (slice(0), slice(0))
 
     def __post_init__(self) -> None:
@@ -85,7 +94,8 @@ class FrameSource:
             raise DataError(f"{self.name}: expected frames of shape (T, H, W) or (T, H, W, 3), found {shape}")
         if shape[0] < 1:
             raise DataError(f"{self.name}: expected at least one frame, found none")
-        check_pixel_count(shape[2], shape[1], self.name)
+        if min(shape[1:3]) < 1:
+            raise DataError(f"{self.name}: expected frames of at least one pixel, found {shape[2]}×{shape[1]}")
         if not self.numbers:
             object.__setattr__(self, "numbers", range(shape[0]))
             object.__setattr__(self, "window", (slice(0, shape[1]), slice(0, shape[2])))
@@ -133,6 +143,66 @@ class FrameSource:
         for index, frame in enumerate(self._frames(chosen)):
             stack[index] = frame
         return stack
+
+    def native(self) -> Iterator[PixelArray]:
+        """Frames of the selection as the file has them: cropped, but neither scaled nor checked.
+
+        Yields
+        ------
+        ndarray, shape (H, W) or (H, W, 3)
+            In the type of the file.
+
+        Raises
+        ------
+        DataError
+            Frames are damaged or missing.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> [int(frame[0, 0]) for frame in FrameSource.from_array(np.full((2, 1, 1), 7, np.uint8)).native()]
+        [7, 7]
+        """
+        for _, pixels in self._native(self.numbers):
+            yield pixels
+
+    def without(self, numbers: Collection[int], warning: str) -> FrameSource:
+        """Leave frames out.
+
+        Parameters
+        ----------
+        numbers : collection of int
+            Numbers, in the file, of the frames to leave out; those that are not selected do not count.
+        warning : str
+            Added to the warnings where a frame is left out.
+
+        Returns
+        -------
+        FrameSource
+
+        Raises
+        ------
+        DataError
+            No frame remains.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> source = FrameSource.from_array(np.zeros((4, 1, 1))).without({1}, "frame 1 left out")
+        >>> source.numbers, source.warnings
+        ((0, 2, 3), ('frame 1 left out',))
+        """
+        places = [place for place, number in enumerate(self.numbers) if number not in numbers]
+        if len(places) == len(self):
+            return self
+        if not places:
+            raise DataError(f"{self.name}: expected at least one frame that can be used, found none")
+        return dataclasses.replace(
+            self,
+            numbers=tuple(self.numbers[place] for place in places),
+            timestamps=None if self.timestamps is None else self.timestamps[places],
+            warnings=(*self.warnings, warning),
+        )
 
     def select(self, frames: FrameRange | None = None, roi: Roi | None = None) -> FrameSource:
         """Part of the frames, cropped.
@@ -232,14 +302,17 @@ class FrameSource:
         top, left = self.window[0].start + y, self.window[1].start + x
         return slice(top, top + h), slice(left, left + w)
 
-    def _frames(self, chosen: range) -> Iterator[FloatArray]:
+    def _frames(self, chosen: range | tuple[int, ...]) -> Iterator[FloatArray]:
+        for number, pixels in self._native(chosen):
+            yield to_unit(pixels, self.full_scale, f"{self.name}: frame {number}")
+
+    def _native(self, chosen: range | tuple[int, ...]) -> Iterator[tuple[int, PixelArray]]:
         done = 0
         for number, pixels in zip(chosen, self.pixels(chosen), strict=False):
-            label = f"{self.name}: frame {number}"
             if pixels.shape != self.file_shape[1:]:
                 expected, found = size_text(self.file_shape[1:]), size_text(pixels.shape)
-                raise DataError(f"{label}: expected {expected} as the first frame, found {found}")
-            yield to_unit(pixels[self.window], self.full_scale, label)
+                raise DataError(f"{self.name}: frame {number}: expected {expected} as the first frame, found {found}")
+            yield number, (pixels if self.repair is None else self.repair(pixels))[self.window]
             done += 1
         if done < len(chosen):
             raise DataError(
@@ -327,3 +400,46 @@ def cut_short_text(intact: int) -> str:
     if intact < 1:
         return "cut short before the end of the first frame; copy the file again"
     return f"cut short after {intact} whole frames; copy the file again or select frames up to {intact}"
+
+
+def skipped_end_text(intact: int) -> str:
+    """Say that only the whole frames of a video that is cut short are used.
+
+    Parameters
+    ----------
+    intact : int
+        Frames that can be read.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> skipped_end_text(59)
+    'cut short; only its first 59 frames are used'
+    """
+    return f"cut short; only its first {intact} frames are used"
+
+
+def numbers_text(numbers: Collection[int]) -> str:
+    """Name frames: how many, and the first few.
+
+    Parameters
+    ----------
+    numbers : collection of int
+        Ascending.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> numbers_text([4])
+    'frame 4'
+    >>> numbers_text(range(10, 30))
+    'frames 10, 11, 12, 13, 14 and 15 more'
+    """
+    first = f"frame{'s' * (len(numbers) > 1)} {', '.join(str(number) for number in islice(numbers, _NAMED))}"
+    return f"{first} and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else first

@@ -12,7 +12,10 @@ from __future__ import annotations
 import io
 import os
 import secrets
+import shutil
+import struct
 import warnings
+import zlib
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,10 +27,16 @@ from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_image, from_unit
 from .errors import ConfigurationError, DataError, InputNotFoundError, OutputError, StorageError
-from .pixels import MAX_PIXELS, PixelArray, check_depth, check_pixel_count, depth_of, full_scale_of, to_unit
+from .limits import DEFAULT_LIMITS, Limits
+from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
 IMAGE_OUTPUT_SUFFIXES = (".png", ".tif", ".tiff")
+# Bytes that must stay free beside what is written.
+_SPARE = 1 << 20
+# What Pillow may take a file for; it knows many formats more.
+_FORMATS = ("PNG", "JPEG", "BMP", "PPM", "WEBP")
+_PNG, _IHDR_BITS, _CHUNK = b"\x89PNG\r\n\x1a\n", 24, 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +58,15 @@ class ImageFile:
     warnings: tuple[str, ...] = ()
 
 
-def read_image(path: str | os.PathLike[str]) -> ImageFile:
+def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> ImageFile:
     """Read a still image.
 
     Parameters
     ----------
     path : path-like
         PNG, JPEG, TIFF (one page), BMP, PGM, PPM or WebP file.
+    limits : Limits
+        Largest image that is read.
 
     Returns
     -------
@@ -80,17 +91,19 @@ def read_image(path: str | os.PathLike[str]) -> ImageFile:
     ImageFile(image=array([[0., 1.]], dtype=float32), bit_depth=8, warnings=())
     """
     path = Path(path)
-    pixels, notes = read_pixels(path)
+    pixels, notes = read_pixels(path, limits)
     return ImageFile(to_unit(pixels, full_scale_of(pixels.dtype, str(path)), str(path)), depth_of(pixels.dtype), notes)
 
 
-def read_pixels(path: Path) -> tuple[PixelArray, tuple[str, ...]]:
+def read_pixels(path: Path, limits: Limits = DEFAULT_LIMITS) -> tuple[PixelArray, tuple[str, ...]]:
     """Read a still image as its file has it: grey or RGB, alpha dropped, values not scaled.
 
     Parameters
     ----------
     path : Path
         See :func:`read_image`.
+    limits : Limits
+        Largest image that is read.
 
     Returns
     -------
@@ -107,10 +120,11 @@ def read_pixels(path: Path) -> tuple[PixelArray, tuple[str, ...]]:
     if path.suffix.lower() not in IMAGE_SUFFIXES:
         raise DataError(f"{path}: expected an image ({', '.join(IMAGE_SUFFIXES)}), found {path.suffix or 'no suffix'}")
     with input_errors(path):
+        limits.check_bytes(path.stat().st_size, str(path))
         data = path.read_bytes()
     if not data:
         raise DataError(f"{path}: the file is empty")
-    _check_header(path, data)
+    _check_header(path, data, limits)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -222,6 +236,39 @@ def check_output(
         raise OutputError(f"{path}: cannot be created ({error.strerror or error})") from error
 
 
+def check_space(path: str | os.PathLike[str], size: int) -> None:
+    """Refuse to begin what does not fit on the disk.
+
+    Parameters
+    ----------
+    path : path-like
+        A file or folder to be written; its folder exists.
+    size : int
+        Bytes that are expected; a tenth and a megabyte more must be free.
+
+    Raises
+    ------
+    StorageError
+        There is less.
+
+    Examples
+    --------
+    >>> check_space("result.png", 10**30)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.StorageError: result.png: needs ... MiB, found ... MiB free; make room on the disk
+    """
+    folder = Path(os.path.realpath(path)).parent
+    needed = size + size // 10 + _SPARE
+    try:
+        total, _, free = shutil.disk_usage(folder)
+    except OSError:
+        return
+    # Not every file system tells; those of the kernel have no size.
+    if total > 0 and free < needed:
+        raise StorageError(f"{path}: needs {needed >> 20} MiB, found {free >> 20} MiB free; make room on the disk")
+
+
 @contextmanager
 def atomic_output(path: str | os.PathLike[str], overwrite: bool = False) -> Iterator[Path]:
     """Give a temporary file in the folder of ``path``, and rename it to ``path`` when the block has succeeded.
@@ -300,6 +347,7 @@ def atomic_write(path: str | os.PathLike[str], data: bytes, overwrite: bool = Fa
     ...     Path(folder, "a.json").read_bytes()
     b'{}'
     """
+    check_space(path, len(data))
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(data)
 
@@ -336,7 +384,7 @@ def input_errors(path: Path) -> Iterator[None]:
         raise StorageError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
-def _check_header(path: Path, data: bytes) -> None:
+def _check_header(path: Path, data: bytes, limits: Limits) -> None:
     """Refuse by the header what must not be decoded: too many pixels, several pages, broken PNG checksums."""
     if path.suffix.lower() in (".tif", ".tiff"):
         import tifffile
@@ -349,28 +397,51 @@ def _check_header(path: Path, data: bytes) -> None:
         if pages != 1:
             raise DataError(f"{path}: expected one image, found {pages} pages; read it as a video")
     else:
-        width, height = _pillow_size(path, data)
-    check_pixel_count(width, height, str(path))
+        width, height = _pillow_size(path, data, limits)
+    limits.check_size(width, height, str(path))
+    if data.startswith(_PNG):
+        _check_inflated(path, data, width, height)
 
 
-def _pillow_size(path: Path, data: bytes) -> tuple[int, int]:
+def _pillow_size(path: Path, data: bytes, limits: Limits) -> tuple[int, int]:
     import PIL.Image
 
     try:
         with warnings.catch_warnings():
-            # Pillow's own limit is lower than MAX_PIXELS and would speak twice.
+            # Pillow warns at a size of its own.
             warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
-            with PIL.Image.open(io.BytesIO(data)) as header:
+            with PIL.Image.open(io.BytesIO(data), formats=_FORMATS) as header:
                 size = header.size
                 # Checks PNG checksums without inflating; libpng would print its complaint to the terminal.
                 header.verify()
     except PIL.Image.DecompressionBombError as error:
-        raise DataError(f"{path}: expected up to {MAX_PIXELS} pixels, found far more ({first_line(error)})") from error
+        raise DataError(f"{path}: expected up to {limits.max_pixels} pixels, found far more") from error
     except PIL.UnidentifiedImageError as error:
         raise DataError(f"{path}: not an image of a known format") from error
     except Exception as error:  # Pillow raises SyntaxError, ValueError, struct.error, … by the format
         raise DataError(f"{path}: not an image, or damaged ({first_line(error)})") from error
     return size
+
+
+def _check_inflated(path: Path, data: bytes, width: int, height: int) -> None:
+    """Refuse a PNG whose pixels are fewer than its header says: libpng would print that to the terminal."""
+    bits, colour, _, _, interlaced = struct.unpack_from(">5B", data, _IHDR_BITS)
+    values = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 0)
+    # Every row has a byte for its filter; the seven passes of an interlaced image need more, never fewer.
+    needed = height * (1 + (width * bits * values + 7) // 8) if not interlaced else width * height * bits * values // 8
+    inflate, found, place = zlib.decompressobj(), 0, len(_PNG)
+    try:
+        while found < needed and place + 8 <= len(data):
+            size, kind = struct.unpack_from(">I4s", data, place)
+            packed = data[place + 8 : place + 8 + size] if kind == b"IDAT" else b""
+            while packed and found < needed:
+                found += len(inflate.decompress(packed, _CHUNK))
+                packed = inflate.unconsumed_tail
+            place += size + 12
+    except zlib.error as error:
+        raise DataError(f"{path}: compressed pixels are damaged ({first_line(error)}); copy the file again") from error
+    if found < needed:
+        raise DataError(f"{path}: expected {needed} bytes of pixels, found {found}; the file is damaged")
 
 
 def _encode(path: Path, image: FloatArray, depth: int) -> bytes:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .alternating import Filtered, FilterParams, filter_frames
+from .alternating import FilterCheckpoint, Filtered, FilterParams, filter_frames
 from .arrays import FloatArray
 from .blind import Deblurred, remove_blur
 from .blur_cues import BlurBounds, bound_blur, displacement_maps
@@ -22,7 +22,16 @@ from .decision import Decision
 from .deconvolution import Deconvolution, DeconvolutionParams
 from .dynamics import DynamicsParams, FlowDynamics, identify, with_displacement
 from .errors import DataError, require
-from .explanation import explain_border, explain_centroid, explain_dynamics, explain_frames, explain_training
+from .explanation import (
+    explain_border,
+    explain_camera,
+    explain_centroid,
+    explain_dynamics,
+    explain_frames,
+    explain_input,
+    explain_motion,
+    explain_training,
+)
 from .flow import MIN_SIDE, FlowParams
 from .frame_selection import Share, best_frames, check_share, frame_quality
 from .frame_source import FrameSource
@@ -48,6 +57,32 @@ _SIGMAS_A_SIDE = 8
 _TRAINING_BYTES = 1.5e9
 
 Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class StageResults:
+    """What has been done of a restoration; one that was interrupted goes on from here.
+
+    Attributes
+    ----------
+    centroid : Centroid or None
+    dynamics : FlowDynamics or None
+    checkpoint : FilterCheckpoint or None
+        Where the filter stands; None before and after it.
+    filtered : Filtered or None
+    mean : ndarray, float32, shape (H, W) or (H, W, 3), or None
+        Temporal mean of the frames that were filtered.
+    blur_bounds : BlurBounds or None
+    deblurred : Deblurred or None
+    """
+
+    centroid: Centroid | None = None
+    dynamics: FlowDynamics | None = None
+    checkpoint: FilterCheckpoint | None = None
+    filtered: Filtered | None = None
+    mean: FloatArray | None = None
+    blur_bounds: BlurBounds | None = None
+    deblurred: Deblurred | None = None
 
 
 @dataclass(frozen=True)
@@ -126,8 +161,9 @@ class Restoration:
         Result of the last stage that ran; smaller than those of the stages where its border is cropped.
     crop : tuple of int
         x, y, width and height of the image within the frames, pixels.
-    mean : ndarray, float32, shape of ``image``
-        Temporal mean of the frames that were read: all of them once the filter has run, else the training frames.
+    mean : ndarray, float32, shape (H, W) or (H, W, 3)
+        Temporal mean of the frames that were read, in their size: all of them once the filter has run, else the
+        training frames.
     centroid : Centroid
     dynamics : FlowDynamics or None
     filtered : Filtered or None
@@ -175,7 +211,8 @@ class Restoration:
         ConfigurationError
             Matplotlib is not installed.
         """
-        return plot_images({"mean": self.mean, "result": self.image})
+        x, y, width, height = self.crop
+        return plot_images({"mean": self.mean[y : y + height, x : x + width], "result": self.image})
 
     def _repr_html_(self) -> str:
         sigma = 0.0 if self.deconvolution is None else self.deconvolution.sigma
@@ -189,7 +226,11 @@ class Restoration:
 
 
 def restore(
-    frames: FrameSource | ArrayLike, params: RestoreParams | None = None, progress: Progress | None = None
+    frames: FrameSource | ArrayLike,
+    params: RestoreParams | None = None,
+    progress: Progress | None = None,
+    done: StageResults | None = None,
+    on_result: Callable[[StageResults], None] | None = None,
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
@@ -204,6 +245,11 @@ def restore(
         Settings of every stage.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
+    done : StageResults, optional
+        What an earlier run of the same frames and settings has done already; the result is the same, bit for bit.
+        Nothing is checked: :mod:`turbrestore.resumption` keeps results on disk and tells which still hold.
+    on_result : callable, optional
+        Called with all that is done after each stage, and after each block of frames in the filter.
 
     Returns
     -------
@@ -232,46 +278,21 @@ def restore(
     train = training_share(len(source), source.shape[1:], params.train)
     _check_sigma(params.deconvolution.sigma, source.shape)
     stages = STAGES[: STAGES.index(params.until) + 1]
-    clock = _Clock()
-    counted = None if params.keep_best == 1 else best_frames(frame_quality(source), params.keep_best)
+    run = _Run(source, params, progress, done or StageResults(), on_result)
     stream = iter(source)
     training = _read_training(stream, train)
-    clock.lap("read")
-    centroid = find_centroid(
-        training, params.centroid, params.flow, stage_counter(progress, "centroid", train * params.centroid.iterations)
-    )
-    clock.lap("centroid")
+    run.clock.lap("read")
+    centroid = _find_centroid(run, training)
     image, mean = centroid.image, training.mean(axis=0, dtype=np.float32)
-    dynamics = filtered = deblurred = bounds = None
-    decisions = [explain_training(train, len(source), params.train), explain_centroid(centroid)]
+    dynamics = filtered = deblurred = None
     if "identify" in stages:
-        dynamics = _identify(centroid.flows, training, params)
-        decisions += explain_dynamics(dynamics)
-        clock.lap("identify")
+        dynamics = _identify(run, centroid, training)
     if "filter" in stages and dynamics is not None:
-        summed = _Sum(training, stream)
-        filtered = filter_frames(
-            summed,
-            centroid.image,
-            dynamics,
-            params.filter,
-            params.flow,
-            centroid.flows,
-            stage_counter(progress, "filter", len(source) * params.filter.inner_iterations - train),
-            counted,
-        )
-        image, mean = filtered.image, summed.mean()
-        decisions.append(explain_frames(filtered, None if counted is None else int(counted.sum())))
-        clock.lap("filter")
+        filtered, mean = _filter(run, centroid, dynamics, training, stream)
+        image = filtered.image
     if "deconvolve" in stages:
-        if params.blur_bounds:
-            exponent = params.deconvolution.exponent or KOLMOGOROV
-            bounds = bound_blur(image, mean, training, len(source), exponent)
-        counter = stage_counter(progress, "deconvolve", params.deconvolution.iterations)
-        deblurred = remove_blur(image, centroid.image, params.deconvolution, params.guards, bounds, counter)
+        deblurred = _deblur(run, image, mean, centroid, training)
         image = deblurred.deconvolution.image
-        decisions += deblurred.decisions
-        clock.lap("deconvolve")
     crop, on_border = _crop(image, centroid.flows, params.border, deblurred)
     x, y, width, height = crop
     return Restoration(
@@ -282,13 +303,13 @@ def restore(
         dynamics=dynamics,
         filtered=filtered,
         blur=None if deblurred is None else deblurred.blur,
-        blur_bounds=bounds,
+        blur_bounds=run.done.blur_bounds,
         deconvolution=None if deblurred is None else deblurred.deconvolution,
         guard_readings=() if deblurred is None else deblurred.readings,
-        decisions=(*decisions, on_border),
+        decisions=(*_decisions(run, training, centroid, dynamics, filtered, deblurred), on_border),
         train=train,
         frame_count=len(source) if filtered is not None else train,
-        seconds=clock.seconds,
+        seconds=run.clock.seconds,
     )
 
 
@@ -402,11 +423,111 @@ class _Sum:
         return (self._total / self._count).astype(np.float32)
 
 
-def _identify(flows: FloatArray, training: FloatArray, params: RestoreParams) -> FlowDynamics:
-    dynamics = identify(flows, params.dynamics)
-    if not params.displacement_cue:
-        return dynamics
-    return with_displacement(dynamics, *displacement_maps(training))
+class _Run:
+    """What every stage needs, and what is done so far."""
+
+    def __init__(
+        self,
+        source: FrameSource,
+        params: RestoreParams,
+        progress: Progress | None,
+        done: StageResults,
+        on_result: Callable[[StageResults], None] | None,
+    ) -> None:
+        self.source, self.params, self.progress = source, params, progress
+        self.done = done
+        self.clock = _Clock()
+        self._on_result = on_result
+
+    def finish(self, done: StageResults, stage: str | None = None) -> None:
+        self.done = done
+        if stage is not None:
+            self.clock.lap(stage)
+        if self._on_result is not None:
+            self._on_result(done)
+
+
+def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
+    if run.done.centroid is not None:
+        return run.done.centroid
+    params = run.params
+    counter = stage_counter(run.progress, "centroid", len(training) * params.centroid.iterations)
+    centroid = find_centroid(training, params.centroid, params.flow, counter)
+    run.finish(replace(run.done, centroid=centroid), "centroid")
+    return centroid
+
+
+def _identify(run: _Run, centroid: Centroid, training: FloatArray) -> FlowDynamics:
+    if run.done.dynamics is not None:
+        return run.done.dynamics
+    dynamics = identify(centroid.flows, run.params.dynamics)
+    if run.params.displacement_cue:
+        dynamics = with_displacement(dynamics, *displacement_maps(training))
+    run.finish(replace(run.done, dynamics=dynamics), "identify")
+    return dynamics
+
+
+def _filter(
+    run: _Run, centroid: Centroid, dynamics: FlowDynamics, training: FloatArray, rest: Iterator[FloatArray]
+) -> tuple[Filtered, FloatArray]:
+    """Return the filtered image, and the mean of all frames."""
+    if run.done.filtered is not None and run.done.mean is not None:
+        return run.done.filtered, run.done.mean
+    params, source = run.params, run.source
+    counted = None if params.keep_best == 1 else best_frames(frame_quality(source), params.keep_best)
+    summed = _Sum(training, rest)
+    filtered = filter_frames(
+        summed,
+        centroid.image,
+        dynamics,
+        params.filter,
+        params.flow,
+        centroid.flows,
+        stage_counter(run.progress, "filter", len(source) * params.filter.inner_iterations - len(training)),
+        counted,
+        run.done.checkpoint,
+        lambda checkpoint: run.finish(replace(run.done, checkpoint=checkpoint)),
+    )
+    mean = summed.mean()
+    run.finish(replace(run.done, checkpoint=None, filtered=filtered, mean=mean), "filter")
+    return filtered, mean
+
+
+def _deblur(run: _Run, image: FloatArray, mean: FloatArray, centroid: Centroid, training: FloatArray) -> Deblurred:
+    if run.done.deblurred is not None:
+        return run.done.deblurred
+    params, bounds = run.params, None
+    if params.blur_bounds:
+        exponent = params.deconvolution.exponent or KOLMOGOROV
+        bounds = bound_blur(image, mean, training, len(run.source), exponent)
+    counter = stage_counter(run.progress, "deconvolve", params.deconvolution.iterations)
+    deblurred = remove_blur(image, centroid.image, params.deconvolution, params.guards, bounds, counter)
+    run.finish(replace(run.done, blur_bounds=bounds, deblurred=deblurred), "deconvolve")
+    return deblurred
+
+
+def _decisions(
+    run: _Run,
+    training: FloatArray,
+    centroid: Centroid,
+    dynamics: FlowDynamics | None,
+    filtered: Filtered | None,
+    deblurred: Deblurred | None,
+) -> Iterator[Decision]:
+    """Put what was chosen into words, in the order of the stages."""
+    yield explain_training(len(training), len(run.source), run.params.train)
+    yield from explain_input(training)
+    yield explain_centroid(centroid)
+    yield from explain_camera(centroid.flows)
+    yield from explain_motion(centroid.flows)
+    if dynamics is not None:
+        yield from explain_dynamics(dynamics)
+    if filtered is not None:
+        # The sharpness of frames that do not count is not measured.
+        chosen = int(np.isfinite(filtered.sharpness).sum())
+        yield explain_frames(filtered, None if run.params.keep_best == 1 else chosen)
+    if deblurred is not None:
+        yield from deblurred.decisions
 
 
 def _crop(image: FloatArray, flows: FloatArray, border: str, deblurred: Deblurred | None) -> tuple[Rectangle, Decision]:
@@ -418,6 +539,8 @@ def _crop(image: FloatArray, flows: FloatArray, border: str, deblurred: Deblurre
     # Pixels within a width of the border are deblurred from light that fell beyond it.
     sigma = 0.0 if deblurred is None else deblurred.deconvolution.sigma
     crop = well_seen(seen, _SEEN, int(np.ceil(sigma)), MIN_SIDE)
+    if crop == whole:
+        return whole, explain_border(float(seen.min()), None)
     return crop, explain_border(float(seen.min()), crop)
 
 

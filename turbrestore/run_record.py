@@ -10,8 +10,7 @@ import dataclasses
 import json
 import os
 import platform
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -36,6 +35,7 @@ from .errors import DataError, InputNotFoundError, OutputError
 from .frame_source import FrameSource
 from .guards import GuardReading
 from .images import atomic_output, atomic_write
+from .npy import read_npz
 from .pipeline import Restoration, RestoreParams
 
 if TYPE_CHECKING:
@@ -46,6 +46,8 @@ RECORD, IMAGES = "run.json", "images.npz"
 RESULTS = ("centroid", "dynamics", "filtered", "blur", "blur_bounds", "deconvolution")
 # All files that a kept run consists of.
 RUN_FILES = (*(f"{name}.npz" for name in RESULTS), IMAGES, RECORD)
+# Where `turbrestore report` writes by default.
+REPORT = "report.html"
 _PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "av", "tifffile", "pillow", "torch")
 
 Kind = TypeVar("Kind")
@@ -161,7 +163,9 @@ def versions() -> dict[str, str]:
     return {**found, "system": f"{platform.system()} {platform.machine()}"}
 
 
-def save_run(folder: str | os.PathLike[str], restoration: Restoration, run: RunRecord) -> None:
+def save_run(
+    folder: str | os.PathLike[str], restoration: Restoration, run: RunRecord, stored: Collection[str] = ()
+) -> None:
     """Keep a run in a folder; what an earlier one left there is replaced.
 
     Parameters
@@ -170,6 +174,8 @@ def save_run(folder: str | os.PathLike[str], restoration: Restoration, run: RunR
         Created if its parent is there.
     restoration : Restoration
     run : RunRecord
+    stored : collection of str
+        Names of results, such as ``"centroid"``, whose artifacts lie in the folder already.
 
     Raises
     ------
@@ -193,15 +199,16 @@ def save_run(folder: str | os.PathLike[str], restoration: Restoration, run: RunR
     place = Path(folder)
     try:
         place.mkdir(exist_ok=True)
-        # Whoever looks while the files are written must not take them for one run.
-        (place / RECORD).unlink(missing_ok=True)
+        # Whoever looks while the files are written must not take them for one run; a report would be of the last one.
+        for name in (RECORD, REPORT):
+            (place / name).unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{place}: cannot be written to ({error.strerror})") from error
     results = {name: getattr(restoration, name) for name in RESULTS}
     for name, result in results.items():
         if result is None:
             (place / f"{name}.npz").unlink(missing_ok=True)
-        else:
+        elif name not in stored:
             save_artifact(place / f"{name}.npz", result, overwrite=True)
     with atomic_output(place / IMAGES, overwrite=True) as temporary, temporary.open("wb") as stream:
         np.savez(stream, allow_pickle=False, frame=run.frame, mean=restoration.mean, image=restoration.image)
@@ -294,6 +301,8 @@ class _Fields:
 
     def value(self, name: str, kind: type[Kind]) -> Kind:
         found = self.record.get(name)
+        if kind is float and type(found) is int:
+            found = float(found)
         if not isinstance(found, kind) or isinstance(found, bool):
             raise DataError(f"{self.path}: expected {name} to be {kind.__name__}, found {found!r:.40}")
         return found
@@ -355,9 +364,9 @@ def _read_images(path: Path, crop: Rectangle) -> dict[str, FloatArray]:
     if not path.is_file():
         raise InputNotFoundError(f"{path}: no such file")
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in ("frame", "mean", "image")}
-    except (OSError, EOFError, KeyError, ValueError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        found = read_npz(path)
+        arrays = {name: found[name] for name in ("frame", "mean", "image")}
+    except (DataError, KeyError) as error:
         raise DataError(f"{path}: expected the images of a run, found something else or damage") from error
     images = {name: check_image(array, f"{path}: {name}") for name, array in arrays.items()}
     x, y, width, height = crop

@@ -18,7 +18,7 @@ pixels, all later ones followed them, and so does this module: 0 is little endia
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 
 from .arrays import FloatArray, from_unit
 from .errors import DataError
-from .frame_source import FrameSource, cut_short_text
+from .frame_source import FrameSource, cut_short_text, skipped_end_text
 from .images import atomic_output, input_errors
-from .pixels import PixelArray, check_depth, check_pixel_count
+from .limits import DEFAULT_LIMITS, Limits
+from .pixels import PixelArray, check_depth
 
 SIGNATURE = b"LUCAM-RECORDER"
 HEADER_SIZE = 178
@@ -86,13 +87,15 @@ class SerHeader:
         return self.width * self.height * self.planes * self.dtype.itemsize
 
 
-def read_ser_header(path: str | os.PathLike[str]) -> SerHeader:
+def read_ser_header(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> SerHeader:
     """Read and check the header of a SER file.
 
     Parameters
     ----------
     path : path-like
         The file.
+    limits : Limits
+        Largest size of a frame that is read.
 
     Returns
     -------
@@ -124,13 +127,15 @@ def read_ser_header(path: str | os.PathLike[str]) -> SerHeader:
         raise DataError(f"{path}: expected mono, Bayer RGB or RGB frames, found colour code {colour}")
     if not 1 <= depth <= 16:
         raise DataError(f"{path}: expected 1 to 16 bits per plane, found {depth}")
-    check_pixel_count(width, height, str(path))
+    limits.check_size(width, height, str(path))
     if frames < 1:
         raise DataError(f"{path}: expected at least one frame, found {frames}; the recording was not completed")
     return SerHeader(colour, flag == 0, width, height, depth, frames)
 
 
-def open_ser(path: str | os.PathLike[str], stop: int | None = None) -> FrameSource:
+def open_ser(
+    path: str | os.PathLike[str], stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
+) -> FrameSource:
     """Open a SER file; Bayer patterns become RGB by bilinear interpolation.
 
     Parameters
@@ -139,6 +144,10 @@ def open_ser(path: str | os.PathLike[str], stop: int | None = None) -> FrameSour
         The file.
     stop : int, optional
         Frames from this one on are not needed, so they may be missing.
+    limits : Limits
+        Largest video that is read.
+    skip_damaged : bool
+        Read what is whole of a file that is cut short.
 
     Returns
     -------
@@ -161,13 +170,16 @@ def open_ser(path: str | os.PathLike[str], stop: int | None = None) -> FrameSour
     ((4, 2, 3), 'ser/mono12', 50.0)
     """
     path = Path(path)
-    header = read_ser_header(path)
+    header = read_ser_header(path, limits)
     with input_errors(path):
         size = path.stat().st_size
     present = (size - HEADER_SIZE) // header.frame_bytes
-    if present < header.frames and (stop is None or stop > present):
+    cut = present < header.frames
+    if cut and not (skip_damaged and present) and (stop is None or stop > present):
         raise DataError(f"{path}: {cut_short_text(present)}")
+    limits.check_count(min(header.frames, present), str(path))
     times = _timestamps(path, header, size)
+    notes = ("variable frame rate",) if times is not None and _has_gaps(times) else ()
     channels = () if header.colour == _MONO else (3,)
     return FrameSource(
         name=path.name,
@@ -179,6 +191,7 @@ def open_ser(path: str | os.PathLike[str], stop: int | None = None) -> FrameSour
         path=path,
         fps=None if times is None else (len(times) - 1) / float(times[-1]),
         timestamps=times,
+        warnings=(*notes, skipped_end_text(present)) if cut and skip_damaged else notes,
     )
 
 
@@ -244,7 +257,7 @@ def write_ser(
         file.write(SIGNATURE + fields.tobytes())
 
 
-def _frames(path: Path, header: SerHeader, chosen: range) -> Iterator[PixelArray]:
+def _frames(path: Path, header: SerHeader, chosen: Sequence[int]) -> Iterator[PixelArray]:
     shape = (header.height, header.width) if header.planes == 1 else (header.height, header.width, 3)
     for number in chosen:
         with input_errors(path):
@@ -265,3 +278,9 @@ def _timestamps(path: Path, header: SerHeader, size: int) -> NDArray[np.float64]
         ticks = np.fromfile(path, "<i8", header.frames, offset=start)
     # Recorders without a clock leave zeros; a clock that was set back during the recording tells no frame rate.
     return (ticks - ticks[0]) / TICKS_PER_SECOND if np.all(np.diff(ticks) >= 0) and ticks[-1] > ticks[0] else None
+
+
+def _has_gaps(times: NDArray[np.float64]) -> bool:
+    """Whether frames are missing in time; cameras that time their frames themselves scatter by much less."""
+    intervals = np.diff(times)
+    return len(times) > 2 and bool(intervals.max() > 1.5 * np.median(intervals))

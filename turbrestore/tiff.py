@@ -7,9 +7,11 @@ log and gives fewer pages.
 from __future__ import annotations
 
 import dataclasses
+import lzma
 import os
 import struct
-from collections.abc import Iterable, Iterator
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -20,15 +22,18 @@ from .arrays import FloatArray, from_unit
 from .errors import DataError, TurbrestoreError
 from .frame_source import FrameSource
 from .images import atomic_output, first_line, input_errors
-from .pixels import PixelArray, check_depth, check_pixel_count, depth_of, full_scale_of
+from .limits import DEFAULT_LIMITS, Limits
+from .pixels import PixelArray, check_depth, depth_of, full_scale_of
 
 if TYPE_CHECKING:
     import tifffile
 
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
+_DEFLATE, _LZMA = (8, 32946), 34925
+_MOST_SAMPLES = 16
 
 
-def open_tiff(path: str | os.PathLike[str]) -> FrameSource:
+def open_tiff(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     """Open a TIFF stack, grey or RGB, of 8 or 16 bits or floating point.
 
     Parameters
@@ -36,6 +41,8 @@ def open_tiff(path: str | os.PathLike[str]) -> FrameSource:
     path : path-like
         TIFF, BigTIFF or ImageJ stack. Packed bits and compressions other than deflate need the package
         ``imagecodecs``.
+    limits : Limits
+        Largest stack that is read.
 
     Returns
     -------
@@ -61,10 +68,10 @@ def open_tiff(path: str | os.PathLike[str]) -> FrameSource:
 
     path = Path(path)
     with input_errors(path), path.open("rb") as file:
-        pages = _count_pages(path, file)
+        pages = _count_pages(path, file, limits)
     with input_errors(path), _tiff_errors(path), tifffile.TiffFile(path) as tiff:
         page = tiff.pages.first
-        check_pixel_count(page.imagewidth, page.imagelength, str(path))
+        _check_page(path, page, limits)
         packed = _packed_stack(path, tiff) if pages == 1 else None
         if packed is not None:
             return packed
@@ -77,7 +84,7 @@ def open_tiff(path: str | os.PathLike[str]) -> FrameSource:
             file_shape=(pages, page.imagelength, page.imagewidth, *channels),
             full_scale=2**page.bitspersample - 1 if integer else full_scale_of(dtype, str(path)),
             bit_depth=min(page.bitspersample, 32) if integer else depth_of(dtype),
-            pixels=lambda chosen: _frames(path, chosen),
+            pixels=lambda chosen: _frames(path, chosen, limits),
             path=path,
             warnings=notes,
         )
@@ -132,20 +139,49 @@ def write_tiff(
             raise DataError(f"{path}: expected at least one frame, found none")
 
 
-def _frames(path: Path, chosen: range) -> Iterator[PixelArray]:
+def _frames(path: Path, chosen: Sequence[int], limits: Limits) -> Iterator[PixelArray]:
     import tifffile
 
     with input_errors(path), _tiff_errors(path), tifffile.TiffFile(path) as tiff:
         for number in chosen:
             page = tiff.pages[number].aspage()
-            check_pixel_count(page.imagewidth, page.imagelength, str(path))
+            _check_page(path, page, limits)
             channels, _ = _channels(path, page)
+            _check_inflation(path, page)
             pixels = page.asarray()
             if pixels.ndim == 3:
                 # Planes stored one after the other come as (C, H, W).
                 pixels = np.moveaxis(pixels, 0, -1) if page.axes.startswith("S") else pixels
                 pixels = pixels[..., :3] if channels else pixels[..., 0]
             yield np.iinfo(pixels.dtype).max - pixels if page.photometric == _WHITE_IS_ZERO else pixels
+
+
+def _check_page(path: Path, page: tifffile.TiffPage, limits: Limits) -> None:
+    """Refuse a page by its tags: too many pixels in the page or in one of its tiles, or too many values a pixel."""
+    limits.check_size(page.imagewidth, page.imagelength, str(path))
+    if page.is_tiled:
+        limits.check_size(page.tilewidth, page.tilelength, f"{path}: a tile")
+    if page.samplesperpixel > _MOST_SAMPLES:
+        raise DataError(f"{path}: expected up to {_MOST_SAMPLES} values a pixel, found {page.samplesperpixel}")
+
+
+def _check_inflation(path: Path, page: tifffile.TiffPage) -> None:
+    """Refuse compressed parts that inflate to more than the page has room for; tifffile would inflate them first."""
+    if page.compression not in (*_DEFLATE, _LZMA):
+        return
+    room = int(np.prod(page.chunks)) * np.dtype(page.dtype).itemsize
+    for offset, size in zip(page.dataoffsets, page.databytecounts, strict=True):
+        page.parent.filehandle.seek(offset)
+        data = page.parent.filehandle.read(size)
+        inflate = lzma.LZMADecompressor() if page.compression == _LZMA else zlib.decompressobj()
+        try:
+            found = len(inflate.decompress(data, room + 1))
+        except (zlib.error, lzma.LZMAError) as error:
+            raise DataError(
+                f"{path}: compressed pixels are damaged ({first_line(error)}); copy the file again"
+            ) from error
+        if found > room:
+            raise DataError(f"{path}: damaged; compressed pixels hold more than the {room} bytes that the page has")
 
 
 def _channels(path: Path, page: tifffile.TiffPage) -> tuple[tuple[int, ...], tuple[str, ...]]:
@@ -170,7 +206,7 @@ def _packed_stack(path: Path, tiff: tifffile.TiffFile) -> FrameSource | None:
     return dataclasses.replace(source, format=f"tiff/{series.dtype}", path=path)
 
 
-def _count_pages(path: Path, file: BinaryIO) -> int:
+def _count_pages(path: Path, file: BinaryIO, limits: Limits) -> int:
     """Follow the chain of pages to its end."""
     head = file.read(16)
     order = {b"II": "<", b"MM": ">"}.get(head[:2], "")
@@ -180,15 +216,18 @@ def _count_pages(path: Path, file: BinaryIO) -> int:
     count_format, entry_size, link_format = ("H", 12, "I") if version == 42 else ("Q", 20, "Q")
     link_size = struct.calcsize(link_format)
     offset = struct.unpack(order + link_format, head[4:8] if version == 42 else head[8:16])[0]
+    size = os.fstat(file.fileno()).st_size
     seen: set[int] = set()
     while offset:
         if offset in seen:
             raise DataError(f"{path}: damaged; its pages form a circle")
         seen.add(offset)
-        file.seek(offset)
+        limits.check_count(len(seen), str(path))
         try:
+            # Beyond the end nothing is read, and a larger offset than the system knows is none at all.
+            file.seek(min(offset, size))
             (entries,) = struct.unpack(order + count_format, file.read(struct.calcsize(count_format)))
-            file.seek(entries * entry_size, os.SEEK_CUR)
+            file.seek(min(file.tell() + entries * entry_size, size))
             (offset,) = struct.unpack(order + link_format, file.read(link_size))
         except struct.error:
             raise DataError(f"{path}: cut short after {len(seen) - 1} whole pages; copy the file again") from None

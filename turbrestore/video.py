@@ -17,7 +17,7 @@ import dataclasses
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -26,9 +26,11 @@ import numpy as np
 from .arrays import FloatArray, check_image, from_unit
 from .container import CONTAINER_SUFFIXES, open_container, write_mkv, write_mp4
 from .errors import DataError, require
-from .frame_source import FrameRange, FrameSource, Roi, check_frame_range, size_text
-from .images import IMAGE_SUFFIXES, atomic_output, check_output, first_line, input_errors, read_pixels
-from .pixels import PixelArray, check_depth, depth_of, full_scale_of
+from .frame_source import FrameRange, FrameSource, Roi, check_frame_range, numbers_text, size_text
+from .images import IMAGE_SUFFIXES, atomic_output, check_output, input_errors, read_pixels
+from .limits import DEFAULT_LIMITS, Limits
+from .npy import map_npy
+from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit
 from .ser import open_ser, write_ser
 from .tiff import open_tiff, write_tiff
 
@@ -40,7 +42,12 @@ __all__ = ["VIDEO_OUTPUT_SUFFIXES", "VIDEO_SUFFIXES", "FrameSource", "open_frame
 
 
 def open_frames(
-    path: str | os.PathLike[str], *, frames: FrameRange | None = None, roi: Roi | None = None
+    path: str | os.PathLike[str],
+    *,
+    frames: FrameRange | None = None,
+    roi: Roi | None = None,
+    limits: Limits = DEFAULT_LIMITS,
+    skip_damaged: bool = False,
 ) -> FrameSource:
     """Open a video: read its headers, check that it is whole, decode its first frame.
 
@@ -54,11 +61,17 @@ def open_frames(
         of the range is no error.
     roi : tuple of int, optional
         (x, y, width, height) in pixels.
+    limits : Limits
+        Largest video that is read.
+    skip_damaged : bool
+        Leave out, with a warning, what would be refused: the missing end of a file that is cut short, and frames whose
+        checksum fails and that no others depend on.
 
     Returns
     -------
     FrameSource
-        Decodes while iterating; nothing but one frame at a time is in memory.
+        Decodes while iterating; nothing but one frame at a time is in memory. NaN and infinite values are refused
+        there, unless :func:`turbrestore.clean_source` has filled them.
 
     Raises
     ------
@@ -86,22 +99,23 @@ def open_frames(
         is_folder = stat.S_ISDIR(path.stat().st_mode)
     suffix = path.suffix.lower()
     if is_folder:
-        source = _open_folder(path)
+        source = _open_folder(path, limits)
     elif suffix in CONTAINER_SUFFIXES:
-        source = open_container(path, frames)
+        source = open_container(path, frames, limits, skip_damaged)
     elif suffix == ".ser":
-        source = open_ser(path, wanted.stop)
+        source = open_ser(path, wanted.stop, limits, skip_damaged)
     elif suffix in TIFF_SUFFIXES:
-        source = open_tiff(path)
+        source = open_tiff(path, limits)
     elif suffix == ".npy":
-        source = _open_npy(path)
+        source = _open_npy(path, limits)
     elif suffix in IMAGE_SUFFIXES:
         raise DataError(f"{path}: a single image; name the folder that holds the frames")
     else:
         names = ", ".join(VIDEO_SUFFIXES)
         raise DataError(f"{path}: expected a folder of images or one of {names}, found {suffix or 'no suffix'}")
     source = source.select(frames, roi)
-    source.read(0, 1)
+    source = source.without(source.damaged, f"checksum fails: {numbers_text(source.damaged)} left out")
+    _check_first(source)
     return source
 
 
@@ -163,7 +177,15 @@ def write_video(
         write_tiff(path, checked, bit_depth, overwrite)
 
 
-def _open_folder(folder: Path) -> FrameSource:
+def _check_first(source: FrameSource) -> None:
+    """Refuse now what the first frame tells of all: a wrong size or scale."""
+    (pixels,) = source.select((0, 1)).native()
+    if np.issubdtype(pixels.dtype, np.floating):
+        pixels = np.where(np.isfinite(pixels), pixels, 0)
+    to_unit(pixels, source.full_scale, f"{source.name}: frame {source.numbers[0]}")
+
+
+def _open_folder(folder: Path, limits: Limits) -> FrameSource:
     with input_errors(folder):
         files = sorted(
             (
@@ -175,14 +197,15 @@ def _open_folder(folder: Path) -> FrameSource:
         )
     if not files:
         raise DataError(f"{folder}: expected images ({', '.join(IMAGE_SUFFIXES)}), found none in the folder")
-    first, notes = read_pixels(files[0])
+    limits.check_count(len(files), str(folder))
+    first, notes = read_pixels(files[0], limits)
     return FrameSource(
         name=folder.name,
         format=f"images/{files[0].suffix.lower()[1:]}",
         file_shape=(len(files), *first.shape),
         full_scale=full_scale_of(first.dtype, str(files[0])),
         bit_depth=depth_of(first.dtype),
-        pixels=lambda chosen: _images(files, chosen, first.dtype, first.shape),
+        pixels=lambda chosen: _images(files, chosen, first.dtype, first.shape, limits),
         path=folder,
         warnings=notes,
     )
@@ -194,22 +217,22 @@ def _natural(file: Path) -> tuple[list[tuple[int, str]], str]:
     return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts], file.name
 
 
-def _images(files: list[Path], chosen: range, dtype: np.dtype, shape: tuple[int, ...]) -> Iterator[PixelArray]:
+def _images(
+    files: list[Path], chosen: Sequence[int], dtype: np.dtype, shape: tuple[int, ...], limits: Limits
+) -> Iterator[PixelArray]:
     for number in chosen:
-        pixels, _ = read_pixels(files[number])
+        pixels, _ = read_pixels(files[number], limits)
         if pixels.dtype != dtype or pixels.shape != shape:
             expected, found = f"{size_text(shape)} {dtype}", f"{size_text(pixels.shape)} {pixels.dtype}"
             raise DataError(f"{files[number]}: expected {expected} as the first image, found {found}")
         yield pixels
 
 
-def _open_npy(path: Path) -> FrameSource:
-    with input_errors(path):
-        try:
-            array = np.lib.format.open_memmap(path, mode="r")
-        except (ValueError, EOFError, SyntaxError) as error:
-            raise DataError(f"{path}: not a whole .npy array of numbers ({first_line(error)})") from error
+def _open_npy(path: Path, limits: Limits) -> FrameSource:
+    array = map_npy(path)
     source = FrameSource.from_array(array, path.name)
+    limits.check_size(source.shape[2], source.shape[1], str(path))
+    limits.check_count(len(source), str(path))
     return dataclasses.replace(source, format=f"npy/{array.dtype}", path=path)
 
 

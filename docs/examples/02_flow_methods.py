@@ -85,8 +85,8 @@ for method in METHODS:
 print(f"mean length of the true flow {found.true_length:.2f} px")
 
 # %% [markdown]
-# All three find most of the motion; the error is a mean over the image, flat sky included. `dis` is the most exact
-# here, TV-L1 takes several times as long, and Farneback's method is the fastest.
+# All three find most of the motion; the error is a mean over the image, flat sky included. `dis` and TV-L1 are equally
+# exact here and take about as long; Farneback's method is faster and errs a little more.
 
 # %% [markdown]
 # ## Where they err
@@ -110,8 +110,7 @@ for ax in axes.flat:
 # %% [markdown]
 # On the ground and on the face all methods are nearly exact. In the sky there is nothing to hold on to: the flow
 # continues that of the surroundings, and where the true flow does something else, as in the upper right, no method can
-# know. TV-L1 has the smoothest flow, in patches of one value; Farneback's method errs in spots, also along the outline
-# of the coat.
+# know. TV-L1 has the smoothest flow; Farneback's method errs in spots, also along the outline of the coat.
 
 # %% [markdown]
 # ## Texture and noise
@@ -148,5 +147,5 @@ for ax in (left, right):
 
 # %% [markdown]
 # In the flattest fifth the error is several times that where there is detail, whatever the method. That is less bad
-# than it looks: where nothing can be seen to move, little is blurred by moving it wrongly. `dis` errs least in every
-# fifth, and is the default for that and for its speed. With much noise the methods come together.
+# than it looks: where nothing can be seen to move, little is blurred by moving it wrongly. Where there is detail, `dis`
+# and TV-L1 err less than Farneback's method. `dis` is the default: the centroid that it leads to is a little sharper.

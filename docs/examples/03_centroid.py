@@ -96,7 +96,8 @@ show({name: images[name][detail] for name in ("temporal mean", "centroid, fused"
 
 # %% [markdown]
 # ## Convergence
-# What is iterated to zero is the mean of the flows from the image to all frames. Right, the same with fewer frames.
+# What is iterated to zero is the mean of the flows from the image to all frames. Right, how close the centroid comes to
+# the scene as more frames are used.
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3))

@@ -1,0 +1,59 @@
+"""The folder of ``--keep`` while a run is at work in it: lock, checkpoints, and what becomes of an interruption."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from turbrestore.folder_lock import lock_folder
+from turbrestore.frame_source import FrameSource
+from turbrestore.images import check_space
+from turbrestore.pipeline import RestoreParams, training_share
+from turbrestore.resumption import KeptStages, read_stages
+
+from .progress import say
+
+# Images that a kept run holds, some of them twice while they are replaced, at most four bytes a channel.
+_IMAGES = 24
+# The flow model has at most one mode for so many training frames.
+_FRAMES_A_MODE = 2
+
+
+@contextmanager
+def kept_stages(
+    folder: Path | None, source: FrameSource, params: RestoreParams, resume: bool, every: int, quiet: bool
+) -> Iterator[KeptStages | None]:
+    """Hold the folder, take over what an earlier run has left, and keep the newest state if this one is interrupted."""
+    if folder is None:
+        yield None
+        return
+    with lock_folder(folder) as locks:
+        if not locks:
+            say(f"{folder}: this file system knows no locks; see to it that no other run uses the folder", quiet)
+        stages = KeptStages(folder, source, params, resume, every)
+        for note in stages.notes:
+            say(f"{folder}: {note}", quiet)
+        try:
+            yield stages
+        except KeyboardInterrupt as stop:
+            stages.flush()
+            stop.args = (f"{str(stop) or 'interrupted'}; --keep {folder} --resume goes on {stages.progress()}",)
+            raise
+
+
+def own_outputs(folder: Path) -> set[Path]:
+    """List the outputs that an earlier run was writing when it died; it may replace them."""
+    record = read_stages(folder)
+    return set() if record is None else {Path(name) for name in record["outputs"]}
+
+
+def check_room(source: FrameSource, params: RestoreParams, output: Path, folder: Path | None) -> None:
+    """Refuse to begin what would end on a full disk."""
+    height, width = source.shape[1:3]
+    image = 4 * height * width * (3 if len(source.shape) == 4 else 1)
+    check_space(output, image)
+    if folder is not None:
+        flow = 8 * height * width
+        train = training_share(len(source), source.shape[1:], params.train)
+        check_space(folder, flow * (train + train // _FRAMES_A_MODE) + _IMAGES * image)

@@ -1,0 +1,178 @@
+"""Whatever the bytes: a reader gives frames in [0, 1] or one of the errors that are meant, never anything else."""
+
+import json
+import struct
+import warnings
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from turbrestore.artifacts import load_artifact, save_artifact
+from turbrestore.centroid import Centroid
+from turbrestore.content import check_content, clean_source
+from turbrestore.errors import TurbrestoreError
+from turbrestore.images import read_image
+from turbrestore.limits import Limits
+from turbrestore.npy import map_npy, read_npz
+from turbrestore.video import open_frames, write_video
+
+SMALL = Limits(max_pixels=10_000, max_frames=200, max_bytes=10**6)
+FRAMES = np.random.default_rng(0).random((3, 8, 10), dtype=np.float32)
+# Shared folders are fine here: every example writes the same file anew.
+MANY = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+CHANGES = st.lists(
+    st.tuples(st.sampled_from(["set", "cut", "insert", "repeat"]), st.floats(0, 1), st.binary(min_size=1, max_size=8)),
+    min_size=1,
+    max_size=4,
+)
+
+
+def changed(data: bytes, changes) -> bytes:
+    for kind, share, value in changes:
+        place = int(share * len(data))
+        if kind == "set":
+            data = data[:place] + value + data[place + len(value) :]
+        elif kind == "insert":
+            data = data[:place] + value + data[place:]
+        elif kind == "repeat":
+            data = data[:place] + data[max(0, place - 40) : place] + data[place:]
+        elif len(data) > 20:
+            data = data[:place]
+    return data
+
+
+def looked_through(path):
+    """Frames, or None where the file is refused in one line."""
+    try:
+        source = open_frames(path, limits=SMALL)
+        frames = list(clean_source(source, check_content(source)))
+    except TurbrestoreError as error:
+        assert "\n" not in str(error) and str(path.name) in str(error)
+        return None
+    for frame in frames:
+        assert frame.dtype == np.float32 and frame.size <= 3 * SMALL.max_pixels
+        assert frame.min() >= 0 and frame.max() <= 1
+    return frames
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    for suffix in (".ser", ".npy", ".tif", ".mkv", ".mp4"):
+        write_video(folder / f"a{suffix}", FRAMES, 25, 8)
+    flows = np.zeros((2, 8, 10, 2), np.float32)
+    save_artifact(folder / "a.npz", Centroid(FRAMES[0], flows, np.zeros(2), True))
+    return folder
+
+
+@pytest.mark.parametrize("suffix", [".ser", ".npy", ".tif", ".mkv", ".mp4"])
+@given(changes=CHANGES)
+@MANY
+def test_changed_files(tmp_path, whole, suffix, changes):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(changed((whole / path.name).read_bytes(), changes))
+    looked_through(path)
+
+
+@given(
+    colour=st.sampled_from([0, 8, 9, 11, 100, 101, 7, -1]),
+    flag=st.integers(-1, 2),
+    sizes=st.tuples(*[st.sampled_from([-1, 0, 1, 2, 3, 8, 200, 2**20, 2**31 - 1])] * 2),
+    depth=st.integers(-1, 18),
+    count=st.sampled_from([-5, 0, 1, 2, 5, 300, 2**31 - 1]),
+    body=st.binary(max_size=600),
+)
+@settings(MANY, max_examples=200)
+def test_any_ser_header(tmp_path, colour, flag, sizes, depth, count, body):
+    head = b"LUCAM-RECORDER" + struct.pack("<7i", 0, colour, flag, *sizes, depth, count)
+    (tmp_path / "a.ser").write_bytes(head.ljust(178, b"\0") + body)
+    looked_through(tmp_path / "a.ser")
+
+
+@given(data=st.binary(max_size=300), suffix=st.sampled_from([".ser", ".npy", ".tif", ".mkv", ".gif", ".avi", ".mp4"]))
+@settings(MANY, max_examples=100)
+def test_any_bytes(tmp_path, data, suffix):
+    magic = {".ser": b"LUCAM-RECORDER", ".npy": b"\x93NUMPY\x01\x00", ".tif": b"II*\0\x08\0\0\0", ".gif": b"GIF89a"}
+    (tmp_path / f"a{suffix}").write_bytes(magic.get(suffix, b"") + data)
+    assert looked_through(tmp_path / f"a{suffix}") is None or suffix in (".ser", ".npy", ".gif")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".webp", ".jpg"])
+@given(changes=CHANGES)
+@MANY
+def test_changed_images(tmp_path, suffix, changes):
+    data = cv2.imencode(suffix, np.uint8(255 * FRAMES[0]))[1].tobytes()
+    (tmp_path / f"a{suffix}").write_bytes(changed(data, changes))
+    try:
+        image = read_image(tmp_path / f"a{suffix}", SMALL).image
+    except TurbrestoreError as error:
+        assert "\n" not in str(error)
+    else:
+        assert image.min() >= 0 and image.max() <= 1
+
+
+class TestArchives:
+    @given(changes=CHANGES)
+    @settings(MANY, max_examples=150)
+    def test_changed_archives(self, tmp_path, whole, changes):
+        (tmp_path / "a.npz").write_bytes(changed((whole / "a.npz").read_bytes(), changes))
+        try:
+            arrays = read_npz(tmp_path / "a.npz", SMALL)
+        except TurbrestoreError as error:
+            assert "\n" not in str(error)
+        else:
+            assert sum(array.nbytes for array in arrays.values()) <= SMALL.max_bytes
+
+    @given(
+        text=st.text(st.sampled_from("(){}[]',:0123456789-<>|ufOVdescrfortran_orderTrueFalseshape \n"), max_size=120)
+    )
+    @settings(MANY, max_examples=200)
+    def test_any_header_of_an_array(self, tmp_path, text):
+        header = text.encode() + b"\n"
+        data = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(64)
+        (tmp_path / "a.npy").write_bytes(data)
+        with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+            archive.writestr("a.npy", data)
+        for read in (map_npy, read_npz):
+            with warnings.catch_warnings():
+                # NumPy warns of headers as Python 2 wrote them.
+                warnings.simplefilter("ignore", UserWarning)
+                try:
+                    read(tmp_path / ("a.npy" if read is map_npy else "a.npz"))
+                except TurbrestoreError as error:
+                    assert "\n" not in str(error)
+
+    @given(
+        header=st.recursive(
+            st.none()
+            | st.booleans()
+            | st.floats()
+            | st.text(max_size=8)
+            | st.sampled_from(["centroid", 1, "dynamics"]),
+            lambda inner: (
+                st.lists(inner, max_size=3)
+                | st.dictionaries(
+                    st.sampled_from(
+                        ["kind", "schema", "fields", "converged", "image", "flows", "mean_flow_sizes", "x"]
+                    ),
+                    inner,
+                    max_size=4,
+                )
+            ),
+            max_leaves=8,
+        ),
+        kept=st.sets(st.sampled_from(["image", "flows", "mean_flow_sizes"])),
+    )
+    @settings(MANY, max_examples=150)
+    def test_any_header_of_an_artifact(self, tmp_path, header, kept):
+        arrays = {name: np.zeros(3) for name in kept}
+        np.savez(tmp_path / "a.npz", allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
+        try:
+            load_artifact(tmp_path / "a.npz", Centroid)
+        except TurbrestoreError as error:
+            assert "\n" not in str(error)

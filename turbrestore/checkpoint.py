@@ -1,0 +1,96 @@
+"""The state of the filter on disk, between two blocks of frames."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from .alternating import FilterCheckpoint, FilterState, FrameRecord
+from .errors import DataError, InputNotFoundError
+from .images import atomic_output
+from .kalman import Gaussian, PixelGaussian
+from .npy import read_npz
+
+_FIGURES = ("gain", "innovation", "sharpness", "information")
+_ARRAYS = ("image", "variance", "flow", "covariance", "flow_states", *_FIGURES)
+
+
+def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, key: str) -> None:
+    """Write a checkpoint; an older one is replaced when the new one is complete.
+
+    Parameters
+    ----------
+    path : path
+    checkpoint : FilterCheckpoint
+    key : str
+        Tells of which frames and settings it is; kept in the file, so that file and key cannot come apart.
+
+    Raises
+    ------
+    OutputError, StorageError
+        The file cannot be created or completed; the older one is left.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> state = FilterState(PixelGaussian(np.zeros((2, 3)), np.ones((2, 3))), Gaussian(np.zeros(1), np.eye(1)))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     one = FilterCheckpoint(state, (FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0),))
+    ...     save_checkpoint(folder + "/c.npz", one, "A")
+    ...     len(load_checkpoint(folder + "/c.npz", "A").records)
+    1
+    """
+    image, flow, records = checkpoint.state.image, checkpoint.state.flow, checkpoint.records
+    arrays: dict[str, np.ndarray] = {name: np.array([getattr(record, name) for record in records]) for name in _FIGURES}
+    states = np.array([record.flow_state for record in records], np.float64)
+    arrays |= {"image": image.mean, "variance": image.variance, "flow": flow.mean, "covariance": flow.cov}
+    with atomic_output(path, overwrite=True) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, key=np.array(key), flow_states=states, **arrays)
+
+
+def load_checkpoint(path: str | os.PathLike[str], key: str) -> FilterCheckpoint:
+    """Read a checkpoint back.
+
+    Parameters
+    ----------
+    path : path
+        File written by :func:`save_checkpoint`.
+    key : str
+        What it was written with.
+
+    Returns
+    -------
+    FilterCheckpoint
+
+    Raises
+    ------
+    InputNotFoundError
+        There is no such file.
+    DataError
+        It is damaged, something else or has another key.
+
+    Examples
+    --------
+    >>> load_checkpoint("missing.npz", "A")
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.InputNotFoundError: missing.npz: no such file
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise InputNotFoundError(f"{source}: no such file")
+    try:
+        kept = read_npz(source)
+        arrays, found = {name: kept[name] for name in _ARRAYS}, str(kept["key"])
+        states, figures = arrays["flow_states"], np.stack([arrays[name] for name in _FIGURES], axis=-1)
+        records = tuple(FrameRecord(state, *map(float, row)) for state, row in zip(states, figures, strict=True))
+        state = FilterState(
+            PixelGaussian(arrays["image"], arrays["variance"]), Gaussian(arrays["flow"], arrays["covariance"])
+        )
+    except (DataError, KeyError, ValueError, AttributeError, TypeError) as error:
+        raise DataError(f"{source}: expected a checkpoint of the filter, found something else or damage") from error
+    if found != key:
+        raise DataError(f"{source}: expected a checkpoint of this run, found one of other frames or settings")
+    return FilterCheckpoint(state, records)
