@@ -126,7 +126,6 @@ class KeptStages:
         every: int = 50,
     ) -> None:
         require(every >= 1, f"checkpoint_every: expected at least 1 frame, found {every}")
-        require(every >= 1, f"checkpoint_every: expected at least 1 frame, found {every}")
         self.folder, self._every, self._block = Path(folder), every, params.filter.block
         self._facts = stage_facts(source, params)
         self._key = _key(self._facts)

@@ -1,0 +1,152 @@
+"""Everything that the documentation promises about odd input, bad arguments, interruptions and files, in one table.
+
+Run ``python benchmarks/robustness.py``; it prints a Markdown table and exits with 1 when a row fails.  ``--groups``
+runs some of them; ``--write`` puts the table into a document, between its marks.
+
+Hostile input and interruptions are programs of their own; bad arguments and round trips are the cases of the tests.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from turbrestore.images import atomic_write
+
+HERE = Path(__file__).parent
+TESTS = HERE.parent / "tests"
+START, END = "<!-- robustness -->\n", "<!-- end of robustness -->"
+
+
+@dataclass(frozen=True)
+class Row:
+    """Cases of one kind: how many, when they pass, how many did, and what failed."""
+
+    title: str
+    count: int
+    rule: str
+    passed: int
+    failures: tuple[str, ...] = ()
+
+
+def main() -> int:
+    """Run the groups and print the table."""
+    options = _options()
+    rows: list[Row] = []
+    for name in options.groups or GROUPS:
+        print(f"{name} …", file=sys.stderr, flush=True)
+        rows += GROUPS[name]()
+    text = table(rows)
+    print(text, end="")
+    for row in rows:
+        for failure in row.failures:
+            print(f"{row.title}: {failure}", file=sys.stderr)
+    if options.write is not None:
+        _put(options.write, text)
+    return int(any(row.passed < row.count for row in rows))
+
+
+def table(rows: list[Row]) -> str:
+    """Rows as Markdown."""
+    lines = [f"| {row.title} | {row.count} | {row.rule} | {row.passed} |" for row in rows]
+    return "\n".join(["| group | count | passes when | passed |", "|---|---|---|---|", *lines]) + "\n"
+
+
+def hostile_input() -> list[Row]:
+    """Rows of benchmarks/hostile_input.py as it prints them."""
+    done = _program("hostile_input.py")
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines() if line[:1] == "|"]
+    rows = [Row(title, int(count), rule, int(passed)) for title, count, rule, passed in cells[2:]]
+    # Its complaints name the case; a program that broke off has no rows to show for it.
+    return rows or [Row("hostile input", 1, "the program runs", 0, (done.stderr[-500:],))]
+
+
+def interruptions() -> list[Row]:
+    """Rows of benchmarks/interruptions.py."""
+    done = _program("interruptions.py", "--json")
+    try:
+        record = json.loads(done.stdout)
+    except ValueError:
+        return [Row("interruptions", 1, "the program runs", 0, (done.stderr[-500:],))]
+    rule = (
+        "nothing partial is left, inputs stay as they are, a resumed run ends bit for bit as one without interruption"
+    )
+    refused = "the exit code for it, one line, nothing is left or changed"
+    left_out = "" if record.pop("mounts") else "; without full and read-only disks, which need the right to mount"
+    rows = []
+    for title, found in record.items():
+        failures = tuple(f"{name}: {'; '.join(faults)}" for name, faults in found["failed"].items())
+        signal = title.startswith("SIG")
+        words = f"interrupted by {title}" if signal else f"{title}{left_out}"
+        rows.append(Row(words, found["cases"], rule if signal else refused, found["cases"] - len(failures), failures))
+    return rows
+
+
+def bad_arguments() -> list[Row]:
+    """Arguments and settings files of tests/test_bad_arguments.py."""
+    cases = importlib.import_module("test_bad_arguments")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        cases.write_inputs(folder)
+        found = [(str(case), cases.complaint(case, folder)) for case in cases.CASES]
+    failures = tuple(f"{case}: {complaint}" for case, complaint in found if complaint)
+    rule = (
+        "exit 2, or 66 for a missing file; one line, no traceback, no output; names the option or key, and the nearest "
+        "name for a misspelt one"
+    )
+    title = "bad arguments and TOML: misspelt, wrong types, out of range, contradicting, misplaced, missing"
+    return [Row(title, len(found), rule, len(found) - len(failures), failures)]
+
+
+def round_trips() -> list[Row]:
+    """Pairs of a writer and its reader of tests/test_round_trips.py."""
+    pairs = importlib.import_module("test_round_trips")
+    passed, failures = 0, []
+    for name in pairs.PAIRS:
+        try:
+            count = pairs.passed(name)
+            passed += count >= pairs.EXAMPLES
+        except Exception as error:  # whatever a writer or reader raises is what failed
+            failures.append(f"{name}: {error!r:.300}")
+    title = f"round trips of every writer and reader, {pairs.EXAMPLES} random examples each"
+    return [Row(title, len(pairs.PAIRS), "every array and field comes back, bit for bit", passed, tuple(failures))]
+
+
+GROUPS: dict[str, Callable[[], list[Row]]] = {
+    "hostile-input": hostile_input,
+    "bad-arguments": bad_arguments,
+    "interruptions": interruptions,
+    "round-trips": round_trips,
+}
+
+
+def _program(name: str, *words: str) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run([sys.executable, str(HERE / name), *words], capture_output=True, text=True, check=False)
+    sys.stderr.write(done.stderr)
+    return done
+
+
+def _put(path: Path, text: str) -> None:
+    head, start, rest = path.read_text("utf-8").partition(START)
+    if not start:
+        raise SystemExit(f"{path}: expected the line {START.strip()}")
+    atomic_write(path, f"{head}{START}{text}{END}{rest.partition(END)[2]}".encode(), overwrite=True)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--groups", nargs="+", choices=GROUPS, metavar="NAME", help=f"some of: {', '.join(GROUPS)}")
+    parser.add_argument("--write", type=Path, help="document whose table is replaced")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(TESTS))
+    sys.exit(main())
