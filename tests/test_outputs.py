@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from collections import namedtuple
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -44,19 +45,24 @@ WRITERS = {
 resource = pytest.importorskip("resource", reason="the size of files is limited by a call that Windows lacks")
 
 
-@pytest.fixture
+@contextmanager
 def small_files():
-    """No file grows beyond 2 KiB, as on a full disk."""
+    """No file grows beyond 2 KiB, as on a full disk.
+
+    Not a fixture: pytest would write its report, which may be a file, while the limit holds.
+    """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2048, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize("name", WRITERS)
 class TestWriters:
-    def test_what_breaks_off_leaves_nothing(self, tmp_path, small_files, name):
-        with pytest.raises(StorageError, match=name):
+    def test_what_breaks_off_leaves_nothing(self, tmp_path, name):
+        with pytest.raises(StorageError, match=name), small_files():
             WRITERS[name](tmp_path / name)
         assert list(tmp_path.iterdir()) == []
 
