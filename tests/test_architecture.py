@@ -11,10 +11,12 @@ PACKAGE = Path(__file__).parents[1] / "turbrestore"
 # A module imports only from those before it.
 ORDER = [
     "errors", "arrays", "decision", "plots", "preview",
-    "parallel", "pixels", "limits", "images", "npy", "frame_source", "content", "integrity", "ser", "tiff",
-    "container", "video", "warp", "psf", "stabilisation", "confidence", "image_stacks", "tvl1_sweeps", "tvl1", "flow",
+    "parallel", "pixels", "limits", "images", "npy", "frame_source", "stuck_pixels",
+    "scene_cuts", "content", "integrity", "ser", "tiff", "container", "encoding", "video",
+    "warp", "psf", "stabilisation", "confidence", "image_stacks", "tvl1_sweeps", "tvl1", "flow",
     "centroid", "dynamics", "kalman",
-    "blur_moments", "frame_noise", "alternating", "blur_estimation", "blur_cues", "nonlocal_tv", "deconvolution",
+    "blur_moments", "frame_noise", "alternating", "blur_estimation", "blur_cues", "nonlocal_tv", "convolution_problem",
+    "conjugate_gradients", "primal_dual", "local_tv", "deconvolution",
     "blur_map", "guards", "blind", "border", "frame_selection", "explanation", "synthesis", "metrics", "pipeline",
     "artifacts", "run_record", "checkpoint", "folder_lock", "resumption", "report",
 ]  # fmt: skip

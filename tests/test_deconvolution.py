@@ -8,23 +8,13 @@ import pytest
 from scipy import fft, optimize
 from skimage import data
 
-from turbrestore import deconvolution
+from turbrestore import primal_dual
 from turbrestore.blur_estimation import BlurEstimate
-from turbrestore.deconvolution import (
-    BOUNDARIES,
-    METHODS,
-    ConjugateGradients,
-    DeconvolutionParams,
-    PrimalDual,
-    PrimalDualState,
-    Problem,
-    Regulariser,
-    automatic_fidelity,
-    deconvolve,
-    local_divergence,
-    local_gradient,
-)
+from turbrestore.conjugate_gradients import ConjugateGradients
+from turbrestore.convolution_problem import Problem
+from turbrestore.deconvolution import BOUNDARIES, METHODS, DeconvolutionParams, automatic_fidelity, deconvolve
 from turbrestore.errors import ConfigurationError, DataError
+from turbrestore.local_tv import local_divergence, local_gradient
 from turbrestore.nonlocal_tv import (
     NonlocalParams,
     nonlocal_divergence,
@@ -34,6 +24,7 @@ from turbrestore.nonlocal_tv import (
     nonlocal_weights,
     project_to_unit,
 )
+from turbrestore.primal_dual import PrimalDual, PrimalDualState, Regulariser
 from turbrestore.psf import gaussian_otf, gaussian_psf, laplacian_symbol, psf_to_otf
 
 TV = Regulariser(
@@ -131,8 +122,8 @@ def test_one_step_is_the_proximal_step_of_the_filled_in_data(margin):
     u = rng.random((8, 8)).astype(np.float32)
     p = TV.project(rng.normal(size=(2, 8, 8)).astype(np.float32))
     after = PrimalDual(TV).step(problem, PrimalDualState(u, p)).image
-    relaxed = u + (after - u) / deconvolution._RELAXATION
-    tau = deconvolution._PRIMAL_STEP / np.sqrt(TV.norm_squared)
+    relaxed = u + (after - u) / primal_dual._RELAXATION
+    tau = primal_dual._PRIMAL_STEP / np.sqrt(TV.norm_squared)
     blur = dense_blur(problem)
     target = (u - tau * TV.adjoint(p)).ravel()
     filled = np.where(problem.seen > 0, problem.observed, (blur @ u.ravel()).reshape(8, 8)).ravel()

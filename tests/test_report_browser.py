@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from playwright.sync_api import sync_playwright
 
 from conftest import make_sequence
 from turbrestore.centroid import CentroidParams
@@ -25,9 +26,9 @@ WIDE, NARROW = {"width": 1000, "height": 700}, {"width": 360, "height": 640}
 @pytest.fixture(scope="module")
 def browser():
     if CHROMIUM is None:
+        # A browser is no Python package: the extra `dev` cannot bring it.
         pytest.skip("no Chromium on the path; install chromium to test the report in a browser")
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
-    with api.sync_playwright() as playwright:
+    with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield browser
         browser.close()

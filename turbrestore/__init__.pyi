@@ -15,7 +15,6 @@ from .centroid import CentroidParams as CentroidParams
 from .centroid import find_centroid as find_centroid
 from .content import ContentParams as ContentParams
 from .content import ContentReport as ContentReport
-from .content import Scene as Scene
 from .content import check_content as check_content
 from .content import clean_source as clean_source
 from .decision import Decision as Decision
@@ -45,6 +44,7 @@ from .run_record import RunRecord as RunRecord
 from .run_record import describe_run as describe_run
 from .run_record import load_run as load_run
 from .run_record import save_run as save_run
+from .scene_cuts import Scene as Scene
 from .stabilisation import global_shifts as global_shifts
 from .synthesis.anisoplanatic import diffraction_limited as diffraction_limited
 from .synthesis.anisoplanatic import phase_screen_frames as phase_screen_frames

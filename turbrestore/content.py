@@ -11,15 +11,7 @@ cuts                  two frames look alike under no shift                      
 saturation            half of the values or more at white                                only says so
 ====================  =================================================================  =============================
 
-Frames are compared as 32×32 thumbnails without their slow shading, by the normalised cross-correlation at its best
-circular shift.  On stored clips (eight simulated, twelve real, drift and shake among them) frames of one scene reach
-0.69 or more; half of all pairs of different scenes stay below 0.23.  Scenes that look alike at this size, such as two
-pages of text, pass for one.  Where frames are unlike throughout, as under heavy noise, no cut is claimed.
-
-A stuck pixel differs from a small detail of the scene in two ways, one of which has to hold: it stands alone, its
-neighbours show nothing of it although any lens and any motion would spread it; or it never changes while its
-neighbours do.  Pairs and clusters are not found, nor pixels at the border, nor what a lossy codec or a Bayer pattern
-has spread.
+How cuts and stuck pixels are told from the scene: :mod:`turbrestore.scene_cuts`, :mod:`turbrestore.stuck_pixels`.
 """
 
 from __future__ import annotations
@@ -32,31 +24,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import FloatArray, luminance
 from .errors import ConfigurationError, DataError, require_between
 from .frame_source import FrameSource, numbers_text
 from .pixels import PixelArray, to_unit
+from .scene_cuts import Scene, SceneWatch, divide, thumbnail
+from .stuck_pixels import StuckPixels, without_stuck
 
 # More values than this share are no isolated defects.
 _MOST_MISSING = 0.01
-_MOST_STUCK = 0.005
 # Rings of values that are filled around what is known.
 _WIDEST_HOLE = 32
-_FEWEST_FRAMES = 10
-# Frames in which pixels are compared everywhere before only few candidates are left to follow.
-_DENSE_FRAMES = 8
-# Share of its height over the median of the neighbours by which a lone pixel stands over the highest of them.
-_ALONE = 0.8
-_STILL, _MOVING = 1.5 / 255, 8 / 255
 _LEAST_CONTRAST = 1 / 510
 _SATURATED = 0.5
-_SIDE = 32
-# A scene follows slow changes, such as drift and daylight, at this rate.
-_FORGETTING = 0.1
-# Scenes that are remembered, to know one that comes back.
-_MOST_SCENES = 16
-_RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
-_AROUND = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
 
 
 @dataclass(frozen=True)
@@ -90,23 +69,6 @@ class ContentParams:
     def __post_init__(self) -> None:
         for name in ("blank_contrast", "cut_similarity", "stuck_excess"):
             require_between(name, getattr(self, name), 0, 1)
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Frames that show the same.
-
-    Attributes
-    ----------
-    first, last : int
-        Numbers, in the file, of its first and its last frame; frames of other scenes may lie between.
-    count : int
-        How many frames it has.
-    """
-
-    first: int
-    last: int
-    count: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +189,7 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
 
     def repaired(pixels: PixelArray) -> PixelArray:
         pixels = _filled(pixels) if fill else pixels
-        return _without_stuck(pixels, stuck) if len(stuck) else pixels
+        return without_stuck(pixels, stuck) if len(stuck) else pixels
 
     return dataclasses.replace(
         cleaned,
@@ -248,8 +210,8 @@ class _Watch:
         self._filled: list[int] = []
         self._filled_values = 0
         self._duplicated: list[int] = []
-        self._stuck = _StuckPixels(params.stuck_excess)
-        self._scenes = _Scenes(params.cut_similarity)
+        self._stuck = StuckPixels(params.stuck_excess)
+        self._scenes = SceneWatch(params.cut_similarity)
 
     def look(self, number: int, pixels: PixelArray) -> None:
         pixels = self._complete(number, pixels)
@@ -258,7 +220,7 @@ class _Watch:
         if self._previous is not None and np.array_equal(pixels, self._previous):
             self._duplicated.append(number)
         self._previous = pixels
-        thumb = _thumbnail(values)
+        thumb = thumbnail(values)
         contrast = float(thumb.std())
         self._contrasts.append(contrast)
         # A slowly updated median: blank frames must not count as scenes, nor end the watch on stuck pixels.
@@ -276,7 +238,7 @@ class _Watch:
         blank &= ~blank.all()
         duplicated = np.isin(numbers, self._duplicated)
         labels = np.where(blank, -1, self._scenes.labels())
-        scenes, used = _divide(numbers, labels)
+        scenes, used = divide(numbers, labels)
         left_out = blank | ~used
         # A video of one repeated frame is a still image; there is nothing else to take.
         repeated = (~(left_out | duplicated)).sum() < 2
@@ -316,126 +278,6 @@ class _Watch:
         return _filled(pixels) if missing else pixels
 
 
-class _StuckPixels:
-    """Pixels that have stood out of all their neighbours in every frame so far."""
-
-    def __init__(self, excess: float) -> None:
-        self._excess = excess
-        self._frames = 0
-        self._high: NDArray[np.bool_] | None = None
-        self._low: NDArray[np.bool_] | None = None
-        self._searching = True
-        self._places = np.empty((0, 2), np.int64)
-
-    def look(self, values: FloatArray) -> None:
-        if min(values.shape[:2]) < 3:
-            return
-        self._frames += 1
-        if self._searching:
-            self._look_everywhere(values)
-        elif len(self._places):
-            self._follow(values)
-
-    def found(self) -> NDArray[np.int64]:
-        """Row, column, and channel of colour frames."""
-        none = np.empty((0, 2), np.int64)
-        if self._searching or not len(self._places) or self._frames < _FEWEST_FRAMES:
-            return none
-        still = (self._most - self._least <= _STILL) & (self._moved() >= _MOVING)
-        stuck = self._places[still | (self._alone >= _ALONE)]
-        return none if len(stuck) > _MOST_STUCK * self._size else stuck
-
-    def _look_everywhere(self, values: FloatArray) -> None:
-        high = values - cv2.dilate(values, _RING) > self._excess
-        low = cv2.erode(values, _RING) - values > self._excess
-        self._high = high if self._high is None else self._high & high
-        self._low = low if self._low is None else self._low & low
-        count = np.count_nonzero(self._high) + np.count_nonzero(self._low)
-        if count > _MOST_STUCK * values.size and self._frames < _DENSE_FRAMES:
-            return
-        self._size = values.size
-        # At the border half of the neighbours are missing, and codecs and scalers leave marks.
-        for marks in (self._high, self._low):
-            marks[[0, -1]] = marks[:, [0, -1]] = False
-        self._places = np.argwhere(self._high | self._low)
-        if len(self._places) > 4 * _MOST_STUCK * values.size:
-            self._places = self._places[:0]
-        self._sign = np.where(self._high[tuple(self._places.T)], 1, -1).astype(np.float32)
-        self._searching, self._high, self._low = False, None, None
-        own, around = _with_neighbours(values, self._places)
-        self._least, self._most, self._lowest, self._highest = own, own, around, around
-        self._alone = np.full(len(own), np.inf, np.float32)
-
-    def _follow(self, values: FloatArray) -> None:
-        own, around = _with_neighbours(values, self._places)
-        sign = self._sign[:, None]
-        over = (sign * (own[:, None] - around)).min(axis=1)
-        keep = over > self._excess
-        height = np.abs(own - np.median(around, axis=1))
-        self._alone = np.minimum(self._alone, over / np.maximum(height, self._excess))[keep]
-        self._places, self._sign = self._places[keep], self._sign[keep]
-        self._least, self._most = np.minimum(self._least, own)[keep], np.maximum(self._most, own)[keep]
-        self._lowest = np.minimum(self._lowest, around)[keep]
-        self._highest = np.maximum(self._highest, around)[keep]
-
-    def _moved(self) -> FloatArray:
-        return (self._highest - self._lowest).mean(axis=1)
-
-
-class _Scenes:
-    """Which frames show the same; a scene that comes back is known again."""
-
-    def __init__(self, similarity: float) -> None:
-        self._similarity = similarity
-        self._labels = array("i")
-        self._alike = array("f")
-        self._references: list[FloatArray] = []
-        self._current = -1
-
-    def look(self, thumb: FloatArray) -> None:
-        detail = thumb - cv2.GaussianBlur(thumb, (0, 0), _SIDE / 6)
-        others = [label for label in range(len(self._references)) if label != self._current]
-        candidates = [self._current, *others] if self._current >= 0 else []
-        best = -1.0
-        for label in candidates:
-            alike = _similarity(detail, self._references[label])
-            best = max(best, alike)
-            if alike >= self._similarity:
-                self._current = label
-                self._references[label] += _FORGETTING * (detail - self._references[label])
-                break
-        else:
-            if len(self._references) < _MOST_SCENES:
-                self._references.append(detail.copy())
-            self._current = len(self._references) - 1
-        self._labels.append(self._current)
-        self._alike.append(best if candidates else 1.0)
-
-    def skip(self) -> None:
-        """Count a blank frame, which is of no scene."""
-        self._labels.append(-1)
-
-    def labels(self) -> NDArray[np.int32]:
-        """Scene of every frame; one for all where frames are unlike throughout."""
-        labels = np.array(self._labels, np.int32)
-        full = len(self._references) >= _MOST_SCENES
-        unlike = len(self._alike) > 0 and float(np.median(np.array(self._alike))) < (1 + self._similarity) / 2 - 0.1
-        return np.zeros_like(labels) if full or unlike else labels
-
-
-def _divide(numbers: NDArray[np.int64], labels: NDArray[np.int32]) -> tuple[tuple[Scene, ...], NDArray[np.bool_]]:
-    """Scenes by the labels of frames, and which frames belong to the longest; labels below 0 are of none."""
-    scenes: dict[int, Scene] = {}
-    for label in dict.fromkeys(labels.tolist()):
-        members = numbers[labels == label]
-        scenes[label] = Scene(int(members[0]), int(members[-1]), len(members))
-    scenes.pop(-1, None)
-    if not scenes:
-        return (Scene(int(numbers[0]), int(numbers[-1]), len(numbers)),), np.ones(len(numbers), bool)
-    longest = max(scenes, key=lambda label: scenes[label].count)
-    return tuple(scenes.values()), labels == longest
-
-
 def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     if report.contrast == 0:
         return ["every frame is of one intensity: there is no scene"]
@@ -466,36 +308,6 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     if report.saturated >= _SATURATED:
         lines.append(f"{100 * report.saturated:.0f} % of the values are at white: detail there is lost")
     return lines
-
-
-def _thumbnail(values: FloatArray) -> FloatArray:
-    size = min(_SIDE, values.shape[1]), min(_SIDE, values.shape[0])
-    thumb = luminance(cv2.resize(values, size, interpolation=cv2.INTER_AREA))
-    return thumb - thumb.mean()
-
-
-def _similarity(a: FloatArray, b: FloatArray) -> float:
-    """Normalised cross-correlation at the best circular shift; 0 where one has no detail."""
-    scale = float(np.linalg.norm(a)) * float(np.linalg.norm(b))
-    if scale == 0:
-        return 0.0
-    peak = np.fft.irfft2(np.fft.rfft2(a) * np.conj(np.fft.rfft2(b)), a.shape).max()
-    return float(peak) / scale
-
-
-def _with_neighbours(values: PixelArray, places: NDArray[np.int64]) -> tuple[PixelArray, PixelArray]:
-    """Values at places off the border, shape (N,), and those of their eight neighbours, shape (N, 8)."""
-    rows, columns = places[:, :1] + _AROUND[:, 0], places[:, 1:2] + _AROUND[:, 1]
-    channels = [places[:, 2:3]] if places.shape[1] == 3 else []
-    return values[tuple(places.T)], values[(rows, columns, *channels)]
-
-
-def _without_stuck(pixels: PixelArray, stuck: NDArray[np.int64]) -> PixelArray:
-    _, around = _with_neighbours(pixels, stuck)
-    middle = np.median(around, axis=1)
-    repaired = pixels.copy()
-    repaired[tuple(stuck.T)] = middle if np.issubdtype(pixels.dtype, np.floating) else np.rint(middle)
-    return repaired
 
 
 def _filled(pixels: PixelArray) -> PixelArray:

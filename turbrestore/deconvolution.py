@@ -9,8 +9,6 @@ k : point spread function; B : convolution with k, Bᵀ its adjoint (convolution
 M : 1 where a pixel was seen, 0 in the margin.
 λ : fidelity, the weight of the data. The paper's μ is 1 here, and 1/λ for its linear methods.
 J : ``Σ|∇_w u|`` ("nltv"), ``Σ|∇u|`` ("tv"), ``½‖∇u‖²`` ("wiener"), ``½‖u − mean f‖²`` ("tikhonov").
-K : gradient of the penalty, ∇_w or ∇; p : dual variable on its edges.
-τ, s : primal and dual step; ρ : over-relaxation.
 
 Boundary
 --------
@@ -18,24 +16,9 @@ Pixels near the border of f saw light from beyond it. The unknown u therefore ha
 side, in which M is 0, and the convolution is periodic on that larger domain: where its two sides meet nothing was
 seen. Local differences are periodic too.
 
-Algorithm for nltv and tv
--------------------------
-Condat–Vũ primal-dual splitting in the metric P = I/τ + λBᵀB. With ``h(u) = λ/2 ‖M(Bu − f)‖²``:
-
-    u' = u − P⁻¹(∇h(u) + Kᵀp),  ∇h(u) = λBᵀM(Bu − f)
-    p' = projection of p + sK(2u' − u) on |p|(x) ≤ 1
-    (u, p) ← (u, p) + ρ(u' − u, p' − p)
-
-P is diagonal in Fourier. The first line solves the data term exactly for data that are filled in where nothing was
-seen, ``u' = P⁻¹(u/τ − Kᵀp + λBᵀ(Mf + (1−M)Bu))``, so with M = 1 it is the proximal step of h. The start is the
-Wiener solution by conjugate gradients: it has a good margin already, which the splitting is slow to find.
-
-It converges for sτ‖K‖² ≤ 1 and ρ < 3/2. M is a projection, so with d = u − v
-
-    ‖∇h(u) − ∇h(v)‖² in the metric (λBᵀB)⁻¹  ≤  λ‖MBd‖²  =  ⟨∇h(u) − ∇h(v), d⟩,
-
-and ``P − sKᵀK ⪰ λBᵀB``: ∇h is 1-cocoercive in the metric (P − sKᵀK)⁻¹, which is what a forward step of the
-preconditioned splitting sees. Forward-backward splitting needs more than 1/2 and allows ρ < 2 − 1/2.
+Algorithms
+----------
+nltv and tv: :mod:`turbrestore.primal_dual`; wiener and tikhonov: :mod:`turbrestore.conjugate_gradients`.
 """
 
 from __future__ import annotations
@@ -51,7 +34,10 @@ from scipy import fft
 
 from .arrays import FloatArray, check_image, luminance
 from .blur_estimation import BlurEstimate
+from .conjugate_gradients import ConjugateGradients
+from .convolution_problem import Problem, inner
 from .errors import DataError, require, require_between
+from .local_tv import LOCAL_TV
 from .nonlocal_tv import (
     NonlocalParams,
     nonlocal_divergence,
@@ -62,9 +48,9 @@ from .nonlocal_tv import (
 )
 from .plots import plot_objective
 from .preview import preview
+from .primal_dual import PrimalDual, Regulariser
 from .psf import (
     GAUSSIAN,
-    Spectrum,
     blur_otf,
     check_exponent,
     check_psf,
@@ -82,9 +68,6 @@ BOUNDARIES = ("unknown", "periodic")
 CHANNELS = ("luminance", "each")
 
 _MARGIN_SIGMAS = 4.0
-_RELAXATION = 1.4
-# τ‖K‖: small primal steps suit images in [0, 1] with fidelities from 300 to 30000.
-_PRIMAL_STEP = 0.08
 # Steps and relative change at which the Wiener solution is good enough to start from.
 _START_STEPS = 40
 _START_TOLERANCE = 1e-4
@@ -208,148 +191,12 @@ class Deconvolution:
         return preview("Deblurred image", facts, self.image)
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """Data term ``λ/2 ‖M(k∗u − f)‖²`` on the padded domain.
-
-    Attributes
-    ----------
-    observed : ndarray, float32, shape (P, Q)
-        f, continued by reflection where nothing was seen.
-    seen : ndarray, float32, shape (P, Q)
-        M.
-    otf : ndarray, shape (P, Q // 2 + 1)
-        Transfer function of k.
-    fidelity : float
-        λ.
-    """
-
-    observed: FloatArray
-    seen: FloatArray
-    otf: Spectrum
-    fidelity: float
-
-    def gradient_spectrum(self, u: FloatArray) -> Spectrum:
-        """Fourier transform of the gradient ``λBᵀM(Bu − f)``."""
-        return self.fidelity * self.otf.conj() * fft.rfft2(self.residual(u))
-
-    def residual(self, u: FloatArray) -> FloatArray:
-        """``M(Bu − f)``."""
-        return self.seen * (fft.irfft2(self.otf * fft.rfft2(u), s=u.shape) - self.observed)
-
-    def misfit(self, u: FloatArray) -> float:
-        """``λ/2 ‖M(Bu − f)‖²``."""
-        return self.fidelity / 2 * float(np.square(self.residual(u)).sum(dtype=np.float64))
-
-
-class Regulariser(NamedTuple):
-    """A penalty ``J(u) = Σ_x |Ku|(x)``: K, Kᵀ, the projection on |p|(x) ≤ 1, J, and a bound of ‖K‖²."""
-
-    gradient: Callable[[FloatArray], FloatArray]
-    adjoint: Callable[[FloatArray], FloatArray]
-    project: Callable[[FloatArray], FloatArray]
-    value: Callable[[FloatArray], float]
-    norm_squared: float
-
-
 class _State(Protocol):
     @property
     def image(self) -> FloatArray: ...
 
 
 State = TypeVar("State", bound=_State)
-
-
-class PrimalDualState(NamedTuple):
-    """u and p."""
-
-    image: FloatArray
-    dual: FloatArray
-
-
-class GradientState(NamedTuple):
-    """u, residual of the normal equations, search direction, and ⟨residual, preconditioned residual⟩."""
-
-    image: FloatArray
-    residual: FloatArray
-    direction: FloatArray
-    decrease: float
-
-
-@dataclass(frozen=True, eq=False)
-class PrimalDual:
-    """Solver for nltv and tv; see the module's docstring."""
-
-    regulariser: Regulariser
-
-    def start(self, u: FloatArray) -> PrimalDualState:
-        """Start from the image ``u`` and p = 0."""
-        return PrimalDualState(u, np.zeros_like(self.regulariser.gradient(u)))
-
-    def step(self, problem: Problem, state: PrimalDualState) -> PrimalDualState:
-        """One iteration, over-relaxed."""
-        norm = np.sqrt(self.regulariser.norm_squared)
-        tau, s = _PRIMAL_STEP / norm, 1 / (_PRIMAL_STEP * norm)
-        u, p = state
-        metric = np.float32(1 / tau) + np.float32(problem.fidelity) * np.abs(problem.otf) ** 2
-        force = fft.rfft2(self.regulariser.adjoint(p)) + problem.gradient_spectrum(u)
-        down = fft.irfft2(force / metric, s=u.shape)
-        ascent = self.regulariser.gradient(u - 2 * down)
-        ascent *= np.float32(s)
-        ascent += p
-        forward = self.regulariser.project(ascent)
-        forward -= p
-        forward *= np.float32(_RELAXATION)
-        forward += p
-        return PrimalDualState(u - np.float32(_RELAXATION) * down, forward)
-
-    def penalty(self, problem: Problem, u: FloatArray) -> float:
-        """J(u)."""
-        return self.regulariser.value(u)
-
-
-@dataclass(frozen=True, eq=False)
-class ConjugateGradients:
-    """Solver for wiener and tikhonov: ``(λBᵀMB + R)(u − m) = λBᵀM(f − m)``, m the mean of what was seen.
-
-    R is diagonal in Fourier (``symbol``), and ``(λBᵀB + R)⁻¹`` is the preconditioner. With M = 1 it is the solution.
-    Both penalties are unaware of m or defined relative to it, so that a constant image stays what it is.
-    """
-
-    symbol: FloatArray
-
-    def start(self, problem: Problem) -> GradientState:
-        """Start from the solution for the continued image."""
-        m = _seen_mean(problem)
-        right = fft.rfft2(problem.observed - m) * problem.otf.conj() * problem.fidelity
-        u = m + self._precondition(problem, right)
-        residual = -fft.irfft2(problem.gradient_spectrum(u) + self.symbol * fft.rfft2(u - m), s=u.shape)
-        direction = self._precondition(problem, fft.rfft2(residual))
-        return GradientState(u, residual, direction, _inner(residual, direction))
-
-    def step(self, problem: Problem, state: GradientState) -> GradientState:
-        """One iteration of preconditioned conjugate gradients."""
-        if state.decrease <= 0:
-            return state
-        spectrum = fft.rfft2(state.direction)
-        blurred = problem.seen * fft.irfft2(problem.otf * spectrum, s=state.image.shape)
-        data = problem.fidelity * problem.otf.conj() * fft.rfft2(blurred)
-        image = fft.irfft2(data + self.symbol * spectrum, s=state.image.shape)
-        length = np.float32(state.decrease / _inner(state.direction, image))
-        residual = state.residual - length * image
-        preconditioned = self._precondition(problem, fft.rfft2(residual))
-        decrease = _inner(residual, preconditioned)
-        direction = preconditioned + np.float32(decrease / state.decrease) * state.direction
-        return GradientState(state.image + length * state.direction, residual, direction, decrease)
-
-    def penalty(self, problem: Problem, u: FloatArray) -> float:
-        """½⟨u − m, R(u − m)⟩."""
-        deviation = u - _seen_mean(problem)
-        return _inner(deviation, fft.irfft2(self.symbol * fft.rfft2(deviation), s=u.shape)) / 2
-
-    def _precondition(self, problem: Problem, spectrum: Spectrum) -> FloatArray:
-        denominator = problem.fidelity * np.abs(problem.otf) ** 2 + self.symbol
-        return fft.irfft2(spectrum / denominator, s=problem.observed.shape)
 
 
 def deconvolve(
@@ -460,49 +307,6 @@ def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
     return fidelity if method == "wiener" else fidelity / 2
 
 
-def local_gradient(u: FloatArray) -> FloatArray:
-    """Periodic forward differences.
-
-    Parameters
-    ----------
-    u : ndarray, float32, shape (H, W)
-        Image.
-
-    Returns
-    -------
-    ndarray, float32, shape (2, H, W)
-        Along rows' index y, and along x.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> local_gradient(np.array([[1.0, 3.0]], np.float32))[1]
-    array([[ 2., -2.]], dtype=float32)
-    """
-    return np.stack([np.roll(u, -1, axis=0) - u, np.roll(u, -1, axis=1) - u])
-
-
-def local_divergence(v: FloatArray) -> FloatArray:
-    """Negative adjoint of :func:`local_gradient`.
-
-    Parameters
-    ----------
-    v : ndarray, float32, shape (2, H, W)
-        Vector field.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> local_divergence(np.array([[[0.0, 0.0]], [[2.0, 0.0]]], np.float32))
-    array([[ 2., -2.]], dtype=float32)
-    """
-    return v[0] - np.roll(v[0], 1, axis=0) + v[1] - np.roll(v[1], 1, axis=1)
-
-
 class _Solution(NamedTuple):
     images: list[FloatArray]
     iterations: int
@@ -525,7 +329,7 @@ def _solve(
         quadratic = _wiener_solver(problems[0])
         return _iterate(quadratic, problems, [quadratic.start(p) for p in problems], params, progress)
     starts = [_wiener_image(problem) for problem in problems]
-    solver = PrimalDual(_TV if params.method == "tv" else _nonlocal_tv(problems, starts, guide, params))
+    solver = PrimalDual(LOCAL_TV if params.method == "tv" else _nonlocal_tv(problems, starts, guide, params))
     return _iterate(solver, problems, [solver.start(u) for u in starts], params, progress)
 
 
@@ -595,15 +399,6 @@ def _nonlocal_tv(
     )
 
 
-_TV = Regulariser(
-    gradient=local_gradient,
-    adjoint=lambda p: -local_divergence(p),
-    project=lambda p: p / np.maximum(np.sqrt(np.square(p).sum(axis=0)), 1),
-    value=lambda u: float(np.sqrt(np.square(local_gradient(u)).sum(axis=0)).sum(dtype=np.float64)),
-    norm_squared=8.0,
-)
-
-
 def _read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:
     """PSF (None for a Gaussian), its standard deviation, and how many pixels it reaches."""
     if np.ndim(sigma_or_psf) == 0:
@@ -652,14 +447,6 @@ def _padded_guide(guide: ArrayLike | None, shape: tuple[int, ...], widths: list[
 
 def _relative_change(before: list[FloatArray], after: list[FloatArray], seen: FloatArray) -> float:
     """Change relative to the norm, both over the pixels that were seen: the margin drifts for long and is cut off."""
-    moved = sum(_inner(seen, np.square(b - a)) for a, b in zip(before, after, strict=True))
-    size = sum(_inner(seen, np.square(u)) for u in after)
+    moved = sum(inner(seen, np.square(b - a)) for a, b in zip(before, after, strict=True))
+    size = sum(inner(seen, np.square(u)) for u in after)
     return float(np.sqrt(moved / size)) if size > 0 else float(moved > 0)
-
-
-def _seen_mean(problem: Problem) -> np.float32:
-    return np.float32(_inner(problem.seen, problem.observed) / problem.seen.sum(dtype=np.float64))
-
-
-def _inner(a: FloatArray, b: FloatArray) -> float:
-    return float(np.sum(a * b, dtype=np.float64))

@@ -24,7 +24,8 @@ from typing import BinaryIO
 import numpy as np
 
 from .arrays import FloatArray, check_image, from_unit
-from .container import CONTAINER_SUFFIXES, open_container, write_mkv, write_mp4
+from .container import CONTAINER_SUFFIXES, open_container
+from .encoding import write_mkv, write_mp4
 from .errors import DataError, require
 from .frame_source import FrameRange, FrameSource, Roi, check_frame_range, numbers_text, size_text
 from .images import IMAGE_SUFFIXES, atomic_output, check_output, input_errors, read_pixels
