@@ -19,8 +19,8 @@ from turbrestore import __version__
 from turbrestore.arrays import FloatArray
 from turbrestore.errors import ConfigurationError, OutputError, require, require_between
 from turbrestore.images import check_output, read_image, write_image
+from turbrestore.limits import Limits
 from turbrestore.pipeline import Progress, stage_counter, training_share
-from turbrestore.pixels import MAX_PIXELS
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import DynamicTextureParams, synthesize_like
@@ -29,7 +29,7 @@ from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.sequence import CameraParams, SyntheticFrame, check_scene, record
 from turbrestore.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video
 
-from .options import Flag
+from .options import Flag, limits_of
 from .output import print_json
 from .progress import progress_bars, say
 
@@ -63,6 +63,7 @@ def synthesize(
     strength: Literal["weak", "medium", "strong"] | None = None,
     like: Path | None = None,
     train: int | None = None,
+    max_pixels: int | None = None,
     overwrite: Flag = False,
     json: Flag = False,
     quiet: Flag = False,
@@ -95,6 +96,8 @@ def synthesize(
         Video whose motion the dynamic texture continues.
     train : int
         Frames of it to learn from, from the first on; by default as many as a restoration would take.
+    max_pixels : int
+        Largest scene, and frame of --like, pixels; by default 67 million.
     overwrite : bool
         Replace existing outputs.
     json : bool
@@ -109,6 +112,7 @@ def synthesize(
         Settings of the dynamic texture.
     """
     require_between("--frames", frames, 1, MOST_FRAMES)
+    limits = limits_of(max_pixels)
     require(seed >= 0, f"--seed: expected a whole number from 0, found {seed}")
     inputs = [item for item in (None if scene in (*SCENES, CENTROID) else Path(scene), like) if item is not None]
     check_output(output, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
@@ -121,12 +125,14 @@ def synthesize(
             require(like is None and train is None, "--like, --train: have no effect on phase screens; leave them out")
             idle = dynamic_texture == DynamicTextureParams()
             require(idle, "--dynamic-texture: has no effect on phase screens; leave it out")
-            made = _through_screens(_scene(scene, size), frames, rng, _with_strength(path, strength), camera)
+            made = _through_screens(_scene(scene, size, limits), frames, rng, _with_strength(path, strength), camera)
         else:
             require(strength is None, "--strength: has no effect with --model dynamic-texture; leave it out")
             require(path == PhaseScreenParams(), "--model dynamic-texture: knows no path and no optics; leave them out")
-            truth = None if scene == CENTROID and size is None else _scene(scene, size)
-            made = _like_a_clip(_training_frames(like, train), truth, frames, rng, dynamic_texture, camera, progress)
+            truth = None if scene == CENTROID and size is None else _scene(scene, size, limits)
+            made = _like_a_clip(
+                _training_frames(like, train, limits), truth, frames, rng, dynamic_texture, camera, progress
+            )
         request = {"scene": scene, "model": model, "like": None if like is None else str(like), "seed": seed}
         facts = _write(outputs, made, camera, request, stage_counter(progress, "synthesize", frames))
     if overwrite and DIFFRACTION not in outputs:
@@ -145,27 +151,28 @@ def _outputs(output: Path, has_diffraction: bool) -> dict[str, Path]:
     return {VIDEO: output, **{ending: output.with_name(output.stem + ending) for ending in endings}}
 
 
-def _scene(scene: str, size: str | None) -> FloatArray:
+def _scene(scene: str, size: str | None, limits: Limits) -> FloatArray:
     if scene not in SCENES:
         require(size is None, f"--size: has no effect on {scene}, which has a size; leave it out")
         require(scene != CENTROID, "centroid: needs --model dynamic-texture and --like")
         if not Path(scene).suffix:
             raise ConfigurationError(f"{scene}: expected an image file or one of {', '.join(sorted(SCENES))}")
-        return read_image(scene).image
+        return read_image(scene, limits).image
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", "256x256" if size is None else size)
     if found is None:
         raise ConfigurationError(f"--size: expected width and height as 256x256, found {size!r}")
     width, height = int(found[1]), int(found[2])
-    require(width * height <= MAX_PIXELS, f"--size: expected at most {MAX_PIXELS} pixels, found {width}×{height}")
+    most = limits.max_pixels
+    require(width * height <= most, f"--size: expected at most {most} pixels, found {width}×{height}")
     return SCENES[scene](height, width)
 
 
-def _training_frames(like: Path | None, train: int | None) -> FloatArray:
+def _training_frames(like: Path | None, train: int | None, limits: Limits) -> FloatArray:
     if like is None:
         raise ConfigurationError("--like: expected a video for --model dynamic-texture to learn from")
     # Two flows have no dynamics.
     require(train is None or train >= 3, f"--train: expected 3 frames or more, found {train}")
-    source = open_frames(like)
+    source = open_frames(like, limits=limits)
     return source.read(0, training_share(len(source), source.shape[1:], train))
 
 

@@ -262,17 +262,21 @@ def test_max_pixels_is_an_option_of_what_reads(run, tmp_path):
     hostile.write_clip(tmp_path / "a.npy")
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((40, 40), np.uint8))
     few = ("--max-pixels", "1000")
+    learnt = ("synthesize", "--model", "dynamic-texture", "--like", tmp_path / "a.npy")
     for words in (
         ("info", tmp_path / "a.npy"),
         ("centroid", tmp_path / "a.npy", tmp_path / "a.result.npz"),
         ("flow", tmp_path / "a.png", tmp_path / "a.npy", tmp_path / "a.result.npy"),
         ("deconvolve", tmp_path / "a.png", tmp_path / "a.result.png"),
         ("evaluate", tmp_path / "a.png", tmp_path / "a.png"),
+        ("synthesize", tmp_path / "a.png", tmp_path / "a.result.mkv"),
+        (*learnt, "centroid", tmp_path / "a.result.mkv"),
     ):
         result = run(*words, *few)
         refused(result, tmp_path)
         assert "1000 pixels" in result[2]
     refused(run("info", tmp_path / "a.npy", "--max-pixels", "0"), tmp_path, 2)
+    refused(run("synthesize", "chart", tmp_path / "a.result.mkv", "--size", "40x40", *few), tmp_path, 2)
     assert run("info", tmp_path / "a.npy", "--max-pixels", "4000")[0] == 0
 
 
