@@ -21,9 +21,11 @@ from turbrestore.blur_estimation import BlurEstimate, estimate_blur
 from turbrestore.blur_moments.cues import RelativeBlur, displacement_variance
 from turbrestore.centroid import find_centroid
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.dynamics import FlowDynamics, identify, with_displacement
+from turbrestore.displacement import with_displacement
+from turbrestore.dynamics import identify
+from turbrestore.flow_model import FlowDynamics
+from turbrestore.memory import training_share
 from turbrestore.metrics import compare
-from turbrestore.pipeline import training_share
 from turbrestore.psf import KOLMOGOROV
 
 SETTINGS = DeconvolutionParams()

@@ -18,8 +18,8 @@ from turbrestore.arrays import FloatArray
 from turbrestore.centroid import find_centroid
 from turbrestore.dynamics import identify
 from turbrestore.images import read_image
+from turbrestore.memory import training_share
 from turbrestore.metrics import compare
-from turbrestore.pipeline import training_share
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
 from turbrestore.video import open_frames

@@ -1,30 +1,263 @@
-"""Time of a whole restoration against the bare flow calls it makes, memory against frames, and time of the help.
+"""Time of whole restorations against the bare flow calls they make, how it grows, memory against frames, and the help.
 
-Run ``python benchmarks/speed.py``; it prints a table and exits with 1 when a bound is broken.  Both times are taken in
-the same process, in turn, because machines differ and drift; peak memory is that of child processes.
+    python benchmarks/speed.py --write docs/speed.md
+    python benchmarks/speed.py --full --before 890600a --write docs/speed.md
+
+prints a Markdown document, writes it, and exits with 1 when a bound is broken.  Times of a row are taken in one child
+process, flow calls before and after the restoration, because machines differ and drift; peak memory is that of a child
+process.  ``--before`` names a revision of this repository that is measured beside the present tree, row by row.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
+import os
 import resource
 import subprocess
 import sys
+import tarfile
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
+from turbrestore.centroid import CentroidParams
 from turbrestore.flow import FlowParams, iterate_flows
 from turbrestore.frame_source import FrameSource
+from turbrestore.images import atomic_write
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
-TIME_BOUND, MEMORY_BOUND_MB, HELP_BOUND = 1.6, 50.0, 6.0
+TIME_BOUND, MEMORY_BOUND_MB, HELP_BOUND = 1.25, 20.0, 6.0
+FRAMES_BOUND, PIXELS_BOUND = 1.05, 1.1
+# Shorter clips pay for what is done once, whatever their length.
+FEWEST_BOUND = 120
 THREADS = 2
+# Frames, height and width.
+ROWS = ((50, 128, 128), (120, 256, 256), (300, 256, 256), (200, 512, 512))
+FULL_ROWS = ((1000, 256, 256), (25, 1080, 1920))
+# What the exponents are fitted to: two passes of the centroid, whatever the clip.
+COUNTS, COUNTS_SIDE = (60, 120, 240, 480), 128
+SIDES, SIDES_COUNT = (128, 192, 256, 384), 60
+FEW, MANY, TRAINED = 260, 2060, 60
+# Distinct frames of a clip; longer ones repeat them.
+DISTINCT = 60
+# Share of the frames whose flow is measured alone before, and again after.
+SAMPLE = 2
+
+Figures = dict[str, Any]
+Result = TypeVar("Result")
+
+
+def main() -> int:
+    """Print the document; 1 when a bound is broken."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help="1,000 frames and 1920×1080 as well")
+    parser.add_argument("--before", metavar="REVISION", help="measure this revision beside the present tree")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
+    parser.add_argument("--child", metavar="JSON", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child is not None:
+        print(json.dumps(run_child(json.loads(options.child))))
+        return 0
+    with revision(options.before) as tree:
+        text, broken = document(options.full, options.before, tree)
+    print(text, end="")
+    if options.write is not None:
+        atomic_write(options.write, text.encode(), overwrite=True)
+    for line in broken:
+        print(f"speed: {line}", file=sys.stderr)
+    return int(bool(broken))
+
+
+@contextmanager
+def revision(name: str | None) -> Iterator[Path | None]:
+    """Lay out the files of a revision in a folder that goes away afterwards."""
+    if name is None:
+        yield None
+        return
+    root = Path(__file__).resolve().parent.parent
+    command = ["git", "archive", "--format=tar", name, "turbrestore"]
+    packed = subprocess.run(command, cwd=root, capture_output=True, check=False)
+    if packed.returncode:
+        sys.exit(f"speed: {packed.stderr.decode().strip()}")
+    with tempfile.TemporaryDirectory() as folder:
+        with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
+            archive.extractall(folder, filter="data")
+        yield Path(folder)
+
+
+def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, list[str]]:
+    """Markdown of the tables, and the bounds that are broken."""
+    broken: list[str] = []
+    command = f"python benchmarks/speed.py{' --full' if full else ''}{f' --before {before}' if before else ''}"
+    lines = [
+        "# Speed\n",
+        f"What `{command} --write docs/speed.md` measures: the chart under smooth random flow, {THREADS} threads, "
+        f"{_machine()}.  It ends with 1 where a bound is broken.\n",
+        "## Against the flow calls\n",
+        "Seconds of a whole restoration with the default settings, and of the optical flow alone that it asks for. The "
+        f"bound of the ratio, {TIME_BOUND}, holds from {FEWEST_BOUND} frames on.  Where others compute on the same "
+        "machine, the ratio of processor time is the one to believe.\n",
+        *_time_table((*ROWS, *FULL_ROWS) if full else ROWS, tree, broken),
+        "\n## Growth\n",
+        "Exponent of the time of a restoration, fitted to four clips each, with two passes of the centroid.\n",
+        *_growth_table(tree, broken),
+        "\n## Memory\n",
+        f"Peak resident memory of a process that restores frames of 128×128, {TRAINED} of them to train.\n",
+        *_memory_table(tree, broken),
+    ]
+    seconds, cost = help_ratio(9)
+    if cost > HELP_BOUND:
+        broken.append(f"--help takes {cost:.1f} times as long as importing NumPy, bound {HELP_BOUND}")
+    lines.append(
+        f"\n`turbrestore --help` takes {seconds:.2f} s, {cost:.1f} times as long as Python with NumPy takes to start; "
+        f"bound {HELP_BOUND:.0f}."
+    )
+    return "\n".join(lines) + "\n", broken
+
+
+def _time_table(rows: tuple[tuple[int, int, int], ...], tree: Path | None, broken: list[str]) -> list[str]:
+    stages = ("centroid", "identify", "filter", "deconvolve")
+    earlier = ["before: whole, s", "flow calls", "ratio"] if tree else []
+    names = ["whole, s", "flow calls", "alone, s", "ratio", "of processor time", *(f"{stage}, s" for stage in stages)]
+    lines = [f"| {' | '.join(['frames', 'size', *earlier, *names])} |", "|" + "---:|" * (2 + len(earlier) + len(names))]
+    for count, height, width in rows:
+        task = {"kind": "time", "frames": count, "height": height, "width": width}
+        old = child(task, tree) if tree else None
+        new = child(task)
+        ratio = new["whole"] / new["bare"]
+        if count >= FEWEST_BOUND and ratio > TIME_BOUND:
+            broken.append(f"{count} frames of {width}×{height}: ratio {ratio:.2f}, bound {TIME_BOUND}")
+        cells = [f"{count:,}", f"{width}×{height}"]
+        if old is not None:
+            cells += [f"{old['whole']:.1f}", f"{old['calls']}", f"{old['whole'] / old['bare']:.2f}"]
+        cells += [f"{new['whole']:.1f}", f"{new['calls']}", f"{new['bare']:.1f}", f"{ratio:.2f}"]
+        cells.append(f"{new['whole_work'] / new['bare_work']:.2f}")
+        cells += [f"{new['stages'].get(stage, 0.0):.1f}" for stage in stages]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def _growth_table(tree: Path | None, broken: list[str]) -> list[str]:
+    lines = [f"| against |{' before |' if tree else ''} exponent | bound |", f"|---|{'---:|' * (2 + bool(tree))}"]
+    frames = [(count, COUNTS_SIDE) for count in COUNTS]
+    pixels = [(SIDES_COUNT, side) for side in SIDES]
+    for name, clips, bound in (
+        (f"frames: {', '.join(map(str, COUNTS))} of {COUNTS_SIDE}×{COUNTS_SIDE}", frames, FRAMES_BOUND),
+        (f"pixels: {SIDES_COUNT} frames of side {', '.join(map(str, SIDES))}", pixels, PIXELS_BOUND),
+    ):
+        found = exponent(clips)
+        if found > bound:
+            broken.append(f"exponent against {name}: {found:.2f}, bound {bound}")
+        earlier = f" {exponent(clips, tree):.2f} |" if tree else ""
+        lines.append(f"| {name} |{earlier} {found:.2f} | {bound} |")
+    return lines
+
+
+def _memory_table(tree: Path | None, broken: list[str]) -> list[str]:
+    lines = [
+        f"| | filtered: {FEW - TRAINED} | {MANY - TRAINED:,} | growth, MB | bound |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for name, where in ((("before", tree),) if tree else ()) + (("now", None),):
+        few, many = (
+            child({"kind": "memory", "frames": count, "height": 128, "width": 128}, where)["peak"]
+            for count in (FEW, MANY)
+        )
+        lines.append(f"| {name} | {few:.0f} MB | {many:.0f} MB | {many - few:.1f} | {MEMORY_BOUND_MB:.0f} |")
+        if where is None and many - few > MEMORY_BOUND_MB:
+            broken.append(f"memory grows by {many - few:.1f} MB, bound {MEMORY_BOUND_MB}")
+    return lines
+
+
+def exponent(clips: list[tuple[int, int]], tree: Path | None = None) -> float:
+    """Slope of log time over log size of clips, given as frames and side, that differ in one of them."""
+    tasks = [{"kind": "growth", "frames": count, "height": side, "width": side} for count, side in clips]
+    seconds = [child(task, tree)["whole"] for task in tasks]
+    sizes = [count * side * side for count, side in clips]
+    return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
+
+
+def child(task: Figures, tree: Path | None = None) -> Figures:
+    """Measure in a process of its own, of the present tree or another one."""
+    paths = [str(tree)] if tree else []
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*paths, os.environ.get("PYTHONPATH", "")]).strip(":")}
+    command = [sys.executable, __file__, "--child", json.dumps(task)]
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=folder, env=environment)
+    figures: Figures = json.loads(done.stdout)
+    print(f"{'before' if tree else 'now'}: {task} {figures}", file=sys.stderr, flush=True)
+    return figures
+
+
+def run_child(task: Figures) -> Figures:
+    """Restore a clip and say how long it took, how long its flow calls take alone, and the peak memory, MB."""
+    source, sample = repeated(task["frames"], task["height"], task["width"])
+    train = TRAINED if task["kind"] == "memory" else None
+    centroid = CentroidParams() if task["kind"] == "time" else CentroidParams(iterations=2)
+    params = RestoreParams(train=train, flow=FlowParams(threads=THREADS), centroid=centroid)
+    part = max(task["frames"] // SAMPLE, 8)
+
+    def alone() -> None:
+        frames = (sample[index % len(sample)] for index in range(part))
+        for _ in iterate_flows(sample.mean(axis=0), frames, params.flow):
+            pass
+
+    # What is loaded and started once.
+    restore(sample[:4, :32, :32])
+    first, _ = clocked(alone) if task["kind"] == "time" else ((0.0, 0.0), None)
+    whole, restoration = clocked(lambda: restore(source, params))
+    # Linux counts kilobytes, macOS bytes.
+    unit = 1024 if sys.platform != "darwin" else 1024 * 1024
+    figures = {"whole": whole[0], "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
+    if task["kind"] != "time":
+        return figures
+    second, _ = clocked(alone)
+    passes = len(restoration.centroid.mean_flow_sizes)
+    # The last pass of the centroid serves the first of the filter.
+    calls = (passes - 1) * restoration.train + params.filter.inner_iterations * task["frames"]
+    bare = np.mean([first, second], axis=0) * calls / part
+    figures |= {"whole_work": whole[1], "bare": bare[0], "bare_work": bare[1], "calls": calls}
+    return figures | {"stages": restoration.seconds}
+
+
+def clocked(call: Callable[[], Result]) -> tuple[tuple[float, float], Result]:
+    """Seconds of wall and of processor time that a call takes, and what it returns."""
+    begun, worked = time.perf_counter(), time.process_time()
+    result = call()
+    return (time.perf_counter() - begun, time.process_time() - worked), result
+
+
+def repeated(count: int, height: int, width: int) -> tuple[FrameSource, np.ndarray]:
+    """Clip that repeats a few 8-bit frames, and those frames as they are read."""
+    frames = np.rint(make_frames(min(count, DISTINCT, max(8, 2**24 // (height * width))), height, width) * 255)
+    stored = frames.astype(np.uint8)
+
+    def pixels(numbers: Sequence[int]) -> Iterator[np.ndarray]:
+        for number in numbers:
+            yield stored[number % len(stored)]
+
+    source = FrameSource(
+        name="repeated", format="array", file_shape=(count, height, width), full_scale=255, bit_depth=8, pixels=pixels
+    )
+    return source, (frames / 255).astype(np.float32)
+
+
+def make_frames(count: int, height: int, width: int | None = None) -> np.ndarray:
+    """Frames of the chart under smooth random flow, blurred by 1 to 2 pixels."""
+    width = height if width is None else width
+    rng = np.random.default_rng(0)
+    flows = smooth_flows(count, height, width, rng, SmoothFlowParams(rms=1.5))
+    scene = resolution_chart(height, width)
+    return np.stack([distort(scene, flow[None], rng, blur=1 + rng.random(), noise=0.01)[0] for flow in flows])
 
 
 def help_ratio(runs: int) -> tuple[float, float]:
@@ -42,80 +275,11 @@ def help_ratio(runs: int) -> tuple[float, float]:
     return float(np.median([a for a, _ in pairs])), float(np.median([a / b for a, b in pairs]))
 
 
-def make_frames(count: int, size: int) -> np.ndarray:
-    """Frames of the chart under smooth random flow, blurred by 1 to 2 pixels."""
-    rng = np.random.default_rng(0)
-    flows = smooth_flows(count, size, size, rng, SmoothFlowParams(rms=1.5))
-    scene = resolution_chart(size, size)
-    return np.stack([distort(scene, flow[None], rng, blur=1 + rng.random(), noise=0.01)[0] for flow in flows])
-
-
-def time_ratio(count: int, size: int, runs: int) -> tuple[float, float, float]:
-    """Median seconds of a restoration, of its flow calls alone, and the median of their ratios."""
-    frames = make_frames(count, size)
-    params = RestoreParams(flow=FlowParams(threads=THREADS))
-    whole, bare = [], []
-    for _ in range(runs):
-        begun = time.perf_counter()
-        restoration = restore(frames, params)
-        whole.append(time.perf_counter() - begun)
-        passes = len(restoration.centroid.mean_flow_sizes)
-        calls = passes * restoration.train + params.filter.inner_iterations * count - restoration.train
-        begun = time.perf_counter()
-        stream = (frames[index % count] for index in range(calls))
-        for _ in iterate_flows(restoration.mean, stream, params.flow):
-            pass
-        bare.append(time.perf_counter() - begun)
-    ratios = [a / b for a, b in zip(whole, bare, strict=True)]
-    return float(np.median(whole)), float(np.median(bare)), float(np.median(ratios))
-
-
-def peak_memory(count: int, size: int) -> float:
-    """Peak resident memory, MB, of a child process that restores ``count`` frames made as they are read."""
-    command = [sys.executable, __file__, "--child", str(count), "--size", str(size)]
-    with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder)
-    return float(json.loads(done.stdout)["peak_mb"])
-
-
-def run_child(count: int, size: int) -> None:
-    """Restore a repeated clip of 100 frames and print the peak resident memory of this process."""
-    frames = np.rint(make_frames(100, size) * 255).astype(np.uint8)
-
-    def pixels(numbers: range) -> Iterator[np.ndarray]:
-        for number in numbers:
-            yield frames[number % len(frames)]
-
-    source = FrameSource(
-        name="repeated", format="array", file_shape=(count, size, size), full_scale=255, bit_depth=8, pixels=pixels
-    )
-    restore(source, RestoreParams(train=60))
-    # Linux counts kilobytes, macOS bytes.
-    unit = 1024 if sys.platform != "darwin" else 1024 * 1024
-    print(json.dumps({"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}))
-
-
-def main() -> int:
-    """Print both tables; 1 when a bound is broken."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", type=int, default=256)
-    parser.add_argument("--frames", type=int, default=120)
-    parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--child", type=int)
-    options = parser.parse_args()
-    if options.child is not None:
-        run_child(options.child, options.size)
-        return 0
-    whole, bare, ratio = time_ratio(options.frames, options.size, options.runs)
-    print("| frames | size | whole, s | flow calls alone, s | ratio | bound |\n|---|---|---|---|---|---|")
-    print(f"| {options.frames} | {options.size} | {whole:.1f} | {bare:.1f} | {ratio:.2f} | {TIME_BOUND} |\n")
-    few, many = peak_memory(260, 128), peak_memory(2060, 128)
-    print("| filtered frames | peak memory, MB | growth, MB | bound |\n|---|---|---|---|")
-    print(f"| 200 | {few:.0f} | | |\n| 2,000 | {many:.0f} | {many - few:.1f} | {MEMORY_BOUND_MB:.0f} |")
-    help_seconds, help_cost = help_ratio(9)
-    print("\n| --help, s | ratio to importing NumPy | bound |\n|---|---|---|")
-    print(f"| {help_seconds:.2f} | {help_cost:.2f} | {HELP_BOUND:.0f} |")
-    return int(help_cost > HELP_BOUND or ratio > TIME_BOUND or many - few > MEMORY_BOUND_MB)
+def _machine() -> str:
+    models = Path("/proc/cpuinfo")
+    text = models.read_text() if models.is_file() else ""
+    names = [line.split(":")[1].strip() for line in text.splitlines() if line.startswith("model name")]
+    return names[0] if names else sys.platform
 
 
 if __name__ == "__main__":

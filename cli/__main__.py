@@ -112,7 +112,7 @@ def _explain(error: BaseException) -> tuple[str, int]:
     if isinstance(error, OSError):
         return f"{error.filename or 'system'}: {error.strerror or error}", StorageError.exit_code
     if isinstance(error, MemoryError):
-        return "out of memory; use --roi, fewer --train frames or a smaller video", BUG
+        return "out of memory; use --memory-limit, --roi or fewer --train frames", BUG
     return str(error) or "interrupted", getattr(error, "exit_code", INTERRUPTED)
 
 

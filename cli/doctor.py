@@ -33,7 +33,7 @@ REQUIRED = {
     "tifffile": "tifffile",
     "threadpoolctl": "threadpoolctl",
 }
-EXTRAS = {"torch": "torch", "kornia": "torch", "matplotlib": "report", "jinja2": "report"}
+EXTRAS = {"torch": "torch", "matplotlib": "report", "jinja2": "report"}
 READ = ("h264", "ffv1", "hevc", "vp9", "mjpeg", "gif")
 WRITTEN = ("ffv1", "libx264")
 OLDEST_PYTHON = (3, 11)

@@ -17,8 +17,8 @@ from turbrestore.content import clean_source
 from turbrestore.errors import DataError, require
 from turbrestore.images import input_errors, read_image
 from turbrestore.limits import DEFAULT_LIMITS
+from turbrestore.memory import training_share
 from turbrestore.metrics import appearance, compare, compare_flows
-from turbrestore.pipeline import training_share
 
 from .inputs import open_checked, read_input_image
 from .options import Flag, Selection, limits_of

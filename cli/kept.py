@@ -9,7 +9,8 @@ from pathlib import Path
 from turbrestore.folder_lock import lock_folder
 from turbrestore.frame_source import FrameSource
 from turbrestore.images import check_space
-from turbrestore.pipeline import RestoreParams, training_share
+from turbrestore.pipeline import memory_plan
+from turbrestore.restoration import RestoreParams
 from turbrestore.resumption import KeptStages, read_stages
 
 from .progress import say
@@ -55,5 +56,6 @@ def check_room(source: FrameSource, params: RestoreParams, output: Path, folder:
     check_space(output, image)
     if folder is not None:
         flow = 8 * height * width
-        train = training_share(len(source), source.shape[1:], params.train)
-        check_space(folder, flow * (train + train // _FRAMES_A_MODE) + _IMAGES * image)
+        plan = memory_plan(source, params)
+        size = flow * (plan.train + plan.train // _FRAMES_A_MODE) + _IMAGES * image
+        check_space(folder, size + plan.file_bytes)

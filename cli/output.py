@@ -19,7 +19,7 @@ from turbrestore.errors import OutputError
 from turbrestore.folder_lock import LOCK
 from turbrestore.images import atomic_write, check_output, write_image
 from turbrestore.metrics import compare
-from turbrestore.pipeline import Restoration, RestoreParams
+from turbrestore.restoration import Restoration, RestoreParams
 from turbrestore.resumption import STAGE_FILES, KeptStages, read_stages
 from turbrestore.run_record import RUN_FILES, RunRecord, save_run
 

@@ -11,10 +11,10 @@ from cyclopts import Parameter
 from turbrestore.errors import require
 from turbrestore.images import check_output, write_image
 from turbrestore.metrics import comparable
-from turbrestore.pipeline import RestoreParams
 from turbrestore.pipeline import restore as run_pipeline
 from turbrestore.pixels import check_depth
 from turbrestore.report import check_report, write_report
+from turbrestore.restoration import RestoreParams
 from turbrestore.run_record import describe_run
 
 from .inputs import open_input, read_input_image
@@ -107,7 +107,7 @@ def restore(
     with kept_stages(keep, source, settings, resume, checkpoint_every, quiet) as stages:
         with progress_bars(quiet) as progress:
             done, on_result = (None, None) if stages is None else (stages.done, stages.keep)
-            restoration = run_pipeline(source, settings, progress, done, on_result)
+            restoration = run_pipeline(source, settings, progress, done, on_result, keep)
         record = settings_record(settings, selection, bit_depth)
         run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
         depth = source.bit_depth if bit_depth is None else bit_depth

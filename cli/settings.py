@@ -6,7 +6,7 @@ import difflib
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from cyclopts.config import Dict
 
@@ -21,7 +21,7 @@ NOT_SETTINGS = {"config", "overwrite", "keep", "resume", "checkpoint_every", "tr
 
 
 def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
-    """Fill what no flag has set from the TOML file named by ``--config``, and check whole numbers."""
+    """Fill what no flag has set from the TOML file named by ``--config``, and check numbers."""
     for argument in arguments:
         if "--config" in argument.names and argument.tokens:
             path = Path(argument.tokens[0].value)
@@ -34,6 +34,10 @@ def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollec
     for argument in arguments:
         if argument.hint in (int, int | None):
             _refuse_fractions(argument)
+        for kind in get_args(argument.hint):
+            # Types of our own say what they expect; in a union with None nobody would hear of it.
+            if isinstance(kind, type) and issubclass(kind, float) and kind is not float:
+                _read_all(kind, argument)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -88,6 +92,11 @@ def _suggestion(name: str, known: set[str]) -> str:
 
 def _key(argument: Argument) -> str:
     return argument.name.removeprefix("--").replace("-", "_")
+
+
+def _read_all(kind: type[float], argument: Argument) -> None:
+    for token in argument.tokens:
+        kind(token.value)
 
 
 def _refuse_fractions(argument: Argument) -> None:

@@ -13,13 +13,15 @@ from turbrestore.artifacts import load_artifact, load_flows, save_artifact, save
 from turbrestore.blind import remove_blur
 from turbrestore.centroid import Centroid, CentroidParams, find_centroid
 from turbrestore.deconvolution import Deconvolution, DeconvolutionParams
-from turbrestore.dynamics import DynamicsParams, FlowDynamics
+from turbrestore.dynamics import DynamicsParams
 from turbrestore.dynamics import identify as identify_flows
 from turbrestore.errors import require
 from turbrestore.flow import FlowParams, estimate_flow
+from turbrestore.flow_model import FlowDynamics
 from turbrestore.guards import GuardParams
 from turbrestore.images import IMAGE_OUTPUT_SUFFIXES, check_output, read_image, write_image
-from turbrestore.pipeline import stage_counter, training_share
+from turbrestore.memory import training_share
+from turbrestore.pipeline import stage_counter
 from turbrestore.pixels import check_depth
 
 from .inputs import open_input, read_input_image

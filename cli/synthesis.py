@@ -20,7 +20,8 @@ from turbrestore.arrays import FloatArray
 from turbrestore.errors import ConfigurationError, OutputError, require, require_between
 from turbrestore.images import check_output, read_image, write_image
 from turbrestore.limits import Limits
-from turbrestore.pipeline import Progress, stage_counter, training_share
+from turbrestore.memory import training_share
+from turbrestore.pipeline import Progress, stage_counter
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import DynamicTextureParams, synthesize_like

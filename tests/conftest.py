@@ -1,5 +1,6 @@
 """Small synthetic sequences with known motion, shared by several tests."""
 
+import signal
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +17,15 @@ class Sequence:
     scene: np.ndarray
     flows: np.ndarray
     frames: np.ndarray
+
+
+@pytest.fixture(scope="session", autouse=True)
+def signals_as_in_the_foreground():
+    """Shells start background jobs with signals ignored, and every process that a test interrupts would inherit it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def natural_scene(size: int) -> np.ndarray:

@@ -92,7 +92,9 @@ def test_in_the_subspace_it_is_the_linear_kalman_filter(sequence):
 
     flow = Gaussian(np.zeros(rank), model.state_covariance)
     image = PixelGaussian(reference, np.full((96, 96), noise / prior_frames, np.float32))
-    for frame, xi, found in zip(frames, states, filtered.flow_states, strict=True):
+    for frame, xi, found, unforeseen in zip(frames, states, filtered.flow_states, filtered.innovations, strict=True):
+        missed = (model.C @ (xi - predict(flow, model.A, model.Q).mean).astype(np.float32)).astype(np.float64)
+        assert unforeseen == pytest.approx(np.sqrt(np.mean(missed**2)), rel=1e-3)
         # With CᵀC = I the measurement Cᵀ(W − W̄) = ξ + Cᵀr says all that W does.
         flow, _ = update(predict(flow, model.A, model.Q), xi, np.eye(rank), model.R * np.eye(rank))
         assert np.allclose(found, flow.mean, rtol=1e-4, atol=1e-4)

@@ -10,14 +10,16 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "turbrestore"
 # A module imports only from those before it.
 ORDER = [
-    "errors", "arrays", "decision", "plots", "preview",
+    "errors", "scratch", "arrays", "decision", "device", "plots", "preview",
     "parallel", "pixels", "limits", "images", "npy", "frame_source", "stuck_pixels",
     "scene_cuts", "content", "integrity", "ser", "tiff", "container", "encoding", "video",
-    "warp", "psf", "stabilisation", "confidence", "image_stacks", "tvl1_sweeps", "tvl1", "flow",
-    "centroid", "dynamics", "kalman",
-    "blur_moments", "frame_noise", "alternating", "blur_estimation", "blur_cues", "nonlocal_tv", "convolution_problem",
-    "conjugate_gradients", "primal_dual", "local_tv", "deconvolution",
-    "blur_map", "guards", "blind", "border", "frame_selection", "explanation", "synthesis", "metrics", "pipeline",
+    "image_stacks", "warp", "psf", "stabilisation", "confidence", "tvl1_sweeps", "tvl1", "flow",
+    "centroid", "flow_model", "flow_subspace", "dynamics", "displacement", "simulation", "kalman",
+    "blur_moments", "frame_noise", "torch_fusion", "alternating", "blur_estimation", "blur_cues",
+    "patch_search", "edge_strips", "nonlocal_tv", "nonlocal_penalty", "convolution_problem",
+    "conjugate_gradients", "primal_dual", "local_tv", "torch_weights", "torch_deconvolution", "deconvolution",
+    "blur_map", "guards", "blind", "border", "frame_selection", "explanation", "synthesis", "metrics",
+    "memory", "restoration", "pipeline",
     "artifacts", "run_record", "checkpoint", "folder_lock", "resumption", "report",
 ]  # fmt: skip
 HEAVY = {"torch", "kornia", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
@@ -90,6 +92,6 @@ def test_the_test_command_of_the_readme_is_what_ci_runs():
     root = PACKAGE.parent
     commands = [line.removeprefix(".venv-ci/bin/") for line in (root / ".ci" / "run").read_text().splitlines()]
     readme = (root / "README.md").read_text()
-    for command in ("pip install --quiet -c constraints.txt -e '.[torch,dev]'", "python -m pytest"):
+    for command in ("pip install --quiet -c constraints.txt -e '.[torch,dev]'", "python -m pytest -n auto"):
         assert command in commands
         assert command.replace(" --quiet", "") in readme

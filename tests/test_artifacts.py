@@ -8,8 +8,8 @@ from conftest import make_sequence
 from turbrestore.artifacts import load_artifact, load_flows, load_stage_image, save_artifact, save_flows
 from turbrestore.centroid import Centroid, CentroidParams
 from turbrestore.deconvolution import Deconvolution
-from turbrestore.dynamics import FlowDynamics
 from turbrestore.errors import ConfigurationError, DataError, InputNotFoundError, OutputError
+from turbrestore.flow_model import FlowDynamics
 from turbrestore.images import write_image
 from turbrestore.pipeline import RestoreParams, restore
 

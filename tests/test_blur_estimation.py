@@ -93,7 +93,7 @@ def test_the_scene_of_a_blur_solves_its_normal_equations():
     otf = np.exp(-2 * (np.pi * 1.5 * gradients.frequency) ** 2)
 
     def blur(v):
-        return np.fft.irfft2(otf * np.fft.rfft2(v), s=v.shape[1:])
+        return np.fft.ifft2(otf[..., None] * np.fft.fft2(v, axes=(0, 1)), axes=(0, 1)).real
 
     before = prior
     for _ in range(40):

@@ -14,6 +14,7 @@ from turbrestore.flow import (
     normalise_contrast,
 )
 from turbrestore.metrics import endpoint_error
+from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 from turbrestore.warp import warp
 
@@ -179,3 +180,27 @@ def test_frames_of_another_size_are_refused():
 def test_bad_settings_name_themselves(make, name):
     with pytest.raises(ConfigurationError, match=f"^{name}: expected"):
         make()
+
+
+@pytest.mark.parametrize("train", [4, 9])
+def test_a_restoration_measures_no_flow_twice(monkeypatch, train):
+    """The flows of the last pass of the centroid serve the identification and the first pass of the filter."""
+    solved, dis = [], FLOW_METHODS["dis"]
+
+    def counting(params, reference):
+        solve = dis(params, reference)
+
+        def counted(frames):
+            solved.extend(frame.tobytes() + reference.tobytes() for frame in frames)
+            return solve(frames)
+
+        return counted
+
+    monkeypatch.setitem(FLOW_METHODS, "dis", counting)
+    rng = np.random.default_rng(2)
+    flows = smooth_flows(9, 48, 48, rng, SmoothFlowParams(rms=1.0, correlation_length=8.0))
+    frames = np.stack([warp(texture(size=48), flow) for flow in flows])
+    restoration = restore(frames, RestoreParams(train=train))
+    passes = restoration.centroid.mean_flow_sizes.size
+    assert len(solved) == (passes - 1) * train + RestoreParams().filter.inner_iterations * len(frames)
+    assert len(set(solved)) == len(solved)

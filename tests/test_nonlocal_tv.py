@@ -60,12 +60,30 @@ def test_weights_match_a_double_loop(nearest, shape):
     )
 
 
-def test_strips_leave_no_seam(monkeypatch):
-    guide = np.random.default_rng(1).random((20, 12)).astype(np.float32)
+def test_bands_tiles_and_strips_leave_no_seam(monkeypatch):
+    guide = np.random.default_rng(1).random((40, 31)).astype(np.float32)
     whole = nonlocal_weights(guide, SMALL)
-    monkeypatch.setattr("turbrestore.nonlocal_tv._STRIP_PIXELS", 36)
-    strips = nonlocal_weights(guide, SMALL)
-    assert (whole.difference != strips.difference).nnz == 0
+    for name, size in (
+        ("patch_search.BAND_ROWS", 7),
+        ("patch_search._TILE_COLUMNS", 6),
+        ("nonlocal_tv._STRIP_PIXELS", 1),
+    ):
+        monkeypatch.setattr(f"turbrestore.{name}", size)
+    parts = nonlocal_weights(guide, SMALL)
+    assert len(parts.strips) > 8
+    assert len(whole.strips) == 1
+    assert np.array_equal(whole.tails, parts.tails)
+    assert np.array_equal(whole.heads, parts.heads)
+    assert np.allclose(whole.weights, parts.weights, atol=1e-5)
+
+
+def test_pairs_in_a_file_are_those_in_memory(tmp_path):
+    guide = np.random.default_rng(1).random((80, 31)).astype(np.float32)
+    kept, filed = nonlocal_weights(guide), nonlocal_weights(guide, folder=tmp_path)
+    assert isinstance(filed.strips[0].roots.base.base, np.memmap)
+    assert np.array_equal(kept.heads, filed.heads)
+    assert np.array_equal(kept.weights, filed.weights)
+    assert kept.norm_squared == filed.norm_squared
 
 
 def test_pairs_are_stored_once_and_weights_are_positive():

@@ -1,9 +1,13 @@
 import threading
 
 import cv2
+import numpy as np
 import pytest
 
+from conftest import make_sequence
+from turbrestore.flow import FlowParams
 from turbrestore.parallel import map_ahead
+from turbrestore.pipeline import RestoreParams, restore
 
 
 def test_results_keep_their_order():
@@ -31,3 +35,13 @@ def test_opencv_threads_are_given_back():
     before = cv2.getNumThreads()
     list(map_ahead(abs, [1]))
     assert cv2.getNumThreads() == before
+
+
+def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads():
+    frames = make_sequence(seed=3, count=14).frames[:, :64, :80]
+    one, *others = (restore(frames, RestoreParams(train=6, flow=FlowParams(threads=n))) for n in (1, 2, 4))
+    for other in others:
+        for name in ("image", "mean"):
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+        assert one.centroid.flows.tobytes() == other.centroid.flows.tobytes()
+        assert np.array_equal(one.filtered.shares, other.filtered.shares)

@@ -14,8 +14,10 @@ from turbrestore.deconvolution import DeconvolutionParams
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.flow import FlowParams
 from turbrestore.frame_source import FrameSource
+from turbrestore.memory import training_share
 from turbrestore.metrics import compare
-from turbrestore.pipeline import RestoreParams, restore, training_share
+from turbrestore.pipeline import restore
+from turbrestore.restoration import RestoreParams
 
 QUICK = RestoreParams(centroid=CentroidParams(iterations=2))
 

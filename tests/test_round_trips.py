@@ -166,6 +166,7 @@ def chosen_settings(draw):
     params = RestoreParams(
         train=draw(st.integers(2, 1000)),
         keep_best=Share(draw(share)),
+        memory_limit=draw(st.none() | st.integers(10**9, 10**12)),
         border=draw(st.sampled_from(["keep", "crop"])),
         displacement_cue=draw(st.booleans()),
         flow=FlowParams(method=draw(st.sampled_from(["dis", "tvl1", "farneback"])), global_shift=draw(st.booleans())),

@@ -44,18 +44,22 @@ from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_flow, check_image
-from .dynamics import FlowDynamics, flow_of
+from .device import PROCESSOR, check_device, find_device
 from .errors import DataError, require, require_between
 from .flow import FlowParams, iterate_flows
-from .frame_noise import FrameNoise, measure_frame_noise, noise_of_frame, relative_sharpness
+from .flow_model import FlowDynamics, flow_of, project
+from .frame_noise import FrameNoise, judge_frame, measure_frame_noise
 from .kalman import Gaussian, PixelGaussian, predict, predict_pixels, update_information, update_pixels
 from .parallel import map_ahead, one_thread_each
 from .plots import plot_frames
 from .preview import preview
+from .scratch import walk
+from .torch_fusion import DeviceFusion, fuse_frame, load_fusion, load_pixels, store_pixels
 from .warp import warp
 
 if TYPE_CHECKING:
@@ -95,6 +99,8 @@ class FilterParams:
         S: variance by which the image may drift from one frame to the next, squared intensity.
     prior_frames : float
         How many frames' worth of information the starting image carries; 0 lets the first frames replace it.
+    device : str
+        Where frames are warped and fused: cpu, cuda or auto; on the processor where blur is what counts.
     """
 
     residual: Literal["keep", "drop"] = "keep"
@@ -106,6 +112,7 @@ class FilterParams:
     image_noise: float | None = None
     image_drift: float = 0.0
     prior_frames: float = 0.0
+    device: str = PROCESSOR
 
     def __post_init__(self) -> None:
         require(
@@ -124,6 +131,7 @@ class FilterParams:
             require_between("image_noise", self.image_noise, 1e-12, 1)
         require_between("image_drift", self.image_drift, 0, 1)
         require_between("prior_frames", self.prior_frames, 0, 1e6)
+        check_device(self.device)
 
 
 @dataclass(frozen=True)
@@ -248,9 +256,12 @@ class _Setting:
 
     dynamics: FlowDynamics
     model: FrameNoise
+    # G for both components of a flow: NumPy multiplies arrays of one shape several times as fast.
+    motion_share: FloatArray
     params: FilterParams
     flow_params: FlowParams
     progress: Callable[[int], None] | None
+    fusion: DeviceFusion | None
 
 
 @dataclass(frozen=True)
@@ -337,7 +348,8 @@ def filter_frames(
     if flows is None:
         flows = np.stack([flow for _, flow in iterate_flows(image, first, flow_params)])
     model = _noise_model(first, flows, image, dynamics, params, flow_params.threads)
-    setting = _Setting(dynamics, model, params, flow_params, progress)
+    share = cv2.merge([model.motion_share] * 2)
+    setting = _Setting(dynamics, model, share, params, flow_params, progress, _fusion(model, params))
     with one_thread_each():
         if start is None:
             prior = _prior(image, setting)
@@ -463,14 +475,40 @@ def _filter_block(
     state, records = prior, list[FrameRecord]()
     for iteration in range(setting.params.inner_iterations):
         if iteration == 0 and known is not None:
-            state, records = _filter_pass(prior, zip(frames, known, strict=True), setting)
+            state, records = _filter_pass(prior, zip(walk(frames), walk(known), strict=True), setting)
         else:
             state, records = _filter_pass(prior, _measure(state.image.mean, frames, setting), setting)
     return state, records
 
 
+def _fusion(model: FrameNoise, params: FilterParams) -> DeviceFusion | None:
+    """Bring to a device what fusion needs; None for the processor, where alone blur is measured."""
+    device = find_device(params.device)
+    if device == PROCESSOR or model.blur is not None:
+        return None
+    return load_fusion(model, params.sharpness, params.image_drift, device)
+
+
+def _fuse_on_device(
+    prior: FilterState, pairs: Iterable[Pair], dynamics: FlowDynamics, fusion: DeviceFusion
+) -> tuple[FilterState, list[FrameRecord]]:
+    """:func:`_filter_pass` with the image on a device from the first frame to the last."""
+    pixels, flow = load_pixels(prior.image, fusion), prior.flow
+    records: list[FrameRecord] = []
+    for motion in _update_motion(prior.flow, pairs, dynamics):
+        flow = motion.state
+        if motion.frame is None or motion.measured is None:
+            records.append(FrameRecord(flow.mean, 0.0, np.nan, np.nan, 0.0))
+            continue
+        pixels, fused = fuse_frame(pixels, motion.frame, flow_of(dynamics, flow.mean), motion.measured, fusion)
+        records.append(FrameRecord(flow.mean, fused.gain, motion.innovation, fused.sharpness, fused.information))
+    return FilterState(store_pixels(pixels, fusion), flow), records
+
+
 def _filter_pass(prior: FilterState, pairs: Iterable[Pair], setting: _Setting) -> tuple[FilterState, list[FrameRecord]]:
     """Update the flow state and the image by each frame and its flow (eqs. 14 to 19)."""
+    if setting.fusion is not None:
+        return _fuse_on_device(prior, pairs, setting.dynamics, setting.fusion)
     image, flow, drift = prior.image, prior.flow, setting.params.image_drift
     records: list[FrameRecord] = []
     motions = _update_motion(prior.flow, pairs, setting.dynamics)
@@ -487,7 +525,8 @@ def _filter_pass(prior: FilterState, pairs: Iterable[Pair], setting: _Setting) -
 
 
 def _measure(image: np.ndarray, frames: Block, setting: _Setting) -> Iterator[Pair]:
-    pairs = iterate_flows(image, (frame for frame in frames if frame is not None), setting.flow_params)
+    counting = walk(frame for frame in frames if frame is not None)
+    pairs = iterate_flows(image, counting, setting.flow_params)
     for frame in frames:
         if setting.progress is not None:
             setting.progress(1)
@@ -499,17 +538,19 @@ def _update_motion(prior: Gaussian, pairs: Iterable[Pair], dynamics: FlowDynamic
 
     It needs no image, so that frames can be warped side by side afterwards.
     """
-    state, noise = prior, max(dynamics.R, _FLOW_NOISE_FLOOR)
+    state, noise, unit = prior, max(dynamics.R, _FLOW_NOISE_FLOOR), np.eye(dynamics.rank)
     for frame, measured in pairs:
         prediction = predict(state, dynamics.A, dynamics.Q)
         if frame is None or measured is None:
             state = prediction
             yield _Motion(None, None, state, np.nan)
             continue
-        deviation = (measured - dynamics.mean_flow).reshape(-1)
-        state, _ = update_information(prediction, deviation, dynamics.C, noise, orthonormal=True)
-        unforeseen = measured - flow_of(dynamics, prediction.mean)
-        yield _Motion(frame, measured, state, float(np.sqrt(np.mean(np.square(unforeseen)))))
+        # As CᵀC = I, what is measured of the state is Cᵀ(W^meas − W̄), and its noise that of the flow.
+        seen = project(dynamics, measured)
+        state, _ = update_information(prediction, seen, unit, noise, orthonormal=True)
+        foreseen = float(prediction.mean @ (2 * seen - prediction.mean))
+        squared = cv2.norm(measured, dynamics.mean_flow) ** 2 - foreseen
+        yield _Motion(frame, measured, state, (max(squared, 0.0) / measured.size) ** 0.5)
 
 
 def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, float | FloatArray, float]:
@@ -517,8 +558,8 @@ def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, float | F
     if motion.frame is None or motion.measured is None:
         return np.full_like(setting.model.usual, np.nan), np.inf, np.nan
     modelled = flow_of(setting.dynamics, motion.state.mean)
-    share = setting.model.motion_share[..., None]
-    estimate = modelled + share * (motion.measured - modelled)
+    estimate = motion.measured - modelled
+    estimate *= setting.motion_share
+    estimate += modelled
     registered = warp(motion.frame, estimate)
-    noise = noise_of_frame(registered, estimate, setting.model, setting.params.sharpness)
-    return registered, noise, relative_sharpness(registered, setting.model)
+    return registered, *judge_frame(registered, estimate, setting.model, setting.params.sharpness)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import DataError
+from .scratch import parts
 
 FloatArray = NDArray[np.float32]
 
@@ -194,7 +195,7 @@ def _finite(array: FloatArray, name: str) -> FloatArray:
     if array.size == 0:
         raise DataError(f"{name}: expected at least one pixel, found shape {array.shape}")
     # One pass without a temporary of the array's size: a NaN or infinity anywhere makes the sum non-finite.
-    if not np.isfinite(np.sum(array, dtype=np.float64)):
+    if not np.isfinite(sum(float(np.sum(part, dtype=np.float64)) for part in parts(array))):
         bad = int(array.size - np.count_nonzero(np.isfinite(array)))
         raise DataError(f"{name}: expected finite values, found {bad} NaN or infinite ones")
     return array

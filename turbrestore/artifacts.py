@@ -21,10 +21,10 @@ from .blur_cues import BlurBounds
 from .blur_estimation import BlurEstimate
 from .centroid import Centroid
 from .deconvolution import Deconvolution
-from .dynamics import FlowDynamics
 from .errors import DataError, InputNotFoundError
+from .flow_model import FlowDynamics
 from .images import atomic_output, check_output, read_image
-from .npy import map_npy, read_npz
+from .npy import map_npy, read_npz, write_npz
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -67,7 +67,8 @@ def save_artifact(path: str | os.PathLike[str], result: DataclassInstance, overw
     Examples
     --------
     >>> import numpy as np, tempfile
-    >>> from turbrestore.dynamics import FlowDynamics, identify
+    >>> from turbrestore.dynamics import identify
+    >>> from turbrestore.flow_model import FlowDynamics
     >>> dynamics = identify(np.random.default_rng(0).normal(size=(5, 4, 4, 2)).astype(np.float32))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     save_artifact(folder + "/dynamics.npz", dynamics)
@@ -83,10 +84,10 @@ def save_artifact(path: str | os.PathLike[str], result: DataclassInstance, overw
     others = {name: value for name, value in values.items() if name not in arrays}
     header = json.dumps({"kind": kind, "schema": SCHEMA, "fields": others})
     with atomic_output(target, overwrite) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, allow_pickle=False, **{_HEADER: np.array(header)}, **arrays)
+        write_npz(stream, {_HEADER: np.array(header), **arrays})
 
 
-def load_artifact(path: str | os.PathLike[str], kind: type[Result]) -> Result:
+def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Path | None = None) -> Result:
     """Read a stage result back.
 
     Parameters
@@ -95,6 +96,8 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result]) -> Result:
         File written by :func:`save_artifact`.
     kind : type
         Class that is expected.
+    scratch : Path, optional
+        Folder of a file that holds what is large; by default that is in memory.
 
     Returns
     -------
@@ -115,7 +118,7 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result]) -> Result:
     ...
     turbrestore.errors.InputNotFoundError: missing.npz: no such file
     """
-    name, (found, fields) = _kind_of(kind), _read(Path(path))
+    name, (found, fields) = _kind_of(kind), _read(Path(path), scratch)
     if found != name:
         raise DataError(f"{path}: expected a {name} artifact, found a {found} artifact")
     return _build(Path(path), kind, fields)
@@ -230,12 +233,12 @@ def load_flows(path: str | os.PathLike[str]) -> FloatArray:
     return check_flow(flows, str(source))
 
 
-def _read(source: Path) -> tuple[str, dict[str, Any]]:
+def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any]]:
     """Kind and fields of an artifact."""
     if not source.is_file():
         raise InputNotFoundError(f"{source}: no such file")
     try:
-        arrays = read_npz(source)
+        arrays = read_npz(source, scratch=scratch)
         header: dict[str, Any] = json.loads(str(arrays.pop(_HEADER)))
         kind, schema, fields = str(header["kind"]), header["schema"], {**header["fields"], **arrays}
     except (DataError, KeyError, TypeError, ValueError, AttributeError) as error:

@@ -17,6 +17,7 @@ from .blur_moments.cues import displacement_variance, relative_blur
 from .blur_moments.frame_blur import blur_against, refer_blur
 from .blur_moments.tiles import tile_map
 from .psf import KOLMOGOROV, estimate_noise
+from .scratch import walk
 
 # Frames that the noise of a frame is measured on.
 _NOISE_FRAMES = 8
@@ -147,4 +148,4 @@ def typical_noise(frames: FloatArray) -> float:
     0.01
     """
     step = max(len(frames) // _NOISE_FRAMES, 1)
-    return float(np.median([estimate_noise(frame) for frame in frames[::step]]))
+    return float(np.median([estimate_noise(frame) for frame in walk(frames[::step])]))

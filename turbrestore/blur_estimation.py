@@ -36,7 +36,6 @@ A fused image is never sharper than its pixels and the interpolation in registra
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
@@ -282,19 +281,23 @@ def _fast_size(size: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class _Gradients:
-    """y, its half-spectrum, and the frequency of each entry of one."""
+    """y, its Fourier transform, and the frequency of each entry of one.
+
+    The last axis holds the planes along x and along y.  A symmetric kernel does not mix real and imaginary parts, so
+    they go through one complex transform.
+    """
 
     planes: FloatArray
-    spectrum: NDArray[np.complex64]
+    spectrum: FloatArray
     frequency: FloatArray
 
 
 def _gradients(image: FloatArray) -> _Gradients:
     dx, dy = image[:-1, 1:] - image[:-1, :-1], image[1:, :-1] - image[:-1, :-1]
     rows, columns = (_taper(size) for size in dx.shape)
-    planes = np.stack([dx, dy]) * np.outer(rows, columns)
-    frequency = np.hypot(fft.fftfreq(len(rows))[:, None], fft.rfftfreq(len(columns)))
-    return _Gradients(planes, fft.rfft2(planes), frequency.astype(np.float32))
+    planes = np.stack([dx, dy], axis=-1) * np.outer(rows, columns)[..., None]
+    frequency = np.hypot(fft.fftfreq(len(rows))[:, None], fft.fftfreq(len(columns)))
+    return _Gradients(planes, cv2.dft(planes), frequency.astype(np.float32))
 
 
 def _taper(size: int) -> FloatArray:
@@ -309,15 +312,18 @@ def _fit_scene(
     """Update x and γ for a blur of given width and exponent: both, and L."""
     width, exponent = blur
     otf = np.exp(-np.log(2) * (gradients.frequency / half_frequency(width)) ** exponent).astype(np.float32)
-    transform = partial(fft.irfft2, s=scene.shape[1:])
-    energy, variance = np.float32(np.square(transform(otf)).sum()), np.float32(2 * noise**2)
-    power, right = otf**2 / variance, transform(otf * gradients.spectrum) / variance
+    # The energy of k is that of its spectrum; the inverse transform leaves the division by the size to its input.
+    energy, variance = np.float32(np.square(otf).mean()), np.float32(2 * noise**2)
+    kernel = np.repeat((otf / np.float32(otf.size))[..., None], 2, axis=2)
+    power = kernel * (otf[..., None] / variance)
+    right = cv2.dft(kernel * gradients.spectrum, flags=cv2.DFT_INVERSE) / variance
     for _ in range(_UPDATES):
         precision = np.reciprocal(prior)
         posterior = np.reciprocal(energy / variance + precision)
         scene = _solve(power, precision, right, posterior, scene)
         prior = scene**2 + posterior
-    misfit = np.square(gradients.planes - transform(otf * fft.rfft2(scene))).sum(dtype=np.float64) / variance
+    blurred = cv2.dft(kernel * cv2.dft(scene), flags=cv2.DFT_INVERSE)
+    misfit = np.square(gradients.planes - blurred).sum(dtype=np.float64) / variance
     total = float(misfit + np.sum(scene**2 / prior + np.log(variance + prior * energy), dtype=np.float64))
     return scene, prior, total / scene.size
 
@@ -325,22 +331,30 @@ def _fit_scene(
 def _solve(
     power: FloatArray, precision: FloatArray, right: FloatArray, preconditioner: FloatArray, start: FloatArray
 ) -> FloatArray:
-    """Conjugate gradients on ``(KᵀK / λ + 1 / γ) x = Kᵀy / λ``; ``power`` is |K|² / λ in Fourier."""
+    """Conjugate gradients on ``(KᵀK / λ + 1 / γ) x = Kᵀy / λ``; ``power`` is |K|² / λ in Fourier over the size."""
+    spectrum, work = np.empty_like(start), np.empty_like(start)
 
     def apply(v: FloatArray) -> FloatArray:
-        return fft.irfft2(power * fft.rfft2(v), s=v.shape[1:]) + precision * v
+        cv2.dft(v, dst=spectrum)
+        np.multiply(spectrum, power, out=spectrum)
+        found = cv2.dft(spectrum, flags=cv2.DFT_INVERSE)
+        found += np.multiply(precision, v, out=work)
+        return found
 
-    x = start
+    x = start.copy()
     residual = right - apply(x)
-    direction = preconditioned = preconditioner * residual
+    preconditioned = preconditioner * residual
+    direction = preconditioned.copy()
     decrease = np.vdot(residual, preconditioned)
     for _ in range(_STEPS):
         if decrease <= 0:
             break
         image = apply(direction)
         length = decrease / np.vdot(direction, image)
-        x, residual = x + length * direction, residual - length * image
-        preconditioned = preconditioner * residual
+        x += np.multiply(direction, length, out=work)
+        residual -= np.multiply(image, length, out=image)
+        np.multiply(preconditioner, residual, out=preconditioned)
         before, decrease = decrease, np.vdot(residual, preconditioned)
-        direction = preconditioned + (decrease / before) * direction
+        direction *= decrease / before
+        direction += preconditioned
     return x

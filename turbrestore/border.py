@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_flow
 from .errors import DataError, require_between
+from .scratch import walk
 from .warp import inside
 
 Rectangle = tuple[int, int, int, int]
@@ -40,7 +41,10 @@ def coverage(flows: ArrayLike) -> FloatArray:
     stack = check_flow(flows, "flows")
     if stack.ndim != 4 or not len(stack):
         raise DataError(f"flows: expected shape (T, H, W, 2) with at least one flow, found {stack.shape}")
-    return np.mean([inside(flow) for flow in stack], axis=0, dtype=np.float32)
+    total = np.zeros(stack.shape[1:3], np.float32)
+    for flow in walk(stack):
+        total += inside(flow)
+    return total / np.float32(len(stack))
 
 
 def well_seen(seen: ArrayLike, least: float = 0.9, margin: int = 0, smallest: int = 16) -> Rectangle:

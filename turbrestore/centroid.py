@@ -16,17 +16,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_frames
+from .device import PROCESSOR
 from .errors import require, require_between
 from .flow import FlowParams, estimate_flow
 from .parallel import map_ahead
 from .plots import plot_displacements
 from .preview import preview
+from .scratch import mean_of, new_stack, release, walk
 from .stabilisation import mean_stabilised
 from .warp import compose_flows, inside, invert_flow, warp
 
@@ -124,6 +128,7 @@ def find_centroid(
     params: CentroidParams | None = None,
     flow_params: FlowParams | None = None,
     progress: Callable[[int], None] | None = None,
+    scratch: Path | None = None,
 ) -> Centroid:
     """Iterate to the centroid of ``frames``.
 
@@ -137,6 +142,8 @@ def find_centroid(
         How flow is measured.
     progress : callable, optional
         Called with 1 after each flow.
+    scratch : Path, optional
+        Folder of a file that holds the flows; by default they are in memory.
 
     Returns
     -------
@@ -163,10 +170,11 @@ def find_centroid(
     require(params.start < len(stack), f"start: expected a frame below {len(stack)}, found {params.start}")
     image = _start(stack, params, flow_params)
     total = np.zeros((*stack.shape[1:3], 2), np.float32)
+    flows = new_stack((*stack.shape[:3], 2), scratch)
     sizes: list[float] = []
     while True:
-        flows = estimate_flow(image, stack, flow_params, progress)
-        mean_flow = flows.mean(axis=0, dtype=np.float32)
+        flows = estimate_flow(image, stack, flow_params, progress, flows)
+        mean_flow = mean_of(flows)
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
         change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
         # The temporal mean is a blurred reference: flow from the first registered mean is better, wherever it lies.
@@ -175,10 +183,9 @@ def find_centroid(
         if not converged:
             recentre = invert_flow(mean_flow)
             total = compose_flows(total, recentre)
-            for index in range(len(flows)):
-                flows[index] = compose_flows(flows[index], recentre)
+            _recentre(flows, recentre, flow_params.threads)
         image = (
-            mean_registered(stack, flows, flow_params.threads)
+            mean_registered(stack, flows, flow_params.threads, flow_params.device)
             if params.mode == "fused"
             else warp(stack[params.start], total)
         )
@@ -189,10 +196,20 @@ def find_centroid(
 def _start(stack: FloatArray, params: CentroidParams, flow_params: FlowParams) -> FloatArray:
     if params.mode == "single":
         return stack[params.start]
-    return mean_stabilised(stack) if flow_params.global_shift else stack.mean(axis=0, dtype=np.float32)
+    return mean_stabilised(stack) if flow_params.global_shift else mean_of(stack)
 
 
-def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0) -> FloatArray:
+def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:
+    """Let flows start from where ``recentre`` leads, in place."""
+
+    def move(index: int) -> None:
+        flows[index] = compose_flows(flows[index], recentre)
+
+    for _ in map_ahead(move, range(len(flows)), threads):
+        release(flows)
+
+
+def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0, device: str = PROCESSOR) -> FloatArray:
     """Average of frames warped onto the reference that their flows start from.
 
     At each pixel those frames count that show it; where none does, all of them, with their borders repeated.
@@ -204,6 +221,8 @@ def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0) -> 
         Pixels.
     threads : int
         Frames warped side by side; 0 means one per available core.
+    device : str
+        Where they are warped, see :mod:`turbrestore.device`.
 
     Returns
     -------
@@ -217,11 +236,12 @@ def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0) -> 
     """
 
     def register(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
-        seen = np.maximum(inside(pair[1]), _UNSEEN)
-        return (warp(*pair).T * seen.T).T, seen
+        registered, seen = warp(*pair, device=device), np.maximum(inside(pair[1]), _UNSEEN)
+        registered *= seen if registered.ndim == seen.ndim else seen[..., None]
+        return registered, seen
 
     total, weight = np.zeros(frames.shape[1:]), np.zeros(frames.shape[1:3])
-    for _, (registered, seen) in map_ahead(register, zip(frames, flows, strict=True), threads):
-        total += registered
-        weight += seen
+    for _, (registered, seen) in map_ahead(register, zip(walk(frames), walk(flows), strict=True), threads):
+        cv2.accumulate(registered, total)
+        cv2.accumulate(seen, weight)
     return (total.T / weight.T).T.astype(np.float32)

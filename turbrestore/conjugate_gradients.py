@@ -9,16 +9,16 @@ import numpy as np
 from scipy import fft
 
 from .arrays import FloatArray
-from .convolution_problem import Problem, inner, seen_mean
+from .convolution_problem import Problem, inner, seen_mean, spectral_inner
 from .psf import Spectrum
 
 
 class GradientState(NamedTuple):
-    """u, residual of the normal equations, search direction, and ⟨residual, preconditioned residual⟩."""
+    """u, and of u − m in Fourier: residual of the normal equations, search direction; ⟨residual, preconditioned⟩."""
 
     image: FloatArray
-    residual: FloatArray
-    direction: FloatArray
+    residual: Spectrum
+    direction: Spectrum
     decrease: float
 
 
@@ -34,33 +34,42 @@ class ConjugateGradients:
 
     def start(self, problem: Problem) -> GradientState:
         """Start from the solution for the continued image."""
-        m = seen_mean(problem)
-        right = fft.rfft2(problem.observed - m) * problem.otf.conj() * problem.fidelity
-        u = m + self._precondition(problem, right)
-        residual = -fft.irfft2(problem.gradient_spectrum(u) + self.symbol * fft.rfft2(u - m), s=u.shape)
-        direction = self._precondition(problem, fft.rfft2(residual))
-        return GradientState(u, residual, direction, inner(residual, direction))
+        m, shape = seen_mean(problem), problem.observed.shape
+        deviation = fft.rfft2(problem.observed - m) * problem.otf.conj()
+        deviation *= np.float32(problem.fidelity) * self._inverse(problem)
+        u = m + fft.irfft2(deviation, s=shape)
+        residual = -self.symbol * deviation
+        deviation[0, 0] += m * u.size
+        residual -= problem.gradient_spectrum(deviation)
+        direction = residual * self._inverse(problem)
+        return GradientState(u, residual, direction, spectral_inner(residual, direction, shape))
 
     def step(self, problem: Problem, state: GradientState) -> GradientState:
-        """One iteration of preconditioned conjugate gradients."""
+        """One iteration of preconditioned conjugate gradients.
+
+        Inner products are those of the images, by Parseval, so that only u and what was seen of it are transformed.
+        """
         if state.decrease <= 0:
             return state
-        spectrum = fft.rfft2(state.direction)
-        blurred = problem.seen * fft.irfft2(problem.otf * spectrum, s=state.image.shape)
-        data = problem.fidelity * problem.otf.conj() * fft.rfft2(blurred)
-        image = fft.irfft2(data + self.symbol * spectrum, s=state.image.shape)
-        length = np.float32(state.decrease / inner(state.direction, image))
-        residual = state.residual - length * image
-        preconditioned = self._precondition(problem, fft.rfft2(residual))
-        decrease = inner(residual, preconditioned)
-        direction = preconditioned + np.float32(decrease / state.decrease) * state.direction
-        return GradientState(state.image + length * state.direction, residual, direction, decrease)
+        direction, shape = state.direction, state.image.shape
+        image = problem.normal_spectrum(direction)
+        image += self.symbol * direction
+        length = np.float32(state.decrease / spectral_inner(direction, image, shape))
+        image *= -length
+        image += state.residual
+        preconditioned = image * self._inverse(problem)
+        decrease = spectral_inner(image, preconditioned, shape)
+        u = fft.irfft2(direction, s=shape)
+        u *= length
+        u += state.image
+        preconditioned += np.float32(decrease / state.decrease) * direction
+        return GradientState(u, image, preconditioned, decrease)
 
     def penalty(self, problem: Problem, u: FloatArray) -> float:
         """½⟨u − m, R(u − m)⟩."""
         deviation = u - seen_mean(problem)
         return inner(deviation, fft.irfft2(self.symbol * fft.rfft2(deviation), s=u.shape)) / 2
 
-    def _precondition(self, problem: Problem, spectrum: Spectrum) -> FloatArray:
-        denominator = problem.fidelity * np.abs(problem.otf) ** 2 + self.symbol
-        return fft.irfft2(spectrum / denominator, s=problem.observed.shape)
+    def _inverse(self, problem: Problem) -> FloatArray:
+        """Find the preconditioner in Fourier."""
+        return np.reciprocal(np.float32(problem.fidelity) * problem.power + self.symbol)

@@ -24,8 +24,11 @@ nltv and tv: :mod:`turbrestore.primal_dual`; wiener and tikhonov: :mod:`turbrest
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -36,19 +39,15 @@ from .arrays import FloatArray, check_image, luminance
 from .blur_estimation import BlurEstimate
 from .conjugate_gradients import ConjugateGradients
 from .convolution_problem import Problem, inner
+from .device import PROCESSOR, check_device, find_device
 from .errors import DataError, require, require_between
 from .local_tv import LOCAL_TV
-from .nonlocal_tv import (
-    NonlocalParams,
-    nonlocal_divergence,
-    nonlocal_gradient,
-    nonlocal_total_variation,
-    nonlocal_weights,
-    project_to_unit,
-)
+from .nonlocal_penalty import NonlocalPenalty
+from .nonlocal_tv import NonlocalParams, nonlocal_weights
+from .parallel import available_cores, one_thread_each
 from .plots import plot_objective
 from .preview import preview
-from .primal_dual import PrimalDual, Regulariser
+from .primal_dual import Penalty, PrimalDual
 from .psf import (
     GAUSSIAN,
     blur_otf,
@@ -59,6 +58,7 @@ from .psf import (
     psf_to_otf,
     wiener_fidelity,
 )
+from .torch_deconvolution import SolverSettings, solve_on_device
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,6 +72,10 @@ _MARGIN_SIGMAS = 4.0
 _START_STEPS = 40
 _START_TOLERANCE = 1e-4
 _RECORD_EVERY = 10
+# Memory: to work with, of the images of a channel for each pixel, of each pair, and of each pair for each channel.
+_WORK_BYTES, _IMAGE_BYTES, _PAIR_BYTES, _DUAL_BYTES = 1e8, 120, 8, 12
+# Pairs per pixel over those that a pixel chooses: many are chosen from both sides.
+_SHARE_OF_PAIRS = 0.65
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,12 @@ class DeconvolutionParams:
         patches tell more about which pixels belong together (0.2 to 4 dB on photographs, brick and text).
     weights : NonlocalParams
         Nonlocal weights.
+    device : str
+        Where weights and image are computed: cpu, cuda or auto.
+    memory : float, optional
+        Bytes that nltv may take.  Where the nonlocal pairs and what is known of them need more, they are kept in a
+        file in the folder for temporary files and worked on in strips of rows, to the same result.  What remains is
+        120 bytes per pixel and 100 MB, whatever is asked for.  By default there is no limit.
     """
 
     method: Literal["nltv", "tv", "wiener", "tikhonov"] = "nltv"
@@ -114,6 +124,8 @@ class DeconvolutionParams:
     channels: Literal["luminance", "each"] = "luminance"
     sharpen_guide: bool = True
     weights: NonlocalParams = field(default_factory=NonlocalParams)
+    device: str = PROCESSOR
+    memory: float | None = None
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -130,6 +142,9 @@ class DeconvolutionParams:
             require_between("fidelity", self.fidelity, 1e-6, 1e9)
         require_between("iterations", self.iterations, 1, 100_000)
         require_between("tolerance", self.tolerance, 0, 1)
+        check_device(self.device)
+        if self.memory is not None:
+            require_between("memory", self.memory, 1, 1e15, "bytes")
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,15 +337,46 @@ def _solve(
     guide: FloatArray | None,
     progress: Callable[[int], None] | None,
 ) -> _Solution:
+    if find_device(params.device) != PROCESSOR:
+        return _solve_on_device(problems, params, guide, progress)
     if params.method == "tikhonov":
         quadratic = ConjugateGradients(np.ones((1, 1), np.float32))
         return _iterate(quadratic, problems, [quadratic.start(p) for p in problems], params, progress)
     if params.method == "wiener":
         quadratic = _wiener_solver(problems[0])
         return _iterate(quadratic, problems, [quadratic.start(p) for p in problems], params, progress)
-    starts = [_wiener_image(problem) for problem in problems]
-    solver = PrimalDual(LOCAL_TV if params.method == "tv" else _nonlocal_tv(problems, starts, guide, params))
-    return _iterate(solver, problems, [solver.start(u) for u in starts], params, progress)
+    cores = available_cores()
+    with one_thread_each(), fft.set_workers(cores), ThreadPoolExecutor(cores) as pool:
+        starts, guide = _sharpened(problems, guide, params, pool)
+        penalty: Penalty = LOCAL_TV
+        if params.method == "nltv":
+            folder = _folder_of_pairs(problems, params)
+            penalty = NonlocalPenalty(nonlocal_weights(guide, params.weights, folder), pool, folder)
+        solver = PrimalDual(penalty)
+        states = [solver.start(problem, u) for problem, u in zip(problems, starts, strict=True)]
+        return _iterate(solver, problems, states, params, progress)
+
+
+def _solve_on_device(
+    problems: list[Problem],
+    params: DeconvolutionParams,
+    guide: FloatArray | None,
+    progress: Callable[[int], None] | None,
+) -> _Solution:
+    settings = SolverSettings(
+        params.method,
+        params.iterations,
+        params.tolerance,
+        _RECORD_EVERY,
+        _START_STEPS,
+        _START_TOLERANCE,
+        params.sharpen_guide,
+        params.weights,
+    )
+    found = solve_on_device(problems, guide, settings, find_device(params.device), progress)
+    recorded, objective, changes = zip(*found.records, strict=True)
+    figures = np.array(recorded), np.array(objective), np.array(changes)
+    return _Solution(found.images, found.iterations, found.converged, *figures)
 
 
 class _Solver(Protocol[State]):
@@ -381,22 +427,28 @@ def _wiener_image(problem: Problem) -> FloatArray:
     return state.image
 
 
-def _nonlocal_tv(
-    problems: list[Problem], starts: list[FloatArray], guide: FloatArray | None, params: DeconvolutionParams
-) -> Regulariser:
-    """Penalty whose weights come from the guide, or from the image itself (the mean of its channels)."""
-    if guide is not None and params.sharpen_guide:
-        guide = _wiener_image(dataclasses.replace(problems[0], observed=guide))
+def _folder_of_pairs(problems: list[Problem], params: DeconvolutionParams) -> Path | None:
+    """Where nonlocal pairs are kept; None in memory, where there is room for them."""
+    pairs = _SHARE_OF_PAIRS * (params.weights.best + params.weights.nearest)
+    images, edges = _IMAGE_BYTES * len(problems), (_PAIR_BYTES + _DUAL_BYTES * len(problems)) * pairs
+    need = _WORK_BYTES + problems[0].seen.size * (images + edges)
+    return Path(tempfile.gettempdir()) if params.memory is not None and need > params.memory else None
+
+
+def _sharpened(
+    problems: list[Problem], guide: FloatArray | None, params: DeconvolutionParams, pool: Executor
+) -> tuple[list[FloatArray], FloatArray]:
+    """Wiener solutions to start from, and the guide of the weights: by default the mean of what is deblurred."""
+    blurred = list(problems)
+    if params.method == "nltv" and params.sharpen_guide and guide is not None:
+        blurred.append(dataclasses.replace(problems[0], observed=guide))
+    sharp = list(pool.map(_wiener_image, blurred))
+    starts, further = sharp[: len(problems)], sharp[len(problems) :]
+    if further:
+        guide = further[0]
     elif guide is None:
         guide = np.mean(starts if params.sharpen_guide else [p.observed for p in problems], axis=0, dtype=np.float32)
-    graph = nonlocal_weights(guide, params.weights)
-    return Regulariser(
-        gradient=lambda u: nonlocal_gradient(graph, u),
-        adjoint=lambda p: -nonlocal_divergence(graph, p),
-        project=lambda p: project_to_unit(graph, p),
-        value=lambda u: nonlocal_total_variation(graph, u),
-        norm_squared=graph.norm_squared,
-    )
+    return starts, guide
 
 
 def _read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:

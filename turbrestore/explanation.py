@@ -9,7 +9,8 @@ from .arrays import FloatArray, luminance
 from .border import Rectangle
 from .centroid import Centroid
 from .decision import Decision
-from .dynamics import FlowDynamics
+from .flow_model import FlowDynamics
+from .scratch import walk
 from .stabilisation import DEAD_ZONE
 
 # A frame that counts for less than this share of the average hardly counts.
@@ -74,17 +75,20 @@ def explain_input(training: FloatArray) -> tuple[Decision, ...]:
     [('saturation', 'left as it is'), ('flat frames', '1 of 4, kept')]
     """
     said = []
-    saturated = float(np.mean(training >= _FULL))
+    saturated, contrast = 0.0, np.zeros(len(training))
+    for index, frame in enumerate(walk(training)):
+        saturated += float(np.mean(frame >= _FULL)) / len(training)
+        grey = luminance(frame)
+        # A saturated part is no texture.
+        textured = grey[grey < _FULL]
+        contrast[index] = textured.std() if textured.size else 0.0
     if saturated > _MUCH:
         reason = f"{saturated:.0%} of the training frames is at full scale: detail is lost there, and edges may ring"
         said.append(Decision("saturation", "left as it is", reason))
-    grey = luminance(training)
-    # A saturated part is no texture.
-    contrast = np.array([float(frame[frame < _FULL].std()) if (frame < _FULL).any() else 0.0 for frame in grey])
     faint = int(np.sum(contrast < _FAINT * contrast.max()))
     if faint:
         reason = "hardly any contrast: their flow follows noise, and their weight is what their sharpness gives them"
-        said.append(Decision("flat frames", f"{faint} of {len(grey)}, kept", reason))
+        said.append(Decision("flat frames", f"{faint} of {len(training)}, kept", reason))
     return tuple(said)
 
 
@@ -107,7 +111,8 @@ def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
     >>> explain_motion(np.full((2, 24, 24, 2), 3.0, np.float32))[0].choice
     'taken as measured'
     """
-    size = float(np.sqrt(2 * np.mean(np.square(flows, dtype=np.float64))))
+    squares = sum(float(np.mean(np.square(flow, dtype=np.float64))) for flow in walk(flows))
+    size = float(np.sqrt(2 * squares / len(flows)))
     side = min(flows.shape[1:3])
     if size < _FAR * side:
         return ()
@@ -136,7 +141,7 @@ def explain_camera(flows: FloatArray) -> tuple[Decision, ...]:
     >>> explain_camera(still + np.float32([6, -8]))[0].choice
     'followed over 10.0 pixels'
     """
-    shifts = np.median(flows[:, ::4, ::4].reshape(len(flows), -1, 2), axis=1)
+    shifts = np.array([np.median(flow[::4, ::4].reshape(-1, 2), axis=0) for flow in walk(flows)])
     largest = float(np.hypot(shifts[:, 0], shifts[:, 1]).max())
     if largest <= DEAD_ZONE:
         return ()

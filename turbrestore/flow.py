@@ -31,9 +31,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, check_frames, check_image, luminance
 from .confidence import flow_confidence, regularise_flow
+from .device import PROCESSOR, check_device, find_device
 from .errors import DataError, require, require_between
 from .parallel import map_ahead
 from .psf import estimate_noise
+from .scratch import release, walk
 from .stabilisation import DEAD_ZONE, ShiftReference, overlap, refer_shift, shift_against
 from .tvl1 import TvL1Params, refer_tvl1, tvl1_flows
 
@@ -128,6 +130,8 @@ class FlowParams:
         Draw the flow of flat regions, and along edges, towards its neighbourhood.
     threads : int
         Frames solved side by side; 0 means one per available core.
+    device : str
+        Where ``tvl1`` runs: cpu, cuda or auto; the other methods are OpenCV's and run on the processor.
     dis : DisParams
         Settings of dense inverse search.
     tvl1 : TvL1Params
@@ -142,6 +146,7 @@ class FlowParams:
     global_shift: bool = True
     confidence: bool = True
     threads: int = 0
+    device: str = PROCESSOR
     dis: DisParams = field(default_factory=DisParams)
     tvl1: TvL1Params = field(default_factory=TvL1Params)
     farneback: FarnebackParams = field(default_factory=FarnebackParams)
@@ -154,6 +159,7 @@ class FlowParams:
         require_between("contrast_window", self.contrast_window, 0, 1000, "pixels")
         require_between("contrast_floor", self.contrast_floor, 1e-6, 1)
         require_between("threads", self.threads, 0, 256)
+        check_device(self.device)
 
 
 def estimate_flow(
@@ -161,6 +167,7 @@ def estimate_flow(
     frames: ArrayLike,
     params: FlowParams | None = None,
     progress: Callable[[int], None] | None = None,
+    out: FloatArray | None = None,
 ) -> FloatArray:
     """Flows from ``reference`` to each of ``frames``.
 
@@ -174,6 +181,8 @@ def estimate_flow(
         Method and settings.
     progress : callable, optional
         Called with 1 after each frame, in the calling thread.
+    out : ndarray, float32, shape (T, H, W, 2), optional
+        Where the flows are put, in memory or in a mapped file; by default a new array.
 
     Returns
     -------
@@ -197,9 +206,10 @@ def estimate_flow(
     True
     """
     stack = check_frames(frames)
-    flows = np.empty((*stack.shape[:3], 2), np.float32)
-    for index, (_, flow) in enumerate(iterate_flows(reference, stack, params)):
+    flows = np.empty((*stack.shape[:3], 2), np.float32) if out is None else out
+    for index, (_, flow) in enumerate(iterate_flows(reference, walk(stack), params)):
         flows[index] = flow
+        release(flows)
         if progress is not None:
             progress(1)
     return flows
@@ -263,7 +273,7 @@ def iterate_flows(
         if confidence is not None:
             noises = map(estimate_noise, batch)
             flows = [regularise_flow(flow, confidence, n) for flow, n in zip(flows, noises, strict=True)]
-        return [shift + flow for shift, flow in zip(shifts, flows, strict=True)]
+        return [flow + shift if shift.any() else flow for shift, flow in zip(shifts, flows, strict=True)]
 
     def checked() -> Iterator[FloatArray]:
         for index, frame in enumerate(frames):
@@ -272,8 +282,10 @@ def iterate_flows(
                 raise DataError(f"frame {index}: expected {target.shape[:2]} pixels, found {image.shape[:2]}")
             yield image
 
-    stream, size = checked(), params.tvl1.batch if params.method == "tvl1" else 1
-    for batch, flows in map_ahead(solve, iter(lambda: list(islice(stream, size)), []), params.threads):
+    # A device solves a batch at once, while the next is prepared; on the processor every frame has a thread.
+    on_device = params.method == "tvl1" and find_device(params.device) != PROCESSOR
+    stream, size, threads = checked(), *((params.tvl1.batch, 2) if on_device else (1, params.threads))
+    for batch, flows in map_ahead(solve, iter(lambda: list(islice(stream, size)), []), threads):
         yield from zip(batch, flows, strict=True)
 
 
@@ -303,18 +315,22 @@ def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> 
     grey = luminance(check_image(image))
     # Centred first: E[x²] − E[x]² loses all digits of a faint texture on a bright ground.
     centred = grey - cv2.GaussianBlur(grey, (0, 0), window)
-    deviation = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), window) + np.float32(floor) ** 2)
-    return centred / deviation
+    deviation = cv2.GaussianBlur(centred * centred, (0, 0), window)
+    deviation += np.float32(floor) ** 2
+    centred /= np.sqrt(deviation, out=deviation)
+    return centred
 
 
 def _prepare(image: FloatArray, params: FlowParams) -> GreyBytes:
     """8-bit image for the solvers: DIS takes nothing else, and the others lose nothing measurable."""
     if params.contrast_window > 0:
         normalised = normalise_contrast(image, params.contrast_window, params.contrast_floor)
-        levels = normalised * _LEVELS_PER_DEVIATION + 128.0
+        normalised *= _LEVELS_PER_DEVIATION
+        normalised += 128.0
+        levels = normalised
     else:
         levels = luminance(image) * 255.0
-    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+    return np.clip(np.rint(levels, out=levels), 0, 255, out=levels).astype(np.uint8)
 
 
 def _whole_shift(frame: FloatArray, position: ShiftReference) -> FloatArray:
@@ -350,7 +366,7 @@ def _dis(params: FlowParams, reference: GreyBytes) -> Solver:
 
 
 def _tvl1(params: FlowParams, reference: GreyBytes) -> Solver:
-    referred = refer_tvl1(reference.astype(np.float32), params.tvl1)
+    referred = refer_tvl1(reference.astype(np.float32), params.tvl1, params.device)
     return lambda frames: tvl1_flows(frames.astype(np.float32), referred).flows
 
 

@@ -27,7 +27,8 @@ from .arrays import FloatArray, luminance
 from .blur_moments.frame_blur import BlurReference, blur_against, refer_blur
 from .blur_moments.fusion import FusionRule, fusion_rule, laplacian_energy, noise_factor
 from .parallel import map_ahead
-from .warp import inside, warp
+from .scratch import walk
+from .warp import inside, strips, warp
 
 # Smallest variance, so that noise-free synthetic data keep every gain defined: (1/4096 of full scale)².
 _IMAGE_NOISE_FLOOR = 6e-8
@@ -36,11 +37,9 @@ _LARGEST_SCORE = 3.0
 # Sharpness that differs by less than this share is not worth averaging fewer frames.
 _LEAST_SPREAD = 0.03
 # Z is so many times larger where a map folds.
-_DISTRUST = 1e3
+_LOG_DISTRUST = np.log(np.float32(1e3))
 # A frame that deviates from the usual by more than this many variances shows something that is not the scene.
 _OUTLIER, _OUTLIER_WINDOW = 6.0, 3.0
-# Z grows with that power of the excess.
-_REJECTION = 3
 # Share of the mean variance that every pixel varies by at least.
 _LEAST_DEVIATION = 0.1
 # Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels it correlates over.
@@ -57,6 +56,8 @@ class FrameNoise:
         Z before sharpness, squared intensity.
     template : tuple of two ndarrays, float32, shape (H, W)
         Gradient of the image that the frames are registered to, along x and y, intensity per pixel.
+    template_energy : float
+        Sum of its square.
     usual : ndarray, float32, shape (H, W)
         Mean sharpness over the frames.
     score_scale : ndarray, float32, shape (H, W)
@@ -78,6 +79,7 @@ class FrameNoise:
 
     image_noise: float
     template: tuple[FloatArray, FloatArray]
+    template_energy: float
     usual: FloatArray
     score_scale: FloatArray
     score_variance: FloatArray
@@ -140,15 +142,15 @@ def measure_frame_noise(
 
     def measure(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
         registered = luminance(warp(*pair))
-        return registered, _sharpness(registered, template, window)
+        return registered, _smooth(_product(registered, template), window)
 
     total, squares, sharp, sharp_squares = (np.zeros(image.shape[:2]) for _ in range(4))
     kept: list[FloatArray] = []
-    for _, (registered, sharpness) in map_ahead(measure, zip(frames, flows, strict=True), threads):
-        total += registered
-        squares += np.square(registered, dtype=np.float64)
-        sharp += sharpness
-        sharp_squares += np.square(sharpness, dtype=np.float64)
+    for _, (registered, sharpness) in map_ahead(measure, zip(walk(frames), walk(flows), strict=True), threads):
+        cv2.accumulate(registered, total)
+        cv2.accumulateSquare(registered, squares)
+        cv2.accumulate(sharpness, sharp)
+        cv2.accumulateSquare(sharpness, sharp_squares)
         if by_blur:
             kept.append(registered)
     count = len(frames)
@@ -156,13 +158,15 @@ def measure_frame_noise(
     usual = sharp / count
     spread = np.maximum(sharp_squares / count - usual**2, 0.0)
     # The flattest fifth of the image varies by sensor noise alone; elsewhere blur and misregistration add to it.
-    energy = _smooth(template[0] ** 2 + template[1] ** 2, window)
+    square = template[0] ** 2 + template[1] ** 2
+    energy = _smooth(square, window)
     usual_frame, deviation = _without_outliers(frames, flows, total / count, variance, threads)
     sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
     scale = _score_scale(usual, spread, energy * _SOBEL_NOISE * sensor_noise, window)
     return FrameNoise(
         image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
         template=template,
+        template_energy=float(square.sum(dtype=np.float64)),
         usual=usual.astype(np.float32),
         score_scale=scale,
         score_variance=(scale**2 * spread).astype(np.float32),
@@ -174,11 +178,14 @@ def measure_frame_noise(
     )
 
 
-def noise_of_frame(registered: FloatArray, flow: FloatArray, model: FrameNoise, sharpness: float) -> float | FloatArray:
-    """Z of one frame: lower where it is sharper than usual, higher where it shows something else or its flow errs.
+def judge_frame(
+    registered: FloatArray, flow: FloatArray, model: FrameNoise, sharpness: float
+) -> tuple[float | FloatArray, float]:
+    """Z of one frame, and how sharp it is.
 
-    A frame shows something else, a bird or a flash, where it deviates from the usual by far more than frames do; its
-    flow errs where it folds or leaves the frame.
+    Z is lower where the frame is sharper than usual, higher where it shows something else or its flow errs.  A frame
+    shows something else, a bird or a flash, where it deviates from the usual by far more than frames do; its flow errs
+    where it folds or leaves the frame.
 
     Parameters
     ----------
@@ -188,53 +195,15 @@ def noise_of_frame(registered: FloatArray, flow: FloatArray, model: FrameNoise, 
         The flow it was warped by, pixels.
     model : FrameNoise
     sharpness : float
-        β; 0 gives the same number for every frame and pixel, as in the paper.  Without effect where ``model.blur`` is
-        there.
+        β; 0 gives the same Z for every frame and pixel, as in the paper.  Without effect where ``model.blur`` is there.
 
     Returns
     -------
-    float or ndarray, float32, shape (H, W)
+    noise : float or ndarray, float32, shape (H, W)
         Squared intensity.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> frames = list(np.random.default_rng(0).normal(0.5, 0.1, (50, 16, 16)).astype(np.float32))
-    >>> still = np.zeros((50, 16, 16, 2), np.float32)
-    >>> model = measure_frame_noise(frames, still, np.full((16, 16), 0.5, np.float32), np.ones((16, 16), np.float32))
-    >>> noise_of_frame(frames[0], still[0], model, sharpness=0.0) == model.image_noise
-    True
-    """
-    if model.blur is None and sharpness == 0:
-        return model.image_noise
-    grey = luminance(registered)
-    excess = np.maximum(_deviates(grey, model.usual_frame, model.deviation) / _OUTLIER, 1)
-    distrust = np.float32(model.image_noise) * np.power(excess, _REJECTION) * _distrust(flow)
-    if model.blur is not None:
-        reference, rule = model.blur
-        return noise_factor(rule, blur_against(registered[None], reference).extra[0]) * distrust
-    seen = _sharpness(grey, model.template, model.window)
-    score = np.clip(model.score_scale * (seen - model.usual), -_LARGEST_SCORE, _LARGEST_SCORE)
-    # What is not the scene may well have more contrast than the scene.
-    score = np.where(score > 0, score / np.square(excess), score)
-    # For a normal score of variance s² the mean of exp(β z − β² s² / 2) is one: the information per frame stays 1/Z.
-    exponent = 0.5 * sharpness**2 * model.score_variance - sharpness * score
-    return np.exp(exponent) * distrust
-
-
-def relative_sharpness(registered: FloatArray, model: FrameNoise) -> float:
-    """Gradient of a registered frame projected on that of the image the model was measured with.
-
-    Parameters
-    ----------
-    registered : ndarray, float32, shape (H, W) or (H, W, 3)
-        The frame, warped onto the image.
-    model : FrameNoise
-
-    Returns
-    -------
-    float
-        1 for the image itself, less for a blurred, torn or misregistered frame.
+    sharpness : float
+        Gradient of the frame projected on that of the image the model was measured with: 1 for the image itself, less
+        for a blurred, torn or misregistered frame.
 
     Examples
     --------
@@ -242,13 +211,48 @@ def relative_sharpness(registered: FloatArray, model: FrameNoise) -> float:
     >>> image = np.tile(np.sin(np.arange(16.0)), (16, 1)).astype(np.float32)
     >>> still = np.zeros((2, 16, 16, 2), np.float32)
     >>> model = measure_frame_noise([image, image], still, image, np.ones((16, 16), np.float32))
-    >>> round(relative_sharpness(0.5 * image, model), 3)
-    0.5
+    >>> noise, sharp = judge_frame(0.5 * image, still[0], model, sharpness=0.0)
+    >>> noise == model.image_noise, round(sharp, 3)
+    (True, 0.5)
     """
-    dx, dy = _gradient(luminance(registered))
-    along, across = model.template
-    energy = float(np.sum(np.square(along) + np.square(across)))
-    return float(np.sum(dx * along + dy * across)) / max(energy, 1e-12)
+    grey = luminance(registered)
+    product = _product(grey, model.template)
+    sharp = float(cv2.sumElems(product)[0]) / max(model.template_energy, 1e-12)
+    if model.blur is None and sharpness == 0:
+        return model.image_noise, sharp
+    noise = _deviates(grey, model.usual_frame, model.deviation)
+    lost = _lost(flow)
+    seen = None if model.blur is not None else _smooth(product, model.window)
+    for rows in strips(noise.shape):
+        excess = np.maximum(noise[rows] / _OUTLIER, 1)
+        squared = excess * excess
+        exponent = lost[rows] * _LOG_DISTRUST
+        if seen is not None:
+            exponent += _exponent(seen[rows], squared, model, rows, sharpness)
+        # The third power: what deviates twice as much as is tolerated counts an eighth.
+        excess *= squared
+        excess *= np.float32(model.image_noise)
+        np.multiply(excess, np.exp(exponent, out=exponent), out=noise[rows])
+    if model.blur is not None:
+        reference, rule = model.blur
+        noise = noise_factor(rule, blur_against(registered[None], reference).extra[0]) * noise
+    return noise, sharp
+
+
+def _exponent(seen: FloatArray, excess: FloatArray, model: FrameNoise, rows: slice, sharpness: float) -> FloatArray:
+    """Logarithm of the factor on Z by which a frame of the local sharpness ``seen`` differs."""
+    score = seen - model.usual[rows]
+    score *= model.score_scale[rows]
+    np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE, out=score)
+    # What is not the scene may well have more contrast than the scene.
+    better = np.maximum(score, 0)
+    better /= excess
+    score = np.minimum(score, 0, out=score)
+    score += better
+    # For a normal score of variance s² the mean of exp(β z − β² s² / 2) is one: the information per frame stays 1/Z.
+    score *= np.float32(-sharpness)
+    score += np.float32(0.5 * sharpness**2) * model.score_variance[rows]
+    return score
 
 
 def _blur_rule(registered: FloatArray, image: FloatArray, sensor_noise: float) -> tuple[BlurReference, FusionRule]:
@@ -264,16 +268,16 @@ def _without_outliers(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean of the registered frames and their variance about it, once what deviates from all of them is left out."""
 
-    def trim(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def trim(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, NDArray[np.uint8]]:
         registered = luminance(warp(*pair))
-        return registered, _deviates(registered, centre, spread) <= _OUTLIER
+        return registered, (_deviates(registered, centre, spread) <= _OUTLIER).view(np.uint8)
 
     centre, spread = mean.astype(np.float32), _deviation(variance)
     counted, total, squares = (np.zeros(mean.shape) for _ in range(3))
-    for _, (registered, kept) in map_ahead(trim, zip(frames, flows, strict=True), threads):
-        counted += kept
-        total += registered * kept
-        squares += np.square(registered - centre, dtype=np.float64) * kept
+    for _, (registered, kept) in map_ahead(trim, zip(walk(frames), walk(flows), strict=True), threads):
+        cv2.accumulate(kept, counted)
+        cv2.accumulate(registered, total, kept)
+        cv2.accumulateSquare(registered - centre, squares, kept)
     trimmed = np.where(counted > 0, total / np.maximum(counted, 1), mean)
     counted = np.maximum(counted, 1)
     return trimmed.astype(np.float32), _deviation(np.maximum(squares / counted - (trimmed - centre) ** 2, 0.0))
@@ -286,25 +290,40 @@ def _deviation(variance: np.ndarray) -> FloatArray:
 
 def _deviates(registered: FloatArray, usual: FloatArray, deviation: FloatArray) -> FloatArray:
     """Squared deviation of a frame in units of the usual one; about 1 for most."""
-    return _smooth(np.square(registered - usual), _OUTLIER_WINDOW) / deviation
+    difference = registered - usual
+    difference *= difference
+    difference = _smooth(difference, _OUTLIER_WINDOW)
+    difference /= deviation
+    return difference
 
 
-def _distrust(flow: FloatArray) -> FloatArray:
-    """Factor on Z: large where the map id + Ŵ folds, and where it leaves the frame.
+def _lost(flow: FloatArray) -> FloatArray:
+    """1 where the map id + Ŵ folds, and where it leaves the frame; fading to 0 around it.
 
     Beyond the frame its border is repeated, which is no measurement.  Paper 3 takes the maps to be diffeomorphisms:
     where the estimate is none, the flow has lost its way, and what it brings there may have more contrast than the
     scene.
     """
-    (ux, uy), (vx, vy) = (
-        (cv2.Sobel(part, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(part, cv2.CV_32F, 0, 1, scale=1 / 8))
-        for part in (np.ascontiguousarray(flow[..., 0]), np.ascontiguousarray(flow[..., 1]))
-    )
-    stretch = (1 + ux) * (1 + vy) - uy * vx
-    folded = (stretch <= 0).astype(np.float32)
+    lost = inside(flow)
+    np.subtract(1, lost, out=lost)
+    folded = np.concatenate([_folded(flow, rows) for rows in strips(flow.shape)])
+    if not folded.any():
+        return lost
     # Faded out: an abrupt change of weights would show as an edge.
-    lost = np.maximum(_smooth(cv2.dilate(folded, np.ones((7, 7), np.uint8)), 2.0), 1 - inside(flow))
-    return np.power(np.float32(_DISTRUST), lost)
+    fade = _smooth(cv2.dilate(folded.astype(np.float32), np.ones((7, 7), np.uint8)), 2.0)
+    return np.maximum(fade, lost, out=lost)
+
+
+def _folded(flow: FloatArray, rows: slice) -> NDArray[np.bool_]:
+    """Where the map id + Ŵ has a Jacobian of zero or less."""
+    start, stop = max(rows.start - 1, 0), rows.stop + 1
+    inner = slice(rows.start - start, rows.stop - start)
+    (ux, uy), (vx, vy) = (_gradient(plane) for plane in cv2.split(flow[start:stop]))
+    ux += 1
+    vy += 1
+    ux *= vy
+    uy *= vx
+    return ux[inner] <= uy[inner]
 
 
 def _score_scale(usual: np.ndarray, spread: np.ndarray, noise: np.ndarray, window: float) -> FloatArray:
@@ -330,14 +349,17 @@ def _motion_share(energy: FloatArray, noise: float, residual_variance: np.ndarra
     return (1.0 - np.minimum(noise_variance / np.maximum(total, 1e-12), 1.0)).astype(np.float32)
 
 
-def _sharpness(registered: FloatArray, template: tuple[FloatArray, FloatArray], window: float) -> FloatArray:
-    """Gradient of a frame projected on that of the template, in a Gaussian window.
+def _product(registered: FloatArray, template: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Gradient of a frame projected on that of the template; in a Gaussian window this is sharpness.
 
     A blurred frame has a smaller projection.  So has one that is torn, misregistered or covered, though its gradient
     may be large: plain gradient energy would prefer it.  And noise, being linear here, does not add up.
     """
     dx, dy = _gradient(registered)
-    return _smooth(dx * template[0] + dy * template[1], window)
+    dx *= template[0]
+    dy *= template[1]
+    dx += dy
+    return dx
 
 
 def _gradient(image: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from .arrays import CHANNELS, FloatArray
 from .errors import ConfigurationError, DataError, require
 from .pixels import PixelArray, depth_of, full_scale_of, to_unit
+from .scratch import release
 
 FrameRange = tuple[int | None, int | None] | tuple[int | None, int | None, int | None]
 Roi = tuple[int, int, int, int]
@@ -313,6 +314,8 @@ class FrameSource:
                 expected, found = size_text(self.file_shape[1:]), size_text(pixels.shape)
                 raise DataError(f"{self.name}: frame {number}: expected {expected} as the first frame, found {found}")
             yield number, (pixels if self.repair is None else self.repair(pixels))[self.window]
+            # A mapped video would be in memory as a whole at the end.
+            release(pixels)
             done += 1
         if done < len(chosen):
             raise DataError(

@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 
 from .arrays import FloatArray
-from .errors import ConfigurationError
 
 # Pole of the cubic B-spline prefilter; its impulse response below is cut off where it falls under 1e-7.
 _POLE = np.sqrt(3.0) - 2.0
@@ -46,8 +45,9 @@ class StackOps:
         ``filter(stack, kernel_x, kernel_y)`` correlates along both axes with kernels of odd length.
     resize : callable
         ``resize(stack, (H, W))`` interpolates linearly.
-    bilinear : callable
-        ``bilinear(stack, x, y)`` is the stack (B, H, W) at positions x and y (B, H, W).
+    sample : callable
+        ``sample(coefficients, x, y)`` sums 4×4 B-spline coefficients (B, H, W) about positions x and y (B, H, W); those
+        outside are moved to the border.
     median : callable
         ``median(stack, side)`` of windows of 3×3 or 5×5 pixels.
     """
@@ -58,7 +58,7 @@ class StackOps:
     zeros: Callable[[Shape], Stack]
     filter: Callable[[Stack, FloatArray, FloatArray], Stack]
     resize: Callable[[Stack, Shape], Stack]
-    bilinear: Callable[[Stack, Stack, Stack], Stack]
+    sample: Callable[[Stack, Stack, Stack], Stack]
     median: Callable[[Stack, int], Stack]
 
 
@@ -89,12 +89,6 @@ def numpy_ops() -> StackOps:
 
         return each(correlate, stack, stack.shape[-2:])
 
-    def bilinear(stack: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-        result = np.empty(x.shape, np.float32)
-        for plane, u, v, out in zip(stack, x, y, result, strict=True):
-            cv2.remap(plane, u, v, cv2.INTER_LINEAR, dst=out, borderMode=cv2.BORDER_REFLECT_101)
-        return result
-
     return StackOps(
         arrays=np,
         load=lambda array: array,
@@ -102,7 +96,7 @@ def numpy_ops() -> StackOps:
         zeros=lambda shape: np.zeros(shape, np.float32),
         filter=filtered,
         resize=lambda stack, size: each(lambda plane, out: cv2.resize(plane, size[::-1], dst=out), stack, size),
-        bilinear=bilinear,
+        sample=_sample_blended,
         median=lambda stack, side: each(
             lambda plane, out: cv2.medianBlur(plane, side, dst=out), stack, stack.shape[-2:]
         ),
@@ -110,21 +104,19 @@ def numpy_ops() -> StackOps:
 
 
 def torch_ops(device: str) -> StackOps:
-    """Operations of torch.
+    """Operations of torch, made of additions, comparisons and gathers alone.
+
+    Each sums in one fixed order, so that results repeat from run to run on a GPU too, and in full single precision;
+    convolutions of cuDNN, which may round to ten bits, and scattering are avoided.
 
     Parameters
     ----------
     device : str
-        ``"cpu"``, ``"cuda"`` or any other name that torch gives a device.
+        What torch calls it, such as ``"cuda"``; ``"cpu"`` is torch on the processor.  It has to be there.
 
     Returns
     -------
     StackOps
-
-    Raises
-    ------
-    ConfigurationError
-        torch is not installed, or has no such device.
 
     Examples
     --------
@@ -134,51 +126,106 @@ def torch_ops(device: str) -> StackOps:
     >>> ops.store(ops.resize(ops.load(ramp), (4, 4)))[0, 0]
     array([0.5, 2.5, 4.5, 6.5], dtype=float32)
     """
-    try:
-        import torch
-        from torch.nn import functional
-    except ImportError as error:
-        raise ConfigurationError("backend: torch is not installed, install turbrestore[torch]") from error
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise ConfigurationError(f"device: torch sees no CUDA here, found {device!r}; use 'cpu'")
-
-    def filtered(stack: Stack, kernel_x: FloatArray, kernel_y: FloatArray) -> Stack:
-        planes = stack.reshape(-1, 1, *stack.shape[-2:])
-        x, y = (torch.from_numpy(kernel).to(device) for kernel in (kernel_x, kernel_y))
-        half_x, half_y = len(x) // 2, len(y) // 2
-        planes = functional.pad(planes, (half_x, half_x, half_y, half_y), mode="reflect")
-        planes = functional.conv2d(functional.conv2d(planes, x.reshape(1, 1, 1, -1)), y.reshape(1, 1, -1, 1))
-        return planes.reshape(stack.shape)
+    import torch
+    from torch.nn import functional
 
     def resized(stack: Stack, size: Shape) -> Stack:
         planes = stack.reshape(-1, 1, *stack.shape[-2:])
         planes = functional.interpolate(planes, size=size, mode="bilinear", align_corners=False)
         return planes.reshape(*stack.shape[:-2], *size)
 
-    def bilinear(stack: Stack, x: Stack, y: Stack) -> Stack:
-        height, width = stack.shape[-2:]
-        grid = torch.stack([x * (2 / (width - 1)) - 1, y * (2 / (height - 1)) - 1], dim=-1)
-        planes = stack[:, None]
-        return functional.grid_sample(planes, grid, mode="bilinear", padding_mode="reflection", align_corners=True)[
-            :, 0
-        ]
-
     def median(stack: Stack, side: int) -> Stack:
-        planes = stack.reshape(-1, 1, *stack.shape[-2:])
-        half = side // 2
-        planes = functional.pad(planes, (half,) * 4, mode="replicate").unfold(2, side, 1).unfold(3, side, 1)
-        return planes.flatten(-2).median(dim=-1).values.reshape(stack.shape)
+        height, width = stack.shape[-2:]
+        # Padding by repetition takes stacks of four axes at most.
+        planes = functional.pad(stack.reshape(-1, 1, height, width), (side // 2,) * 4, mode="replicate")
+        shifts = ((y, x) for y in range(side) for x in range(side))
+        windows = [planes[..., y : y + height, x : x + width] for y, x in shifts]
+        return _median_of(windows, torch).reshape(stack.shape)
 
     return StackOps(
         arrays=torch,
-        load=lambda array: torch.from_numpy(np.ascontiguousarray(array)).to(device),
+        # torch shares no memory that cannot be written.
+        load=lambda array: torch.from_numpy(np.require(array, requirements=["C", "W"])).to(device),
         store=lambda stack: stack.cpu().numpy(),
         zeros=lambda shape: torch.zeros(shape, device=device),
-        filter=filtered,
+        filter=lambda stack, kernel_x, kernel_y: _correlate(
+            _correlate(stack, kernel_x, -1, torch), kernel_y, -2, torch
+        ),
         resize=resized,
-        bilinear=bilinear,
+        sample=lambda coefficients, x, y: _sample_gathered(coefficients, x, y, torch),
         median=median,
     )
+
+
+def _correlate(stack: Stack, kernel: FloatArray, axis: int, torch: Any) -> Stack:
+    """Sum of shifted copies; the same to the bit as a convolution, which is three times slower on a processor."""
+    half, length = len(kernel) // 2, stack.shape[axis]
+    if half == 0:
+        return stack * float(kernel[0])
+    reflected = torch.from_numpy(np.pad(np.arange(length), half, mode="reflect")).to(stack.device)
+    longer = stack.index_select(axis, reflected)
+    result = longer.narrow(axis, 0, length) * float(kernel[0])
+    for shift, weight in enumerate(kernel.tolist()):
+        if shift and weight:
+            result.add_(longer.narrow(axis, shift, length), alpha=weight)
+    return result
+
+
+def _sample_gathered(coefficients: Stack, x: Stack, y: Stack, torch: Any) -> Stack:
+    """Sixteen gathers; torch's grid_sample rounds positions to 1e-7 of the width, which is 2e-4 px of 1920."""
+    count, height, width = coefficients.shape
+    x, y = x.clip(0, width - 1), y.clip(0, height - 1)
+    left, top = x.floor(), y.floor()
+    columns, rows = _spline_weights(x - left), _spline_weights(y - top)
+    # One coefficient more on the near side and two on the far side, so that no index has to be reflected.
+    across, down = (
+        torch.from_numpy(np.pad(np.arange(length), (1, 2), mode="reflect")).to(coefficients.device)
+        for length in (width, height)
+    )
+    around = coefficients.index_select(2, across).index_select(1, down).reshape(-1)
+    first = torch.arange(count, device=x.device, dtype=torch.int32) * ((height + 3) * (width + 3))
+    index = (first[:, None, None] + top.int() * (width + 3) + left.int()).reshape(-1)
+    result = torch.zeros_like(x)
+    for row, of_row in enumerate(rows):
+        line = torch.zeros_like(x)
+        for column, of_column in enumerate(columns):
+            step = row * (width + 3) + column
+            taken = around.narrow(0, step, around.numel() - step).index_select(0, index)
+            line.addcmul_(taken.reshape(x.shape), of_column)
+        result.addcmul_(line, of_row)
+    return result
+
+
+def _spline_weights(t: Stack) -> tuple[Stack, Stack, Stack, Stack]:
+    """Weights of the cubic B-spline for the pixels at −1, 0, 1 and 2, t beyond 0."""
+    rest = 1 - t
+    first, second, last = rest * rest * rest / 6, 2 / 3 - t * t * (1 - t / 2), t * t * t / 6
+    return first, second, 1 - first - second - last, last
+
+
+def _median_of(planes: list[Stack], arrays: Any) -> Stack:
+    """Median of an odd number of planes by minima and maxima.
+
+    Of any ``n // 2 + 2`` values neither the smallest nor the largest is the median of all n: they are dropped, the next
+    one joins, and again, until one is left.
+    """
+    kept, rest = planes[: len(planes) // 2 + 2], planes[len(planes) // 2 + 2 :]
+
+    def order(low: int, high: int) -> None:
+        a, b = kept[low], kept[high]
+        kept[low], kept[high] = arrays.minimum(a, b), arrays.maximum(a, b)
+
+    while len(kept) > 1:
+        last = len(kept) - 1
+        for i in range(len(kept) // 2):
+            order(i, last - i)
+        for i in range(1, (last + 2) // 2):
+            order(0, i)
+        for i in range((last + 1) // 2, last):
+            order(i, last)
+        kept = kept[1:last] + rest[:1]
+        rest = rest[1:]
+    return kept[0]
 
 
 def spline_coefficients(stack: Stack, ops: StackOps) -> Stack:
@@ -203,14 +250,15 @@ def spline_coefficients(stack: Stack, ops: StackOps) -> Stack:
     return ops.filter(stack, _PREFILTER, _PREFILTER)
 
 
-def sample_spline(coefficients: Stack, x: Stack, y: Stack, ops: StackOps) -> Stack:
-    """Sum of 4×4 B-spline coefficients as a blend of four bilinear samples (Sigg and Hadwiger 2005).
+def warp_stack(stack: Stack, flow: Stack, ops: StackOps) -> Stack:
+    """Backward warp by cubic B-splines, as :func:`turbrestore.warp.warp`.
 
     Parameters
     ----------
-    coefficients : stack, shape (B, H, W)
-    x, y : stack, shape (B, H, W)
-        Positions; those outside are moved to the border.
+    stack : stack, shape (B, H, W)
+        Channels of one image.
+    flow : stack, shape (H, W, 2)
+        Displacements (dx, dy), pixels.
     ops : StackOps
 
     Returns
@@ -220,25 +268,37 @@ def sample_spline(coefficients: Stack, x: Stack, y: Stack, ops: StackOps) -> Sta
     Examples
     --------
     >>> import numpy as np
-    >>> ops, image = numpy_ops(), np.random.default_rng(0).random((1, 16, 16)).astype(np.float32)
-    >>> y, x = np.mgrid[:16, :16].astype(np.float32)
-    >>> bool(np.allclose(sample_spline(spline_coefficients(image, ops), x[None], y[None], ops), image, atol=1e-5))
-    True
+    >>> ramp = np.tile(np.arange(16, dtype=np.float32), (1, 16, 1))
+    >>> warp_stack(ramp, np.full((16, 16, 2), 0.25, np.float32), numpy_ops())[0, 0, 6:10].round(3)
+    array([6.25, 7.25, 8.25, 9.25], dtype=float32)
     """
+    y, x = (ops.load(axis) for axis in np.mgrid[: stack.shape[-2], : stack.shape[-1]].astype(np.float32))
+    x, y = (ops.arrays.broadcast_to(axis, stack.shape) for axis in (x + flow[..., 0], y + flow[..., 1]))
+    return ops.sample(spline_coefficients(stack, ops), x, y)
+
+
+def _sample_blended(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Sum of 4×4 B-spline coefficients as a blend of four bilinear samples (Sigg and Hadwiger 2005)."""
+
+    def bilinear(map_x: FloatArray, map_y: FloatArray) -> FloatArray:
+        result = np.empty(x.shape, np.float32)
+        for plane, u, v, out in zip(coefficients, map_x, map_y, result, strict=True):
+            cv2.remap(plane, u, v, cv2.INTER_LINEAR, dst=out, borderMode=cv2.BORDER_REFLECT_101)
+        return result
+
     height, width = coefficients.shape[-2:]
-    left, right, to_right = _spline_pair(x, width, ops.arrays)
-    upper, lower, to_lower = _spline_pair(y, height, ops.arrays)
+    left, right, to_right = _spline_pair(x, width)
+    upper, lower, to_lower = _spline_pair(y, height)
     top, bottom = (
-        a + to_right * (ops.bilinear(coefficients, right, row) - a)
-        for row, a in ((row, ops.bilinear(coefficients, left, row)) for row in (upper, lower))
+        a + to_right * (bilinear(right, row) - a) for row, a in ((row, bilinear(left, row)) for row in (upper, lower))
     )
     return top + to_lower * (bottom - top)
 
 
-def _spline_pair(position: Stack, length: int, arrays: Any) -> tuple[Stack, Stack, Stack]:
+def _spline_pair(position: FloatArray, length: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Two positions and a blend whose bilinear samples weigh four neighbours as the cubic B-spline does."""
-    position = arrays.clip(position, 0, length - 1)
-    whole = arrays.floor(position)
+    position = np.clip(position, 0, length - 1)
+    whole = np.floor(position)
     t = position - whole
     rest = 1 - t
     before = rest * rest * rest / 6 + (2 / 3 - t * t * (1 - t / 2))

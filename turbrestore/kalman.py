@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import DataError
+from .scratch import release
 
 Float64Array = NDArray[np.float64]
 
@@ -384,12 +385,18 @@ def update_pixels(
     difference = z - mean
     absent = np.isnan(difference)
     missing = (absent.any(-1) if mean.ndim > prior.ndim else absent) | np.isinf(noise)
-    noise = np.where(missing, noise.dtype.type(1), noise)
-    gain = np.where(missing, noise.dtype.type(0), prior / (prior + noise))
+    some = bool(missing.any())
+    if some:
+        noise = np.where(missing, noise.dtype.type(1), noise)
+        difference = np.where(absent, mean.dtype.type(0), difference)
+    gain = prior / (prior + noise)
     # L Z equals (1 − L) Σ of eq. 16 without the cancellation when Z is small.
-    variance = np.where(missing, prior, gain * noise)
-    spread = gain[..., None] if mean.ndim > prior.ndim else gain
-    return PixelGaussian(mean + spread * np.where(absent, mean.dtype.type(0), difference), variance), gain
+    variance = gain * noise
+    if some:
+        gain, variance = np.where(missing, noise.dtype.type(0), gain), np.where(missing, prior, variance)
+    difference *= gain[..., None] if mean.ndim > prior.ndim else gain
+    difference += mean
+    return PixelGaussian(difference, variance), gain
 
 
 def _information_step(
@@ -445,6 +452,7 @@ def _projection(H: NDArray[np.floating], z: NDArray[np.floating]) -> tuple[Float
         part = z[..., rows]
         Hz = Hz + np.matmul(part.astype(H.dtype, copy=False)[..., None, :], H[..., rows, :])[..., 0, :]
         zz = zz + np.square(part, dtype=np.float64).sum(-1)
+        release(H)
     return Hz, zz
 
 

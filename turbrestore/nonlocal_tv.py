@@ -9,13 +9,18 @@ h : filtering parameter, intensity.
 div_w v : nonlocal divergence, ``⟨div_w v, u⟩ = −⟨v, ∇_w u⟩``.
 J[u] : nonlocal total variation, ``Σ_x |∇_w u|(x)`` with ``|v|(x)² = Σ_y v(x, y)²``.
 
-The graph stores every pair once. A function on edges is an array of shape (2, E): row 0 is its value from the tail
-to the head of each pair, row 1 from the head to the tail.
+The graph stores every pair once, in strips of rows (:mod:`turbrestore.edge_strips`). A function on edges is an array of
+shape (2, E): row 0 is its value from the tail to the head of each pair, row 1 from the head to the tail.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,12 +28,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from .arrays import FloatArray, check_image, luminance
+from .edge_strips import EdgeStrip, sum_strips
 from .errors import DataError, require
-from .parallel import map_ahead
+from .parallel import available_cores, one_thread_each
+from .patch_search import BAND_ROWS, OUTSIDE, Keys, PatchSearch, search_bands
 from .psf import estimate_noise
+from .scratch import new_stack, release
 
-# Pixels whose distances to all offsets are held at once by a thread: 4096 × 440 float32 are 7 MB.
-_STRIP_PIXELS = 4096
+# Pixels of a strip, about: all that an iteration needs of their edges fits in the cache of a processor.
+_STRIP_PIXELS = 16000
 # A weight must be positive for its edge to stay in the graph.
 _SMALLEST_WEIGHT = 1e-6
 
@@ -84,10 +92,8 @@ class NonlocalGraph:
     ----------
     shape : (int, int)
         Rows and columns of the image.
-    difference : scipy.sparse.csr_array, float32, shape (E, H·W)
-        One row per pair: −√w at its tail, +√w at its head.
-    incidence : scipy.sparse.csc_array, float32, shape (H·W, 2E)
-        Sums a flattened function on edges over the edges that leave each pixel.
+    strips : tuple of EdgeStrip
+        The pairs, from the first row to the last.
     norm_squared : float
         Upper bound of ‖∇_w‖².
     h : float
@@ -95,28 +101,44 @@ class NonlocalGraph:
     """
 
     shape: tuple[int, int]
-    difference: sparse.csr_array
-    incidence: sparse.csc_array
+    strips: tuple[EdgeStrip, ...]
     norm_squared: float
     h: float
 
     @property
+    def size(self) -> int:
+        """Number of pairs, E."""
+        return sum(len(strip.heads) for strip in self.strips)
+
+    @property
     def tails(self) -> NDArray[np.int32]:
         """Pixel (row · W + column) at which each pair starts; below that at which it ends."""
-        return self.difference.indices[0::2]
+        degrees = np.concatenate([strip.degrees for strip in self.strips])
+        return np.repeat(np.arange(len(degrees), dtype=np.int32), degrees)
 
     @property
     def heads(self) -> NDArray[np.int32]:
         """Pixel (row · W + column) at which each pair ends."""
-        return self.difference.indices[1::2]
+        return np.concatenate([strip.heads + np.int32(strip.first) for strip in self.strips])
 
     @property
     def weights(self) -> FloatArray:
         """Weight w of each pair, above 0 and up to 1."""
-        return self.difference.data[1::2] ** 2
+        return np.concatenate([strip.roots for strip in self.strips]) ** 2
+
+    @cached_property
+    def difference(self) -> sparse.csr_array:
+        """∇_w as a matrix, float32, shape (E, H·W): one row per pair, −√w at its tail and +√w at its head."""
+        root = np.sqrt(self.weights)
+        both = np.stack([self.tails, self.heads], axis=1).ravel()
+        rows = np.arange(0, len(both) + 1, 2, dtype=np.int32)
+        values = np.stack([-root, root], axis=1).ravel()
+        return sparse.csr_array((values, both, rows), shape=(self.size, self.shape[0] * self.shape[1]))
 
 
-def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None) -> NonlocalGraph:
+def nonlocal_weights(
+    guide: ArrayLike, params: NonlocalParams | None = None, folder: Path | None = None
+) -> NonlocalGraph:
     """Weights ``w(x, y) = exp(−d(x, y)/h²)``, ``d = Σ_z G_a(z) [g(x + z) − g(y + z)]²`` (paper 3, eq. 23).
 
     The printed equation has the absolute difference instead of its square, which does not fit the unit of h²; the
@@ -134,6 +156,8 @@ def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None) -> 
         g; colour is reduced to luminance.
     params : NonlocalParams, optional
         Size of patches, search and neighbourhood.
+    folder : Path, optional
+        Where the pairs are kept in files; without it they are in memory.
 
     Returns
     -------
@@ -156,11 +180,8 @@ def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None) -> 
     if grey.size < 2:
         raise DataError(f"guide: expected two pixels or more, found shape {grey.shape}")
     h = params.h if params.h is not None else _automatic_h(grey)
-    pixels, neighbours, distances = _neighbours(grey, params)
-    weights = np.maximum(np.exp(-distances / np.float32(h**2)), np.float32(_SMALLEST_WEIGHT))
-    directed = sparse.coo_array((weights, (pixels, neighbours)), shape=(grey.size, grey.size)).tocsr()
-    pairs = sparse.triu(directed.maximum(directed.T.tocsr()), 1, format="csr").tocoo()
-    return _graph(grey.shape, pairs.coords[0], pairs.coords[1], pairs.data, h)
+    strips = tuple(_strips(grey, params, h, folder))
+    return NonlocalGraph(grey.shape, strips, _norm_squared_bound(strips, grey.size), h)
 
 
 def nonlocal_gradient(graph: NonlocalGraph, u: FloatArray) -> FloatArray:
@@ -234,7 +255,7 @@ def nonlocal_magnitude(graph: NonlocalGraph, v: FloatArray) -> FloatArray:
     >>> nonlocal_magnitude(graph, np.array([[2.0], [-3.0]], np.float32))
     array([[2., 3.]], dtype=float32)
     """
-    return np.sqrt(graph.incidence @ np.square(v).ravel()).reshape(graph.shape)
+    return np.sqrt(np.bincount(_owners(graph), np.square(v).ravel())).astype(np.float32).reshape(graph.shape)
 
 
 def project_to_unit(graph: NonlocalGraph, v: FloatArray) -> FloatArray:
@@ -259,8 +280,8 @@ def project_to_unit(graph: NonlocalGraph, v: FloatArray) -> FloatArray:
     array([[ 1. ],
            [-0.5]], dtype=float32)
     """
-    factor = 1 / np.maximum(nonlocal_magnitude(graph, v), 1).ravel()
-    return v * factor.take(graph.incidence.indices).reshape(v.shape)
+    factor = np.reciprocal(np.maximum(nonlocal_magnitude(graph, v), np.float32(1))).ravel()
+    return v * factor[_owners(graph)].reshape(v.shape)
 
 
 def nonlocal_total_variation(graph: NonlocalGraph, u: FloatArray) -> float:
@@ -293,33 +314,9 @@ def _automatic_h(grey: FloatArray) -> float:
     return float(max((high - low) / 8, 4 * estimate_noise(grey), 1e-3))
 
 
-def _neighbours(grey: FloatArray, params: NonlocalParams) -> tuple[NDArray[np.int32], NDArray[np.int32], FloatArray]:
-    """Directed edges: pixel, neighbour and patch distance, each of shape (edges,)."""
-    height, width = grey.shape
-    offsets = _offsets(params.search)
-    bits = len(offsets).bit_length()
-    strip_rows = max(1, _STRIP_PIXELS // width)
-    margin = params.search // 2 + params.patch // 2
-    padded = cv2.copyMakeBorder(grey, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
-
-    def best_of_strip(top: int) -> NDArray[np.int32]:
-        rows = min(strip_rows, height - top)
-        distances = _distances(padded[top : top + rows + 2 * margin], offsets, params)
-        _exclude_outside(distances, offsets, top, height)
-        return _best_keys(distances.reshape(len(offsets), -1), bits, params)
-
-    strips = map_ahead(best_of_strip, range(0, height, strip_rows))
-    keys = np.concatenate([part for _, part in strips])
-    ranks = keys & ((1 << bits) - 1)
-    distances = (keys - ranks).view(np.float32)
-    # The nearest offsets come first; where they are also among the best they would count twice.
-    useful = np.ones(keys.shape, bool)
-    useful[:, params.nearest :] = ranks[:, params.nearest :] >= params.nearest
-    y, x = np.divmod(np.arange(grey.size, dtype=np.int32)[:, None], np.int32(width))
-    y, x = y + offsets[ranks, 0], x + offsets[ranks, 1]
-    useful &= (y >= 0) & (y < height) & (x >= 0) & (x < width)
-    pixels = np.broadcast_to(np.arange(grey.size, dtype=np.int32)[:, None], keys.shape)[useful]
-    return pixels, (y * np.int32(width) + x)[useful], distances[useful]
+def _owners(graph: NonlocalGraph) -> NDArray[np.int32]:
+    """Pixel that each value of a flattened function on edges leaves."""
+    return np.concatenate([graph.tails, graph.heads])
 
 
 def _offsets(search: int) -> NDArray[np.int32]:
@@ -331,81 +328,90 @@ def _offsets(search: int) -> NDArray[np.int32]:
     return grid[order[1:]]
 
 
-def _distances(strip: FloatArray, offsets: NDArray[np.int32], params: NonlocalParams) -> FloatArray:
-    """Patch distances of the inner pixels of ``strip`` to each offset; shape (offsets, rows, columns)."""
-    reach, half = params.search // 2, params.patch // 2
-    rows, columns = strip.shape[0] - 2 * reach, strip.shape[1] - 2 * reach
+def _strips(grey: FloatArray, params: NonlocalParams, h: float, folder: Path | None) -> Iterator[EdgeStrip]:
     window = cv2.getGaussianKernel(params.patch, params.patch_sigma, cv2.CV_32F)
-    centre = strip[reach : reach + rows, reach : reach + columns]
-    distances = np.empty((len(offsets), rows - 2 * half, columns - 2 * half), np.float32)
-    for index, (dy, dx) in enumerate(offsets):
-        moved = strip[reach + dy : reach + dy + rows, reach + dx : reach + dx + columns]
-        squares = np.square(centre - moved)
-        smooth = cv2.sepFilter2D(squares, cv2.CV_32F, window, window)
-        distances[index] = smooth[half : rows - half, half : columns - half]
-    return distances
+    search = PatchSearch(window, _offsets(params.search), params.nearest, params.best)
+    bands = search_bands(grey, search)
+    top, keys = next(bands)
+    for following, below in chain(bands, [(grey.shape[0], keys[:0])]):
+        tails, heads, distances = _pairs(keys, below, grey.shape[1], search)
+        stack = np.asarray(new_stack((2, len(tails)), folder))
+        np.exp(-distances / np.float32(h**2), out=stack[0])
+        np.sqrt(np.maximum(stack[0], np.float32(_SMALLEST_WEIGHT)), out=stack[0])
+        stack[1].view(np.int32)[:] = heads
+        yield from _cut(tails, stack, (top, following), grey.shape, search.reach)
+        release(stack)
+        top, keys = following, below
 
 
-def _exclude_outside(distances: FloatArray, offsets: NDArray[np.int32], top: int, height: int) -> None:
-    """Make the distance to pixels outside the image infinite; ``top`` is the first row of the strip."""
-    columns = distances.shape[2]
-    for plane, (dy, dx) in zip(distances, offsets, strict=True):
-        plane[: max(-dy - top, 0)] = np.inf
-        plane[max(height - dy - top, 0) :] = np.inf
-        plane[:, : max(-dx, 0)] = np.inf
-        plane[:, max(columns - dx, 0) :] = np.inf
+def _pairs(
+    keys: Keys, below: Keys, width: int, search: PatchSearch
+) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """Tail, head and distance of the pairs whose tails are in a band, by tail and head.
 
-
-def _best_keys(distances: FloatArray, bits: int, params: NonlocalParams) -> NDArray[np.int32]:
-    """Distance and rank of offset in one integer, for the nearest and the best offsets of each pixel.
-
-    Floats of 0 or more sort like the integers of the same bits, so one partial sort of integers finds both the
-    distances and where they were; it is ten times faster than a partial sort of indices. Distances lose the last
-    bits of their mantissa to the rank (relative error 6e-5 for 21×21), and ties go to the nearer offset.
+    Pixels count from the first of the band.  A pixel chooses some of its pairs as their tail and others as their head,
+    so the choices of the rows below are needed too.
     """
-    keys = distances.view(np.int32)
-    keys &= ~((1 << bits) - 1)
-    keys |= np.arange(len(keys), dtype=np.int32)[:, None]
-    by_pixel = np.ascontiguousarray(keys.T)
-    nearest = by_pixel[:, : params.nearest].copy()
-    if params.best == 0:
-        return nearest
-    by_pixel.partition(params.best - 1, axis=1)
-    return np.concatenate([nearest, by_pixel[:, : params.best]], axis=1)
+    offsets = search.offsets.astype(np.int64)
+    forward = (offsets[:, 0] > 0) | ((offsets[:, 0] == 0) & (offsets[:, 1] > 0))
+    steps = offsets[:, 0] * width + offsets[:, 1]
+    order = np.lexsort((offsets[forward][:, 1], offsets[forward][:, 0]))
+    halves = offsets[forward][order]
+    place = {(int(dy), int(dx)): number for number, (dy, dx) in enumerate(halves)}
+    half = np.array([place[max((dy, dx), (-dy, -dx))] for dy, dx in offsets.tolist()])
+    # Number of the pair among all of the band, less that of the first pair of the pixel that chose it.
+    ahead = np.where(forward, 0, steps) * len(halves) + half
+    own, mask, bits = len(keys), search.rank_mask, np.uint64(31)
+    found = []
+    for first, part in ((0, keys), (own, below[: search.reach * width])):
+        numbers = ahead[part & mask]
+        numbers += (np.arange(first, first + len(part)) * len(halves))[:, None]
+        useful = (part < OUTSIDE) & (numbers >= 0) & (numbers < own * len(halves))
+        found.append((numbers[useful].view(np.uint64) << bits) | part[useful].view(np.uint32))
+    # Runs are sorted already, which this kind of sort makes use of.
+    codes = np.sort(np.concatenate(found), kind="stable")
+    pairs = (codes >> bits).view(np.int64)
+    kept = np.ones(len(pairs), bool)
+    np.not_equal(pairs[1:], pairs[:-1], out=kept[1:])
+    tails, numbers = np.divmod(pairs[kept], len(halves))
+    distances = (codes[kept] & np.uint64(np.iinfo(np.int32).max - mask)).astype(np.int32).view(np.float32)
+    return tails, tails + (halves[:, 0] * width + halves[:, 1])[numbers], distances
 
 
-def _graph(
-    shape: tuple[int, int], tails: NDArray[np.int32], heads: NDArray[np.int32], weights: FloatArray, h: float
-) -> NonlocalGraph:
-    count, pixels = len(weights), shape[0] * shape[1]
-    root = np.sqrt(weights)
-    both = np.stack([tails, heads], axis=1).astype(np.int32, copy=False)
-    difference = sparse.csr_array(
-        (np.stack([-root, root], axis=1).ravel(), both.ravel(), np.arange(0, 2 * count + 1, 2, dtype=np.int32)),
-        shape=(count, pixels),
-    )
-    incidence = sparse.csc_array(
-        (np.ones(2 * count, np.float32), both.T.ravel(), np.arange(2 * count + 1, dtype=np.int32)),
-        shape=(pixels, 2 * count),
-    )
-    return NonlocalGraph(shape, difference, incidence, _norm_squared_bound(difference), h)
+def _cut(
+    tails: NDArray[np.int64], stack: FloatArray, rows: tuple[int, int], shape: tuple[int, int], reach: int
+) -> Iterator[EdgeStrip]:
+    """Cut a band into strips; ``stack`` holds √w of its pairs and, as integers, their heads from its first pixel on."""
+    (top, stop), (height, width) = rows, shape
+    step = max(4, min(BAND_ROWS, _STRIP_PIXELS // width))
+    heads, order = stack[1].view(np.int32), np.arange(stack.shape[1] + 1, dtype=np.int32)
+    for row in range(top, stop, step):
+        first, own = (row - top) * width, (min(row + step, stop) - row) * width
+        part = slice(*np.searchsorted(tails, (first, first + own)))
+        heads[part] -= np.int32(first)
+        window = min(own + reach * (width + 1), (height - row) * width)
+        degrees = np.bincount(tails[part] - first, minlength=own).astype(np.intp)
+        yield EdgeStrip(row * width, window, degrees, heads[part], stack[0, part], order)
 
 
-def _norm_squared_bound(difference: sparse.csr_array, iterations: int = 10) -> float:
+def _norm_squared_bound(strips: tuple[EdgeStrip, ...], pixels: int, iterations: int = 10) -> float:
     """Upper bound of ‖∇_w‖² = 2‖D‖², D the differences.
 
     ``‖D‖² = ρ(DᵀD) ≤ ρ(|D|ᵀ|D|)``, and for a non-negative matrix A and any positive x, ``ρ(A) ≤ max_i (Ax)_i / x_i``
     (Collatz–Wielandt). The bound falls with each power of A that is applied to x.
     """
-    positive = sparse.csr_array(
-        (np.abs(difference.data), difference.indices, difference.indptr), shape=difference.shape
-    )
-    x = np.ones(difference.shape[1], np.float32)
-    bound = np.inf
-    for _ in range(iterations):
-        # Pixels without edges do not take part.
-        x = np.maximum(x / x.max(), np.float32(1e-6))
-        image = positive.T @ (positive @ x)
-        bound = min(bound, float((image / x).max()))
-        x = image
+    x, bound = np.ones(pixels, np.float32), np.inf
+
+    def apply(_: int, strip: EdgeStrip) -> FloatArray:
+        values = strip.view(x)
+        sums = (strip.at_tails(values) + strip.at_heads(values)) * strip.roots
+        return strip.gather((strip.roots, sums), (strip.roots, sums))
+
+    with one_thread_each(), ThreadPoolExecutor(available_cores()) as pool:
+        for _ in range(iterations):
+            # Pixels without edges do not take part.
+            x = np.maximum(x / x.max(), np.float32(1e-6))
+            image = sum_strips(strips, apply, pixels, pool)
+            bound = min(bound, float((image / x).max()))
+            x = image
     return 2 * bound

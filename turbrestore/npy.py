@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,7 +20,10 @@ from numpy.typing import NDArray
 from .errors import DataError, TurbrestoreError
 from .images import first_line, input_errors
 from .limits import DEFAULT_LIMITS, Limits
+from .scratch import new_stack, parts
 
+# Arrays of more bytes may be put in a file.
+_LARGE = 1 << 26
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -66,7 +70,9 @@ def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
         raise DataError(f"{path}: not a whole .npy array of numbers ({first_line(error)})") from error
 
 
-def read_npz(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> dict[str, NDArray[Any]]:
+def read_npz(
+    path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, scratch: Path | None = None
+) -> dict[str, NDArray[Any]]:
     """Read all arrays of an uncompressed ``.npz`` file.
 
     Parameters
@@ -75,6 +81,8 @@ def read_npz(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> d
         The file, as :func:`numpy.savez` writes it.
     limits : Limits
         Most bytes that are read.
+    scratch : Path, optional
+        Folder of a file for arrays of more than 64 MiB; by default they are in memory.
 
     Returns
     -------
@@ -105,23 +113,65 @@ def read_npz(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> d
             names = [member.filename.removesuffix(".npy") for member in members]
             if len(set(names)) < len(names):
                 raise ValueError("one name stands twice in it")
-            return {name: _member(archive, member) for name, member in zip(names, members, strict=True)}
+            return {name: _member(archive, member, scratch) for name, member in zip(names, members, strict=True)}
     except TurbrestoreError:
         raise
     except Exception as error:  # neither NumPy nor zipfile documents a closed list of exceptions for damaged files
         raise DataError(f"{path}: not a whole archive of arrays ({first_line(error)})") from error
 
 
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays as :func:`numpy.savez` does, those of a mapped file without taking them into memory.
+
+    Parameters
+    ----------
+    stream : binary file
+    arrays : mapping of str to ndarray
+
+    Examples
+    --------
+    >>> import io
+    >>> stream = io.BytesIO()
+    >>> write_npz(stream, {"x": np.arange(3)})
+    >>> _ = stream.seek(0)
+    >>> np.load(stream)["x"]
+    array([0, 1, 2])
+    """
+    with zipfile.ZipFile(stream, "w", allowZip64=True) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                if isinstance(array, np.memmap) and array.ndim and array.flags.c_contiguous:
+                    np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(array))
+                    for part in parts(array):
+                        member.write(part.data)
+                else:
+                    np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | None) -> NDArray[Any]:
     if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
         raise ValueError(f"{member.filename} is compressed; expected it as numpy.savez writes it")
     with archive.open(member) as stream:
         shape, is_fortran, dtype = _header(stream)
+        if scratch is not None and member.file_size > _LARGE and dtype == np.float32 and not is_fortran:
+            return _stack_of(stream, shape, member, scratch)
         # Reading to the end lets zipfile compare the checksum.
         data = stream.read()
     if math.prod(shape) * dtype.itemsize != len(data):
         raise ValueError(f"{member.filename} has {len(data)} bytes, which do not fill shape {shape}")
     return np.frombuffer(bytearray(data), dtype).reshape(shape, order="F" if is_fortran else "C")
+
+
+def _stack_of(stream: IO[bytes], shape: tuple[int, ...], member: zipfile.ZipInfo, scratch: Path) -> NDArray[np.float32]:
+    """Copy a stack to a file of its own, one part after the other."""
+    if not 0 < 4 * math.prod(shape) <= member.file_size:
+        raise ValueError(f"{member.filename} has {member.file_size} bytes, which do not fill shape {shape}")
+    stack = new_stack(shape, scratch)
+    for part in parts(stack):
+        part[...] = np.frombuffer(stream.read(part.nbytes), np.float32).reshape(part.shape)
+    if stream.read(1):
+        raise ValueError(f"{member.filename} has more bytes than shape {shape}")
+    return stack
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -10,7 +11,11 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 import cv2
-from threadpoolctl import threadpool_limits
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
+# An array of this size is the largest from whose release the C library of Linux learns; bytes.
+_LEARNT = 31 << 20
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -43,6 +48,7 @@ def map_ahead(
     [(-1, 1), (2, 2)]
     """
     workers = threads or available_cores()
+    _keep_freed_memory()
     with one_thread_each(), ThreadPoolExecutor(workers) as pool:
         pending: deque[tuple[Item, Future[Result]]] = deque()
         try:
@@ -91,7 +97,23 @@ def one_thread_each() -> Iterator[None]:
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        with threadpool_limits(limits=1, user_api="blas"):
+        with _controller().limit(limits=1, user_api="blas"):
             yield
     finally:
         cv2.setNumThreads(before)
+
+
+@functools.cache
+def _controller() -> ThreadpoolController:
+    """Libraries with threads of their own; finding them takes a millisecond, as long as a small frame."""
+    return ThreadpoolController()
+
+
+def _keep_freed_memory() -> None:
+    """Let the C library keep what arrays of a frame give back for the next ones.
+
+    By default glibc gives every array of a megabyte back to the system, and filling the pages of the next one with
+    zeros takes a seventh of the time of optical flow at 512×512.  It keeps what is smaller than the largest array that
+    it has seen given back (mallopt(3), M_MMAP_THRESHOLD), so one that is never filled is all it takes.
+    """
+    np.empty(_LEARNT, np.uint8)

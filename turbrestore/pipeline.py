@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import islice
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .alternating import FilterCheckpoint, Filtered, FilterParams, filter_frames
+from .alternating import Filtered, filter_frames
 from .arrays import FloatArray
 from .blind import Deblurred, remove_blur
-from .blur_cues import BlurBounds, bound_blur, displacement_maps
-from .blur_estimation import BlurEstimate
+from .blur_cues import bound_blur, displacement_maps
 from .border import Rectangle, coverage, well_seen
-from .centroid import Centroid, CentroidParams, find_centroid
+from .centroid import Centroid, find_centroid
 from .decision import Decision
-from .deconvolution import Deconvolution, DeconvolutionParams
-from .dynamics import DynamicsParams, FlowDynamics, identify, with_displacement
+from .device import explain_device, find_device
+from .displacement import with_displacement
+from .dynamics import identify
 from .errors import DataError, require
 from .explanation import (
     explain_border,
@@ -32,197 +33,24 @@ from .explanation import (
     explain_motion,
     explain_training,
 )
-from .flow import MIN_SIDE, FlowParams
-from .frame_selection import Share, best_frames, check_share, frame_quality
+from .flow import MIN_SIDE
+from .flow_model import FlowDynamics
+from .frame_selection import best_frames, frame_quality
 from .frame_source import FrameSource
-from .guards import GuardParams, GuardReading
-from .plots import plot_images
-from .preview import preview
+from .images import check_space
+from .memory import MemoryPlan, plan_memory
 from .psf import KOLMOGOROV
+from .restoration import STAGES, Restoration, RestoreParams, StageResults, place_stages
+from .scratch import mean_of, new_stack, release, return_freed, walk
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-STAGES = ("centroid", "identify", "filter", "deconvolve")
-BORDERS = ("keep", "crop")
 # Share of the training frames that show every pixel of a cropped image.
 _SEEN = 0.9
-_ALL = Share(1)
 # Contrast below one grey level of an 8-bit camera is no scene.
 _LEAST_CONTRAST = 1 / 255
-_FEWEST_TRAINED, _MOST_TRAINED = 40, 100
 # A blur wider than this share of the image leaves nothing to restore.
 _SIGMAS_A_SIDE = 8
-# Training frames and their flows stay in memory: 12 bytes a pixel for grey frames, up to this many bytes.
-_TRAINING_BYTES = 1.5e9
 
 Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True)
-class StageResults:
-    """What has been done of a restoration; one that was interrupted goes on from here.
-
-    Attributes
-    ----------
-    centroid : Centroid or None
-    dynamics : FlowDynamics or None
-    checkpoint : FilterCheckpoint or None
-        Where the filter stands; None before and after it.
-    filtered : Filtered or None
-    mean : ndarray, float32, shape (H, W) or (H, W, 3), or None
-        Temporal mean of the frames that were filtered.
-    blur_bounds : BlurBounds or None
-    deblurred : Deblurred or None
-    """
-
-    centroid: Centroid | None = None
-    dynamics: FlowDynamics | None = None
-    checkpoint: FilterCheckpoint | None = None
-    filtered: Filtered | None = None
-    mean: FloatArray | None = None
-    blur_bounds: BlurBounds | None = None
-    deblurred: Deblurred | None = None
-
-
-@dataclass(frozen=True)
-class RestoreParams:
-    """Settings of the whole chain.
-
-    Parameters
-    ----------
-    train : int, optional
-        Frames, from the first on, that give the centroid and the flow dynamics.  By default all of up to 40, then
-        half of them, at most 100.
-    until : {"centroid", "identify", "filter", "deconvolve"}
-        Last stage to run.
-    keep_best : float
-        Lucky imaging: share of the frames, the sharpest, that the image is made of; such as 0.3 or 30%.
-    border : {"keep", "crop"}
-        Keep the border, where fewer frames show the scene, or crop it to what nine frames in ten show.
-    displacement_cue : bool
-        Draw the size of the motion in the flow model towards what the blur of the mean of the training frames says.
-    blur_bounds : bool
-        Keep an estimated width of the blur within what the blur of frames, mean and fused image relative to each other
-        allows.
-    flow : FlowParams
-        Optical flow.
-    centroid : CentroidParams
-        Centroid iteration.
-    dynamics : DynamicsParams
-        Dynamic texture of the flow.
-    filter : FilterParams
-        Alternating-estimation Kalman filter.
-    deconvolution : DeconvolutionParams
-        Deconvolution.
-    guards : GuardParams
-        What the deconvolved image must not exceed.
-    """
-
-    train: int | None = None
-    until: Literal["centroid", "identify", "filter", "deconvolve"] = "deconvolve"
-    keep_best: Share = _ALL
-    border: Literal["keep", "crop"] = "keep"
-    displacement_cue: bool = False
-    blur_bounds: bool = False
-    flow: FlowParams = field(default_factory=FlowParams)
-    centroid: CentroidParams = field(default_factory=CentroidParams)
-    dynamics: DynamicsParams = field(default_factory=DynamicsParams)
-    filter: FilterParams = field(default_factory=FilterParams)
-    deconvolution: DeconvolutionParams = field(default_factory=DeconvolutionParams)
-    guards: GuardParams = field(default_factory=GuardParams)
-
-    def __post_init__(self) -> None:
-        require(self.train is None or self.train >= 2, f"train: expected 2 frames or more, found {self.train}")
-        require(
-            self.until == STAGES[-1] or self.deconvolution.sigma is None,
-            f"deconvolution.sigma: has no effect with until = {self.until}; leave one of them out",
-        )
-        require(self.border in BORDERS, f"border: expected one of {', '.join(BORDERS)}, found {self.border!r}")
-        check_share(self.keep_best)
-        require(
-            self.keep_best == 1 or self.until in STAGES[2:],
-            f"keep_best: has no effect with until = {self.until}; leave one of them out",
-        )
-        require(self.until in STAGES, f"until: expected one of {', '.join(STAGES)}, found {self.until!r}")
-        require(
-            not self.blur_bounds or (self.until == STAGES[-1] and self.deconvolution.sigma is None),
-            "blur_bounds: has an effect only where the width of the blur is estimated; leave it out",
-        )
-
-
-@dataclass(frozen=True)
-class Restoration:
-    """The restored image and everything it came from.
-
-    Attributes
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Result of the last stage that ran; smaller than those of the stages where its border is cropped.
-    crop : tuple of int
-        x, y, width and height of the image within the frames, pixels.
-    mean : ndarray, float32, shape (H, W) or (H, W, 3)
-        Temporal mean of the frames that were read, in their size: all of them once the filter has run, else the
-        training frames.
-    centroid : Centroid
-    dynamics : FlowDynamics or None
-    filtered : Filtered or None
-    blur : BlurEstimate or None
-        Estimated blur of the filtered image; None where sigma was given.
-    blur_bounds : BlurBounds or None
-        Bounds that the estimated width was kept within; None where they were not asked for.
-    deconvolution : Deconvolution or None
-    guard_readings : tuple of GuardReading
-        What the guards saw of every width of the blur that was tried.
-    decisions : tuple of Decision
-        What was chosen from the data, and why, in the order of the stages.
-    train : int
-        Number of training frames.
-    frame_count : int
-        Number of frames that were read.
-    seconds : dict of str to float
-        Wall time of each stage.
-    """
-
-    image: FloatArray
-    crop: Rectangle
-    mean: FloatArray
-    centroid: Centroid
-    dynamics: FlowDynamics | None
-    filtered: Filtered | None
-    blur: BlurEstimate | None
-    blur_bounds: BlurBounds | None
-    deconvolution: Deconvolution | None
-    guard_readings: tuple[GuardReading, ...]
-    decisions: tuple[Decision, ...]
-    train: int
-    frame_count: int
-    seconds: dict[str, float]
-
-    def plot(self) -> Figure:
-        """Draw the temporal mean beside the result.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        ConfigurationError
-            Matplotlib is not installed.
-        """
-        x, y, width, height = self.crop
-        return plot_images({"mean": self.mean[y : y + height, x : x + width], "result": self.image})
-
-    def _repr_html_(self) -> str:
-        sigma = 0.0 if self.deconvolution is None else self.deconvolution.sigma
-        facts = [
-            ("frames", f"{self.frame_count}, {self.train} to train"),
-            ("blur removed", f"{sigma:.2f} pixels" if sigma > 0 else "none"),
-            ("time", f"{sum(self.seconds.values()):.1f} s"),
-            *((decision.subject, decision.choice) for decision in self.decisions),
-        ]
-        return preview("Restoration", facts, self.image)
 
 
 def restore(
@@ -231,11 +59,12 @@ def restore(
     progress: Progress | None = None,
     done: StageResults | None = None,
     on_result: Callable[[StageResults], None] | None = None,
+    scratch: Path | None = None,
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
     The frames are read from the first to the last, once (twice where only the best are kept); only the training frames
-    stay in memory.
+    stay in memory, or in a file where a memory limit is given and they do not fit.
 
     Parameters
     ----------
@@ -250,6 +79,8 @@ def restore(
         Nothing is checked: :mod:`turbrestore.resumption` keeps results on disk and tells which still hold.
     on_result : callable, optional
         Called with all that is done after each stage, and after each block of frames in the filter.
+    scratch : Path, optional
+        Folder of the file for what memory does not hold; by default that of temporary files.
 
     Returns
     -------
@@ -260,7 +91,9 @@ def restore(
     DataError
         Too few, too small, damaged or constant frames.
     ConfigurationError
-        More training frames than frames.
+        More training frames than frames, or a memory limit that cannot be kept.
+    StorageError
+        There is no room for the file.
 
     Examples
     --------
@@ -273,17 +106,20 @@ def restore(
     >>> restoration.image.shape, restoration.train
     ((64, 64), 6)
     """
-    params = params or RestoreParams()
+    params = place_stages(params or RestoreParams())
     source = frames if isinstance(frames, FrameSource) else FrameSource.from_array(frames)
-    train = training_share(len(source), source.shape[1:], params.train)
+    plan = memory_plan(source, params)
     _check_sigma(params.deconvolution.sigma, source.shape)
     stages = STAGES[: STAGES.index(params.until) + 1]
-    run = _Run(source, params, progress, done or StageResults(), on_result)
+    run = _Run(source, _within(plan, params), progress, done or StageResults(), on_result)
+    if plan.in_file:
+        run.scratch = scratch or Path(tempfile.gettempdir())
+        check_space(run.scratch / "training frames", plan.file_bytes)
     stream = iter(source)
-    training = _read_training(stream, train)
+    training = _read_training(stream, plan.train, source.shape, run.scratch)
     run.clock.lap("read")
     centroid = _find_centroid(run, training)
-    image, mean = centroid.image, training.mean(axis=0, dtype=np.float32)
+    image, mean = centroid.image, mean_of(training)
     dynamics = filtered = deblurred = None
     if "identify" in stages:
         dynamics = _identify(run, centroid, training)
@@ -306,55 +142,45 @@ def restore(
         blur_bounds=run.done.blur_bounds,
         deconvolution=None if deblurred is None else deblurred.deconvolution,
         guard_readings=() if deblurred is None else deblurred.readings,
-        decisions=(*_decisions(run, training, centroid, dynamics, filtered, deblurred), on_border),
-        train=train,
-        frame_count=len(source) if filtered is not None else train,
+        decisions=(
+            *plan.decisions,
+            *_decisions(run, training, centroid, dynamics, filtered, deblurred),
+            on_border,
+        ),
+        train=plan.train,
+        frame_count=len(source) if filtered is not None else plan.train,
         seconds=run.clock.seconds,
     )
 
 
-def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int | None = None) -> int:
-    """How many frames the centroid and the flow dynamics are taken from.
+def memory_plan(source: FrameSource, params: RestoreParams) -> MemoryPlan:
+    """Plan what a restoration does to keep within its memory limit.
 
     Parameters
     ----------
-    frame_count : int
-        Frames there are.
-    frame_shape : tuple of int
-        (H, W) or (H, W, 3).
-    wanted : int, optional
-        What the user asked for.
+    source : FrameSource
+    params : RestoreParams
 
     Returns
     -------
-    int
-        ``wanted``; else all of up to 40 frames, then half of them, at most 100 and at most what 1.5 GB hold.
+    MemoryPlan
 
     Raises
     ------
     DataError
-        Fewer than two frames, or frames too small.
+        Too few or too small frames.
     ConfigurationError
-        More wanted than there are.
+        More training frames than frames, or a limit that cannot be kept.
 
     Examples
     --------
-    >>> [training_share(n, (256, 256)) for n in (5, 40, 60, 120, 900)]
-    [5, 40, 40, 60, 100]
+    >>> plan = memory_plan(FrameSource.from_array(np.zeros((9, 64, 64))), RestoreParams())
+    >>> plan.train, plan.in_file
+    (9, False)
     """
-    if frame_count < 2:
-        raise DataError(f"frames: expected at least 2 to restore an image from, found {frame_count}")
-    if min(frame_shape[:2]) < MIN_SIDE:
-        raise DataError(
-            f"frames: expected at least {MIN_SIDE}×{MIN_SIDE} pixels, found {frame_shape[1]}×{frame_shape[0]}"
-        )
-    if wanted is not None:
-        require(wanted >= 2, f"train: expected 2 frames or more, found {wanted}")
-        require(wanted <= frame_count, f"train: expected at most the {frame_count} frames there are, found {wanted}")
-        return wanted
-    share = min(max(frame_count // 2, _FEWEST_TRAINED), _MOST_TRAINED)
-    frame_bytes = 4 * (int(np.prod(frame_shape)) + 2 * frame_shape[0] * frame_shape[1])
-    return min(frame_count, max(2, min(share, int(_TRAINING_BYTES // frame_bytes))))
+    return plan_memory(
+        source.shape, params.memory_limit, params.train, params.flow, params.filter, params.dynamics, params.until
+    )
 
 
 def stage_counter(progress: Progress | None, stage: str, total: int) -> Callable[[int], None] | None:
@@ -413,7 +239,7 @@ class _Sum:
         self._count = 0
 
     def __iter__(self) -> Iterator[FloatArray]:
-        for frames in (self._training, self._rest):
+        for frames in (walk(self._training), self._rest):
             for frame in frames:
                 self._total += frame
                 self._count += 1
@@ -437,6 +263,7 @@ class _Run:
         self.source, self.params, self.progress = source, params, progress
         self.done = done
         self.clock = _Clock()
+        self.scratch: Path | None = None
         self._on_result = on_result
 
     def finish(self, done: StageResults, stage: str | None = None) -> None:
@@ -452,7 +279,7 @@ def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
         return run.done.centroid
     params = run.params
     counter = stage_counter(run.progress, "centroid", len(training) * params.centroid.iterations)
-    centroid = find_centroid(training, params.centroid, params.flow, counter)
+    centroid = find_centroid(training, params.centroid, params.flow, counter, run.scratch)
     run.finish(replace(run.done, centroid=centroid), "centroid")
     return centroid
 
@@ -460,7 +287,7 @@ def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
 def _identify(run: _Run, centroid: Centroid, training: FloatArray) -> FlowDynamics:
     if run.done.dynamics is not None:
         return run.done.dynamics
-    dynamics = identify(centroid.flows, run.params.dynamics)
+    dynamics = identify(centroid.flows, run.params.dynamics, run.scratch)
     if run.params.displacement_cue:
         dynamics = with_displacement(dynamics, *displacement_maps(training))
     run.finish(replace(run.done, dynamics=dynamics), "identify")
@@ -515,6 +342,7 @@ def _decisions(
     deblurred: Deblurred | None,
 ) -> Iterator[Decision]:
     """Put what was chosen into words, in the order of the stages."""
+    yield from explain_device(run.params.device, find_device(run.params.device), run.params.flow.method)
     yield explain_training(len(training), len(run.source), run.params.train)
     yield from explain_input(training)
     yield explain_centroid(centroid)
@@ -544,6 +372,20 @@ def _crop(image: FloatArray, flows: FloatArray, border: str, deblurred: Deblurre
     return crop, explain_border(float(seen.min()), crop)
 
 
+def _within(plan: MemoryPlan, params: RestoreParams) -> RestoreParams:
+    """Change the settings that the plan needs and that change nothing of the result beyond rounding."""
+    if params.memory_limit is None:
+        return params
+    return_freed()
+    asked = params.deconvolution.memory
+    memory = plan.deconvolution if asked is None or plan.deconvolution is None else min(asked, plan.deconvolution)
+    return replace(
+        params,
+        flow=replace(params.flow, threads=plan.threads),
+        deconvolution=replace(params.deconvolution, memory=memory),
+    )
+
+
 def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
     largest = min(shape[1:3]) / _SIGMAS_A_SIDE
     require(
@@ -552,9 +394,12 @@ def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
     )
 
 
-def _read_training(stream: Iterator[FloatArray], train: int) -> FloatArray:
-    training = np.stack(list(islice(stream, train)))
-    contrast = float(np.ptp(training.mean(axis=0)))
+def _read_training(stream: Iterator[FloatArray], train: int, shape: tuple[int, ...], folder: Path | None) -> FloatArray:
+    training = new_stack((train, *shape[1:]), folder)
+    for index, frame in enumerate(islice(stream, train)):
+        training[index] = frame
+        release(training)
+    contrast = float(np.ptp(mean_of(training)))
     if contrast < _LEAST_CONTRAST:
         raise DataError(
             f"frames: expected a scene with some contrast, found one intensity within {contrast:.1g} of full scale"

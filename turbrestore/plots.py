@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, check_flow, check_image, luminance
 from .errors import ConfigurationError, DataError
+from .scratch import variance_of, walk
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -144,10 +145,10 @@ def plot_displacements(flows: ArrayLike, image: ArrayLike | None = None) -> Figu
     stack = check_flow(flows, "flows")
     if stack.ndim != 4 or len(stack) < 2:
         raise DataError(f"flows: expected at least two, shape (T, H, W, 2), found {stack.shape}")
-    spread = np.sqrt(stack.var(axis=0).sum(axis=-1))
+    spread = np.sqrt(variance_of(stack).sum(axis=-1))
     figure, axes = _map(spread, image, "Standard deviation of displacement, pixels")
     rows, columns = _lattice(stack.shape[1:3])
-    samples = stack[:, rows][:, :, columns]
+    samples = np.stack([flow[np.ix_(rows, columns)] for flow in walk(stack)])
     samples = samples - samples.mean(axis=0)
     covariance = np.einsum("tyxi,tyxj->yxij", samples, samples) / (len(stack) - 1)
     values, vectors = np.linalg.eigh(covariance)

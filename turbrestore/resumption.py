@@ -13,6 +13,9 @@ filtered    the dynamics, all frames selected, settings of the filter, the share
 deblurred   the filtered image, settings of deconvolution and guards, the bounds of the blur
 ==========  =========================================================================================================
 
+Neither the number of threads nor a memory limit changes a result, so nothing depends on them; but where a limit leaves
+fewer training frames, the centroid depends on those.
+
 The content of the input is a checksum of all its bytes: of a folder, the names and bytes of its images.  Reading a file
 takes a few thousandths of the time of measuring flow in it, and no time stamp is believed.  Only where there are
 more than 4 GiB the size, the time of the last change and 64 MiB spread evenly over the file stand for all of it.
@@ -41,13 +44,14 @@ from .centroid import Centroid
 from .checkpoint import load_checkpoint, save_checkpoint
 from .decision import Decision
 from .deconvolution import Deconvolution
-from .dynamics import FlowDynamics
 from .errors import DataError, OutputError, require
+from .flow_model import FlowDynamics
 from .frame_source import FrameSource
 from .guards import GuardReading
 from .images import IMAGE_SUFFIXES, atomic_output, atomic_write, input_errors
 from .npy import map_npy
-from .pipeline import RestoreParams, StageResults, training_share
+from .pipeline import memory_plan
+from .restoration import RestoreParams, StageResults, place_stages
 from .run_record import RECORD as RUN_RECORD
 from .run_record import versions
 
@@ -128,6 +132,7 @@ class KeptStages:
         require(every >= 1, f"checkpoint_every: expected at least 1 frame, found {every}")
         self.folder, self._every, self._block = Path(folder), every, params.filter.block
         self._facts = stage_facts(source, params)
+        self._scratch = self.folder if memory_plan(source, params).in_file else None
         self._key = _key(self._facts)
         self._files: dict[str, str] = {}
         self._verdict: dict[str, Any] = {}
@@ -239,7 +244,8 @@ class KeptStages:
         """Read the results whose files are as they were written."""
 
         def load(name: str, kind: type[Loaded]) -> Loaded | None:
-            return load_artifact(self.folder / f"{name}.npz", kind) if f"{name}.npz" in self._files else None
+            path = self.folder / f"{name}.npz"
+            return load_artifact(path, kind, self._scratch) if path.name in self._files else None
 
         filtered, deconvolution = load("filtered", Filtered), load("deconvolution", Deconvolution)
         mean = _load_mean(self.folder / MEAN) if MEAN in self._files else None
@@ -319,10 +325,11 @@ def stage_facts(source: FrameSource, params: RestoreParams) -> dict[str, dict[st
     >>> list(facts), facts["filtered"]["frames"]
     (['centroid', 'dynamics', 'filtered', 'deblurred'], [0, 5, 1])
     """
-    settings = dataclasses.asdict(params)
-    # The number of threads changes nothing but the time.
+    settings = dataclasses.asdict(place_stages(params))
+    # The number of threads changes nothing but the time, and a memory limit nothing but the training frames.
     flow = {name: value for name, value in settings["flow"].items() if name != "threads"}
-    training = source.numbers[: training_share(len(source), source.shape[1:], params.train)]
+    del settings["deconvolution"]["memory"]
+    training = source.numbers[: memory_plan(source, params).train]
     rows, columns = source.window
     facts = {
         "centroid": {

@@ -30,13 +30,13 @@ from .border import Rectangle
 from .centroid import Centroid
 from .decision import Decision
 from .deconvolution import Deconvolution
-from .dynamics import FlowDynamics
 from .errors import DataError, InputNotFoundError, OutputError
+from .flow_model import FlowDynamics
 from .frame_source import FrameSource
 from .guards import GuardReading
 from .images import atomic_output, atomic_write
 from .npy import read_npz
-from .pipeline import Restoration, RestoreParams
+from .restoration import Restoration, RestoreParams
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -26,6 +26,7 @@ from scipy import fft
 
 from .arrays import FloatArray, check_frames, check_image, luminance
 from .errors import DataError
+from .scratch import mean_of, release
 
 # Images are reduced by a whole factor until no side is longer: beyond it only the time grows.
 _LONGEST_SIDE = 192
@@ -195,16 +196,17 @@ def mean_stabilised(frames: ArrayLike) -> FloatArray:
     True
     """
     stack = check_frames(frames)
-    mean = stack.mean(axis=0, dtype=np.float32)
+    mean = mean_of(stack)
     shifts, known = _known_shifts(stack)
     if np.abs(shifts).max() <= DEAD_ZONE:
         return mean
     total = np.zeros(mean.shape)
     count = np.zeros(mean.shape[:2])
-    for frame, shift in zip(stack[known], np.rint(shifts[known]), strict=True):
-        to, origin = overlap(count.shape, shift)
-        total[to] += frame[origin]
+    for index in np.flatnonzero(known):
+        to, origin = overlap(count.shape, np.rint(shifts[index]))
+        total[to] += stack[index][origin]
         count[to] += 1
+        release(stack)
     seen = count > 0
     mean[seen] = (total[seen].T / count[seen]).T
     return mean
@@ -266,6 +268,7 @@ def _walk(stack: FloatArray, anchor: int, order: Iterable[int], shifts: Shift, k
                 key, key_shift = nearer, shifts[last]
         if found is not None:
             shifts[index], known[index], last = key_shift + found, True, index
+        release(stack)
 
 
 def _reduce(image: FloatArray) -> FloatArray:

@@ -35,17 +35,16 @@ Departures from Zach et al. and OpenCV's DualTVL1
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, check_flow, check_frames, check_image, luminance
+from .device import PROCESSOR, find_device
 from .errors import DataError, require, require_between
-from .image_stacks import Shape, Stack, StackOps, numpy_ops, sample_spline, spline_coefficients, torch_ops
+from .image_stacks import Shape, Stack, StackOps, numpy_ops, spline_coefficients, torch_ops
 from .tvl1_sweeps import FlowProblem, SweepParams, resize_dual, sweep
 
-BACKENDS = ("numpy", "torch")
 MEDIANS = (1, 3, 5)
 # A level of the pyramid has at least half of this many pixels a side.
 _LEAST_SIDE = 32
@@ -82,12 +81,8 @@ class TvL1Params:
         Most levels of the pyramid; fewer where the image is small.
     tolerance : float
         A level ends when half of its pixels move by less than this in a warp, pixels.
-    backend : {"numpy", "torch"}
-        What computes: NumPy with OpenCV, or torch.
-    device : str
-        Where torch computes: ``"cpu"`` or ``"cuda"``.
     batch : int
-        Frames solved together, which pays on a GPU only.
+        Frames that a device solves together; memory grows with it.  A processor solves one after the other.
     """
 
     attachment: float = 0.08
@@ -98,9 +93,7 @@ class TvL1Params:
     median: int = 5
     levels: int = 5
     tolerance: float = 0.1
-    backend: Literal["numpy", "torch"] = "numpy"
-    device: str = "cpu"
-    batch: int = 1
+    batch: int = 4
 
     def __post_init__(self) -> None:
         require_between("attachment", self.attachment, 1e-4, 1e3)
@@ -110,11 +103,6 @@ class TvL1Params:
         require_between("step", self.step, 1e-3, 1e3, "pixels")
         require(self.median in MEDIANS, f"median: expected 1 (off), 3 or 5, found {self.median}")
         require_between("tolerance", self.tolerance, 0, 10, "pixels")
-        require(self.backend in BACKENDS, f"backend: expected one of {', '.join(BACKENDS)}, found {self.backend!r}")
-        require(
-            self.device == "cpu" or self.backend == "torch",
-            f"device: expected 'cpu' with the backend {self.backend}, found {self.device!r}; set backend to 'torch'",
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +133,15 @@ class TvL1Reference:
         From the image to the coarsest.
     params : TvL1Params
     ops : StackOps
-        Operations of the backend.
+        Operations of where it is computed.
+    together : bool
+        Whether frames are solved together, as on a device.
     """
 
     levels: tuple[ReferenceLevel, ...]
     params: TvL1Params
     ops: StackOps
+    together: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +163,7 @@ class TvL1Flows:
     settled: NDArray[np.bool_]
 
 
-def refer_tvl1(reference: ArrayLike, params: TvL1Params | None = None) -> TvL1Reference:
+def refer_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device: str = PROCESSOR) -> TvL1Reference:
     """Prepare the reference of many flows.
 
     Parameters
@@ -181,6 +172,8 @@ def refer_tvl1(reference: ArrayLike, params: TvL1Params | None = None) -> TvL1Re
         At least 16×16 pixels; colour is reduced to luminance.
     params : TvL1Params, optional
         Settings of all flows from this reference.
+    device : str
+        Where they are computed, see :mod:`turbrestore.device`.
 
     Returns
     -------
@@ -191,7 +184,7 @@ def refer_tvl1(reference: ArrayLike, params: TvL1Params | None = None) -> TvL1Re
     DataError
         Wrong shape, too small, or values that are not finite.
     ConfigurationError
-        The backend or the device is not there.
+        The device is not there.
 
     Examples
     --------
@@ -203,9 +196,10 @@ def refer_tvl1(reference: ArrayLike, params: TvL1Params | None = None) -> TvL1Re
     image = luminance(check_image(reference, "reference"))
     if min(image.shape) < _LEAST_SIDE // 2:
         raise DataError(f"reference: expected at least 16×16 pixels, found {image.shape[1]}×{image.shape[0]}")
-    ops = torch_ops(params.device) if params.backend == "torch" else numpy_ops()
+    found = find_device(device)
+    ops = numpy_ops() if found == PROCESSOR else torch_ops(found)
     levels = (_refer_level(stack, ops) for stack in _pyramid(ops.load(image[None]), params.levels, ops))
-    return TvL1Reference(tuple(levels), params, ops)
+    return TvL1Reference(tuple(levels), params, ops, found != PROCESSOR)
 
 
 def tvl1_flows(frames: ArrayLike, reference: TvL1Reference, start: ArrayLike | None = None) -> TvL1Flows:
@@ -214,7 +208,7 @@ def tvl1_flows(frames: ArrayLike, reference: TvL1Reference, start: ArrayLike | N
     Parameters
     ----------
     frames : array_like, shape (T, H, W) or (T, H, W, 3)
-        In the intensity unit of the reference; torch solves them together, so memory grows with T.
+        In the intensity unit of the reference; a device solves them together, so memory grows with T.
     reference : TvL1Reference
         What :func:`refer_tvl1` made of it.
     start : array_like, shape (T, H, W, 2), optional
@@ -248,8 +242,8 @@ def tvl1_flows(frames: ArrayLike, reference: TvL1Reference, start: ArrayLike | N
     flows = None if start is None else check_flow(start, "start")
     if flows is not None and flows.shape != (*stack.shape, 2):
         raise DataError(f"start: expected shape {(*stack.shape, 2)}, found {flows.shape}")
-    # On a CPU one frame after the other stays in the cache.
-    size = len(stack) if reference.params.backend == "torch" else 1
+    # On a processor one frame after the other stays in the cache.
+    size = len(stack) if reference.together else 1
     groups = [slice(first, first + size) for first in range(0, len(stack), size)]
     parts = [_solve(stack[group], reference, None if flows is None else flows[group]) for group in groups]
     return TvL1Flows(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("flows", "warps", "settled")))
@@ -316,10 +310,12 @@ def _settle(
         after = _minimise(problem, before, p, reference)
         if params.median > 1:
             after = ops.median(after, params.median)
-        moved = ops.store(ops.arrays.square(after - before).sum(1))
+        little = ops.arrays.square(after - before).sum(1) < params.tolerance**2
+        # Counted where the flow is, so that a device gives back one number a frame.
+        still = ops.store(little.reshape(len(running), -1).sum(1))
         flow[running], dual[running] = after, p
         warps[running] += 1
-        settled[running] = np.median(moved.reshape(len(running), -1), axis=1) < params.tolerance**2
+        settled[running] = 2 * still > little.shape[-2] * little.shape[-1]
     return warps, settled
 
 
@@ -329,7 +325,7 @@ def _linearise(level: ReferenceLevel, frames: Stack, flow: Stack, reference: TvL
     x, y = level.x + flow[:, 0], level.y + flow[:, 1]
     height, width = x.shape[-2:]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    warped = sample_spline(frames, x, y, ops)
+    warped = ops.sample(frames, x, y)
     g = _gradient(warped, ops)
     g += level.gradient
     # Where nothing is seen g vanishes, and with it the way that the data term can push.

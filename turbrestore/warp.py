@@ -12,6 +12,8 @@ spline reproduces cubics.
 from __future__ import annotations
 
 import functools
+import math
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -19,14 +21,18 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from .arrays import FloatArray, check_flow, check_image
+from .device import PROCESSOR, find_device
 from .errors import ConfigurationError, DataError
+from .image_stacks import StackOps, torch_ops, warp_stack
 
 # Pole of the cubic B-spline prefilter; its impulse response below is cut off where it falls under 1e-7.
 _POLE = np.sqrt(3.0) - 2.0
+# Pixels of a strip: a dozen arrays of it stay in the cache of a core.
+_STRIP = 1 << 14
 _PREFILTER = (-6 * _POLE / (1 - _POLE**2) * _POLE ** np.abs(np.arange(-12, 13))).astype(np.float32)
 
 
-def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic") -> FloatArray:
+def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device: str = PROCESSOR) -> FloatArray:
     """Backward warp: ``result(x, y) = image(x + dx, y + dy)``.
 
     With ``flow = estimate_flow(reference, frame)`` the result lies on the reference (``I ∘ w``; paper 3, eq. 15).
@@ -39,6 +45,8 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic") -> Flo
         Displacements (dx, dy) in pixels.
     interpolation : {"cubic", "linear"}
         Cubic B-splines keep detail; linear never leaves the range of the image and has an exact adjoint.
+    device : str
+        Where the cubic warp is computed, see :mod:`turbrestore.device`.
 
     Returns
     -------
@@ -64,6 +72,8 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic") -> Flo
         raise ConfigurationError(f"interpolation: expected one of {', '.join(INTERPOLATIONS)}, found {interpolation!r}")
     if flow.ndim != 3 or image.shape[:2] != flow.shape[:2]:
         raise DataError(f"flow: expected shape {(*image.shape[:2], 2)}, found {flow.shape}")
+    if interpolation == "cubic" and find_device(device) != PROCESSOR:
+        return _on_device(image, flow, torch_ops(find_device(device)))
     return INTERPOLATIONS[interpolation](image, flow)
 
 
@@ -209,13 +219,44 @@ def inside(flow: ArrayLike) -> FloatArray:
     flow = check_flow(flow)
     if flow.ndim != 3:
         raise DataError(f"flow: expected shape (H, W, 2), found {flow.shape}")
-    height, width = flow.shape[:2]
-    x, y = _pixel_grid(height, width)
-    return _inside_axis(x + flow[..., 0], width) * _inside_axis(y + flow[..., 1], height)
+    seen = np.ones(flow.shape[:2], np.float32)
+    dx, dy = cv2.split(flow)
+    _fade(seen.T, dx.T)
+    _fade(seen, dy)
+    return seen
 
 
-def _inside_axis(position: FloatArray, length: int) -> FloatArray:
-    return np.clip(1 - np.maximum(-position, position - (length - 1)), 0, 1)
+def strips(shape: tuple[int, ...]) -> Iterator[slice]:
+    """Rows of an image in pieces that are worked on one after the other, so that intermediate results stay in cache.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        (H, W) and what follows.
+
+    Yields
+    ------
+    slice
+
+    Examples
+    --------
+    >>> list(strips((100, 400)))
+    [slice(0, 40, None), slice(40, 80, None), slice(80, 100, None)]
+    """
+    rows = max(_STRIP // shape[1], 1)
+    return (slice(start, min(start + rows, shape[0])) for start in range(0, shape[0], rows))
+
+
+def _fade(seen: FloatArray, flow: FloatArray) -> None:
+    """Multiply ``seen`` by how far samples along the first axis lie within the image."""
+    length = len(flow)
+    position = np.arange(length, dtype=np.float32)[:, None]
+    # Only samples within reach of a border can lie beyond it.
+    before = min(max(math.ceil(-flow.min()), 0), length)
+    after = max(length - max(math.ceil(flow.max()), 0), before)
+    for part in (slice(0, before), slice(after, length)):
+        sample = position[part] + flow[part]
+        seen[part] *= np.clip(1 - np.maximum(-sample, sample - (length - 1)), 0, 1)
 
 
 @functools.lru_cache(maxsize=4)
@@ -233,38 +274,78 @@ def _linear(image: FloatArray, flow: FloatArray) -> FloatArray:
         return cv2.remap(plane, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     # For one and three channels OpenCV 5 is exact; for the two of a flow it still rounds positions to 1/32 px.
-    return np.dstack([sample(image[..., 0]), sample(image[..., 1])]) if image.shape[2:] == (2,) else sample(image)
+    return cv2.merge([sample(plane) for plane in cv2.split(image)]) if image.shape[2:] == (2,) else sample(image)
 
 
 def _cubic(image: FloatArray, flow: FloatArray) -> FloatArray:
     """Sum of 4×4 B-spline coefficients as a blend of four bilinear samples (Sigg and Hadwiger 2005)."""
-    height, width = flow.shape[:2]
-    x, y = _pixel_grid(height, width)
+    grid = _pixel_grid(*flow.shape[:2])
+    coefficients = cv2.sepFilter2D(image, -1, _PREFILTER, _PREFILTER, borderType=cv2.BORDER_REFLECT_101)
+    result = np.empty_like(coefficients)
+    for rows in strips(flow.shape):
+        x, y = (axis[rows] + flow[rows, :, index] for index, axis in enumerate(grid))
+        result[rows] = _sample(coefficients, x, y)
+    return result
+
+
+def _sample(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Spline with these coefficients at x and y, which are overwritten."""
+    height, width = coefficients.shape[:2]
     mirrored = cv2.BORDER_REFLECT_101
-    coefficients = cv2.sepFilter2D(image, -1, _PREFILTER, _PREFILTER, borderType=mirrored)
-    left, right, to_right = _spline_pair(np.clip(x + flow[..., 0], 0, width - 1))
-    upper, lower, to_lower = _spline_pair(np.clip(y + flow[..., 1], 0, height - 1))
-    if image.ndim == 3:
-        to_right, to_lower = to_right[..., None], to_lower[..., None]
+    left, right, to_right = _spline_pair(x, width - 1)
+    upper, lower, to_lower = _spline_pair(y, height - 1)
+    if coefficients.ndim == 3:
+        to_right, to_lower = (cv2.merge([blend] * coefficients.shape[2]) for blend in (to_right, to_lower))
 
     def row(map_y: FloatArray) -> FloatArray:
         a = cv2.remap(coefficients, left, map_y, cv2.INTER_LINEAR, borderMode=mirrored)
-        b = cv2.remap(coefficients, right, map_y, cv2.INTER_LINEAR, borderMode=mirrored)
-        return a + to_right * (b - a)
+        return _blend(a, cv2.remap(coefficients, right, map_y, cv2.INTER_LINEAR, borderMode=mirrored), to_right)
 
-    top = row(upper)
-    return top + to_lower * (row(lower) - top)
+    return _blend(row(upper), row(lower), to_lower)
 
 
-def _spline_pair(position: FloatArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Two positions and a blend whose bilinear samples weigh four neighbours as the cubic B-spline does."""
+def _blend(first: FloatArray, second: FloatArray, share: FloatArray) -> FloatArray:
+    """``first + share (second − first)``, in the memory of ``second``."""
+    second -= first
+    second *= share
+    second += first
+    return second
+
+
+def _spline_pair(position: FloatArray, last: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Two positions and a blend whose bilinear samples weigh four neighbours as the cubic B-spline does.
+
+    Positions beyond 0 and ``last`` are moved there, in place.  With weights w0 to w3 the blend is w2 + w3.
+    """
+    np.clip(position, 0, last, out=position)
     whole = np.floor(position)
-    t = position - whole
-    rest = 1 - t
-    w0, w3 = rest * rest * rest / 6, t * t * t / 6
-    w1 = 2 / 3 - t * t * (1 - t / 2)
-    before = w0 + w1
-    return whole - 1 + w1 / before, whole + 1 + w3 / (1 - before), 1 - before
+    t = np.subtract(position, whole, out=position)
+    square = t * t
+    first = t * np.float32(0.5)
+    first -= 1
+    first *= square
+    first += np.float32(2 / 3)
+    second = np.multiply(square, t, out=square)
+    second /= 6
+    rest = np.subtract(1, t, out=t)
+    before = rest * rest
+    before *= rest
+    before /= 6
+    before += first
+    share = np.subtract(1, before, out=rest)
+    first /= before
+    first += whole
+    first -= 1
+    second /= share
+    second += whole
+    second += 1
+    return first, second, share
+
+
+def _on_device(image: FloatArray, flow: FloatArray, ops: StackOps) -> FloatArray:
+    planes = image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)
+    warped = ops.store(warp_stack(ops.load(planes), ops.load(flow), ops))
+    return warped[0] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(warped, 0, -1))
 
 
 INTERPOLATIONS = {"linear": _linear, "cubic": _cubic}

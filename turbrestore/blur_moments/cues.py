@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import check_frames, check_image, luminance
 from ..errors import DataError
+from ..scratch import walk
 from .exponent_fit import fit_difference
 from .tiles import CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
 
@@ -154,7 +155,7 @@ def displacement_variance(frames: ArrayLike, noise: float, params: CueParams | N
     count = len(stack)
     spectra = TileSpectra.of(stack.shape[1:3], params)
     mean, power = np.zeros(stack.shape[1:3]), np.zeros(1)
-    for frame in stack:
+    for frame in walk(stack):
         grey = luminance(frame)
         mean += grey / np.float64(count)
         power = power + spectra.power(grey) / np.float64(count)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import FloatArray, check_frames, luminance
 from ..errors import DataError
+from ..scratch import walk
 from .exponent_fit import LARGEST_EXPONENT, PRIOR, fit_relative
 from .tiles import CORRELATED, CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
 
@@ -219,7 +220,7 @@ def blur_against(frames: ArrayLike, reference: BlurReference, noise: float | Non
 
 def _ring_power(frames: FloatArray, spectra: TileSpectra, averaging: FloatArray) -> Float64Array:
     """Power of frames in rings, shape (T, tiles, rings)."""
-    return np.stack([spectra.power(luminance(frame)) @ averaging for frame in frames]).astype(np.float64)
+    return np.stack([spectra.power(luminance(frame)) @ averaging for frame in walk(frames)]).astype(np.float64)
 
 
 def _common_spectrum(

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..metrics import sharpness
-from ..pipeline import Restoration, RestoreParams
+from ..restoration import Restoration, RestoreParams
 from ..run_record import RunRecord
+from ..scratch import variance_of
 
 _STAGE_NAMES = {
     "read": "Reading",
@@ -86,7 +87,7 @@ def headline(restoration: Restoration) -> list[Fact]:
     -------
     list of Fact
     """
-    spread = float(np.sqrt(restoration.centroid.flows.var(axis=0).sum(axis=-1).mean()))
+    spread = float(np.sqrt(variance_of(restoration.centroid.flows).sum(axis=-1).mean()))
     facts = [
         Fact("Frames", str(restoration.frame_count), f"{restoration.train} trained the model"),
         Fact("Motion", f"{spread:.2f} px", "root mean square"),

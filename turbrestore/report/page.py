@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 from ..errors import ConfigurationError
 from ..images import atomic_write, check_output
-from ..pipeline import Restoration
 from ..plots import new_figure
+from ..restoration import Restoration
 from ..run_record import RunRecord
 from .facts import findings, headline, laps, remarks, settings
 from .panels import draw_panels

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from ..alternating import Filtered
 from ..deconvolution import Deconvolution
-from ..dynamics import FlowDynamics
-from ..pipeline import Restoration
+from ..flow_model import FlowDynamics
 from ..plots import (
     plot_blur,
     plot_convergence,
@@ -20,6 +19,7 @@ from ..plots import (
     plot_objective,
     plot_singular_values,
 )
+from ..restoration import Restoration
 from ..run_record import RunRecord
 from .vector import inline_svg
 

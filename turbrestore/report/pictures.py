@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import cv2
 
 from ..arrays import FloatArray
-from ..pipeline import Restoration
 from ..preview import data_uri, encode_image
+from ..restoration import Restoration
 
 # All images together, bytes before base64, which with half a megabyte of plots and text stays below 2 MB; quality
 # beyond it; longest side that is shown, pixels.

@@ -35,9 +35,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import FloatArray, check_flow
 from ..centroid import CentroidParams, find_centroid
-from ..dynamics import DynamicsParams, FlowDynamics, identify, simulate, stable_system
+from ..dynamics import DynamicsParams, identify
 from ..errors import DataError, require
 from ..flow import FlowParams
+from ..flow_model import FlowDynamics
+from ..simulation import simulate, stable_system
 from .sequence import check_scene
 
 Float64Array = NDArray[np.float64]

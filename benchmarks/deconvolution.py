@@ -1,0 +1,187 @@
+"""Time and memory of the deconvolution: nonlocal weights, an iteration, the whole stage.
+
+Run ``python benchmarks/deconvolution.py``; it prints tables and exits with 1 when a bound is broken.  Ratios are to
+work that any implementation has to do, taken in the same process and in turn: comparing every pixel with those of its
+search window, shift by shift, and the four Fourier transforms of an iteration.  Of repeated runs the fastest counts,
+for others may use the machine.  Peak memory is that of child processes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+from scipy import fft
+
+from turbrestore.blind import remove_blur
+from turbrestore.convolution_problem import Problem
+from turbrestore.deconvolution import DeconvolutionParams, automatic_fidelity, deconvolve
+from turbrestore.nonlocal_penalty import NonlocalPenalty
+from turbrestore.nonlocal_tv import nonlocal_weights
+from turbrestore.parallel import available_cores, one_thread_each
+from turbrestore.primal_dual import PrimalDual
+from turbrestore.psf import KOLMOGOROV, blur_otf
+from turbrestore.synthesis.scenes import SCENES
+
+SIZES = (256, 384, 512, 768, 1024)
+STATED = 512
+WEIGHTS_BOUND_S, ITERATION_BOUND_MS, EXPONENT_BOUND = 2.5, 25.0, 1.1
+STAGE_BOUNDS_S = {256: 1.0, 512: 4.0}
+# Of a child that removes the blur of a frame of 1920×1080, by the limit it is given; MB.
+MEMORY_BOUNDS = {None: 1200, 6e8: 800}
+NOISE, WIDTH = 0.003, 1.2
+
+
+def make_image(height: int, width: int) -> np.ndarray:
+    """Scene with a blur of turbulence and some noise."""
+    side = max(height, width)
+    scene = SCENES["camera"](side, side)[:height, :width]
+    blurred = fft.irfft2(fft.rfft2(scene) * blur_otf(scene.shape, WIDTH, KOLMOGOROV), s=scene.shape)
+    return (blurred + np.random.default_rng(0).normal(0, NOISE, scene.shape)).astype(np.float32)
+
+
+def fastest(function: Callable[[], object], runs: int) -> float:
+    """Seconds of the fastest of some runs."""
+    seconds = []
+    for _ in range(runs):
+        begun = time.perf_counter()
+        function()
+        seconds.append(time.perf_counter() - begun)
+    return min(seconds)
+
+
+def compare_shifts(image: np.ndarray) -> np.ndarray:
+    """Distances of all patches of 5×5 pixels to those of half of the shifts of 21×21 pixels; the least of each."""
+    least = np.full(image.shape, np.inf, np.float32)
+    for dy in range(11):
+        for dx in range(-10 if dy else 1, 11):
+            distances = cv2.boxFilter(np.square(image - np.roll(image, (-dy, -dx), (0, 1))), -1, (5, 5))
+            np.minimum(least, distances, out=least)
+    return least
+
+
+def weigh(image: np.ndarray) -> tuple[float, float]:
+    """Seconds of the weights, and of comparing shifts."""
+    return fastest(lambda: nonlocal_weights(image), 3), fastest(lambda: compare_shifts(image), 3)
+
+
+def iterate(image: np.ndarray, runs: int = 8) -> tuple[float, float]:
+    """Seconds of an iteration on the padded domain, and of four transforms of that size."""
+    margin = int(np.ceil(4 * WIDTH))
+    shape = tuple(fft.next_fast_len(size + 2 * margin, real=True) for size in image.shape)
+    widths = [
+        ((padded - size) // 2, padded - size - (padded - size) // 2)
+        for padded, size in zip(shape, image.shape, strict=True)
+    ]
+    padded = np.pad(image, widths, mode="symmetric")
+    problem = Problem(
+        padded,
+        np.pad(np.ones_like(image), widths),
+        blur_otf(shape, WIDTH, KOLMOGOROV),
+        automatic_fidelity("nltv", image, NOISE),
+    )
+    with one_thread_each(), ThreadPoolExecutor(available_cores()) as pool:
+        solver = PrimalDual(NonlocalPenalty(nonlocal_weights(padded), pool))
+        state = solver.start(problem, padded)
+        step = fastest(lambda: solver.step(problem, state), runs)
+    return step, fastest(lambda: [fft.irfft2(fft.rfft2(padded), s=shape) for _ in range(2)], runs)
+
+
+def exponent(seconds: list[float]) -> float:
+    """Power of the number of pixels that the times grow with."""
+    return float(np.polyfit(2 * np.log(SIZES), np.log(seconds), 1)[0])
+
+
+def peak_memory(limit: float | None) -> float:
+    """Peak resident memory, MB, of a child process that removes the blur of a large frame."""
+    command = [sys.executable, __file__, "--child", "0" if limit is None else str(limit)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return float(json.loads(done.stdout)["peak_mb"])
+
+
+def run_child(limit: float) -> None:
+    """Remove the blur of a frame of 1920×1080 and print the peak resident memory of this process.
+
+    A few iterations will do: they all need the same memory.
+    """
+    image = make_image(1080, 1920)
+    remove_blur(image, image, DeconvolutionParams(iterations=5, memory=limit or None))
+    # Linux counts kilobytes, macOS bytes.
+    unit = 1024 if sys.platform != "darwin" else 1024 * 1024
+    print(json.dumps({"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}))
+
+
+def tiled_difference() -> float:
+    """Largest difference between an image deblurred in memory and by strips from a file."""
+    image, params = make_image(192, 256), DeconvolutionParams(iterations=40)
+    parts = deconvolve(image, WIDTH, dataclasses.replace(params, memory=1e6))
+    return float(np.abs(parts.image - deconvolve(image, WIDTH, params).image).max())
+
+
+def time_parts() -> bool:
+    """Print the times of weights and iterations over the sizes; whether all bounds hold."""
+    weights, steps = [], []
+    print("| size | weights, s | to comparing shifts | iteration, ms | to four transforms |\n|---|---|---|---|---|")
+    for size in SIZES:
+        image = make_image(size, size)
+        (weighing, shifts), (step, transforms) = weigh(image), iterate(image)
+        weights.append(weighing)
+        steps.append(step)
+        ratios = f"{weighing:.2f} | {weighing / shifts:.2f} | {1e3 * step:.1f} | {step / transforms:.1f}"
+        print(f"| {size}² | {ratios} |", flush=True)
+    growth = exponent(weights), exponent(steps)
+    print(f"| exponent | {growth[0]:.2f} | | {growth[1]:.2f} | |")
+    print(f"| bound at {STATED}² | {WEIGHTS_BOUND_S} | | {ITERATION_BOUND_MS:.0f} | |\n")
+    stated = SIZES.index(STATED)
+    fast = weights[stated] <= WEIGHTS_BOUND_S and 1e3 * steps[stated] <= ITERATION_BOUND_MS
+    return fast and max(growth) <= EXPONENT_BOUND
+
+
+def time_stage() -> bool:
+    """Print the seconds of the whole stage; whether the bounds hold."""
+    print("| size | whole stage, s | bound |\n|---|---|---|")
+    held = True
+    for size, bound in STAGE_BOUNDS_S.items():
+        image = make_image(size, size)
+        seconds = fastest(lambda image=image: remove_blur(image, image), 2)
+        print(f"| {size}² | {seconds:.2f} | {bound:.1f} |", flush=True)
+        held &= seconds <= bound
+    return held
+
+
+def measure_memory() -> bool:
+    """Print the peak memory at 1920×1080; whether the bounds hold."""
+    print("\n| memory asked for, MB | peak at 1920×1080, MB | bound |\n|---|---|---|")
+    held = True
+    for limit, bound in MEMORY_BOUNDS.items():
+        peak = peak_memory(limit)
+        print(f"| {'no limit' if limit is None else f'{limit / 1e6:.0f}'} | {peak:.0f} | {bound} |", flush=True)
+        held &= peak <= bound
+    difference = tiled_difference()
+    print(f"\nLargest difference between strips and the whole: {difference:.1e} (bound 1e-5).")
+    return held and difference <= 1e-5
+
+
+def main() -> int:
+    """Print all tables; 1 when a bound is broken."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--child", type=float)
+    options = parser.parse_args()
+    if options.child is not None:
+        run_child(options.child)
+        return 0
+    held = [time_parts(), time_stage(), measure_memory()]
+    return int(not all(held))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

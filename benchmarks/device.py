@@ -1,0 +1,190 @@
+"""Milliseconds of every stage on the processor and on a device, its share of the memory bandwidth, and agreement.
+
+Run ``python benchmarks/device.py --device cuda --size 1080 1920``; it prints a table and exits with 1 where device and
+processor differ by more than 0.02 dB or 0.02 px.  Without ``--device`` it takes a GPU where torch sees one and else
+torch on the processor.  Times are the best of some runs, all in one process; they include the way to the device and
+back.
+
+Bytes are those that a stage cannot do without: every array that a step takes and gives, once for each step, 4 bytes a
+number, and none of the intermediate results.  The bandwidth that they are held against is that of copying 256 MB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from turbrestore.alternating import FilterParams, filter_frames
+from turbrestore.arrays import FloatArray
+from turbrestore.deconvolution import DeconvolutionParams, deconvolve
+from turbrestore.device import PROCESSOR, find_device
+from turbrestore.dynamics import identify
+from turbrestore.flow import FlowParams, estimate_flow
+from turbrestore.metrics import psnr
+from turbrestore.nonlocal_tv import NonlocalParams, nonlocal_weights
+from turbrestore.pipeline import restore
+from turbrestore.restoration import RestoreParams
+from turbrestore.synthesis.scenes import SCENES
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
+from turbrestore.torch_weights import weights_on_device
+from turbrestore.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
+from turbrestore.warp import warp
+
+DECIBELS, PIXELS = 0.02, 0.02
+FRAMES, SIGMA = 8, 1.5
+MANY = 30
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A scene, frames of it, and flows from the mean of the frames to each."""
+
+    scene: FloatArray
+    frames: FloatArray
+    flows: FloatArray
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Run it on a device; ``numbers`` a pixel that it takes and gives; divide by ``count`` for one frame."""
+
+    name: str
+    run: Callable[[str], object]
+    numbers: float
+    count: int = 1
+
+
+def make_clip(height: int, width: int) -> Clip:
+    """Make frames of a photograph under smooth random flow of 1.5 px."""
+    rng = np.random.default_rng(0)
+    scene = SCENES["camera"](height, width)
+    flows = smooth_flows(FRAMES, height, width, rng, SmoothFlowParams(rms=1.5))
+    return Clip(scene, distort(scene, flows, rng, blur=SIGMA, noise=0.01), flows)
+
+
+def stages(clip: Clip, device: str) -> list[Stage]:
+    """List what is measured, up to the iterations of the deconvolution."""
+    grey, image = 255 * clip.frames, clip.frames.mean(axis=0)
+    referred = {name: refer_tvl1(grey.mean(axis=0), device=name) for name in (PROCESSOR, device)}
+    params, dynamics = TvL1Params(), identify(clip.flows)
+    warps = float(tvl1_flows(grey[:1], referred[PROCESSOR]).warps[0])
+    # Flow, its extrapolation and the dual variable come and go in a sweep, and four maps of the data term come; a warp
+    # takes coefficients, reference, gradient and flow and gives those maps and a median.  A pyramid adds a third.
+    flow = 4 / 3 * warps * (20 * params.sweeps + 15)
+
+    def weigh(name: str) -> object:
+        if name == PROCESSOR:
+            return nonlocal_weights(image)
+        return weights_on_device(image, NonlocalParams(h=0.1), name).root.cpu()
+
+    def fuse(name: str) -> object:
+        settings = FilterParams(inner_iterations=1, device=name)
+        return filter_frames(clip.frames, image, dynamics, settings, known_flows=clip.flows)
+
+    return [
+        Stage("flow (tvl1)", lambda name: tvl1_flows(grey, referred[name]), flow, FRAMES),
+        # Pixels and flow come, pixels go; coefficients come and go between.
+        Stage("warp", lambda name: warp(image, clip.flows[0], device=name), 6),
+        # A frame and two flows come; eight maps, image and variance come, the last two go.
+        Stage("filter, statistics and flow state included", fuse, 17, FRAMES),
+        # Distances to all pixels of the window are written and read.
+        Stage("nonlocal weights", weigh, 2 * NonlocalParams().search ** 2),
+    ]
+
+
+def milliseconds(run: Callable[[], object], runs: int) -> float:
+    """Best time of a few runs after one that is not counted."""
+    run()
+    times = []
+    for _ in range(runs):
+        begun = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - begun)
+    return 1e3 * min(times)
+
+
+def solver(clip: Clip, device: str, runs: int) -> tuple[float, float]:
+    """Milliseconds of an iteration of nltv, and numbers a pixel that it takes and gives."""
+    image = clip.frames.mean(axis=0)
+
+    params = DeconvolutionParams(iterations=MANY, tolerance=0.0, device=device)
+    times = []
+    for _ in range(runs):
+        ends: list[float] = []
+        deconvolve(image, SIGMA, params, progress=lambda _, ends=ends: ends.append(time.perf_counter()))
+        times.append(1e3 * float(np.median(np.diff(ends))))
+
+    edges = len(nonlocal_weights(image).weights) / image.size
+    # The dual variable comes and goes, twice what it is made of; three maps of the edges come twice; four transforms.
+    return min(times), 14 * edges + 16
+
+
+def copy_bandwidth(device: str) -> float:
+    """Bytes a second that copying moves, reading and writing."""
+    if device == PROCESSOR:
+        a = np.zeros(2**26, np.float32)
+        b = np.ones_like(a)
+        return 2e3 * a.nbytes / milliseconds(lambda: np.copyto(b, a), 5)
+    import torch
+
+    source = torch.zeros(2**26, device=device)
+    target = torch.ones_like(source)
+
+    def copy() -> None:
+        for _ in range(10):
+            target.copy_(source)
+        # Reading a number waits for the device.
+        target[0].item()
+
+    return 10 * 2e3 * 4 * 2**26 / milliseconds(copy, 5)
+
+
+def agreement(clip: Clip, device: str) -> tuple[float, float, float]:
+    """Difference of a restoration in dB, and of its flows in pixels, mean and largest."""
+    base = RestoreParams(flow=FlowParams(method="tvl1"))
+    here, there = (restore(clip.frames, replace(base, device=name)) for name in (PROCESSOR, device))
+    image = clip.frames.mean(axis=0)
+    flows = [estimate_flow(image, clip.frames, replace(base.flow, device=name)) for name in (PROCESSOR, device)]
+    apart = np.linalg.norm(flows[0] - flows[1], axis=-1)
+    return psnr(there.image, clip.scene) - psnr(here.image, clip.scene), float(apart.mean()), float(apart.max())
+
+
+def main() -> int:
+    """Measure, print, and judge."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device")
+    parser.add_argument("--size", type=int, nargs=2, default=(256, 256), metavar=("HEIGHT", "WIDTH"))
+    parser.add_argument("--runs", type=int, default=3)
+    options = parser.parse_args()
+    device = find_device(options.device or "auto")
+    device = "cpu:0" if device == PROCESSOR else device
+    clip = make_clip(*options.size)
+    bandwidth = copy_bandwidth(device)
+    print(f"{options.size[1]}×{options.size[0]}; device {device} copies {bandwidth / 1e9:.1f} GB/s\n")
+    print("| stage, one frame or iteration | processor, ms | device, ms | ratio | GB/s | share of copying |")
+    print("|---|---:|---:|---:|---:|---:|")
+    rows = []
+    for stage in stages(clip, device):
+        times = [
+            milliseconds(lambda s=stage, n=name: s.run(n), options.runs) / stage.count for name in (PROCESSOR, device)
+        ]
+        rows.append((stage.name, *times, stage.numbers))
+    here, (there, numbers) = solver(clip, PROCESSOR, options.runs)[0], solver(clip, device, options.runs)
+    for name, on_processor, on_device, a_pixel in [*rows, ("iteration of nltv", here, there, numbers)]:
+        moved = 4e3 * a_pixel * clip.scene.size / on_device
+        cells = f"{on_processor:.1f} | {on_device:.1f} | {on_processor / on_device:.2f} | {moved / 1e9:.1f}"
+        print(f"| {name} | {cells} | {moved / bandwidth:.0%} |")
+    decibels, mean, largest = agreement(clip, device)
+    print(f"\nRestoration {decibels:+.4f} dB; flows {mean:.5f} px apart, {largest:.3f} at most.")
+    good = abs(decibels) <= DECIBELS and mean <= PIXELS
+    print(f"Within {DECIBELS} dB and {PIXELS} px: {'yes' if good else 'NO'}.")
+    return int(not good)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

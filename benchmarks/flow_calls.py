@@ -1,0 +1,212 @@
+"""What flow calls buy: PSNR of the fused and of the restored image against passes of the centroid and of the filter.
+
+    TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --write docs/flow_calls.md
+
+prints a Markdown document and writes it, with a picture of the curves beside it.  Clips are those of
+``benchmarks/quality.py`` that have a truth, cut to their first frames and their middle; ``--clips`` takes names or
+patterns.  Time is the number of flow calls times what one takes, measured on each clip, so that a busy machine changes
+the scale of the curves and not their shape.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from clips import find_clips
+
+from turbrestore.alternating import FilterParams
+from turbrestore.arrays import FloatArray
+from turbrestore.centroid import CentroidParams
+from turbrestore.errors import TurbrestoreError
+from turbrestore.flow import FlowParams, iterate_flows
+from turbrestore.images import atomic_write
+from turbrestore.metrics import compare
+from turbrestore.pipeline import RestoreParams, restore
+
+CLIPS = ("quick_*", "ao_*", "purdue1_*")
+FRAMES, SIDE, THREADS = 48, 160, 2
+CENTROID, INNER = range(1, 7), range(1, 4)
+DEFAULT = RestoreParams(flow=FlowParams(threads=THREADS))
+# Quality that a default must not cost on any clip, dB.
+TOLERATED = 0.05
+
+
+@dataclass(frozen=True)
+class Point:
+    """One setting on one clip: PSNR, dB, of the fused and of the restored image, flow calls, and their seconds."""
+
+    fused: float
+    restored: float
+    calls: int
+    seconds: float
+
+
+# Of one clip: the default, then each setting.
+Curves = dict[str, Point]
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clips", nargs="+", default=CLIPS, metavar="NAME", help="names or patterns")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the document and a picture")
+    options = parser.parse_args()
+    measured: dict[str, Curves] = {}
+    try:
+        for name, load in find_clips(options.clips).items():
+            clip = load()
+            if clip.truth is not None:
+                measured[name] = measure(_middle(clip.frames[:FRAMES]), _middle(clip.truth[None])[0])
+                print(f"{name}: {measured[name]}", file=sys.stderr, flush=True)
+    except TurbrestoreError as error:
+        print(f"flow_calls: {error}", file=sys.stderr)
+        return error.exit_code
+    text = document(measured)
+    print(text, end="")
+    if options.write is not None:
+        atomic_write(options.write, text.encode(), overwrite=True)
+        draw(measured, options.write.parent / "images" / "flow_calls.png")
+    return 0
+
+
+def settings() -> dict[str, RestoreParams]:
+    """Name the default, and what is changed of it."""
+    centroid = {
+        f"centroid {count}": replace(DEFAULT, centroid=CentroidParams(iterations=count, tolerance=0.0))
+        for count in CENTROID
+    }
+    inner = {f"inner {count}": replace(DEFAULT, filter=FilterParams(inner_iterations=count)) for count in INNER}
+    return {"default": DEFAULT, **centroid, **inner}
+
+
+def measure(frames: FloatArray, truth: FloatArray) -> Curves:
+    """Restore with every setting."""
+    begun = time.perf_counter()
+    for _ in iterate_flows(frames.mean(axis=0), frames, DEFAULT.flow):
+        pass
+    a_call = (time.perf_counter() - begun) / len(frames)
+    curves = {}
+    for name, params in settings().items():
+        restoration = restore(frames, params)
+        if restoration.filtered is None:
+            raise RuntimeError("the whole chain did not run")
+        passes = restoration.centroid.mean_flow_sizes.size
+        # The last pass of the centroid serves the first of the filter.
+        calls = (passes - 1) * restoration.train + params.filter.inner_iterations * len(frames)
+        fused, restored = (compare(image, truth).psnr for image in (restoration.filtered.image, restoration.image))
+        curves[name] = Point(fused, restored, calls, calls * a_call)
+    return curves
+
+
+def document(measured: dict[str, Curves]) -> str:
+    """Markdown of the tables."""
+    lines = [
+        "# What flow calls buy\n",
+        "Optical flow takes most of the time of a restoration. This page says what its repetitions are worth, as "
+        "`TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --write docs/flow_calls.md` measures it on "
+        f"{len(measured)} simulated clips: the first {FRAMES} frames, the middle {SIDE}×{SIDE} pixels, two threads.\n",
+        "![PSNR against seconds of flow calls](images/flow_calls.png)\n",
+        "## Mean over the clips\n",
+        "PSNR, dB, of the fused image (after the filter) and of the restored one; seconds of the flow calls; and what "
+        "one more repetition adds. The number of passes of the centroid is the largest allowed, without tolerance: it "
+        "stops by itself where its mean flow no longer shrinks. The default stops as soon as that is below the "
+        "tolerance, after two passes at least.\n",
+        "| setting | calls | seconds | fused | restored | one more adds: fused | restored | dB a second, restored |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    mean = {name: _mean([curves[name] for curves in measured.values()]) for name in settings()}
+    for group, counts in (("centroid", CENTROID), ("inner", INNER)):
+        before = None
+        for count in counts:
+            point = mean[f"{group} {count}"]
+            lines.append(_row(f"{group}, {count}", point, before))
+            before = point
+    lines.append(_row("**default**", mean["default"], None))
+    lines += [
+        "\n## Every clip\n",
+        "PSNR, dB, of the restored image: of the default, and what another setting adds to it.\n",
+        f"| clip | default | {' | '.join(list(settings())[1:])} |",
+        f"|---|---:|{'---:|' * (len(settings()) - 1)}",
+    ]
+    for name, curves in measured.items():
+        base = curves["default"].restored
+        changes = [f"{curves[other].restored - base:+.2f}" for other in list(settings())[1:]]
+        lines.append(f"| {name} | {base:.2f} | {' | '.join(changes)} |")
+    return "\n".join([*lines, *_verdict(measured, mean)]) + "\n"
+
+
+def draw(measured: dict[str, Curves], path: Path) -> None:
+    """Curves of the mean over the clips."""
+    default = _mean([curves["default"] for curves in measured.values()])
+    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), sharey=True, layout="constrained")
+    for axis, (group, counts) in zip(axes, (("centroid", CENTROID), ("inner", INNER)), strict=True):
+        for kind in ("fused", "restored"):
+            points = {n: _mean([curves[f"{group} {n}"] for curves in measured.values()]) for n in counts}
+            # Passes that are never made are no points.
+            made = [n for n in counts if n == counts[0] or points[n].calls > points[n - 1].calls]
+            changes = [getattr(points[n], kind) - getattr(default, kind) for n in made]
+            axis.plot([points[n].seconds for n in made], changes, "o-", label=kind)
+            for number, change in zip(made, changes, strict=True):
+                axis.annotate(str(number), (points[number].seconds, change), (0, 6), textcoords="offset points")
+        axis.set(
+            xlabel="seconds of flow calls", title={"centroid": "passes of the centroid"}.get(group, "inner passes")
+        )
+        axis.margins(y=0.15)
+    axes[0].set_ylabel("PSNR beside the default, dB")
+    axes[1].legend()
+    path.parent.mkdir(exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
+def _verdict(measured: dict[str, Curves], mean: Curves) -> list[str]:
+    """Which settings cost no clip more than is tolerated, and what they save."""
+    lines = [
+        "\n## The knee\n",
+        f"A default may change where it costs no clip more than {TOLERATED} dB.\n",
+        "| setting | largest loss on a clip, dB | mean change, dB | flow calls |",
+        "|---|---:|---:|---:|",
+    ]
+    default, cheaper = mean["default"], list[str]()
+    for name, point in mean.items():
+        loss = max(curves["default"].restored - curves[name].restored for curves in measured.values())
+        change, calls = point.restored - default.restored, point.calls / default.calls - 1
+        lines.append(f"| {name} | {max(loss, 0.0):.2f} | {change:+.2f} | {100 * calls:+.0f} % |")
+        if calls < 0 and loss <= TOLERATED:
+            cheaper.append(name)
+    names = ", ".join(cheaper)
+    found = f"With fewer flow calls this holds for: {names}."
+    return [*lines, f"\n{found if cheaper else 'No setting with fewer flow calls holds this: the defaults stay.'}"]
+
+
+def _row(name: str, point: Point, before: Point | None) -> str:
+    cells = [name, f"{point.calls}", f"{point.seconds:.2f}", f"{point.fused:.2f}", f"{point.restored:.2f}"]
+    if before is None:
+        return f"| {' | '.join(cells)} | | | |"
+    spent, gained = point.seconds - before.seconds, point.restored - before.restored
+    rate = f"{gained / spent:+.2f}" if spent > 0 else ""
+    return f"| {' | '.join(cells)} | {point.fused - before.fused:+.2f} | {gained:+.2f} | {rate} |"
+
+
+def _mean(points: list[Point]) -> Point:
+    return Point(
+        float(np.mean([point.fused for point in points])),
+        float(np.mean([point.restored for point in points])),
+        round(float(np.mean([point.calls for point in points]))),
+        float(np.mean([point.seconds for point in points])),
+    )
+
+
+def _middle(frames: FloatArray) -> FloatArray:
+    height, width = frames.shape[1:3]
+    y, x = max(height - SIDE, 0) // 2, max(width - SIDE, 0) // 2
+    return frames[:, y : y + SIDE, x : x + SIDE]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,203 @@
+"""Peak memory of whole restorations in processes of their own, and of each stage by itself.
+
+``python benchmarks/memory.py`` prints a table of frames × size × limit and exits with 1 when a bound is broken:
+300 grey frames of 1920×1080 within 2 GB, every other limit kept, and 2,000 frames no more than 20 MB above 200.
+``--quick`` takes 40 frames of that size, with the same training frames: minutes instead of a quarter of an hour.
+``--stages`` prints the peak of every stage without a limit, in bytes a pixel: what the plan of
+``turbrestore/memory.py`` rests on.  Memory is the largest resident set, mapped files included.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+GROWTH_BOUND_MB = 20.0
+SEED = 0
+# A process takes over the peak of the one that starts it, so this one stays small.
+STATM = Path("/proc/self/statm")
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames, height, width and channels."""
+
+    count: int
+    height: int
+    width: int
+    channels: int = 1
+
+    def __str__(self) -> str:
+        return f"{self.count} × {self.width}×{self.height} {'RGB' if self.channels == 3 else 'grey'}"
+
+    def write(self, path: Path) -> None:
+        """Write 8-bit frames of a random scene under smooth random motion, one after the other."""
+        rng = np.random.default_rng(SEED)
+        shape = (self.count, self.height, self.width, *([3] if self.channels == 3 else []))
+        frames = np.lib.format.open_memmap(path, "w+", np.uint8, shape)
+        scene = cv2.GaussianBlur(rng.random(shape[1:], dtype=np.float32), (0, 0), 2)
+        scene = np.clip(0.5 + 2.5 * (scene - scene.mean()), 0, 1)
+        y, x = np.mgrid[: self.height, : self.width].astype(np.float32)
+        for index in range(self.count):
+            coarse = rng.normal(0, 1.5, (max(self.height // 24, 2), max(self.width // 24, 2), 2)).astype(np.float32)
+            flow = cv2.resize(coarse, (self.width, self.height), interpolation=cv2.INTER_CUBIC)
+            moved = cv2.remap(
+                scene, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+            )
+            noise = cv2.randn(np.empty(moved.shape, np.float32), 0, 0.01)
+            frames[index] = np.clip(255 * (moved + noise), 0, 255).astype(np.uint8)
+            frames.flush()
+
+
+def restore_peak(clip: Path, options: list[str]) -> tuple[float, float]:
+    """Largest resident set, MB, and seconds of ``turbrestore restore``."""
+    output = clip.with_suffix(".png")
+    words = ["restore", str(clip), str(output), "--quiet", "--overwrite", *options]
+    code = f"import sys; from turbrestore_cli.__main__ import main; sys.exit(main({words!r}))"
+    begun = time.perf_counter()
+    child = subprocess.Popen([sys.executable, "-c", code])
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise RuntimeError(f"turbrestore {' '.join(words)} ended with {child.returncode}")
+    return usage.ru_maxrss * 1024 / 1e6, time.perf_counter() - begun
+
+
+def limited_rows(quick: bool) -> Iterator[tuple[Clip, float, list[str]]]:
+    """Clips, limits in MB, and further options."""
+    train = ["--train=60"] if not quick else ["--train=40"]
+    yield Clip(40 if quick else 300, 1080, 1920), 2000, train
+    yield Clip(24, 540, 960), 700, []
+    yield Clip(24, 540, 960, 3), 900, []
+    if not quick:
+        yield Clip(24, 1080, 1920, 3), 3000, []
+        yield Clip(16, 2160, 3840), 6000, []
+
+
+def check_limits(folder: Path, quick: bool, extra: list[str]) -> bool:
+    """Print what limited runs take; whether all keep their limit."""
+    kept = True
+    for clip, limit, options in limited_rows(quick):
+        path = folder / "clip.npy"
+        clip.write(path)
+        peak, seconds = restore_peak(path, [f"--memory-limit={limit}MB", *options, *extra])
+        kept &= peak <= limit
+        print(f"{clip!s:28} limit {limit:6.0f} MB  peak {peak:6.0f} MB  {seconds:6.0f} s", flush=True)
+    return kept
+
+
+def check_growth(folder: Path, extra: list[str]) -> bool:
+    """Print what more frames take; whether it is within the bound."""
+    peaks = []
+    for count in (200, 2000):
+        path = folder / "clip.npy"
+        clip = Clip(count, 128, 128)
+        clip.write(path)
+        peak, seconds = restore_peak(path, ["--train=60", "--sigma=1", "--deconvolution.method=wiener", *extra])
+        peaks.append(peak)
+        print(f"{clip!s:28} no limit        peak {peak:6.0f} MB  {seconds:6.0f} s", flush=True)
+    growth = peaks[1] - peaks[0]
+    print(f"2,000 frames take {growth:.1f} MB more than 200; bound {GROWTH_BOUND_MB:g} MB")
+    return growth <= GROWTH_BOUND_MB
+
+
+class StageWatch:
+    """Largest resident set of every stage, above what was there when it began; bytes."""
+
+    def __init__(self) -> None:
+        self.taken: dict[str, float] = {}
+        self._floor = self._peak = self._resident()
+        threading.Thread(target=self._look, daemon=True).start()
+
+    def result(self, done: object) -> None:
+        """Take the call of a restoration that a stage, or a block of frames, is done."""
+        name = next(name for name in ("filtered", "checkpoint", "dynamics", "centroid") if getattr(done, name))
+        if name != "checkpoint" and name not in self.taken:
+            self.taken[name] = self._peak - self._floor
+            self._floor = self._peak = self._resident()
+
+    def _look(self) -> None:
+        while True:
+            self._peak = max(self._peak, self._resident())
+            time.sleep(0.003)
+
+    def _resident(self) -> float:
+        return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def measure_stages(clip: Clip, threads: int, method: str) -> None:
+    """Print the peak of each stage above what earlier ones left, bytes a pixel; in a process of its own."""
+    from turbrestore import pipeline
+    from turbrestore.centroid import CentroidParams
+    from turbrestore.flow import FlowParams
+    from turbrestore.frame_source import FrameSource
+    from turbrestore.restoration import RestoreParams
+    from turbrestore.scratch import return_freed
+
+    train, pixels = 4, clip.height * clip.width
+    settings = RestoreParams(
+        train=train,
+        until="filter",
+        flow=FlowParams(threads=threads, method=method),
+        centroid=CentroidParams(iterations=2),
+    )
+    return_freed()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "clip.npy"
+        clip.write(path)
+        watch = StageWatch()
+        pipeline.restore(FrameSource.from_array(np.load(path, mmap_mode="r")), settings, on_result=watch.result)
+    # Frames and flows, which the plan counts apart.
+    watch.taken["centroid"] -= train * pixels * (4 * clip.channels + 8)
+    words = "  ".join(f"{name} {size / pixels:4.0f}" for name, size in watch.taken.items())
+    print(f"{clip} {method:9} {threads} threads: {words} bytes a pixel", flush=True)
+
+
+def print_stages() -> None:
+    """Run every combination in a process of its own."""
+    for channels, threads, method in (
+        (1, 1, "dis"),
+        (1, 2, "dis"),
+        (1, 4, "dis"),
+        (3, 1, "dis"),
+        (3, 2, "dis"),
+        (1, 1, "farneback"),
+        (1, 2, "farneback"),
+        (1, 1, "tvl1"),
+        (1, 2, "tvl1"),
+    ):
+        call = f"measure_stages(Clip(16, 720, 1280, {channels}), {threads}, {method!r})"
+        code = f"from memory import Clip, measure_stages; {call}"
+        subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent)
+
+
+def main() -> int:
+    """Print the tables; 1 where a bound is broken."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="40 frames of 1920×1080 instead of 300, no 4K")
+    parser.add_argument("--stages", action="store_true", help="bytes a pixel of every stage, and nothing else")
+    parser.add_argument("--only", choices=("limits", "growth"), help="one of the two tables")
+    parser.add_argument("options", nargs="*", help="further options of turbrestore restore, after --")
+    arguments = parser.parse_args()
+    if arguments.stages:
+        print_stages()
+        return 0
+    with tempfile.TemporaryDirectory() as name:
+        kept = arguments.only == "growth" or check_limits(Path(name), arguments.quick, arguments.options)
+        steady = arguments.only == "limits" or check_growth(Path(name), arguments.options)
+    return 0 if kept and steady else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

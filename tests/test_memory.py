@@ -1,0 +1,217 @@
+"""Restorations within a memory limit: the plan, and that the result is the same."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from conftest import make_sequence
+from turbrestore import pipeline
+from turbrestore.centroid import CentroidParams
+from turbrestore.deconvolution import DeconvolutionParams
+from turbrestore.dynamics import DynamicsParams
+from turbrestore.errors import ConfigurationError, StorageError
+from turbrestore.flow import FlowParams
+from turbrestore.frame_source import FrameSource
+from turbrestore.memory import MemorySize, StageMemory, plan_memory, training_share
+from turbrestore.restoration import RestoreParams
+from turbrestore.resumption import KeptStages, stage_facts
+from turbrestore_cli.__main__ import main
+
+FULL_HD = (300, 1080, 1920)
+QUICK = RestoreParams(
+    train=16,
+    centroid=CentroidParams(iterations=2),
+    flow=FlowParams(threads=2),
+    deconvolution=DeconvolutionParams(sigma=1.0, iterations=5),
+)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return make_sequence(seed=51, count=24, size=96, blur=1.0).frames
+
+
+def limit_that(shape, holds, **settings):
+    """Return the largest limit, in steps of 200 kB, whose plan is like that."""
+    for limit in np.arange(4e8, 1.6e8, -2e5):
+        plan = plan_memory(shape, limit, **settings)
+        if holds(plan):
+            return float(limit)
+    raise AssertionError("no limit has such a plan")
+
+
+@pytest.fixture(scope="module")
+def in_file(frames):
+    """Settings whose plan is a file, and nothing else."""
+    limit = limit_that(frames.shape, lambda plan: plan.in_file, wanted=16, flow=QUICK.flow)
+    return replace(QUICK, memory_limit=limit)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("2GB", 2e9), ("1.5 GiB", 1.5 * 2**30), ("800mb", 8e8), ("64 KiB", 65536), ("12kB", 12000), ("3", 3), (7e8, 7e8)],
+)
+def test_sizes_are_read(text, size):
+    assert MemorySize(text) == size
+    assert RestoreParams(memory_limit=text).memory_limit == size
+
+
+@pytest.mark.parametrize("text", ["", "GB", "2 bananas", "2QB", "0", "-1GB", "nan", "inf", "1e400GB", "2 G B", True])
+def test_what_is_no_size_is_refused(text):
+    with pytest.raises(ConfigurationError, match="^--memory-limit: expected a size such as 2GB") as caught:
+        MemorySize(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_a_limit_nothing_changes():
+    plan = plan_memory(FULL_HD, flow=FlowParams(threads=3))
+    assert (plan.train, plan.threads, plan.in_file, plan.decisions) == (60, 3, False, ())
+    assert plan.train == training_share(300, FULL_HD[1:])
+
+
+def test_what_changes_no_result_comes_first():
+    generous, tight, small = (plan_memory(FULL_HD, limit, flow=FlowParams(threads=8)) for limit in (2e10, 2e9, 1.4e9))
+    assert (generous.threads, generous.in_file, generous.decisions) == (8, False, ())
+    assert tight.in_file and 1 <= tight.threads < 8 and tight.train == 60
+    assert small.threads == 1 and small.in_file
+    assert [decision.choice for decision in tight.decisions] == [
+        "training frames kept in a file",
+        f"{tight.threads} of 8 threads",
+    ]
+
+
+def test_threads_are_kept_where_a_file_is_enough():
+    shape = (100, 480, 640)
+    limit = 9e8
+    alone = plan_memory(shape, limit, flow=FlowParams(threads=1))
+    assert plan_memory(shape, limit, flow=FlowParams(threads=3)).threads == 3
+    assert not alone.in_file
+
+
+@given(
+    st.integers(2, 3000),
+    st.integers(16, 5000),
+    st.integers(16, 5000),
+    st.sampled_from([(), (3,)]),
+    st.floats(1e6, 1e12),
+    st.sampled_from(["dis", "tvl1", "farneback"]),
+)
+@settings(max_examples=60, deadline=None)
+def test_a_plan_keeps_the_limit_or_names_one_that_can_be_kept(count, height, width, colour, limit, method):
+    shape, flow = (count, height, width, *colour), FlowParams(method=method, threads=4)
+    try:
+        plan = plan_memory(shape, limit, flow=flow)
+    except ConfigurationError as error:
+        words = str(error).split("expected at least ")[1].split(" for frames")[0]
+        least = MemorySize(words)
+        assert least > limit
+        assert plan_memory(shape, least, flow=flow).train >= 2
+        return
+    assert 2 <= plan.train <= training_share(count, shape[1:])
+    assert 1 <= plan.threads <= 4
+    assert 0 < plan.deconvolution < limit
+    assert plan.file_bytes >= 0 and plan.in_file == (plan.file_bytes > 0)
+
+
+def test_more_memory_is_never_worse():
+    plans = [plan_memory((400, 2160, 3840), limit, flow=FlowParams(threads=4)) for limit in np.geomspace(5e9, 1e11, 40)]
+    assert all(before.train <= after.train for before, after in pairwise(plans))
+    assert all(
+        before.deconvolution <= after.deconvolution
+        for before, after in pairwise(plans)
+        if before.in_file == after.in_file
+    )
+
+
+def test_training_frames_asked_for_are_not_made_fewer():
+    with pytest.raises(ConfigurationError, match=r"of 1920×1080 and 300 training frames, found 700 MB; allow more"):
+        plan_memory(FULL_HD, 7e8, wanted=300)
+    assert plan_memory(FULL_HD, 2e9, wanted=300).train == 300
+
+
+def test_every_channel_and_thread_counts():
+    memory = StageMemory(10, 3, 5, 2)
+    assert memory.bytes(7, 1, 1) == 7 * 20
+    assert memory.bytes(7, 3, 4) == 7 * (10 + 9 + 4 * 11)
+
+
+def test_the_result_is_the_same_bit_for_bit(frames, in_file, tmp_path):
+    free, limited = (pipeline.restore(frames, params, scratch=tmp_path) for params in (QUICK, in_file))
+    assert isinstance(limited.centroid.flows, np.memmap)
+    assert isinstance(limited.dynamics.C, np.memmap)
+    for name in ("image", "mean"):
+        assert np.array_equal(getattr(free, name), getattr(limited, name))
+    assert np.array_equal(free.centroid.flows, limited.centroid.flows)
+    assert np.array_equal(free.dynamics.C, limited.dynamics.C)
+    assert np.array_equal(free.filtered.image, limited.filtered.image)
+    assert limited.decisions[0].subject == "memory"
+    assert limited.decisions[1:] == free.decisions
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_file_lies_in_the_folder_that_is_named(frames, in_file, tmp_path):
+    with pytest.raises(StorageError, match="nowhere"):
+        pipeline.restore(frames, in_file, scratch=tmp_path / "nowhere")
+
+
+def test_a_disk_without_room_is_refused_before_the_work(frames, in_file, tmp_path, monkeypatch):
+    def full(path, size):
+        raise StorageError(f"{path}: needs {size}")
+
+    monkeypatch.setattr(pipeline, "check_space", full)
+    monkeypatch.setattr(pipeline, "find_centroid", None)
+    with pytest.raises(StorageError, match="training frames: needs"):
+        pipeline.restore(frames, in_file, scratch=tmp_path)
+
+
+def test_a_limit_changes_nothing_that_a_stage_depends_on(frames, in_file):
+    source = FrameSource.from_array(frames)
+    assert stage_facts(source, in_file) == stage_facts(source, QUICK)
+    fewer = limit_that(frames.shape, lambda plan: plan.train < 24, flow=QUICK.flow, dynamics=DynamicsParams(rank=20))
+    loose, strict = (
+        replace(QUICK, train=None, dynamics=DynamicsParams(rank=20), memory_limit=limit) for limit in (4e8, fewer)
+    )
+    assert stage_facts(source, loose) != stage_facts(source, strict)
+
+
+def test_the_command_says_what_the_limit_caused_and_leaves_no_file(frames, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.save("clip.npy", frames)
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    quick = ["--train=16", "--flow.threads=2", "--until=identify", "--centroid.iterations=1", "--quiet"]
+    least = limit_that(frames.shape, lambda plan: plan.in_file, wanted=16, flow=QUICK.flow, until="identify")
+    limit = f"--memory-limit={least / 1e6}MB"
+    for words in ([], ["--keep=kept"]):
+        assert main(["restore", "clip.npy", f"o{len(words)}.png", limit, "--json", *quick, *words]) == 0
+        decisions = json.loads(capsys.readouterr().out)["decisions"]
+        assert decisions[0]["choice"] == "training frames kept in a file"
+    assert "memory_limit = " in Path("o0.png.toml").read_text()
+    assert main(["restore", "clip.npy", "again.png", "--config=o0.png.toml", "--quiet"]) == 0
+    assert Path("again.png").read_bytes() == Path("o0.png").read_bytes()
+    assert not list((tmp_path / "temporary").iterdir())
+    assert not [path for path in Path("kept").iterdir() if path.name.startswith("turbrestore-")]
+
+
+def test_a_kept_run_goes_on_with_another_limit(frames, in_file, tmp_path, monkeypatch):
+    monkeypatch.setattr("turbrestore.npy._LARGE", 1000)
+    source = FrameSource.from_array(frames)
+    first = KeptStages(tmp_path, source, QUICK)
+    whole = pipeline.restore(source, QUICK, done=first.done, on_result=first.keep)
+    later = KeptStages(tmp_path, source, in_file, resume=True)
+    assert later.notes == ("goes on after the deconvolution",)
+    assert isinstance(later.done.centroid.flows, np.memmap)
+    again = pipeline.restore(source, in_file, done=later.done, scratch=tmp_path)
+    assert np.array_equal(again.image, whole.image)
+    # And what a limited run keeps is what any run keeps.
+    limited = KeptStages(tmp_path, source, in_file)
+    pipeline.restore(source, in_file, done=limited.done, on_result=limited.keep, scratch=tmp_path)
+    found = KeptStages(tmp_path, source, QUICK, resume=True).done
+    assert np.array_equal(found.centroid.flows, whole.centroid.flows)
+    assert np.array_equal(found.dynamics.C, whole.dynamics.C)

@@ -1,0 +1,68 @@
+"""Nonlocal TV by strips against its operators on all edges at once."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from turbrestore.nonlocal_penalty import NonlocalPenalty
+from turbrestore.nonlocal_tv import (
+    NonlocalGraph,
+    NonlocalParams,
+    nonlocal_divergence,
+    nonlocal_gradient,
+    nonlocal_total_variation,
+    nonlocal_weights,
+    project_to_unit,
+)
+from turbrestore.primal_dual import Regulariser
+
+
+def by_operators(graph: NonlocalGraph) -> Regulariser:
+    return Regulariser(
+        lambda u: nonlocal_gradient(graph, u),
+        lambda p: -nonlocal_divergence(graph, p),
+        lambda p: project_to_unit(graph, p),
+        lambda u: nonlocal_total_variation(graph, u),
+        graph.norm_squared,
+    )
+
+
+@pytest.fixture(params=[1, 10_000], ids=["strips", "whole"])
+def graph(request, monkeypatch):
+    monkeypatch.setattr("turbrestore.nonlocal_tv._STRIP_PIXELS", request.param)
+    guide = np.random.default_rng(0).random((23, 14)).astype(np.float32)
+    return nonlocal_weights(guide, NonlocalParams(patch=3, search=7, best=5))
+
+
+def test_the_value_is_that_of_the_operators(graph):
+    image = np.random.default_rng(1).random(graph.shape).astype(np.float32)
+    assert NonlocalPenalty(graph).value(image) == pytest.approx(nonlocal_total_variation(graph, image), rel=1e-5)
+
+
+@pytest.mark.parametrize("relaxation", [1.0, 1.4])
+def test_steps_are_those_of_the_operators(graph, relaxation):
+    rng = np.random.default_rng(2)
+    found, expected = NonlocalPenalty(graph), by_operators(graph)
+    image = rng.random(graph.shape).astype(np.float32)
+    dual, reference = found.dual(image), expected.dual(image)
+    for _ in range(5):
+        image = rng.normal(size=graph.shape).astype(np.float32)
+        pull = found.ascend(dual, image, 0.7, relaxation)
+        assert pull == pytest.approx(expected.ascend(reference, image, 0.7, relaxation), abs=2e-5)
+        # The third row holds no part of p.
+        assert dual.values[:2] == pytest.approx(reference, abs=2e-5)
+    assert np.abs(reference).max() > 0.5
+
+
+def test_threads_and_files_change_nothing(graph, tmp_path):
+    image = np.random.default_rng(3).normal(size=graph.shape).astype(np.float32)
+    pulls = []
+    for workers, folder in ((None, None), (1, None), (4, tmp_path)):
+        pool = ThreadPoolExecutor(workers) if workers else None
+        penalty = NonlocalPenalty(graph, pool, folder)
+        dual = penalty.dual(image)
+        pulls.append(b"".join(penalty.ascend(dual, image, 0.7, 1.4).tobytes() for _ in range(3)))
+        if pool is not None:
+            pool.shutdown()
+    assert len(set(pulls)) == 1

@@ -1,0 +1,110 @@
+"""Arrays in a file without a name: what they hold, what they take, and what is left of them."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+from collections import namedtuple
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from turbrestore.errors import StorageError
+from turbrestore.scratch import mean_of, new_stack, parts, release, variance_of, walk
+
+STATM = Path("/proc/self/statm")
+SHAPES = st.lists(st.integers(1, 7), min_size=1, max_size=4).map(tuple)
+
+
+def resident() -> int:
+    """Bytes of this process that are in memory."""
+    return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+needs_proc = pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
+
+
+@given(SHAPES, st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_a_stack_in_a_file_is_one_in_memory(tmp_path_factory, shape, seed):
+    values = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    mapped = new_stack(shape, tmp_path_factory.getbasetemp())
+    mapped[...] = values
+    release(mapped)
+    assert isinstance(mapped, np.memmap)
+    assert np.array_equal(mapped, values)
+    for stack in (values, mapped):
+        assert np.array_equal(mean_of(stack), values.mean(axis=0, dtype=np.float32))
+        assert np.allclose(variance_of(stack), values.var(axis=0), atol=1e-5)
+        assert np.array_equal(np.concatenate(list(parts(stack))), values)
+        assert all(np.array_equal(a, b) for a, b in zip(walk(stack), values, strict=True))
+
+
+def test_without_a_folder_or_numbers_it_is_in_memory(tmp_path):
+    assert not isinstance(new_stack((2, 3)), np.memmap)
+    assert new_stack((5, 0), tmp_path).shape == (5, 0)
+
+
+def test_no_file_is_left(tmp_path):
+    stack = new_stack((4, 10), tmp_path)
+    stack[:] = 1
+    assert not list(tmp_path.iterdir())
+    assert stack.sum() == 40
+
+
+@pytest.mark.parametrize("number", ["SIGKILL", "SIGINT", "SIGTERM"])
+def test_no_file_is_left_by_a_process_that_dies(tmp_path, number):
+    code = f"""
+        import os, signal
+        from pathlib import Path
+        from turbrestore.scratch import new_stack
+        stack = new_stack((4, 1000), Path({str(tmp_path)!r}))
+        stack[:] = 1
+        os.kill(os.getpid(), signal.{number})
+        signal.pause()
+    """
+    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, check=False)
+    assert ended.returncode == -getattr(signal, number)
+    assert not list(tmp_path.iterdir())
+
+
+@needs_proc
+def test_walking_a_stack_takes_one_frame_at_a_time(tmp_path):
+    stack = new_stack((40, 512, 1024), tmp_path)
+    before = resident()
+    for frame in stack:
+        frame[:] = 1
+        release(frame)
+    peak = max(resident() for frame in walk(stack) if frame.sum())
+    assert peak - before < 12e6
+    assert stack.sum(dtype=np.float64) == stack.size
+    # What was written is there, and the counter above would have seen it.
+    assert resident() - before > 70e6
+
+
+def test_changes_of_a_private_map_are_kept(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros(10_000, np.float32))
+    private = np.load(tmp_path / "a.npy", mmap_mode="c")
+    private[:] = 3
+    release(private[5:])
+    assert (private == 3).all()
+
+
+def test_what_is_no_map_is_left_alone():
+    for thing in (np.ones(3), None, [np.ones(2)], 4):
+        release(thing)
+
+
+def test_a_full_disk_is_a_clear_error(tmp_path, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage(10**9, 10**9 - 10**8, 10**8))
+    with pytest.raises(StorageError, match=r"expected 0\.4 GB free .*, found 0\.1 GB; name another folder by TMPDIR"):
+        new_stack((100, 1000, 1000), tmp_path)
+    with pytest.raises(StorageError, match="nowhere: cannot hold"):
+        monkeypatch.undo()
+        new_stack((2, 2), tmp_path / "nowhere")

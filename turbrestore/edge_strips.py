@@ -1,0 +1,139 @@
+"""Edges of a graph over the pixels of an image, in strips of rows that stay in the cache of a processor.
+
+Symbols
+-------
+w(x, y) : weight of the pair of pixels x, y.  Each pair is stored once, with the strip of its tail x < y.
+∇_w u, div_w v : as in :mod:`turbrestore.nonlocal_tv`.
+window : the pixels from the first of a strip to the last that its edges reach, in the order of the image.
+
+A strip knows nothing of the others.  What it adds to pixels is an array over its window; windows overlap, and are
+added up in the order of the strips, so that the sum does not depend on which thread came first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from .arrays import FloatArray
+from .scratch import release
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeStrip:
+    """Pairs whose tails are in some rows of the image.
+
+    Attributes
+    ----------
+    first : int
+        First pixel, row · W + column.
+    window : int
+        Pixels of the window.
+    degrees : ndarray, intp, shape (n,)
+        Pairs of each of the n pixels of the strip, of which it is the tail.
+    heads : ndarray, int32, shape (e,)
+        Where each pair ends, pixels from the first on; ordered by tail, then by head.
+    roots : ndarray, float32, shape (e,)
+        √w.
+    order : ndarray, int32, shape (e + 1 or more,)
+        0, 1, 2 and so on; strips share it.
+    """
+
+    first: int
+    window: int
+    degrees: NDArray[np.intp]
+    heads: NDArray[np.int32]
+    roots: FloatArray
+    order: NDArray[np.int32]
+
+    def view(self, image: FloatArray) -> FloatArray:
+        """Part of a flattened image that the edges reach."""
+        return image[self.first : self.first + self.window]
+
+    def differences(self, image: FloatArray) -> FloatArray:
+        """``[u(y) − u(x)] √w`` of a flattened image u."""
+        values = self.view(image)
+        found = np.take(values, self.heads, mode="clip")
+        found -= self.at_tails(values)
+        found *= self.roots
+        return found
+
+    def at_tails(self, values: FloatArray) -> FloatArray:
+        """Values over the window, for the tail of each pair."""
+        return np.repeat(values[: len(self.degrees)], self.degrees)
+
+    def at_heads(self, values: FloatArray) -> FloatArray:
+        """Values over the window, for the head of each pair."""
+        return np.take(values, self.heads, mode="clip")
+
+    def gather(self, tails: tuple[FloatArray, FloatArray], heads: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """Sum products of two functions on edges, one pair of them at the tails and one at the heads.
+
+        Returns
+        -------
+        ndarray, float32, shape (window,)
+        """
+        at_tails, at_heads = self._sums
+        # A product with a matrix adds up products without an array of them.
+        at_tails.data, at_heads.data = tails[0], heads[0]
+        total: FloatArray = at_heads @ heads[1]
+        total[: len(self.degrees)] += at_tails @ tails[1]
+        return total
+
+    @cached_property
+    def _sums(self) -> tuple[sparse.csr_array, sparse.csc_array]:
+        """Matrices that add up edges at tails and at heads; their constructor would copy what it is given."""
+        count, own = len(self.heads), len(self.degrees)
+        at_tails = sparse.csr_array((own, count), dtype=np.float32)
+        at_heads = sparse.csc_array((self.window, count), dtype=np.float32)
+        at_tails.indices, at_tails.indptr = self.order[:count], np.zeros(own + 1, np.int32)
+        np.cumsum(self.degrees, out=at_tails.indptr[1:])
+        at_heads.indices, at_heads.indptr = self.heads, self.order[: count + 1]
+        return at_tails, at_heads
+
+
+def sum_strips(
+    strips: Sequence[EdgeStrip],
+    part: Callable[[int, EdgeStrip], FloatArray],
+    pixels: int,
+    pool: Executor | None = None,
+) -> FloatArray:
+    """Add up what every strip gives its window.
+
+    Parameters
+    ----------
+    strips : sequence of EdgeStrip
+    part : callable
+        From the number of a strip and the strip to values over its window.
+    pixels : int
+        Pixels of the image.
+    pool : Executor, optional
+        Threads that work on strips side by side.
+
+    Returns
+    -------
+    ndarray, float32, shape (pixels,)
+
+    Examples
+    --------
+    >>> strip = EdgeStrip(1, 2, np.array([1]), np.array([1], np.int32), np.ones(1, np.float32), np.arange(2))
+    >>> sum_strips([strip], lambda number, strip: np.float32([5, 7]), 3)
+    array([0., 5., 7.], dtype=float32)
+    """
+
+    def work(number: int) -> FloatArray:
+        values = part(number, strips[number])
+        release(strips[number].roots)
+        return values
+
+    numbers = range(len(strips))
+    total = np.zeros(pixels, np.float32)
+    for strip, values in zip(strips, map(work, numbers) if pool is None else pool.map(work, numbers), strict=True):
+        strip.view(total)[:] += values
+    return total

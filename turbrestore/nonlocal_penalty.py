@@ -1,0 +1,117 @@
+"""Nonlocal total variation as a penalty of the primal-dual splitting, strip by strip.
+
+Symbols as in :mod:`turbrestore.primal_dual`: ``K = ∇_w``, ``Kᵀ = −div_w``.
+
+An iteration reads and writes every value on the edges in two passes: what has been added to p decides |p| everywhere,
+and |p| how far each value is drawn back.  Within a pass a strip stays in the cache of its processor.  With
+``a = p + sKū`` and the factor ``f = 1 / max(|a|, 1)`` of the projection, the over-relaxed update is
+
+    p + ρ(fa − p) = (1 − ρ + ρf) a + (ρ − 1) sKū.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .arrays import FloatArray
+from .edge_strips import EdgeStrip, sum_strips
+from .nonlocal_tv import NonlocalGraph
+from .scratch import new_stack, release
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeDual:
+    """p of one image.
+
+    Attributes
+    ----------
+    values : ndarray, float32, shape (3, E)
+        p from tail to head, from head to tail, and what the last iteration added.
+    parts : tuple of slice
+        Edges of each strip.
+    """
+
+    values: FloatArray
+    parts: tuple[slice, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class NonlocalPenalty:
+    """J[u] with the weights of a graph.
+
+    Attributes
+    ----------
+    graph : NonlocalGraph
+    pool : Executor, optional
+        Threads that work on strips side by side.
+    folder : Path, optional
+        Where p is kept in a file; without it it is in memory.
+    """
+
+    graph: NonlocalGraph
+    pool: Executor | None = None
+    folder: Path | None = None
+
+    @property
+    def norm_squared(self) -> float:
+        """Upper bound of ‖K‖²."""
+        return self.graph.norm_squared
+
+    def dual(self, image: FloatArray) -> EdgeDual:
+        """Start from p = 0 for an image of this size."""
+        ends = np.cumsum([0] + [len(strip.heads) for strip in self.graph.strips])
+        values = np.asarray(new_stack((3, int(ends[-1])), self.folder))
+        for part in (parts := tuple(map(slice, ends[:-1], ends[1:]))):
+            values[:, part] = 0
+            release(values)
+        return EdgeDual(values, parts)
+
+    def ascend(self, dual: EdgeDual, image: FloatArray, step: float, relaxation: float) -> FloatArray:
+        """Add ``step`` times K of the image to p, project and over-relax, in place; return Kᵀp."""
+        flat, values = image.ravel(), dual.values
+        root_step, drawn = np.float32(step), np.float32(relaxation - 1)
+
+        def add(number: int, strip: EdgeStrip) -> FloatArray:
+            part = dual.parts[number]
+            there, back, added = values[0, part], values[1, part], values[2, part]
+            np.multiply(strip.differences(flat), root_step, out=added)
+            there += added
+            back -= added
+            squares = strip.gather((there, there), (back, back))
+            release(values)
+            return squares
+
+        factor = np.sqrt(sum_strips(self.graph.strips, add, flat.size, self.pool))
+        np.maximum(factor, 1, out=factor)
+        np.divide(np.float32(relaxation), factor, out=factor)
+        factor -= drawn
+
+        def draw_back(number: int, strip: EdgeStrip) -> FloatArray:
+            part, own = dual.parts[number], strip.view(factor)
+            there, back, added = values[0, part], values[1, part], values[2, part]
+            there *= strip.at_tails(own)
+            back *= strip.at_heads(own)
+            added *= drawn
+            there += added
+            back -= added
+            net = np.subtract(back, there, out=added)
+            pull = strip.gather((net, strip.roots), (np.negative(net), strip.roots))
+            release(values)
+            return pull
+
+        return sum_strips(self.graph.strips, draw_back, flat.size, self.pool).reshape(image.shape)
+
+    def value(self, image: FloatArray) -> float:
+        """J[u]."""
+        flat = image.ravel()
+
+        def squares(_: int, strip: EdgeStrip) -> FloatArray:
+            along = strip.differences(flat)
+            return strip.gather((along, along), (along, along))
+
+        total = sum_strips(self.graph.strips, squares, flat.size, self.pool)
+        return float(np.sqrt(total).sum(dtype=np.float64))

@@ -1,0 +1,215 @@
+"""Stacks that are too large for memory: kept in a file without a name, and walked frame by frame.
+
+The file is deleted as soon as it is open, so that nothing is left behind however the process ends; its space is free
+again when the last array that shows it goes.  What is mapped counts as memory of the process while its pages are
+there: they are handed back after every frame, and the system keeps in its cache what it has room for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import mmap
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import StorageError
+
+Item = TypeVar("Item")
+# Pages of a private map would lose what has been written to them.
+_SHARED = ("r", "r+", "w+")
+# Left free beside the file: others write to the disk as well.
+_SPARE = 1 << 26
+# Numbers that a piece of a large array has.
+_PART = 1 << 22
+# M_MMAP_THRESHOLD of mallopt, and the bytes from which an array is large.
+_MMAP_THRESHOLD, _LARGE = -3, 1 << 20
+
+
+def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.float32]:
+    """Return an array to be filled, in memory or in a file.
+
+    Parameters
+    ----------
+    shape : tuple of int
+    folder : Path, optional
+        Where the file lies; without it the array is in memory.
+
+    Returns
+    -------
+    ndarray, float32
+        A :class:`numpy.memmap` where it is in a file.
+
+    Raises
+    ------
+    StorageError
+        The folder has no room for it, or cannot be written to.
+
+    Examples
+    --------
+    >>> stack = new_stack((3, 4, 4), Path(tempfile.gettempdir()))
+    >>> stack[1] = 1
+    >>> float(stack.sum())
+    16.0
+    """
+    size = 4 * int(np.prod(shape, dtype=np.int64))
+    if folder is None or size == 0:
+        return np.empty(shape, np.float32)
+    try:
+        # Past the end of a full disk a mapped page kills the process: better to hear of it now.
+        free = shutil.disk_usage(folder).free
+        if free < size + _SPARE:
+            raise StorageError(
+                f"{folder}: expected {size / 1e9:.1f} GB free for frames that memory does not hold, found "
+                f"{free / 1e9:.1f} GB; name another folder by TMPDIR, or a higher memory limit"
+            )
+        with tempfile.TemporaryFile(dir=folder, prefix="turbrestore-") as file:
+            _reserve(file, size)
+            return np.memmap(file, np.float32, "r+", shape=shape)
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot hold {size / 1e9:.1f} GB of frames ({error.strerror})") from error
+
+
+def release(array: object) -> None:
+    """Hand back the memory that the pages of a mapped file take; they are read again when they are needed.
+
+    Parameters
+    ----------
+    array : object
+        An array of a mapped file, or a part of one; nothing happens to anything else.
+
+    Examples
+    --------
+    >>> stack = new_stack((2, 4, 4), Path(tempfile.gettempdir()))
+    >>> stack[:] = 2
+    >>> release(stack[1])
+    >>> float(stack[1, 0, 0])
+    2.0
+    """
+    mode = None
+    while isinstance(array, np.ndarray):
+        mode = array.mode if isinstance(array, np.memmap) else mode
+        array = array.base
+    if isinstance(array, mmap.mmap) and mode in _SHARED and hasattr(mmap, "MADV_DONTNEED"):
+        # A map that is locked in memory cannot be handed back, and need not be.
+        with contextlib.suppress(OSError):
+            array.madvise(mmap.MADV_DONTNEED)
+
+
+def walk(items: Iterable[Item]) -> Iterator[Item]:
+    """Yield one item after the other, and hand back the memory of each that is part of a mapped file.
+
+    Parameters
+    ----------
+    items : iterable
+        A stack of frames or flows, or a list of them.
+
+    Yields
+    ------
+    object
+
+    Examples
+    --------
+    >>> [float(frame.mean()) for frame in walk(np.ones((2, 3, 3), np.float32))]
+    [1.0, 1.0]
+    """
+    for item in items:
+        yield item
+        release(item)
+
+
+def parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """Yield consecutive pieces of an array, each small, and hand back their memory if it is a mapped file.
+
+    Parameters
+    ----------
+    array : ndarray
+        Split along its first axis.
+
+    Yields
+    ------
+    ndarray
+        Views.
+
+    Examples
+    --------
+    >>> [part.shape for part in parts(np.zeros((3, 1000, 1000)))]
+    [(3, 1000, 1000)]
+    """
+    step = max(1, len(array) * _PART // max(array.size, 1))
+    yield from walk(array[start : start + step] for start in range(0, len(array), step))
+
+
+def mean_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mean over the first axis, as ``stack.mean(axis=0)`` gives it, bit for bit.
+
+    Parameters
+    ----------
+    stack : ndarray, float32, shape (T, ...)
+        At least one frame or flow; in memory, or mapped.
+
+    Returns
+    -------
+    ndarray, float32, shape (...)
+
+    Examples
+    --------
+    >>> mean_of(np.array([[1.0, 2.0], [3.0, 4.0]], np.float32))
+    array([2., 3.], dtype=float32)
+    """
+    total = np.zeros(stack.shape[1:], np.float32)
+    for part in walk(stack):
+        total += part
+    return total / np.float32(len(stack))
+
+
+def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Variance over the first axis.
+
+    Parameters
+    ----------
+    stack : ndarray, float32, shape (T, ...)
+        At least one frame or flow; in memory, or mapped.
+
+    Returns
+    -------
+    ndarray, float32, shape (...)
+
+    Examples
+    --------
+    >>> variance_of(np.array([[1.0, 2.0], [3.0, 6.0]], np.float32))
+    array([1., 4.], dtype=float32)
+    """
+    mean, total = mean_of(stack), np.zeros(stack.shape[1:], np.float32)
+    for part in walk(stack):
+        total += np.square(part - mean)
+    return total / np.float32(len(stack))
+
+
+def return_freed() -> None:
+    """Have large arrays given back to the system as soon as they are freed, for the rest of the process.
+
+    The allocator of glibc otherwise raises the size from which it does so with every large array that is freed, and
+    what lies between those that are in use stays with the process: a third of the peak at 1920×1080.
+
+    Examples
+    --------
+    >>> return_freed()
+    """
+    if platform.libc_ver()[0] == "glibc":
+        ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGE)
+
+
+def _reserve(file: IO[bytes], size: int) -> None:
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file.fileno(), 0, size)
+    else:
+        file.truncate(size)

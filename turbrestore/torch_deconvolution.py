@@ -1,0 +1,341 @@
+"""The solvers of deconvolution in torch: primal-dual splitting (nltv, tv) and conjugate gradients (wiener, tikhonov).
+
+Symbols, problems, steps and stopping as in :mod:`turbrestore.deconvolution`, :mod:`turbrestore.primal_dual` and
+:mod:`turbrestore.conjugate_gradients`; nothing leaves the device between iterations but the change that they stop by.
+Sums that decide are taken in double precision, as they are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from .arrays import FloatArray
+from .convolution_problem import Problem
+from .nonlocal_tv import NonlocalParams
+from .psf import estimate_noise, laplacian_symbol, wiener_fidelity
+from .torch_weights import (
+    device_divergence,
+    device_gradient,
+    device_magnitude,
+    device_norm_squared,
+    device_projection,
+    weights_on_device,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+# As in primal_dual: ρ and τ‖K‖.
+_RELAXATION, _PRIMAL_STEP = 1.4, 0.08
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """When the solvers stop, and what the penalty is.
+
+    Parameters
+    ----------
+    method : {"nltv", "tv", "wiener", "tikhonov"}
+    iterations : int
+        Most iterations.
+    tolerance : float
+        Relative change below which they stop.
+    record_every : int
+        Iterations from one record of the energy to the next.
+    start_steps, start_tolerance
+        The same of the Wiener solution that nltv and tv start from.
+    sharpen_guide : bool
+        Compare patches of the guide after a Wiener deconvolution.
+    weights : NonlocalParams
+    """
+
+    method: str
+    iterations: int
+    tolerance: float
+    record_every: int
+    start_steps: int
+    start_tolerance: float
+    sharpen_guide: bool
+    weights: NonlocalParams
+
+
+class DeviceSolution(NamedTuple):
+    """Images, iterations, whether they converged, and a record (iteration, energy, change) every so often."""
+
+    images: list[FloatArray]
+    iterations: int
+    converged: bool
+    records: list[tuple[int, float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Data term ``λ/2 ‖M(k∗u − f)‖²`` on a device; see :class:`turbrestore.convolution_problem.Problem`."""
+
+    observed: Tensor
+    seen: Tensor
+    otf: Tensor
+    fidelity: float
+
+    def gradient_spectrum(self, spectrum: Tensor) -> Tensor:
+        return self.fidelity * self.otf.conj() * _forward(self.residual(spectrum))
+
+    def residual(self, spectrum: Tensor) -> Tensor:
+        return self.seen * (_back(self.otf * spectrum, self.observed) - self.observed)
+
+    def misfit(self, u: Tensor) -> float:
+        residual = self.residual(_forward(u))
+        return self.fidelity / 2 * _inner(residual, residual)
+
+    def mean(self) -> float:
+        return _inner(self.seen, self.observed) / _total(self.seen)
+
+
+class _Penalty(NamedTuple):
+    gradient: Callable[[Tensor], Tensor]
+    adjoint: Callable[[Tensor], Tensor]
+    project: Callable[[Tensor], Tensor]
+    value: Callable[[Tensor], float]
+    norm_squared: float
+
+
+class _DualState(NamedTuple):
+    image: Tensor
+    spectrum: Tensor
+    dual: Tensor
+
+
+class _GradientState(NamedTuple):
+    image: Tensor
+    residual: Tensor
+    direction: Tensor
+    decrease: float
+
+
+def solve_on_device(
+    problems: list[Problem],
+    guide: FloatArray | None,
+    settings: SolverSettings,
+    device: str,
+    progress: Callable[[int], None] | None = None,
+) -> DeviceSolution:
+    """Solve the problems of all channels side by side.
+
+    Parameters
+    ----------
+    problems : list of Problem
+        One for each channel.
+    guide : ndarray, float32, shape of the images, or None
+        What nonlocal weights are taken from; None for the images themselves.
+    settings : SolverSettings
+    device : str
+        Name that torch gives it.
+    progress : callable, optional
+        Called with 1 after each iteration.
+
+    Returns
+    -------
+    DeviceSolution
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> flat = np.full((16, 16), 0.5, np.float32)
+    >>> problem = Problem(flat, np.ones_like(flat), np.ones((16, 9), np.float32), 100.0)
+    >>> settings = SolverSettings("tv", 50, 1e-4, 10, 40, 1e-4, True, NonlocalParams())
+    >>> solution = solve_on_device([problem], None, settings, "cpu")
+    >>> solution.converged, bool(np.allclose(solution.images[0], 0.5, atol=1e-5))
+    (True, True)
+    """
+    loaded = [_load(problem, device) for problem in problems]
+    if settings.method in ("wiener", "tikhonov"):
+        symbol = np.ones((1, 1), np.float32) if settings.method == "tikhonov" else _laplacian(problems[0])
+        quadratic = _Quadratic(_tensor(symbol, device))
+        return _iterate(quadratic, loaded, [quadratic.start(p) for p in loaded], settings, progress)
+    starts = [_wiener_image(problem, settings, device) for problem in problems]
+    penalty = _local_tv() if settings.method == "tv" else _nonlocal_tv(problems, starts, guide, settings, device)
+    solver = _PrimalDual(penalty)
+    return _iterate(solver, loaded, [solver.start(u) for u in starts], settings, progress)
+
+
+def _iterate(
+    solver: _PrimalDual | _Quadratic,
+    problems: list[_Problem],
+    states: list,
+    settings: SolverSettings,
+    progress: Callable[[int], None] | None,
+) -> DeviceSolution:
+    records: list[tuple[int, float, float]] = []
+    for iteration in range(1, settings.iterations + 1):
+        before = [state.image for state in states]
+        states = [solver.step(problem, state) for problem, state in zip(problems, states, strict=True)]
+        images = [state.image for state in states]
+        change = _relative_change(before, images, problems[0].seen)
+        converged = change <= settings.tolerance
+        last = converged or iteration == settings.iterations
+        if last or iteration % settings.record_every == 0:
+            energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
+            records.append((iteration, sum(energies), change))
+        if progress is not None:
+            progress(1)
+        if last:
+            break
+    return DeviceSolution([u.cpu().numpy() for u in images], iteration, converged, records)
+
+
+@dataclass(frozen=True, eq=False)
+class _PrimalDual:
+    """See :class:`turbrestore.primal_dual.PrimalDual`."""
+
+    regulariser: _Penalty
+
+    def start(self, u: Tensor) -> _DualState:
+        return _DualState(u, _forward(u), self.regulariser.gradient(u) * 0)
+
+    def step(self, problem: _Problem, state: _DualState) -> _DualState:
+        norm = self.regulariser.norm_squared**0.5
+        tau, s = _PRIMAL_STEP / norm, 1 / (_PRIMAL_STEP * norm)
+        u, spectrum, p = state
+        metric = 1 / tau + problem.fidelity * problem.otf.abs() ** 2
+        down = (_forward(self.regulariser.adjoint(p)) + problem.gradient_spectrum(spectrum)) / metric
+        moved = _back(down, u)
+        ascent = self.regulariser.gradient(u - 2 * moved).mul_(s).add_(p)
+        forward = self.regulariser.project(ascent)
+        return _DualState(u - _RELAXATION * moved, spectrum - _RELAXATION * down, p + _RELAXATION * (forward - p))
+
+    def penalty(self, problem: _Problem, u: Tensor) -> float:
+        return self.regulariser.value(u)
+
+
+@dataclass(frozen=True, eq=False)
+class _Quadratic:
+    """See :class:`turbrestore.conjugate_gradients.ConjugateGradients`."""
+
+    symbol: Tensor
+
+    def start(self, problem: _Problem) -> _GradientState:
+        m = problem.mean()
+        u = m + self._precondition(problem, _forward(problem.observed - m) * problem.otf.conj() * problem.fidelity)
+        residual = -_back(problem.gradient_spectrum(_forward(u)) + self.symbol * _forward(u - m), u)
+        direction = self._precondition(problem, _forward(residual))
+        return _GradientState(u, residual, direction, _inner(residual, direction))
+
+    def step(self, problem: _Problem, state: _GradientState) -> _GradientState:
+        if state.decrease <= 0:
+            return state
+        spectrum = _forward(state.direction)
+        blurred = problem.seen * _back(problem.otf * spectrum, state.image)
+        data = problem.fidelity * problem.otf.conj() * _forward(blurred)
+        image = _back(data + self.symbol * spectrum, state.image)
+        length = state.decrease / _inner(state.direction, image)
+        residual = state.residual - length * image
+        preconditioned = self._precondition(problem, _forward(residual))
+        decrease = _inner(residual, preconditioned)
+        direction = preconditioned + (decrease / state.decrease) * state.direction
+        return _GradientState(state.image + length * state.direction, residual, direction, decrease)
+
+    def penalty(self, problem: _Problem, u: Tensor) -> float:
+        deviation = u - problem.mean()
+        return _inner(deviation, _back(self.symbol * _forward(deviation), u)) / 2
+
+    def _precondition(self, problem: _Problem, spectrum: Tensor) -> Tensor:
+        denominator = problem.fidelity * problem.otf.abs() ** 2 + self.symbol
+        return _back(spectrum / denominator, problem.observed)
+
+
+def _wiener_image(problem: Problem, settings: SolverSettings, device: str) -> Tensor:
+    """Wiener solution with its own fidelity."""
+    fidelity = wiener_fidelity(problem.observed, estimate_noise(problem.observed))
+    loaded = _load(replace(problem, fidelity=fidelity), device)
+    solver = _Quadratic(_tensor(_laplacian(problem), device))
+    state = solver.start(loaded)
+    for _ in range(settings.start_steps):
+        before, state = state.image, solver.step(loaded, state)
+        if _relative_change([before], [state.image], loaded.seen) <= settings.start_tolerance:
+            break
+    return state.image
+
+
+def _nonlocal_tv(
+    problems: list[Problem], starts: list[Tensor], guide: FloatArray | None, settings: SolverSettings, device: str
+) -> _Penalty:
+    """Penalty whose weights come from the guide, or from the image itself (the mean of its channels)."""
+    if guide is not None and settings.sharpen_guide:
+        guide = _wiener_image(replace(problems[0], observed=guide), settings, device).cpu().numpy()
+    elif guide is None:
+        own = [u.cpu().numpy() for u in starts] if settings.sharpen_guide else [p.observed for p in problems]
+        guide = np.mean(own, axis=0, dtype=np.float32)
+    graph = weights_on_device(guide, settings.weights, device)
+    return _Penalty(
+        gradient=lambda u: device_gradient(graph, u),
+        adjoint=lambda p: -device_divergence(graph, p),
+        project=lambda p: device_projection(graph, p),
+        value=lambda u: _total(device_magnitude(graph, device_gradient(graph, u))),
+        norm_squared=device_norm_squared(graph),
+    )
+
+
+def _local_tv() -> _Penalty:
+    """See :mod:`turbrestore.local_tv`."""
+    import torch
+
+    def gradient(u: Tensor) -> Tensor:
+        return torch.stack([u.roll(-1, 0) - u, u.roll(-1, 1) - u])
+
+    def length(p: Tensor) -> Tensor:
+        return p.square().sum(0).sqrt()
+
+    return _Penalty(
+        gradient=gradient,
+        adjoint=lambda p: p[0].roll(1, 0) - p[0] + p[1].roll(1, 1) - p[1],
+        project=lambda p: p / length(p).clamp(min=1),
+        value=lambda u: _total(length(gradient(u))),
+        norm_squared=8.0,
+    )
+
+
+def _laplacian(problem: Problem) -> FloatArray:
+    return laplacian_symbol(problem.seen.shape[0], problem.seen.shape[1])
+
+
+def _load(problem: Problem, device: str) -> _Problem:
+    observed, seen, otf = (_tensor(array, device) for array in (problem.observed, problem.seen, problem.otf))
+    return _Problem(observed, seen, otf, problem.fidelity)
+
+
+def _tensor(array: np.ndarray, device: str) -> Tensor:
+    import torch
+
+    return torch.from_numpy(np.require(array, requirements=["C", "W"])).to(device)
+
+
+def _forward(u: Tensor) -> Tensor:
+    import torch
+
+    return torch.fft.rfft2(u)
+
+
+def _back(spectrum: Tensor, like: Tensor) -> Tensor:
+    import torch
+
+    return torch.fft.irfft2(spectrum, s=like.shape)
+
+
+def _inner(a: Tensor, b: Tensor) -> float:
+    return _total(a * b)
+
+
+def _total(values: Tensor) -> float:
+    import torch
+
+    return float(values.sum(dtype=torch.float64))
+
+
+def _relative_change(before: list[Tensor], after: list[Tensor], seen: Tensor) -> float:
+    moved = sum(_inner(seen, (b - a).square()) for a, b in zip(before, after, strict=True))
+    size = sum(_inner(seen, u.square()) for u in after)
+    return float(np.sqrt(moved / size)) if size > 0 else float(moved > 0)
