@@ -18,6 +18,8 @@ from turbrestore.video import write_video
 
 FORMATS = (".mkv", ".mp4", ".avi", ".mov", ".gif", ".ser", ".tif", ".npy")
 FLIPPED = {"FFV1 with checksums": ".mkv", "H.264": ".mp4", "SER": ".ser", "TIFF": ".tif", "npy": ".npy"}
+# Still images, and whether every flip within the compressed pixels has to be found.
+STILLS = {"deflate": True, "LZW": False, "PackBits": False}
 CUTS = (0.01, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.75, 0.9, 0.995)
 _HEIGHT, _WIDTH, _COUNT = 48, 64, 12
 _HUGE = 60_000
@@ -120,6 +122,28 @@ def flipped(path: Path, kind: str, count: int) -> Iterator[bytes]:
         yield bytes(data)
 
 
+def write_still(path: Path, compression: str) -> tuple[int, int]:
+    """Write a compressed TIFF image, and return from where to where its pixels are."""
+    import PIL.Image
+    import tifffile
+
+    names = {"deflate": "tiff_adobe_deflate", "LZW": "tiff_lzw", "PackBits": "packbits"}
+    pixels = np.tile(np.uint8(255 * clip(1)[0]), (2, 2))
+    PIL.Image.fromarray(pixels).save(path, compression=names[compression])
+    with tifffile.TiffFile(path) as tiff:
+        page = tiff.pages.first
+        return page.dataoffsets[0], page.dataoffsets[-1] + page.databytecounts[-1]
+
+
+def flipped_still(path: Path, span: tuple[int, int], count: int) -> Iterator[bytes]:
+    """Copy with one byte of the compressed pixels changed."""
+    whole, rng = path.read_bytes(), np.random.default_rng(2)
+    for _ in range(count):
+        data = bytearray(whole)
+        data[rng.integers(*span)] ^= int(rng.integers(1, 256))
+        yield bytes(data)
+
+
 def _png(path: Path, side: int, bits: int = 8, colour: int = 0, extra: bytes = b"") -> None:
     def chunk(kind: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
@@ -163,6 +187,17 @@ def _inflating_tiff(path: Path) -> None:
     tifffile.imwrite(path, iter([packed]), shape=(100, 100), dtype=np.uint8, compression="zlib", metadata=None)
 
 
+def _short_still(path: Path, compression: str) -> None:
+    """Write a few kilobytes of compressed pixels under a header of 8000 by 8000."""
+    write_still(path, compression)
+    data = bytearray(path.read_bytes())
+    for tag in (256, 257, 278):
+        place = data.index(struct.pack("<HH", tag, 4), 8) if struct.pack("<HH", tag, 4) in data else 0
+        place = place or data.index(struct.pack("<HH", tag, 3), 8)
+        data[place + 2 : place + 12] = struct.pack("<HII", 4, 1, 8000)
+    path.write_bytes(data)
+
+
 def _npy_header(shape: tuple[int, ...], descr: str = "<f4") -> bytes:
     text = repr({"descr": descr, "fortran_order": False, "shape": shape}).encode().ljust(117) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
@@ -172,6 +207,24 @@ def _npz(path: Path, members: dict[str, bytes], compression: int = zipfile.ZIP_S
     with zipfile.ZipFile(path, "w", compression) as archive:
         for name, data in members.items():
             archive.writestr(f"{name}.npy", data)
+
+
+def _nested_npz(path: Path) -> None:
+    """Write members that lie within each other: each is stored, and holds the headers of all that follow."""
+    core = _npy_header((5 * 10**6,)) + bytes(2 * 10**7)
+    body, entries, count = core, [], 60
+    names = [b"%d.npy" % number for number in range(count)]
+    for name in reversed(names):
+        fields = (20, 0, 0, 0, 33, zlib.crc32(body), len(body), len(body), len(name))
+        body = struct.pack("<4s5H3I2H", b"PK\3\4", *fields, 0) + name + body
+        entries.append((name, fields, len(body)))
+    whole = len(body)
+    central = b"".join(
+        struct.pack("<4s6H3I5H2I", b"PK\1\2", 20, *fields, 0, 0, 0, 0, 0, whole - start) + name
+        for name, fields, start in reversed(entries)
+    )
+    end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, count, count, len(central), whole, 0)
+    path.write_bytes(body + central + end)
 
 
 def _ser(path: Path, width: int, height: int, frames: int) -> None:
@@ -225,6 +278,11 @@ BOMBS = {
     "stack.tif": Bomb(lambda path: _tiff(path, {256: _HUGE, 257: _HUGE, 278: _HUGE})),
     "short.tif": Bomb(lambda path: _tiff(path, {256: 8000, 257: 8000, 278: 8000})),
     "inflating.tif": Bomb(_inflating_tiff),
+    **{
+        f"short {name}.tif": Bomb(lambda path, name=name: _short_still(path, name), _EVALUATE)
+        for name in ("deflate", "LZW", "PackBits")
+    },
+    "short still.tif": Bomb(lambda path: _tiff(path, {256: 8000, 257: 8000, 278: 8000}), _EVALUATE),
     "many.npy": Bomb(lambda path: path.write_bytes(_npy_header((2**31, 4, 4), "|u1") + bytes(5000))),
     "huge.npy": Bomb(lambda path: path.write_bytes(_npy_header((9, 10**6, 10**6)) + bytes(5000))),
     "overflow.npy": Bomb(lambda path: path.write_bytes(_npy_header((2**32, 2**32, 2**32)) + bytes(5000))),
@@ -234,6 +292,7 @@ BOMBS = {
         _DEBLUR,
     ),
     "lying.npz": Bomb(lambda path: _npz(path, {"image": _npy_header((10**6, 10**6)) + bytes(500)}), _DEBLUR),
+    "nested.npz": Bomb(_nested_npz, _DEBLUR),
     "objects.npz": Bomb(lambda path: _npz(path, {"header": _npy_header((), "|O") + b"cos\nsystem\n."}), _DEBLUR),
     "huge.ser": Bomb(lambda path: _ser(path, 30_000, 30_000, 5)),
     "many.ser": Bomb(lambda path: _ser(path, 40, 40, 2**31 - 1)),

@@ -1,7 +1,7 @@
 """Feed the command line files that are malformed, damaged, lying or of odd content, and count what is handled.
 
-Run ``python benchmarks/hostile_input.py``; it prints a Markdown table and exits with 1 when a row fails.  ``--write``
-puts the table into a document, between its marks; ``--sample`` runs a few cases of every group; ``--only`` one group.
+Run ``python benchmarks/hostile_input.py``; it prints a Markdown table and exits with 1 when a row fails.
+``--sample`` runs a few cases of every group; ``--only`` one group.
 
 Every case is a call of the real command line in a process of its own, forked from this one, which has everything
 imported and nothing decoded; where memory is measured the process starts from nothing.
@@ -23,10 +23,22 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from hostile_files import BOMBS, CONTENT, FLIPPED, FORMATS, Content, flipped, malformed, write_clip
+from hostile_files import (
+    BOMBS,
+    CONTENT,
+    FLIPPED,
+    FORMATS,
+    STILLS,
+    Content,
+    flipped,
+    flipped_still,
+    malformed,
+    write_clip,
+    write_still,
+)
 
 from turbrestore.errors import DataError
-from turbrestore.images import atomic_write, read_image
+from turbrestore.images import read_image
 from turbrestore_cli.__main__ import main as command_line
 
 BAD_DATA, DONE = 65, 0
@@ -41,7 +53,6 @@ IMPORTED = (
     "turbrestore_cli.stages",
     "turbrestore_cli.inspection",
 )
-START, END = "<!-- hostile input -->\n", "<!-- end of hostile input -->"
 
 
 @dataclass(frozen=True)
@@ -85,12 +96,9 @@ def main() -> int:
                 place.mkdir()
                 rows += group(place, options.sample)
                 print(f"{name}: {time.perf_counter() - started:.0f} s", file=sys.stderr)
-    text = table(rows)
-    print(text)
+    print(table(rows))
     failures = [failure for row in rows for failure in row.failures or []]
     print("\n".join(failures), file=sys.stderr)
-    if options.write is not None:
-        _put(options.write, text)
     return 1 if failures else 0
 
 
@@ -136,7 +144,23 @@ def flipped_bytes(folder: Path, sample: bool) -> list[Row]:
             path.unlink()
         row.note = f"found {found}"
         rows.append(row)
-    return rows
+    return rows + [_flipped_stills(folder, name, 5 if sample else FLIPS) for name in STILLS]
+
+
+def _flipped_stills(folder: Path, compression: str, count: int) -> Row:
+    """Flip one byte of the compressed pixels of a TIFF image."""
+    checked = STILLS[compression]
+    rule = "found every time, exit 65" if checked else "exit 65 or read; no crash, no hang"
+    row = Row(f"one byte of the pixels flipped: TIFF image, {compression}", rule)
+    whole, path, found = folder / f"{compression}.tif", folder / f"flip {compression}.tif", 0
+    span = write_still(whole, compression)
+    for number, data in enumerate(flipped_still(whole, span, count)):
+        path.write_bytes(data)
+        ended = run_forked(["evaluate", str(path), str(whole)])
+        found += ended.code == BAD_DATA
+        row.judge(f"{compression} {number}", refusal(ended) if checked or ended.code != DONE else "")
+    row.note = f"found {found}"
+    return row
 
 
 def bombs(folder: Path, sample: bool) -> list[Row]:
@@ -303,15 +327,8 @@ def _wait(child: int, started: float) -> tuple[int, float, int]:
         time.sleep(0.002)
 
 
-def _put(path: Path, text: str) -> None:
-    document = path.read_text("utf-8") if path.exists() else f"{START}{END}\n"
-    head, _, rest = document.partition(START)
-    atomic_write(path, f"{head}{START}{text}{END}{rest.partition(END)[2]}".encode(), overwrite=True)
-
-
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", type=Path, help="document whose table is replaced")
     parser.add_argument("--sample", action="store_true", help="a few cases of every group")
     parser.add_argument("--only", choices=GROUPS, help="one group")
     return parser.parse_args()

@@ -4,7 +4,8 @@
 
 Runs the command line in processes of its own on a small clip that it makes: every way in which an output can be
 refused or break off, SIGINT and SIGKILL at ten points of a run each.  Nothing partial may be left, inputs must stay as
-they are, and a run that was interrupted must end as one that was not, bit for bit.  Exit code 1 if anything fails.
+they are, and a run that was interrupted must go on with what it has kept and end as one that was not, bit for bit.
+Exit code 1 if anything fails.
 
 As root on Linux disks that are full or read-only are small file systems in memory (``mount -t tmpfs``); elsewhere the
 size of files is limited (RLIMIT_FSIZE), and what needs a mount is left out and said so.
@@ -33,10 +34,16 @@ from turbrestore.synthesis.smooth_flow import distort, smooth_flows
 from turbrestore.video import write_video
 
 COMMAND = [sys.executable, "-m", "turbrestore_cli"]
-SETTINGS = ["--train=8", "--centroid.iterations=1", "--deconvolution.iterations=5", "--quiet"]
+SETTINGS = ["--train=8", "--centroid.iterations=1", "--filter.block=8", "--deconvolution.iterations=5", "--quiet"]
 POINTS = 10
 DATA, CREATE, STORAGE, USAGE = 65, 73, 74, 2
 MEGABYTE = 1 << 20
+STAGES = {
+    "centroid.npz": "centroid",
+    "dynamics.npz": "flow model",
+    "filtered.npz": "filter",
+    "deconvolution.npz": "deconvolution",
+}
 
 
 @dataclass(frozen=True)
@@ -315,7 +322,10 @@ def try_interruption(
         if number == signal.SIGINT and hidden:
             faults.append(f"left behind: {', '.join(hidden)}")
         faults += [f"{item}: not whole" for item in ("o.png", "o.png.toml") if not whole(folder / item, expected)]
-        resumed = execute([*RESTORE, "--resume"], folder)
+        kept = last_kept(folder)
+        resumed = execute([*(word for word in RESTORE if word != "--quiet"), "--resume"], folder)
+        if kept not in resumed.error:
+            faults.append(f"expected {kept!r} of the resumed run: {resumed.error.strip()[-300:]!r}")
         if resumed.code:
             faults.append(f"resuming ended with {resumed.code}: {resumed.error.strip()[-300:]}")
         if not (folder / "r.html").exists():
@@ -323,6 +333,24 @@ def try_interruption(
         found = {name: digest for name, digest in digests(folder).items() if not name.endswith(".part")}
         faults += [f"{item}: differs" for item in sorted({*found, *expected}) if found.get(item) != expected.get(item)]
         return Result(f"{number.name} after {delay:.2f} s", tuple(faults))
+
+
+def last_kept(folder: Path) -> str:
+    """Where a run in the folder should go on, in its words; read from the folder, not from the run."""
+    record = folder / "kept" / "stages.json"
+    if not record.exists():
+        # Nothing was kept, and nothing is said of it.
+        return ""
+    files, words = json.loads(record.read_text())["files"], "from the start"
+    for name, stage in STAGES.items():
+        if name not in files:
+            break
+        words = f"after the {stage}"
+    checkpoint = folder / "kept" / "checkpoint.npz"
+    if checkpoint.exists() and "filtered.npz" not in files:
+        with np.load(checkpoint) as arrays:
+            words += f" and {len(arrays['gain'])} frames of the filter"
+    return f"goes on {words}\n"
 
 
 def whole(path: Path, expected: dict[str, str]) -> bool:
@@ -336,6 +364,8 @@ def whole(path: Path, expected: dict[str, str]) -> bool:
 def main() -> int:
     """Print the table."""
     as_json = "--json" in sys.argv[1:]
+    # Shells start background jobs with this signal ignored, and every process started here would inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="interruptions-") as name:
         root = Path(name)
         rng = np.random.default_rng(0)

@@ -143,7 +143,7 @@ def measure_stages(clip: Clip, threads: int, method: str) -> None:
     from turbrestore.flow import FlowParams
     from turbrestore.frame_source import FrameSource
     from turbrestore.restoration import RestoreParams
-    from turbrestore.scratch import return_freed
+    from turbrestore.scratch import returning_freed
 
     train, pixels = 4, clip.height * clip.width
     settings = RestoreParams(
@@ -152,8 +152,7 @@ def measure_stages(clip: Clip, threads: int, method: str) -> None:
         flow=FlowParams(threads=threads, method=method),
         centroid=CentroidParams(iterations=2),
     )
-    return_freed()
-    with tempfile.TemporaryDirectory() as folder:
+    with returning_freed(), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clip.npy"
         clip.write(path)
         watch = StageWatch()

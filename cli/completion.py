@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Literal
 
 from cyclopts.completion.detect import ShellDetectionError
 
 from turbrestore.errors import ConfigurationError
+
+from .streams import tell
 
 
 def install_completion(*, shell: Literal["bash", "zsh", "fish"] | None = None, output: Path | None = None) -> None:
@@ -22,10 +23,10 @@ def install_completion(*, shell: Literal["bash", "zsh", "fish"] | None = None, o
         File to write, for you to load; by default where the shell looks for it, and bash and zsh are told in their
         start file.
     """
-    from .__main__ import build
+    from .application import build
 
     try:
         written = build().install_completion(shell=shell, output=output, add_to_startup=output is None)
     except ShellDetectionError as error:
         raise ConfigurationError("--shell: expected bash, zsh or fish, found no shell around; name one") from error
-    sys.stderr.write(f"turbrestore: {written}: completion is written; open a new shell to use it\n")
+    tell(f"turbrestore: {written}: completion is written; open a new shell to use it")

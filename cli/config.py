@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 import textwrap
 from pathlib import Path
 from types import NoneType
@@ -15,9 +14,11 @@ from turbrestore import __version__
 from turbrestore.errors import require
 from turbrestore.images import atomic_write, check_output
 from turbrestore.pixels import check_depth
+from turbrestore.restoration import RestoreParams
 
 from .options import Flag, known_sigma
 from .settings import read_toml, settings
+from .streams import put
 
 if TYPE_CHECKING:
     from cyclopts import App
@@ -41,14 +42,14 @@ def config(*, init: Path | None = None, check: Path | None = None, overwrite: Fl
     require((init is None) != (check is None), "config: expected either --init FILE or --check FILE")
     require(init is not None or not overwrite, "--overwrite: has no effect with --check; leave it out")
     # The commands hang on the application, and the application on this command.
-    from .__main__ import build
+    from .application import build
 
     app = build()
     if init is not None:
         check_output(init, overwrite=overwrite, suffixes=(".toml",))
         atomic_write(init, template(app).encode(), overwrite)
     if check is not None:
-        sys.stdout.write("\n".join([f"{check}: valid", *_changes(app, check)]) + "\n")
+        put("\n".join([f"{check}: valid", *_changes(app, check)]))
 
 
 def template(app: App) -> str:
@@ -108,8 +109,8 @@ def _changes(app: App, path: Path) -> list[str]:
         given["selection"].region()
     if "bit_depth" in given:
         check_depth(given["bit_depth"])
-    if "params" in given:
-        known_sigma(given.get("sigma"), given["params"].deconvolution)
+    params = given.get("params", RestoreParams())
+    known_sigma(given.get("sigma"), params.deconvolution)
     defaults = {key: argument.field_info.default for key, argument in _settings(app).items()}
     return [
         f"{key} = {value!r} (default: {'left open' if defaults[key] is None else repr(defaults[key])})"

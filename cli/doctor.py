@@ -22,6 +22,8 @@ from cyclopts import Parameter
 from turbrestore import __version__
 from turbrestore.errors import TurbrestoreError
 
+from .streams import put
+
 # Module and distribution of what every run needs, and of what extras add.
 REQUIRED = {
     "numpy": "numpy",
@@ -64,12 +66,12 @@ def doctor(*, json: Annotated[bool, Parameter(negative="")] = False) -> None:
     findings = [finding for check in CHECKS for finding in check()]
     if json:
         record = {"turbrestore": __version__, "findings": [asdict(finding) for finding in findings]}
-        sys.stdout.write(json_format.dumps(record, indent=2) + "\n")
+        put(json_format.dumps(record, indent=2))
     else:
         for item in findings:
-            sys.stdout.write(f"{item.state:<8} {item.name:<14} {item.found}\n")
+            put(f"{item.state:<8} {item.name:<14} {item.found}")
             if item.advice:
-                sys.stdout.write(f"{'':<23} → {item.advice}\n")
+                put(f"{'':<23} → {item.advice}")
     broken = [finding.name for finding in findings if finding.state == "broken"]
     if broken:
         raise TurbrestoreError(f"doctor: {', '.join(broken)} must work and does not; the report says what to do")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +14,8 @@ from turbrestore.arrays import FloatArray, check_flow
 from turbrestore.artifacts import load_flows
 from turbrestore.content import clean_source
 from turbrestore.errors import DataError, require
-from turbrestore.images import input_errors, read_image
+from turbrestore.images import read_image
+from turbrestore.input_files import check_input, input_errors
 from turbrestore.limits import DEFAULT_LIMITS
 from turbrestore.memory import training_share
 from turbrestore.metrics import appearance, compare, compare_flows
@@ -23,6 +23,7 @@ from turbrestore.metrics import appearance, compare, compare_flows
 from .inputs import open_checked, read_input_image
 from .options import Flag, Selection, limits_of
 from .output import print_json
+from .streams import put
 
 FLOW_SUFFIXES = (".npy", ".npz", ".flo")
 # First bytes of a Middlebury flow file: 202021.25 as a float.
@@ -116,8 +117,8 @@ def _read_flows(path: Path) -> FloatArray:
     """Flows of shape (T, H, W, 2); one from a .flo file."""
     if path.suffix.lower() != ".flo":
         return load_flows(path)
+    DEFAULT_LIMITS.check_bytes(check_input(path).st_size, str(path))
     with input_errors(path):
-        DEFAULT_LIMITS.check_bytes(path.stat().st_size, str(path))
         data = path.read_bytes()
     header = np.frombuffer(data[:12].ljust(12, b"\0"), "<i4")
     width, height = int(header[1]), int(header[2])
@@ -134,7 +135,5 @@ def _report(record: dict[str, object], as_json: bool) -> None:
     if as_json:
         print_json(record)
         return
-    for name, value in record.items():
-        lines = value if isinstance(value, list) else [value]
-        for line in lines:
-            sys.stdout.write(f"{name.replace('_', ' '):<18} {'–' if line is None else line}\n")
+    rows = [(name, line) for name, value in record.items() for line in (value if isinstance(value, list) else [value])]
+    put("\n".join(f"{name.replace('_', ' '):<18} {'–' if line is None else line}" for name, line in rows))

@@ -39,7 +39,11 @@ def kept_stages(
             yield stages
         except KeyboardInterrupt as stop:
             stages.flush()
+            stages.withdraw()
             stop.args = (f"{str(stop) or 'interrupted'}; --keep {folder} --resume goes on {stages.progress()}",)
+            raise
+        except Exception:
+            stages.withdraw()
             raise
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ from turbrestore.images import atomic_write, check_output
 
 from .options import Flag
 from .output import print_json
+from .streams import flush
 
 _PLOTS = (".png",)
 _MOST_SEEDS = 100_000
@@ -54,7 +54,7 @@ def wavefront(
     if json:
         print_json(record | describe(experiment))
     else:
-        sys.stdout.write(f"wavefront, {seeds} seeds, error of the state\n{table(experiment)}")
+        flush(f"wavefront, {seeds} seeds, error of the state\n{table(experiment)}")
 
 
 def mirror(
@@ -90,8 +90,8 @@ def mirror(
     if json:
         print_json(record | {"plant_known": describe(known), "plant_unknown": describe(unknown)})
         return
-    sys.stdout.write(f"mirror, {seeds} seeds, plant known, error of the output within the exposure\n{table(known)}")
-    sys.stdout.write(f"\nmirror, plant within {deviation:g} dB\n{table(unknown)}")
+    flush(f"mirror, {seeds} seeds, plant known, error of the output within the exposure\n{table(known)}")
+    flush(f"\nmirror, plant within {deviation:g} dB\n{table(unknown)}")
 
 
 def describe(experiment: Experiment) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,17 +19,18 @@ from turbrestore.folder_lock import LOCK
 from turbrestore.images import atomic_write, check_output, write_image
 from turbrestore.metrics import compare
 from turbrestore.restoration import Restoration, RestoreParams
-from turbrestore.resumption import STAGE_FILES, KeptStages, read_stages
+from turbrestore.resumption import STAGE_FILES, KeptStages, is_part, read_stages
 from turbrestore.run_record import RUN_FILES, RunRecord, save_run
 
 from .options import Selection
+from .streams import put
 
 _IMAGES = ("frame", "mean", "centroid", "filtered", "deconvolved")
 
 
 def print_json(record: dict[str, Any]) -> None:
     """Write one JSON object to standard output; what is not a finite number becomes null."""
-    sys.stdout.write(json.dumps(_plain(record), indent=2, allow_nan=False) + "\n")
+    put(json.dumps(_plain(record), indent=2, allow_nan=False))
 
 
 def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, Any]:
@@ -117,11 +117,15 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: 
     if not folder.is_dir():
         raise OutputError(f"{folder}: is a file; name a folder to keep the stages in")
     known = resume and read_stages(folder) is not None
-    if not overwrite and not known and any(path.name != LOCK for path in folder.iterdir()):
+    # What a run leaves that is killed while it starts.
+    rest = [path for path in folder.iterdir() if path.name != LOCK and not is_part(path)]
+    if not overwrite and not known and rest:
         if resume:
             raise OutputError(f"{folder}: holds no run to go on with; choose another folder or allow overwriting")
         raise OutputError(f"{folder}: is not empty; choose another folder, allow overwriting, or resume the run in it")
-    for name in (*RUN_FILES, *STAGE_FILES, *(f"{image}.png" for image in _IMAGES)):
+    for name in (LOCK, *RUN_FILES, *STAGE_FILES, *(f"{image}.png" for image in _IMAGES)):
+        if (folder / name).is_symlink():
+            raise OutputError(f"{folder / name}: is a link to a file elsewhere; remove it or name another folder")
         if (folder / name).resolve() in {path.resolve() for path in taken}:
             raise OutputError(f"{folder / name}: is an input or output already; name another folder")
         check_output(folder / name, taken, overwrite=True, suffixes=None)

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from .streams import tell
+
 TITLES = {
     "flow": "optical flow",
     "centroid": "centroid",
@@ -44,4 +46,4 @@ def progress_bars(quiet: bool) -> Iterator[Callable[[str, int, int], None] | Non
 def say(message: str, quiet: bool) -> None:
     """Write one line for a person to standard error."""
     if not quiet:
-        sys.stderr.write(f"turbrestore: {message}\n")
+        tell(f"turbrestore: {message}")

@@ -46,7 +46,9 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputNotFoundError(f"{path}: no such settings file")
     try:
         return tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except RecursionError as error:
+        raise ConfigurationError(f"{path}: expected settings as TOML, found lists in lists without end") from error
+    except ValueError as error:
         raise ConfigurationError(f"{path}: expected settings as TOML, found {error}") from error
 
 

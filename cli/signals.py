@@ -1,44 +1,58 @@
-"""A request to end, from the system or a closed terminal, ends a command the way Ctrl-C does."""
+"""Ctrl-C, a request to end from the system and a closed terminal all end a command in the same way, once."""
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 # Windows knows no SIGHUP.
-NAMES = ("SIGTERM", "SIGHUP")
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 # Shells add the number of the signal to this.
 ENDED_BY_SIGNAL = 128
+INTERRUPTED = 130
+# Seconds for which more signals after one change nothing; a saving that hangs can be ended after that.
+PATIENCE = 5.0
 
 
 class Terminated(KeyboardInterrupt):
     """Raised where a signal arrives, so that temporary files go and checkpoints are kept."""
 
     def __init__(self, number: int) -> None:
-        super().__init__("terminated")
+        super().__init__("interrupted" if number == signal.SIGINT else "terminated")
         self.exit_code = ENDED_BY_SIGNAL + number
 
 
 @contextmanager
-def termination_raises() -> Iterator[None]:
-    """Raise :class:`Terminated` on SIGTERM and SIGHUP within the block; what is ignored (``nohup``) stays ignored."""
+def termination_raises(heard: list[KeyboardInterrupt]) -> Iterator[None]:
+    """Raise :class:`Terminated` on the first signal within the block, and note it in ``heard``.
+
+    Those that follow within a few seconds would disturb the saving that the first one has set off, and those after the
+    block the end of the interpreter: they are ignored.  What is ignored from the start (``nohup``) stays ignored.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
     before = {number: signal.getsignal(number) for number in numbers}
-    heard = [number for number in numbers if before[number] is not signal.SIG_IGN]
-    for number in heard:
-        signal.signal(number, _stop)
+    caught = [number for number in numbers if before[number] is not signal.SIG_IGN]
+    last = -math.inf
+
+    def stop(number: int, _: FrameType | None) -> None:
+        nonlocal last
+        if time.monotonic() - last > PATIENCE:
+            last = time.monotonic()
+            heard.append(Terminated(number))
+            raise heard[-1]
+
+    for number in caught:
+        signal.signal(number, stop)
     try:
         yield
     finally:
-        for number in heard:
-            signal.signal(number, before[number])
-
-
-def _stop(number: int, _: FrameType | None) -> None:
-    raise Terminated(number)
+        for number in caught:
+            signal.signal(number, signal.SIG_IGN if heard else before[number])

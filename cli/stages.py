@@ -19,7 +19,7 @@ from turbrestore.errors import require
 from turbrestore.flow import FlowParams, estimate_flow
 from turbrestore.flow_model import FlowDynamics
 from turbrestore.guards import GuardParams
-from turbrestore.images import IMAGE_OUTPUT_SUFFIXES, check_output, read_image, write_image
+from turbrestore.images import IMAGE_OUTPUT_SUFFIXES, check_output, check_space, read_image, write_image
 from turbrestore.memory import training_share
 from turbrestore.pipeline import stage_counter
 from turbrestore.pixels import check_depth
@@ -65,6 +65,7 @@ def centroid(
     check_output(output, [input], overwrite, ARTIFACT)
     source = open_input(input, selection, quiet)
     count = training_share(len(source), source.shape[1:], train)
+    check_space(output, _flow_bytes(count, source.shape) + _image_bytes(source.shape))
     with progress_bars(quiet) as progress:
         found = find_centroid(
             source.read(0, count), centroid, flow, stage_counter(progress, "centroid", count * centroid.iterations)
@@ -105,6 +106,7 @@ def flow(
     check_output(output, [reference, input], overwrite, (".npy",))
     image = read_input_image(reference, selection.limits())
     source = open_input(input, selection, quiet)
+    check_space(output, _flow_bytes(len(source), source.shape))
     with progress_bars(quiet) as progress:
         flows = estimate_flow(image, source.read(), flow, stage_counter(progress, "flow", len(source)))
     save_flows(output, flows, overwrite)
@@ -136,7 +138,12 @@ def identify(
         No remarks.
     """
     check_output(output, [flows], overwrite, ARTIFACT)
-    found = identify_flows(load_flows(flows), dynamics)
+    measured = load_flows(flows)
+    most = int(len(measured) / dynamics.frames_per_state) if dynamics.rank is None else dynamics.rank
+    modes = min(most, dynamics.max_rank if dynamics.rank is None else len(measured))
+    # The mean flow is one more.
+    check_space(output, _flow_bytes(modes + 1, measured.shape))
+    found = identify_flows(measured, dynamics)
     save_artifact(output, found, overwrite)
     for note in found.notes:
         say(f"{output}: {note}", quiet)
@@ -180,6 +187,7 @@ def filter_(
     check_output(output, [input, centroid, dynamics], overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
     start, model = load_artifact(centroid, Centroid), load_artifact(dynamics, FlowDynamics)
     source = open_input(input, selection, quiet)
+    check_space(output, _image_bytes(source.shape))
     total = len(source) * filter.inner_iterations - len(start.flows)
     with progress_bars(quiet) as progress:
         filtered = filter_frames(
@@ -245,6 +253,16 @@ def deconvolve(
     _write(output, deblurred.deconvolution, bit_depth, overwrite)
     for decision in deblurred.decisions:
         say(f"{output}: {decision.subject}: {decision.choice} ({decision.reason})", quiet)
+
+
+def _flow_bytes(count: int, shape: tuple[int, ...]) -> int:
+    """Bytes of so many flows between frames of a stack of this shape."""
+    return 8 * count * shape[1] * shape[2]
+
+
+def _image_bytes(shape: tuple[int, ...]) -> int:
+    """Bytes of an image in full precision, in one channel at least."""
+    return 4 * shape[1] * shape[2]
 
 
 def _write(output: Path, result: Filtered | Deconvolution, bit_depth: int, overwrite: bool) -> None:

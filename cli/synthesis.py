@@ -18,7 +18,7 @@ from cyclopts import Parameter
 from turbrestore import __version__
 from turbrestore.arrays import FloatArray
 from turbrestore.errors import ConfigurationError, OutputError, require, require_between
-from turbrestore.images import check_output, read_image, write_image
+from turbrestore.images import check_output, check_space, read_image, write_image
 from turbrestore.limits import Limits
 from turbrestore.memory import training_share
 from turbrestore.pipeline import Progress, stage_counter
@@ -233,6 +233,8 @@ def _write(
     counter: Callable[[int], None] | None,
 ) -> dict[str, Any]:
     """Write everything into a hidden folder first, so that a failure leaves nothing; what the JSON file says."""
+    # The flows; how much a codec saves of the frames is not known.
+    check_space(outputs[VIDEO], 8 * made.count * made.truth.shape[0] * made.truth.shape[1])
     with _hidden_folder(outputs[VIDEO]) as folder:
         staged = {ending: folder / path.name for ending, path in outputs.items()}
         flow_rms = _write_frames(staged[VIDEO], staged[FLOW], made, camera, counter)

@@ -10,17 +10,19 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "turbrestore"
 # A module imports only from those before it.
 ORDER = [
-    "errors", "scratch", "arrays", "decision", "device", "plots", "preview",
-    "parallel", "pixels", "limits", "images", "npy", "frame_source", "stuck_pixels",
+    "errors", "memory_size", "scratch", "arrays", "decision", "device", "plots", "preview",
+    "parallel", "pixels", "limits", "input_files", "tiff_pages", "image_headers",
+    "images", "npy", "frame_source", "stuck_pixels",
     "scene_cuts", "content", "integrity", "ser", "tiff", "container", "encoding", "video",
     "image_stacks", "warp", "psf", "stabilisation", "confidence", "tvl1_sweeps", "tvl1", "flow",
     "centroid", "flow_model", "flow_subspace", "dynamics", "displacement", "simulation", "kalman",
     "blur_moments", "frame_noise", "torch_fusion", "alternating", "blur_estimation", "blur_cues",
-    "patch_search", "edge_strips", "nonlocal_tv", "nonlocal_penalty", "convolution_problem",
-    "conjugate_gradients", "primal_dual", "local_tv", "torch_weights", "torch_deconvolution", "deconvolution",
+    "patch_search", "edge_strips", "nonlocal_tv", "nonlocal_penalty", "deconvolution_memory", "convolution_problem",
+    "conjugate_gradients", "primal_dual", "local_tv", "planes", "torch_weights", "torch_deconvolution", "deconvolution",
     "blur_map", "guards", "blind", "border", "frame_selection", "explanation", "synthesis", "metrics",
     "memory", "restoration", "pipeline",
-    "artifacts", "run_record", "checkpoint", "folder_lock", "resumption", "report",
+    "artifact_fields", "artifacts", "record_fields", "run_record", "checkpoint", "folder_lock",
+    "digests", "resumption", "report",
 ]  # fmt: skip
 HEAVY = {"torch", "kornia", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")

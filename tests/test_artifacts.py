@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore.artifacts import load_artifact, load_flows, load_stage_image, save_artifact, save_flows
+from turbrestore.artifact_fields import FIELDS
+from turbrestore.artifacts import KINDS, load_artifact, load_flows, load_stage_image, save_artifact, save_flows
+from turbrestore.blur_cues import BlurBounds
 from turbrestore.centroid import Centroid, CentroidParams
 from turbrestore.deconvolution import Deconvolution
 from turbrestore.errors import ConfigurationError, DataError, InputNotFoundError, OutputError
@@ -96,3 +98,103 @@ def test_flows_of_another_shape_are_refused(tmp_path):
     (tmp_path / "t.npy").write_text("text")
     with pytest.raises(DataError, match="found something else"):
         load_flows(tmp_path / "t.npy")
+
+
+def test_every_field_of_every_kind_is_laid_down():
+    assert {kind: set(fields) for kind, fields in FIELDS.items()} == {
+        kind: {item.name for item in dataclasses.fields(cls)} for kind, cls in KINDS.items()
+    }
+
+
+def text_of(array):
+    return array.astype("U8")
+
+
+def short(array):
+    return array[:-1]
+
+
+def spoilt(value, place=0):
+    def change(array):
+        changed = array.copy()
+        changed.flat[place] = value
+        return changed
+
+    return change
+
+
+DOCTORED = [
+    *[("centroid", "flows", change) for change in (np.sum, short, text_of, spoilt(np.nan), np.float64)],
+    *[("centroid", "image", change) for change in (np.ravel, spoilt(np.inf), text_of, lambda image: image[..., None])],
+    ("centroid", "mean_flow_sizes", lambda sizes: sizes[:0]),
+    *[("dynamics", field, text_of) for field in ("A", "C", "Q", "mean_flow", "motion_factor", "states")],
+    *[("dynamics", field, text_of) for field in ("residual_variance", "singular_values")],
+    *[("dynamics", field, short) for field in ("A", "C", "motion_factor", "residual_variance", "singular_values")],
+    *[("dynamics", "mean_flow", spoilt(value)) for value in (np.nan, 1e30)],
+    *[("dynamics", "states", change) for change in (spoilt(np.nan), lambda states: states[:, :1])],
+    *[("dynamics", "Q", change) for change in (np.negative, spoilt(1e6, 1), spoilt(np.nan))],
+    *[("dynamics", "residual_variance", change) for change in (spoilt(np.nan), spoilt(-1.0))],
+    *[("filtered", "variance", change) for change in (spoilt(np.nan), spoilt(-1.0), short)],
+    *[("filtered", "gains", change) for change in (text_of, short, spoilt(np.nan))],
+    ("filtered", "innovations", spoilt(np.inf)),
+    ("deconvolution", "recorded", np.float64),
+    ("deconvolution", "objective", short),
+]
+
+
+@pytest.mark.parametrize(("stage", "field", "change"), DOCTORED)
+def test_arrays_that_no_stage_makes_are_refused_by_name(restoration, tmp_path, stage, field, change):
+    result = getattr(restoration, stage)
+    changed = np.asarray(change(getattr(result, field)))
+    if stage == "centroid" and field == "flows" and changed.dtype == np.float32 and changed.ndim == 4:
+        # Any number of flows is right; of rows, those of the image.
+        changed = changed[:, :-1] if np.isfinite(changed).all() else changed
+    path = tmp_path / "a.npz"
+    save_artifact(path, dataclasses.replace(result, **{field: changed}))
+    with pytest.raises(DataError, match=rf"a\.npz: expected {field} .*found") as caught:
+        load_artifact(path, type(result))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("stage", "field", "value"),
+    [
+        ("dynamics", "R", -5.0),
+        ("dynamics", "R", float("nan")),
+        ("dynamics", "R", "one"),
+        ("dynamics", "R", 10**400),
+        ("dynamics", "energy_share", True),
+        ("dynamics", "notes", [1]),
+        ("dynamics", "notes", "text"),
+        ("dynamics", "overfitted", 1),
+        ("filtered", "image_noise", float("inf")),
+        ("deconvolution", "iterations", 1.5),
+    ],
+)
+def test_figures_that_no_stage_makes_are_refused_by_name(restoration, tmp_path, stage, field, value):
+    result = getattr(restoration, stage)
+    save_artifact(tmp_path / "a.npz", dataclasses.replace(result, **{field: value}))
+    with pytest.raises(DataError, match=rf"a\.npz: expected {field} .*found"):
+        load_artifact(tmp_path / "a.npz", type(result))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "[" * 100_000,
+        "9" * 6000,
+        '{"kind": "blur_bounds", "schema": true, "fields": {"low": 1, "high": 2}}',
+        '{"kind": "blur_bounds", "schema": 1.0, "fields": {"low": 1, "high": 2}}',
+        '{"kind": ["blur_bounds"], "schema": 1, "fields": {"low": 1, "high": 2}}',
+        '{"kind": "blur_bounds", "schema": 1, "fields": [1]}',
+    ],
+)
+def test_odd_headers_are_refused(tmp_path, header):
+    np.savez(tmp_path / "a.npz", header=np.array(header))
+    with pytest.raises(DataError, match=r"a\.npz: expected an artifact of"):
+        load_artifact(tmp_path / "a.npz", BlurBounds)
+
+
+def test_bounds_may_be_open(tmp_path):
+    save_artifact(tmp_path / "a.npz", BlurBounds(0.0, float("inf")))
+    assert load_artifact(tmp_path / "a.npz", BlurBounds) == BlurBounds(0.0, float("inf"))

@@ -18,7 +18,8 @@ from turbrestore.images import read_image, write_image
 from turbrestore.pipeline import RestoreParams
 from turbrestore.video import open_frames, write_video
 from turbrestore_cli import doctor
-from turbrestore_cli.__main__ import COMMANDS, build, main
+from turbrestore_cli.__main__ import main
+from turbrestore_cli.application import COMMANDS, build
 from turbrestore_cli.examples import EXAMPLES, FIRST_STEPS
 from turbrestore_cli.options import Selection
 
@@ -136,6 +137,7 @@ class TestSettings:
             ("train = 1\n", "train: expected 2 frames or more"),
             ("roi = '3'\n", "--roi"),
             ("bit_depth = 20\n", "bit_depth"),
+            ("sigma = 1e999\n", "sigma: expected"),
             ("sigma = 1\n[deconvolution]\nsigma = 2\n", "contradicts"),
         ],
     )
@@ -148,6 +150,13 @@ class TestSettings:
             assert (code, out, err.count("\n")) == (2, "", 1)
             assert part in err
         assert list(tmp_path.iterdir()) == [path]
+
+    @pytest.mark.parametrize("text", ["a = " + "[" * 100_000, "train = " + "9" * 6000], ids=["nested", "digits"])
+    def test_what_python_does_not_read_is_said(self, run, tmp_path, text):
+        (tmp_path / "run.toml").write_text(text)
+        code, out, err = run("config", "--check", tmp_path / "run.toml")
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert "run.toml: expected settings as TOML" in err
 
     def test_written_file_is_what_a_restoration_without_it_uses(self, run, folder):
         write_video("small.mkv", open_frames("sample_data/chart.mkv", roi=(96, 0, 64, 64)).read(0, 4), 25)

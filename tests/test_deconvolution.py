@@ -116,8 +116,8 @@ def test_one_step_is_the_proximal_step_of_the_filled_in_data(margin):
     p = TV.project(rng.normal(size=(2, 8, 8)).astype(np.float32))
     solver = PrimalDual(TV)
     after = solver.step(problem, PrimalDualState(u, fft.rfft2(u), p.copy(), TV.adjoint(p))).image
-    relaxed = u + (after - u) / primal_dual._RELAXATION
-    tau = primal_dual._PRIMAL_STEP / np.sqrt(TV.norm_squared)
+    relaxed = u + (after - u) / primal_dual.RELAXATION
+    tau = primal_dual.PRIMAL_STEP / np.sqrt(TV.norm_squared)
     blur = dense_blur(problem)
     target = (u - tau * TV.adjoint(p)).ravel()
     filled = np.where(problem.seen > 0, problem.observed, (blur @ u.ravel()).reshape(8, 8)).ravel()
@@ -211,8 +211,8 @@ def test_stopping_rule_is_as_good_as_two_thousand_iterations(method, scene, nois
 
 
 def test_pairs_in_a_file_give_the_same_image(monkeypatch, tmp_path):
-    monkeypatch.setattr("turbrestore.nonlocal_tv._STRIP_PIXELS", 700)
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 700)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "nowhere"))
     held = []
     monkeypatch.setattr("turbrestore.nonlocal_penalty.release", held.append)
     _, blurred = camera(72, 1.5, 0.002)
@@ -220,7 +220,7 @@ def test_pairs_in_a_file_give_the_same_image(monkeypatch, tmp_path):
     params = DeconvolutionParams(iterations=12, channels="each")
     whole = deconvolve(colour, 1.5, params)
     assert not any(isinstance(values.base, np.memmap) for values in held)
-    parts = deconvolve(colour, 1.5, dataclasses.replace(params, memory=1e7))
+    parts = deconvolve(colour, 1.5, dataclasses.replace(params, memory=1e7), scratch=tmp_path)
     assert isinstance(held[-1].base, np.memmap)
     assert np.abs(parts.image - whole.image).max() < 1e-5
     assert list(tmp_path.iterdir()) == []
@@ -229,14 +229,14 @@ def test_pairs_in_a_file_give_the_same_image(monkeypatch, tmp_path):
 def test_strips_give_the_image_of_the_whole(monkeypatch):
     _, blurred = camera(72, 1.5, 0.002)
     whole = deconvolve(blurred, 1.5, DeconvolutionParams(iterations=40))
-    monkeypatch.setattr("turbrestore.nonlocal_tv._STRIP_PIXELS", 1)
+    monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 1)
     strips = deconvolve(blurred, 1.5, DeconvolutionParams(iterations=40))
     assert np.abs(strips.image - whole.image).max() < 1e-5
 
 
 @pytest.mark.parametrize("method", ["nltv", "wiener"])
 def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch, method):
-    monkeypatch.setattr("turbrestore.nonlocal_tv._STRIP_PIXELS", 700)
+    monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 700)
     _, blurred = camera(72, 1.5, 0.002)
     images = []
     for threads in (1, 2, 5):

@@ -1,7 +1,12 @@
 """Every stage on a device finds what it finds on the processor; torch on the processor stands in for a GPU."""
 
+import subprocess
+import sys
+import textwrap
 from dataclasses import replace
 from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,11 +18,12 @@ from turbrestore.alternating import FilterParams, filter_frames
 from turbrestore.centroid import CentroidParams
 from turbrestore.decision import Decision
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.device import check_device, explain_device, find_device
+from turbrestore.device import TORCH_BYTES, check_device, explain_device, find_device, memory_of, needs_torch
 from turbrestore.dynamics import identify
 from turbrestore.errors import ConfigurationError
 from turbrestore.flow import FlowParams, estimate_flow
 from turbrestore.frame_selection import Share
+from turbrestore.frame_source import FrameSource
 from turbrestore.nonlocal_tv import (
     NonlocalParams,
     nonlocal_divergence,
@@ -27,7 +33,8 @@ from turbrestore.nonlocal_tv import (
     project_to_unit,
 )
 from turbrestore.pipeline import restore
-from turbrestore.restoration import RestoreParams, place_stages
+from turbrestore.restoration import RestoreParams, explain_devices, place_stages
+from turbrestore.resumption import stage_facts
 from turbrestore.synthesis.scenes import SCENES, resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 from turbrestore.torch_weights import (
@@ -76,17 +83,18 @@ def coloured(scene):
 
 class TestChoice:
     def test_the_processor_needs_no_torch(self, monkeypatch):
-        monkeypatch.setitem(__import__("sys").modules, "torch", None)
+        monkeypatch.setitem(sys.modules, "torch", None)
         assert find_device("cpu") == find_device("auto") == "cpu"
 
     @NO_TORCH
     @pytest.mark.parametrize(("there", "found"), [(False, "cpu"), (True, "cuda")])
     def test_auto_takes_a_gpu_where_torch_sees_one(self, there, found, monkeypatch):
+        monkeypatch.setattr(device_module, "_may_have_gpu", lambda: True)
         monkeypatch.setattr(device_module, "_cuda_is_there", lambda: there)
         assert find_device("auto") == found
 
     def test_missing_torch_is_named(self, monkeypatch):
-        monkeypatch.setitem(__import__("sys").modules, "torch", None)
+        monkeypatch.setitem(sys.modules, "torch", None)
         with pytest.raises(
             ConfigurationError, match=r"^device: torch is not installed, found 'cuda'; install .* 'cpu'$"
         ):
@@ -103,26 +111,96 @@ class TestChoice:
             find_device("cuda:1")
 
     @NO_TORCH
-    @pytest.mark.parametrize("name", ["gpu", "mps", "meta:x", "quantum:3"])
+    @pytest.mark.parametrize("name", ["gpu", "mps", "meta", "meta:x", "quantum:3", "hpu"])
     def test_unknown_names_are_named(self, name):
         with pytest.raises(ConfigurationError, match=f"^device: .*'{name}'"):
             find_device(name)
 
     @pytest.mark.parametrize("name", ["", "GPU", "cuda 1", "cuda:", None, 0])
     def test_settings_are_checked_without_torch(self, name, monkeypatch):
-        monkeypatch.setitem(__import__("sys").modules, "torch", None)
+        monkeypatch.setitem(sys.modules, "torch", None)
         with pytest.raises(ConfigurationError, match="^device: expected auto, cpu, cuda"):
             check_device(name)
-        with pytest.raises(ConfigurationError, match="^device: expected auto, cpu, cuda"):
-            FlowParams(device=name)
+        for settings in (FlowParams, FilterParams, DeconvolutionParams):
+            if name is None:
+                assert settings(device=name).device is None
+            else:
+                with pytest.raises(ConfigurationError, match="^device: expected auto, cpu, cuda"):
+                    settings(device=name)
+
+    @pytest.mark.parametrize(
+        ("system", "nodes", "library", "asked"),
+        [
+            ("linux", ["null", "nvme0", "dri"], False, False),
+            ("linux", ["nvidiactl"], False, True),
+            ("linux", ["kfd"], False, True),
+            ("linux", ["dxg"], False, True),
+            ("linux", [], True, True),
+            ("darwin", ["nvidiactl"], True, False),
+            ("win32", [], False, True),
+        ],
+    )
+    def test_auto_loads_torch_where_there_may_be_a_gpu(self, system, nodes, library, asked, monkeypatch, tmp_path):
+        import_of = SimpleNamespace(cuda=SimpleNamespace(is_available=lambda: asked_for.append(1) or True))
+        asked_for = []
+
+        def load(name):
+            assert name == "libcuda.so.1"
+            if not library:
+                raise OSError(name)
+
+        monkeypatch.setattr(device_module.sys, "platform", system)
+        monkeypatch.setattr(device_module, "_DEVICES", tmp_path)
+        monkeypatch.setattr(device_module.ctypes, "CDLL", load)
+        monkeypatch.setattr(device_module.importlib.util, "find_spec", lambda name: name)
+        monkeypatch.setitem(sys.modules, "torch", import_of)
+        for node in nodes:
+            (tmp_path / node).touch()
+        assert find_device("auto") == ("cuda" if asked else "cpu")
+        assert bool(asked_for) is needs_torch("auto") is asked
+
+    @NO_TORCH
+    def test_memory_that_torch_takes_is_known(self):
+        script = """
+            import re, numpy, cv2, scipy
+            from pathlib import Path
+            import turbrestore.restoration
+            def most():
+                return 1024 * int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1])
+            before = most()
+            import torch
+            float(torch.fft.rfft2(torch.ones(64, 64)).abs().sum(dtype=torch.float64))
+            print(most() - before, torch.version.cuda or torch.version.hip or "")
+        """
+        if not Path("/proc/self/status").exists():
+            pytest.skip("the system does not say how much memory a process takes")
+        words = [sys.executable, "-c", textwrap.dedent(script)]
+        taken, *build = subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()
+        assert int(taken) > 0.7 * TORCH_BYTES
+        assert build or int(taken) < 1.2 * TORCH_BYTES
 
     def test_what_is_said(self):
-        assert explain_device("cpu", "cpu", "tvl1") == ()
-        assert explain_device("auto", "cpu", "dis") == (Decision("device", "processor", "no GPU that torch sees"),)
-        assert explain_device("cuda", "cuda", "tvl1") == (Decision("device", "cuda", "asked for"),)
-        first, second = explain_device("auto", "cuda", "farneback")
+        def told(wanted, found, method, **own):
+            return explain_device(wanted, found, {"optical flow": found, "filter": found, **own}, method)
+
+        assert told("cpu", "cpu", "tvl1") == ()
+        assert told("auto", "cpu", "dis") == (Decision("device", "processor", "no GPU that torch sees"),)
+        assert told("cuda", "cuda", "tvl1") == (Decision("device", "cuda", "asked for"),)
+        first, second = told("auto", "cuda", "farneback")
         assert (first.choice, second.choice) == ("cuda", "on the processor")
         assert "farneback" in second.reason
+        assert told("cpu", "cpu", "dis", filter="cuda") == (Decision("filter", "on cuda", "a setting of its own"),)
+        own = told("cuda", "cuda", "tvl1", **{"optical flow": "cpu"})
+        assert own[1:] == (Decision("optical flow", "on the processor", "a setting of its own"),)
+        assert [item.subject for item in told("cpu", "cpu", "dis", **{"optical flow": "cuda"})] == ["optical flow"]
+
+    def test_lack_of_memory_is_one_line_and_other_errors_are_not(self):
+        line = r"^device: the memory of 'cuda:1' is not enough; lower --flow.tvl1.batch or use 'cpu'$"
+        for said in ("CUDA out of memory. Tried 2 GiB", "[enforce] DefaultCPUAllocator: not enough memory: you tried"):
+            with pytest.raises(ConfigurationError, match=line), memory_of("cuda:1", "lower --flow.tvl1.batch"):
+                raise RuntimeError(said)
+        with pytest.raises(RuntimeError, match="^a bug$"), memory_of("cuda", "lower the batch"):
+            raise RuntimeError("a bug")
 
 
 @on_devices
@@ -158,6 +236,28 @@ class TestFlow:
 
 
 @on_devices
+class TestMemory:
+    @pytest.mark.parametrize(
+        ("place", "advice", "settings"),
+        [
+            ("flow.tvl1_flows", "lower --flow.tvl1.batch", {"flow": FlowParams(method="tvl1")}),
+            ("warp.warp_stack", "take a smaller --roi", {}),
+            ("torch_fusion.warp_stack", "take a smaller --roi", {}),
+            ("torch_deconvolution.weights_on_device", "take a smaller --roi", {}),
+        ],
+    )
+    def test_what_to_do_is_said_where_it_is_not_enough(self, device, place, advice, settings, monkeypatch):
+        def fail(*_):
+            raise RuntimeError("CUDA out of memory.")
+
+        monkeypatch.setattr(f"turbrestore.{place}", fail)
+        frames, _ = frames_of(SCENES["camera"](48, 48), 3, seed=17)
+        line = f"^device: the memory of '{device[:3]}.* is not enough; {advice} or use 'cpu'$"
+        with pytest.raises(ConfigurationError, match=line):
+            restore(frames, RestoreParams(device=device, **settings))
+
+
+@on_devices
 class TestFusion:
     def run(self, scene, device, spread=0.0, **settings):
         """Fuse frames here and there; the flows have some noise, and so fold, where ``spread`` is large."""
@@ -189,6 +289,25 @@ class TestFusion:
         calm, _ = self.run(scene, device)
         assert here.variance.mean() > 2 * calm.variance.mean()
         assert np.abs(here.image - there.image).max() < 1e-4
+
+    def test_a_foreign_frame_has_a_finite_noise_however_much_sharpness_counts(self, device):
+        scene = SCENES["camera"](SIZE, SIZE)
+        frames, flows = frames_of(scene, 12, seed=4)
+        image, dynamics = frames.mean(axis=0), identify(flows)
+        # Its gradient is against that of the scene, and its flow folds.
+        frames[8] = 1 - frames[8]
+        flows[8] += np.random.default_rng(5).normal(0, 3, flows[8].shape).astype(np.float32)
+        params = FilterParams(inner_iterations=1, sharpness=10.0)
+        here, there = (
+            filter_frames(frames, image, dynamics, replace(params, device=d), known_flows=flows)
+            for d in ("cpu", device)
+        )
+        for found in (here, there):
+            assert np.isfinite(found.image).all()
+            assert np.isfinite(found.variance).all()
+            assert found.variance.min() > 0
+        assert np.abs(here.image - there.image).max() < 1e-4
+        assert here.shares[8] < 0.01
 
     def test_warp(self, device):
         scene = SCENES["camera"](50, 64)
@@ -323,8 +442,30 @@ class TestRestoration:
 class TestPlacing:
     def test_a_stage_keeps_a_device_of_its_own(self, monkeypatch):
         monkeypatch.setattr(restoration_module, "find_device", lambda wanted: wanted)
-        placed = place_stages(RestoreParams(device="cuda", filter=FilterParams(device="cuda:1")))
-        assert (placed.flow.device, placed.filter.device, placed.deconvolution.device) == ("cuda", "cuda:1", "cuda")
+        own = {"flow": FlowParams(device="cpu"), "filter": FilterParams(device="cuda:1")}
+        placed = place_stages(RestoreParams(device="cuda", **own))
+        assert (placed.flow.device, placed.filter.device, placed.deconvolution.device) == ("cpu", "cuda:1", "cuda")
+        assert place_stages(placed) == placed
+        assert [(item.subject, item.choice) for item in explain_devices(placed)] == [
+            ("device", "cuda"),
+            ("optical flow", "on the processor"),
+            ("filter", "on cuda:1"),
+        ]
+
+    @pytest.mark.parametrize("stage", ["flow", "filter", "deconvolution"])
+    def test_the_device_of_a_stage_is_looked_for_before_the_first(self, stage, tmp_path, capsys, monkeypatch):
+        monkeypatch.setitem(sys.modules, "torch", None)
+        np.save(tmp_path / "in.npy", np.random.default_rng(0).random((3, 32, 32)).astype(np.float32))
+        words = ["restore", str(tmp_path / "in.npy"), str(tmp_path / "out.png"), f"--{stage}.device", "cuda"]
+        assert main([*words, "--keep", str(tmp_path / "kept")]) == 2
+        assert "device: torch is not installed, found 'cuda'" in capsys.readouterr().err
+        assert not list(tmp_path.glob("**/*.npz"))
+
+    def test_auto_of_a_stage_is_settled_in_what_is_kept(self, monkeypatch):
+        monkeypatch.setattr(device_module, "_cuda_is_there", lambda: False)
+        source = FrameSource.from_array(np.zeros((5, 16, 16)))
+        auto = RestoreParams(filter=FilterParams(device="auto"), deconvolution=DeconvolutionParams(device="auto"))
+        assert stage_facts(source, auto) == stage_facts(source, RestoreParams())
 
     def test_auto_is_settled_before_the_stages(self, monkeypatch):
         monkeypatch.setattr(device_module, "_cuda_is_there", lambda: False)

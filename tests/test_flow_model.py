@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import os
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from flow_systems import (
@@ -10,7 +14,10 @@ from flow_systems import (
 from turbrestore.dynamics import DynamicsParams, identify
 from turbrestore.errors import DataError
 from turbrestore.flow_model import flow_of, predict_flow, project
+from turbrestore.scratch import new_stack, release
 from turbrestore.simulation import simulate, stable_system
+
+STATM = Path("/proc/self/statm")
 
 
 @pytest.fixture
@@ -73,3 +80,31 @@ def test_unusable_states_and_flows_are_a_clear_error(rng):
 def test_flow_variance_is_that_of_the_flows_whatever_the_rank(noise_flows, rank):
     found = identify(noise_flows, DynamicsParams(rank=rank)).flow_variance
     np.testing.assert_allclose(found, noise_flows.var(axis=0, ddof=1).mean(axis=-1), rtol=1e-4)
+
+
+def test_a_state_is_the_same_from_a_file_and_piece_by_piece(noise_flows, tmp_path, monkeypatch):
+    whole = identify(noise_flows, DynamicsParams(rank=7))
+    mapped = new_stack(whole.C.shape, tmp_path)
+    mapped[:] = whole.C
+    at_once = project(whole, noise_flows[3])
+    monkeypatch.setattr("turbrestore.scratch._PART", 70)
+    kept, filed = project(whole, noise_flows[3]), project(replace(whole, C=mapped), noise_flows[3])
+    np.testing.assert_array_equal(kept, filed)
+    np.testing.assert_allclose(kept, at_once, atol=1e-5)
+
+
+@pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
+def test_a_state_takes_a_piece_of_the_modes_at_a_time(rng, tmp_path):
+    dynamics = identify(rng.normal(size=(4, 256, 512, 2)).astype(np.float32), DynamicsParams(rank=2))
+    modes = new_stack((len(dynamics.C), 80), tmp_path)
+    modes[:] = 1e-3
+    release(modes)
+    before = resident()
+    project(replace(dynamics, C=modes), np.ones((256, 512, 2), np.float32))
+    # All of them are 84 MB.
+    assert resident() - before < 40e6
+
+
+def resident() -> int:
+    """Bytes of this process that are in memory."""
+    return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")

@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import os
 import struct
 import sys
 import tracemalloc
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from turbrestore import tiff_pages
 from turbrestore.errors import ConfigurationError, DataError, InputNotFoundError
 from turbrestore.frame_source import FrameSource
 from turbrestore.images import read_image
@@ -86,6 +88,25 @@ def test_lying_headers_cost_no_memory(run, tmp_path, name):
     refused(run(*[word.format(**places) for word in bomb.command]), tmp_path)
 
 
+def test_pipes_and_devices_are_no_input(run, tmp_path):
+    """Whatever reads them would wait for a writer, or fill the memory."""
+    cv2.imwrite(str(tmp_path / "truth.png"), np.zeros((32, 32), np.uint8))
+    for suffix in (".mkv", ".npy", ".ser", ".tif"):
+        os.mkfifo(tmp_path / f"a{suffix}")
+        refused(run("info", tmp_path / f"a{suffix}"), tmp_path)
+    for suffix in (".png", ".npz"):
+        os.mkfifo(tmp_path / f"a{suffix}")
+        refused(run("deconvolve", tmp_path / f"a{suffix}", tmp_path / "a.result.png"), tmp_path)
+    for name, truth in (("z.png", "truth.png"), ("z.flo", "z.flo"), ("z.mkv", "truth.png")):
+        (tmp_path / name).symlink_to("/dev/zero")
+        result = run("evaluate", tmp_path / name, tmp_path / truth)
+        refused(result, tmp_path)
+        assert "a device" in result[2] or name == "z.mkv"
+    for read in (read_npz, map_npy):
+        with pytest.raises(DataError, match="a named pipe"):
+            read(tmp_path / "a.npy")
+
+
 CONTENT = {
     f"{content.name} {' '.join(content.options)}": content
     for content in hostile.CONTENT
@@ -152,6 +173,15 @@ class TestArrayFiles:
             with pytest.raises(DataError, match="not a whole"):
                 read(tmp_path / f"a.{'npy' if read is map_npy else 'npz'}")
 
+    def test_members_within_each_other_cost_no_memory(self, tmp_path):
+        hostile._nested_npz(tmp_path / "a.npz")
+        tracemalloc.start()
+        with pytest.raises(DataError, match="members hold more than"):
+            read_npz(tmp_path / "a.npz")
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 1e6
+
     def test_objects_are_not_unpickled(self, tmp_path):
         harmful = b"cbuiltins\nexec\n(S'raise SystemExit(99)'\ntR."
         (tmp_path / "a.npy").write_bytes(hostile._npy_header((2,), "|O") + harmful)
@@ -186,6 +216,99 @@ class TestInflation:
             for page in pages:
                 tiff.write(page, photometric="rgb", compression=compression, metadata=None, **options)
         np.testing.assert_array_equal(open_tiff(tmp_path / "a.tif").read(), stack / np.float32(65535))
+
+    @pytest.mark.parametrize("compression", [1, 5, 8, 32773, 32946])
+    @pytest.mark.parametrize("form", [(33, 35), (33, 35, 3), (33, 35, 4)])
+    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+    def test_whole_still_tiffs_are_read(self, tmp_path, compression, form, dtype):
+        pixels = np.random.default_rng(0).integers(0, 2, form).astype(dtype)
+        cv2.imwrite(str(tmp_path / "a.tif"), pixels, [cv2.IMWRITE_TIFF_COMPRESSION, compression])
+        with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+            assert tiff.pages.first.compression == compression
+        assert np.ptp(read_image(tmp_path / "a.tif").image) > 0
+
+    # OpenCV does not read tiles of RGB that are not compressed.
+    @pytest.mark.parametrize(
+        ("options", "compression"),
+        [
+            ({"tile": (16, 16)}, "zlib"),
+            ({"rowsperstrip": 5}, "zlib"),
+            ({"rowsperstrip": 5}, None),
+            ({"planarconfig": "separate"}, "zlib"),
+            ({"planarconfig": "separate"}, None),
+        ],
+    )
+    def test_still_tiffs_of_tiles_strips_and_planes_are_read(self, tmp_path, options, compression):
+        pixels = np.random.default_rng(0).integers(0, 256, (33, 35, 3), dtype=np.uint8)
+        stored = np.moveaxis(pixels, -1, 0) if "planarconfig" in options else pixels
+        tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", compression=compression, **options)
+        np.testing.assert_array_equal(read_image(tmp_path / "a.tif").image, pixels / np.float32(255))
+
+    @pytest.mark.parametrize("mode", ["1", "P", "L", "RGBA"])
+    @pytest.mark.parametrize("compression", ["raw", "packbits", "tiff_lzw", "tiff_adobe_deflate", "jpeg"])
+    def test_still_tiffs_of_other_kinds_are_read(self, tmp_path, mode, compression):
+        import PIL.Image
+
+        if mode in ("1", "P", "RGBA") and compression == "jpeg":
+            mode = "RGB"
+        image = PIL.Image.fromarray(np.uint8(np.arange(63).reshape(7, 9)))
+        image.convert(mode).save(tmp_path / "a.tif", compression=compression)
+        assert read_image(tmp_path / "a.tif").image.shape[:2] == (7, 9)
+
+    @pytest.mark.parametrize("compression", ["zlib", "lzma"])
+    def test_stacks_of_flipped_or_short_parts_are_refused(self, tmp_path, compression):
+        frames = np.random.default_rng(0).integers(0, 256, (2, 40, 50), dtype=np.uint8)
+        tifffile.imwrite(tmp_path / "a.tif", frames, photometric="minisblack", compression=compression)
+        with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+            start, size = tiff.pages[1].dataoffsets[0], tiff.pages[1].databytecounts[0]
+        data = (tmp_path / "a.tif").read_bytes()
+        for place, length in ((start + size - 20, 20), (start + size // 2, 1)):
+            (tmp_path / "a.tif").write_bytes(data[:place] + bytes(length) + data[place + length :])
+            with pytest.raises(DataError, match="damaged"):
+                open_tiff(tmp_path / "a.tif").read()
+
+    def test_every_flip_in_a_deflated_still_is_found(self, tmp_path):
+        span = hostile.write_still(tmp_path / "a.tif", "deflate")
+        for data in hostile.flipped_still(tmp_path / "a.tif", span, 40):
+            (tmp_path / "b.tif").write_bytes(data)
+            with pytest.raises(DataError, match="compressed pixels are damaged"):
+                read_image(tmp_path / "b.tif")
+
+    @pytest.mark.parametrize("shape", [(1, 1), (7, 300), (150, 200), (300, 400)])
+    @pytest.mark.parametrize("levels", [1, 2, 20, 256])
+    def test_whole_lzw_is_counted_as_it_is(self, tmp_path, capfd, shape, levels):
+        import PIL.Image
+
+        pixels = np.random.default_rng(levels).integers(0, levels, shape, dtype=np.uint8)
+        PIL.Image.fromarray(pixels).save(tmp_path / "a.tif", compression="tiff_lzw")
+        with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+            page = tiff.pages.first
+            found = 0
+            for start, size in zip(page.dataoffsets, page.databytecounts, strict=True):
+                data = (tmp_path / "a.tif").read_bytes()[start : start + size]
+                found += tiff_pages._lzw_size(tmp_path, data, 10**9)
+        assert found == pixels.size
+        np.testing.assert_array_equal(read_image(tmp_path / "a.tif").image, pixels / np.float32(255))
+        assert capfd.readouterr().err == ""
+
+    @pytest.mark.parametrize("compression", ["LZW", "PackBits"])
+    def test_what_a_decoder_would_complain_of_is_refused(self, tmp_path, capfd, compression):
+        span, refusals = hostile.write_still(tmp_path / "a.tif", compression), 0
+        for data in hostile.flipped_still(tmp_path / "a.tif", span, 60):
+            (tmp_path / "b.tif").write_bytes(data)
+            try:
+                read_image(tmp_path / "b.tif")
+            except DataError:
+                refusals += 1
+        assert capfd.readouterr().err == ""
+        assert refusals
+
+    def test_a_still_whose_end_is_zeroed_is_refused(self, tmp_path):
+        _, stop = hostile.write_still(tmp_path / "a.tif", "deflate")
+        data = (tmp_path / "a.tif").read_bytes()
+        (tmp_path / "a.tif").write_bytes(data[: stop - 30] + bytes(30) + data[stop:])
+        with pytest.raises(DataError, match="damaged"):
+            read_image(tmp_path / "a.tif")
 
     @pytest.mark.parametrize("form", [(), (5, 7), (5, 7, 3), (5, 7, 4)])
     @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -14,12 +14,16 @@ from conftest import make_sequence
 from turbrestore import pipeline
 from turbrestore.centroid import CentroidParams
 from turbrestore.deconvolution import DeconvolutionParams
+from turbrestore.deconvolution_memory import NonlocalWork
+from turbrestore.device import TORCH_BYTES
 from turbrestore.dynamics import DynamicsParams
 from turbrestore.errors import ConfigurationError, StorageError
 from turbrestore.flow import FlowParams
 from turbrestore.frame_source import FrameSource
-from turbrestore.memory import MemorySize, StageMemory, plan_memory, training_share
-from turbrestore.restoration import RestoreParams
+from turbrestore.memory import StageMemory, plan_memory, training_share
+from turbrestore.memory_size import MemorySize
+from turbrestore.nonlocal_tv import NonlocalParams
+from turbrestore.restoration import STAGES, RestoreParams
 from turbrestore.resumption import KeptStages, stage_facts
 from turbrestore_cli.__main__ import main
 
@@ -39,6 +43,7 @@ def frames():
 
 def limit_that(shape, holds, **settings):
     """Return the largest limit, in steps of 200 kB, whose plan is like that."""
+    settings = {"deconvolution": QUICK.deconvolution, **settings}
     for limit in np.arange(4e8, 1.6e8, -2e5):
         plan = plan_memory(shape, limit, **settings)
         if holds(plan):
@@ -69,6 +74,25 @@ def test_what_is_no_size_is_refused(text):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(("text", "meant"), [("2GBB", "2GB"), ("2G", "2GB"), ("512 k", "512kB"), ("1.5mi", "1.5MiB")])
+def test_a_unit_that_is_nearly_right_is_suggested(text, meant):
+    with pytest.raises(ConfigurationError, match=rf"did you mean {meant}\?"):
+        MemorySize(text)
+
+
+@pytest.mark.parametrize("text", ["2QB", "2 bananas", "plenty"])
+def test_nothing_is_suggested_for_a_guess(text):
+    with pytest.raises(ConfigurationError) as caught:
+        MemorySize(text)
+    assert "did you mean" not in str(caught.value)
+
+
+def test_the_deconvolution_takes_a_size_too():
+    assert DeconvolutionParams(memory="500MB").memory == 5e8
+    with pytest.raises(ConfigurationError, match=r"^--deconvolution\.memory: expected a size such as 2GB"):
+        DeconvolutionParams(memory="5QB")
+
+
 def test_without_a_limit_nothing_changes():
     plan = plan_memory(FULL_HD, flow=FlowParams(threads=3))
     assert (plan.train, plan.threads, plan.in_file, plan.decisions) == (60, 3, False, ())
@@ -88,10 +112,11 @@ def test_what_changes_no_result_comes_first():
 
 def test_threads_are_kept_where_a_file_is_enough():
     shape = (100, 480, 640)
-    limit = 9e8
+    limit = 6.5e8
     alone = plan_memory(shape, limit, flow=FlowParams(threads=1))
-    assert plan_memory(shape, limit, flow=FlowParams(threads=3)).threads == 3
-    assert not alone.in_file
+    three = plan_memory(shape, limit, flow=FlowParams(threads=3))
+    assert (three.threads, three.in_file) == (3, True)
+    assert (alone.threads, alone.in_file) == (1, False)
 
 
 @given(
@@ -101,22 +126,85 @@ def test_threads_are_kept_where_a_file_is_enough():
     st.sampled_from([(), (3,)]),
     st.floats(1e6, 1e12),
     st.sampled_from(["dis", "tvl1", "farneback"]),
+    st.sampled_from(STAGES),
+    st.none() | st.integers(2, 3000),
+    st.booleans(),
 )
-@settings(max_examples=60, deadline=None)
-def test_a_plan_keeps_the_limit_or_names_one_that_can_be_kept(count, height, width, colour, limit, method):
-    shape, flow = (count, height, width, *colour), FlowParams(method=method, threads=4)
+@settings(max_examples=100, deadline=None)
+def test_a_plan_keeps_the_limit_or_names_one_that_can_be_kept(
+    count, height, width, colour, limit, method, until, wanted, on_device
+):
+    shape, wanted = (count, height, width, *colour), wanted if wanted is None else min(wanted, count)
+    rest = {"flow": FlowParams(method=method, threads=4), "wanted": wanted, "until": until, "on_device": on_device}
     try:
-        plan = plan_memory(shape, limit, flow=flow)
+        plan = plan_memory(shape, limit, **rest)
     except ConfigurationError as error:
         words = str(error).split("expected at least ")[1].split(" for frames")[0]
         least = MemorySize(words)
         assert least > limit
-        assert plan_memory(shape, least, flow=flow).train >= 2
+        assert plan_memory(shape, least, **rest).train >= 2
         return
-    assert 2 <= plan.train <= training_share(count, shape[1:])
+    assert 2 <= plan.train <= training_share(count, shape[1:], wanted)
     assert 1 <= plan.threads <= 4
-    assert 0 < plan.deconvolution < limit
-    assert plan.file_bytes >= 0 and plan.in_file == (plan.file_bytes > 0)
+    if until == "deconvolve":
+        assert 0 < plan.deconvolution < limit
+        assert DeconvolutionParams(memory=plan.deconvolution).memory == plan.deconvolution
+        assert plan.file_bytes >= 0 and (plan.file_bytes > 0 or not plan.in_file)
+    else:
+        assert plan.deconvolution is None
+        assert plan.in_file == (plan.file_bytes > 0)
+    assert plan.tight or not plan.decisions
+
+
+def test_a_limit_beyond_all_memory_is_none():
+    assert plan_memory(FULL_HD, 2e15).deconvolution <= 1e15
+    assert not plan_memory(FULL_HD, 2e15).tight
+
+
+def test_torch_counts():
+    limits = (plan_memory(FULL_HD, 1e12, on_device=device).deconvolution for device in (False, True))
+    assert next(limits) - next(limits) == TORCH_BYTES
+
+
+def test_a_limit_for_a_run_that_does_not_deconvolve(frames):
+    limit = limit_that(frames.shape, lambda plan: plan.in_file, wanted=24, flow=QUICK.flow, until="centroid")
+    settings = replace(QUICK, train=24, until="centroid", deconvolution=DeconvolutionParams(), memory_limit=limit)
+    assert pipeline.restore(frames, settings).train == 24
+
+
+def test_room_is_asked_for_all_files(frames, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(pipeline, "check_space", lambda path, size: asked.append((path.parent, size)))
+    settings = replace(QUICK, deconvolution=DeconvolutionParams(sigma=1.0, iterations=2, memory="1MB"))
+    pipeline.restore(frames, settings, scratch=tmp_path)
+    # The margin of four widths is part of it.
+    assert asked == [(tmp_path, int(NonlocalWork((104, 104), 1, NonlocalParams()).pairs()))]
+
+
+def test_pairs_lie_in_the_folder_that_is_named(frames, tmp_path, monkeypatch):
+    def full(shape, folder):
+        raise StorageError(f"{folder} has no room")
+
+    for module in ("nonlocal_tv", "nonlocal_penalty"):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"turbrestore.{module}.new_stack", full)
+            settings = replace(QUICK, deconvolution=DeconvolutionParams(sigma=1.0, memory="1MB"))
+            with pytest.raises(StorageError, match=rf"^{tmp_path} has no room"):
+                pipeline.restore(frames, settings, scratch=tmp_path)
+
+
+@pytest.mark.parametrize(("limit", "tight"), [(None, False), ("20GB", False), ("300MB", True)])
+def test_the_allocator_is_left_alone_where_there_is_room(frames, monkeypatch, limit, tight):
+    wanted = []
+
+    def returning(wish):
+        wanted.append(wish)
+        raise StorageError("seen")
+
+    monkeypatch.setattr(pipeline, "returning_freed", returning)
+    with pytest.raises(StorageError, match="seen"):
+        pipeline.restore(frames, replace(QUICK, memory_limit=limit))
+    assert wanted == [tight]
 
 
 def test_more_memory_is_never_worse():
@@ -166,7 +254,7 @@ def test_a_disk_without_room_is_refused_before_the_work(frames, in_file, tmp_pat
 
     monkeypatch.setattr(pipeline, "check_space", full)
     monkeypatch.setattr(pipeline, "find_centroid", None)
-    with pytest.raises(StorageError, match="training frames: needs"):
+    with pytest.raises(StorageError, match="what memory does not hold: needs"):
         pipeline.restore(frames, in_file, scratch=tmp_path)
 
 

@@ -30,7 +30,7 @@ def by_operators(graph: NonlocalGraph) -> Regulariser:
 
 @pytest.fixture(params=[1, 10_000], ids=["strips", "whole"])
 def graph(request, monkeypatch):
-    monkeypatch.setattr("turbrestore.nonlocal_tv._STRIP_PIXELS", request.param)
+    monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", request.param)
     guide = np.random.default_rng(0).random((23, 14)).astype(np.float32)
     return nonlocal_weights(guide, NonlocalParams(patch=3, search=7, best=5))
 

@@ -66,7 +66,7 @@ def test_bands_tiles_and_strips_leave_no_seam(monkeypatch):
     for name, size in (
         ("patch_search.BAND_ROWS", 7),
         ("patch_search._TILE_COLUMNS", 6),
-        ("nonlocal_tv._STRIP_PIXELS", 1),
+        ("nonlocal_tv.STRIP_PIXELS", 1),
     ):
         monkeypatch.setattr(f"turbrestore.{name}", size)
     parts = nonlocal_weights(guide, SMALL)

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import stat
 import subprocess
 import sys
 from collections import namedtuple
@@ -124,6 +125,28 @@ def test_a_disk_that_is_too_full_is_told_before_the_work(place, monkeypatch, cap
     assert [path.name for path in place.iterdir()] == ["clip.npy"]
 
 
+@pytest.mark.parametrize(
+    ("words", "stage"),
+    [
+        (["centroid", "clip.npy", "c.npz"], "stages.find_centroid"),
+        (["flow", "centroid.npz", "clip.npy", "f.npy"], "stages.estimate_flow"),
+        (["identify", "centroid.npz", "d.npz"], "stages.identify_flows"),
+        (["filter", "clip.npy", "centroid.npz", "dynamics.npz", "o.tif"], "stages.filter_frames"),
+        (["synthesize", "chart", "s.mkv", "--size=256x256", "--frames=9"], "synthesis._write_frames"),
+    ],
+)
+def test_every_stage_asks_for_room_before_the_work(place, monkeypatch, capsys, words, stage):
+    assert main(["restore", "clip.npy", "o.png", "--keep=kept", "--sigma=0", *QUICK]) == 0
+    for name in ("centroid.npz", "dynamics.npz"):
+        (place / "kept" / name).rename(place / name)
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr("turbrestore.images.shutil.disk_usage", lambda _: usage(1 << 30, 0, 1 << 20))
+    monkeypatch.setattr(f"turbrestore_cli.{stage}", None)
+    before = sorted(place.iterdir())
+    fails(capsys, [*words, "--quiet"], StorageError.exit_code, "make room on the disk")
+    assert sorted(place.iterdir()) == before
+
+
 def test_room_is_asked_for_with_a_margin(tmp_path):
     free = shutil.disk_usage(tmp_path).free
     check_space(tmp_path / "o.png", free // 2)
@@ -173,10 +196,32 @@ def test_a_folder_that_is_no_folder_cannot_hold_an_output(place, capsys):
     fails(capsys, ["restore", "clip.npy", "loop/o.png"], OutputError.exit_code, "loop")
 
 
+@pytest.mark.parametrize("kind", ["pipe", "device", "link to a device", "link to a pipe"])
+def test_what_is_no_file_is_not_replaced(place, capsys, kind):
+    path = place / "o.png"
+    if kind == "device":
+        try:
+            os.mknod(path, 0o600 | stat.S_IFCHR, os.makedev(1, 7))
+        except OSError:
+            pytest.skip("making a device needs rights")
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "link to a device":
+        path.symlink_to("/dev/full")
+    else:
+        os.mkfifo(place / "pipe")
+        path.symlink_to("pipe")
+    words = ["restore", "clip.npy", "o.png", "--overwrite", *QUICK]
+    fails(capsys, words, OutputError.exit_code, "o.png: is a device or a pipe")
+    assert not path.is_file()
+
+
 def test_no_command_opens_a_socket(place):
     """Everything runs in a process that would end with 99 if it did."""
     commands = [
-        ["info", "clip.npy"],
+        ["synthesize", "chart", "clip.mkv", "--frames=4", "--size=64x64", "--quiet"],
+        ["info", "clip.mkv"],
+        ["restore", "clip.mkv", "video.png", "--sigma=1", *QUICK],
         ["restore", "clip.npy", "o.png", "--keep=kept", "--report=r.html", "--sigma=1", *QUICK],
         ["report", "kept", "--quiet"],
         ["deconvolve", "kept/filtered.npz", "d.png", "--sigma=1", "--deconvolution.iterations=2", "--quiet"],

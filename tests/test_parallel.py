@@ -1,4 +1,5 @@
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -35,6 +36,37 @@ def test_opencv_threads_are_given_back():
     before = cv2.getNumThreads()
     list(map_ahead(abs, [1]))
     assert cv2.getNumThreads() == before
+
+
+def test_streams_that_are_worked_on_in_turns_give_the_threads_back():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        pairs = zip(map_ahead(abs, [1, 2]), map_ahead(abs, [3, 4, 5]), strict=False)
+        next(pairs)
+        assert cv2.getNumThreads() == 1
+        list(pairs)
+        del pairs
+        assert cv2.getNumThreads() == 2
+        first, second = map_ahead(abs, [1, 2]), map_ahead(abs, [3, 4])
+        next(first), next(second)
+        first.close()
+        assert cv2.getNumThreads() == 1
+        second.close()
+        assert cv2.getNumThreads() == 2
+    finally:
+        cv2.setNumThreads(before)
+
+
+def test_uses_in_several_threads_give_the_threads_back():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(lambda n: list(map_ahead(abs, range(n), threads=1)), range(40)))
+        assert cv2.getNumThreads() == 2
+    finally:
+        cv2.setNumThreads(before)
 
 
 def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads():

@@ -29,7 +29,8 @@ from turbrestore.report import check_report, facts, pictures, render_report, wri
 from turbrestore.report.vector import inline_svg
 from turbrestore.run_record import RUN_FILES, RunRecord, describe_run, load_run, save_run
 from turbrestore.video import write_video
-from turbrestore_cli.__main__ import build, main
+from turbrestore_cli.__main__ import main
+from turbrestore_cli.application import build
 from turbrestore_cli.options import Selection
 from turbrestore_cli.output import repeating_command, settings_record
 
@@ -287,6 +288,12 @@ class TestFiles:
         save_run(tmp_path, found, run)
         same(load_run(tmp_path)[0], found)
 
+    def test_names_need_not_be_text(self, whole, run, tmp_path):
+        odd = dataclasses.replace(run, name="bad\udcff.mkv", command=("turbrestore", "restore", "bad\udcff.mkv"))
+        save_run(tmp_path, whole, odd)
+        write_report(tmp_path / "r.html", *load_run(tmp_path))
+        assert "bad?.mkv" in (tmp_path / "r.html").read_text("utf-8")
+
 
 def same(found, expected):
     """Equal, field by field, down to every array."""
@@ -341,6 +348,15 @@ DAMAGE = {
     "number for text": (spoil("run.name", 3), DataError),
     "flag for number": (spoil("restoration.train", True), DataError),
     "text for time": (spoil("restoration.seconds", {"filter": "long"}), DataError),
+    "schema is a flag": (spoil("schema", True), DataError),
+    "no section of settings": (spoil("run.settings.centroid", None), DataError),
+    "text in a setting": (spoil("run.settings.centroid", {"tolerance": "small"}), DataError),
+    "more than a number holds": (spoil("restoration.seconds", {"filter": 10**400}), DataError),
+    "reading is no record": (spoil("restoration.guard_readings", [1]), DataError),
+    "verdict of a guard is no flag": (
+        spoil("restoration.guard_readings", [{"sigma": 1, "overshoot": 1, "noise_gain": 1, "passed": 1}]),
+        DataError,
+    ),
     "half a decision": (spoil("restoration.decisions", [{"subject": "blur"}]), DataError),
     "unknown result": (spoil("restoration.results", ["centroid", "hologram"]), DataError),
     "no centroid": (spoil("restoration.results", []), DataError),

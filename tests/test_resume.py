@@ -18,16 +18,17 @@ from conftest import make_sequence
 from turbrestore.alternating import FilterCheckpoint, FilterParams, FilterState, FrameRecord
 from turbrestore.centroid import CentroidParams
 from turbrestore.checkpoint import load_checkpoint, save_checkpoint
+from turbrestore.digests import content_digest
 from turbrestore.errors import ConfigurationError, DataError, OutputError
 from turbrestore.folder_lock import LOCK, lock_folder
 from turbrestore.frame_source import FrameSource
 from turbrestore.kalman import Gaussian, PixelGaussian
 from turbrestore.pipeline import RestoreParams, restore
-from turbrestore.resumption import KeptStages, content_digest, read_stages, stage_facts
+from turbrestore.resumption import KeptStages, read_stages, stage_facts
 from turbrestore.video import open_frames, write_video
 from turbrestore_cli.__main__ import main
 
-SETTINGS = ["--train=8", "--centroid.iterations=1", "--deconvolution.iterations=3"]
+SETTINGS = ["--train=8", "--centroid.iterations=1", "--filter.block=8", "--deconvolution.iterations=3"]
 OFTEN = "--checkpoint-every=8"
 STAGES = ("find_centroid", "identify", "filter_frames", "remove_blur")
 WORDS = ["restore", "clip.mkv", "sharp.png", "--keep=kept", OFTEN, *SETTINGS]
@@ -139,7 +140,7 @@ def test_what_is_done_is_not_done_again(place, monkeypatch):
 
 
 def params_of(words):
-    from turbrestore_cli.__main__ import build
+    from turbrestore_cli.application import build
 
     _, bound, _ = build().parse_args(words, exit_on_error=False, print_error=False)
     return bound.arguments["params"]
@@ -367,7 +368,7 @@ class TestContent:
         assert content_digest(open_frames(folder)) != before
 
     def test_a_huge_file_is_sampled(self, tmp_path, monkeypatch):
-        monkeypatch.setattr("turbrestore.resumption._WHOLE", 1000)
+        monkeypatch.setattr("turbrestore.digests._WHOLE", 1000)
         path = tmp_path / "a.npy"
         np.save(path, np.zeros((100, 64, 64), np.float32))
         source = open_frames(path)

@@ -24,7 +24,7 @@ from turbrestore.images import read_image, write_image
 from turbrestore.pipeline import Restoration, RestoreParams
 from turbrestore.run_record import RunRecord, load_run, save_run
 from turbrestore.video import open_frames, write_video
-from turbrestore_cli.__main__ import build
+from turbrestore_cli.application import build
 from turbrestore_cli.options import Selection
 from turbrestore_cli.output import settings_record, write_settings
 
@@ -136,7 +136,7 @@ def kept_run(folder, kept):
 APP = functools.cache(build)
 
 
-# Shapes that fit together; what one field allows is what the stage can make.
+# What a stage can make: shapes that fit together, values from 0 to 1, and a covariance.
 def results(kind):
     """Results of a stage with every field made up."""
     shapes = st.tuples(st.integers(2, 5), st.integers(2, 5), st.integers(1, 3))
@@ -146,15 +146,25 @@ def results(kind):
 def _fields(kind, height, width, count):
     dims = {
         "image": (height, width), "variance": (height, width), "flows": (count, height, width, 2),
-        "C": (height * width * 2, count), "A": (count, count), "Q": (count, count), "mean_flow": (height, width, 2),
+        "C": (height * width * 2, count), "A": (count, count), "mean_flow": (height, width, 2),
+        "residual_variance": (height, width), "motion_factor": (height, width), "states": (count, count + 1),
+        "singular_values": (count + 1,), "flow_states": (count, 2),
     }  # fmt: skip
-    scalars = {"float": NUMBERS, "int": st.integers(0, 10**9), "bool": st.booleans()}
+    scalars = {"float": st.floats(0, 1), "int": st.integers(1, 10**9), "bool": st.booleans()}
     scalars["tuple[str, ...]"] = st.lists(TEXT, max_size=3).map(tuple)
     found = {}
     for item in dataclasses.fields(kind):
-        text = str(item.type)
-        dtype = np.float32 if text == "FloatArray" else np.int64 if "int64" in text else np.float64
-        found[item.name] = scalars[text] if text in scalars else raw(dtype, dims.get(item.name, (count,)))
+        text, shape = str(item.type), dims.get(item.name, (count,))
+        if text in scalars:
+            found[item.name] = scalars[text]
+        elif item.name == "Q":
+            found["Q"] = raw(np.uint32, (count, count)).map(lambda bits: (bits / 2.0**32) @ (bits / 2.0**32).T)
+        elif "int64" in text:
+            found[item.name] = raw(np.uint16, shape).map(np.int64)
+        else:
+            found[item.name] = (
+                floats(*shape) if text == "FloatArray" else raw(np.uint32, shape).map(lambda x: x / 2**32)
+            )
     return found
 
 

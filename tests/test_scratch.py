@@ -8,6 +8,7 @@ import sys
 import textwrap
 from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.errors import StorageError
-from turbrestore.scratch import mean_of, new_stack, parts, release, variance_of, walk
+from turbrestore.scratch import mean_of, new_stack, parts, release, returning_freed, variance_of, walk
 
 STATM = Path("/proc/self/statm")
 SHAPES = st.lists(st.integers(1, 7), min_size=1, max_size=4).map(tuple)
@@ -103,8 +104,28 @@ def test_what_is_no_map_is_left_alone():
 def test_a_full_disk_is_a_clear_error(tmp_path, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage(10**9, 10**9 - 10**8, 10**8))
-    with pytest.raises(StorageError, match=r"expected 0\.4 GB free .*, found 0\.1 GB; name another folder by TMPDIR"):
+    with pytest.raises(StorageError, match=r"expected 0\.4 GB free .*, found 0\.1 GB; name another --keep folder"):
+        new_stack((100, 1000, 1000), tmp_path)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(StorageError, match="name another folder by TMPDIR"):
         new_stack((100, 1000, 1000), tmp_path)
     with pytest.raises(StorageError, match="nowhere: cannot hold"):
         monkeypatch.undo()
         new_stack((2, 2), tmp_path / "nowhere")
+
+
+def test_the_allocator_gets_back_what_it_had(monkeypatch):
+    calls = []
+    library = SimpleNamespace(mallopt=lambda *setting: calls.append(setting))
+    monkeypatch.setattr("ctypes.CDLL", lambda name: library)
+    monkeypatch.setattr("platform.libc_ver", lambda: ("glibc", "2.36"))
+    with returning_freed(False):
+        pass
+    assert calls == []
+    with pytest.raises(KeyError), returning_freed():
+        assert calls == [(-3, 1 << 20)]
+        raise KeyError
+    assert calls[1:] == [(-3, 32 << 20), (-1, 64 << 20)]
+    monkeypatch.setattr("platform.libc_ver", lambda: ("", ""))
+    with returning_freed():
+        assert len(calls) == 3

@@ -11,8 +11,8 @@ from packaging.version import Version
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-# What `.ci/run` installs at its oldest; of torch one version alone has builds without CUDA.
-OLDEST = [Requirement(text) for text in (*PROJECT["dependencies"], *EXTRAS["report"], *EXTRAS["dev"])]
+# What `.ci/run` installs at its oldest.
+OLDEST = [Requirement(text) for text in (*PROJECT["dependencies"], *EXTRAS["torch"], *EXTRAS["report"], *EXTRAS["dev"])]
 ALL = [Requirement(text) for text in (*PROJECT["dependencies"], *(text for extra in EXTRAS.values() for text in extra))]
 # Style and types are checked with the newest version alone.
 CHECKERS = {"ruff", "mypy"}

@@ -99,20 +99,21 @@ class FilterParams:
         S: variance by which the image may drift from one frame to the next, squared intensity.
     prior_frames : float
         How many frames' worth of information the starting image carries; 0 lets the first frames replace it.
-    device : str
-        Where frames are warped and fused: cpu, cuda or auto; on the processor where blur is what counts.
+    device : str, optional
+        Where frames are warped and fused: cpu, cuda or auto; on the processor where blur is what counts.  By
+        default where the whole chain is computed, and cpu for this stage alone.
     """
 
     residual: Literal["keep", "drop"] = "keep"
     inner_iterations: int = 2
-    block: int = 8
+    block: int = 24
     frame_noise: Literal["sharpness", "blur"] = "sharpness"
     sharpness: float = 2.0
     sharpness_window: float = 3.0
     image_noise: float | None = None
     image_drift: float = 0.0
     prior_frames: float = 0.0
-    device: str = PROCESSOR
+    device: str | None = None
 
     def __post_init__(self) -> None:
         require(
@@ -131,7 +132,8 @@ class FilterParams:
             require_between("image_noise", self.image_noise, 1e-12, 1)
         require_between("image_drift", self.image_drift, 0, 1)
         require_between("prior_frames", self.prior_frames, 0, 1e6)
-        check_device(self.device)
+        if self.device is not None:
+            check_device(self.device)
 
 
 @dataclass(frozen=True)
@@ -483,7 +485,7 @@ def _filter_block(
 
 def _fusion(model: FrameNoise, params: FilterParams) -> DeviceFusion | None:
     """Bring to a device what fusion needs; None for the processor, where alone blur is measured."""
-    device = find_device(params.device)
+    device = find_device(params.device or PROCESSOR)
     if device == PROCESSOR or model.blur is not None:
         return None
     return load_fusion(model, params.sharpness, params.image_drift, device)
@@ -549,7 +551,8 @@ def _update_motion(prior: Gaussian, pairs: Iterable[Pair], dynamics: FlowDynamic
         seen = project(dynamics, measured)
         state, _ = update_information(prediction, seen, unit, noise, orthonormal=True)
         foreseen = float(prediction.mean @ (2 * seen - prediction.mean))
-        squared = cv2.norm(measured, dynamics.mean_flow) ** 2 - foreseen
+        deviation = np.subtract(measured, dynamics.mean_flow, dtype=np.float64)
+        squared = float(np.vdot(deviation, deviation)) - foreseen
         yield _Motion(frame, measured, state, (max(squared, 0.0) / measured.size) ** 0.5)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from .alternating import Filtered
 from .arrays import FloatArray, check_flow, check_image
+from .artifact_fields import check_fields
 from .blur_cues import BlurBounds
 from .blur_estimation import BlurEstimate
 from .centroid import Centroid
@@ -24,6 +25,7 @@ from .deconvolution import Deconvolution
 from .errors import DataError, InputNotFoundError
 from .flow_model import FlowDynamics
 from .images import atomic_output, check_output, read_image
+from .input_files import check_input
 from .npy import map_npy, read_npz, write_npz
 
 if TYPE_CHECKING:
@@ -39,7 +41,6 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "blur_bounds": BlurBounds,
 }
 _HEADER = "header"
-_SCALARS: dict[str, Any] = {"float": (int, float), "int": int, "bool": bool, "tuple[str, ...]": list}
 
 Result = TypeVar("Result", bound="DataclassInstance")
 
@@ -108,7 +109,7 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Pat
     InputNotFoundError
         There is no such file.
     DataError
-        The file is damaged, of another kind, or of another version of the layout.
+        The file is damaged, of another kind, of another version of the layout, or holds what no stage makes.
 
     Examples
     --------
@@ -121,7 +122,7 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Pat
     name, (found, fields) = _kind_of(kind), _read(Path(path), scratch)
     if found != name:
         raise DataError(f"{path}: expected a {name} artifact, found a {found} artifact")
-    return _build(Path(path), kind, fields)
+    return _build(kind, fields)
 
 
 def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
@@ -235,28 +236,25 @@ def load_flows(path: str | os.PathLike[str]) -> FloatArray:
 
 def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any]]:
     """Kind and fields of an artifact."""
-    if not source.is_file():
+    if source.is_dir() or not source.exists():
         raise InputNotFoundError(f"{source}: no such file")
+    check_input(source)
     try:
         arrays = read_npz(source, scratch=scratch)
         header: dict[str, Any] = json.loads(str(arrays.pop(_HEADER)))
-        kind, schema, fields = str(header["kind"]), header["schema"], {**header["fields"], **arrays}
-    except (DataError, KeyError, TypeError, ValueError, AttributeError) as error:
+        kind, schema, fields = header["kind"], header["schema"], {**header["fields"], **arrays}
+        known = kind in KINDS
+    except (DataError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise DataError(f"{source}: expected an artifact of turbrestore, found something else or damage") from error
-    if schema != SCHEMA or kind not in KINDS:
-        raise DataError(f"{source}: expected an artifact of layout {SCHEMA}, found a {kind} of layout {schema}")
+    if type(schema) is not int or schema != SCHEMA or not known:
+        raise DataError(
+            f"{source}: expected an artifact of layout {SCHEMA}, found a {kind!r:.40} of layout {schema!r:.40}"
+        )
+    check_fields(kind, fields, str(source))
     return kind, fields
 
 
-def _build(source: Path, kind: type[Result], fields: dict[str, Any]) -> Result:
-    expected = {item.name for item in dataclasses.fields(kind)}
-    if set(fields) != expected:
-        raise DataError(f"{source}: expected the fields {sorted(expected)}, found {sorted(fields)}")
-    for item in dataclasses.fields(kind):
-        # Annotations are text here; what is no number, flag or list of text is an array.
-        wanted = _SCALARS.get(str(item.type), np.ndarray)
-        if not isinstance(fields[item.name], wanted) or isinstance(fields[item.name], bool) is not (wanted is bool):
-            raise DataError(f"{source}: expected {item.name} to be {item.type}, found {fields[item.name]!r:.40}")
+def _build(kind: type[Result], fields: dict[str, Any]) -> Result:
     return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})
 
 

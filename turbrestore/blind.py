@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from .arrays import FloatArray
 from .blur_cues import BlurBounds
@@ -46,6 +47,7 @@ def remove_blur(
     guards: GuardParams | None = None,
     bounds: BlurBounds | None = None,
     progress: Callable[[int], None] | None = None,
+    scratch: Path | None = None,
 ) -> Deblurred:
     """Deblur an image by the width asked for, else by the width estimated, as far as the guards allow.
 
@@ -67,6 +69,8 @@ def remove_blur(
         What an estimated width is kept within.
     progress : callable, optional
         Called with the number of iterations done.
+    scratch : Path, optional
+        Folder of the file for what memory does not hold; by default that of temporary files.
 
     Returns
     -------
@@ -76,6 +80,8 @@ def remove_blur(
     ------
     DataError
         Shapes do not agree, or values are not finite.
+    StorageError
+        There is no room for the file.
 
     Examples
     --------
@@ -97,8 +103,10 @@ def remove_blur(
 
     def attempt(width: float) -> Deconvolution:
         if tiles is None or not tiles.varies or width == 0:
-            return deconvolve(image, width, settings, guide=guide, progress=progress)
-        return deconvolve_varying(lambda part: deconvolve(image, part, settings, guide=guide), widths * (width / sigma))
+            return deconvolve(image, width, settings, guide, progress, scratch)
+        return deconvolve_varying(
+            lambda part: deconvolve(image, part, settings, guide, scratch=scratch), widths * (width / sigma)
+        )
 
     if blind:
         result, readings = deconvolve_guarded(attempt, image, sigma, guards)

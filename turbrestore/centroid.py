@@ -185,7 +185,7 @@ def find_centroid(
             total = compose_flows(total, recentre)
             _recentre(flows, recentre, flow_params.threads)
         image = (
-            mean_registered(stack, flows, flow_params.threads, flow_params.device)
+            mean_registered(stack, flows, flow_params.threads, flow_params.device or PROCESSOR)
             if params.mode == "fused"
             else warp(stack[params.start], total)
         )

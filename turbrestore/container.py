@@ -30,7 +30,7 @@ from .frame_source import (
     cut_short_text,
     skipped_end_text,
 )
-from .images import input_errors
+from .input_files import input_errors
 from .integrity import ffv1_slices_intact, is_cut_short
 from .limits import DEFAULT_LIMITS, Limits
 from .pixels import PixelArray

@@ -35,16 +35,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from .arrays import FloatArray, check_image, luminance
+from .arrays import FloatArray, check_image
 from .blur_estimation import BlurEstimate
 from .conjugate_gradients import ConjugateGradients
 from .convolution_problem import Problem, inner
+from .deconvolution_memory import NonlocalWork
 from .device import PROCESSOR, check_device, find_device
-from .errors import DataError, require, require_between
+from .errors import require, require_between
 from .local_tv import LOCAL_TV
+from .memory_size import DeconvolutionMemory
 from .nonlocal_penalty import NonlocalPenalty
 from .nonlocal_tv import NonlocalParams, nonlocal_weights
 from .parallel import available_cores, one_thread_each
+from .planes import join_planes, margin_widths, padded_guide, split_planes
 from .plots import plot_objective
 from .preview import preview
 from .primal_dual import Penalty, PrimalDual
@@ -67,15 +70,12 @@ METHODS = ("nltv", "tv", "wiener", "tikhonov")
 BOUNDARIES = ("unknown", "periodic")
 CHANNELS = ("luminance", "each")
 
-_MARGIN_SIGMAS = 4.0
+# Least margin, in widths of the blur.
+MARGIN_SIGMAS = 4.0
 # Steps and relative change at which the Wiener solution is good enough to start from.
 _START_STEPS = 40
 _START_TOLERANCE = 1e-4
 _RECORD_EVERY = 10
-# Memory: to work with, of the images of a channel for each pixel, of each pair, and of each pair for each channel.
-_WORK_BYTES, _IMAGE_BYTES, _PAIR_BYTES, _DUAL_BYTES = 1e8, 120, 8, 12
-# Pairs per pixel over those that a pixel chooses: many are chosen from both sides.
-_SHARE_OF_PAIRS = 0.65
 
 
 @dataclass(frozen=True)
@@ -106,12 +106,15 @@ class DeconvolutionParams:
         patches tell more about which pixels belong together (0.2 to 4 dB on photographs, brick and text).
     weights : NonlocalParams
         Nonlocal weights.
-    device : str
-        Where weights and image are computed: cpu, cuda or auto.
-    memory : float, optional
-        Bytes that nltv may take.  Where the nonlocal pairs and what is known of them need more, they are kept in a
-        file in the folder for temporary files and worked on in strips of rows, to the same result.  What remains is
-        120 bytes per pixel and 100 MB, whatever is asked for.  By default there is no limit.
+    device : str, optional
+        Where weights and image are computed: cpu, cuda or auto.  By default where the whole chain is computed, and cpu
+        for this stage alone.
+    memory : DeconvolutionMemory, optional
+        Most that nltv may take, such as 500MB; it has no effect on a device.  Where that is too little for the nonlocal
+        pairs and what is known of them, they are kept in a file and worked on in strips of rows, and then by fewer
+        threads, to the same result.  What remains is taken whatever is asked for: 120 bytes per pixel and channel, some
+        60 MB, and what grows with ``weights``, see :mod:`turbrestore.deconvolution_memory`.  By default there is no
+        limit.
     """
 
     method: Literal["nltv", "tv", "wiener", "tikhonov"] = "nltv"
@@ -124,8 +127,8 @@ class DeconvolutionParams:
     channels: Literal["luminance", "each"] = "luminance"
     sharpen_guide: bool = True
     weights: NonlocalParams = field(default_factory=NonlocalParams)
-    device: str = PROCESSOR
-    memory: float | None = None
+    device: str | None = None
+    memory: DeconvolutionMemory | None = None
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -142,9 +145,11 @@ class DeconvolutionParams:
             require_between("fidelity", self.fidelity, 1e-6, 1e9)
         require_between("iterations", self.iterations, 1, 100_000)
         require_between("tolerance", self.tolerance, 0, 1)
-        check_device(self.device)
+        if self.device is not None:
+            check_device(self.device)
         if self.memory is not None:
-            require_between("memory", self.memory, 1, 1e15, "bytes")
+            # A number or text is as good where settings are written in Python.
+            object.__setattr__(self, "memory", DeconvolutionMemory(self.memory))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +225,7 @@ def deconvolve(
     params: DeconvolutionParams | None = None,
     guide: ArrayLike | None = None,
     progress: Callable[[int], None] | None = None,
+    scratch: Path | None = None,
 ) -> Deconvolution:
     """Deblur an image.
 
@@ -238,6 +244,8 @@ def deconvolve(
         the centroid.
     progress : callable, optional
         Called with 1 after each iteration. Channels are solved side by side.
+    scratch : Path, optional
+        Folder of the file for what ``params.memory`` does not allow in memory; by default that of temporary files.
 
     Returns
     -------
@@ -249,6 +257,8 @@ def deconvolve(
         Wrong shapes, values that are not finite, or an unusable PSF.
     ConfigurationError
         ``sigma_or_psf`` is negative or not finite.
+    StorageError
+        There is no room for the file.
 
     Examples
     --------
@@ -265,20 +275,20 @@ def deconvolve(
         params = dataclasses.replace(params, exponent=params.exponent or sigma_or_psf.exponent)
         sigma_or_psf = sigma_or_psf.removable
     psf, sigma, margin = _read_blur(sigma_or_psf)
-    planes = _planes(pixels, params.channels)
+    planes = split_planes(pixels, params.channels)
     noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))
     fidelity = params.fidelity or automatic_fidelity(params.method, planes[0], noise)
     nothing = np.zeros(0)
     if sigma == 0:
         return Deconvolution(pixels, 0.0, fidelity, noise, 0, True, nothing.astype(np.int64), nothing, nothing)
-    widths = _margins(planes[0].shape, margin if params.boundary == "unknown" else None)
+    widths = margin_widths(planes[0].shape, margin if params.boundary == "unknown" else None)
     shape = tuple(size + sum(width) for size, width in zip(planes[0].shape, widths, strict=True))
     otf = blur_otf(shape, sigma, params.exponent or GAUSSIAN) if psf is None else psf_to_otf(psf, shape)
     seen = np.pad(np.ones_like(planes[0]), widths)
     problems = [Problem(np.pad(plane, widths, mode="symmetric"), seen, otf, fidelity) for plane in planes]
-    result = _solve(problems, params, _padded_guide(guide, planes[0].shape, widths), progress)
+    result = _solve(problems, params, padded_guide(guide, planes[0].shape, widths), progress, scratch)
     inside = tuple(slice(before, before + size) for (before, _), size in zip(widths, planes[0].shape, strict=True))
-    restored = _assemble(pixels, [u[inside] for u in result.images], params.channels)
+    restored = join_planes(pixels, [u[inside] for u in result.images], params.channels)
     return Deconvolution(np.clip(restored, 0, 1), sigma, fidelity, noise, *result[1:])
 
 
@@ -336,8 +346,9 @@ def _solve(
     params: DeconvolutionParams,
     guide: FloatArray | None,
     progress: Callable[[int], None] | None,
+    scratch: Path | None,
 ) -> _Solution:
-    if find_device(params.device) != PROCESSOR:
+    if find_device(params.device or PROCESSOR) != PROCESSOR:
         return _solve_on_device(problems, params, guide, progress)
     if params.method == "tikhonov":
         quadratic = ConjugateGradients(np.ones((1, 1), np.float32))
@@ -345,13 +356,14 @@ def _solve(
     if params.method == "wiener":
         quadratic = _wiener_solver(problems[0])
         return _iterate(quadratic, problems, [quadratic.start(p) for p in problems], params, progress)
-    cores = available_cores()
-    with one_thread_each(), fft.set_workers(cores), ThreadPoolExecutor(cores) as pool:
+    nonlocal_work = NonlocalWork(problems[0].seen.shape, len(problems), params.weights)
+    room = nonlocal_work.room(params.memory if params.method == "nltv" else None, available_cores())
+    with one_thread_each(), fft.set_workers(room.threads), ThreadPoolExecutor(room.threads) as pool:
         starts, guide = _sharpened(problems, guide, params, pool)
         penalty: Penalty = LOCAL_TV
         if params.method == "nltv":
-            folder = _folder_of_pairs(problems, params)
-            penalty = NonlocalPenalty(nonlocal_weights(guide, params.weights, folder), pool, folder)
+            folder = (scratch or Path(tempfile.gettempdir())) if room.in_file else None
+            penalty = NonlocalPenalty(nonlocal_weights(guide, params.weights, folder, room.threads), pool, folder)
         solver = PrimalDual(penalty)
         states = [solver.start(problem, u) for problem, u in zip(problems, starts, strict=True)]
         return _iterate(solver, problems, states, params, progress)
@@ -373,7 +385,7 @@ def _solve_on_device(
         params.sharpen_guide,
         params.weights,
     )
-    found = solve_on_device(problems, guide, settings, find_device(params.device), progress)
+    found = solve_on_device(problems, guide, settings, find_device(params.device or PROCESSOR), progress)
     recorded, objective, changes = zip(*found.records, strict=True)
     figures = np.array(recorded), np.array(objective), np.array(changes)
     return _Solution(found.images, found.iterations, found.converged, *figures)
@@ -427,14 +439,6 @@ def _wiener_image(problem: Problem) -> FloatArray:
     return state.image
 
 
-def _folder_of_pairs(problems: list[Problem], params: DeconvolutionParams) -> Path | None:
-    """Where nonlocal pairs are kept; None in memory, where there is room for them."""
-    pairs = _SHARE_OF_PAIRS * (params.weights.best + params.weights.nearest)
-    images, edges = _IMAGE_BYTES * len(problems), (_PAIR_BYTES + _DUAL_BYTES * len(problems)) * pairs
-    need = _WORK_BYTES + problems[0].seen.size * (images + edges)
-    return Path(tempfile.gettempdir()) if params.memory is not None and need > params.memory else None
-
-
 def _sharpened(
     problems: list[Problem], guide: FloatArray | None, params: DeconvolutionParams, pool: Executor
 ) -> tuple[list[FloatArray], FloatArray]:
@@ -459,42 +463,11 @@ def _read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | N
             np.isfinite(sigma) and sigma >= 0,
             f"sigma_or_psf: expected a finite number of 0 or more pixels, found {sigma}",
         )
-        return None, float(sigma), int(np.ceil(_MARGIN_SIGMAS * sigma))
+        return None, float(sigma), int(np.ceil(MARGIN_SIGMAS * sigma))
     psf = check_psf(sigma_or_psf)
     y, x = (np.arange(size) - size // 2 for size in psf.shape)
     squares = psf.sum(axis=1) @ y**2 + psf.sum(axis=0) @ x**2
     return psf, float(np.sqrt(squares / 2)), max(psf.shape) // 2
-
-
-def _planes(image: FloatArray, channels: str) -> list[FloatArray]:
-    if image.ndim == 3 and channels == "each":
-        return [np.ascontiguousarray(image[..., index]) for index in range(image.shape[2])]
-    return [luminance(image)]
-
-
-def _assemble(image: FloatArray, restored: list[FloatArray], channels: str) -> FloatArray:
-    if image.ndim == 2:
-        return restored[0]
-    if channels == "each":
-        return np.stack(restored, axis=-1)
-    return image + (restored[0] - luminance(image))[..., None]
-
-
-def _margins(shape: tuple[int, ...], margin: int | None) -> list[tuple[int, int]]:
-    """Pixels to add before and after each axis: ``margin`` or more, up to a size with a fast transform."""
-    if margin is None:
-        return [(0, 0)] * len(shape)
-    extra = [fft.next_fast_len(size + 2 * margin, real=True) - size for size in shape]
-    return [(total // 2, total - total // 2) for total in extra]
-
-
-def _padded_guide(guide: ArrayLike | None, shape: tuple[int, ...], widths: list[tuple[int, int]]) -> FloatArray | None:
-    if guide is None:
-        return None
-    grey = luminance(check_image(guide, "guide"))
-    if grey.shape != shape:
-        raise DataError(f"guide: expected the size of the image {shape}, found {grey.shape}")
-    return np.pad(grey, widths, mode="symmetric")
 
 
 def _relative_change(before: list[FloatArray], after: list[FloatArray], seen: FloatArray) -> float:

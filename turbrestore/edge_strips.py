@@ -12,6 +12,7 @@ added up in the order of the strips, so that the sum does not depend on which th
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -72,17 +73,28 @@ class EdgeStrip:
         """Values over the window, for the head of each pair."""
         return np.take(values, self.heads, mode="clip")
 
-    def gather(self, tails: tuple[FloatArray, FloatArray], heads: tuple[FloatArray, FloatArray]) -> FloatArray:
+    def gather(
+        self, tails: tuple[FloatArray, FloatArray], heads: tuple[FloatArray, FloatArray], subtract: bool = False
+    ) -> FloatArray:
         """Sum products of two functions on edges, one pair of them at the tails and one at the heads.
+
+        Parameters
+        ----------
+        tails, heads : tuple of two ndarrays, float32, shape (e,)
+        subtract : bool
+            Whether sums at the heads count as negative.
 
         Returns
         -------
         ndarray, float32, shape (window,)
         """
-        at_tails, at_heads = self._sums
+        # Shallow copies hold what is summed for this call alone: it is freed, and no other thread sees it.
+        at_tails, at_heads = (copy.copy(matrix) for matrix in self._sums)
         # A product with a matrix adds up products without an array of them.
         at_tails.data, at_heads.data = tails[0], heads[0]
         total: FloatArray = at_heads @ heads[1]
+        if subtract:
+            np.negative(total, out=total)
         total[: len(self.degrees)] += at_tails @ tails[1]
         return total
 

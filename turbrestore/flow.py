@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, check_frames, check_image, luminance
 from .confidence import flow_confidence, regularise_flow
-from .device import PROCESSOR, check_device, find_device
+from .device import PROCESSOR, check_device, find_device, memory_of
 from .errors import DataError, require, require_between
 from .parallel import map_ahead
 from .psf import estimate_noise
@@ -130,8 +130,9 @@ class FlowParams:
         Draw the flow of flat regions, and along edges, towards its neighbourhood.
     threads : int
         Frames solved side by side; 0 means one per available core.
-    device : str
-        Where ``tvl1`` runs: cpu, cuda or auto; the other methods are OpenCV's and run on the processor.
+    device : str, optional
+        Where ``tvl1`` runs: cpu, cuda or auto; the other methods are OpenCV's and run on the processor.  By
+        default where the whole chain is computed, and cpu for this stage alone.
     dis : DisParams
         Settings of dense inverse search.
     tvl1 : TvL1Params
@@ -146,7 +147,7 @@ class FlowParams:
     global_shift: bool = True
     confidence: bool = True
     threads: int = 0
-    device: str = PROCESSOR
+    device: str | None = None
     dis: DisParams = field(default_factory=DisParams)
     tvl1: TvL1Params = field(default_factory=TvL1Params)
     farneback: FarnebackParams = field(default_factory=FarnebackParams)
@@ -159,7 +160,8 @@ class FlowParams:
         require_between("contrast_window", self.contrast_window, 0, 1000, "pixels")
         require_between("contrast_floor", self.contrast_floor, 1e-6, 1)
         require_between("threads", self.threads, 0, 256)
-        check_device(self.device)
+        if self.device is not None:
+            check_device(self.device)
 
 
 def estimate_flow(
@@ -283,7 +285,7 @@ def iterate_flows(
             yield image
 
     # A device solves a batch at once, while the next is prepared; on the processor every frame has a thread.
-    on_device = params.method == "tvl1" and find_device(params.device) != PROCESSOR
+    on_device = params.method == "tvl1" and find_device(params.device or PROCESSOR) != PROCESSOR
     stream, size, threads = checked(), *((params.tvl1.batch, 2) if on_device else (1, params.threads))
     for batch, flows in map_ahead(solve, iter(lambda: list(islice(stream, size)), []), threads):
         yield from zip(batch, flows, strict=True)
@@ -366,8 +368,15 @@ def _dis(params: FlowParams, reference: GreyBytes) -> Solver:
 
 
 def _tvl1(params: FlowParams, reference: GreyBytes) -> Solver:
-    referred = refer_tvl1(reference.astype(np.float32), params.tvl1, params.device)
-    return lambda frames: tvl1_flows(frames.astype(np.float32), referred).flows
+    device = find_device(params.device or PROCESSOR)
+
+    def solve(frames: GreyBytes) -> FloatArray:
+        with memory_of(device, "lower --flow.tvl1.batch"):
+            return tvl1_flows(frames.astype(np.float32), referred).flows
+
+    with memory_of(device, "take a smaller --roi"):
+        referred = refer_tvl1(reference.astype(np.float32), params.tvl1, device)
+    return solve
 
 
 def _farneback(params: FlowParams, reference: GreyBytes) -> Solver:

@@ -182,7 +182,13 @@ def project(dynamics: FlowDynamics, flow: ArrayLike) -> Float64Array:
     flow = check_flow(flow)
     if flow.shape != dynamics.mean_flow.shape:
         raise DataError(f"flow: expected shape {dynamics.mean_flow.shape}, found {flow.shape}")
-    return ((flow - dynamics.mean_flow).reshape(-1) @ dynamics.C).astype(np.float64)
+    rest, done = (flow - dynamics.mean_flow).reshape(-1), 0
+    state = np.zeros(dynamics.C.shape[1])
+    # C may be mapped: all of it at once would come into memory.
+    for part in parts(dynamics.C):
+        state += rest[done : done + len(part)] @ part
+        done += len(part)
+    return state
 
 
 def flow_of(dynamics: FlowDynamics, state: ArrayLike) -> FloatArray:

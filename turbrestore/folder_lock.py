@@ -71,7 +71,8 @@ def lock_folder(folder: str | os.PathLike[str]) -> Iterator[bool]:
 def _acquire(path: Path) -> tuple[int, bool]:
     """Open and lock a file; whether the file system locks."""
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        # A link would have a file made or locked somewhere else.
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         try:
             locks = _lock(descriptor)
             # The holder before may have removed the file between our opening and our locking it.

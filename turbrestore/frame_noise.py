@@ -33,13 +33,18 @@ from .warp import inside, strips, warp
 # Smallest variance, so that noise-free synthetic data keep every gain defined: (1/4096 of full scale)².
 _IMAGE_NOISE_FLOOR = 6e-8
 # Standardised sharpness beyond this is an outlier, not a better frame.
-_LARGEST_SCORE = 3.0
+LARGEST_SCORE = 3.0
+# Most that sharpness and folds together raise the logarithm of Z by.  Z is then beyond any variance of the image, and
+# times the largest excess of deviation still a number in single precision.
+LARGEST_EXPONENT = 40.0
 # Sharpness that differs by less than this share is not worth averaging fewer frames.
 _LEAST_SPREAD = 0.03
 # Z is so many times larger where a map folds.
-_LOG_DISTRUST = np.log(np.float32(1e3))
+LOG_DISTRUST = np.log(np.float32(1e3))
+# Pixels around a fold that are lost with it, on each side, and standard deviation of how that fades.
+AROUND_FOLD, FOLD_FADE = 3, 2.0
 # A frame that deviates from the usual by more than this many variances shows something that is not the scene.
-_OUTLIER, _OUTLIER_WINDOW = 6.0, 3.0
+OUTLIER, OUTLIER_WINDOW = 6.0, 3.0
 # Share of the mean variance that every pixel varies by at least.
 _LEAST_DEVIATION = 0.1
 # Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels it correlates over.
@@ -217,18 +222,20 @@ def judge_frame(
     """
     grey = luminance(registered)
     product = _product(grey, model.template)
-    sharp = float(cv2.sumElems(product)[0]) / max(model.template_energy, 1e-12)
+    # Sums and norms of OpenCV depend on where an array lies in memory, in the last bit.
+    sharp = float(product.sum(dtype=np.float64)) / max(model.template_energy, 1e-12)
     if model.blur is None and sharpness == 0:
         return model.image_noise, sharp
     noise = _deviates(grey, model.usual_frame, model.deviation)
     lost = _lost(flow)
     seen = None if model.blur is not None else _smooth(product, model.window)
     for rows in strips(noise.shape):
-        excess = np.maximum(noise[rows] / _OUTLIER, 1)
+        excess = np.maximum(noise[rows] / OUTLIER, 1)
         squared = excess * excess
-        exponent = lost[rows] * _LOG_DISTRUST
+        exponent = lost[rows] * LOG_DISTRUST
         if seen is not None:
             exponent += _exponent(seen[rows], squared, model, rows, sharpness)
+        np.minimum(exponent, LARGEST_EXPONENT, out=exponent)
         # The third power: what deviates twice as much as is tolerated counts an eighth.
         excess *= squared
         excess *= np.float32(model.image_noise)
@@ -243,7 +250,7 @@ def _exponent(seen: FloatArray, excess: FloatArray, model: FrameNoise, rows: sli
     """Logarithm of the factor on Z by which a frame of the local sharpness ``seen`` differs."""
     score = seen - model.usual[rows]
     score *= model.score_scale[rows]
-    np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE, out=score)
+    np.clip(score, -LARGEST_SCORE, LARGEST_SCORE, out=score)
     # What is not the scene may well have more contrast than the scene.
     better = np.maximum(score, 0)
     better /= excess
@@ -270,7 +277,7 @@ def _without_outliers(
 
     def trim(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, NDArray[np.uint8]]:
         registered = luminance(warp(*pair))
-        return registered, (_deviates(registered, centre, spread) <= _OUTLIER).view(np.uint8)
+        return registered, (_deviates(registered, centre, spread) <= OUTLIER).view(np.uint8)
 
     centre, spread = mean.astype(np.float32), _deviation(variance)
     counted, total, squares = (np.zeros(mean.shape) for _ in range(3))
@@ -285,14 +292,14 @@ def _without_outliers(
 
 def _deviation(variance: np.ndarray) -> FloatArray:
     floor = max(_LEAST_DEVIATION * float(variance.mean()), _IMAGE_NOISE_FLOOR)
-    return _smooth(variance.astype(np.float32), _OUTLIER_WINDOW) + np.float32(floor)
+    return _smooth(variance.astype(np.float32), OUTLIER_WINDOW) + np.float32(floor)
 
 
 def _deviates(registered: FloatArray, usual: FloatArray, deviation: FloatArray) -> FloatArray:
     """Squared deviation of a frame in units of the usual one; about 1 for most."""
     difference = registered - usual
     difference *= difference
-    difference = _smooth(difference, _OUTLIER_WINDOW)
+    difference = _smooth(difference, OUTLIER_WINDOW)
     difference /= deviation
     return difference
 
@@ -310,7 +317,8 @@ def _lost(flow: FloatArray) -> FloatArray:
     if not folded.any():
         return lost
     # Faded out: an abrupt change of weights would show as an edge.
-    fade = _smooth(cv2.dilate(folded.astype(np.float32), np.ones((7, 7), np.uint8)), 2.0)
+    side = 2 * AROUND_FOLD + 1
+    fade = _smooth(cv2.dilate(folded.astype(np.float32), np.ones((side, side), np.uint8)), FOLD_FADE)
     return np.maximum(fade, lost, out=lost)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import operator
+import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -19,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arrays import CHANNELS, FloatArray
 from .errors import ConfigurationError, DataError, require
+from .images import IMAGE_SUFFIXES
 from .pixels import PixelArray, depth_of, full_scale_of, to_unit
 from .scratch import release
 
@@ -358,6 +360,41 @@ def check_frame_range(frames: FrameRange | None) -> slice:
         raise wrong
     require(len(values) == 2 or values[2] != 0, f"frames: expected a step of at least 1, found {frames}")
     return slice(*values)
+
+
+def frame_files(folder: Path) -> list[Path]:
+    """Images of a folder that are the frames of a video: no hidden files, no folders, no links that lead nowhere.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    list of Path
+        In the order of their names, with the digits counting as numbers.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     for name in ("a10.png", "a9.png", ".a1.png", "notes.txt"):
+    ...         Path(folder, name).touch()
+    ...     [path.name for path in frame_files(Path(folder))]
+    ['a9.png', 'a10.png']
+    """
+
+    def natural(file: Path) -> tuple[list[tuple[int, str]], str]:
+        parts = re.findall(r"\d+|\D+", file.name)
+        return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts], file.name
+
+    named = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != ".")
+    return sorted((path for path in named if path.is_file()), key=natural)
 
 
 def size_text(shape: tuple[int, ...]) -> str:

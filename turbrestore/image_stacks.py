@@ -22,7 +22,7 @@ from .arrays import FloatArray
 
 # Pole of the cubic B-spline prefilter; its impulse response below is cut off where it falls under 1e-7.
 _POLE = np.sqrt(3.0) - 2.0
-_PREFILTER = (-6 * _POLE / (1 - _POLE**2) * _POLE ** np.abs(np.arange(-12, 13))).astype(np.float32)
+PREFILTER = (-6 * _POLE / (1 - _POLE**2) * _POLE ** np.abs(np.arange(-12, 13))).astype(np.float32)
 
 # ndarray or torch tensor, float32.
 Stack = Any
@@ -247,7 +247,7 @@ def spline_coefficients(stack: Stack, ops: StackOps) -> Stack:
     >>> bool(np.allclose(spline_coefficients(flat, numpy_ops()), 0.5))
     True
     """
-    return ops.filter(stack, _PREFILTER, _PREFILTER)
+    return ops.filter(stack, PREFILTER, PREFILTER)
 
 
 def warp_stack(stack: Stack, flow: Stack, ops: StackOps) -> Stack:

@@ -3,8 +3,8 @@
 Every file is written under a temporary name in its folder and takes its real name only when it is complete
 (:func:`atomic_output`), so a failure leaves nothing behind.
 
-OpenCV decodes the images, because imageio and Pillow cut 16-bit RGB down to 8 bits. The size is taken from the
-header first: OpenCV would allocate whatever a forged header asks for.
+OpenCV decodes the images, because imageio and Pillow cut 16-bit RGB down to 8 bits. What must not be decoded is refused
+before (:mod:`turbrestore.image_headers`).
 """
 
 from __future__ import annotations
@@ -13,9 +13,6 @@ import io
 import os
 import secrets
 import shutil
-import struct
-import warnings
-import zlib
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,7 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_image, from_unit
-from .errors import ConfigurationError, DataError, InputNotFoundError, OutputError, StorageError
+from .errors import ConfigurationError, DataError, OutputError, StorageError
+from .image_headers import check_still
+from .input_files import check_input, input_errors
 from .limits import DEFAULT_LIMITS, Limits
 from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit
 
@@ -34,9 +33,6 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".pp
 IMAGE_OUTPUT_SUFFIXES = (".png", ".tif", ".tiff")
 # Bytes that must stay free beside what is written.
 _SPARE = 1 << 20
-# What Pillow may take a file for; it knows many formats more.
-_FORMATS = ("PNG", "JPEG", "BMP", "PPM", "WEBP")
-_PNG, _IHDR_BITS, _CHUNK = b"\x89PNG\r\n\x1a\n", 24, 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +115,12 @@ def read_pixels(path: Path, limits: Limits = DEFAULT_LIMITS) -> tuple[PixelArray
     """
     if path.suffix.lower() not in IMAGE_SUFFIXES:
         raise DataError(f"{path}: expected an image ({', '.join(IMAGE_SUFFIXES)}), found {path.suffix or 'no suffix'}")
+    limits.check_bytes(check_input(path).st_size, str(path))
     with input_errors(path):
-        limits.check_bytes(path.stat().st_size, str(path))
         data = path.read_bytes()
     if not data:
         raise DataError(f"{path}: the file is empty")
-    _check_header(path, data, limits)
+    check_still(path, data, limits)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -224,6 +220,8 @@ def check_output(
         folder = Path(os.path.realpath(path)).parent
         if path.is_dir():
             raise OutputError(f"{path}: is a folder; name a file in it")
+        if path.exists() and not path.is_file():
+            raise OutputError(f"{path}: is a device or a pipe, which is not written to; name a file")
         if not folder.is_dir():
             raise OutputError(f"{path}: the folder {folder} does not exist; create it first")
         for source in map(Path, inputs):
@@ -352,98 +350,6 @@ def atomic_write(path: str | os.PathLike[str], data: bytes, overwrite: bool = Fa
         temporary.write_bytes(data)
 
 
-@contextmanager
-def input_errors(path: Path) -> Iterator[None]:
-    """Turn the system's errors while reading ``path`` into turbrestore's.
-
-    Parameters
-    ----------
-    path : Path
-        The file or folder that is read.
-
-    Raises
-    ------
-    InputNotFoundError
-        It does not exist.
-    StorageError
-        It cannot be read, for example for want of permission.
-
-    Examples
-    --------
-    >>> with input_errors(Path("missing.mkv")):
-    ...     Path("missing.mkv").read_bytes()
-    Traceback (most recent call last):
-    ...
-    turbrestore.errors.InputNotFoundError: missing.mkv: no such file or folder
-    """
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise InputNotFoundError(f"{path}: no such file or folder") from error
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be read ({error.strerror or error})") from error
-
-
-def _check_header(path: Path, data: bytes, limits: Limits) -> None:
-    """Refuse by the header what must not be decoded: too many pixels, several pages, broken PNG checksums."""
-    if path.suffix.lower() in (".tif", ".tiff"):
-        import tifffile
-
-        try:
-            with tifffile.TiffFile(io.BytesIO(data)) as tiff:
-                pages, width, height = len(tiff.pages), tiff.pages.first.imagewidth, tiff.pages.first.imagelength
-        except Exception as error:  # tifffile documents no closed list of exceptions for damaged files
-            raise DataError(f"{path}: not a TIFF file, or damaged ({first_line(error)})") from error
-        if pages != 1:
-            raise DataError(f"{path}: expected one image, found {pages} pages; read it as a video")
-    else:
-        width, height = _pillow_size(path, data, limits)
-    limits.check_size(width, height, str(path))
-    if data.startswith(_PNG):
-        _check_inflated(path, data, width, height)
-
-
-def _pillow_size(path: Path, data: bytes, limits: Limits) -> tuple[int, int]:
-    import PIL.Image
-
-    try:
-        with warnings.catch_warnings():
-            # Pillow warns at a size of its own.
-            warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
-            with PIL.Image.open(io.BytesIO(data), formats=_FORMATS) as header:
-                size = header.size
-                # Checks PNG checksums without inflating; libpng would print its complaint to the terminal.
-                header.verify()
-    except PIL.Image.DecompressionBombError as error:
-        raise DataError(f"{path}: expected up to {limits.max_pixels} pixels, found far more") from error
-    except PIL.UnidentifiedImageError as error:
-        raise DataError(f"{path}: not an image of a known format") from error
-    except Exception as error:  # Pillow raises SyntaxError, ValueError, struct.error, … by the format
-        raise DataError(f"{path}: not an image, or damaged ({first_line(error)})") from error
-    return size
-
-
-def _check_inflated(path: Path, data: bytes, width: int, height: int) -> None:
-    """Refuse a PNG whose pixels are fewer than its header says: libpng would print that to the terminal."""
-    bits, colour, _, _, interlaced = struct.unpack_from(">5B", data, _IHDR_BITS)
-    values = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 0)
-    # Every row has a byte for its filter; the seven passes of an interlaced image need more, never fewer.
-    needed = height * (1 + (width * bits * values + 7) // 8) if not interlaced else width * height * bits * values // 8
-    inflate, found, place = zlib.decompressobj(), 0, len(_PNG)
-    try:
-        while found < needed and place + 8 <= len(data):
-            size, kind = struct.unpack_from(">I4s", data, place)
-            packed = data[place + 8 : place + 8 + size] if kind == b"IDAT" else b""
-            while packed and found < needed:
-                found += len(inflate.decompress(packed, _CHUNK))
-                packed = inflate.unconsumed_tail
-            place += size + 12
-    except zlib.error as error:
-        raise DataError(f"{path}: compressed pixels are damaged ({first_line(error)}); copy the file again") from error
-    if found < needed:
-        raise DataError(f"{path}: expected {needed} bytes of pixels, found {found}; the file is damaged")
-
-
 def _encode(path: Path, image: FloatArray, depth: int) -> bytes:
     is_tiff = path.suffix.lower() != ".png"
     if depth == 32 and is_tiff:
@@ -461,28 +367,6 @@ def _encode(path: Path, image: FloatArray, depth: int) -> bytes:
     if not done:
         raise StorageError(f"{path}: the PNG encoder failed on an image of shape {image.shape}")
     return data.tobytes()
-
-
-def first_line(error: BaseException) -> str:
-    r"""First line of an error's message, for messages of one line.
-
-    Parameters
-    ----------
-    error : BaseException
-        Any error.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> first_line(ValueError("too short\nmore"))
-    'too short'
-    """
-    # A failed look-up says no more than its key.
-    lines = [] if isinstance(error, LookupError) else str(error).splitlines()
-    return (lines or [type(error).__name__])[0]
 
 
 def _check_not_input(path: Path, folder: Path, source: Path) -> None:

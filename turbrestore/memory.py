@@ -8,17 +8,19 @@ threads::
     stack = τ HW · (4 c + 8)    training frames and their flows
     modes = 8 n HW              modes of the flow model, once it is identified
 
+and for the deconvolution what :mod:`turbrestore.deconvolution_memory` says.
+
 Stack and modes may be kept in a file; what the threads have in hand of it then still counts.
 
 The constants are those of ``python benchmarks/memory.py --stages`` at 1280×720, grey and in colour, with one, two and
-four threads, and a tenth added.  The deconvolution is told what is left, and works in strips where that is little;
+four threads, and a tenth added.  torch counts where a device is asked for, but not what a stage holds there, on the
+processor or not.  The deconvolution is told what is left, and works in strips and fewer threads where that is little;
 the other stages need what they need.  So the training frames go to a file first, then fewer threads work side by side,
 and at last fewer frames are trained on.  Only the last changes the result.
 """
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -26,9 +28,13 @@ import numpy as np
 
 from .alternating import FilterParams
 from .decision import Decision
+from .deconvolution import MARGIN_SIGMAS, DeconvolutionParams
+from .deconvolution_memory import NonlocalWork, Room
+from .device import TORCH_BYTES
 from .dynamics import DynamicsParams
 from .errors import ConfigurationError, DataError, require
 from .flow import MIN_SIDE, FlowParams
+from .memory_size import size_text
 from .parallel import available_cores
 
 _FEWEST_TRAINED, _MOST_TRAINED = 40, 100
@@ -36,49 +42,12 @@ _FEWEST_TRAINED, _MOST_TRAINED = 40, 100
 _FEWEST_IN_NEED = 10
 # Training frames and their flows: 12 bytes a pixel for grey frames, up to this many bytes where no limit is given.
 _TRAINING_BYTES = 1.5e9
-_UNITS = {"": 1, "b": 1, "kb": 1e3, "mb": 1e6, "gb": 1e9, "tb": 1e12, "kib": 2**10, "mib": 2**20, "gib": 2**30}
-_SPELT = {"kb": "kB", "kib": "KiB", "mib": "MiB", "gib": "GiB"}
 # Interpreter and libraries, readers, heap between the arrays.
 _BASE = 160e6
 # Numbers of the modes that a thread has in hand.
 _IN_HAND = 1 << 23
 # Strips of flows in float64 and what is made of one, and what a flow adds to them a pixel where all fit in one.
 _STRIPS, _STRIP_NUMBER = 140e6, 70.0
-
-
-class MemorySize(float):
-    """Number of bytes; text such as ``"2GB"`` or ``"1.5 GiB"`` is understood.
-
-    Parameters
-    ----------
-    value : float or str
-        A number of bytes, or text of a number with a unit: B, kB, MB, GB, TB, KiB, MiB, GiB.
-
-    Raises
-    ------
-    ConfigurationError
-        Neither.
-
-    Examples
-    --------
-    >>> MemorySize("2GB"), MemorySize("1.5 MiB"), MemorySize(3e9)
-    (2000000000.0, 1572864.0, 3000000000.0)
-    """
-
-    def __new__(cls, value: float | str) -> MemorySize:
-        """Read number and unit."""
-        text = str(value).strip()
-        digits = text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ ")
-        unit = text[len(digits) :].strip().lower()
-        expected = "--memory-limit: expected a size such as 2GB, 800MB or 1.5GiB"
-        try:
-            size = float(digits) * _UNITS[unit]
-        except (KeyError, ValueError):
-            close = difflib.get_close_matches(unit, _UNITS, n=1, cutoff=0.4)
-            meant = f"; did you mean {digits}{_SPELT.get(close[0], close[0].upper())}?" if digits and close else ""
-            raise ConfigurationError(f"{expected}, found {value!r}{meant}") from None
-        require(0 < size < float("inf"), f"{expected}, found {value!r}")
-        return super().__new__(cls, size)
 
 
 @dataclass(frozen=True)
@@ -122,9 +91,14 @@ class StageMemory:
 _FLOW = StageMemory(120, 5, 185, 10)
 # While frames are registered and weighed beside that.
 _FILTER = StageMemory(30, 20, 25, 15)
-# Images and maps that earlier stages leave, and the least that the deconvolution works with.
-_HELD = StageMemory(60, 40, 0, 0)
-_DECONVOLUTION_WORK, _DECONVOLUTION = 110e6, StageMemory(40, 120, 0, 0)
+# Images and maps that earlier stages leave, and what is made of them while the width of the blur is found.
+_HELD, _BLUR = StageMemory(60, 40, 0, 0), StageMemory(40, 0, 0, 0)
+# Width of the blur where it is not known yet, pixels.
+_SIGMA = 3.0
+# From this share of the limit on, what freed arrays leave in the heap counts.
+_ROOMY = 0.5
+# The largest limit that means anything, bytes.
+_MOST = 1e15
 
 
 @dataclass(frozen=True)
@@ -140,9 +114,11 @@ class MemoryPlan:
     in_file : bool
         Whether training frames and flows are kept in a file.
     file_bytes : int
-        Size of the file.
+        Size of all files, with those of the deconvolution.
     deconvolution : float or None
-        Bytes that are left for the deconvolution; None where there is no limit.
+        Bytes that are left for the deconvolution; None where there is no limit, or no deconvolution.
+    tight : bool
+        Whether memory that is freed has to go back to the system.
     decisions : tuple of Decision
         What the limit has caused.
     """
@@ -152,6 +128,7 @@ class MemoryPlan:
     in_file: bool = False
     file_bytes: int = 0
     deconvolution: float | None = None
+    tight: bool = False
     decisions: tuple[Decision, ...] = ()
 
 
@@ -159,17 +136,41 @@ class MemoryPlan:
 class _Work:
     """Size of a restoration, and the settings that memory depends on."""
 
-    frames: int
-    pixels: int
-    channels: int
+    shape: tuple[int, ...]
     filter: FilterParams
     dynamics: DynamicsParams
+    deconvolution: DeconvolutionParams
     until: str
+    on_device: bool
+
+    @property
+    def pixels(self) -> int:
+        return self.shape[1] * self.shape[2]
+
+    @property
+    def channels(self) -> int:
+        return self.shape[3] if len(self.shape) == 4 else 1
+
+    @property
+    def base(self) -> float:
+        return _BASE + (TORCH_BYTES if self.on_device else 0)
+
+    @property
+    def pairs(self) -> NonlocalWork:
+        """The deconvolution, with its margin."""
+        sigma = _SIGMA if self.deconvolution.sigma is None else self.deconvolution.sigma
+        margin = int(np.ceil(MARGIN_SIGMAS * sigma))
+        channels = self.channels if self.deconvolution.channels == "each" else 1
+        return NonlocalWork(
+            (self.shape[1] + 2 * margin, self.shape[2] + 2 * margin), channels, self.deconvolution.weights
+        )
 
     def stack(self, train: int) -> float:
         return train * self.pixels * (4.0 * self.channels + 8.0)
 
     def modes(self, train: int) -> float:
+        if self.until == "centroid":
+            return 0.0
         chosen = self.dynamics.rank
         most = min(self.dynamics.max_rank, int(train / self.dynamics.frames_per_state))
         return 8.0 * self.pixels * min(most if chosen is None else chosen, train - 1)
@@ -177,25 +178,36 @@ class _Work:
     def peak(self, train: int, threads: int, in_file: bool) -> float:
         """Largest need of any stage, the deconvolution at its least."""
         size = self.pixels, self.channels, threads
-        stack, modes = self.stack(train), self.modes(train) if self.until != "centroid" else 0.0
+        stack, modes = self.stack(train), self.modes(train)
         if in_file:
             # What threads have in hand comes into memory while it is used.
             stack, modes = min(stack, self.stack(2 * threads + 3)), min(modes, 4.0 * _IN_HAND * threads)
         flow = _FLOW.bytes(*size)
-        block = 4.0 * self.pixels * self.channels * min(self.filter.block, self.frames)
+        block = 4.0 * self.pixels * self.channels * min(self.filter.block, self.shape[0])
         judged = 8.0 * self.pixels * train if self.filter.frame_noise == "blur" else 0.0
         later = {
             "centroid": 0.0,
             "identify": min(_STRIPS, _STRIP_NUMBER * self.pixels * train),
             "filter": flow + _FILTER.bytes(*size) + block + judged,
-            "deconvolve": self.held() + _DECONVOLUTION_WORK + _DECONVOLUTION.bytes(*size),
+            "deconvolve": self.held() + _BLUR.bytes(*size) + self.pairs.peak(Room(1, True)),
         }
         stages = list(later)[: list(later).index(self.until) + 1]
-        return _BASE + stack + max(flow, modes + max(later[stage] for stage in stages))
+        return self.base + stack + max(flow, modes + max(later[stage] for stage in stages))
 
     def held(self) -> float:
         """Results of the stages before the deconvolution."""
         return _HELD.bytes(self.pixels, self.channels, 0)
+
+    def left(self, limit: float, kept: float) -> float | None:
+        """Bytes for the deconvolution, beside what is kept in memory."""
+        if self.until != "deconvolve":
+            return None
+        return min(limit - self.base - self.held() - kept, self.deconvolution.memory or _MOST)
+
+    def room(self, memory: float | None) -> Room:
+        """How the deconvolution works."""
+        nonlocal_ = self.until == "deconvolve" and self.deconvolution.method == "nltv"
+        return self.pairs.room(memory if nonlocal_ else None, available_cores())
 
 
 def plan_memory(
@@ -205,7 +217,9 @@ def plan_memory(
     flow: FlowParams | None = None,
     filter: FilterParams | None = None,
     dynamics: DynamicsParams | None = None,
+    deconvolution: DeconvolutionParams | None = None,
     until: str = "deconvolve",
+    on_device: bool = False,
 ) -> MemoryPlan:
     """Decide how many frames are trained on, where they are kept, and how many threads work.
 
@@ -220,8 +234,11 @@ def plan_memory(
     flow : FlowParams, optional
     filter : FilterParams, optional
     dynamics : DynamicsParams, optional
+    deconvolution : DeconvolutionParams, optional
     until : str
         Last stage.
+    on_device : bool
+        Whether any stage may compute with torch.
 
     Returns
     -------
@@ -244,24 +261,21 @@ def plan_memory(
     """
     flow, filter, dynamics = flow or FlowParams(), filter or FilterParams(), dynamics or DynamicsParams()
     train = training_share(shape[0], shape[1:], wanted)
+    work = _Work(shape, filter, dynamics, deconvolution or DeconvolutionParams(), until, on_device)
     if limit is None:
-        return MemoryPlan(train, flow.threads)
-    channels = shape[3] if len(shape) == 4 else 1
-    work = _Work(shape[0], shape[1] * shape[2], channels, filter, dynamics, until)
+        room = work.room(work.deconvolution.memory)
+        return MemoryPlan(train, flow.threads, file_bytes=int(work.pairs.pairs()) if room.in_file else 0)
     most = flow.threads or available_cores()
     fewest = train if wanted is not None else min(train, _FEWEST_IN_NEED)
     for count in range(train, fewest - 1, -1):
         if work.peak(count, 1, True) <= limit:
             choices = ((threads, in_file) for threads in range(most, 0, -1) for in_file in (False, True))
-            threads, in_file = next(choice for choice in choices if work.peak(count, *choice) <= limit)
-            kept = work.modes(count) + work.stack(count)
-            left = limit - _BASE - work.held() - (0 if in_file else kept)
-            decisions = tuple(_decisions(work, limit, (train, most), (count, threads, in_file)))
-            return MemoryPlan(count, threads, in_file, int(kept) if in_file else 0, left, decisions)
+            chosen = next(choice for choice in choices if work.peak(count, *choice) <= limit)
+            return _plan(work, limit, (train, most), (count, *chosen))
     asked = f" and {train} training frames" if wanted is not None else ""
     raise ConfigurationError(
-        f"--memory-limit: expected at least {_text(1.01 * work.peak(fewest, 1, True))} for frames of "
-        f"{shape[2]}×{shape[1]}{asked}, found {_text(limit)}; allow more, or use a --roi"
+        f"--memory-limit: expected at least {size_text(1.01 * work.peak(fewest, 1, True))} for frames of "
+        f"{shape[2]}×{shape[1]}{asked}, found {size_text(limit)}; allow more, or use a --roi"
     )
 
 
@@ -309,20 +323,33 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
     return min(frame_count, max(2, min(share, int(_TRAINING_BYTES // frame_bytes))))
 
 
-def _decisions(work: _Work, limit: float, wanted: tuple[int, int], chosen: tuple[int, int, bool]) -> Iterator[Decision]:
+def _plan(work: _Work, limit: float, wanted: tuple[int, int], chosen: tuple[int, int, bool]) -> MemoryPlan:
+    """Training frames and threads are wanted, and chosen with a file or without."""
+    count, threads, in_file = chosen
+    kept = work.modes(count) + work.stack(count)
+    left = work.left(limit, 0 if in_file else kept)
+    room = work.room(left)
+    files = (kept if in_file else 0) + (work.pairs.pairs() if room.in_file else 0)
+    decisions = tuple(_decisions(work, limit, wanted, chosen, room))
+    tight = bool(decisions) or work.peak(*chosen) > _ROOMY * limit
+    return MemoryPlan(count, threads, in_file, int(files), left, tight, decisions)
+
+
+def _decisions(
+    work: _Work, limit: float, wanted: tuple[int, int], chosen: tuple[int, int, bool], room: Room
+) -> Iterator[Decision]:
     """Put into words what the limit has changed."""
     (train, most), (count, threads, in_file) = wanted, chosen
-    allowed = f"of {_text(limit)} allowed"
+    allowed = f"of {size_text(limit)} allowed"
     if count < train:
-        needed = _text(work.peak(train, 1, True))
+        needed = size_text(work.peak(train, 1, True))
         yield Decision("memory", f"{count} training frames, not {train}", f"all of them would take {needed} {allowed}")
     if in_file:
-        size = _text(work.stack(count) + work.modes(count))
+        size = size_text(work.stack(count) + work.modes(count))
         yield Decision("memory", "training frames kept in a file", f"with flows and modes they take {size} {allowed}")
     if threads < most:
-        needed = _text(work.peak(count, most, in_file))
+        needed = size_text(work.peak(count, most, in_file))
         yield Decision("memory", f"{threads} of {most} threads", f"all of them would take {needed} {allowed}")
-
-
-def _text(size: float) -> str:
-    return f"{size / 1e9:.2f} GB" if size >= 1e9 else f"{np.ceil(size / 1e6):.0f} MB"
+    if room.in_file:
+        size = size_text(work.pairs.pairs())
+        yield Decision("memory", "nonlocal pairs kept in a file", f"they take {size} {allowed}")

@@ -99,7 +99,7 @@ class NonlocalPenalty:
             there += added
             back -= added
             net = np.subtract(back, there, out=added)
-            pull = strip.gather((net, strip.roots), (np.negative(net), strip.roots))
+            pull = strip.gather((net, strip.roots), (net, strip.roots), subtract=True)
             release(values)
             return pull
 

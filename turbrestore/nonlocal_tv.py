@@ -10,7 +10,9 @@ div_w v : nonlocal divergence, ``⟨div_w v, u⟩ = −⟨v, ∇_w u⟩``.
 J[u] : nonlocal total variation, ``Σ_x |∇_w u|(x)`` with ``|v|(x)² = Σ_y v(x, y)²``.
 
 The graph stores every pair once, in strips of rows (:mod:`turbrestore.edge_strips`). A function on edges is an array of
-shape (2, E): row 0 is its value from the tail to the head of each pair, row 1 from the head to the tail.
+shape (2, E): row 0 is its value from the tail to the head of each pair, row 1 from the head to the tail.  The operators
+on such arrays, and the matrix ``difference``, are for reference: the solvers work on the strips, or on a device, and
+are tested against them.
 """
 
 from __future__ import annotations
@@ -36,9 +38,9 @@ from .psf import estimate_noise
 from .scratch import new_stack, release
 
 # Pixels of a strip, about: all that an iteration needs of their edges fits in the cache of a processor.
-_STRIP_PIXELS = 16000
+STRIP_PIXELS = 16000
 # A weight must be positive for its edge to stay in the graph.
-_SMALLEST_WEIGHT = 1e-6
+SMALLEST_WEIGHT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,7 @@ class NonlocalGraph:
 
 
 def nonlocal_weights(
-    guide: ArrayLike, params: NonlocalParams | None = None, folder: Path | None = None
+    guide: ArrayLike, params: NonlocalParams | None = None, folder: Path | None = None, threads: int = 0
 ) -> NonlocalGraph:
     """Weights ``w(x, y) = exp(−d(x, y)/h²)``, ``d = Σ_z G_a(z) [g(x + z) − g(y + z)]²`` (paper 3, eq. 23).
 
@@ -158,6 +160,8 @@ def nonlocal_weights(
         Size of patches, search and neighbourhood.
     folder : Path, optional
         Where the pairs are kept in files; without it they are in memory.
+    threads : int
+        Parts of the image worked on side by side; 0 means one per available core.
 
     Returns
     -------
@@ -179,9 +183,10 @@ def nonlocal_weights(
     grey = luminance(check_image(guide, "guide"))
     if grey.size < 2:
         raise DataError(f"guide: expected two pixels or more, found shape {grey.shape}")
-    h = params.h if params.h is not None else _automatic_h(grey)
-    strips = tuple(_strips(grey, params, h, folder))
-    return NonlocalGraph(grey.shape, strips, _norm_squared_bound(strips, grey.size), h)
+    h = params.h if params.h is not None else automatic_h(grey)
+    threads = threads or available_cores()
+    strips = tuple(_strips(grey, params, h, folder, threads))
+    return NonlocalGraph(grey.shape, strips, _norm_squared_bound(strips, grey.size, threads), h)
 
 
 def nonlocal_gradient(graph: NonlocalGraph, u: FloatArray) -> FloatArray:
@@ -308,7 +313,24 @@ def nonlocal_total_variation(graph: NonlocalGraph, u: FloatArray) -> float:
     return float(nonlocal_magnitude(graph, nonlocal_gradient(graph, u)).sum(dtype=np.float64))
 
 
-def _automatic_h(grey: FloatArray) -> float:
+def automatic_h(grey: FloatArray) -> float:
+    """Find the filtering parameter from contrast and noise of the guide, see :func:`nonlocal_weights`.
+
+    Parameters
+    ----------
+    grey : ndarray, float32, shape (H, W)
+        g.
+
+    Returns
+    -------
+    float
+        Intensity.
+
+    Examples
+    --------
+    >>> round(automatic_h(np.tile(np.linspace(0, 1, 101, dtype=np.float32), (9, 1))), 3)
+    0.123
+    """
     low, high = np.percentile(grey, (1, 99))
     # The last term only keeps h positive for an image of one colour, where all distances are 0.
     return float(max((high - low) / 8, 4 * estimate_noise(grey), 1e-3))
@@ -319,8 +341,23 @@ def _owners(graph: NonlocalGraph) -> NDArray[np.int32]:
     return np.concatenate([graph.tails, graph.heads])
 
 
-def _offsets(search: int) -> NDArray[np.int32]:
-    """All (dy, dx) of the search window but (0, 0), nearest first."""
+def search_offsets(search: int) -> NDArray[np.int32]:
+    """All (dy, dx) of the search window but (0, 0), nearest first.
+
+    Parameters
+    ----------
+    search : int
+        Width of the window, pixels, odd.
+
+    Returns
+    -------
+    ndarray, int32, shape (search² - 1, 2)
+
+    Examples
+    --------
+    >>> search_offsets(3)[:4].tolist()
+    [[-1, 0], [0, -1], [0, 1], [1, 0]]
+    """
     radius = search // 2
     axis = np.arange(-radius, radius + 1, dtype=np.int32)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -328,16 +365,18 @@ def _offsets(search: int) -> NDArray[np.int32]:
     return grid[order[1:]]
 
 
-def _strips(grey: FloatArray, params: NonlocalParams, h: float, folder: Path | None) -> Iterator[EdgeStrip]:
+def _strips(
+    grey: FloatArray, params: NonlocalParams, h: float, folder: Path | None, threads: int
+) -> Iterator[EdgeStrip]:
     window = cv2.getGaussianKernel(params.patch, params.patch_sigma, cv2.CV_32F)
-    search = PatchSearch(window, _offsets(params.search), params.nearest, params.best)
-    bands = search_bands(grey, search)
+    search = PatchSearch(window, search_offsets(params.search), params.nearest, params.best)
+    bands = search_bands(grey, search, threads)
     top, keys = next(bands)
     for following, below in chain(bands, [(grey.shape[0], keys[:0])]):
         tails, heads, distances = _pairs(keys, below, grey.shape[1], search)
         stack = np.asarray(new_stack((2, len(tails)), folder))
         np.exp(-distances / np.float32(h**2), out=stack[0])
-        np.sqrt(np.maximum(stack[0], np.float32(_SMALLEST_WEIGHT)), out=stack[0])
+        np.sqrt(np.maximum(stack[0], np.float32(SMALLEST_WEIGHT)), out=stack[0])
         stack[1].view(np.int32)[:] = heads
         yield from _cut(tails, stack, (top, following), grey.shape, search.reach)
         release(stack)
@@ -383,7 +422,7 @@ def _cut(
 ) -> Iterator[EdgeStrip]:
     """Cut a band into strips; ``stack`` holds √w of its pairs and, as integers, their heads from its first pixel on."""
     (top, stop), (height, width) = rows, shape
-    step = max(4, min(BAND_ROWS, _STRIP_PIXELS // width))
+    step = max(4, min(BAND_ROWS, STRIP_PIXELS // width))
     heads, order = stack[1].view(np.int32), np.arange(stack.shape[1] + 1, dtype=np.int32)
     for row in range(top, stop, step):
         first, own = (row - top) * width, (min(row + step, stop) - row) * width
@@ -394,7 +433,7 @@ def _cut(
         yield EdgeStrip(row * width, window, degrees, heads[part], stack[0, part], order)
 
 
-def _norm_squared_bound(strips: tuple[EdgeStrip, ...], pixels: int, iterations: int = 10) -> float:
+def _norm_squared_bound(strips: tuple[EdgeStrip, ...], pixels: int, threads: int, iterations: int = 10) -> float:
     """Upper bound of ‖∇_w‖² = 2‖D‖², D the differences.
 
     ``‖D‖² = ρ(DᵀD) ≤ ρ(|D|ᵀ|D|)``, and for a non-negative matrix A and any positive x, ``ρ(A) ≤ max_i (Ax)_i / x_i``
@@ -407,7 +446,7 @@ def _norm_squared_bound(strips: tuple[EdgeStrip, ...], pixels: int, iterations: 
         sums = (strip.at_tails(values) + strip.at_heads(values)) * strip.roots
         return strip.gather((strip.roots, sums), (strip.roots, sums))
 
-    with one_thread_each(), ThreadPoolExecutor(available_cores()) as pool:
+    with one_thread_each(), ThreadPoolExecutor(threads) as pool:
         for _ in range(iterations):
             # Pixels without edges do not take part.
             x = np.maximum(x / x.max(), np.float32(1e-6))

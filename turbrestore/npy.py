@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import DataError, TurbrestoreError
-from .images import first_line, input_errors
+from .input_files import check_input, first_line, input_errors
 from .limits import DEFAULT_LIMITS, Limits
 from .scratch import new_stack, parts
 
@@ -56,10 +56,11 @@ def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
     [3, 4, 5]
     """
     path = Path(path)
+    size = check_input(path).st_size
     try:
         with input_errors(path), path.open("rb") as file:
             shape, is_fortran, dtype = _header(file)
-            offset, size = file.tell(), path.stat().st_size
+            offset = file.tell()
             needed = math.prod(shape) * dtype.itemsize
             if not 0 < needed <= size - offset:
                 raise ValueError(f"its header asks for {needed} bytes, {size - offset} are there")
@@ -105,14 +106,17 @@ def read_npz(
     {'x': array([0, 1, 2])}
     """
     path = Path(path)
-    with input_errors(path):
-        limits.check_bytes(path.stat().st_size, str(path))
+    size = check_input(path).st_size
+    limits.check_bytes(size, str(path))
     try:
         with input_errors(path), path.open("rb") as file, zipfile.ZipFile(file) as archive:
             members = archive.infolist()
             names = [member.filename.removesuffix(".npy") for member in members]
             if len(set(names)) < len(names):
                 raise ValueError("one name stands twice in it")
+            # Members are not compressed; they hold more than the file only where they lie within each other.
+            if sum(member.file_size for member in members) > size:
+                raise ValueError(f"its members hold more than its {size} bytes")
             return {name: _member(archive, member, scratch) for name, member in zip(names, members, strict=True)}
     except TurbrestoreError:
         raise

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ContextDecorator, ExitStack
 from typing import TypeVar
 
 import cv2
@@ -81,12 +82,44 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-@contextmanager
-def one_thread_each() -> Iterator[None]:
+class _OneThreadEach(ContextDecorator):
+    """Threads of OpenCV and BLAS, switched off while anybody is inside: the first takes them, the last gives them back.
+
+    Two streams that are worked on in turns do not end in the order in which they began.
+    """
+
+    def __init__(self) -> None:
+        # Reentrant: memory that is collected meanwhile may end a stream in this very thread.
+        self._lock = threading.RLock()
+        self._inside = 0
+        self._restore = ExitStack()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._restore.callback(cv2.setNumThreads, cv2.getNumThreads())
+                self._restore.enter_context(_controller().limit(limits=1, user_api="blas"))
+                cv2.setNumThreads(1)
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._restore.close()
+
+
+@functools.cache
+def one_thread_each() -> _OneThreadEach:
     """Keep OpenCV and BLAS from starting threads of their own, and give them back what they had afterwards.
 
     Beside busy threads a BLAS call on two threads is not twice as fast but tens of times slower: each waits for the
-    other to be scheduled.
+    other to be scheduled.  Uses may overlap, in one thread or in several: what they had comes back after the last.
+
+    Returns
+    -------
+    context manager
+        The same every time; a decorator too.
 
     Examples
     --------
@@ -94,13 +127,7 @@ def one_thread_each() -> Iterator[None]:
     ...     cv2.getNumThreads()
     1
     """
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        with _controller().limit(limits=1, user_api="blas"):
-            yield
-    finally:
-        cv2.setNumThreads(before)
+    return _OneThreadEach()
 
 
 @functools.cache

@@ -25,9 +25,11 @@ from .arrays import FloatArray
 from .parallel import map_ahead
 
 # Rows of a band, and columns of a tile of it: the distances of 64×192 pixels to 440 offsets are 22 MB.  A band has more
-# rows than an offset reaches, so that pairs span two bands at most.
+# rows than an offset reaches, so that pairs span two bands at most.  Where there are more offsets a tile has fewer
+# columns, but not so few that most of a plane of distances lies outside the tile.
 BAND_ROWS = 64
-_TILE_COLUMNS = 192
+_TILE_COLUMNS, _FEWEST_COLUMNS = 192, 24
+_TILE_DISTANCES = BAND_ROWS * _TILE_COLUMNS * 440
 # Pixels whose distances are sorted at once, so that they stay in the cache.
 _SORTED_PIXELS = 512
 # Bits of a distance that is infinite, because the pixel lies outside the image.
@@ -68,7 +70,27 @@ class PatchSearch:
         return int(self.offsets.max())
 
 
-def search_bands(guide: FloatArray, search: PatchSearch) -> Iterator[tuple[int, Keys]]:
+def tile_columns(offsets: int) -> int:
+    """Columns of pixels that a thread works on at a time.
+
+    Parameters
+    ----------
+    offsets : int
+        Pixels that each is compared with.
+
+    Returns
+    -------
+    int
+
+    Examples
+    --------
+    >>> [tile_columns(search**2 - 1) for search in (5, 21, 41, 101)]
+    [192, 192, 50, 24]
+    """
+    return max(_FEWEST_COLUMNS, min(_TILE_COLUMNS, _TILE_DISTANCES // (BAND_ROWS * max(offsets, 1))))
+
+
+def search_bands(guide: FloatArray, search: PatchSearch, threads: int = 0) -> Iterator[tuple[int, Keys]]:
     """Choices of all pixels, band by band.
 
     Parameters
@@ -76,6 +98,8 @@ def search_bands(guide: FloatArray, search: PatchSearch) -> Iterator[tuple[int, 
     guide : ndarray, float32, shape (H, W)
         g; reflected beyond the border.
     search : PatchSearch
+    threads : int
+        Tiles worked on side by side; 0 means one per available core.
 
     Yields
     ------
@@ -94,11 +118,12 @@ def search_bands(guide: FloatArray, search: PatchSearch) -> Iterator[tuple[int, 
     height, width = guide.shape
     margin = search.reach + len(search.window) // 2
     padded = cv2.copyMakeBorder(guide, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
-    columns = range(0, width, _TILE_COLUMNS)
+    across = tile_columns(len(search.offsets))
+    columns = range(0, width, across)
 
     def choose(corner: tuple[int, int]) -> NDArray[np.int32]:
         top, left = corner
-        rows, wide = min(BAND_ROWS, height - top), min(_TILE_COLUMNS, width - left)
+        rows, wide = min(BAND_ROWS, height - top), min(across, width - left)
         block = padded[top : top + rows + 2 * margin, left : left + wide + 2 * margin]
         keys = _keys(block, search)
         _exclude_outside(keys, search.offsets, corner, (height, width))
@@ -106,7 +131,7 @@ def search_bands(guide: FloatArray, search: PatchSearch) -> Iterator[tuple[int, 
 
     corners = ((top, left) for top in range(0, height, BAND_ROWS) for left in columns)
     tiles: list[NDArray[np.int32]] = []
-    for (top, _), tile in map_ahead(choose, corners):
+    for (top, _), tile in map_ahead(choose, corners, threads):
         tiles.append(tile)
         if len(tiles) == len(columns):
             band = np.concatenate(tiles, axis=1)

@@ -19,7 +19,7 @@ from .blur_cues import bound_blur, displacement_maps
 from .border import Rectangle, coverage, well_seen
 from .centroid import Centroid, find_centroid
 from .decision import Decision
-from .device import explain_device, find_device
+from .device import needs_torch
 from .displacement import with_displacement
 from .dynamics import identify
 from .errors import DataError, require
@@ -39,9 +39,10 @@ from .frame_selection import best_frames, frame_quality
 from .frame_source import FrameSource
 from .images import check_space
 from .memory import MemoryPlan, plan_memory
+from .memory_size import DeconvolutionMemory
 from .psf import KOLMOGOROV
-from .restoration import STAGES, Restoration, RestoreParams, StageResults, place_stages
-from .scratch import mean_of, new_stack, release, return_freed, walk
+from .restoration import STAGES, Restoration, RestoreParams, StageResults, explain_devices, place_stages
+from .scratch import mean_of, new_stack, release, returning_freed, walk
 
 # Share of the training frames that show every pixel of a cropped image.
 _SEEN = 0.9
@@ -110,47 +111,12 @@ def restore(
     source = frames if isinstance(frames, FrameSource) else FrameSource.from_array(frames)
     plan = memory_plan(source, params)
     _check_sigma(params.deconvolution.sigma, source.shape)
-    stages = STAGES[: STAGES.index(params.until) + 1]
-    run = _Run(source, _within(plan, params), progress, done or StageResults(), on_result)
-    if plan.in_file:
-        run.scratch = scratch or Path(tempfile.gettempdir())
-        check_space(run.scratch / "training frames", plan.file_bytes)
-    stream = iter(source)
-    training = _read_training(stream, plan.train, source.shape, run.scratch)
-    run.clock.lap("read")
-    centroid = _find_centroid(run, training)
-    image, mean = centroid.image, mean_of(training)
-    dynamics = filtered = deblurred = None
-    if "identify" in stages:
-        dynamics = _identify(run, centroid, training)
-    if "filter" in stages and dynamics is not None:
-        filtered, mean = _filter(run, centroid, dynamics, training, stream)
-        image = filtered.image
-    if "deconvolve" in stages:
-        deblurred = _deblur(run, image, mean, centroid, training)
-        image = deblurred.deconvolution.image
-    crop, on_border = _crop(image, centroid.flows, params.border, deblurred)
-    x, y, width, height = crop
-    return Restoration(
-        image=image if params.border == "keep" else image[y : y + height, x : x + width],
-        crop=crop,
-        mean=mean,
-        centroid=centroid,
-        dynamics=dynamics,
-        filtered=filtered,
-        blur=None if deblurred is None else deblurred.blur,
-        blur_bounds=run.done.blur_bounds,
-        deconvolution=None if deblurred is None else deblurred.deconvolution,
-        guard_readings=() if deblurred is None else deblurred.readings,
-        decisions=(
-            *plan.decisions,
-            *_decisions(run, training, centroid, dynamics, filtered, deblurred),
-            on_border,
-        ),
-        train=plan.train,
-        frame_count=len(source) if filtered is not None else plan.train,
-        seconds=run.clock.seconds,
-    )
+    folder = scratch or Path(tempfile.gettempdir())
+    if plan.file_bytes:
+        check_space(folder / "what memory does not hold", plan.file_bytes)
+    run = _Run(source, _within(plan, params), progress, done or StageResults(), on_result, folder, plan.in_file)
+    with returning_freed(plan.tight):
+        return _restored(run, plan)
 
 
 def memory_plan(source: FrameSource, params: RestoreParams) -> MemoryPlan:
@@ -178,8 +144,18 @@ def memory_plan(source: FrameSource, params: RestoreParams) -> MemoryPlan:
     >>> plan.train, plan.in_file
     (9, False)
     """
+    params = place_stages(params)
+    placed = params.flow.device, params.filter.device, params.deconvolution.device
     return plan_memory(
-        source.shape, params.memory_limit, params.train, params.flow, params.filter, params.dynamics, params.until
+        source.shape,
+        params.memory_limit,
+        params.train,
+        params.flow,
+        params.filter,
+        params.dynamics,
+        params.deconvolution,
+        params.until,
+        on_device=any(map(needs_torch, (params.device, *placed))),
     )
 
 
@@ -259,11 +235,13 @@ class _Run:
         progress: Progress | None,
         done: StageResults,
         on_result: Callable[[StageResults], None] | None,
+        folder: Path,
+        in_file: bool,
     ) -> None:
         self.source, self.params, self.progress = source, params, progress
         self.done = done
         self.clock = _Clock()
-        self.scratch: Path | None = None
+        self.folder, self.scratch = folder, folder if in_file else None
         self._on_result = on_result
 
     def finish(self, done: StageResults, stage: str | None = None) -> None:
@@ -272,6 +250,48 @@ class _Run:
             self.clock.lap(stage)
         if self._on_result is not None:
             self._on_result(done)
+
+
+def _restored(run: _Run, plan: MemoryPlan) -> Restoration:
+    """Run the stages."""
+    params, source = run.params, run.source
+    stages = STAGES[: STAGES.index(params.until) + 1]
+    stream = iter(source)
+    training = _read_training(stream, plan.train, source.shape, run.scratch)
+    run.clock.lap("read")
+    centroid = _find_centroid(run, training)
+    image, mean = centroid.image, mean_of(training)
+    dynamics = filtered = deblurred = None
+    if "identify" in stages:
+        dynamics = _identify(run, centroid, training)
+    if "filter" in stages and dynamics is not None:
+        filtered, mean = _filter(run, centroid, dynamics, training, stream)
+        image = filtered.image
+    if "deconvolve" in stages:
+        deblurred = _deblur(run, image, mean, centroid, training)
+        image = deblurred.deconvolution.image
+    crop, on_border = _crop(image, centroid.flows, params.border, deblurred)
+    x, y, width, height = crop
+    return Restoration(
+        image=image if params.border == "keep" else image[y : y + height, x : x + width],
+        crop=crop,
+        mean=mean,
+        centroid=centroid,
+        dynamics=dynamics,
+        filtered=filtered,
+        blur=None if deblurred is None else deblurred.blur,
+        blur_bounds=run.done.blur_bounds,
+        deconvolution=None if deblurred is None else deblurred.deconvolution,
+        guard_readings=() if deblurred is None else deblurred.readings,
+        decisions=(
+            *plan.decisions,
+            *_decisions(run, training, centroid, dynamics, filtered, deblurred),
+            on_border,
+        ),
+        train=plan.train,
+        frame_count=len(source) if filtered is not None else plan.train,
+        seconds=run.clock.seconds,
+    )
 
 
 def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
@@ -328,7 +348,7 @@ def _deblur(run: _Run, image: FloatArray, mean: FloatArray, centroid: Centroid, 
         exponent = params.deconvolution.exponent or KOLMOGOROV
         bounds = bound_blur(image, mean, training, len(run.source), exponent)
     counter = stage_counter(run.progress, "deconvolve", params.deconvolution.iterations)
-    deblurred = remove_blur(image, centroid.image, params.deconvolution, params.guards, bounds, counter)
+    deblurred = remove_blur(image, centroid.image, params.deconvolution, params.guards, bounds, counter, run.folder)
     run.finish(replace(run.done, blur_bounds=bounds, deblurred=deblurred), "deconvolve")
     return deblurred
 
@@ -342,7 +362,7 @@ def _decisions(
     deblurred: Deblurred | None,
 ) -> Iterator[Decision]:
     """Put what was chosen into words, in the order of the stages."""
-    yield from explain_device(run.params.device, find_device(run.params.device), run.params.flow.method)
+    yield from explain_devices(run.params)
     yield explain_training(len(training), len(run.source), run.params.train)
     yield from explain_input(training)
     yield explain_centroid(centroid)
@@ -373,12 +393,10 @@ def _crop(image: FloatArray, flows: FloatArray, border: str, deblurred: Deblurre
 
 
 def _within(plan: MemoryPlan, params: RestoreParams) -> RestoreParams:
-    """Change the settings that the plan needs and that change nothing of the result beyond rounding."""
+    """Change the settings that the plan needs, and that change nothing of the result."""
     if params.memory_limit is None:
         return params
-    return_freed()
-    asked = params.deconvolution.memory
-    memory = plan.deconvolution if asked is None or plan.deconvolution is None else min(asked, plan.deconvolution)
+    memory = params.deconvolution.memory if plan.deconvolution is None else DeconvolutionMemory(plan.deconvolution)
     return replace(
         params,
         flow=replace(params.flow, threads=plan.threads),

@@ -14,14 +14,14 @@ from .border import Rectangle
 from .centroid import Centroid, CentroidParams
 from .decision import Decision
 from .deconvolution import Deconvolution, DeconvolutionParams
-from .device import PROCESSOR, check_device, find_device
+from .device import FLOW, PROCESSOR, check_device, explain_device, find_device
 from .dynamics import DynamicsParams
 from .errors import require
 from .flow import FlowParams
 from .flow_model import FlowDynamics
 from .frame_selection import Share, check_share
 from .guards import GuardParams, GuardReading
-from .memory import MemorySize
+from .memory_size import MemorySize
 from .plots import plot_images
 from .preview import preview
 
@@ -84,7 +84,7 @@ class RestoreParams:
         needed.  The result is the same unless even so fewer frames have to be trained on.
     device : str
         Where flow (tvl1), warps, fusion and deconvolution are computed: cpu, cuda, or auto for a GPU where torch sees
-        one.  It holds for the stages whose own ``device`` is cpu.
+        one.  It holds for the stages that have no ``device`` of their own.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -138,7 +138,7 @@ class RestoreParams:
 
 
 def place_stages(params: RestoreParams) -> RestoreParams:
-    """Find the device, and set it in every stage that has one and asks for no other.
+    """Find the device of every stage that has one: its own, or that of the whole chain.
 
     Parameters
     ----------
@@ -151,21 +151,42 @@ def place_stages(params: RestoreParams) -> RestoreParams:
     Raises
     ------
     ConfigurationError
-        The device is not there.
+        One of them is not there.
 
     Examples
     --------
-    >>> place_stages(RestoreParams()) == RestoreParams()
-    True
+    >>> place_stages(RestoreParams()).flow.device
+    'cpu'
     """
-    device = find_device(params.device)
     flow, fusion, deconvolution = params.flow, params.filter, params.deconvolution
     return replace(
         params,
-        flow=replace(flow, device=device) if flow.device == PROCESSOR else flow,
-        filter=replace(fusion, device=device) if fusion.device == PROCESSOR else fusion,
-        deconvolution=replace(deconvolution, device=device) if deconvolution.device == PROCESSOR else deconvolution,
+        flow=replace(flow, device=find_device(flow.device or params.device)),
+        filter=replace(fusion, device=find_device(fusion.device or params.device)),
+        deconvolution=replace(deconvolution, device=find_device(deconvolution.device or params.device)),
     )
+
+
+def explain_devices(params: RestoreParams) -> tuple[Decision, ...]:
+    """Say where the stages compute.
+
+    Parameters
+    ----------
+    params : RestoreParams
+        From :func:`place_stages`.
+
+    Returns
+    -------
+    tuple of Decision
+
+    Examples
+    --------
+    >>> explain_devices(place_stages(RestoreParams()))
+    ()
+    """
+    placed = {FLOW: params.flow.device, "filter": params.filter.device, "deconvolution": params.deconvolution.device}
+    stages = {name: device or PROCESSOR for name, device in placed.items()}
+    return explain_device(params.device, find_device(params.device), stages, params.flow.method)
 
 
 @dataclass(frozen=True)

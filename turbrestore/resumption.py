@@ -25,8 +25,10 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -42,15 +44,15 @@ from .blur_cues import BlurBounds
 from .blur_estimation import BlurEstimate
 from .centroid import Centroid
 from .checkpoint import load_checkpoint, save_checkpoint
-from .decision import Decision
 from .deconvolution import Deconvolution
+from .digests import content_digest, file_digest
 from .errors import DataError, OutputError, require
 from .flow_model import FlowDynamics
 from .frame_source import FrameSource
-from .guards import GuardReading
-from .images import IMAGE_SUFFIXES, atomic_output, atomic_write, input_errors
+from .images import atomic_output, atomic_write
 from .npy import map_npy
 from .pipeline import memory_plan
+from .record_fields import RecordFields
 from .restoration import RestoreParams, StageResults, place_stages
 from .run_record import RECORD as RUN_RECORD
 from .run_record import versions
@@ -66,11 +68,13 @@ FILES = {
     "filtered": ("filtered.npz", MEAN),
     "deblurred": ("deconvolution.npz", "blur.npz", "blur_bounds.npz"),
 }
+_ALL_FILES = tuple(name for names in FILES.values() for name in names)
 # All files that are kept beside those of a complete run.
 STAGE_FILES = (STAGES_RECORD, CHECKPOINT, MEAN)
+# Left by a writer that was killed.
+_PART = re.compile(r"\.[0-9a-f]{16}\.part")
+_ANEW = "start anew with --overwrite, or keep the stages in another folder"
 TITLES = {"centroid": "centroid", "dynamics": "flow model", "filtered": "filter", "deblurred": "deconvolution"}
-# Larger files are sampled: so many bytes, in so many pieces.
-_WHOLE, _PIECE, _PIECES = 4 << 30, 1 << 16, 1024
 
 Loaded = TypeVar("Loaded", bound="DataclassInstance")
 
@@ -166,7 +170,7 @@ class KeptStages:
         for stage in fresh:
             for name in FILES[stage]:
                 self._files.pop(name, None)
-            self._files |= {path.name: _digest(path) for path in self._save(stage)}
+            self._files |= {path.name: file_digest(path) for path in self._save(stage)}
         if fresh:
             self._write_record()
         if done.filtered is not None:
@@ -186,9 +190,6 @@ class KeptStages:
         checkpoint = self.done.checkpoint
         if checkpoint is None or _frames(self.done) <= self._written:
             return
-        # Without a record nobody would know what it belongs to.
-        if not (self.folder / STAGES_RECORD).exists():
-            self._write_record()
         save_checkpoint(self.folder / CHECKPOINT, checkpoint, self._key)
         self._written = _frames(self.done)
 
@@ -210,9 +211,21 @@ class KeptStages:
         -------
         str
         """
-        stages = [TITLES[stage] for stage in FILES if FILES[stage][0] in self._files]
-        words = f"after the {stages[-1]}" if stages else "from the start"
+        stages = itertools.takewhile(self._holds, FILES)
+        last = [TITLES[stage] for stage in stages][-1:]
+        words = f"after the {last[0]}" if last else "from the start"
         return f"{words} and {self._written} frames of the filter" if self._written else words
+
+    def withdraw(self) -> None:
+        """Leave no record of a run that has failed before it had anything to keep."""
+        if self._files or self._written:
+            return
+        for name in (*_ALL_FILES, CHECKPOINT, STAGES_RECORD):
+            (self.folder / name).unlink(missing_ok=True)
+
+    def _holds(self, stage: str) -> bool:
+        """Whether a result is there and on disk."""
+        return getattr(self.done, stage) is not None and FILES[stage][0] in self._files
 
     def _take_over(self, record: dict[str, Any]) -> None:
         """Load what still holds, and say where and why something starts again."""
@@ -265,12 +278,12 @@ class KeptStages:
         """Remove what does not belong to this run: nobody must take it for a part of it."""
         kept = {*self._files, *([CHECKPOINT] if self.done.checkpoint is not None else [])}
         try:
-            for name in {RUN_RECORD, *(name for names in FILES.values() for name in names), CHECKPOINT} - kept:
+            for name in {RUN_RECORD, *_ALL_FILES, CHECKPOINT} - kept:
                 (self.folder / name).unlink(missing_ok=True)
-            if kept:
-                self._write_record()
-            else:
-                (self.folder / STAGES_RECORD).unlink(missing_ok=True)
+            for path in [path for path in self.folder.iterdir() if is_part(path)]:
+                path.unlink(missing_ok=True)
+            # It comes first, so that whatever is found in the folder later is known to be of this run.
+            self._write_record()
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written to ({error.strerror or error})") from error
 
@@ -349,43 +362,6 @@ def stage_facts(source: FrameSource, params: RestoreParams) -> dict[str, dict[st
     return json.loads(json.dumps(facts))
 
 
-def content_digest(source: FrameSource) -> str:
-    """Checksum of what a video holds, wherever it lies and whatever its time stamps say.
-
-    Parameters
-    ----------
-    source : FrameSource
-
-    Returns
-    -------
-    str
-        Hexadecimal.
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The file is gone or cannot be read.
-
-    Examples
-    --------
-    >>> one, other = (FrameSource.from_array(np.full((2, 4, 4), value)) for value in (0.1, 0.2))
-    >>> content_digest(one) == content_digest(one), content_digest(one) == content_digest(other)
-    (True, False)
-    """
-    found = hashlib.blake2b(digest_size=16)
-    if source.path is None:
-        for frame in source.pixels(source.numbers):
-            found.update(np.ascontiguousarray(frame).tobytes())
-        return found.hexdigest()
-    with input_errors(source.path):
-        if not source.path.is_dir():
-            return _digest(source.path)
-        for path in sorted(source.path.iterdir()):
-            if path.suffix.lower() in IMAGE_SUFFIXES:
-                found.update(f"{path.name}\0{_digest(path)}\n".encode())
-    return found.hexdigest()
-
-
 def read_stages(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
     """Record of the stages that are kept in a folder.
 
@@ -409,37 +385,60 @@ def read_stages(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
     True
     """
     path = Path(folder) / STAGES_RECORD
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path}: expected the record of stages, found no file; {_ANEW}")
     try:
         record = json.loads(path.read_text("utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: expected the record of stages, found something else or damage") from error
-    parts = {"facts": dict, "files": dict, "deblurred": dict, "outputs": list}
-    known = isinstance(record, dict) and record.get("schema") == SCHEMA
-    if not known or not all(isinstance(record.get(name), kind) for name, kind in parts.items()):
-        raise DataError(f"{path}: expected the record of stages, layout {SCHEMA}, found another; start anew")
+        raise DataError(f"{path}: expected the record of stages, found something else or damage; {_ANEW}") from error
+    found = record.get("schema") if isinstance(record, dict) else "none"
+    if type(found) is not int or found != SCHEMA:
+        raise DataError(f"{path}: expected the record of stages, layout {SCHEMA}, found {found!r:.40}; {_ANEW}")
+    try:
+        _check_stages(RecordFields(path, record))
+    except DataError as error:
+        raise DataError(f"{error}; {_ANEW}") from error
     return record
 
 
-def _digest(path: Path) -> str:
-    """Checksum of a file; of a very large one, of its size, time stamp and pieces."""
-    found = hashlib.blake2b(digest_size=16)
-    with path.open("rb") as stream:
-        status = os.fstat(stream.fileno())
-        if status.st_size <= _WHOLE:
-            hashlib.file_digest(stream, lambda: found)
-            return found.hexdigest()
-        found.update(f"{status.st_size} {status.st_mtime_ns}".encode())
-        for start in np.linspace(0, status.st_size - _PIECE, _PIECES).astype(np.int64):
-            stream.seek(int(start))
-            found.update(stream.read(_PIECE))
-    return found.hexdigest()
+def _check_stages(fields: RecordFields) -> None:
+    """Refuse a record of stages whose values are of other types than those that are written."""
+    facts = fields.part("facts")
+    for stage in facts.record:
+        facts.part(stage)
+    fields.named_texts("files")
+    fields.texts("outputs")
+    verdict = fields.part("deblurred")
+    if verdict.record:
+        verdict.flag("estimated")
+        verdict.guard_readings("readings")
+        verdict.decisions("decisions")
+
+
+def is_part(path: Path) -> bool:
+    """Tell whether a file is what a writer leaves that is killed.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    bool
+
+    Examples
+    --------
+    >>> is_part(Path(".0123456789abcdef.part")), is_part(Path("letter.part"))
+    (True, False)
+    """
+    return _PART.fullmatch(path.name) is not None
 
 
 def _is_whole(path: Path, digest: str) -> bool:
     try:
-        return _digest(path) == digest
+        return file_digest(path) == digest
     except OSError:
         return False
 
@@ -487,7 +486,7 @@ def _verdict(deblurred: Deblurred) -> dict[str, Any]:
 
 def _deblurred(deconvolution: Deconvolution, blur: BlurEstimate | None, verdict: dict[str, Any]) -> Deblurred | None:
     """Put a deblurred image together again, unless a part of it is lost."""
+    fields = RecordFields(Path(STAGES_RECORD), verdict)
     if (blur is not None) is not verdict.get("estimated"):
         return None
-    readings = tuple(GuardReading(**item) for item in verdict["readings"])
-    return Deblurred(deconvolution, blur, None, readings, tuple(Decision(**item) for item in verdict["decisions"]))
+    return Deblurred(deconvolution, blur, None, fields.guard_readings("readings"), fields.decisions("decisions"))

@@ -28,14 +28,13 @@ from .blur_cues import BlurBounds
 from .blur_estimation import BlurEstimate
 from .border import Rectangle
 from .centroid import Centroid
-from .decision import Decision
 from .deconvolution import Deconvolution
 from .errors import DataError, InputNotFoundError, OutputError
 from .flow_model import FlowDynamics
 from .frame_source import FrameSource
-from .guards import GuardReading
 from .images import atomic_output, atomic_write
 from .npy import read_npz
+from .record_fields import RecordFields
 from .restoration import Restoration, RestoreParams
 
 if TYPE_CHECKING:
@@ -50,7 +49,6 @@ RUN_FILES = (*(f"{name}.npz" for name in RESULTS), IMAGES, RECORD)
 REPORT = "report.html"
 _PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "av", "tifffile", "pillow", "torch")
 
-Kind = TypeVar("Kind")
 Stage = TypeVar("Stage", bound="DataclassInstance")
 
 
@@ -256,7 +254,7 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
     turbrestore.errors.InputNotFoundError: missing: expected a folder written by --keep, found no run.json in it
     """
     place = Path(folder)
-    fields = _Fields(place / RECORD, _read_record(place))
+    fields = RecordFields(place / RECORD, _read_record(place))
     facts, run = fields.part("restoration"), fields.part("run")
     names = facts.texts("results")
     if "centroid" not in names or not set(names) <= set(RESULTS):
@@ -273,8 +271,8 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
         blur=_stage(place, names, "blur", BlurEstimate),
         blur_bounds=_stage(place, names, "blur_bounds", BlurBounds),
         deconvolution=_stage(place, names, "deconvolution", Deconvolution),
-        guard_readings=tuple(_guard_reading(item) for item in facts.parts("guard_readings")),
-        decisions=tuple(_decision(item) for item in facts.parts("decisions")),
+        guard_readings=facts.guard_readings("guard_readings"),
+        decisions=facts.decisions("decisions"),
         train=facts.value("train", int),
         frame_count=facts.value("frame_count", int),
         seconds=facts.numbers("seconds"),
@@ -284,7 +282,7 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
         frame=images["frame"],
         frame_number=run.value("frame_number", int),
         source=run.value("source", str),
-        settings=run.value("settings", dict),
+        settings=run.part("settings").like(dataclasses.asdict(RestoreParams())),
         command=run.texts("command"),
         warnings=run.texts("warnings"),
         versions={name: str(text) for name, text in run.value("versions", dict).items()},
@@ -292,53 +290,11 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
     )
 
 
-@dataclass(frozen=True)
-class _Fields:
-    """Part of a JSON record, read with its types checked."""
-
-    path: Path
-    record: dict[str, Any]
-
-    def value(self, name: str, kind: type[Kind]) -> Kind:
-        found = self.record.get(name)
-        if kind is float and type(found) is int:
-            found = float(found)
-        if not isinstance(found, kind) or isinstance(found, bool):
-            raise DataError(f"{self.path}: expected {name} to be {kind.__name__}, found {found!r:.40}")
-        return found
-
-    def part(self, name: str) -> _Fields:
-        return _Fields(self.path, self.value(name, dict))
-
-    def parts(self, name: str) -> list[_Fields]:
-        items = self.value(name, list)
-        return [_Fields(self.path, {name: item}).part(name) for item in items]
-
-    def texts(self, name: str) -> tuple[str, ...]:
-        return tuple(_Fields(self.path, {name: item}).value(name, str) for item in self.value(name, list))
-
-    def numbers(self, name: str) -> dict[str, float]:
-        part = self.part(name)
-        return {key: part.value(key, float) for key in part.record}
-
-
 def _stage(place: Path, names: tuple[str, ...], name: str, kind: type[Stage]) -> Stage | None:
     return load_artifact(place / f"{name}.npz", kind) if name in names else None
 
 
-def _decision(fields: _Fields) -> Decision:
-    return Decision(*(fields.value(item.name, str) for item in dataclasses.fields(Decision)))
-
-
-def _guard_reading(fields: _Fields) -> GuardReading:
-    figures = {name: fields.value(name, float) for name in ("sigma", "overshoot", "noise_gain")}
-    passed = fields.record.get("passed")
-    if not isinstance(passed, bool):
-        raise DataError(f"{fields.path}: expected passed to be true or false, found {passed!r:.40}")
-    return GuardReading(**figures, passed=passed)
-
-
-def _crop(fields: _Fields) -> Rectangle:
+def _crop(fields: RecordFields) -> Rectangle:
     found = fields.value("crop", list)
     if len(found) != 4 or not all(type(number) is int and number >= 0 for number in found):
         raise DataError(f"{fields.path}: expected crop to be x, y, width and height, found {found!r:.40}")
@@ -348,14 +304,16 @@ def _crop(fields: _Fields) -> Rectangle:
 
 def _read_record(place: Path) -> dict[str, Any]:
     path = place / RECORD
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path}: expected the record of a run, found no file")
     try:
         record = json.loads(path.read_text("utf-8"))
     except (FileNotFoundError, NotADirectoryError) as error:
         raise InputNotFoundError(f"{place}: expected a folder written by --keep, found no {RECORD} in it") from error
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: expected the record of a run, found something else or damage") from error
-    if not isinstance(record, dict) or record.get("schema") != SCHEMA:
-        found = record.get("schema") if isinstance(record, dict) else "none"
+    found = record.get("schema") if isinstance(record, dict) else "none"
+    if type(found) is not int or found != SCHEMA:
         raise DataError(f"{path}: expected the record of a run, layout {SCHEMA}, found layout {found!r:.40}")
     return record
 

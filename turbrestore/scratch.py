@@ -30,8 +30,8 @@ _SHARED = ("r", "r+", "w+")
 _SPARE = 1 << 26
 # Numbers that a piece of a large array has.
 _PART = 1 << 22
-# M_MMAP_THRESHOLD of mallopt, and the bytes from which an array is large.
-_MMAP_THRESHOLD, _LARGE = -3, 1 << 20
+# M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of mallopt; bytes from which an array is large, and of the largest kept.
+_MMAP_THRESHOLD, _TRIM_THRESHOLD, _LARGE, _LARGEST = -3, -1, 1 << 20, 32 << 20
 
 
 def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.float32]:
@@ -68,14 +68,14 @@ def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.
         free = shutil.disk_usage(folder).free
         if free < size + _SPARE:
             raise StorageError(
-                f"{folder}: expected {size / 1e9:.1f} GB free for frames that memory does not hold, found "
-                f"{free / 1e9:.1f} GB; name another folder by TMPDIR, or a higher memory limit"
+                f"{folder}: expected {size / 1e9:.1f} GB free for what memory does not hold, found "
+                f"{free / 1e9:.1f} GB; {_another(folder)}, or a higher memory limit"
             )
         with tempfile.TemporaryFile(dir=folder, prefix="turbrestore-") as file:
             _reserve(file, size)
             return np.memmap(file, np.float32, "r+", shape=shape)
     except OSError as error:
-        raise StorageError(f"{folder}: cannot hold {size / 1e9:.1f} GB of frames ({error.strerror})") from error
+        raise StorageError(f"{folder}: cannot hold a file of {size / 1e9:.1f} GB ({error.strerror})") from error
 
 
 def release(array: object) -> None:
@@ -194,18 +194,41 @@ def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
     return total / np.float32(len(stack))
 
 
-def return_freed() -> None:
-    """Have large arrays given back to the system as soon as they are freed, for the rest of the process.
+@contextlib.contextmanager
+def returning_freed(wanted: bool = True) -> Iterator[None]:
+    """Have large arrays given back to the system as soon as they are freed, meanwhile.
 
     The allocator of glibc otherwise raises the size from which it does so with every large array that is freed, and
-    what lies between those that are in use stays with the process: a third of the peak at 1920×1080.
+    what lies between those that are in use stays with the process: a third of the peak at 1920×1080.  Afterwards it
+    keeps arrays up to the size that it would have come to by itself.  The setting is that of the process: where two
+    work at the same time, it is that of the one that came or left last, which costs one of them time or memory.
+
+    Parameters
+    ----------
+    wanted : bool
+        Whether to do so, or nothing.
 
     Examples
     --------
-    >>> return_freed()
+    >>> with returning_freed():
+    ...     float(np.ones(2).sum())
+    2.0
     """
-    if platform.libc_ver()[0] == "glibc":
+    adjustable = wanted and platform.libc_ver()[0] == "glibc"
+    if adjustable:
         ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGE)
+    try:
+        yield
+    finally:
+        if adjustable:
+            # The first ends the adjustment by itself for good, so both are set to where it ends.
+            ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGEST)
+            ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, 2 * _LARGEST)
+
+
+def _another(folder: Path) -> str:
+    temporary = folder == Path(tempfile.gettempdir())
+    return f"name another {'folder by TMPDIR' if temporary else '--keep folder'}"
 
 
 def _reserve(file: IO[bytes], size: int) -> None:

@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from .arrays import FloatArray, from_unit
 from .errors import DataError
 from .frame_source import FrameSource, cut_short_text, skipped_end_text
-from .images import atomic_output, input_errors
+from .images import atomic_output
+from .input_files import input_errors
 from .limits import DEFAULT_LIMITS, Limits
 from .pixels import PixelArray, check_depth
 

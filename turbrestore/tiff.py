@@ -1,36 +1,31 @@
 """TIFF stacks: one page a frame, read page by page.
 
-The chain of pages is followed here before tifffile sees the file: tifffile ends at a broken link with a line in the
-log and gives fewer pages.
+Every page is checked before it is decoded (:mod:`turbrestore.tiff_pages`).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import lzma
 import os
-import struct
-import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .arrays import FloatArray, from_unit
-from .errors import DataError, TurbrestoreError
+from .errors import DataError
 from .frame_source import FrameSource
-from .images import atomic_output, first_line, input_errors
+from .images import atomic_output
+from .input_files import input_errors
 from .limits import DEFAULT_LIMITS, Limits
 from .pixels import PixelArray, check_depth, depth_of, full_scale_of
+from .tiff_pages import check_page, check_parts, count_pages, tiff_errors
 
 if TYPE_CHECKING:
     import tifffile
 
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
-_DEFLATE, _LZMA = (8, 32946), 34925
-_MOST_SAMPLES = 16
 
 
 def open_tiff(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> FrameSource:
@@ -68,10 +63,10 @@ def open_tiff(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> 
 
     path = Path(path)
     with input_errors(path), path.open("rb") as file:
-        pages = _count_pages(path, file, limits)
-    with input_errors(path), _tiff_errors(path), tifffile.TiffFile(path) as tiff:
+        pages = count_pages(path, file, limits)
+    with input_errors(path), tiff_errors(path), tifffile.TiffFile(path) as tiff:
         page = tiff.pages.first
-        _check_page(path, page, limits)
+        check_page(path, page, limits)
         packed = _packed_stack(path, tiff) if pages == 1 else None
         if packed is not None:
             return packed
@@ -142,46 +137,18 @@ def write_tiff(
 def _frames(path: Path, chosen: Sequence[int], limits: Limits) -> Iterator[PixelArray]:
     import tifffile
 
-    with input_errors(path), _tiff_errors(path), tifffile.TiffFile(path) as tiff:
+    with input_errors(path), tiff_errors(path), tifffile.TiffFile(path) as tiff:
         for number in chosen:
             page = tiff.pages[number].aspage()
-            _check_page(path, page, limits)
+            check_page(path, page, limits)
             channels, _ = _channels(path, page)
-            _check_inflation(path, page)
+            check_parts(path, page)
             pixels = page.asarray()
             if pixels.ndim == 3:
                 # Planes stored one after the other come as (C, H, W).
                 pixels = np.moveaxis(pixels, 0, -1) if page.axes.startswith("S") else pixels
                 pixels = pixels[..., :3] if channels else pixels[..., 0]
             yield np.iinfo(pixels.dtype).max - pixels if page.photometric == _WHITE_IS_ZERO else pixels
-
-
-def _check_page(path: Path, page: tifffile.TiffPage, limits: Limits) -> None:
-    """Refuse a page by its tags: too many pixels in the page or in one of its tiles, or too many values a pixel."""
-    limits.check_size(page.imagewidth, page.imagelength, str(path))
-    if page.is_tiled:
-        limits.check_size(page.tilewidth, page.tilelength, f"{path}: a tile")
-    if page.samplesperpixel > _MOST_SAMPLES:
-        raise DataError(f"{path}: expected up to {_MOST_SAMPLES} values a pixel, found {page.samplesperpixel}")
-
-
-def _check_inflation(path: Path, page: tifffile.TiffPage) -> None:
-    """Refuse compressed parts that inflate to more than the page has room for; tifffile would inflate them first."""
-    if page.compression not in (*_DEFLATE, _LZMA):
-        return
-    room = int(np.prod(page.chunks)) * np.dtype(page.dtype).itemsize
-    for offset, size in zip(page.dataoffsets, page.databytecounts, strict=True):
-        page.parent.filehandle.seek(offset)
-        data = page.parent.filehandle.read(size)
-        inflate = lzma.LZMADecompressor() if page.compression == _LZMA else zlib.decompressobj()
-        try:
-            found = len(inflate.decompress(data, room + 1))
-        except (zlib.error, lzma.LZMAError) as error:
-            raise DataError(
-                f"{path}: compressed pixels are damaged ({first_line(error)}); copy the file again"
-            ) from error
-        if found > room:
-            raise DataError(f"{path}: damaged; compressed pixels hold more than the {room} bytes that the page has")
 
 
 def _channels(path: Path, page: tifffile.TiffPage) -> tuple[tuple[int, ...], tuple[str, ...]]:
@@ -204,43 +171,3 @@ def _packed_stack(path: Path, tiff: tifffile.TiffFile) -> FrameSource | None:
     dtype = series.dtype.newbyteorder(tiff.byteorder)
     source = FrameSource.from_array(np.memmap(path, dtype, "r", series.dataoffset, series.shape), path.name)
     return dataclasses.replace(source, format=f"tiff/{series.dtype}", path=path)
-
-
-def _count_pages(path: Path, file: BinaryIO, limits: Limits) -> int:
-    """Follow the chain of pages to its end."""
-    head = file.read(16)
-    order = {b"II": "<", b"MM": ">"}.get(head[:2], "")
-    version = struct.unpack(f"{order}H", head[2:4])[0] if len(head) == 16 else None
-    if not order or version not in (42, 43):
-        raise DataError(f"{path}: not a TIFF file")
-    count_format, entry_size, link_format = ("H", 12, "I") if version == 42 else ("Q", 20, "Q")
-    link_size = struct.calcsize(link_format)
-    offset = struct.unpack(order + link_format, head[4:8] if version == 42 else head[8:16])[0]
-    size = os.fstat(file.fileno()).st_size
-    seen: set[int] = set()
-    while offset:
-        if offset in seen:
-            raise DataError(f"{path}: damaged; its pages form a circle")
-        seen.add(offset)
-        limits.check_count(len(seen), str(path))
-        try:
-            # Beyond the end nothing is read, and a larger offset than the system knows is none at all.
-            file.seek(min(offset, size))
-            (entries,) = struct.unpack(order + count_format, file.read(struct.calcsize(count_format)))
-            file.seek(min(file.tell() + entries * entry_size, size))
-            (offset,) = struct.unpack(order + link_format, file.read(link_size))
-        except struct.error:
-            raise DataError(f"{path}: cut short after {len(seen) - 1} whole pages; copy the file again") from None
-    if not seen:
-        raise DataError(f"{path}: expected at least one page, found none")
-    return len(seen)
-
-
-@contextmanager
-def _tiff_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (TurbrestoreError, OSError):
-        raise
-    except Exception as error:  # tifffile documents no closed list of exceptions for damaged files
-        raise DataError(f"{path}: cannot be read as TIFF ({first_line(error)})") from error

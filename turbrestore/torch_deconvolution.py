@@ -15,7 +15,9 @@ import numpy as np
 
 from .arrays import FloatArray
 from .convolution_problem import Problem
+from .device import memory_of
 from .nonlocal_tv import NonlocalParams
+from .primal_dual import PRIMAL_STEP, RELAXATION
 from .psf import estimate_noise, laplacian_symbol, wiener_fidelity
 from .torch_weights import (
     device_divergence,
@@ -28,9 +30,6 @@ from .torch_weights import (
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-# As in primal_dual: ρ and τ‖K‖.
-_RELAXATION, _PRIMAL_STEP = 1.4, 0.08
 
 
 @dataclass(frozen=True)
@@ -141,6 +140,11 @@ def solve_on_device(
     -------
     DeviceSolution
 
+    Raises
+    ------
+    ConfigurationError
+        The memory of the device is not enough.
+
     Examples
     --------
     >>> import numpy as np
@@ -151,6 +155,17 @@ def solve_on_device(
     >>> solution.converged, bool(np.allclose(solution.images[0], 0.5, atol=1e-5))
     (True, True)
     """
+    with memory_of(device, "take a smaller --roi"):
+        return _solve(problems, guide, settings, device, progress)
+
+
+def _solve(
+    problems: list[Problem],
+    guide: FloatArray | None,
+    settings: SolverSettings,
+    device: str,
+    progress: Callable[[int], None] | None,
+) -> DeviceSolution:
     loaded = [_load(problem, device) for problem in problems]
     if settings.method in ("wiener", "tikhonov"):
         symbol = np.ones((1, 1), np.float32) if settings.method == "tikhonov" else _laplacian(problems[0])
@@ -198,14 +213,14 @@ class _PrimalDual:
 
     def step(self, problem: _Problem, state: _DualState) -> _DualState:
         norm = self.regulariser.norm_squared**0.5
-        tau, s = _PRIMAL_STEP / norm, 1 / (_PRIMAL_STEP * norm)
+        tau, s = PRIMAL_STEP / norm, 1 / (PRIMAL_STEP * norm)
         u, spectrum, p = state
         metric = 1 / tau + problem.fidelity * problem.otf.abs() ** 2
         down = (_forward(self.regulariser.adjoint(p)) + problem.gradient_spectrum(spectrum)) / metric
         moved = _back(down, u)
         ascent = self.regulariser.gradient(u - 2 * moved).mul_(s).add_(p)
         forward = self.regulariser.project(ascent)
-        return _DualState(u - _RELAXATION * moved, spectrum - _RELAXATION * down, p + _RELAXATION * (forward - p))
+        return _DualState(u - RELAXATION * moved, spectrum - RELAXATION * down, p + RELAXATION * (forward - p))
 
     def penalty(self, problem: _Problem, u: Tensor) -> float:
         return self.regulariser.value(u)

@@ -15,7 +15,17 @@ import cv2
 import numpy as np
 
 from .arrays import FloatArray, luminance
-from .frame_noise import FrameNoise
+from .device import memory_of
+from .frame_noise import (
+    AROUND_FOLD,
+    FOLD_FADE,
+    LARGEST_EXPONENT,
+    LARGEST_SCORE,
+    LOG_DISTRUST,
+    OUTLIER,
+    OUTLIER_WINDOW,
+    FrameNoise,
+)
 from .image_stacks import StackOps, torch_ops, warp_stack
 from .kalman import PixelGaussian
 
@@ -24,11 +34,6 @@ if TYPE_CHECKING:
 
 # Sobel's derivative, divided by 8, is one along and the other across.
 _DIFFERENCE, _BINOMIAL = np.array([-1, 0, 1], np.float32), np.array([0.125, 0.25, 0.125], np.float32)
-# As in frame_noise: what deviates by more variances than this in a window is no scene, scores beyond the next are
-# outliers, and Z is so many times larger where a map folds.
-_OUTLIER, _OUTLIER_WINDOW, _LARGEST_SCORE, _DISTRUST = 6.0, 3.0, 3.0, 1e3
-# Pixels around a fold that are lost with it, on each side, and how far that fades.
-_AROUND, _FADE = 3, 2.0
 
 
 class DevicePixels(NamedTuple):
@@ -90,6 +95,11 @@ def load_fusion(model: FrameNoise, sharpness: float, drift: float, device: str) 
     Returns
     -------
     DeviceFusion
+
+    Raises
+    ------
+    ConfigurationError
+        The memory of the device is not enough.
     """
     ops = torch_ops(device)
     along, across = model.template
@@ -103,7 +113,8 @@ def load_fusion(model: FrameNoise, sharpness: float, drift: float, device: str) 
         "usual_frame": model.usual_frame,
         "deviation": model.deviation,
     }
-    maps = {name: ops.load(np.asarray(array, np.float32)) for name, array in arrays.items()}
+    with memory_of(device, "take a smaller --roi"):
+        maps = {name: ops.load(np.asarray(array, np.float32)) for name, array in arrays.items()}
     return DeviceFusion(maps, model.image_noise, model.window, model.template_energy, sharpness, drift, ops)
 
 
@@ -161,7 +172,19 @@ def fuse_frame(
     -------
     pixels : DevicePixels
     record : FusedFrame
+
+    Raises
+    ------
+    ConfigurationError
+        The memory of the device is not enough.
     """
+    with memory_of(str(pixels.variance.device), "take a smaller --roi"):
+        return _fuse(pixels, frame, modelled, measured, fusion)
+
+
+def _fuse(
+    pixels: DevicePixels, frame: FloatArray, modelled: FloatArray, measured: FloatArray, fusion: DeviceFusion
+) -> tuple[DevicePixels, FusedFrame]:
     ops, maps = fusion.ops, fusion.maps
     flow = ops.load(modelled)
     flow = flow + maps["motion_share"][..., None] * (ops.load(measured) - flow)
@@ -178,18 +201,18 @@ def fuse_frame(
 
 
 def _noise(grey: Tensor, projected: Tensor, flow: Tensor, fusion: DeviceFusion) -> Tensor:
-    """Z of a frame; see :func:`turbrestore.frame_noise.noise_of_frame`."""
+    """Z of a frame; see :func:`turbrestore.frame_noise.judge_frame`."""
     ops, maps, beta = fusion.ops, fusion.maps, fusion.sharpness
     if beta == 0:
         return ops.arrays.full_like(grey, fusion.image_noise)
-    excess = _smooth((grey - maps["usual_frame"]).square(), _OUTLIER_WINDOW, ops) / maps["deviation"] / _OUTLIER
+    excess = _smooth((grey - maps["usual_frame"]).square(), OUTLIER_WINDOW, ops) / maps["deviation"] / OUTLIER
     excess = excess.clamp(min=1)
     squared = excess.square()
     score = maps["score_scale"] * (_smooth(projected, fusion.window, ops) - maps["usual"])
-    score = score.clamp(-_LARGEST_SCORE, _LARGEST_SCORE)
+    score = score.clamp(-LARGEST_SCORE, LARGEST_SCORE)
     score = ops.arrays.where(score > 0, score / squared, score)
-    exponent = 0.5 * beta**2 * maps["score_variance"] - beta * score + float(np.log(_DISTRUST)) * _lost(flow, ops)
-    return fusion.image_noise * squared * excess * exponent.exp()
+    exponent = 0.5 * beta**2 * maps["score_variance"] - beta * score + float(LOG_DISTRUST) * _lost(flow, ops)
+    return fusion.image_noise * squared * excess * exponent.clamp(max=LARGEST_EXPONENT).exp()
 
 
 def _lost(flow: Tensor, ops: StackOps) -> Tensor:
@@ -198,11 +221,11 @@ def _lost(flow: Tensor, ops: StackOps) -> Tensor:
 
     (ux, uy), (vx, vy) = (_gradient(flow[..., axis], ops) for axis in (0, 1))
     folded = ((1 + ux) * (1 + vy) <= uy * vx).float()
-    wider = functional.max_pool2d(folded[None, None], 2 * _AROUND + 1, stride=1, padding=_AROUND)[0, 0]
+    wider = functional.max_pool2d(folded[None, None], 2 * AROUND_FOLD + 1, stride=1, padding=AROUND_FOLD)[0, 0]
     height, width = flow.shape[:2]
     y, x = (ops.load(axis) for axis in np.mgrid[:height, :width].astype(np.float32))
     inside = _inside(x + flow[..., 0], width) * _inside(y + flow[..., 1], height)
-    return ops.arrays.maximum(_smooth(wider, _FADE, ops), 1 - inside)
+    return ops.arrays.maximum(_smooth(wider, FOLD_FADE, ops), 1 - inside)
 
 
 def _inside(position: Tensor, length: int) -> Tensor:

@@ -18,17 +18,13 @@ import numpy as np
 
 from .arrays import FloatArray
 from .image_stacks import torch_ops
-from .nonlocal_tv import NonlocalParams
-from .nonlocal_tv import _automatic_h as automatic_h
-from .nonlocal_tv import _offsets as search_offsets
+from .nonlocal_tv import SMALLEST_WEIGHT, NonlocalParams, automatic_h, search_offsets
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 # Bytes of the distances of a strip: little on a processor, and what keeps a GPU busy.
 _STRIP_BYTES_CPU, _STRIP_BYTES_GPU = 1.6e7, 2.5e8
-# As in nonlocal_tv: of edges that matter least.
-_SMALLEST_WEIGHT = 1e-6
 # Sorts last: the pixel itself, which is no neighbour.
 _LAST = np.iinfo(np.int32).max
 
@@ -87,7 +83,7 @@ def weights_on_device(guide: FloatArray, params: NonlocalParams, device: str) ->
 
     h = params.h if params.h is not None else automatic_h(guide)
     pixels, neighbours, distances = _neighbours(guide, params, device)
-    weights = torch.exp(-distances / float(np.float32(h**2))).clamp(min=_SMALLEST_WEIGHT)
+    weights = torch.exp(-distances / float(np.float32(h**2))).clamp(min=SMALLEST_WEIGHT)
     # Sorted by pair, the two directions of an edge stand side by side, and the larger weight counts.
     pairs, order = torch.sort(torch.minimum(pixels, neighbours) * guide.size + torch.maximum(pixels, neighbours))
     weights = weights[order]
@@ -288,7 +284,7 @@ def _neighbours(guide: FloatArray, params: NonlocalParams, device: str) -> tuple
 def _best_keys(padded: Tensor, top: int, rows: int, height: int, params: NonlocalParams) -> Tensor:
     """Distance and rank of offset in one integer, for the nearest and the best offsets of the pixels of a strip.
 
-    See ``_best_keys`` of :mod:`turbrestore.nonlocal_tv` for why integers.
+    Integers as in :mod:`turbrestore.patch_search`: of like distances the nearer offset comes first.
     """
     import torch
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import re
 import stat
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -27,8 +26,17 @@ from .arrays import FloatArray, check_image, from_unit
 from .container import CONTAINER_SUFFIXES, open_container
 from .encoding import write_mkv, write_mp4
 from .errors import DataError, require
-from .frame_source import FrameRange, FrameSource, Roi, check_frame_range, numbers_text, size_text
-from .images import IMAGE_SUFFIXES, atomic_output, check_output, input_errors, read_pixels
+from .frame_source import (
+    FrameRange,
+    FrameSource,
+    Roi,
+    check_frame_range,
+    frame_files,
+    numbers_text,
+    size_text,
+)
+from .images import IMAGE_SUFFIXES, atomic_output, check_output, read_pixels
+from .input_files import check_input, input_errors
 from .limits import DEFAULT_LIMITS, Limits
 from .npy import map_npy
 from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit
@@ -96,8 +104,7 @@ def open_frames(
     """
     path = Path(path)
     wanted = check_frame_range(frames)
-    with input_errors(path):
-        is_folder = stat.S_ISDIR(path.stat().st_mode)
+    is_folder = stat.S_ISDIR(check_input(path).st_mode)
     suffix = path.suffix.lower()
     if is_folder:
         source = _open_folder(path, limits)
@@ -188,14 +195,7 @@ def _check_first(source: FrameSource) -> None:
 
 def _open_folder(folder: Path, limits: Limits) -> FrameSource:
     with input_errors(folder):
-        files = sorted(
-            (
-                entry
-                for entry in folder.iterdir()
-                if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
-            ),
-            key=_natural,
-        )
+        files = frame_files(folder)
     if not files:
         raise DataError(f"{folder}: expected images ({', '.join(IMAGE_SUFFIXES)}), found none in the folder")
     limits.check_count(len(files), str(folder))
@@ -210,12 +210,6 @@ def _open_folder(folder: Path, limits: Limits) -> FrameSource:
         path=folder,
         warnings=notes,
     )
-
-
-def _natural(file: Path) -> tuple[list[tuple[int, str]], str]:
-    """Sort key in which the digits of a name count as numbers."""
-    parts = re.findall(r"\d+|\D+", file.name)
-    return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts], file.name
 
 
 def _images(

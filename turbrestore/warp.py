@@ -21,15 +21,12 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from .arrays import FloatArray, check_flow, check_image
-from .device import PROCESSOR, find_device
+from .device import PROCESSOR, find_device, memory_of
 from .errors import ConfigurationError, DataError
-from .image_stacks import StackOps, torch_ops, warp_stack
+from .image_stacks import PREFILTER, StackOps, torch_ops, warp_stack
 
-# Pole of the cubic B-spline prefilter; its impulse response below is cut off where it falls under 1e-7.
-_POLE = np.sqrt(3.0) - 2.0
 # Pixels of a strip: a dozen arrays of it stay in the cache of a core.
 _STRIP = 1 << 14
-_PREFILTER = (-6 * _POLE / (1 - _POLE**2) * _POLE ** np.abs(np.arange(-12, 13))).astype(np.float32)
 
 
 def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device: str = PROCESSOR) -> FloatArray:
@@ -57,7 +54,7 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device
     DataError
         Shapes do not agree, or values are not finite.
     ConfigurationError
-        Unknown interpolation.
+        Unknown interpolation, or the device is not there or has not enough memory.
 
     Examples
     --------
@@ -72,8 +69,10 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device
         raise ConfigurationError(f"interpolation: expected one of {', '.join(INTERPOLATIONS)}, found {interpolation!r}")
     if flow.ndim != 3 or image.shape[:2] != flow.shape[:2]:
         raise DataError(f"flow: expected shape {(*image.shape[:2], 2)}, found {flow.shape}")
-    if interpolation == "cubic" and find_device(device) != PROCESSOR:
-        return _on_device(image, flow, torch_ops(find_device(device)))
+    found = find_device(device)
+    if interpolation == "cubic" and found != PROCESSOR:
+        with memory_of(found, "take a smaller --roi"):
+            return _on_device(image, flow, torch_ops(found))
     return INTERPOLATIONS[interpolation](image, flow)
 
 
@@ -280,7 +279,7 @@ def _linear(image: FloatArray, flow: FloatArray) -> FloatArray:
 def _cubic(image: FloatArray, flow: FloatArray) -> FloatArray:
     """Sum of 4×4 B-spline coefficients as a blend of four bilinear samples (Sigg and Hadwiger 2005)."""
     grid = _pixel_grid(*flow.shape[:2])
-    coefficients = cv2.sepFilter2D(image, -1, _PREFILTER, _PREFILTER, borderType=cv2.BORDER_REFLECT_101)
+    coefficients = cv2.sepFilter2D(image, -1, PREFILTER, PREFILTER, borderType=cv2.BORDER_REFLECT_101)
     result = np.empty_like(coefficients)
     for rows in strips(flow.shape):
         x, y = (axis[rows] + flow[rows, :, index] for index, axis in enumerate(grid))

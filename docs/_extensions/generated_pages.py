@@ -15,7 +15,7 @@ from types import NoneType
 from typing import TYPE_CHECKING, Any, get_args
 
 import turbrestore
-from turbrestore_cli.__main__ import COMMANDS, build
+from turbrestore_cli.application import COMMANDS, build
 from turbrestore_cli.examples import EXAMPLES
 
 if TYPE_CHECKING:

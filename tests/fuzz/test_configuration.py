@@ -8,7 +8,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from turbrestore.errors import ConfigurationError
-from turbrestore_cli.__main__ import build, main
+from turbrestore_cli.__main__ import main
+from turbrestore_cli.application import build
 from turbrestore_cli.options import Selection
 from turbrestore_cli.settings import settings as settings_of
 

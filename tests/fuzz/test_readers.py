@@ -1,5 +1,6 @@
 """Whatever the bytes: a reader gives frames in [0, 1] or one of the errors that are meant, never anything else."""
 
+import dataclasses
 import json
 import struct
 import warnings
@@ -11,10 +12,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from turbrestore.artifacts import load_artifact, save_artifact
+from turbrestore.alternating import Filtered, FilterParams, filter_frames
+from turbrestore.artifacts import KINDS, load_artifact, save_artifact
+from turbrestore.blur_cues import BlurBounds
+from turbrestore.blur_estimation import BlurEstimate
 from turbrestore.centroid import Centroid
 from turbrestore.content import check_content, clean_source
+from turbrestore.deconvolution import Deconvolution, DeconvolutionParams, deconvolve
+from turbrestore.dynamics import DynamicsParams, identify
 from turbrestore.errors import TurbrestoreError
+from turbrestore.flow_model import FlowDynamics
 from turbrestore.images import read_image
 from turbrestore.limits import Limits
 from turbrestore.npy import map_npy, read_npz
@@ -30,6 +37,27 @@ CHANGES = st.lists(
     min_size=1,
     max_size=4,
 )
+
+
+CLIP = np.random.default_rng(1).random((4, 16, 16), dtype=np.float32)
+FAST = FilterParams(inner_iterations=1)
+
+
+def make_results():
+    """One small result of every kind."""
+    flows = np.random.default_rng(2).normal(size=(6, 16, 16, 2)).astype(np.float32)
+    dynamics = identify(flows, DynamicsParams(rank=2))
+    return {
+        "centroid": Centroid(CLIP[0], flows, np.ones(2), True),
+        "dynamics": dynamics,
+        "filtered": filter_frames(CLIP, CLIP[0], dynamics, FAST),
+        "deconvolution": deconvolve(CLIP[0], 1.0, DeconvolutionParams(method="tv", iterations=5)),
+        "blur": BlurEstimate(1.0, 0.1, 5 / 3, 0.01, 1, 9.0, np.arange(3.0), np.ones(3)),
+        "blur_bounds": BlurBounds(0.5, 2.0),
+    }
+
+
+WHOLE = make_results()
 
 
 def changed(data: bytes, changes) -> bytes:
@@ -149,16 +177,12 @@ class TestArchives:
 
     @given(
         header=st.recursive(
-            st.none()
-            | st.booleans()
-            | st.floats()
-            | st.text(max_size=8)
-            | st.sampled_from(["centroid", 1, "dynamics"]),
+            st.none() | st.booleans() | st.floats() | st.text(max_size=8) | st.sampled_from([*KINDS, 1]),
             lambda inner: (
                 st.lists(inner, max_size=3)
                 | st.dictionaries(
                     st.sampled_from(
-                        ["kind", "schema", "fields", "converged", "image", "flows", "mean_flow_sizes", "x"]
+                        ["kind", "schema", "fields", "converged", "image", "flows", "mean_flow_sizes", "low", "high"]
                     ),
                     inner,
                     max_size=4,
@@ -167,12 +191,83 @@ class TestArchives:
             max_leaves=8,
         ),
         kept=st.sets(st.sampled_from(["image", "flows", "mean_flow_sizes"])),
+        kind=st.sampled_from(list(KINDS.values())),
     )
     @settings(MANY, max_examples=150)
-    def test_any_header_of_an_artifact(self, tmp_path, header, kept):
+    def test_any_header_of_an_artifact(self, tmp_path, header, kept, kind):
         arrays = {name: np.zeros(3) for name in kept}
         np.savez(tmp_path / "a.npz", allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
         try:
-            load_artifact(tmp_path / "a.npz", Centroid)
+            load_artifact(tmp_path / "a.npz", kind)
         except TurbrestoreError as error:
-            assert "\n" not in str(error)
+            assert "\n" not in str(error) and "a.npz" in str(error)
+
+
+# Values at the edge of what floating point holds, and ordinary ones.
+VALUES = st.sampled_from([0.0, -0.0, 1.0, -1.0, 1e-30, 1e30, -1e30, 1e300, np.nan, np.inf, -np.inf, 5e8]) | st.floats()
+SCALARS = st.none() | st.booleans() | st.integers() | VALUES | st.text(max_size=4) | st.just(10**400)
+ARRAYS = st.one_of(
+    st.tuples(st.just("value"), VALUES, st.floats(0, 1)),
+    st.tuples(st.just("scale"), st.sampled_from([-1.0, 0.0, 1e3, 1e8, 1e-20])),
+    st.tuples(st.just("dtype"), st.sampled_from(["f2", "f8", ">f4", "i4", "c8", "U3", "?", "M8[s]", "u1"])),
+    st.tuples(st.just("axis"), st.sampled_from(["drop", "add", "flat", "turn", "first"])),
+    st.tuples(st.just("cut"), st.integers(0, 3), st.integers(-2, 2)),
+)
+
+
+def doctored(array, change):
+    how, *rest = change
+    if how == "value":
+        array = array.copy()
+        if array.size:
+            with np.errstate(all="ignore"):
+                array.flat[min(int(rest[1] * array.size), array.size - 1)] = rest[0] if array.dtype.kind == "f" else 7
+        return array
+    if how == "scale":
+        return array * array.dtype.type(rest[0])
+    if how == "dtype":
+        with np.errstate(all="ignore"):
+            return array.astype(rest[0])
+    if how == "axis":
+        ways = {"drop": np.squeeze, "add": lambda a: a[None], "flat": np.ravel, "turn": np.transpose}
+        return np.ascontiguousarray(ways.get(rest[0], lambda a: a[0] if len(a) else a)(array))
+    axis, count = rest[0] % array.ndim, rest[1]
+    return np.take(array, range(max(array.shape[axis] + count, 0)), axis, mode="clip") if array.size else array
+
+
+def use(result):
+    """Do with a result what the next stage does, and draw it."""
+    if isinstance(result, Centroid):
+        identify(result.flows)
+        filter_frames(CLIP, result.image, WHOLE["dynamics"], FAST)
+        assert len(result.flows)
+    elif isinstance(result, FlowDynamics):
+        found = filter_frames(CLIP, CLIP[0], result, FAST)
+        assert np.isfinite(found.image).all()
+        assert np.isfinite(result.eigenvalues).all() and np.isfinite(result.state_covariance).all()
+    elif isinstance(result, (Filtered, Deconvolution)):
+        deconvolve(result.image, 1.0, DeconvolutionParams(method="wiener"))
+    result_html = getattr(result, "_repr_html_", None)
+    assert result_html is None or isinstance(result_html(), str)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(data=st.data())
+@settings(MANY, max_examples=60)
+# Numbers up to a billion are read; what they overflow to is told in words or is clipped.
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_doctored_artifacts_are_refused_or_can_be_used(tmp_path, kind, data):
+    result = WHOLE[kind]
+    field = data.draw(st.sampled_from([item.name for item in dataclasses.fields(result)]))
+    value = getattr(result, field)
+    changed_value = doctored(value, data.draw(ARRAYS)) if isinstance(value, np.ndarray) else data.draw(SCALARS)
+    save_artifact(tmp_path / "a.npz", dataclasses.replace(result, **{field: changed_value}), overwrite=True)
+    try:
+        loaded = load_artifact(tmp_path / "a.npz", KINDS[kind])
+    except TurbrestoreError as error:
+        assert "\n" not in str(error) and "a.npz" in str(error)
+        return
+    try:
+        use(loaded)
+    except TurbrestoreError as error:
+        assert "\n" not in str(error)

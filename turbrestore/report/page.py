@@ -99,7 +99,8 @@ def write_report(
     '<!doctype html>'
     """
     check_report(path, overwrite=overwrite)
-    atomic_write(path, render_report(restoration, run).encode(), overwrite)
+    # Names of files are bytes on most systems, and need not be text.
+    atomic_write(path, render_report(restoration, run).encode(errors="replace"), overwrite)
 
 
 def render_report(restoration: Restoration, run: RunRecord) -> str:

@@ -1,0 +1,134 @@
+"""The application: its commands, and how failures end."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import sys
+
+from cyclopts import App, CycloptsError, UnusedCliTokensError
+
+from turbrestore import __version__
+from turbrestore.errors import ConfigurationError, StorageError, TurbrestoreError
+
+from .examples import EXAMPLES, FIRST_STEPS, epilogue
+from .settings import settings_file
+from .signals import INTERRUPTED
+from .streams import flush, silence, tell
+
+# Where each command lives, and what it says in one line.
+COMMANDS = {
+    "restore": ("restore:restore", "Restore a video: the whole chain, input first, output last."),
+    "report": ("report:report", "Write the report of a run that restore --keep has kept."),
+    "centroid": ("stages:centroid", "Find the centroid of a video."),
+    "flow": ("stages:flow", "Measure the flow from one image to every frame of a video."),
+    "identify": ("stages:identify", "Identify the dynamics of flows."),
+    "filter": ("stages:filter_", "Filter a video with known centroid and dynamics."),
+    "deconvolve": ("stages:deconvolve", "Deblur an image."),
+    "synthesize": ("synthesis:synthesize", "Make a turbulent video with known truth and flow."),
+    "info": ("inspection:info", "Say what a video is."),
+    "evaluate": ("inspection:evaluate", "Compare a result with the truth."),
+    "config": ("config:config", "Write a settings file with every setting explained, or check one."),
+    "doctor": ("doctor:doctor", "Check what this installation can do."),
+    "moments wavefront": ("moments:wavefront", "A wavefront sensor that is exposed all the time."),
+    "moments mirror": ("moments:mirror", "A steered mirror seen by a slow camera."),
+    "--install-completion": ("completion:install_completion", "Install completion for bash, zsh or fish."),
+}
+
+BUG = 1
+
+
+def build() -> App:
+    """Assemble the application; commands are imported when they run."""
+    app = App(
+        name="turbrestore",
+        help="Restore one sharp image from a video of a static scene seen through atmospheric turbulence.",
+        help_epilogue=epilogue(FIRST_STEPS),
+        version=__version__,
+        config=settings_file,
+        result_action="return_value",
+        suppress_keyboard_interrupt=False,
+    )
+    groups = {
+        "": app,
+        "moments": App(
+            name="moments",
+            help="Compare estimators for slow sensors of fast motion, on simulated frames.",
+            help_epilogue=epilogue(EXAMPLES["moments wavefront"] + EXAMPLES["moments mirror"]),
+        ),
+    }
+    app.command(groups["moments"])
+    package = __package__ or "turbrestore_cli"
+    for words, (place, summary) in COMMANDS.items():
+        group, _, name = words.rpartition(" ")
+        groups[group].command(f"{package}.{place}", name=name, help=summary, help_epilogue=epilogue(EXAMPLES[words]))
+    return app
+
+
+def run(words: list[str]) -> int:
+    """Run one command.
+
+    Parameters
+    ----------
+    words : list of str
+        Words after the program's name.
+
+    Returns
+    -------
+    int
+        Exit code: 0 done, 2 usage, 65 bad data, 66 no such input, 73 cannot create the output, 74 I/O error,
+        130 interrupted, 143 terminated, 1 a bug.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    # The libraries that decode images print their own complaints; ours is the one line that counts.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
+    try:
+        _refuse_empty(words)
+        build()(words, exit_on_error=False, print_error=False)
+        flush()
+    except BrokenPipeError:
+        # The reader has seen enough; a second complaint at exit would be about the same.
+        silence(sys.stdout)
+    except (CycloptsError, TurbrestoreError, KeyboardInterrupt, OSError, MemoryError) as error:
+        message, code = _explain(error)
+        tell(f"turbrestore: {' '.join(message.split())}")
+        return code
+    return 0
+
+
+def _refuse_empty(words: list[str]) -> None:
+    """Refuse empty words, which mostly come from empty variables of a shell; as paths they would name this folder."""
+    for word in words:
+        if not word or (word.startswith("--") and word.endswith("=")):
+            raise ConfigurationError(f"{word.rstrip('=') or 'command line'}: expected a value, found an empty word")
+
+
+def _explain(error: BaseException) -> tuple[str, int]:
+    """One line and an exit code for a failure that is no bug."""
+    if isinstance(error, TurbrestoreError):
+        return str(error), error.exit_code
+    if isinstance(error, UnusedCliTokensError):
+        words = " ".join(error.unused_tokens or [])
+        return f"{words}: one word too many; --help says what is expected", ConfigurationError.exit_code
+    if isinstance(error, CycloptsError):
+        return str(error), ConfigurationError.exit_code
+    if isinstance(error, OSError):
+        return f"{error.filename or _full_output() or 'system'}: {error.strerror or error}", StorageError.exit_code
+    if isinstance(error, MemoryError):
+        return "out of memory; use --memory-limit, --roi or fewer --train frames", BUG
+    return str(error) or "interrupted", getattr(error, "exit_code", INTERRUPTED)
+
+
+def _full_output() -> str:
+    """Name standard output if it is to blame: what it has not taken before it does not take now."""
+    try:
+        flush()
+    except StorageError:
+        return "standard output"
+    except BrokenPipeError:
+        silence(sys.stdout)
+    return ""
