@@ -23,6 +23,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
 from hostile_files import (
     BOMBS,
     CONTENT,
@@ -88,6 +90,8 @@ def main() -> int:
     rows: list[Row] = []
     for module in IMPORTED:
         importlib.import_module(module)
+    # A fork has none of the threads that OpenCV believes it has, and would wait for them.
+    cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
         for name, group in GROUPS.items():
             if options.only in (None, name):
@@ -275,9 +279,6 @@ def _output(path: Path) -> Path:
 
 
 def _write_bombs(folder: Path, truth: Path) -> None:
-    import cv2
-    import numpy as np
-
     cv2.imwrite(str(truth), np.zeros((32, 32), np.uint8))
     for name, bomb in BOMBS.items():
         bomb.write(folder / name)
