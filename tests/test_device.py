@@ -172,6 +172,7 @@ class TestChoice:
             float(torch.fft.rfft2(torch.ones(64, 64)).abs().sum(dtype=torch.float64))
             print(most() - before, torch.version.cuda or torch.version.hip or "")
         """
+        # Only Linux tells a process the most memory that it has taken since it began, without a library.
         if not Path("/proc/self/status").exists():
             pytest.skip("the system does not say how much memory a process takes")
         words = [sys.executable, "-c", textwrap.dedent(script)]

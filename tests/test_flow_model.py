@@ -93,6 +93,7 @@ def test_a_state_is_the_same_from_a_file_and_piece_by_piece(noise_flows, tmp_pat
     np.testing.assert_allclose(kept, at_once, atol=1e-5)
 
 
+# Pages of a mapped file that are resident are counted by the system alone, and only Linux tells them.
 @pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
 def test_a_state_takes_a_piece_of_the_modes_at_a_time(rng, tmp_path):
     dynamics = identify(rng.normal(size=(4, 256, 512, 2)).astype(np.float32), DynamicsParams(rank=2))
