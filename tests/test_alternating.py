@@ -11,6 +11,7 @@ from turbrestore.centroid import find_centroid
 from turbrestore.dynamics import DynamicsParams, identify
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.flow import FlowParams
+from turbrestore.flow_tracking import state_covariances
 from turbrestore.kalman import Gaussian, PixelGaussian, predict, update, update_pixels
 from turbrestore.metrics import psnr
 from turbrestore.warp import warp
@@ -192,6 +193,18 @@ def test_frames_are_streamed_a_block_at_a_time(sequence):
     assert len(filtered.gains) == 40
     # Four training frames need no new flow; beyond them at most a block is in hand.
     assert furthest <= 4 + 5
+
+
+def test_covariances_of_a_block_are_those_of_the_filter_step_by_step(sequence):
+    _, dynamics = start(sequence)[:2]
+    noise, state = dynamics.R * np.eye(dynamics.rank), Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance)
+    frames = [sequence.frames[0], None, sequence.frames[1], None, None, sequence.frames[2]]
+    found = state_covariances(state, frames, dynamics)
+    for frame, covariance in zip(frames, found, strict=True):
+        state = predict(state, dynamics.A, dynamics.Q)
+        if frame is not None:
+            state, _ = update(state, np.zeros(dynamics.rank), np.eye(dynamics.rank), noise)
+        assert covariance == pytest.approx(state.cov, rel=1e-9, abs=1e-12 * state.cov.max())
 
 
 def test_threads_do_not_change_the_result(sequence):

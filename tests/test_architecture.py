@@ -16,7 +16,7 @@ ORDER = [
     "scene_cuts", "content", "integrity", "ser", "tiff", "container", "encoding", "video",
     "image_stacks", "warp", "psf", "stabilisation", "confidence", "tvl1_sweeps", "tvl1", "flow",
     "centroid", "flow_model", "flow_subspace", "dynamics", "displacement", "simulation", "kalman",
-    "blur_moments", "frame_noise", "torch_fusion", "alternating", "blur_estimation", "blur_cues",
+    "blur_moments", "frame_noise", "torch_fusion", "flow_tracking", "alternating", "blur_estimation", "blur_cues",
     "patch_search", "edge_strips", "nonlocal_tv", "nonlocal_penalty", "deconvolution_memory", "convolution_problem",
     "conjugate_gradients", "primal_dual", "local_tv", "planes", "torch_weights", "torch_deconvolution", "deconvolution",
     "blur_map", "guards", "blind", "border", "frame_selection", "explanation", "synthesis", "metrics",

@@ -10,8 +10,10 @@ from turbrestore.flow import (
     FarnebackParams,
     FlowParams,
     estimate_flow,
+    fill_flows,
     iterate_flows,
     normalise_contrast,
+    refer_flow,
 )
 from turbrestore.metrics import endpoint_error
 from turbrestore.pipeline import RestoreParams, restore
@@ -153,6 +155,18 @@ def test_frames_are_read_only_a_few_ahead():
     assert threading.active_count() < 10
 
 
+def test_what_is_prepared_of_a_frame_serves_every_reference():
+    stack = np.stack([pair(seed)[1] for seed in range(3)])
+    one, other = pair(0)[0], pair(1)[0]
+    kept, flows = {}, np.empty((3, *stack.shape[1:], 2), np.float32)
+    fill_flows(refer_flow(one), stack, flows, kept)
+    assert sorted(kept) == [0, 1, 2]
+    assert np.array_equal(flows, estimate_flow(one, stack))
+    # From what was kept, not from the stack.
+    fill_flows(refer_flow(other), np.zeros_like(stack), flows, kept)
+    assert np.array_equal(flows, estimate_flow(other, stack))
+
+
 @pytest.mark.parametrize("size", [(8, 8), (15, 64)])
 def test_images_too_small_for_flow_are_refused(size):
     image = np.zeros(size, np.float32)
@@ -161,7 +175,7 @@ def test_images_too_small_for_flow_are_refused(size):
 
 
 def test_frames_of_another_size_are_refused():
-    with pytest.raises(DataError, match="frame 0: expected"):
+    with pytest.raises(DataError, match="expected .96, 96. pixels, found .64, 64."):
         estimate_flow(texture(size=96), texture(size=64)[None])
 
 

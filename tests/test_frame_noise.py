@@ -57,7 +57,8 @@ def test_the_noise_is_that_of_its_definition(model_and_frames):
     assert np.median(np.abs(noise / (expected * 1000 ** (1 - seen)) - 1)) < 1e-3
 
 
-def test_a_fold_is_found_wherever_a_strip_ends(model_and_frames):
+def test_a_fold_is_found_wherever_a_strip_ends(model_and_frames, monkeypatch):
+    monkeypatch.setattr("turbrestore.warp._STRIP", 16_000)
     model, _, frames = model_and_frames
     ends = [rows.stop for rows in strips(SHAPE)][:-1]
     assert ends

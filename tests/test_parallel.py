@@ -1,4 +1,6 @@
+import itertools
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -7,7 +9,7 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore.flow import FlowParams
-from turbrestore.parallel import map_ahead
+from turbrestore.parallel import map_ahead, map_in_turns, sum_side_by_side
 from turbrestore.pipeline import RestoreParams, restore
 
 
@@ -69,11 +71,81 @@ def test_uses_in_several_threads_give_the_threads_back():
         cv2.setNumThreads(before)
 
 
-def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads():
-    frames = make_sequence(seed=3, count=14).frames[:, :64, :80]
-    one, *others = (restore(frames, RestoreParams(train=6, flow=FlowParams(threads=n))) for n in (1, 2, 4))
+def hurried(number):
+    """Takes longer for earlier items, so that later ones overtake them."""
+    time.sleep(0.002 * (3 - number % 4))
+    return number
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_what_carries_a_state_sees_items_in_their_order(threads):
+    seen, inside = [], threading.Lock()
+
+    def in_turn(number):
+        assert inside.acquire(blocking=False)
+        seen.append(number)
+        inside.release()
+        return sum(seen)
+
+    expected = list(itertools.accumulate(range(30)))
+    assert list(map_in_turns(hurried, in_turn, float, range(30), threads)) == expected
+    assert seen == list(range(30))
+
+
+@pytest.mark.parametrize("step", ["early", "in_turn", "late"])
+def test_the_first_error_reaches_the_caller_and_nobody_waits_for_a_turn(step):
+    def fail(number):
+        hurried(number)
+        if number in (5, 6):
+            raise ValueError(f"seen {number}")
+        return number
+
+    steps = {name: fail if name == step else hurried for name in ("early", "in_turn", "late")}
+    found = map_in_turns(**steps, items=range(20), threads=3)
+    assert list(itertools.islice(found, 5)) == [0, 1, 2, 3, 4]
+    with pytest.raises(ValueError, match="seen 5"):
+        next(found)
+    assert threading.active_count() == 1
+
+
+def test_a_stream_of_turns_can_be_left_early():
+    found = map_in_turns(hurried, abs, abs, itertools.count(), threads=3)
+    assert next(found) == 0
+    found.close()
+    assert threading.active_count() == 1
+
+
+@pytest.mark.parametrize("count", [1, 8, 9, 40])
+def test_sums_do_not_depend_on_the_number_of_threads(count):
+    values = np.random.default_rng(0).normal(size=(count, 5)) * 10.0 ** np.arange(-2, 3)
+
+    def add(some):
+        return np.sum(some, axis=0), np.sum(np.square(some), axis=0)
+
+    one, *others = (sum_side_by_side(add, iter(values), threads) for threads in (1, 2, 5))
+    assert one[0] == pytest.approx(values.sum(axis=0), rel=1e-12)
+    assert one[1] == pytest.approx(np.square(values).sum(axis=0), rel=1e-12)
+    assert all(a.tobytes() == b.tobytes() for other in others for a, b in zip(one, other, strict=True))
+
+
+def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypatch):
+    # Several strips and several sums of everything.
+    monkeypatch.setattr("turbrestore.warp._STRIP", 1000)
+    monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 700)
+    monkeypatch.setattr("turbrestore.flow_subspace._STRIP_BYTES", 1 << 16)
+    monkeypatch.setattr("turbrestore.deconvolution._THREADED_TRANSFORM", 0)
+    frames = make_sequence(seed=3, count=28).frames[:, :64, :80]
+
+    def run(threads):
+        for module in ("parallel", "deconvolution", "nonlocal_tv"):
+            monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: threads)
+        return restore(frames, RestoreParams(train=12, flow=FlowParams(threads=threads)))
+
+    one, *others = map(run, (1, 2, 4))
     for other in others:
         for name in ("image", "mean"):
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
         assert one.centroid.flows.tobytes() == other.centroid.flows.tobytes()
+        assert one.dynamics.C.tobytes() == other.dynamics.C.tobytes()
+        assert one.blur.sigma == other.blur.sigma
         assert np.array_equal(one.filtered.shares, other.filtered.shares)

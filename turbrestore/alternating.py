@@ -40,7 +40,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Literal
 
@@ -51,16 +50,15 @@ from numpy.typing import ArrayLike
 from .arrays import FloatArray, check_flow, check_image
 from .device import PROCESSOR, check_device, find_device
 from .errors import DataError, require, require_between
-from .flow import FlowParams, iterate_flows
-from .flow_model import FlowDynamics, flow_of, project
-from .frame_noise import FrameNoise, judge_frame, measure_frame_noise
-from .kalman import Gaussian, PixelGaussian, predict, predict_pixels, update_information, update_pixels
-from .parallel import map_ahead, one_thread_each
+from .flow import FlowFrame, FlowParams, iterate_flows
+from .flow_model import FlowDynamics, flow_of
+from .flow_tracking import Block, TrackedFrame, Tracking, state_covariances, track_known, track_measured
+from .frame_noise import FrameNoise, measure_frame_noise
+from .kalman import Gaussian, PixelGaussian, predict_pixels, update_pixels
+from .parallel import one_thread_each
 from .plots import plot_frames
 from .preview import preview
-from .scratch import walk
 from .torch_fusion import DeviceFusion, fuse_frame, load_fusion, load_pixels, store_pixels
-from .warp import warp
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,8 +67,6 @@ RESIDUALS = ("keep", "drop")
 FRAME_NOISES = ("sharpness", "blur")
 # Variance of an image nothing is known of: full scale, squared.
 _DIFFUSE = 1.0
-# Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
-_FLOW_NOISE_FLOOR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -247,33 +243,13 @@ class Filtered:
         return preview("Filtered image", facts, self.image)
 
 
-# Frames of a block, and frames with their flows; None for those that do not count.
-Block = list[FloatArray | None]
-Pair = tuple[FloatArray | None, FloatArray | None]
-
-
 @dataclass(frozen=True)
 class _Setting:
     """What stays the same from frame to frame."""
 
-    dynamics: FlowDynamics
-    model: FrameNoise
-    # G for both components of a flow: NumPy multiplies arrays of one shape several times as fast.
-    motion_share: FloatArray
+    tracking: Tracking
     params: FilterParams
-    flow_params: FlowParams
-    progress: Callable[[int], None] | None
     fusion: DeviceFusion | None
-
-
-@dataclass(frozen=True)
-class _Motion:
-    """One frame with its measured flow (None if it does not count), the flow state after it, and the innovation."""
-
-    frame: FloatArray | None
-    measured: FloatArray | None
-    state: Gaussian
-    innovation: float
 
 
 def filter_frames(
@@ -350,8 +326,9 @@ def filter_frames(
     if flows is None:
         flows = np.stack([flow for _, flow in iterate_flows(image, first, flow_params)])
     model = _noise_model(first, flows, image, dynamics, params, flow_params.threads)
-    share = cv2.merge([model.motion_share] * 2)
-    setting = _Setting(dynamics, model, share, params, flow_params, progress, _fusion(model, params))
+    fusion, share = _fusion(model, params), cv2.merge([model.motion_share] * 2)
+    tracking = Tracking(dynamics, model, share, params.sharpness, flow_params, fusion is None, progress)
+    setting = _Setting(tracking, params, fusion)
     with one_thread_each():
         if start is None:
             prior = _prior(image, setting)
@@ -391,8 +368,8 @@ def _first_block(stream: Iterator[FloatArray], block: int, flows: FloatArray | N
 
 def _prior(image: FloatArray, setting: _Setting) -> FilterState:
     """State before the first frame."""
-    frames, dynamics = setting.params.prior_frames, setting.dynamics
-    variance = setting.model.image_noise / frames if frames else _DIFFUSE
+    frames, dynamics = setting.params.prior_frames, setting.tracking.dynamics
+    variance = setting.tracking.model.image_noise / frames if frames else _DIFFUSE
     return FilterState(
         PixelGaussian(image, np.full(image.shape[:2], variance, np.float32)),
         Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance),
@@ -403,14 +380,14 @@ def _pass_over(
     start: FilterCheckpoint, stream: Iterator[FloatArray], read: int, setting: _Setting
 ) -> tuple[FilterState, list[FrameRecord]]:
     """Read the frames up to a checkpoint, of which the first ``read`` have been."""
-    done = len(start.records)
+    done, dynamics = len(start.records), setting.tracking.dynamics
     shapes = start.state.image.variance.shape, start.state.flow.mean.shape
-    if done < read or shapes != (setting.dynamics.shape, (setting.dynamics.rank,)):
+    if done < read or shapes != (dynamics.shape, (dynamics.rank,)):
         raise DataError(f"start: expected a checkpoint of these frames, found one of {done} frames and shapes {shapes}")
     for _ in islice(stream, done - read):
         pass
-    if setting.progress is not None:
-        setting.progress(done * setting.params.inner_iterations - read)
+    if setting.tracking.progress is not None:
+        setting.tracking.progress(done * setting.params.inner_iterations - read)
     return start.state, list(start.records)
 
 
@@ -474,13 +451,16 @@ def _filter_block(
     prior: FilterState, frames: Block, known: FloatArray | None, setting: _Setting
 ) -> tuple[FilterState, list[FrameRecord]]:
     """Inner iterations over one block, each from the same prior with flows measured from the newest image."""
-    state, records = prior, list[FrameRecord]()
+    image, records = prior.image, list[FrameRecord]()
+    covariances = state_covariances(prior.flow, frames, setting.tracking.dynamics)
+    start, prepared = (prior.flow.mean, covariances, frames), dict[int, FlowFrame]()
     for iteration in range(setting.params.inner_iterations):
         if iteration == 0 and known is not None:
-            state, records = _filter_pass(prior, zip(walk(frames), walk(known), strict=True), setting)
+            tracked = track_known(*start, known, setting.tracking)
         else:
-            state, records = _filter_pass(prior, _measure(state.image.mean, frames, setting), setting)
-    return state, records
+            tracked = track_measured(*start, image.mean, prepared, setting.tracking)
+        image, records = _fuse(prior.image, tracked, setting)
+    return FilterState(image, Gaussian(records[-1].flow_state, covariances[-1])), records
 
 
 def _fusion(model: FrameNoise, params: FilterParams) -> DeviceFusion | None:
@@ -491,78 +471,41 @@ def _fusion(model: FrameNoise, params: FilterParams) -> DeviceFusion | None:
     return load_fusion(model, params.sharpness, params.image_drift, device)
 
 
-def _fuse_on_device(
-    prior: FilterState, pairs: Iterable[Pair], dynamics: FlowDynamics, fusion: DeviceFusion
-) -> tuple[FilterState, list[FrameRecord]]:
-    """:func:`_filter_pass` with the image on a device from the first frame to the last."""
-    pixels, flow = load_pixels(prior.image, fusion), prior.flow
-    records: list[FrameRecord] = []
-    for motion in _update_motion(prior.flow, pairs, dynamics):
-        flow = motion.state
-        if motion.frame is None or motion.measured is None:
-            records.append(FrameRecord(flow.mean, 0.0, np.nan, np.nan, 0.0))
-            continue
-        pixels, fused = fuse_frame(pixels, motion.frame, flow_of(dynamics, flow.mean), motion.measured, fusion)
-        records.append(FrameRecord(flow.mean, fused.gain, motion.innovation, fused.sharpness, fused.information))
-    return FilterState(store_pixels(pixels, fusion), flow), records
-
-
-def _filter_pass(prior: FilterState, pairs: Iterable[Pair], setting: _Setting) -> tuple[FilterState, list[FrameRecord]]:
-    """Update the flow state and the image by each frame and its flow (eqs. 14 to 19)."""
+def _fuse(
+    prior: PixelGaussian, frames: Iterable[TrackedFrame], setting: _Setting
+) -> tuple[PixelGaussian, list[FrameRecord]]:
+    """Take frame after frame into the image (eqs. 14 and 16)."""
     if setting.fusion is not None:
-        return _fuse_on_device(prior, pairs, setting.dynamics, setting.fusion)
-    image, flow, drift = prior.image, prior.flow, setting.params.image_drift
+        return _fuse_on_device(prior, frames, setting.tracking.dynamics, setting.fusion)
+    image, drift = prior, setting.params.image_drift
     records: list[FrameRecord] = []
-    motions = _update_motion(prior.flow, pairs, setting.dynamics)
-    registering = map_ahead(partial(_register, setting), motions, setting.flow_params.threads)
-    for motion, (registered, noise, sharpness) in registering:
-        flow = motion.state
-        if motion.frame is None:
-            records.append(FrameRecord(flow.mean, 0.0, np.nan, np.nan, 0.0))
+    for tracked in frames:
+        one = tracked.registered
+        if one is None:
+            records.append(_left_out_record(tracked))
             continue
-        image, gain = update_pixels(predict_pixels(image, drift) if drift else image, registered, noise)
-        information = float(np.mean(1 / np.asarray(noise)))
-        records.append(FrameRecord(flow.mean, float(gain.mean()), motion.innovation, sharpness, information))
-    return FilterState(image, flow), records
+        image, gain = update_pixels(predict_pixels(image, drift) if drift else image, one.frame, one.noise)
+        information = float(np.mean(1 / np.asarray(one.noise)))
+        records.append(FrameRecord(tracked.state, float(gain.mean()), tracked.innovation, one.sharpness, information))
+    return image, records
 
 
-def _measure(image: np.ndarray, frames: Block, setting: _Setting) -> Iterator[Pair]:
-    counting = walk(frame for frame in frames if frame is not None)
-    pairs = iterate_flows(image, counting, setting.flow_params)
-    for frame in frames:
-        if setting.progress is not None:
-            setting.progress(1)
-        yield (None, None) if frame is None else next(pairs)
-
-
-def _update_motion(prior: Gaussian, pairs: Iterable[Pair], dynamics: FlowDynamics) -> Iterator[_Motion]:
-    """Prediction and update of ξ for each frame (eqs. 14b, 14d, 17, 19).
-
-    It needs no image, so that frames can be warped side by side afterwards.
-    """
-    state, noise, unit = prior, max(dynamics.R, _FLOW_NOISE_FLOOR), np.eye(dynamics.rank)
-    for frame, measured in pairs:
-        prediction = predict(state, dynamics.A, dynamics.Q)
-        if frame is None or measured is None:
-            state = prediction
-            yield _Motion(None, None, state, np.nan)
+def _fuse_on_device(
+    prior: PixelGaussian, frames: Iterable[TrackedFrame], dynamics: FlowDynamics, fusion: DeviceFusion
+) -> tuple[PixelGaussian, list[FrameRecord]]:
+    """:func:`_fuse`, and what comes before it from the warp on, with the image on a device all the time."""
+    pixels = load_pixels(prior, fusion)
+    records: list[FrameRecord] = []
+    for tracked in frames:
+        if tracked.frame is None or tracked.measured is None:
+            records.append(_left_out_record(tracked))
             continue
-        # As CᵀC = I, what is measured of the state is Cᵀ(W^meas − W̄), and its noise that of the flow.
-        seen = project(dynamics, measured)
-        state, _ = update_information(prediction, seen, unit, noise, orthonormal=True)
-        foreseen = float(prediction.mean @ (2 * seen - prediction.mean))
-        deviation = np.subtract(measured, dynamics.mean_flow, dtype=np.float64)
-        squared = float(np.vdot(deviation, deviation)) - foreseen
-        yield _Motion(frame, measured, state, (max(squared, 0.0) / measured.size) ** 0.5)
+        flow = flow_of(dynamics, tracked.state)
+        pixels, fused = fuse_frame(pixels, tracked.frame, flow, tracked.measured, fusion)
+        figures = fused.gain, tracked.innovation, fused.sharpness, fused.information
+        records.append(FrameRecord(tracked.state, *figures))
+    return store_pixels(pixels, fusion), records
 
 
-def _register(setting: _Setting, motion: _Motion) -> tuple[FloatArray, float | FloatArray, float]:
-    """Frame on the image by Ŵ, its noise Z (eq. 15) and its sharpness."""
-    if motion.frame is None or motion.measured is None:
-        return np.full_like(setting.model.usual, np.nan), np.inf, np.nan
-    modelled = flow_of(setting.dynamics, motion.state.mean)
-    estimate = motion.measured - modelled
-    estimate *= setting.motion_share
-    estimate += modelled
-    registered = warp(motion.frame, estimate)
-    return registered, *judge_frame(registered, estimate, setting.model, setting.params.sharpness)
+def _left_out_record(tracked: TrackedFrame) -> FrameRecord:
+    return FrameRecord(tracked.state, gain=0.0, innovation=np.nan, sharpness=np.nan, information=0.0)

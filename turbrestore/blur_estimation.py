@@ -219,7 +219,9 @@ def _estimate_reduced(grey: FloatArray, factor: int, exponent: float, noise: flo
     width, uncertainty = _widen(lowest, factor), float("inf")
     resolved = lowest < _WIDTHS[-1] and (factor == 1 or lowest >= _RESOLVED)
     if resolved and evidence >= (_EVIDENCE if width >= _SOFT else _STRONG_EVIDENCE):
-        less, more = (_widen(_lowest(_costs(gradients, exponent, share * level)), factor) for share in (0.5, 2.0))
+        levels = (level / 2, 2 * level)
+        sweeps = map_ahead(lambda other: _lowest(_costs(gradients, exponent, other)), levels, len(levels))
+        less, more = (_widen(found, factor) for _, found in sweeps)
         uncertainty = abs(more - less) / 2
     tried = factor * _WIDTHS[: len(costs)]
     return BlurEstimate(width, uncertainty, exponent, level, factor, evidence, tried, costs)

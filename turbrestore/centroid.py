@@ -26,8 +26,8 @@ from numpy.typing import ArrayLike
 from .arrays import FloatArray, check_frames
 from .device import PROCESSOR
 from .errors import require, require_between
-from .flow import FlowParams, estimate_flow
-from .parallel import map_ahead
+from .flow import FlowFrame, FlowParams, fill_flows, refer_flow
+from .parallel import map_ahead, sum_side_by_side
 from .plots import plot_displacements
 from .preview import preview
 from .scratch import mean_of, new_stack, release, walk
@@ -171,9 +171,11 @@ def find_centroid(
     image = _start(stack, params, flow_params)
     total = np.zeros((*stack.shape[1:3], 2), np.float32)
     flows = new_stack((*stack.shape[:3], 2), scratch)
+    # Where even the frames are in a file, what is prepared of them is not kept.
+    prepared: dict[int, FlowFrame] | None = {} if scratch is None else None
     sizes: list[float] = []
     while True:
-        flows = estimate_flow(image, stack, flow_params, progress, flows)
+        fill_flows(refer_flow(image, flow_params), stack, flows, prepared, progress)
         mean_flow = mean_of(flows)
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
         change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
@@ -235,13 +237,14 @@ def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0, dev
     array([1., 1., 1., 1.], dtype=float32)
     """
 
-    def register(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
-        registered, seen = warp(*pair, device=device), np.maximum(inside(pair[1]), _UNSEEN)
-        registered *= seen if registered.ndim == seen.ndim else seen[..., None]
-        return registered, seen
+    def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, np.ndarray]:
+        total, weight = np.zeros(frames.shape[1:]), np.zeros(frames.shape[1:3])
+        for frame, flow in pairs:
+            registered, seen = warp(frame, flow, device=device), np.maximum(inside(flow), _UNSEEN)
+            registered *= seen if registered.ndim == seen.ndim else seen[..., None]
+            cv2.accumulate(registered, total)
+            cv2.accumulate(seen, weight)
+        return total, weight
 
-    total, weight = np.zeros(frames.shape[1:]), np.zeros(frames.shape[1:3])
-    for _, (registered, seen) in map_ahead(register, zip(walk(frames), walk(flows), strict=True), threads):
-        cv2.accumulate(registered, total)
-        cv2.accumulate(seen, weight)
+    total, weight = sum_side_by_side(add, zip(walk(frames), walk(flows), strict=True), threads)
     return (total.T / weight.T).T.astype(np.float32)

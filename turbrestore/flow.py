@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Literal
 
 import cv2
@@ -33,9 +32,9 @@ from .arrays import FloatArray, check_frames, check_image, luminance
 from .confidence import flow_confidence, regularise_flow
 from .device import PROCESSOR, check_device, find_device, memory_of
 from .errors import DataError, require, require_between
-from .parallel import map_ahead
+from .parallel import in_batches, map_ahead
 from .psf import estimate_noise
-from .scratch import release, walk
+from .scratch import release
 from .stabilisation import DEAD_ZONE, ShiftReference, overlap, refer_shift, shift_against
 from .tvl1 import TvL1Params, refer_tvl1, tvl1_flows
 
@@ -164,6 +163,49 @@ class FlowParams:
             check_device(self.device)
 
 
+@dataclass(frozen=True)
+class FlowFrame:
+    """A frame with all that is computed once for it, whatever it is compared with.
+
+    Attributes
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+    levels : ndarray, uint8, shape (H, W)
+        What the solvers see.
+    noise : float
+        σ of the frame, intensity; 0 where nothing asks for it.
+    """
+
+    image: FloatArray
+    levels: GreyBytes
+    noise: float
+
+
+@dataclass(frozen=True)
+class FlowReference:
+    """An image that flows start from, with all that is computed once for it.
+
+    Attributes
+    ----------
+    prepare : callable
+        From an image of the size of the reference to a FlowFrame; the same for every reference with these settings.
+    solve : callable
+        From a list of FlowFrame to the list of their flows, pixels.
+    shape : tuple of int
+        Height and width.
+    batch : int
+        Frames that are best solved at once.
+    threads : int
+        Batches that are best solved side by side; 0 means one per available core.
+    """
+
+    prepare: Callable[[FloatArray], FlowFrame]
+    solve: Callable[[list[FlowFrame]], list[FloatArray]]
+    shape: tuple[int, int]
+    batch: int
+    threads: int
+
+
 def estimate_flow(
     reference: ArrayLike,
     frames: ArrayLike,
@@ -209,12 +251,62 @@ def estimate_flow(
     """
     stack = check_frames(frames)
     flows = np.empty((*stack.shape[:3], 2), np.float32) if out is None else out
-    for index, (_, flow) in enumerate(iterate_flows(reference, walk(stack), params)):
-        flows[index] = flow
-        release(flows)
-        if progress is not None:
-            progress(1)
+    fill_flows(refer_flow(reference, params), stack, flows, progress=progress)
     return flows
+
+
+def fill_flows(
+    reference: FlowReference,
+    stack: FloatArray,
+    flows: FloatArray,
+    prepared: dict[int, FlowFrame] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Measure the flow to each of ``stack``, put it into ``flows``, and keep what was prepared of a frame.
+
+    Parameters
+    ----------
+    reference : FlowReference
+    stack : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
+    flows : ndarray, float32, shape (T, H, W, 2)
+        In memory or in a mapped file.
+    prepared : dict, optional
+        From number to frame, for the next reference; nothing is kept by default.  A byte a pixel of every frame.
+    progress : callable, optional
+        Called with 1 after each frame, in the calling thread.
+
+    Raises
+    ------
+    DataError
+        The frames have another size than the reference.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> stack, flows, prepared = np.ones((2, 16, 16), np.float32), np.ones((2, 16, 16, 2), np.float32), {}
+    >>> fill_flows(refer_flow(stack[0]), stack, flows, prepared)
+    >>> float(flows.max()), sorted(prepared)
+    (0.0, [0, 1])
+    """
+    if stack.shape[1:3] != reference.shape:
+        raise DataError(f"frames: expected {reference.shape} pixels, found {stack.shape[1:3]}")
+    known = {} if prepared is None else prepared
+
+    def frame(number: int) -> FlowFrame:
+        found = known.get(number) or reference.prepare(stack[number])
+        if prepared is not None:
+            prepared[number] = found
+        return found
+
+    def fill(numbers: list[int]) -> None:
+        for number, flow in zip(numbers, reference.solve([frame(number) for number in numbers]), strict=True):
+            flows[number] = flow
+        release(flows)
+        release(stack)
+
+    for numbers, _ in map_ahead(fill, in_batches(range(len(stack)), reference.batch), reference.threads):
+        if progress is not None:
+            progress(len(numbers))
 
 
 def iterate_flows(
@@ -252,6 +344,48 @@ def iterate_flows(
     >>> [float(abs(flow).max()) for _, flow in iterate_flows(image, [image, image])]
     [0.0, 0.0]
     """
+    target = refer_flow(reference, params)
+
+    def checked() -> Iterator[FloatArray]:
+        for index, frame in enumerate(frames):
+            image = check_image(frame, f"frame {index}")
+            if image.shape[:2] != target.shape:
+                raise DataError(f"frame {index}: expected {target.shape} pixels, found {image.shape[:2]}")
+            yield image
+
+    def solve(batch: list[FloatArray]) -> list[FloatArray]:
+        return target.solve([target.prepare(frame) for frame in batch])
+
+    for batch, flows in map_ahead(solve, in_batches(checked(), target.batch), target.threads):
+        yield from zip(batch, flows, strict=True)
+
+
+def refer_flow(reference: ArrayLike, params: FlowParams | None = None) -> FlowReference:
+    """Prepare the image that flows start from.
+
+    Parameters
+    ----------
+    reference : array_like, shape (H, W) or (H, W, 3)
+    params : FlowParams, optional
+        Method and settings.
+
+    Returns
+    -------
+    FlowReference
+
+    Raises
+    ------
+    DataError
+        The image is smaller than 16×16, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:32, :32].astype(np.float32)
+    >>> reference = refer_flow(y * x / 1024)
+    >>> float(abs(reference.solve([reference.prepare(y * x / 1024)])[0]).max())
+    0.0
+    """
     params = params or FlowParams()
     target = check_image(reference, "reference")
     if min(target.shape[:2]) < MIN_SIDE:
@@ -259,36 +393,30 @@ def iterate_flows(
             f"reference: expected at least {MIN_SIDE}×{MIN_SIDE} pixels for optical flow, found "
             f"{target.shape[1]}×{target.shape[0]}"
         )
-    prepared = _prepare(target, params)
+    prepared = _levels(target, params)
     position = refer_shift(target) if params.global_shift else None
     confidence = flow_confidence(target) if params.confidence else None
-
     solver = FLOW_METHODS[params.method](params, prepared)
 
-    def shift_of(frame: FloatArray) -> FloatArray:
-        return np.zeros(2, np.float32) if position is None else _whole_shift(frame, position)
+    def prepare(image: FloatArray) -> FlowFrame:
+        return FlowFrame(image, _levels(image, params), estimate_noise(image) if confidence is not None else 0.0)
 
-    def solve(batch: list[FloatArray]) -> list[FloatArray]:
+    def shift_of(frame: FlowFrame) -> FloatArray:
+        return np.zeros(2, np.float32) if position is None else _whole_shift(frame.image, position)
+
+    def solve(batch: list[FlowFrame]) -> list[FloatArray]:
         shifts = [shift_of(frame) for frame in batch]
-        levels = [_shifted(_prepare(frame, params), s, prepared) for frame, s in zip(batch, shifts, strict=True)]
+        levels = [_shifted(frame.levels, s, prepared) for frame, s in zip(batch, shifts, strict=True)]
         flows = list(solver(np.stack(levels)))
         if confidence is not None:
-            noises = map(estimate_noise, batch)
-            flows = [regularise_flow(flow, confidence, n) for flow, n in zip(flows, noises, strict=True)]
+            flows = [regularise_flow(f, confidence, frame.noise) for f, frame in zip(flows, batch, strict=True)]
         return [flow + shift if shift.any() else flow for shift, flow in zip(shifts, flows, strict=True)]
-
-    def checked() -> Iterator[FloatArray]:
-        for index, frame in enumerate(frames):
-            image = check_image(frame, f"frame {index}")
-            if image.shape[:2] != target.shape[:2]:
-                raise DataError(f"frame {index}: expected {target.shape[:2]} pixels, found {image.shape[:2]}")
-            yield image
 
     # A device solves a batch at once, while the next is prepared; on the processor every frame has a thread.
     on_device = params.method == "tvl1" and find_device(params.device or PROCESSOR) != PROCESSOR
-    stream, size, threads = checked(), *((params.tvl1.batch, 2) if on_device else (1, params.threads))
-    for batch, flows in map_ahead(solve, iter(lambda: list(islice(stream, size)), []), threads):
-        yield from zip(batch, flows, strict=True)
+    return FlowReference(
+        prepare, solve, target.shape[:2], *((params.tvl1.batch, 2) if on_device else (1, params.threads))
+    )
 
 
 def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> FloatArray:
@@ -323,7 +451,7 @@ def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> 
     return centred
 
 
-def _prepare(image: FloatArray, params: FlowParams) -> GreyBytes:
+def _levels(image: FloatArray, params: FlowParams) -> GreyBytes:
     """8-bit image for the solvers: DIS takes nothing else, and the others lose nothing measurable."""
     if params.contrast_window > 0:
         normalised = normalise_contrast(image, params.contrast_window, params.contrast_floor)

@@ -22,11 +22,12 @@ import numpy as np
 from .arrays import FloatArray, check_flow
 from .errors import DataError
 from .flow_model import Float64Array
+from .parallel import map_ahead, sum_side_by_side
 from .scratch import new_stack, release
 
-# Size of the float64 strip of all flows that is in memory at once. Smaller strips would save little memory and
-# hand the linear algebra pieces too small to be worth a second thread.
-_STRIP_BYTES = 2**25
+# Size of a float64 strip of all flows; each thread has one in memory.  Flows that are made on the fly are made anew for
+# every strip.
+_STRIP_BYTES, _STRIP_BYTES_MADE = 2**22, 2**25
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,11 @@ class FlowStrips:
                 raise DataError(f"flows: expected all of one shape (H, W, 2), found {shape} beside {shapes[0]}")
         return cls(flows, len(shapes), *shapes[0][:2])
 
+    @property
+    def threads(self) -> int:
+        """Strips worked on side by side, 0 for one a core: flows that may be made on the fly are asked for in turn."""
+        return 0 if isinstance(self.flows, np.ndarray) else 1
+
     def rows(self) -> list[slice]:
         """Rows of each strip.
 
@@ -91,7 +97,8 @@ class FlowStrips:
         -------
         list of slice
         """
-        step = max(_STRIP_BYTES // (16 * self.count * max(self.width, 1)), 1)
+        size = _STRIP_BYTES if isinstance(self.flows, np.ndarray) else _STRIP_BYTES_MADE
+        step = max(size // (16 * self.count * max(self.width, 1)), 1)
         return [slice(start, start + step) for start in range(0, self.height, step)]
 
     def read(self, rows: slice) -> Float64Array:
@@ -142,14 +149,19 @@ def gram_matrix(strips: FlowStrips) -> tuple[FloatArray, Float64Array, float]:
     (array([2., 0.], dtype=float32), [[1.0, -1.0], [-1.0, 1.0]], 10)
     """
     mean = np.empty((strips.height, strips.width, 2), np.float32)
-    gram, energy = np.zeros((strips.count, strips.count)), 0.0
-    for rows in strips.rows():
-        strip = strips.read(rows)
-        energy += float(np.vdot(strip, strip))
-        flat = strip.mean(0).astype(np.float32)
-        mean[rows] = flat.reshape(mean[rows].shape)
-        strip -= flat
-        gram += strip @ strip.T
+
+    def add(batch: list[slice]) -> tuple[Float64Array, ...]:
+        gram, energy = np.zeros((strips.count, strips.count)), np.zeros(())
+        for rows in batch:
+            strip = strips.read(rows)
+            energy += np.vdot(strip, strip)
+            flat = strip.mean(0).astype(np.float32)
+            mean[rows] = flat.reshape(mean[rows].shape)
+            strip -= flat
+            gram += strip @ strip.T
+        return gram, energy
+
+    gram, energy = sum_side_by_side(add, strips.rows(), strips.threads)
     return mean, gram, float(np.sqrt(energy))
 
 
@@ -220,12 +232,17 @@ def spatial_modes(
     """
     C = new_stack((*mean.shape, len(singular_values)), scratch)
     energy = np.empty(mean.shape[:2])
-    for rows in strips.rows():
-        strip = strips.read(rows) - mean[rows].reshape(-1)
+
+    def fill(rows: slice) -> None:
+        strip = strips.read(rows)
+        strip -= mean[rows].reshape(-1)
         modes = strip.T @ V
         # V has orthonormal columns: what the modes hold over time is what the residual does not.
         left = np.einsum("tx,tx->x", strip, strip) - np.einsum("xi,xi->x", modes, modes)
         energy[rows] = np.maximum(left, 0.0).reshape(mean[rows].shape).mean(-1)
         C[rows] = (modes / singular_values).reshape(C[rows].shape)
         release(C)
+
+    for _ in map_ahead(fill, strips.rows(), strips.threads):
+        pass
     return C.reshape(mean.size, len(singular_values)), energy

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from .arrays import FloatArray, luminance
 from .blur_moments.frame_blur import BlurReference, blur_against, refer_blur
 from .blur_moments.fusion import FusionRule, fusion_rule, laplacian_energy, noise_factor
-from .parallel import map_ahead
+from .parallel import sum_side_by_side
 from .scratch import walk
 from .warp import inside, strips, warp
 
@@ -145,19 +145,22 @@ def measure_frame_noise(
     """
     template = _gradient(luminance(image))
 
-    def measure(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
-        registered = luminance(warp(*pair))
-        return registered, _smooth(_product(registered, template), window)
+    kept: dict[int, FloatArray] = {}
 
-    total, squares, sharp, sharp_squares = (np.zeros(image.shape[:2]) for _ in range(4))
-    kept: list[FloatArray] = []
-    for _, (registered, sharpness) in map_ahead(measure, zip(walk(frames), walk(flows), strict=True), threads):
-        cv2.accumulate(registered, total)
-        cv2.accumulateSquare(registered, squares)
-        cv2.accumulate(sharpness, sharp)
-        cv2.accumulateSquare(sharpness, sharp_squares)
-        if by_blur:
-            kept.append(registered)
+    def measure(batch: list[tuple[int, tuple[FloatArray, FloatArray]]]) -> tuple[np.ndarray, ...]:
+        sums = tuple(np.zeros(image.shape[:2]) for _ in range(4))
+        for number, (frame, flow) in batch:
+            registered = luminance(warp(frame, flow))
+            sharpness = _smooth(_product(registered, template), window)
+            for plane, (total, squared) in ((registered, sums[:2]), (sharpness, sums[2:])):
+                cv2.accumulate(plane, total)
+                cv2.accumulateSquare(plane, squared)
+            if by_blur:
+                kept[number] = registered
+        return sums
+
+    pairs = zip(walk(frames), walk(flows), strict=True)
+    total, squares, sharp, sharp_squares = sum_side_by_side(measure, enumerate(pairs), threads)
     count = len(frames)
     variance = np.maximum(squares / count - (total / count) ** 2, 0.0) * count / max(count - 1, 1)
     usual = sharp / count
@@ -179,7 +182,9 @@ def measure_frame_noise(
         window=window,
         usual_frame=usual_frame,
         deviation=deviation,
-        blur=_blur_rule(np.stack(kept), image, sensor_noise) if len(kept) > 1 else None,
+        blur=_blur_rule(np.stack([kept[number] for number in range(count)]), image, sensor_noise)
+        if by_blur and count > 1
+        else None,
     )
 
 
@@ -275,16 +280,18 @@ def _without_outliers(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean of the registered frames and their variance about it, once what deviates from all of them is left out."""
 
-    def trim(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, NDArray[np.uint8]]:
-        registered = luminance(warp(*pair))
-        return registered, (_deviates(registered, centre, spread) <= OUTLIER).view(np.uint8)
+    def trim(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
+        counted, total, squares = (np.zeros(mean.shape) for _ in range(3))
+        for frame, flow in pairs:
+            registered = luminance(warp(frame, flow))
+            kept = (_deviates(registered, centre, spread) <= OUTLIER).view(np.uint8)
+            cv2.accumulate(kept, counted)
+            cv2.accumulate(registered, total, kept)
+            cv2.accumulateSquare(registered - centre, squares, kept)
+        return counted, total, squares
 
     centre, spread = mean.astype(np.float32), _deviation(variance)
-    counted, total, squares = (np.zeros(mean.shape) for _ in range(3))
-    for _, (registered, kept) in map_ahead(trim, zip(walk(frames), walk(flows), strict=True), threads):
-        cv2.accumulate(kept, counted)
-        cv2.accumulate(registered, total, kept)
-        cv2.accumulateSquare(registered - centre, squares, kept)
+    counted, total, squares = sum_side_by_side(trim, zip(walk(frames), walk(flows), strict=True), threads)
     trimmed = np.where(counted > 0, total / np.maximum(counted, 1), mean)
     counted = np.maximum(counted, 1)
     return trimmed.astype(np.float32), _deviation(np.maximum(squares / counted - (trimmed - centre) ** 2, 0.0))

@@ -5,7 +5,7 @@ threads::
 
     base + stack + modes + HW · (shared + c · colour + t · (each + c · each_colour))
 
-    stack = τ HW · (4 c + 8)    training frames and their flows
+    stack = τ HW · (4 c + 8)    training frames and their flows; τ HW more for what flow prepares of frames in memory
     modes = 8 n HW              modes of the flow model, once it is identified
 
 and for the deconvolution what :mod:`turbrestore.deconvolution_memory` says.
@@ -183,7 +183,8 @@ class _Work:
             # What threads have in hand comes into memory while it is used.
             stack, modes = min(stack, self.stack(2 * threads + 3)), min(modes, 4.0 * _IN_HAND * threads)
         flow = _FLOW.bytes(*size)
-        block = 4.0 * self.pixels * self.channels * min(self.filter.block, self.shape[0])
+        prepared = 0.0 if in_file else 1.0 * self.pixels * train
+        block = self.pixels * (4.0 * self.channels + 1.0) * min(self.filter.block, self.shape[0])
         judged = 8.0 * self.pixels * train if self.filter.frame_noise == "blur" else 0.0
         later = {
             "centroid": 0.0,
@@ -192,7 +193,7 @@ class _Work:
             "deconvolve": self.held() + _BLUR.bytes(*size) + self.pairs.peak(Room(1, True)),
         }
         stages = list(later)[: list(later).index(self.until) + 1]
-        return self.base + stack + max(flow, modes + max(later[stage] for stage in stages))
+        return self.base + stack + max(flow + prepared, modes + max(later[stage] for stage in stages))
 
     def held(self) -> float:
         """Results of the stages before the deconvolution."""

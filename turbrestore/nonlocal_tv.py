@@ -37,8 +37,9 @@ from .patch_search import BAND_ROWS, OUTSIDE, Keys, PatchSearch, search_bands
 from .psf import estimate_noise
 from .scratch import new_stack, release
 
-# Pixels of a strip, about: all that an iteration needs of their edges fits in the cache of a processor.
-STRIP_PIXELS = 16000
+# Largest number of pixels of a strip, about: their edges fit in the cache of a processor, and work on them takes much
+# longer than handing it to a thread.
+STRIP_PIXELS = 40_000
 # A weight must be positive for its edge to stay in the graph.
 SMALLEST_WEIGHT = 1e-6
 
@@ -422,7 +423,9 @@ def _cut(
 ) -> Iterator[EdgeStrip]:
     """Cut a band into strips; ``stack`` holds √w of its pairs and, as integers, their heads from its first pixel on."""
     (top, stop), (height, width) = rows, shape
-    step = max(4, min(BAND_ROWS, STRIP_PIXELS // width))
+    # Strips of a band as equal as they can be: a short one at its end would cost as much as a long one.
+    count = -(-(stop - top) // max(4, min(BAND_ROWS, STRIP_PIXELS // width)))
+    step = -(-(stop - top) // count)
     heads, order = stack[1].view(np.int32), np.arange(stack.shape[1] + 1, dtype=np.int32)
     for row in range(top, stop, step):
         first, own = (row - top) * width, (min(row + step, stop) - row) * width

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ContextDecorator, ExitStack
+from itertools import islice
 from typing import TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 # An array of this size is the largest from whose release the C library of Linux learns; bytes.
 _LEARNT = 31 << 20
+# Items that one thread sums before it hands the sum over.
+_SUMMED = 8
 
 Item = TypeVar("Item")
+Early = TypeVar("Early")
+Middle = TypeVar("Middle")
 Result = TypeVar("Result")
 
 
@@ -65,6 +72,116 @@ def map_ahead(
             # After an error or an early end nobody asks for the rest.
             for _, future in pending:
                 future.cancel()
+
+
+def map_in_turns(
+    early: Callable[[Item], Early],
+    in_turn: Callable[[Early], Middle],
+    late: Callable[[Middle], Result],
+    items: Iterable[Item],
+    threads: int = 0,
+) -> Iterator[Result]:
+    """Yield ``late(in_turn(early(item)))`` in order, one thread from an item's first step to its last.
+
+    ``early`` and ``late`` run side by side, ``in_turn`` for one item after the other in their order, so that it may
+    carry a state along.  An item's data stay in the cache of one core, and no more threads run than there are cores.
+
+    Parameters
+    ----------
+    early, in_turn, late : callable
+    items : iterable
+        Consumed lazily, in the calling thread.
+    threads : int
+        0 means one per available core.
+
+    Yields
+    ------
+    result
+
+    Examples
+    --------
+    >>> from itertools import accumulate
+    >>> sums = iter(accumulate([4, 1, 9]))
+    >>> list(map_in_turns(abs, lambda one: next(sums), float, [4, -1, 9]))
+    [4.0, 5.0, 14.0]
+    """
+    turns, due, broken = threading.Condition(), 0, math.inf
+
+    def work(numbered: tuple[int, Item]) -> Result:
+        nonlocal due, broken
+        number, item = numbered
+        try:
+            begun = early(item)
+            with turns:
+                # Threads take items in their order, so the one whose turn it is runs already.
+                turns.wait_for(lambda: due == number or broken < number)
+                if broken < number:
+                    raise RuntimeError("an earlier item failed")
+                middle = in_turn(begun)
+                due += 1
+                turns.notify_all()
+        except BaseException:
+            with turns:
+                broken = min(broken, number)
+                turns.notify_all()
+            raise
+        return late(middle)
+
+    for _, result in map_ahead(work, enumerate(items), threads):
+        yield result
+
+
+def sum_side_by_side(
+    add: Callable[[list[Item]], tuple[NDArray[np.float64], ...]], items: Iterable[Item], threads: int = 0
+) -> tuple[NDArray[np.float64], ...]:
+    """Sum arrays over items: those of a few items in one thread, then those sums in order.
+
+    Which items go together does not depend on the number of threads, so neither do the bytes of the result.
+
+    Parameters
+    ----------
+    add : callable
+        From a few consecutive items to the sums of what is made of them.
+    items : iterable
+        At least one; consumed lazily, in the calling thread.
+    threads : int
+        0 means one per available core.
+
+    Returns
+    -------
+    tuple of ndarray, float64
+
+    Examples
+    --------
+    >>> sum_side_by_side(lambda some: (np.array(sum(some), np.float64),), range(100))
+    (array(4950.),)
+    """
+    totals: tuple[NDArray[np.float64], ...] = ()
+    for _, sums in map_ahead(add, in_batches(items, _SUMMED), threads):
+        totals = tuple(np.add(*pair, out=pair[0]) for pair in zip(totals, sums, strict=True)) if totals else sums
+    return totals
+
+
+def in_batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
+    """Yield lists of ``size`` consecutive items, the last perhaps shorter.
+
+    Parameters
+    ----------
+    items : iterable
+        Consumed lazily.
+    size : int
+
+    Yields
+    ------
+    list
+
+    Examples
+    --------
+    >>> list(in_batches("abc", 2))
+    [['a', 'b'], ['c']]
+    """
+    stream = iter(items)
+    return iter(lambda: list(islice(stream, size)), [])
 
 
 def available_cores() -> int:
