@@ -84,7 +84,7 @@ def test_flow_variance_is_that_of_the_flows_whatever_the_rank(noise_flows, rank)
 
 def test_a_state_is_the_same_from_a_file_and_piece_by_piece(noise_flows, tmp_path, monkeypatch):
     whole = identify(noise_flows, DynamicsParams(rank=7))
-    mapped = new_stack(whole.C.shape, tmp_path)
+    mapped = new_stack(whole.C.shape[::-1], tmp_path).T
     mapped[:] = whole.C
     at_once = project(whole, noise_flows[3])
     monkeypatch.setattr("turbrestore.scratch._PART", 70)

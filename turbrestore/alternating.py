@@ -263,6 +263,7 @@ def filter_frames(
     counted: ArrayLike | None = None,
     start: FilterCheckpoint | None = None,
     on_checkpoint: Callable[[FilterCheckpoint], None] | None = None,
+    prepared: dict[int, FlowFrame] | None = None,
 ) -> Filtered:
     """Run the alternating-estimation filter over ``frames``.
 
@@ -293,6 +294,9 @@ def filter_frames(
         the result is that of one run, bit for bit.
     on_checkpoint : callable, optional
         Called with a FilterCheckpoint after each block of frames.
+    prepared : dict, optional
+        What :func:`turbrestore.centroid.find_centroid` has prepared of the first frames with the same settings;
+        emptied after the first block.
 
     Returns
     -------
@@ -332,7 +336,7 @@ def filter_frames(
     with one_thread_each():
         if start is None:
             prior = _prior(image, setting)
-            state, records = _filter_block(prior, _left_out(first, marks, 0), flows, setting)
+            state, records = _filter_block(prior, _left_out(first, marks, 0), flows, setting, prepared)
         else:
             state, records = _pass_over(start, stream, len(first), setting)
         while True:
@@ -341,7 +345,7 @@ def filter_frames(
             block = list(islice(stream, params.block))
             if not block:
                 break
-            state, done = _filter_block(state, _left_out(block, marks, len(records)), None, setting)
+            state, done = _filter_block(state, _left_out(block, marks, len(records)), None, setting, {})
             records += done
     if marks is not None and marks.size != len(records):
         raise DataError(f"counted: expected one mark for each frame, found {marks.size} marks, {len(records)} frames")
@@ -448,18 +452,24 @@ def _noise_model(
 
 
 def _filter_block(
-    prior: FilterState, frames: Block, known: FloatArray | None, setting: _Setting
+    prior: FilterState,
+    frames: Block,
+    known: FloatArray | None,
+    setting: _Setting,
+    prepared: dict[int, FlowFrame] | None,
 ) -> tuple[FilterState, list[FrameRecord]]:
     """Inner iterations over one block, each from the same prior with flows measured from the newest image."""
     image, records = prior.image, list[FrameRecord]()
     covariances = state_covariances(prior.flow, frames, setting.tracking.dynamics)
-    start, prepared = (prior.flow.mean, covariances, frames), dict[int, FlowFrame]()
+    start = prior.flow.mean, covariances, frames
     for iteration in range(setting.params.inner_iterations):
         if iteration == 0 and known is not None:
             tracked = track_known(*start, known, setting.tracking)
         else:
             tracked = track_measured(*start, image.mean, prepared, setting.tracking)
         image, records = _fuse(prior.image, tracked, setting)
+    if prepared is not None:
+        prepared.clear()
     return FilterState(image, Gaussian(records[-1].flow_state, covariances[-1])), records
 
 

@@ -129,6 +129,7 @@ def find_centroid(
     flow_params: FlowParams | None = None,
     progress: Callable[[int], None] | None = None,
     scratch: Path | None = None,
+    prepared: dict[int, FlowFrame] | None = None,
 ) -> Centroid:
     """Iterate to the centroid of ``frames``.
 
@@ -144,6 +145,8 @@ def find_centroid(
         Called with 1 after each flow.
     scratch : Path, optional
         Folder of a file that holds the flows; by default they are in memory.
+    prepared : dict, optional
+        From the number of a frame to what flow prepares of it: filled here, and of use to the filter.
 
     Returns
     -------
@@ -171,8 +174,9 @@ def find_centroid(
     image = _start(stack, params, flow_params)
     total = np.zeros((*stack.shape[1:3], 2), np.float32)
     flows = new_stack((*stack.shape[:3], 2), scratch)
-    # Where even the frames are in a file, what is prepared of them is not kept.
-    prepared: dict[int, FlowFrame] | None = {} if scratch is None else None
+    if prepared is None and scratch is None:
+        # Where even the frames are in a file, what is prepared of them is not kept.
+        prepared = {}
     sizes: list[float] = []
     while True:
         fill_flows(refer_flow(image, flow_params), stack, flows, prepared, progress)

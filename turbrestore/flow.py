@@ -205,6 +205,13 @@ class FlowReference:
     batch: int
     threads: int
 
+    def frame(self, number: int, image: FloatArray, prepared: dict[int, FlowFrame] | None) -> FlowFrame:
+        """Look a frame up among those that are prepared already, or prepare it and add it to them."""
+        found = (prepared or {}).get(number) or self.prepare(image)
+        if prepared is not None:
+            prepared[number] = found
+        return found
+
 
 def estimate_flow(
     reference: ArrayLike,
@@ -290,16 +297,10 @@ def fill_flows(
     """
     if stack.shape[1:3] != reference.shape:
         raise DataError(f"frames: expected {reference.shape} pixels, found {stack.shape[1:3]}")
-    known = {} if prepared is None else prepared
-
-    def frame(number: int) -> FlowFrame:
-        found = known.get(number) or reference.prepare(stack[number])
-        if prepared is not None:
-            prepared[number] = found
-        return found
 
     def fill(numbers: list[int]) -> None:
-        for number, flow in zip(numbers, reference.solve([frame(number) for number in numbers]), strict=True):
+        frames = [reference.frame(number, stack[number], prepared) for number in numbers]
+        for number, flow in zip(numbers, reference.solve(frames), strict=True):
             flows[number] = flow
         release(flows)
         release(stack)

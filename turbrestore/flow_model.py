@@ -182,7 +182,30 @@ def project(dynamics: FlowDynamics, flow: ArrayLike) -> Float64Array:
     flow = check_flow(flow)
     if flow.shape != dynamics.mean_flow.shape:
         raise DataError(f"flow: expected shape {dynamics.mean_flow.shape}, found {flow.shape}")
-    rest, done = (flow - dynamics.mean_flow).reshape(-1), 0
+    return project_deviation(dynamics, flow - dynamics.mean_flow)
+
+
+def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64Array:
+    """State of a flow that is given as its deviation from the mean, unchecked: Cᵀ (W − W̄).
+
+    Parameters
+    ----------
+    dynamics : FlowDynamics
+    deviation : ndarray, float32, shape (H, W, 2)
+        Pixels.
+
+    Returns
+    -------
+    ndarray, float64, shape (n,)
+
+    Examples
+    --------
+    >>> from turbrestore.dynamics import identify
+    >>> dynamics = identify(np.zeros((3, 2, 2, 2), np.float32))
+    >>> project_deviation(dynamics, dynamics.mean_flow)
+    array([], dtype=float64)
+    """
+    rest, done = deviation.reshape(-1), 0
     state = np.zeros(dynamics.C.shape[1])
     # C may be mapped: all of it at once would come into memory.
     for part in parts(dynamics.C):

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from .arrays import FloatArray
 from .flow import FlowFrame, FlowParams, refer_flow
-from .flow_model import FlowDynamics, flow_of, project
+from .flow_model import FlowDynamics, flow_of, project_deviation
 from .frame_noise import FrameNoise, judge_frame
 from .kalman import Gaussian, predict, update_information
 from .parallel import in_batches, map_in_turns
@@ -142,12 +142,16 @@ def state_covariances(prior: Gaussian, frames: Block, dynamics: FlowDynamics) ->
     >>> bool(seen[0, 0] < 1e-5), bool(unseen[0, 0] > seen[0, 0])
     (True, True)
     """
-    state, unit, nothing = prior, np.eye(dynamics.rank), np.zeros(dynamics.rank)
-    covariances = []
+    unit, nothing = np.eye(dynamics.rank), np.zeros(dynamics.rank)
+    covariances, before, state = [], None, prior
     for frame in frames:
-        state = predict(state, dynamics.A, dynamics.Q)
-        if frame is not None:
-            state, _ = update_information(state, nothing, unit, _flow_noise(dynamics), orthonormal=True)
+        # Where it no longer changes, it is settled for all frames that count.
+        settled = frame is not None and before is not None and np.array_equal(before.cov, state.cov)
+        before = None if frame is None else state
+        if not settled:
+            state = predict(state, dynamics.A, dynamics.Q)
+            if frame is not None:
+                state, _ = update_information(state, nothing, unit, _flow_noise(dynamics), orthonormal=True)
         covariances.append(state.cov)
     return covariances
 
@@ -185,7 +189,7 @@ def track_measured(
     covariances: list[NDArray[np.float64]],
     frames: Block,
     image: FloatArray,
-    prepared: dict[int, FlowFrame],
+    prepared: dict[int, FlowFrame] | None,
     tracking: Tracking,
 ) -> Iterator[TrackedFrame]:
     """Measure flows from an image to frames, and follow them.
@@ -198,8 +202,8 @@ def track_measured(
         From :func:`state_covariances`.
     frames : list of ndarray or None
     image : ndarray, float32, shape (H, W) or (H, W, 3)
-    prepared : dict of int to FlowFrame
-        What has been prepared of frames for an earlier image; the rest is added.
+    prepared : dict of int to FlowFrame, or None
+        What has been prepared of frames for an earlier image; the rest is added.  None keeps nothing.
     tracking : Tracking
 
     Yields
@@ -208,13 +212,8 @@ def track_measured(
     """
     reference = refer_flow(image, tracking.flow)
 
-    def prepare(number: int, frame: FloatArray) -> FlowFrame:
-        if number not in prepared:
-            prepared[number] = reference.prepare(frame)
-        return prepared[number]
-
     def measure(batch: list[tuple[int, FloatArray | None]]) -> list[_Pair]:
-        counted = [prepare(number, frame) for number, frame in batch if frame is not None]
+        counted = [reference.frame(number, frame, prepared) for number, frame in batch if frame is not None]
         flows = iter(reference.solve(counted) if counted else [])
         return [(None, None) if frame is None else (frame, next(flows)) for _, frame in batch]
 
@@ -262,7 +261,8 @@ def _see(frame: FloatArray | None, measured: FloatArray | None, dynamics: FlowDy
     if frame is None or measured is None:
         return _Seen(None, None, np.zeros(0), 0.0)
     deviation = measured - dynamics.mean_flow
-    return _Seen(frame, measured, project(dynamics, measured), float(np.square(deviation).sum(dtype=np.float64)))
+    state = project_deviation(dynamics, deviation)
+    return _Seen(frame, measured, state, float(np.square(deviation, out=deviation).sum(dtype=np.float64)))
 
 
 def _update(

@@ -378,15 +378,16 @@ def update_pixels(
     noise = _pixel_variance(noise_variance, state, "noise_variance")
     if z.shape != mean.shape:
         raise DataError(f"measurement: expected shape {mean.shape}, found {z.shape}")
-    if np.isinf(z).any():
-        raise DataError("measurement: expected finite values, or NaN where missing, found infinite ones")
-    if not (noise > 0).all():
+    if not noise.min() > 0:
         raise DataError("noise_variance: expected values above 0, found others; give the noise a floor")
     difference = z - mean
-    absent = np.isnan(difference)
-    missing = (absent.any(-1) if mean.ndim > prior.ndim else absent) | np.isinf(noise)
-    some = bool(missing.any())
+    # Where nothing is missing, as in most frames, two sums say so.
+    some = not np.isfinite(difference.sum(dtype=np.float64) + noise.sum(dtype=np.float64))
     if some:
+        if np.isinf(z).any():
+            raise DataError("measurement: expected finite values, or NaN where missing, found infinite ones")
+        absent = np.isnan(difference)
+        missing = (absent.any(-1) if mean.ndim > prior.ndim else absent) | np.isinf(noise)
         noise = np.where(missing, noise.dtype.type(1), noise)
         difference = np.where(absent, mean.dtype.type(0), difference)
     gain = prior / (prior + noise)

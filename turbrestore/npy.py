@@ -144,9 +144,10 @@ def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
     with zipfile.ZipFile(stream, "w", allowZip64=True) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                if isinstance(array, np.memmap) and array.ndim and array.flags.c_contiguous:
+                in_order = array if array.flags.c_contiguous else array.T
+                if isinstance(array, np.memmap) and array.ndim and in_order.flags.c_contiguous:
                     np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(array))
-                    for part in parts(array):
+                    for part in parts(in_order):
                         member.write(part.data)
                 else:
                     np.lib.format.write_array(member, array, allow_pickle=False)
@@ -157,8 +158,9 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | N
         raise ValueError(f"{member.filename} is compressed; expected it as numpy.savez writes it")
     with archive.open(member) as stream:
         shape, is_fortran, dtype = _header(stream)
-        if scratch is not None and member.file_size > _LARGE and dtype == np.float32 and not is_fortran:
-            return _stack_of(stream, shape, member, scratch)
+        if scratch is not None and member.file_size > _LARGE and dtype == np.float32:
+            stack = _stack_of(stream, shape[::-1] if is_fortran else shape, member, scratch)
+            return stack.T if is_fortran else stack
         # Reading to the end lets zipfile compare the checksum.
         data = stream.read()
     if math.prod(shape) * dtype.itemsize != len(data):

@@ -21,7 +21,7 @@ from threadpoolctl import ThreadpoolController
 # An array of this size is the largest from whose release the C library of Linux learns; bytes.
 _LEARNT = 31 << 20
 # Items that one thread sums before it hands the sum over.
-_SUMMED = 8
+_SUMMED = 4
 
 Item = TypeVar("Item")
 Early = TypeVar("Early")

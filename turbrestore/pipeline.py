@@ -33,7 +33,7 @@ from .explanation import (
     explain_motion,
     explain_training,
 )
-from .flow import MIN_SIDE
+from .flow import MIN_SIDE, FlowFrame
 from .flow_model import FlowDynamics
 from .frame_selection import best_frames, frame_quality
 from .frame_source import FrameSource
@@ -242,6 +242,8 @@ class _Run:
         self.done = done
         self.clock = _Clock()
         self.folder, self.scratch = folder, folder if in_file else None
+        # Where even the frames are in a file, what is prepared of them is not kept.
+        self.prepared: dict[int, FlowFrame] | None = None if in_file else {}
         self._on_result = on_result
 
     def finish(self, done: StageResults, stage: str | None = None) -> None:
@@ -299,7 +301,7 @@ def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
         return run.done.centroid
     params = run.params
     counter = stage_counter(run.progress, "centroid", len(training) * params.centroid.iterations)
-    centroid = find_centroid(training, params.centroid, params.flow, counter, run.scratch)
+    centroid = find_centroid(training, params.centroid, params.flow, counter, run.scratch, run.prepared)
     run.finish(replace(run.done, centroid=centroid), "centroid")
     return centroid
 
@@ -334,6 +336,7 @@ def _filter(
         counted,
         run.done.checkpoint,
         lambda checkpoint: run.finish(replace(run.done, checkpoint=checkpoint)),
+        run.prepared,
     )
     mean = summed.mean()
     run.finish(replace(run.done, checkpoint=None, filtered=filtered, mean=mean), "filter")

@@ -26,6 +26,7 @@ from scipy import fft
 
 from .arrays import FloatArray, check_frames, check_image, luminance
 from .errors import DataError
+from .parallel import map_ahead
 from .scratch import mean_of, release
 
 # Images are reduced by a whole factor until no side is longer: beyond it only the time grows.
@@ -259,8 +260,16 @@ def _known_shifts(stack: FloatArray) -> tuple[Shift, NDArray[np.bool_]]:
 def _walk(stack: FloatArray, anchor: int, order: Iterable[int], shifts: Shift, known: NDArray[np.bool_]) -> None:
     """Fill in the shifts of frames on one side of the anchor, from near to far."""
     key, key_shift, last = refer_shift(stack[anchor]), shifts[anchor], anchor
-    for index in order:
-        found = shift_against(stack[index], key)
+    first = key
+
+    def held(index: int) -> Shift | None:
+        found = shift_against(stack[index], first)
+        release(stack)
+        return found
+
+    # Most frames are like the anchor: all are held against it side by side, and the others one after the other.
+    for index, against in list(map_ahead(held, order)):
+        found = against if key is first else shift_against(stack[index], key)
         if found is None:
             nearer = refer_shift(stack[last])
             found = shift_against(stack[index], nearer)

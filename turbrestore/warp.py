@@ -27,7 +27,7 @@ from .image_stacks import PREFILTER, StackOps, torch_ops, warp_stack
 
 # Pixels of a strip.  A dozen arrays of a smaller one would stay in the cache of a core, but where two threads run, the
 # interpreter lock that every operation on them gives away and takes again costs more than the cache saves.
-_STRIP = 1 << 17
+_STRIP = 1 << 16
 
 
 def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device: str = PROCESSOR) -> FloatArray:
@@ -240,8 +240,8 @@ def strips(shape: tuple[int, ...]) -> Iterator[slice]:
 
     Examples
     --------
-    >>> list(strips((1000, 400)))
-    [slice(0, 327, None), slice(327, 654, None), slice(654, 981, None), slice(981, 1000, None)]
+    >>> list(strips((400, 400)))
+    [slice(0, 163, None), slice(163, 326, None), slice(326, 400, None)]
     """
     rows = max(_STRIP // shape[1], 1)
     return (slice(start, min(start + rows, shape[0])) for start in range(0, shape[0], rows))
@@ -283,25 +283,25 @@ def _cubic(image: FloatArray, flow: FloatArray) -> FloatArray:
     coefficients = cv2.sepFilter2D(image, -1, PREFILTER, PREFILTER, borderType=cv2.BORDER_REFLECT_101)
     result = np.empty_like(coefficients)
     for rows in strips(flow.shape):
-        x, y = (axis[rows] + flow[rows, :, index] for index, axis in enumerate(grid))
-        result[rows] = _sample(coefficients, x, y)
+        position = np.empty((2, *flow[rows].shape[:2]), np.float32)
+        for index, axis in enumerate(grid):
+            np.add(axis[rows], flow[rows, :, index], out=position[index])
+            np.clip(position[index], 0, flow.shape[1 - index] - 1, out=position[index])
+        result[rows] = _sample(coefficients, position)
     return result
 
 
-def _sample(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Spline with these coefficients at x and y, which are overwritten."""
-    height, width = coefficients.shape[:2]
-    mirrored = cv2.BORDER_REFLECT_101
-    left, right, to_right = _spline_pair(x, width - 1)
-    upper, lower, to_lower = _spline_pair(y, height - 1)
+def _sample(coefficients: FloatArray, position: FloatArray) -> FloatArray:
+    """Spline with these coefficients at the positions (x, y), which are overwritten."""
+    (left, upper), (right, lower), (to_right, to_lower) = _spline_pair(position)
     if coefficients.ndim == 3:
         to_right, to_lower = (cv2.merge([blend] * coefficients.shape[2]) for blend in (to_right, to_lower))
-
-    def row(map_y: FloatArray) -> FloatArray:
-        a = cv2.remap(coefficients, left, map_y, cv2.INTER_LINEAR, borderMode=mirrored)
-        return _blend(a, cv2.remap(coefficients, right, map_y, cv2.INTER_LINEAR, borderMode=mirrored), to_right)
-
-    return _blend(row(upper), row(lower), to_lower)
+    first, second = np.empty((2, 2, *to_right.shape), np.float32)
+    for column, samples in ((left, first), (right, second)):
+        for row, sample in zip((upper, lower), samples, strict=True):
+            cv2.remap(coefficients, column, row, cv2.INTER_LINEAR, dst=sample, borderMode=cv2.BORDER_REFLECT_101)
+    above, below = _blend(first, second, to_right)
+    return _blend(above, below, to_lower)
 
 
 def _blend(first: FloatArray, second: FloatArray, share: FloatArray) -> FloatArray:
@@ -312,12 +312,11 @@ def _blend(first: FloatArray, second: FloatArray, share: FloatArray) -> FloatArr
     return second
 
 
-def _spline_pair(position: FloatArray, last: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _spline_pair(position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Two positions and a blend whose bilinear samples weigh four neighbours as the cubic B-spline does.
 
-    Positions beyond 0 and ``last`` are moved there, in place.  With weights w0 to w3 the blend is w2 + w3.
+    With weights w0 to w3 the blend is w2 + w3.  ``position`` is overwritten.
     """
-    np.clip(position, 0, last, out=position)
     whole = np.floor(position)
     t = np.subtract(position, whole, out=position)
     square = t * t
