@@ -45,7 +45,7 @@ from scipy import fft
 
 from .arrays import FloatArray, check_image, luminance
 from .errors import require
-from .parallel import map_ahead
+from .parallel import available_cores, map_ahead
 from .plots import plot_blur
 from .preview import preview
 from .psf import KOLMOGOROV, check_exponent, estimate_noise, half_frequency
@@ -152,7 +152,9 @@ class BlurEstimate:
         return max(self.sigma - _CAUTION * self.uncertainty, 0.0) if self.sigma > 0 else 0.0
 
 
-def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV) -> BlurEstimate:
+def estimate_blur(
+    image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV, threads: int = 0
+) -> BlurEstimate:
     """Estimate the width of the blur of an image.
 
     Parameters
@@ -163,6 +165,8 @@ def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float 
         Standard deviation of the noise, intensity; estimated by default.
     exponent : float
         Shape of the blur, 1 to 2: 5/3 for images fused from turbulent frames, 2 for a Gaussian.
+    threads : int
+        Reductions of the image, and levels of noise, tried side by side; 0 means one per available core.
 
     Returns
     -------
@@ -193,7 +197,9 @@ def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float 
         return BlurEstimate(0.0, float("inf"), exponent, noise or 0.0, 1, 0.0, np.zeros(0), np.zeros(0))
     factors = [factor for factor in _REDUCTIONS if factor == 1 or min(grey.shape) >= factor * _SMALLEST_SIDE]
     # The image itself takes longest and comes first, so that all others run beside it.
-    estimates = [one for _, one in map_ahead(lambda factor: _estimate_reduced(grey, factor, exponent, noise), factors)]
+    threads = threads or available_cores()
+    tried = map_ahead(lambda factor: _estimate_reduced(grey, factor, exponent, noise, threads), factors, threads)
+    estimates = [one for _, one in tried]
     convincing = [one for one in estimates if np.isfinite(one.uncertainty)]
     if convincing:
         return min(convincing, key=_doubt)
@@ -210,7 +216,9 @@ def _doubt(estimate: BlurEstimate) -> float:
     return preference * estimate.uncertainty / estimate.sigma
 
 
-def _estimate_reduced(grey: FloatArray, factor: int, exponent: float, noise: float | None) -> BlurEstimate:
+def _estimate_reduced(
+    grey: FloatArray, factor: int, exponent: float, noise: float | None, threads: int
+) -> BlurEstimate:
     """Estimate from one reduced image; the uncertainty is infinite where it does not convince."""
     reduced = _reduce(grey, factor)
     gradients, level = _gradients(_most_detailed(reduced)), _effective_noise(reduced, factor, noise)
@@ -220,7 +228,7 @@ def _estimate_reduced(grey: FloatArray, factor: int, exponent: float, noise: flo
     resolved = lowest < _WIDTHS[-1] and (factor == 1 or lowest >= _RESOLVED)
     if resolved and evidence >= (_EVIDENCE if width >= _SOFT else _STRONG_EVIDENCE):
         levels = (level / 2, 2 * level)
-        sweeps = map_ahead(lambda other: _lowest(_costs(gradients, exponent, other)), levels, len(levels))
+        sweeps = map_ahead(lambda other: _lowest(_costs(gradients, exponent, other)), levels, min(threads, 2))
         less, more = (_widen(found, factor) for _, found in sweeps)
         uncertainty = abs(more - less) / 2
     tried = factor * _WIDTHS[: len(costs)]

@@ -90,7 +90,7 @@ class StageMemory:
 # While flow is measured: that of dis, which takes most.
 _FLOW = StageMemory(120, 5, 185, 10)
 # While frames are registered and weighed beside that.
-_FILTER = StageMemory(30, 20, 25, 15)
+_FILTER = StageMemory(10, 5, 10, 5)
 # Images and maps that earlier stages leave, and what is made of them while the width of the blur is found.
 _HELD, _BLUR = StageMemory(60, 40, 0, 0), StageMemory(40, 0, 0, 0)
 # Width of the blur where it is not known yet, pixels.
