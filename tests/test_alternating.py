@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
+from turbrestore import flow
 from turbrestore.alternating import FilterParams, filter_frames
 from turbrestore.centroid import find_centroid
 from turbrestore.dynamics import DynamicsParams, identify
@@ -205,6 +206,21 @@ def test_covariances_of_a_block_are_those_of_the_filter_step_by_step(sequence):
         if frame is not None:
             state, _ = update(state, np.zeros(dynamics.rank), np.eye(dynamics.rank), noise)
         assert covariance == pytest.approx(state.cov, rel=1e-9, abs=1e-12 * state.cov.max())
+
+
+def test_what_was_prepared_before_changes_nothing_and_is_not_kept(sequence, monkeypatch):
+    prepared = {}
+    centroid = find_centroid(sequence.frames, prepared=prepared)
+    dynamics = identify(centroid.flows)
+    assert sorted(prepared) == list(range(len(sequence.frames)))
+    again = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows)
+    levels = []
+    monkeypatch.setattr("turbrestore.flow._levels", lambda *a, find=flow._levels: levels.append(1) or find(*a))
+    filtered = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows, prepared=prepared)
+    # That of the one reference, and of no frame.
+    assert len(levels) == 1
+    assert prepared == {}
+    assert filtered.image.tobytes() == again.image.tobytes()
 
 
 def test_threads_do_not_change_the_result(sequence):

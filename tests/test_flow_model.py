@@ -97,7 +97,7 @@ def test_a_state_is_the_same_from_a_file_and_piece_by_piece(noise_flows, tmp_pat
 @pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
 def test_a_state_takes_a_piece_of_the_modes_at_a_time(rng, tmp_path):
     dynamics = identify(rng.normal(size=(4, 256, 512, 2)).astype(np.float32), DynamicsParams(rank=2))
-    modes = new_stack((len(dynamics.C), 80), tmp_path)
+    modes = new_stack((80, len(dynamics.C)), tmp_path).T
     modes[:] = 1e-3
     release(modes)
     before = resident()

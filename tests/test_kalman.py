@@ -342,6 +342,10 @@ def test_nearly_exact_measurements_leave_their_own_variance(rng):
         (lambda: predict_pixels(PIXELS, -0.1), "drift_variance"),
         (lambda: update_pixels(PIXELS, np.zeros((3, 2)), 1.0), "measurement: expected shape"),
         (lambda: update_pixels(PIXELS, np.full((2, 3), np.inf), 1.0), "measurement: expected finite"),
+        (
+            lambda: update_pixels(PIXELS, np.array([[np.inf, -np.inf, 0], [0, 0, 0]]), 1.0),
+            "measurement: expected finite",
+        ),
         (lambda: update_pixels(PIXELS, np.zeros((2, 3)), 0.0), "noise_variance: expected values"),
         (lambda: update_pixels(PIXELS, np.zeros((2, 3)), np.ones(3)), "noise_variance: expected one"),
         (lambda: PixelGaussian(np.zeros((2, 3)), -np.ones((2, 3))), "variance: expected finite"),

@@ -1,4 +1,5 @@
 import itertools
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -108,11 +109,23 @@ def test_the_first_error_reaches_the_caller_and_nobody_waits_for_a_turn(step):
     assert threading.active_count() == 1
 
 
-def test_a_stream_of_turns_can_be_left_early():
-    found = map_in_turns(hurried, abs, abs, itertools.count(), threads=3)
-    assert next(found) == 0
-    found.close()
-    assert threading.active_count() == 1
+def test_a_stream_of_turns_can_be_left_at_any_moment():
+    def leave_often():
+        interval = sys.getswitchinterval()
+        sys.setswitchinterval(1e-6)
+        try:
+            for _ in range(300):
+                found = map_in_turns(abs, abs, abs, itertools.count(), threads=4)
+                assert [next(found), next(found)] == [0, 1]
+                found.close()
+        finally:
+            sys.setswitchinterval(interval)
+        done.set()
+
+    # An item that waits for one that was given up would never end, and the test with it.
+    done = threading.Event()
+    threading.Thread(target=leave_often, daemon=True).start()
+    assert done.wait(60)
 
 
 @pytest.mark.parametrize("count", [1, 8, 9, 40])
@@ -137,7 +150,7 @@ def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypa
     frames = make_sequence(seed=3, count=28).frames[:, :64, :80]
 
     def run(threads):
-        for module in ("parallel", "deconvolution", "nonlocal_tv"):
+        for module in ("parallel", "deconvolution", "nonlocal_tv", "blur_estimation", "memory"):
             monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: threads)
         return restore(frames, RestoreParams(train=12, flow=FlowParams(threads=threads)))
 

@@ -339,6 +339,7 @@ def filter_frames(
             state, records = _filter_block(prior, _left_out(first, marks, 0), flows, setting, prepared)
         else:
             state, records = _pass_over(start, stream, len(first), setting)
+            (prepared or {}).clear()
         while True:
             if on_checkpoint is not None:
                 on_checkpoint(FilterCheckpoint(state, tuple(records)))

@@ -166,7 +166,8 @@ def estimate_blur(
     exponent : float
         Shape of the blur, 1 to 2: 5/3 for images fused from turbulent frames, 2 for a Gaussian.
     threads : int
-        Reductions of the image, and levels of noise, tried side by side; 0 means one per available core.
+        Reductions of the image tried side by side, where there are several each on two levels of noise at a time; 0
+        means one per available core.
 
     Returns
     -------

@@ -202,7 +202,7 @@ def find_centroid(
 def _start(stack: FloatArray, params: CentroidParams, flow_params: FlowParams) -> FloatArray:
     if params.mode == "single":
         return stack[params.start]
-    return mean_stabilised(stack) if flow_params.global_shift else mean_of(stack)
+    return mean_stabilised(stack, flow_params.threads) if flow_params.global_shift else mean_of(stack)
 
 
 def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:

@@ -85,7 +85,10 @@ class DynamicsParams:
 
 @one_thread_each()
 def identify(
-    flows: FloatArray | Iterable[FloatArray], params: DynamicsParams | None = None, scratch: Path | None = None
+    flows: FloatArray | Iterable[FloatArray],
+    params: DynamicsParams | None = None,
+    scratch: Path | None = None,
+    threads: int = 0,
 ) -> FlowDynamics:
     """Fit the dynamic texture to a training sequence of flows (paper 3, sections 3.1 and 3.2).
 
@@ -98,6 +101,8 @@ def identify(
     params : DynamicsParams, optional
     scratch : Path, optional
         Folder of a file that holds C; by default it is in memory.
+    threads : int
+        Parts of the image worked on side by side; 0 means one per available core.
 
     Returns
     -------
@@ -121,7 +126,7 @@ def identify(
     (2, array([1., 1.]))
     """
     params = params or DynamicsParams()
-    strips = FlowStrips.of(flows)
+    strips = FlowStrips.of(flows, threads)
     mean, gram, norm = gram_matrix(strips)
     singular_values, V = singular_vectors(gram)
     pixels = 2 * strips.height * strips.width

@@ -307,7 +307,8 @@ def fill_flows(
 
     for numbers, _ in map_ahead(fill, in_batches(range(len(stack)), reference.batch), reference.threads):
         if progress is not None:
-            progress(len(numbers))
+            for _ in numbers:
+                progress(1)
 
 
 def iterate_flows(

@@ -39,6 +39,9 @@ class FlowStrips:
     flows : ndarray of shape (τ, H, W, 2), or iterable of arrays of shape (H, W, 2)
     count, height, width : int
         τ, H and W.
+    threads : int
+        Strips of an array worked on side by side, 0 for one per available core; other flows may be made on the fly, and
+        are asked for in turn.
 
     Examples
     --------
@@ -51,14 +54,17 @@ class FlowStrips:
     count: int
     height: int
     width: int
+    threads: int = 0
 
     @classmethod
-    def of(cls, flows: FloatArray | Iterable[FloatArray]) -> FlowStrips:
+    def of(cls, flows: FloatArray | Iterable[FloatArray], threads: int = 0) -> FlowStrips:
         """Look at the shapes of flows.
 
         Parameters
         ----------
         flows : ndarray of shape (τ, H, W, 2), or iterable of arrays of shape (H, W, 2)
+        threads : int
+            0 means one per available core.
 
         Returns
         -------
@@ -83,12 +89,8 @@ class FlowStrips:
         for shape in shapes:
             if len(shape) != 3 or shape[2] != 2 or 0 in shape or shape != shapes[0]:
                 raise DataError(f"flows: expected all of one shape (H, W, 2), found {shape} beside {shapes[0]}")
-        return cls(flows, len(shapes), *shapes[0][:2])
-
-    @property
-    def threads(self) -> int:
-        """Strips worked on side by side, 0 for one a core: flows that may be made on the fly are asked for in turn."""
-        return 0 if isinstance(self.flows, np.ndarray) else 1
+        height, width = shapes[0][:2]
+        return cls(flows, len(shapes), height, width, threads if isinstance(flows, np.ndarray) else 1)
 
     def rows(self) -> list[slice]:
         """Rows of each strip.

@@ -65,7 +65,7 @@ class TrackedFrame:
     Attributes
     ----------
     frame, measured : ndarray or None
-        The frame and W^meas; None if it does not count.
+        The frame and W^meas; None if it does not count, and once it is registered.
     state : ndarray, float64, shape (n,)
         ξ̂ after the frame.
     innovation : float
@@ -142,16 +142,12 @@ def state_covariances(prior: Gaussian, frames: Block, dynamics: FlowDynamics) ->
     >>> bool(seen[0, 0] < 1e-5), bool(unseen[0, 0] > seen[0, 0])
     (True, True)
     """
-    unit, nothing = np.eye(dynamics.rank), np.zeros(dynamics.rank)
-    covariances, before, state = [], None, prior
+    state, unit, nothing = prior, np.eye(dynamics.rank), np.zeros(dynamics.rank)
+    covariances = []
     for frame in frames:
-        # Where it no longer changes, it is settled for all frames that count.
-        settled = frame is not None and before is not None and np.array_equal(before.cov, state.cov)
-        before = None if frame is None else state
-        if not settled:
-            state = predict(state, dynamics.A, dynamics.Q)
-            if frame is not None:
-                state, _ = update_information(state, nothing, unit, _flow_noise(dynamics), orthonormal=True)
+        state = predict(state, dynamics.A, dynamics.Q)
+        if frame is not None:
+            state, _ = update_information(state, nothing, unit, _flow_noise(dynamics), orthonormal=True)
         covariances.append(state.cov)
     return covariances
 
@@ -246,7 +242,10 @@ def _track(
         return tracked
 
     def register(batch: list[TrackedFrame]) -> list[TrackedFrame]:
-        return [replace(tracked, registered=_register(tracked, tracking)) for tracked in batch]
+        # What is registered waits for its place in the image without what it was registered by.
+        return [
+            replace(tracked, frame=None, measured=None, registered=_register(tracked, tracking)) for tracked in batch
+        ]
 
     late: Callable[[list[TrackedFrame]], list[TrackedFrame]] = register if tracking.registers else list
     for done in map_in_turns(see, update, late, batches, threads):

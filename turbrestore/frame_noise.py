@@ -143,18 +143,14 @@ def measure_frame_noise(
     >>> round(model.image_noise, 3)
     0.01
     """
-    template = _gradient(luminance(image))
-
-    kept: dict[int, FloatArray] = {}
+    template, kept = _gradient(luminance(image)), dict[int, FloatArray]()
 
     def measure(batch: list[tuple[int, tuple[FloatArray, FloatArray]]]) -> tuple[np.ndarray, ...]:
         sums = tuple(np.zeros(image.shape[:2]) for _ in range(4))
-        for number, (frame, flow) in batch:
-            registered = luminance(warp(frame, flow))
-            sharpness = _smooth(_product(registered, template), window)
-            for plane, (total, squared) in ((registered, sums[:2]), (sharpness, sums[2:])):
-                cv2.accumulate(plane, total)
-                cv2.accumulateSquare(plane, squared)
+        for number, pair in batch:
+            registered = luminance(warp(*pair))
+            _add_moments(registered, *sums[:2])
+            _add_moments(_smooth(_product(registered, template), window), *sums[2:])
             if by_blur:
                 kept[number] = registered
         return sums
@@ -171,6 +167,7 @@ def measure_frame_noise(
     usual_frame, deviation = _without_outliers(frames, flows, total / count, variance, threads)
     sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
     scale = _score_scale(usual, spread, energy * _SOBEL_NOISE * sensor_noise, window)
+    registered = [kept[number] for number in range(len(kept))]
     return FrameNoise(
         image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
         template=template,
@@ -182,9 +179,7 @@ def measure_frame_noise(
         window=window,
         usual_frame=usual_frame,
         deviation=deviation,
-        blur=_blur_rule(np.stack([kept[number] for number in range(count)]), image, sensor_noise)
-        if by_blur and count > 1
-        else None,
+        blur=_blur_rule(np.stack(registered), image, sensor_noise) if len(registered) > 1 else None,
     )
 
 
@@ -249,6 +244,11 @@ def judge_frame(
         reference, rule = model.blur
         noise = noise_factor(rule, blur_against(registered[None], reference).extra[0]) * noise
     return noise, sharp
+
+
+def _add_moments(plane: FloatArray, total: np.ndarray, squares: np.ndarray) -> None:
+    cv2.accumulate(plane, total)
+    cv2.accumulateSquare(plane, squares)
 
 
 def _exponent(seen: FloatArray, excess: FloatArray, model: FrameNoise, rows: slice, sharpness: float) -> FloatArray:

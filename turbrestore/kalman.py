@@ -382,7 +382,8 @@ def update_pixels(
         raise DataError("noise_variance: expected values above 0, found others; give the noise a floor")
     difference = z - mean
     # Where nothing is missing, as in most frames, two sums say so.
-    some = not np.isfinite(difference.sum(dtype=np.float64) + noise.sum(dtype=np.float64))
+    with np.errstate(invalid="ignore"):
+        some = not np.isfinite(difference.sum(dtype=np.float64) + noise.sum(dtype=np.float64))
     if some:
         if np.isinf(z).any():
             raise DataError("measurement: expected finite values, or NaN where missing, found infinite ones")

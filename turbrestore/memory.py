@@ -5,12 +5,13 @@ threads::
 
     base + stack + modes + HW · (shared + c · colour + t · (each + c · each_colour))
 
-    stack = τ HW · (4 c + 8)    training frames and their flows; τ HW more for what flow prepares of frames in memory
+    stack = τ HW · (4 c + 8)    training frames and their flows
     modes = 8 n HW              modes of the flow model, once it is identified
 
 and for the deconvolution what :mod:`turbrestore.deconvolution_memory` says.
 
-Stack and modes may be kept in a file; what the threads have in hand of it then still counts.
+Stack and modes may be kept in a file; what the threads have in hand of it then still counts.  Where they are in
+memory, what flow prepares of the training frames is kept too, τ HW bytes until the filter has passed over them.
 
 The constants are those of ``python benchmarks/memory.py --stages`` at 1280×720, grey and in colour, with one, two and
 four threads, and a tenth added.  torch counts where a device is asked for, but not what a stage holds there, on the
@@ -188,8 +189,8 @@ class _Work:
         judged = 8.0 * self.pixels * train if self.filter.frame_noise == "blur" else 0.0
         later = {
             "centroid": 0.0,
-            "identify": min(_STRIPS, _STRIP_NUMBER * self.pixels * train),
-            "filter": flow + _FILTER.bytes(*size) + block + judged,
+            "identify": min(_STRIPS, _STRIP_NUMBER * self.pixels * train) + prepared,
+            "filter": flow + _FILTER.bytes(*size) + max(block, prepared) + judged,
             "deconvolve": self.held() + _BLUR.bytes(*size) + self.pairs.peak(Room(1, True)),
         }
         stages = list(later)[: list(later).index(self.until) + 1]

@@ -30,7 +30,10 @@ Result = TypeVar("Result")
 
 
 def map_ahead(
-    function: Callable[[Item], Result], items: Iterable[Item], threads: int = 0
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    threads: int = 0,
+    on_end: Callable[[], None] | None = None,
 ) -> Iterator[tuple[Item, Result]]:
     """Yield ``(item, function(item))`` in order while threads work a few items ahead.
 
@@ -45,6 +48,9 @@ def map_ahead(
         Consumed lazily, in the calling thread.
     threads : int
         0 means one per available core.
+    on_end : callable, optional
+        Called at the end, after an error and where the stream is left early too, before items that have not begun are
+        given up: calls of ``function`` that wait for each other can be woken.
 
     Yields
     ------
@@ -69,6 +75,8 @@ def map_ahead(
                 done, future = pending.popleft()
                 yield done, future.result()
         finally:
+            if on_end is not None:
+                on_end()
             # After an error or an early end nobody asks for the rest.
             for _, future in pending:
                 future.cancel()
@@ -107,27 +115,31 @@ def map_in_turns(
     """
     turns, due, broken = threading.Condition(), 0, math.inf
 
+    def break_at(number: float) -> None:
+        nonlocal broken
+        with turns:
+            broken = min(broken, number)
+            turns.notify_all()
+
     def work(numbered: tuple[int, Item]) -> Result:
-        nonlocal due, broken
+        nonlocal due
         number, item = numbered
         try:
             begun = early(item)
             with turns:
-                # Threads take items in their order, so the one whose turn it is runs already.
                 turns.wait_for(lambda: due == number or broken < number)
                 if broken < number:
-                    raise RuntimeError("an earlier item failed")
+                    raise RuntimeError("an earlier item failed, or nobody asks for this one any more")
                 middle = in_turn(begun)
                 due += 1
                 turns.notify_all()
         except BaseException:
-            with turns:
-                broken = min(broken, number)
-                turns.notify_all()
+            break_at(number)
             raise
         return late(middle)
 
-    for _, result in map_ahead(work, enumerate(items), threads):
+    # An item that is given up before it begins never has its turn, so those that have begun must not wait for it.
+    for _, result in map_ahead(work, enumerate(items), threads, on_end=lambda: break_at(-1)):
         yield result
 
 

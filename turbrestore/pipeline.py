@@ -309,7 +309,7 @@ def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
 def _identify(run: _Run, centroid: Centroid, training: FloatArray) -> FlowDynamics:
     if run.done.dynamics is not None:
         return run.done.dynamics
-    dynamics = identify(centroid.flows, run.params.dynamics, run.scratch)
+    dynamics = identify(centroid.flows, run.params.dynamics, run.scratch, run.params.flow.threads)
     if run.params.displacement_cue:
         dynamics = with_displacement(dynamics, *displacement_maps(training))
     run.finish(replace(run.done, dynamics=dynamics), "identify")

@@ -168,7 +168,7 @@ def global_shifts(frames: ArrayLike) -> Shift:
     return _known_shifts(check_frames(frames))[0]
 
 
-def mean_stabilised(frames: ArrayLike) -> FloatArray:
+def mean_stabilised(frames: ArrayLike, threads: int = 0) -> FloatArray:
     """Temporal mean of the frames, each moved by whole pixels to the mean position.
 
     Where all frames lie within two pixels of it they are averaged as they are; else frames that cannot be placed are
@@ -178,6 +178,8 @@ def mean_stabilised(frames: ArrayLike) -> FloatArray:
     ----------
     frames : array_like, shape (T, H, W) or (T, H, W, 3)
         Frames of one scene.
+    threads : int
+        Frames looked at side by side; 0 means one per available core.
 
     Returns
     -------
@@ -198,7 +200,7 @@ def mean_stabilised(frames: ArrayLike) -> FloatArray:
     """
     stack = check_frames(frames)
     mean = mean_of(stack)
-    shifts, known = _known_shifts(stack)
+    shifts, known = _known_shifts(stack, threads)
     if np.abs(shifts).max() <= DEAD_ZONE:
         return mean
     total = np.zeros(mean.shape)
@@ -243,21 +245,23 @@ def _overlap_of_axis(length: int, step: int) -> Slices:
     return slice(max(-step, 0), length - max(step, 0)), slice(max(step, 0), length - max(-step, 0))
 
 
-def _known_shifts(stack: FloatArray) -> tuple[Shift, NDArray[np.bool_]]:
+def _known_shifts(stack: FloatArray, threads: int = 0) -> tuple[Shift, NDArray[np.bool_]]:
     """Shifts of all frames, and which of them were found."""
     numbers = np.arange(len(stack))
     # The middle frame may itself be the odd one out.
     for anchor in (len(stack) // 2, len(stack) // 4, 3 * len(stack) // 4):
         shifts, known = np.zeros((len(stack), 2)), numbers == anchor
         for order in (numbers[anchor + 1 :], numbers[:anchor][::-1]):
-            _walk(stack, anchor, order, shifts, known)
+            _walk(stack, anchor, order, shifts, known, threads)
         if 2 * known.sum() > len(stack):
             break
     shifts = np.column_stack([np.interp(numbers, numbers[known], axis) for axis in shifts[known].T])
     return shifts - shifts.mean(axis=0), known
 
 
-def _walk(stack: FloatArray, anchor: int, order: Iterable[int], shifts: Shift, known: NDArray[np.bool_]) -> None:
+def _walk(
+    stack: FloatArray, anchor: int, order: Iterable[int], shifts: Shift, known: NDArray[np.bool_], threads: int
+) -> None:
     """Fill in the shifts of frames on one side of the anchor, from near to far."""
     key, key_shift, last = refer_shift(stack[anchor]), shifts[anchor], anchor
     first = key
@@ -268,7 +272,7 @@ def _walk(stack: FloatArray, anchor: int, order: Iterable[int], shifts: Shift, k
         return found
 
     # Most frames are like the anchor: all are held against it side by side, and the others one after the other.
-    for index, against in list(map_ahead(held, order)):
+    for index, against in list(map_ahead(held, order, threads)):
         found = against if key is first else shift_against(stack[index], key)
         if found is None:
             nearer = refer_shift(stack[last])
