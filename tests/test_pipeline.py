@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from conftest import SCENES, make_sequence
+from turbrestore import flow
 from turbrestore.alternating import FilterParams
 from turbrestore.blind import blur_to_remove
 from turbrestore.blur_cues import BlurBounds, bound_blur
@@ -261,3 +262,13 @@ def test_every_stage_says_what_it_decided(blurred):
 def test_settings_that_make_no_sense_are_refused(settings, message):
     with pytest.raises(ConfigurationError, match=message):
         RestoreParams(**settings)
+
+
+def test_a_frame_is_prepared_for_flow_once(monkeypatch):
+    prepared = []
+    monkeypatch.setattr("turbrestore.flow._levels", lambda *a, find=flow._levels: prepared.append(1) or find(*a))
+    frames = make_sequence(count=20).frames[:, :48, :48]
+    found = restore(frames, RestoreParams(train=12, until="filter"))
+    # One for each pass of the centroid, one for the training frames and two for the rest in the filter.
+    references = found.centroid.mean_flow_sizes.size + 3
+    assert len(prepared) == len(frames) + references
