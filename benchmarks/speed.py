@@ -39,8 +39,8 @@ from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_
 
 TIME_BOUND, MEMORY_BOUND_MB, HELP_BOUND = 1.25, 20.0, 6.0
 FRAMES_BOUND, PIXELS_BOUND = 1.05, 1.1
-# Shorter clips pay for what is done once, whatever their length: an eighth of 120 frames is deconvolution.
-FEWEST_BOUND = 200
+# Shorter clips pay for what is done once, whatever their length.
+FEWEST_BOUND = 120
 THREADS = 2
 # Frames, height and width.
 ROWS = ((50, 128, 128), (120, 256, 256), (300, 256, 256), (200, 512, 512))
