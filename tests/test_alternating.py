@@ -200,7 +200,7 @@ def test_covariances_of_a_block_are_those_of_the_filter_step_by_step(sequence):
     _, dynamics = start(sequence)[:2]
     noise, state = dynamics.R * np.eye(dynamics.rank), Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance)
     frames = [sequence.frames[0], None, sequence.frames[1], None, None, sequence.frames[2]]
-    found = state_covariances(state, frames, dynamics)
+    found = state_covariances(state, [frame is not None for frame in frames], dynamics)
     for frame, covariance in zip(frames, found, strict=True):
         state = predict(state, dynamics.A, dynamics.Q)
         if frame is not None:

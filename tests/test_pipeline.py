@@ -269,6 +269,6 @@ def test_a_frame_is_prepared_for_flow_once(monkeypatch):
     monkeypatch.setattr("turbrestore.flow._levels", lambda *a, find=flow._levels: prepared.append(1) or find(*a))
     frames = make_sequence(seed=1, count=20).frames[:, :48, :48]
     found = restore(frames, RestoreParams(train=12, until="filter"))
-    # One for each pass of the centroid, one for the training frames and two for the rest in the filter.
-    references = found.centroid.mean_flow_sizes.size + 3
+    # One for each pass of the centroid, one for the training frames with the rest and one for the rest in the filter.
+    references = found.centroid.mean_flow_sizes.size + 2
     assert len(prepared) == len(frames) + references

@@ -101,8 +101,8 @@ def spy(monkeypatch):
 PLACES = {
     "centroid": ("turbrestore.pipeline.find_centroid", 1),
     "flow model": ("turbrestore.pipeline.identify", 1),
-    "first block": ("turbrestore.alternating._filter_block", 1),
-    "third block": ("turbrestore.alternating._filter_block", 3),
+    "first block": ("turbrestore.alternating._filter_window", 1),
+    "third block": ("turbrestore.alternating._filter_window", 4),
     "deconvolution": ("turbrestore.pipeline.remove_blur", 1),
     "kept images": ("turbrestore_cli.output.write_image", 2),
     "output": ("turbrestore_cli.restore.write_image", 1),
@@ -124,15 +124,15 @@ def test_an_interrupted_run_ends_as_if_nothing_had_happened(whole, place, capsys
 
 def test_what_is_done_is_not_done_again(place, monkeypatch):
     with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, "turbrestore.alternating._filter_block", 3)
+        interrupt(patch, "turbrestore.alternating._filter_window", 4)
         main(WORDS)
     # Eight training frames, then blocks of eight: two are done and kept.
     key = KeptStages("kept", open_frames("clip.mkv"), params_of(WORDS), resume=True)
     assert len(key.done.checkpoint.records) == 16
     called, blocks = spy(monkeypatch), []
-    real = sys.modules["turbrestore.alternating"]._filter_block
+    real = sys.modules["turbrestore.alternating"]._filter_window
     monkeypatch.setattr(
-        "turbrestore.alternating._filter_block", lambda *words: blocks.append(len(words[1])) or real(*words)
+        "turbrestore.alternating._filter_window", lambda *words: blocks.append(words[2]) or real(*words)
     )
     assert main([*WORDS, "--resume"]) == 0
     assert called == ["filter_frames", "remove_blur"]
@@ -241,7 +241,7 @@ def test_files_that_are_not_what_was_written_are_made_again(whole, ended, capsys
 
 def test_a_damaged_checkpoint_costs_the_filter_only(whole, place, monkeypatch, capsys):
     with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, "turbrestore.alternating._filter_block", 3)
+        interrupt(patch, "turbrestore.alternating._filter_window", 4)
         main(WORDS)
     path = place / "kept" / "checkpoint.npz"
     path.write_bytes(path.read_bytes()[:-40])
@@ -387,7 +387,9 @@ def test_a_checkpoint_comes_back_bit_for_bit(tmp_path):
         image = PixelGaussian(rng.normal(size=shape).astype(np.float32), rng.uniform(size=(5, 4)).astype(np.float32))
         flow = Gaussian(rng.normal(size=rank), 0.1 * np.eye(rank))
         records = tuple(FrameRecord(rng.normal(size=rank), 0.1 * k, np.nan, np.nan, 3.0) for k in range(4))
-        save_checkpoint(tmp_path / "c.npz", FilterCheckpoint(FilterState(image, flow), records), "key")
+        save_checkpoint(
+            tmp_path / "c.npz", FilterCheckpoint(FilterState(image, flow), records, np.zeros((2, 3))), "key"
+        )
         found = load_checkpoint(tmp_path / "c.npz", "key")
         assert np.array_equal(found.state.image.mean, image.mean)
         assert found.state.image.mean.dtype == np.float32

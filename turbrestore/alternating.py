@@ -21,9 +21,10 @@ Departures from the paper, each with its reason:
 * The flow outside the subspace is kept (``residual="keep"``): by eq. 10 the flow is ``C ξ + r``, and where r is
   motion its mean is ``Ŵ = C ξ̂ + G (W^meas − C ξ̂)``.  With ``Ŵ = C ξ̂`` alone (``"drop"``, as printed) that motion
   stays in the frames and blurs the image, below the centroid that the filter starts from.
-* Frames are handled in blocks: their flows are measured against the image before the block, side by side, and the
-  inner iteration repeats the block from the same prior.  A block of one frame is the paper's scheme, except that the
-  image the flow is first measured from does not contain the frame itself.
+* Frames are handled in blocks, whose flows are measured side by side; the inner iteration repeats a block from the same
+  prior.  The last iteration of a block and the first of the next measure from the same image, and run as one: the
+  image holds the earlier block then as its last iteration but one has left it.  A block of one frame is the paper's
+  scheme but for that, and but for the frame itself, which the image does not contain when its flow is first measured.
 * Every inner iteration starts from the prediction, not from its own result, so a frame counts once; on a linear
   model the iteration then changes nothing.
 * Z may vary from pixel to pixel: it falls where a frame is locally sharper than usual, by ``exp(−β z)`` with z the
@@ -38,6 +39,7 @@ Departures from the paper, each with its reason:
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -45,14 +47,14 @@ from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, check_flow, check_image
 from .device import PROCESSOR, check_device, find_device
 from .errors import DataError, require, require_between
 from .flow import FlowFrame, FlowParams, iterate_flows
 from .flow_model import FlowDynamics, flow_of
-from .flow_tracking import Block, TrackedFrame, Tracking, state_covariances, track_known, track_measured
+from .flow_tracking import Frames, TrackedFrame, Tracking, state_covariances, track_known, track_measured
 from .frame_noise import FrameNoise, measure_frame_noise
 from .kalman import Gaussian, PixelGaussian, predict_pixels, update_pixels
 from .parallel import one_thread_each
@@ -80,7 +82,7 @@ class FilterParams:
     inner_iterations : int
         Times that flow is measured, and image and flow updated, for each block of frames.
     block : int
-        Frames whose flows are measured against the same image; 1 follows the paper, more run side by side.
+        Frames whose flows are measured against the same image; 1 is closest to the paper, more run side by side.
     frame_noise : {"sharpness", "blur"}
         What tells good frames from bad ones: local sharpness, or the blur of tiles of 48 pixels that their spectra
         show.
@@ -174,12 +176,16 @@ class FilterCheckpoint:
     Attributes
     ----------
     state : FilterState
+        After the frames that have been filtered.
     records : tuple of FrameRecord
-        One for each frame that has been filtered.
+        One for each of them.
+    reference : ndarray, float32, shape (H, W) or (H, W, 3)
+        Image that the next flows are measured from: ρ̂ with the next block in it, as its iterations so far have left it.
     """
 
     state: FilterState
     records: tuple[FrameRecord, ...]
+    reference: FloatArray
 
 
 @dataclass(frozen=True)
@@ -250,6 +256,7 @@ class _Setting:
     tracking: Tracking
     params: FilterParams
     fusion: DeviceFusion | None
+    marks: NDArray[np.bool_] | None
 
 
 def filter_frames(
@@ -296,7 +303,7 @@ def filter_frames(
         Called with a FilterCheckpoint after each block of frames.
     prepared : dict, optional
         What :func:`turbrestore.centroid.find_centroid` has prepared of the first frames with the same settings;
-        emptied after the first block.
+        emptied block by block.
 
     Returns
     -------
@@ -332,25 +339,26 @@ def filter_frames(
     model = _noise_model(first, flows, image, dynamics, params, flow_params.threads)
     fusion, share = _fusion(model, params), cv2.merge([model.motion_share] * 2)
     tracking = Tracking(dynamics, model, share, params.sharpness, flow_params, fusion is None, progress)
-    setting = _Setting(tracking, params, fusion)
+    setting = _Setting(tracking, params, fusion, marks)
+    once = params.inner_iterations == 1
     with one_thread_each():
         if start is None:
-            prior = _prior(image, setting)
-            state, records = _filter_block(prior, _left_out(first, marks, 0), flows, setting, prepared)
+            at, begun = (
+                FilterCheckpoint(_prior(image, setting), (), image),
+                deque[FloatArray]() if once else deque(first),
+            )
+            at = _filter_window(at, first, len(first) - len(begun), setting, prepared, flows)
         else:
-            state, records = _pass_over(start, stream, len(first), setting)
-            (prepared or {}).clear()
-        while True:
+            at, begun = start, _pass_over(start, stream, len(first), setting)
+            _forget(prepared, len(at.records))
+        for passed in _windows(at, begun, stream, setting, prepared):
+            at = passed
             if on_checkpoint is not None:
-                on_checkpoint(FilterCheckpoint(state, tuple(records)))
-            block = list(islice(stream, params.block))
-            if not block:
-                break
-            state, done = _filter_block(state, _left_out(block, marks, len(records)), None, setting, {})
-            records += done
-    if marks is not None and marks.size != len(records):
-        raise DataError(f"counted: expected one mark for each frame, found {marks.size} marks, {len(records)} frames")
-    return _filtered(state, records, model)
+                on_checkpoint(at)
+    if marks is not None and marks.size != len(at.records):
+        found = f"{marks.size} marks, {len(at.records)} frames"
+        raise DataError(f"counted: expected one mark for each frame, found {found}")
+    return _filtered(at, model)
 
 
 def _check_flows(image: FloatArray, dynamics: FlowDynamics, known_flows: ArrayLike | None) -> FloatArray | None:
@@ -383,20 +391,22 @@ def _prior(image: FloatArray, setting: _Setting) -> FilterState:
 
 def _pass_over(
     start: FilterCheckpoint, stream: Iterator[FloatArray], read: int, setting: _Setting
-) -> tuple[FilterState, list[FrameRecord]]:
-    """Read the frames up to a checkpoint, of which the first ``read`` have been."""
-    done, dynamics = len(start.records), setting.tracking.dynamics
-    shapes = start.state.image.variance.shape, start.state.flow.mean.shape
-    if done < read or shapes != (dynamics.shape, (dynamics.rank,)):
+) -> deque[FloatArray]:
+    """Read the frames up to a checkpoint, of which the first ``read`` have been, and the block that it has begun."""
+    done, dynamics, params = len(start.records), setting.tracking.dynamics, setting.params
+    shapes = start.state.image.variance.shape, start.state.flow.mean.shape, start.reference.shape[:2]
+    if done < read or shapes != (dynamics.shape, (dynamics.rank,), dynamics.shape):
         raise DataError(f"start: expected a checkpoint of these frames, found one of {done} frames and shapes {shapes}")
     for _ in islice(stream, done - read):
         pass
+    begun = deque(islice(stream, params.block if params.inner_iterations > 1 else 0))
     if setting.tracking.progress is not None:
-        setting.tracking.progress(done * setting.params.inner_iterations - read)
-    return start.state, list(start.records)
+        setting.tracking.progress(done * params.inner_iterations - read + len(begun))
+    return begun
 
 
-def _filtered(state: FilterState, records: list[FrameRecord], model: FrameNoise) -> Filtered:
+def _filtered(at: FilterCheckpoint, model: FrameNoise) -> Filtered:
+    state, records = at.state, at.records
     information = np.array([record.information for record in records])
     return Filtered(
         image=state.image.mean.astype(np.float32),
@@ -419,14 +429,12 @@ def _checked(frames: Iterable[ArrayLike], shape: tuple[int, ...]) -> Iterator[Fl
         yield image
 
 
-def _left_out(frames: list[FloatArray], marks: np.ndarray | None, start: int) -> Block:
-    """Put None for the frames that do not count."""
-    if marks is None:
-        return list(frames)
-    of_block = marks[start : start + len(frames)]
-    if of_block.size < len(frames):
-        raise DataError(f"counted: expected one mark for each frame, found {marks.size} marks and more frames")
-    return [frame if mark else None for frame, mark in zip(frames, of_block, strict=True)]
+def _left_out(frames: Iterable[FloatArray], marks: NDArray[np.bool_] | None, number: int) -> Frames:
+    """Put None for the frames that do not count; ``number`` is that of the first."""
+    for index, frame in enumerate(frames, number):
+        if marks is not None and index >= marks.size:
+            raise DataError(f"counted: expected one mark for each frame, found {marks.size} marks and more frames")
+        yield frame if marks is None or marks[index] else None
 
 
 def _noise_model(
@@ -452,26 +460,72 @@ def _noise_model(
     return replace(model, motion_share=np.minimum(model.motion_share, largest))
 
 
-def _filter_block(
-    prior: FilterState,
-    frames: Block,
-    known: FloatArray | None,
+def _windows(
+    at: FilterCheckpoint,
+    begun: deque[FloatArray],
+    stream: Iterator[FloatArray],
     setting: _Setting,
     prepared: dict[int, FlowFrame] | None,
-) -> tuple[FilterState, list[FrameRecord]]:
-    """Inner iterations over one block, each from the same prior with flows measured from the newest image."""
-    image, records = prior.image, list[FrameRecord]()
-    covariances = state_covariances(prior.flow, frames, setting.tracking.dynamics)
-    start = prior.flow.mean, covariances, frames
-    for iteration in range(setting.params.inner_iterations):
-        if iteration == 0 and known is not None:
-            tracked = track_known(*start, known, setting.tracking)
-        else:
-            tracked = track_measured(*start, image.mean, prepared, setting.tracking)
-        image, records = _fuse(prior.image, tracked, setting)
-    if prepared is not None:
-        prepared.clear()
-    return FilterState(image, Gaussian(records[-1].flow_state, covariances[-1])), records
+) -> Iterator[FilterCheckpoint]:
+    """Finish the block that has begun while the next begins, until no frames are left."""
+    iterations, size = setting.params.inner_iterations, setting.params.block
+    while begun or iterations == 1:
+        for _ in range(iterations - 2):
+            at = _filter_window(at, begun, 0, setting, prepared)
+        begun = begun or deque(islice(stream, size))
+        if not begun:
+            return
+        # Both in one stream, because threads stand still where one ends.
+        following = deque[FloatArray]()
+        frames = _turn_over(begun, islice(stream, 0 if iterations == 1 else size), following)
+        at = _filter_window(at, frames, len(begun), setting, prepared)
+        yield at
+        begun = following
+        # Where the first block was too large to keep what is prepared of it, later ones are not.
+        prepared = {} if prepared is None else prepared
+
+
+def _turn_over(
+    done: deque[FloatArray], stream: Iterable[FloatArray], following: deque[FloatArray]
+) -> Iterator[FloatArray]:
+    """Give away the frames of one block, and keep those of the next, so that no two blocks are in memory."""
+    while done:
+        yield done.popleft()
+    for frame in stream:
+        following.append(frame)
+        yield frame
+
+
+def _filter_window(
+    at: FilterCheckpoint,
+    frames: Iterable[FloatArray],
+    done: int,
+    setting: _Setting,
+    prepared: dict[int, FlowFrame] | None,
+    known: FloatArray | None = None,
+) -> FilterCheckpoint:
+    """One iteration over frames that follow ``at``, the last over the first ``done`` of them."""
+    number, marks, state = len(at.records), setting.marks, at.state
+    most = done + setting.params.block if known is None else len(known)
+    counted = [marks is None or k >= marks.size or bool(marks[k]) for k in range(number, number + most)]
+    covariances = state_covariances(state.flow, counted, setting.tracking.dynamics)
+    start = state.flow.mean, covariances, _left_out(frames, marks, number)
+    if known is None:
+        tracked = track_measured(*start, at.reference, number, done, prepared, setting.tracking)
+    else:
+        tracked = track_known(*start, known, setting.tracking)
+    image, records = _fuse(state.image, islice(tracked, done), setting)
+    if done:
+        state = FilterState(image, Gaussian(records[-1].flow_state, covariances[done - 1]))
+    after = FilterCheckpoint(state, (*at.records, *records), _fuse(image, tracked, setting)[0].mean)
+    _forget(prepared, number + done)
+    return after
+
+
+def _forget(prepared: dict[int, FlowFrame] | None, done: int) -> None:
+    """Drop what was prepared of frames that are done with, whether a flow was measured to them or not."""
+    for number in [number for number in prepared or {} if number < done]:
+        del (prepared or {})[number]
 
 
 def _fusion(model: FrameNoise, params: FilterParams) -> DeviceFusion | None:

@@ -14,7 +14,7 @@ from .kalman import Gaussian, PixelGaussian
 from .npy import read_npz
 
 _FIGURES = ("gain", "innovation", "sharpness", "information")
-_ARRAYS = ("image", "variance", "flow", "covariance", "flow_states", *_FIGURES)
+_ARRAYS = ("image", "variance", "flow", "covariance", "reference", "flow_states", *_FIGURES)
 
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, key: str) -> None:
@@ -37,7 +37,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, 
     >>> import tempfile
     >>> state = FilterState(PixelGaussian(np.zeros((2, 3)), np.ones((2, 3))), Gaussian(np.zeros(1), np.eye(1)))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     one = FilterCheckpoint(state, (FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0),))
+    ...     one = FilterCheckpoint(state, (FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0),), np.zeros((2, 3)))
     ...     save_checkpoint(folder + "/c.npz", one, "A")
     ...     len(load_checkpoint(folder + "/c.npz", "A").records)
     1
@@ -46,6 +46,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, 
     arrays: dict[str, np.ndarray] = {name: np.array([getattr(record, name) for record in records]) for name in _FIGURES}
     states = np.array([record.flow_state for record in records], np.float64)
     arrays |= {"image": image.mean, "variance": image.variance, "flow": flow.mean, "covariance": flow.cov}
+    arrays["reference"] = checkpoint.reference
     with atomic_output(path, overwrite=True) as temporary, temporary.open("wb") as stream:
         np.savez(stream, allow_pickle=False, key=np.array(key), flow_states=states, **arrays)
 
@@ -93,4 +94,4 @@ def load_checkpoint(path: str | os.PathLike[str], key: str) -> FilterCheckpoint:
         raise DataError(f"{source}: expected a checkpoint of the filter, found something else or damage") from error
     if found != key:
         raise DataError(f"{source}: expected a checkpoint of this run, found one of other frames or settings")
-    return FilterCheckpoint(state, records)
+    return FilterCheckpoint(state, records, arrays["reference"])

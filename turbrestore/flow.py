@@ -205,10 +205,12 @@ class FlowReference:
     batch: int
     threads: int
 
-    def frame(self, number: int, image: FloatArray, prepared: dict[int, FlowFrame] | None) -> FlowFrame:
-        """Look a frame up among those that are prepared already, or prepare it and add it to them."""
-        found = (prepared or {}).get(number) or self.prepare(image)
-        if prepared is not None:
+    def frame(
+        self, number: int, image: FloatArray, prepared: dict[int, FlowFrame] | None, last: bool = False
+    ) -> FlowFrame:
+        """Take a frame from those that are prepared already, or prepare it; put it there but for the last time."""
+        found = (prepared or {}).pop(number, None) or self.prepare(image)
+        if prepared is not None and not last:
             prepared[number] = found
         return found
 

@@ -10,7 +10,7 @@ Z : noise of a registered frame
 
 The state of the flow needs no image once its flow is measured, and as CᵀC = I a measured flow says nothing of the state
 but ``z = Cᵀ(W^meas − W̄)``, with noise R.  So ``M = P / R`` with P after the update, and no P depends on what is
-measured: they are found once for a block of frames.  What is left to do frame after frame are two small products; flow,
+measured: they are found for some frames at once.  What is left to do frame after frame are two small products; flow,
 projection and registration run side by side.
 """
 
@@ -35,8 +35,8 @@ from .warp import warp
 # Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
 _FLOW_NOISE_FLOOR = 1e-6
 
-# Frames of a block, and frames with their flows; None for those that do not count.
-Block = list[FloatArray | None]
+# Frames, and frames with their flows; None for those that do not count.
+Frames = Iterator[FloatArray | None]
 _Pair = tuple[FloatArray | None, FloatArray | None]
 _Item = TypeVar("_Item")
 
@@ -119,14 +119,15 @@ class _Seen:
     squared: float
 
 
-def state_covariances(prior: Gaussian, frames: Block, dynamics: FlowDynamics) -> list[NDArray[np.float64]]:
-    """P after each frame of a block (eqs. 14d and 19).
+def state_covariances(prior: Gaussian, counted: list[bool], dynamics: FlowDynamics) -> list[NDArray[np.float64]]:
+    """P after each of some frames (eqs. 14d and 19).
 
     Parameters
     ----------
     prior : Gaussian
         Before the first.
-    frames : list of ndarray or None
+    counted : list of bool
+        Whether a flow is measured to each.
     dynamics : FlowDynamics
 
     Returns
@@ -138,15 +139,15 @@ def state_covariances(prior: Gaussian, frames: Block, dynamics: FlowDynamics) ->
     >>> from turbrestore.dynamics import identify
     >>> flows = np.zeros((4, 2, 2, 2), np.float32); flows[..., 0] = np.array([1, -1, 1, -1])[:, None, None]
     >>> dynamics = identify(flows)
-    >>> seen, unseen = state_covariances(Gaussian(np.zeros(1), np.eye(1)), [flows[0, ..., 0], None], dynamics)
+    >>> seen, unseen = state_covariances(Gaussian(np.zeros(1), np.eye(1)), [True, False], dynamics)
     >>> bool(seen[0, 0] < 1e-5), bool(unseen[0, 0] > seen[0, 0])
     (True, True)
     """
     state, unit, nothing = prior, np.eye(dynamics.rank), np.zeros(dynamics.rank)
     covariances = []
-    for frame in frames:
+    for counts in counted:
         state = predict(state, dynamics.A, dynamics.Q)
-        if frame is not None:
+        if counts:
             state, _ = update_information(state, nothing, unit, _flow_noise(dynamics), orthonormal=True)
         covariances.append(state.cov)
     return covariances
@@ -155,7 +156,7 @@ def state_covariances(prior: Gaussian, frames: Block, dynamics: FlowDynamics) ->
 def track_known(
     state: NDArray[np.float64],
     covariances: list[NDArray[np.float64]],
-    frames: Block,
+    frames: Frames,
     flows: FloatArray,
     tracking: Tracking,
 ) -> Iterator[TrackedFrame]:
@@ -167,7 +168,7 @@ def track_known(
         ξ̂ before the first.
     covariances : list of ndarray
         From :func:`state_covariances`.
-    frames : list of ndarray or None
+    frames : iterator of ndarray or None
     flows : ndarray, float32, shape (T, H, W, 2)
         Pixels.
     tracking : Tracking
@@ -183,8 +184,10 @@ def track_known(
 def track_measured(
     state: NDArray[np.float64],
     covariances: list[NDArray[np.float64]],
-    frames: Block,
+    frames: Frames,
     image: FloatArray,
+    number: int,
+    done: int,
     prepared: dict[int, FlowFrame] | None,
     tracking: Tracking,
 ) -> Iterator[TrackedFrame]:
@@ -196,10 +199,14 @@ def track_measured(
         ξ̂ before the first.
     covariances : list of ndarray
         From :func:`state_covariances`.
-    frames : list of ndarray or None
+    frames : iterator of ndarray or None
     image : ndarray, float32, shape (H, W) or (H, W, 3)
+    number : int
+        Of the first frame.
+    done : int
+        Of so many frames, the first ones, no flow will be measured any more.
     prepared : dict of int to FlowFrame, or None
-        What has been prepared of frames for an earlier image; the rest is added.  None keeps nothing.
+        What has been prepared of frames for an earlier image, by their numbers; the rest is added.  None keeps nothing.
     tracking : Tracking
 
     Yields
@@ -209,11 +216,15 @@ def track_measured(
     reference = refer_flow(image, tracking.flow)
 
     def measure(batch: list[tuple[int, FloatArray | None]]) -> list[_Pair]:
-        counted = [reference.frame(number, frame, prepared) for number, frame in batch if frame is not None]
+        counted = [
+            reference.frame(index, frame, prepared, index < number + done)
+            for index, frame in batch
+            if frame is not None
+        ]
         flows = iter(reference.solve(counted) if counted else [])
         return [(None, None) if frame is None else (frame, next(flows)) for _, frame in batch]
 
-    batches = in_batches(enumerate(walk(frames)), reference.batch)
+    batches = in_batches(enumerate(walk(frames), number), reference.batch)
     for tracked in _track(state, covariances, batches, measure, reference.threads, tracking):
         if tracking.progress is not None:
             tracking.progress(1)
