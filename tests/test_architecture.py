@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "turbrestore"
 # A module imports only from those before it.
 ORDER = [
-    "errors", "memory_size", "scratch", "arrays", "decision", "device", "plots", "preview",
+    "errors", "memory_size", "scratch", "arrays", "compiled", "decision", "device", "plots", "preview",
     "parallel", "pixels", "limits", "input_files", "tiff_pages", "image_headers",
     "images", "npy", "frame_source", "stuck_pixels",
     "scene_cuts", "content", "integrity", "ser", "tiff", "container", "encoding", "video",
@@ -24,7 +24,7 @@ ORDER = [
     "artifact_fields", "artifacts", "record_fields", "run_record", "checkpoint", "folder_lock",
     "digests", "resumption", "report",
 ]  # fmt: skip
-HEAVY = {"torch", "kornia", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
+HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")
 
 
@@ -64,7 +64,7 @@ def test_every_module_is_placed():
     assert {layer(path) for path in MODULES} == set(ORDER)
 
 
-LIBRARIES = {"torch", "kornia", "matplotlib", "cv2", "scipy"}
+LIBRARIES = {"torch", "kornia", "numba", "matplotlib", "cv2", "scipy"}
 
 
 @pytest.mark.parametrize(

@@ -99,13 +99,19 @@ class EdgeStrip:
         return total
 
     @cached_property
+    def starts(self) -> NDArray[np.int32]:
+        """Where the pairs of each pixel of the strip begin, and where the last end; int32, shape (n + 1,)."""
+        starts = np.zeros(len(self.degrees) + 1, np.int32)
+        np.cumsum(self.degrees, out=starts[1:])
+        return starts
+
+    @cached_property
     def _sums(self) -> tuple[sparse.csr_array, sparse.csc_array]:
         """Matrices that add up edges at tails and at heads; their constructor would copy what it is given."""
         count, own = len(self.heads), len(self.degrees)
         at_tails = sparse.csr_array((own, count), dtype=np.float32)
         at_heads = sparse.csc_array((self.window, count), dtype=np.float32)
-        at_tails.indices, at_tails.indptr = self.order[:count], np.zeros(own + 1, np.int32)
-        np.cumsum(self.degrees, out=at_tails.indptr[1:])
+        at_tails.indices, at_tails.indptr = self.order[:count], self.starts
         at_heads.indices, at_heads.indptr = self.heads, self.order[: count + 1]
         return at_tails, at_heads
 

@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from .arrays import FloatArray, luminance
 from .blur_moments.frame_blur import BlurReference, blur_against, refer_blur
 from .blur_moments.fusion import FusionRule, fusion_rule, laplacian_energy, noise_factor
+from .compiled import compiled
 from .parallel import sum_side_by_side
 from .scratch import walk
-from .warp import inside, strips, warp
+from .warp import inside, mirror, strips, warp
 
 # Smallest variance, so that noise-free synthetic data keep every gain defined: (1/4096 of full scale)².
 _IMAGE_NOISE_FLOOR = 6e-8
@@ -228,18 +229,12 @@ def judge_frame(
         return model.image_noise, sharp
     noise = _deviates(grey, model.usual_frame, model.deviation)
     lost = _lost(flow)
-    seen = None if model.blur is not None else _smooth(product, model.window)
-    for rows in strips(noise.shape):
-        excess = np.maximum(noise[rows] / OUTLIER, 1)
-        squared = excess * excess
-        exponent = lost[rows] * LOG_DISTRUST
-        if seen is not None:
-            exponent += _exponent(seen[rows], squared, model, rows, sharpness)
-        np.minimum(exponent, LARGEST_EXPONENT, out=exponent)
-        # The third power: what deviates twice as much as is tolerated counts an eighth.
-        excess *= squared
-        excess *= np.float32(model.image_noise)
-        np.multiply(excess, np.exp(exponent, out=exponent), out=noise[rows])
+    if model.blur is None:
+        _weigh(noise, _smooth(product, model.window), lost, model, sharpness)
+    else:
+        lost *= LOG_DISTRUST
+        excess = np.maximum(noise / OUTLIER, 1)
+        noise = np.float32(model.image_noise) * excess**3 * np.exp(lost)
     if model.blur is not None:
         reference, rule = model.blur
         noise = noise_factor(rule, blur_against(registered[None], reference).extra[0]) * noise
@@ -249,6 +244,71 @@ def judge_frame(
 def _add_moments(plane: FloatArray, total: np.ndarray, squares: np.ndarray) -> None:
     cv2.accumulate(plane, total)
     cv2.accumulateSquare(plane, squares)
+
+
+def _weigh(noise: FloatArray, seen: FloatArray, lost: FloatArray, model: FrameNoise, sharpness: float) -> None:
+    """Turn the deviation of a frame into its Z, in place, by its local sharpness ``seen`` and where it is lost."""
+    usual, scale, variance = model.usual, model.score_scale, model.score_variance
+    weigh = compiled(weigh_pixels)
+    if weigh is not None:
+        beta, image_noise = np.float32(sharpness), np.float32(model.image_noise)
+        # What was lost becomes the exponent.
+        weigh(beta, image_noise, *(plane.ravel() for plane in (seen, usual, scale, variance, noise, lost)))
+        noise *= np.exp(lost, out=lost)
+        return
+    for rows in strips(noise.shape):
+        excess = np.maximum(noise[rows] / OUTLIER, 1)
+        squared = excess * excess
+        exponent = lost[rows] * LOG_DISTRUST
+        exponent += _exponent(seen[rows], squared, model, rows, sharpness)
+        np.minimum(exponent, LARGEST_EXPONENT, out=exponent)
+        # The third power: what deviates twice as much as is tolerated counts an eighth.
+        excess *= squared
+        excess *= np.float32(model.image_noise)
+        np.multiply(excess, np.exp(exponent, out=exponent), out=noise[rows])
+
+
+def weigh_pixels(
+    beta: np.float32,
+    image_noise: np.float32,
+    seen: FloatArray,
+    usual: FloatArray,
+    scale: FloatArray,
+    variance: FloatArray,
+    noise: FloatArray,
+    lost: FloatArray,
+) -> None:
+    """Z of each pixel without its exponential factor, and the exponent of that; to be compiled.
+
+    Parameters
+    ----------
+    beta, image_noise : float32
+        β, and Z before sharpness.
+    seen, usual, scale, variance : ndarray, float32, shape (P,)
+        Sharpness, and what is usual; see :class:`FrameNoise`.
+    noise : ndarray, float32, shape (P,)
+        Squared deviation in units of the usual one; becomes Z.
+    lost : ndarray, float32, shape (P,)
+        1 where the flow errs; becomes the exponent.
+
+    Examples
+    --------
+    >>> one, lost = np.ones(1, np.float32), np.zeros(1, np.float32)
+    >>> noise = np.array([12.0], np.float32)
+    >>> weigh_pixels(np.float32(0.5), np.float32(0.1), 3 * one, one, one, 0 * one, noise, lost)
+    >>> noise, lost
+    (array([0.8], dtype=float32), array([-0.25], dtype=float32))
+    """
+    one, outlier, largest = np.float32(1), np.float32(OUTLIER), np.float32(LARGEST_SCORE)
+    half, distrust, most = np.float32(0.5), np.float32(LOG_DISTRUST), np.float32(LARGEST_EXPONENT)
+    for pixel in range(noise.size):
+        excess = max(noise[pixel] / outlier, one)
+        score = min(max((seen[pixel] - usual[pixel]) * scale[pixel], -largest), largest)
+        if score > 0:
+            score /= excess * excess
+        exponent = half * beta * beta * variance[pixel] - beta * score + distrust * lost[pixel]
+        lost[pixel] = min(exponent, most)
+        noise[pixel] = excess * excess * excess * image_noise
 
 
 def _exponent(seen: FloatArray, excess: FloatArray, model: FrameNoise, rows: slice, sharpness: float) -> FloatArray:
@@ -320,7 +380,7 @@ def _lost(flow: FloatArray) -> FloatArray:
     """
     lost = inside(flow)
     np.subtract(1, lost, out=lost)
-    folded = np.concatenate([_folded(flow, rows) for rows in strips(flow.shape)])
+    folded = _folded(flow)
     if not folded.any():
         return lost
     # Faded out: an abrupt change of weights would show as an edge.
@@ -329,8 +389,50 @@ def _lost(flow: FloatArray) -> FloatArray:
     return np.maximum(fade, lost, out=lost)
 
 
-def _folded(flow: FloatArray, rows: slice) -> NDArray[np.bool_]:
+def _folded(flow: FloatArray) -> NDArray[np.bool_]:
     """Where the map id + Ŵ has a Jacobian of zero or less."""
+    mark = compiled(mark_folds)
+    if mark is None:
+        return np.concatenate([_folded_strip(flow, rows) for rows in strips(flow.shape)])
+    folded = np.empty(flow.shape[:2], np.bool_)
+    mark(mirror(flow, 1, 1), folded)
+    return folded
+
+
+def mark_folds(flow: FloatArray, folded: NDArray[np.bool_]) -> None:
+    """Find where a map has a Jacobian of zero or less, by Sobel's derivatives; to be compiled.
+
+    Parameters
+    ----------
+    flow : ndarray, float32, shape (H + 2, W + 2, 2)
+        Pixels, with a border of one.
+    folded : ndarray, bool, shape (H, W)
+        Filled.
+
+    Examples
+    --------
+    >>> flow, folded = np.zeros((3, 6, 2), np.float32), np.empty((1, 4), bool)
+    >>> flow[..., 0] = [0, 0, 0, -3, -3, -3]
+    >>> mark_folds(flow, folded)
+    >>> folded[0].tolist()
+    [False, True, True, False]
+    """
+    two, eight = np.float32(2), np.float32(8)
+    for row in range(folded.shape[0]):
+        above, level, below = flow[row], flow[row + 1], flow[row + 2]
+        for column in range(folded.shape[1]):
+            ux = above[column + 2, 0] - above[column, 0] + two * (level[column + 2, 0] - level[column, 0])
+            vx = above[column + 2, 1] - above[column, 1] + two * (level[column + 2, 1] - level[column, 1])
+            uy = below[column, 0] - above[column, 0] + two * (below[column + 1, 0] - above[column + 1, 0])
+            vy = below[column, 1] - above[column, 1] + two * (below[column + 1, 1] - above[column + 1, 1])
+            ux += below[column + 2, 0] - below[column, 0]
+            vx += below[column + 2, 1] - below[column, 1]
+            uy += below[column + 2, 0] - above[column + 2, 0]
+            vy += below[column + 2, 1] - above[column + 2, 1]
+            folded[row, column] = (eight + ux) * (eight + vy) <= uy * vx
+
+
+def _folded_strip(flow: FloatArray, rows: slice) -> NDArray[np.bool_]:
     start, stop = max(rows.start - 1, 0), rows.stop + 1
     inner = slice(rows.start - start, rows.stop - start)
     (ux, uy), (vx, vy) = (_gradient(plane) for plane in cv2.split(flow[start:stop]))

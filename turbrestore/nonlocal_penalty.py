@@ -16,8 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .arrays import FloatArray
+from .compiled import compiled
 from .edge_strips import EdgeStrip, sum_strips
 from .nonlocal_tv import NonlocalGraph
 from .scratch import new_stack, release
@@ -75,9 +77,17 @@ class NonlocalPenalty:
         flat, values = image.ravel(), dual.values
         root_step, drawn = np.float32(step), np.float32(relaxation - 1)
 
+        add_loops, draw_loops = compiled(add_differences), compiled(draw_back)
+
         def add(number: int, strip: EdgeStrip) -> FloatArray:
             part = dual.parts[number]
             there, back, added = values[0, part], values[1, part], values[2, part]
+            if add_loops is not None:
+                squares = np.zeros(strip.window, np.float32)
+                edges = strip.starts, strip.heads, strip.roots
+                add_loops(strip.view(flat), root_step, *edges, there, back, added, squares)
+                release(values)
+                return squares
             np.multiply(strip.differences(flat), root_step, out=added)
             there += added
             back -= added
@@ -90,9 +100,14 @@ class NonlocalPenalty:
         np.divide(np.float32(relaxation), factor, out=factor)
         factor -= drawn
 
-        def draw_back(number: int, strip: EdgeStrip) -> FloatArray:
+        def draw(number: int, strip: EdgeStrip) -> FloatArray:
             part, own = dual.parts[number], strip.view(factor)
             there, back, added = values[0, part], values[1, part], values[2, part]
+            if draw_loops is not None:
+                pull = np.zeros(strip.window, np.float32)
+                draw_loops(own, drawn, strip.starts, strip.heads, strip.roots, there, back, added, pull)
+                release(values)
+                return pull
             there *= strip.at_tails(own)
             back *= strip.at_heads(own)
             added *= drawn
@@ -103,7 +118,7 @@ class NonlocalPenalty:
             release(values)
             return pull
 
-        return sum_strips(self.graph.strips, draw_back, flat.size, self.pool).reshape(image.shape)
+        return sum_strips(self.graph.strips, draw, flat.size, self.pool).reshape(image.shape)
 
     def value(self, image: FloatArray) -> float:
         """J[u]."""
@@ -115,3 +130,95 @@ class NonlocalPenalty:
 
         total = sum_strips(self.graph.strips, squares, flat.size, self.pool)
         return float(np.sqrt(total).sum(dtype=np.float64))
+
+
+def add_differences(
+    image: FloatArray,
+    step: np.float32,
+    starts: NDArray[np.int32],
+    heads: NDArray[np.int32],
+    roots: FloatArray,
+    there: FloatArray,
+    back: FloatArray,
+    added: FloatArray,
+    squares: FloatArray,
+) -> None:
+    """Add K of an image to p along the edges of a strip, and the square of |p| to its pixels; to be compiled.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (window,)
+    step : float32
+        s.
+    starts, heads, roots : ndarray
+        Of the strip, see :class:`turbrestore.edge_strips.EdgeStrip`.
+    there, back, added : ndarray, float32, shape (e,)
+        p from tail to head, from head to tail, and what is added; changed.
+    squares : ndarray, float32, shape (window,)
+        Added to.
+
+    Examples
+    --------
+    >>> edge = np.array([0, 1, 1], np.int32), np.array([1], np.int32), np.ones(1, np.float32)
+    >>> there, back, added, squares = np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(2)
+    >>> add_differences(np.array([3.0, 5.0]), np.float32(10), *edge, there, back, added, squares)
+    >>> there, back, squares
+    (array([20.]), array([-20.]), array([400., 400.]))
+    """
+    for tail in range(starts.size - 1):
+        own, total = image[tail], np.float32(0)
+        for edge in range(starts[tail], starts[tail + 1]):
+            head = heads[edge]
+            more = (image[head] - own) * roots[edge] * step
+            forward, backward = there[edge] + more, back[edge] - more
+            there[edge], back[edge], added[edge] = forward, backward, more
+            total += forward * forward
+            squares[head] += backward * backward
+        squares[tail] += total
+
+
+def draw_back(
+    factor: FloatArray,
+    drawn: np.float32,
+    starts: NDArray[np.int32],
+    heads: NDArray[np.int32],
+    roots: FloatArray,
+    there: FloatArray,
+    back: FloatArray,
+    added: FloatArray,
+    pull: FloatArray,
+) -> None:
+    """Project and over-relax p on the edges of a strip, and add Kᵀp to its pixels; to be compiled.
+
+    Parameters
+    ----------
+    factor : ndarray, float32, shape (window,)
+        (1 − ρ + ρf) of each pixel.
+    drawn : float32
+        ρ − 1.
+    starts, heads, roots : ndarray
+        Of the strip, see :class:`turbrestore.edge_strips.EdgeStrip`.
+    there, back, added : ndarray, float32, shape (e,)
+        p from tail to head, from head to tail, and what has been added; the first two are changed.
+    pull : ndarray, float32, shape (window,)
+        Added to.
+
+    Examples
+    --------
+    >>> edge = np.array([0, 1, 1], np.int32), np.array([1], np.int32), np.ones(1, np.float32)
+    >>> there, back, added, pull = np.full(1, 20.0), np.full(1, -20.0), np.full(1, 20.0), np.zeros(2)
+    >>> draw_back(np.array([0.05, 0.05]), np.float32(0), *edge, there, back, added, pull)
+    >>> there, back, pull
+    (array([1.]), array([-1.]), array([-2.,  2.]))
+    """
+    for tail in range(starts.size - 1):
+        own, total = factor[tail], np.float32(0)
+        for edge in range(starts[tail], starts[tail + 1]):
+            head = heads[edge]
+            forward = there[edge] * own + added[edge] * drawn
+            backward = back[edge] * factor[head] - added[edge] * drawn
+            there[edge], back[edge] = forward, backward
+            net = (backward - forward) * roots[edge]
+            total += net
+            pull[head] -= net
+        pull[tail] += total

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from .arrays import FloatArray, check_flow, check_image
+from .compiled import compiled
 from .device import PROCESSOR, find_device, memory_of
 from .errors import ConfigurationError, DataError
 from .image_stacks import PREFILTER, StackOps, torch_ops, warp_stack
@@ -28,6 +29,8 @@ from .image_stacks import PREFILTER, StackOps, torch_ops, warp_stack
 # Pixels of a strip.  A dozen arrays of a smaller one would stay in the cache of a core, but where two threads run, the
 # interpreter lock that every operation on them gives away and takes again costs more than the cache saves.
 _STRIP = 1 << 16
+# Coefficients that a spline reaches before the image and beyond it.
+_BEFORE, _BEYOND = 1, 2
 
 
 def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device: str = PROCESSOR) -> FloatArray:
@@ -220,9 +223,10 @@ def inside(flow: ArrayLike) -> FloatArray:
     if flow.ndim != 3:
         raise DataError(f"flow: expected shape (H, W, 2), found {flow.shape}")
     seen = np.ones(flow.shape[:2], np.float32)
-    dx, dy = cv2.split(flow)
-    _fade(seen.T, dx.T)
-    _fade(seen, dy)
+    # Only samples within reach of a border can lie beyond it.
+    reach = math.ceil(cv2.norm(flow, cv2.NORM_INF))
+    _fade(seen.T, flow[..., 0].T, reach)
+    _fade(seen, flow[..., 1], reach)
     return seen
 
 
@@ -247,14 +251,12 @@ def strips(shape: tuple[int, ...]) -> Iterator[slice]:
     return (slice(start, min(start + rows, shape[0])) for start in range(0, shape[0], rows))
 
 
-def _fade(seen: FloatArray, flow: FloatArray) -> None:
-    """Multiply ``seen`` by how far samples along the first axis lie within the image."""
+def _fade(seen: FloatArray, flow: FloatArray, reach: int) -> None:
+    """Multiply ``seen`` by how far samples along the first axis lie within the image; none moves by more than reach."""
     length = len(flow)
     position = np.arange(length, dtype=np.float32)[:, None]
-    # Only samples within reach of a border can lie beyond it.
-    before = min(max(math.ceil(-flow.min()), 0), length)
-    after = max(length - max(math.ceil(flow.max()), 0), before)
-    for part in (slice(0, before), slice(after, length)):
+    before = min(reach, length)
+    for part in (slice(0, before), slice(max(length - reach, before), length)):
         sample = position[part] + flow[part]
         seen[part] *= np.clip(1 - np.maximum(-sample, sample - (length - 1)), 0, 1)
 
@@ -278,9 +280,84 @@ def _linear(image: FloatArray, flow: FloatArray) -> FloatArray:
 
 
 def _cubic(image: FloatArray, flow: FloatArray) -> FloatArray:
+    coefficients = cv2.sepFilter2D(image, -1, PREFILTER, PREFILTER, borderType=cv2.BORDER_REFLECT_101)
+    sample = compiled(sample_spline)
+    if sample is None:
+        return _sample_strips(coefficients, flow)
+    coefficients, result = mirror(coefficients, _BEFORE, _BEYOND), np.empty(image.shape, np.float32)
+    if image.ndim == 2:
+        sample(coefficients, flow, result)
+        return result
+    for channel, plane in enumerate(cv2.split(coefficients)):
+        sample(plane, flow, result[..., channel])
+    return result
+
+
+def mirror(image: FloatArray, before: int, beyond: int) -> FloatArray:
+    """Continue an image beyond its border pixels, mirrored at them.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, C)
+    before, beyond : int
+        Pixels at the top and at the left, at the bottom and at the right.
+
+    Returns
+    -------
+    ndarray, float32, shape (H + before + beyond, W + before + beyond) or with C
+
+    Examples
+    --------
+    >>> mirror(np.array([[1, 2, 3]], np.float32), 1, 2)[0]
+    array([2., 1., 2., 3., 2., 1.], dtype=float32)
+    """
+    return cv2.copyMakeBorder(image, before, beyond, before, beyond, cv2.BORDER_REFLECT_101)
+
+
+def sample_spline(coefficients: FloatArray, flow: FloatArray, result: FloatArray) -> None:
+    """Sum of 4×4 B-spline coefficients at each position of a map, to be compiled.
+
+    Parameters
+    ----------
+    coefficients : ndarray, float32, shape (H + 3, W + 3)
+        With a pixel before and two beyond the image.
+    flow : ndarray, float32, shape (H, W, 2)
+        Displacements (dx, dy) in pixels.
+    result : ndarray, float32, shape (H, W)
+        Filled.
+
+    Examples
+    --------
+    >>> shifted = np.empty((2, 3), np.float32)
+    >>> sample_spline(np.ones((5, 6), np.float32), np.full((2, 3, 2), 0.5, np.float32), shifted)
+    >>> shifted.round(6).tolist()
+    [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
+    """
+    zero, one, sixth = np.float32(0), np.float32(1), np.float32(1 / 6)
+    three, four, six = np.float32(3), np.float32(4), np.float32(6)
+    bottom, right = np.float32(result.shape[0] - 1), np.float32(result.shape[1] - 1)
+    for row in range(result.shape[0]):
+        for column in range(result.shape[1]):
+            x = min(max(np.float32(column) + flow[row, column, 0], zero), right)
+            y = min(max(np.float32(row) + flow[row, column, 1], zero), bottom)
+            # Without a sign they need no look whether they count from the end.
+            j, i = np.uint32(x), np.uint32(y)
+            t, u = x - np.float32(j), y - np.float32(i)
+            left, upper = (one - t) * (one - t) * (one - t) * sixth, (one - u) * (one - u) * (one - u) * sixth
+            centre, middle = (four - (six - three * t) * t * t) * sixth, (four - (six - three * u) * u * u) * sixth
+            far, lower = t * t * t * sixth, u * u * u * sixth
+            beside, below = one - left - centre - far, one - upper - middle - lower
+            rows = coefficients[i], coefficients[i + 1], coefficients[i + 2], coefficients[i + 3]
+            a = rows[0][j] * left + rows[0][j + 1] * centre + rows[0][j + 2] * beside + rows[0][j + 3] * far
+            b = rows[1][j] * left + rows[1][j + 1] * centre + rows[1][j + 2] * beside + rows[1][j + 3] * far
+            c = rows[2][j] * left + rows[2][j + 1] * centre + rows[2][j + 2] * beside + rows[2][j + 3] * far
+            d = rows[3][j] * left + rows[3][j + 1] * centre + rows[3][j + 2] * beside + rows[3][j + 3] * far
+            result[row, column] = a * upper + b * middle + c * below + d * lower
+
+
+def _sample_strips(coefficients: FloatArray, flow: FloatArray) -> FloatArray:
     """Sum of 4×4 B-spline coefficients as a blend of four bilinear samples (Sigg and Hadwiger 2005)."""
     grid = _pixel_grid(*flow.shape[:2])
-    coefficients = cv2.sepFilter2D(image, -1, PREFILTER, PREFILTER, borderType=cv2.BORDER_REFLECT_101)
     result = np.empty_like(coefficients)
     for rows in strips(flow.shape):
         position = np.empty((2, *flow[rows].shape[:2]), np.float32)
