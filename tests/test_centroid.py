@@ -65,7 +65,7 @@ def test_flows_start_from_the_centroid_and_average_out(sequence, mode):
 def test_a_mean_flow_that_stalls_has_converged_and_one_that_grows_has_not(monkeypatch, sizes, converged):
     found = iter(sizes)
 
-    def fill(reference, stack, flows, *_):
+    def fill(reference, stack, flows, *_, again):
         flows[:] = (next(found), 0.0)
 
     monkeypatch.setattr("turbrestore.centroid.fill_flows", fill)

@@ -204,9 +204,9 @@ def test_a_restoration_measures_no_flow_twice(monkeypatch, train):
     def counting(params, reference):
         solve = dis(params, reference)
 
-        def counted(frames):
+        def counted(frames, starts):
             solved.extend(frame.tobytes() + reference.tobytes() for frame in frames)
-            return solve(frames)
+            return solve(frames, starts)
 
         return counted
 

@@ -56,8 +56,9 @@ from .flow import FlowFrame, FlowParams, iterate_flows
 from .flow_model import FlowDynamics, flow_of
 from .flow_tracking import Frames, TrackedFrame, Tracking, state_covariances, track_known, track_measured
 from .frame_noise import FrameNoise, measure_frame_noise
-from .kalman import Gaussian, PixelGaussian, predict_pixels, update_pixels
+from .kalman import Gaussian, PixelGaussian
 from .parallel import one_thread_each
+from .pixel_fusion import PixelFusion
 from .plots import plot_frames
 from .preview import preview
 from .torch_fusion import DeviceFusion, fuse_frame, load_fusion, load_pixels, store_pixels
@@ -180,7 +181,7 @@ class FilterCheckpoint:
     records : tuple of FrameRecord
         One for each of them.
     reference : ndarray, float32, shape (H, W) or (H, W, 3)
-        Image that the next flows are measured from: ρ̂ with the next block in it, as its iterations so far have left it.
+        Image that the flows of the next block are first measured from.
     """
 
     state: FilterState
@@ -250,6 +251,15 @@ class Filtered:
 
 
 @dataclass(frozen=True)
+class _Standing:
+    """State and records after the frames that are done, and the image that flows are measured from next."""
+
+    state: FilterState
+    records: tuple[FrameRecord, ...]
+    image: FloatArray
+
+
+@dataclass(frozen=True)
 class _Setting:
     """What stays the same from frame to frame."""
 
@@ -257,6 +267,7 @@ class _Setting:
     params: FilterParams
     fusion: DeviceFusion | None
     marks: NDArray[np.bool_] | None
+    known: FloatArray
 
 
 def filter_frames(
@@ -303,7 +314,7 @@ def filter_frames(
         Called with a FilterCheckpoint after each block of frames.
     prepared : dict, optional
         What :func:`turbrestore.centroid.find_centroid` has prepared of the first frames with the same settings;
-        emptied block by block.
+        emptied.
 
     Returns
     -------
@@ -339,22 +350,21 @@ def filter_frames(
     model = _noise_model(first, flows, image, dynamics, params, flow_params.threads)
     fusion, share = _fusion(model, params), cv2.merge([model.motion_share] * 2)
     tracking = Tracking(dynamics, model, share, params.sharpness, flow_params, fusion is None, progress)
-    setting = _Setting(tracking, params, fusion, marks)
-    once = params.inner_iterations == 1
+    setting = _Setting(tracking, params, fusion, marks, flows)
+    begun = deque(first if params.inner_iterations > 1 else [])
     with one_thread_each():
         if start is None:
-            at, begun = (
-                FilterCheckpoint(_prior(image, setting), (), image),
-                deque[FloatArray]() if once else deque(first),
-            )
-            at = _filter_window(at, first, len(first) - len(begun), setting, prepared, flows)
+            at = _Standing(_prior(image, setting), (), image)
+            at = _filter_window(at, first, len(first) - len(begun), setting, {}, from_known=True)
         else:
-            at, begun = start, _pass_over(start, stream, len(first), setting)
-            _forget(prepared, len(at.records))
-        for passed in _windows(at, begun, stream, setting, prepared):
+            at, begun = _pass_over(start, stream, len(first), setting)
+        # Only those of the first block can be too many to be kept.
+        prepared = {} if prepared is None else prepared
+        for passed, checkpoint in _windows(at, begun, stream, setting, prepared):
             at = passed
             if on_checkpoint is not None:
-                on_checkpoint(at)
+                on_checkpoint(checkpoint)
+        prepared.clear()
     if marks is not None and marks.size != len(at.records):
         found = f"{marks.size} marks, {len(at.records)} frames"
         raise DataError(f"counted: expected one mark for each frame, found {found}")
@@ -391,21 +401,20 @@ def _prior(image: FloatArray, setting: _Setting) -> FilterState:
 
 def _pass_over(
     start: FilterCheckpoint, stream: Iterator[FloatArray], read: int, setting: _Setting
-) -> deque[FloatArray]:
-    """Read the frames up to a checkpoint, of which the first ``read`` have been, and the block that it has begun."""
+) -> tuple[_Standing, deque[FloatArray]]:
+    """Read the frames up to a checkpoint, of which the first ``read`` have been; the next block begins anew."""
     done, dynamics, params = len(start.records), setting.tracking.dynamics, setting.params
     shapes = start.state.image.variance.shape, start.state.flow.mean.shape, start.reference.shape[:2]
     if done < read or shapes != (dynamics.shape, (dynamics.rank,), dynamics.shape):
         raise DataError(f"start: expected a checkpoint of these frames, found one of {done} frames and shapes {shapes}")
     for _ in islice(stream, done - read):
         pass
-    begun = deque(islice(stream, params.block if params.inner_iterations > 1 else 0))
     if setting.tracking.progress is not None:
-        setting.tracking.progress(done * params.inner_iterations - read + len(begun))
-    return begun
+        setting.tracking.progress(done * params.inner_iterations - read)
+    return _Standing(start.state, start.records, start.reference), deque()
 
 
-def _filtered(at: FilterCheckpoint, model: FrameNoise) -> Filtered:
+def _filtered(at: _Standing, model: FrameNoise) -> Filtered:
     state, records = at.state, at.records
     information = np.array([record.information for record in records])
     return Filtered(
@@ -461,28 +470,27 @@ def _noise_model(
 
 
 def _windows(
-    at: FilterCheckpoint,
+    at: _Standing,
     begun: deque[FloatArray],
     stream: Iterator[FloatArray],
     setting: _Setting,
-    prepared: dict[int, FlowFrame] | None,
-) -> Iterator[FilterCheckpoint]:
+    prepared: dict[int, FlowFrame],
+) -> Iterator[tuple[_Standing, FilterCheckpoint]]:
     """Finish the block that has begun while the next begins, until no frames are left."""
     iterations, size = setting.params.inner_iterations, setting.params.block
-    while begun or iterations == 1:
+    if not begun:
+        begun = deque(islice(stream, size))
+        # After a checkpoint: begin the block as the run before has done.
+        at = _filter_window(at, begun, 0, setting, prepared) if iterations > 1 and begun else at
+    while begun:
         for _ in range(iterations - 2):
             at = _filter_window(at, begun, 0, setting, prepared)
-        begun = begun or deque(islice(stream, size))
-        if not begun:
-            return
         # Both in one stream, because threads stand still where one ends.
-        following = deque[FloatArray]()
+        following, first_seen_from = deque[FloatArray](), at.image
         frames = _turn_over(begun, islice(stream, 0 if iterations == 1 else size), following)
         at = _filter_window(at, frames, len(begun), setting, prepared)
-        yield at
-        begun = following
-        # Where the first block was too large to keep what is prepared of it, later ones are not.
-        prepared = {} if prepared is None else prepared
+        yield at, FilterCheckpoint(at.state, at.records, at.image if iterations == 1 else first_seen_from)
+        begun = deque(islice(stream, size)) if iterations == 1 else following
 
 
 def _turn_over(
@@ -497,35 +505,27 @@ def _turn_over(
 
 
 def _filter_window(
-    at: FilterCheckpoint,
+    at: _Standing,
     frames: Iterable[FloatArray],
     done: int,
     setting: _Setting,
-    prepared: dict[int, FlowFrame] | None,
-    known: FloatArray | None = None,
-) -> FilterCheckpoint:
+    prepared: dict[int, FlowFrame],
+    from_known: bool = False,
+) -> _Standing:
     """One iteration over frames that follow ``at``, the last over the first ``done`` of them."""
-    number, marks, state = len(at.records), setting.marks, at.state
-    most = done + setting.params.block if known is None else len(known)
+    number, marks, known, state = len(at.records), setting.marks, setting.known, at.state
+    most = done + max(setting.params.block, len(known))
     counted = [marks is None or k >= marks.size or bool(marks[k]) for k in range(number, number + most)]
     covariances = state_covariances(state.flow, counted, setting.tracking.dynamics)
     start = state.flow.mean, covariances, _left_out(frames, marks, number)
-    if known is None:
-        tracked = track_measured(*start, at.reference, number, done, prepared, setting.tracking)
-    else:
+    if from_known:
         tracked = track_known(*start, known, setting.tracking)
+    else:
+        tracked = track_measured(*start, at.image, number, done, prepared, known, setting.tracking)
     image, records = _fuse(state.image, islice(tracked, done), setting)
     if done:
         state = FilterState(image, Gaussian(records[-1].flow_state, covariances[done - 1]))
-    after = FilterCheckpoint(state, (*at.records, *records), _fuse(image, tracked, setting)[0].mean)
-    _forget(prepared, number + done)
-    return after
-
-
-def _forget(prepared: dict[int, FlowFrame] | None, done: int) -> None:
-    """Drop what was prepared of frames that are done with, whether a flow was measured to them or not."""
-    for number in [number for number in prepared or {} if number < done]:
-        del (prepared or {})[number]
+    return _Standing(state, (*at.records, *records), _fuse(image, tracked, setting)[0].mean)
 
 
 def _fusion(model: FrameNoise, params: FilterParams) -> DeviceFusion | None:
@@ -542,17 +542,15 @@ def _fuse(
     """Take frame after frame into the image (eqs. 14 and 16)."""
     if setting.fusion is not None:
         return _fuse_on_device(prior, frames, setting.tracking.dynamics, setting.fusion)
-    image, drift = prior, setting.params.image_drift
-    records: list[FrameRecord] = []
+    fusion, records = PixelFusion(prior, setting.params.image_drift), list[FrameRecord]()
     for tracked in frames:
         one = tracked.registered
         if one is None:
             records.append(_left_out_record(tracked))
             continue
-        image, gain = update_pixels(predict_pixels(image, drift) if drift else image, one.frame, one.noise)
-        information = float(np.mean(1 / np.asarray(one.noise)))
-        records.append(FrameRecord(tracked.state, float(gain.mean()), tracked.innovation, one.sharpness, information))
-    return image, records
+        gain, information = fusion.take_in(one.frame, one.noise)
+        records.append(FrameRecord(tracked.state, gain, tracked.innovation, one.sharpness, information))
+    return fusion.image, records
 
 
 def _fuse_on_device(

@@ -179,7 +179,7 @@ def find_centroid(
         prepared = {}
     sizes: list[float] = []
     while True:
-        fill_flows(refer_flow(image, flow_params), stack, flows, prepared, progress)
+        fill_flows(refer_flow(image, flow_params), stack, flows, prepared, progress, again=bool(sizes))
         mean_flow = mean_of(flows)
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
         change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
@@ -188,7 +188,7 @@ def find_centroid(
         converged = (sizes[-1] <= params.tolerance and settled) or _STALLED < change <= _DIVERGED
         if not converged:
             recentre = invert_flow(mean_flow)
-            total = compose_flows(total, recentre)
+            total = compose_flows(total, recentre) if params.mode == "single" else total
             _recentre(flows, recentre, flow_params.threads)
         image = (
             mean_registered(stack, flows, flow_params.threads, flow_params.device or PROCESSOR)

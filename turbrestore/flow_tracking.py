@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,7 +28,7 @@ from .arrays import FloatArray
 from .flow import FlowFrame, FlowParams, refer_flow
 from .flow_model import FlowDynamics, flow_of, project_deviation
 from .frame_noise import FrameNoise, judge_frame
-from .kalman import Gaussian, predict, update_information
+from .kalman import Gaussian
 from .parallel import in_batches, map_in_turns
 from .scratch import walk
 from .warp import warp
@@ -143,13 +144,16 @@ def state_covariances(prior: Gaussian, counted: list[bool], dynamics: FlowDynami
     >>> bool(seen[0, 0] < 1e-5), bool(unseen[0, 0] > seen[0, 0])
     (True, True)
     """
-    state, unit, nothing = prior, np.eye(dynamics.rank), np.zeros(dynamics.rank)
+    noise, unit = _flow_noise(dynamics), np.eye(dynamics.rank)
+    P: NDArray[np.float64] = prior.cov
     covariances = []
     for counts in counted:
-        state = predict(state, dynamics.A, dynamics.Q)
+        P = dynamics.A @ P @ dynamics.A.T + dynamics.Q
         if counts:
-            state, _ = update_information(state, nothing, unit, _flow_noise(dynamics), orthonormal=True)
-        covariances.append(state.cov)
+            # (P⁻¹ + I / R)⁻¹, and no inverse of P is needed.
+            P = noise * np.asarray(np.linalg.solve(P + noise * unit, P), np.float64)
+        P = (P + P.T) / 2
+        covariances.append(P)
     return covariances
 
 
@@ -188,7 +192,8 @@ def track_measured(
     image: FloatArray,
     number: int,
     done: int,
-    prepared: dict[int, FlowFrame] | None,
+    prepared: dict[int, FlowFrame],
+    known: FloatArray,
     tracking: Tracking,
 ) -> Iterator[TrackedFrame]:
     """Measure flows from an image to frames, and follow them.
@@ -205,8 +210,10 @@ def track_measured(
         Of the first frame.
     done : int
         Of so many frames, the first ones, no flow will be measured any more.
-    prepared : dict of int to FlowFrame, or None
-        What has been prepared of frames for an earlier image, by their numbers; the rest is added.  None keeps nothing.
+    prepared : dict of int to FlowFrame
+        What has been prepared of frames for an earlier image, by their numbers; the rest is added.
+    known : ndarray, float32, shape (K, H, W, 2)
+        Earlier flows to the first frames of all, pixels; flows start from them, and later ones from the last measured.
     tracking : Tracking
 
     Yields
@@ -215,14 +222,18 @@ def track_measured(
     """
     reference = refer_flow(image, tracking.flow)
 
+    def prepare(index: int, frame: FloatArray) -> FlowFrame:
+        found = reference.frame(index, frame, prepared, index < number + done)
+        return replace(found, start=known[index]) if index < len(known) else found
+
     def measure(batch: list[tuple[int, FloatArray | None]]) -> list[_Pair]:
-        counted = [
-            reference.frame(index, frame, prepared, index < number + done)
-            for index, frame in batch
-            if frame is not None
-        ]
-        flows = iter(reference.solve(counted) if counted else [])
-        return [(None, None) if frame is None else (frame, next(flows)) for _, frame in batch]
+        counted = [(index, prepare(index, frame)) for index, frame in batch if frame is not None]
+        flows = reference.solve([frame for _, frame in counted]) if counted else []
+        for (index, frame), flow in zip(counted, flows, strict=True):
+            if index >= max(number + done, len(known)):
+                prepared[index] = replace(frame, start=_coarse(flow))
+        left = iter(flows)
+        return [(None, None) if frame is None else (frame, next(left)) for _, frame in batch]
 
     batches = in_batches(enumerate(walk(frames), number), reference.batch)
     for tracked in _track(state, covariances, batches, measure, reference.threads, tracking):
@@ -261,6 +272,12 @@ def _track(
     late: Callable[[list[TrackedFrame]], list[TrackedFrame]] = register if tracking.registers else list
     for done in map_in_turns(see, update, late, batches, threads):
         yield from done
+
+
+def _coarse(flow: FloatArray) -> NDArray[np.float16]:
+    """Flow at half the resolution, a byte a pixel of the image: for a start that is as good as all of it."""
+    height, width = flow.shape[:2]
+    return cv2.resize(flow, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.float16)
 
 
 def _flow_noise(dynamics: FlowDynamics) -> float:

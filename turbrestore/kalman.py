@@ -21,8 +21,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arrays import FloatArray
-from .compiled import compiled
 from .errors import DataError
 from .scratch import release
 
@@ -380,9 +378,6 @@ def update_pixels(
     noise = _pixel_variance(noise_variance, state, "noise_variance")
     if z.shape != mean.shape:
         raise DataError(f"measurement: expected shape {mean.shape}, found {z.shape}")
-    updated = _update_compiled(mean, prior, z, noise)
-    if updated is not None:
-        return updated
     if not noise.min() > 0:
         raise DataError("noise_variance: expected values above 0, found others; give the noise a floor")
     difference = z - mean
@@ -404,62 +399,6 @@ def update_pixels(
     difference *= gain[..., None] if mean.ndim > prior.ndim else gain
     difference += mean
     return PixelGaussian(difference, variance), gain
-
-
-def _update_compiled(
-    mean: NDArray[np.floating], prior: NDArray[np.floating], z: NDArray[np.floating], noise: NDArray[np.floating]
-) -> tuple[PixelGaussian, NDArray[np.floating]] | None:
-    """Update in one pass, where it can be compiled, all pixels are measured and all values can be computed with."""
-    usual = mean.dtype == np.float32 and noise.shape == prior.shape
-    update = compiled(update_measured) if usual else None
-    if update is None:
-        return None
-    mean_after, (after, gain), done = np.empty(z.shape, z.dtype), np.empty((2, *prior.shape), z.dtype), np.zeros(1)
-    flat = [array.reshape(-1) for array in (prior, noise, after, gain)]
-    for channel in range(mean.shape[2] if mean.ndim > prior.ndim else 1):
-        planes = (array.reshape(prior.size, -1)[:, channel] for array in (mean, z, mean_after))
-        update(*planes, *flat, done)
-    return (PixelGaussian(mean_after, after), gain) if done[0] == mean.size else None
-
-
-def update_measured(
-    mean: FloatArray,
-    z: FloatArray,
-    mean_after: FloatArray,
-    prior: FloatArray,
-    noise: FloatArray,
-    after: FloatArray,
-    gain: FloatArray,
-    done: Float64Array,
-) -> None:
-    """Update pixels that are all measured, see :func:`update_pixels`; to be compiled.
-
-    Parameters
-    ----------
-    mean, z, mean_after : ndarray, shape (P,)
-        ρ̂ before, what was measured, and ρ̂ after, which is filled.
-    prior, noise, after, gain : ndarray, shape (P,)
-        Σ before, Z, and Σ after and L, which are filled.
-    done : ndarray, float64, shape (1,)
-        The pixels are added for which this is right: those with a measurement and a positive Z.
-
-    Examples
-    --------
-    >>> one, (after, variance, gain, done) = np.ones(1), np.zeros((4, 1))
-    >>> update_measured(0 * one, one, after, one, 3 * one, variance, gain, done)
-    >>> after, variance, gain, done
-    (array([0.25]), array([0.75]), array([0.25]), array([1.]))
-    """
-    count = 0
-    for pixel in range(prior.size):
-        difference, variance = z[pixel] - mean[pixel], noise[pixel]
-        share = prior[pixel] / (prior[pixel] + variance)
-        gain[pixel] = share
-        after[pixel] = share * variance
-        mean_after[pixel] = mean[pixel] + share * difference
-        # Neither infinite nor NaN.
-        count += difference - difference == 0 and variance - variance == 0 and variance > 0
-    done[0] += count
 
 
 def _information_step(
