@@ -193,7 +193,7 @@ def test_pairs_lie_in_the_folder_that_is_named(frames, tmp_path, monkeypatch):
                 pipeline.restore(frames, settings, scratch=tmp_path)
 
 
-@pytest.mark.parametrize(("limit", "tight"), [(None, False), ("20GB", False), ("300MB", True)])
+@pytest.mark.parametrize(("limit", "tight"), [(None, False), ("20GB", False), ("400MB", True)])
 def test_the_allocator_is_left_alone_where_there_is_room(frames, monkeypatch, limit, tight):
     wanted = []
 

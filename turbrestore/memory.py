@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .alternating import FilterParams
+from .compiled import COMPILER_BYTES, can_compile
 from .decision import Decision
 from .deconvolution import MARGIN_SIGMAS, DeconvolutionParams
 from .deconvolution_memory import NonlocalWork, Room
@@ -154,7 +155,7 @@ class _Work:
 
     @property
     def base(self) -> float:
-        return _BASE + (TORCH_BYTES if self.on_device else 0)
+        return _BASE + (TORCH_BYTES if self.on_device else 0) + (COMPILER_BYTES if can_compile() else 0)
 
     @property
     def pairs(self) -> NonlocalWork:
@@ -185,7 +186,8 @@ class _Work:
             stack, modes = min(stack, self.stack(2 * threads + 3)), min(modes, 4.0 * _IN_HAND * threads)
         flow = _FLOW.bytes(*size)
         prepared = 0.0 if in_file else 1.0 * self.pixels * train
-        block = self.pixels * (4.0 * self.channels + 1.0) * min(self.filter.block, self.shape[0])
+        # A frame, what flow prepares of it, and half of its flow.
+        block = self.pixels * (4.0 * self.channels + 2.0) * min(self.filter.block, self.shape[0])
         judged = 8.0 * self.pixels * train if self.filter.frame_noise == "blur" else 0.0
         later = {
             "centroid": 0.0,

@@ -1,0 +1,142 @@
+"""Compiled loops against the operations of NumPy and OpenCV that stand in for them, and life without a compiler."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from turbrestore import compiled as compiling
+from turbrestore.edge_strips import EdgeStrip
+from turbrestore.frame_noise import judge_frame, mark_folds, measure_frame_noise
+from turbrestore.kalman import PixelGaussian
+from turbrestore.nonlocal_penalty import NonlocalPenalty
+from turbrestore.nonlocal_tv import NonlocalParams, nonlocal_weights
+from turbrestore.pixel_fusion import PixelFusion
+from turbrestore.warp import warp
+
+USERS = ("frame_noise", "nonlocal_penalty", "pixel_fusion", "warp")
+rng = np.random.default_rng(0)
+needs_compiler = pytest.mark.skipif(not compiling.can_compile(), reason="Numba is not installed: nothing to compare")
+
+
+@pytest.fixture
+def plain(monkeypatch):
+    """Call a function as where Numba is not installed."""
+
+    def call(function):
+        with monkeypatch.context() as patch:
+            for user in USERS:
+                patch.setattr(f"turbrestore.{user}.compiled", lambda loops: None)
+            return function()
+
+    return call
+
+
+def both(plain, function):
+    return function(), plain(function)
+
+
+@needs_compiler
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (2, 2), (9, 1), (31, 45), (12, 20, 3)])
+def test_a_spline_is_sampled_alike(plain, shape):
+    image = rng.random(shape, np.float32)
+    flow = rng.normal(0, 3, (*shape[:2], 2)).astype(np.float32)
+    fast, slow = both(plain, lambda: warp(image, flow))
+    assert fast.dtype == slow.dtype == np.float32
+    assert fast == pytest.approx(slow, abs=2e-5)
+
+
+def model_of(frames, flows):
+    image = frames.mean(axis=0)
+    return measure_frame_noise(list(frames), flows, image, np.ones(image.shape, np.float32))
+
+
+@needs_compiler
+@pytest.mark.parametrize("amplitude", [0.0, 0.5, 6.0])
+def test_a_frame_is_judged_alike(plain, amplitude):
+    """With no motion, with little, and with maps that fold and leave the frame."""
+    frames = rng.random((6, 40, 50), np.float32)
+    frames[2, 10:20, 10:20] += 3
+    flows = (amplitude * rng.normal(size=(6, 40, 50, 2))).astype(np.float32)
+    model = model_of(frames, np.zeros_like(flows))
+    for frame, flow in zip(frames, flows, strict=True):
+        (fast, sharp), (slow, plainly) = both(plain, lambda f=frame, w=flow: judge_frame(f, w, model, 2.0))
+        assert np.log(fast) == pytest.approx(np.log(slow), abs=1e-3)
+        assert sharp == plainly
+
+
+@needs_compiler
+def test_folds_are_found_where_the_jacobian_vanishes(plain):
+    from turbrestore.frame_noise import _folded
+
+    flow = rng.normal(0, 0.6, (33, 21, 2)).astype(np.float32)
+    fast, slow = both(plain, lambda: _folded(flow))
+    assert 0 < slow.sum() < slow.size
+    assert np.array_equal(fast, slow)
+
+
+def test_loops_give_what_they_give_when_compiled():
+    """The functions that are compiled run without a compiler too, slowly: each is tested as it is written."""
+    flow, folded = np.zeros((4, 5, 2), np.float32), np.empty((2, 3), bool)
+    flow[:, 2:, 0] = -4
+    mark_folds(flow, folded)
+    assert folded.tolist() == [[True, True, False]] * 2
+
+
+@needs_compiler
+@pytest.mark.parametrize("colour", [False, True])
+@pytest.mark.parametrize("drift", [0.0, 1e-3])
+def test_a_frame_is_taken_in_alike(plain, colour, drift):
+    shape = (17, 23, 3) if colour else (17, 23)
+    prior = PixelGaussian(rng.random(shape, np.float32), np.full((17, 23), 0.01, np.float32))
+    before = prior.mean.copy(), prior.variance.copy()
+    frames = rng.random((3, *shape), np.float32)
+    noises = [0.02, *rng.uniform(1e-3, 1, (2, 17, 23)).astype(np.float32)]
+
+    def fused():
+        fusion = PixelFusion(prior, drift)
+        figures = [fusion.take_in(*pair) for pair in zip(frames, noises, strict=True)]
+        return fusion.image, figures
+
+    (fast, fast_figures), (slow, slow_figures) = both(plain, fused)
+    assert fast.mean == pytest.approx(slow.mean, abs=1e-6)
+    assert fast.variance == pytest.approx(slow.variance, rel=1e-5)
+    assert np.array(fast_figures) == pytest.approx(np.array(slow_figures), rel=1e-5)
+    assert np.array_equal(prior.mean, before[0])
+    assert np.array_equal(prior.variance, before[1])
+
+
+@needs_compiler
+def test_the_dual_variable_moves_alike(plain):
+    guide = rng.random((30, 28), np.float32)
+    graph = nonlocal_weights(guide, NonlocalParams(search=7, patch=3))
+    assert all(isinstance(strip, EdgeStrip) for strip in graph.strips)
+    penalty, images = NonlocalPenalty(graph), rng.random((4, 30, 28), np.float32)
+
+    def ascended():
+        dual = penalty.dual(guide)
+        pulls = [penalty.ascend(dual, image, 3.0, 1.4) for image in images]
+        return dual.values, pulls
+
+    (fast, fast_pulls), (slow, slow_pulls) = both(plain, ascended)
+    assert np.abs(fast[:2]).max() > 0.1
+    assert fast[:2] == pytest.approx(slow[:2], abs=1e-5)
+    assert np.array(fast_pulls) == pytest.approx(np.array(slow_pulls), abs=1e-5)
+
+
+def test_without_the_compiler_everything_runs():
+    """The import is blocked in a process of its own, as a missing package would."""
+    code = (
+        "import sys; sys.modules['numba'] = None\n"
+        "import importlib.util as u; find = u.find_spec\n"
+        "u.find_spec = lambda name, *rest: None if name == 'numba' else find(name, *rest)\n"
+        "import turbrestore.compiled as c; c.find_spec = u.find_spec\n"
+        "import numpy as np; from turbrestore.pipeline import restore\n"
+        "from turbrestore.synthesis.scenes import resolution_chart\n"
+        "assert not c.can_compile() and c.compiled(abs) is None\n"
+        "frames = np.stack([np.roll(resolution_chart(64, 64), k % 3, 1) for k in range(6)])\n"
+        "assert np.isfinite(restore(frames).image).all()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
