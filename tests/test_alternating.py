@@ -208,6 +208,35 @@ def test_covariances_of_a_block_are_those_of_the_filter_step_by_step(sequence):
         assert covariance == pytest.approx(state.cov, rel=1e-9, abs=1e-12 * state.cov.max())
 
 
+@pytest.mark.parametrize(
+    ("iterations", "train", "colour", "left_out"),
+    [(1, 9, False, ()), (2, 9, False, ()), (2, 3, True, ()), (3, 9, False, ()), (2, 9, False, (2, 8, 9, 10, 13))],
+)
+def test_from_every_checkpoint_a_run_goes_on_bit_for_bit(sequence, iterations, train, colour, left_out):
+    frames = sequence.frames[:15, :48, :48]
+    frames = np.stack([frames, 0.5 * frames, frames**2], axis=-1) if colour else frames
+    centroid = find_centroid(frames[:train])
+    params = FilterParams(inner_iterations=iterations, block=4)
+    counted, kept = np.isin(np.arange(15), left_out, invert=True), []
+
+    def run(**options):
+        options = {"known_flows": centroid.flows, "counted": counted, **options}
+        dynamics = identify(centroid.flows, DynamicsParams(rank=2))
+        found = filter_frames(frames, centroid.image, dynamics, params, **options)
+        arrays = found.image, found.variance, found.flow_states, found.shares, found.innovations
+        return [array.tobytes() for array in arrays]
+
+    whole = run(on_checkpoint=kept.append)
+    assert [len(one.records) for one in kept] == list(dict.fromkeys([*range(train, 15, 4), 15]))
+    steps = []
+    for checkpoint in kept:
+        steps.clear()
+        assert run(start=checkpoint, progress=steps.append) == whole
+        assert sum(steps) == 15 * iterations - train
+    assert run(flow_params=FlowParams(threads=3)) == whole
+    assert run(prepared={}) == whole
+
+
 def test_what_was_prepared_before_changes_nothing_and_is_not_kept(sequence, monkeypatch):
     prepared = {}
     centroid = find_centroid(sequence.frames, prepared=prepared)

@@ -167,6 +167,39 @@ def test_what_is_prepared_of_a_frame_serves_every_reference():
     assert np.array_equal(flows, estimate_flow(other, stack))
 
 
+def test_a_flow_from_a_good_start_is_as_good_as_one_from_none():
+    reference, frame, truth = pair(rms=2.0)
+    params, found = FlowParams(confidence=False), (truth + np.float32(0.5))[None]
+    anew = estimate_flow(reference, frame[None], params)[0]
+    fill_flows(refer_flow(reference, params), frame[None], found, again=True)
+    errors = [endpoint_error(one[8:-8, 8:-8], truth[8:-8, 8:-8]) for one in (found[0], anew)]
+    assert errors[0] <= 1.05 * errors[1] + 0.005
+
+
+@pytest.mark.parametrize("finest", [0, 1])
+def test_a_flow_begins_at_its_start(finest):
+    """Without the coarse levels nothing brings a flow back that starts beyond the reach of a patch."""
+    params = FlowParams(global_shift=False, confidence=False, dis=DisParams(finest_scale=finest))
+    image, errors = texture(size=160), []
+    for start in (10, 10 + 12 * 2**finest):
+        flows = np.full((1, 160, 160, 2), (start, 0), np.float32)
+        fill_flows(refer_flow(image, params), np.roll(image, 10, axis=1)[None], flows, again=True)
+        errors.append(float(np.abs(flows[0, 40:-40, 40:-40, 0] - 10).mean()))
+    assert errors[0] < 0.1
+    assert errors[1] > 2
+
+
+def test_a_start_includes_the_shift_of_the_frame():
+    reference, frame = texture(size=128), texture(size=128)
+    frame = np.roll(frame, 20, axis=1)
+    flows = estimate_flow(reference, frame[None])
+    again = flows.copy()
+    fill_flows(refer_flow(reference), frame[None], again, again=True)
+    inside = np.s_[0, 30:-30, 30:-30, 0]
+    assert np.median(flows[inside]) == pytest.approx(20, abs=0.1)
+    assert again[inside] == pytest.approx(flows[inside], abs=0.2)
+
+
 @pytest.mark.parametrize("size", [(8, 8), (15, 64)])
 def test_images_too_small_for_flow_are_refused(size):
     image = np.zeros(size, np.float32)

@@ -352,19 +352,20 @@ def filter_frames(
     tracking = Tracking(dynamics, model, share, params.sharpness, flow_params, fusion is None, progress)
     setting = _Setting(tracking, params, fusion, marks, flows)
     begun = deque(first if params.inner_iterations > 1 else [])
+    prepared = {} if prepared is None else prepared
     with one_thread_each():
         if start is None:
             at = _Standing(_prior(image, setting), (), image)
-            at = _filter_window(at, first, len(first) - len(begun), setting, {}, from_known=True)
+            at = _filter_window(at, first, len(first) - len(begun), setting, prepared, from_known=True)
+            if on_checkpoint is not None and at.records:
+                on_checkpoint(FilterCheckpoint(at.state, at.records, at.image))
         else:
             at, begun = _pass_over(start, stream, len(first), setting)
-        # Only those of the first block can be too many to be kept.
-        prepared = {} if prepared is None else prepared
+            prepared.clear()
         for passed, checkpoint in _windows(at, begun, stream, setting, prepared):
             at = passed
             if on_checkpoint is not None:
                 on_checkpoint(checkpoint)
-        prepared.clear()
     if marks is not None and marks.size != len(at.records):
         found = f"{marks.size} marks, {len(at.records)} frames"
         raise DataError(f"counted: expected one mark for each frame, found {found}")
@@ -404,8 +405,8 @@ def _pass_over(
 ) -> tuple[_Standing, deque[FloatArray]]:
     """Read the frames up to a checkpoint, of which the first ``read`` have been; the next block begins anew."""
     done, dynamics, params = len(start.records), setting.tracking.dynamics, setting.params
-    shapes = start.state.image.variance.shape, start.state.flow.mean.shape, start.reference.shape[:2]
-    if done < read or shapes != (dynamics.shape, (dynamics.rank,), dynamics.shape):
+    shapes = start.state.image.variance.shape, start.state.flow.mean.shape, start.reference.shape
+    if done < read or shapes != (dynamics.shape, (dynamics.rank,), start.state.image.mean.shape):
         raise DataError(f"start: expected a checkpoint of these frames, found one of {done} frames and shapes {shapes}")
     for _ in islice(stream, done - read):
         pass
@@ -514,7 +515,7 @@ def _filter_window(
 ) -> _Standing:
     """One iteration over frames that follow ``at``, the last over the first ``done`` of them."""
     number, marks, known, state = len(at.records), setting.marks, setting.known, at.state
-    most = done + max(setting.params.block, len(known))
+    most = done + (max(setting.params.block, len(known)) if number == 0 else setting.params.block)
     counted = [marks is None or k >= marks.size or bool(marks[k]) for k in range(number, number + most)]
     covariances = state_covariances(state.flow, counted, setting.tracking.dynamics)
     start = state.flow.mean, covariances, _left_out(frames, marks, number)
@@ -522,10 +523,16 @@ def _filter_window(
         tracked = track_known(*start, known, setting.tracking)
     else:
         tracked = track_measured(*start, at.image, number, done, prepared, known, setting.tracking)
-    image, records = _fuse(state.image, islice(tracked, done), setting)
+    records = at.records
     if done:
-        state = FilterState(image, Gaussian(records[-1].flow_state, covariances[done - 1]))
-    return _Standing(state, (*at.records, *records), _fuse(image, tracked, setting)[0].mean)
+        image, found = _fuse(state.image, islice(tracked, done), setting)
+        state = FilterState(image, Gaussian(found[-1].flow_state, covariances[done - 1]))
+        records += tuple(found)
+    newest = _fuse(state.image, tracked, setting)[0].mean
+    # Of frames that do not count, no last flow was measured.
+    for index in range(number, number + done):
+        prepared.pop(index, None)
+    return _Standing(state, records, newest)
 
 
 def _fusion(model: FrameNoise, params: FilterParams) -> DeviceFusion | None:

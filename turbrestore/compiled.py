@@ -50,7 +50,7 @@ def compiled(loops: Loops) -> Loops | None:
     Returns
     -------
     callable or None
-        It works without the interpreter lock; None where Numba is not installed.
+        It works without the interpreter lock; None where Numba is not installed, or does not work with this NumPy.
 
     Examples
     --------
@@ -64,7 +64,11 @@ def compiled(loops: Loops) -> Loops | None:
     """
     if not can_compile():
         return None
-    numba: Any = importlib.import_module("numba")
+    try:
+        numba: Any = importlib.import_module("numba")
+    except ImportError:
+        # It refuses a NumPy that is newer than it knows.
+        return None
     try:
         fast: Loops = numba.njit(cache=True, **_OPTIONS)(loops)
     except RuntimeError:

@@ -179,14 +179,14 @@ class FlowFrame:
         What the solvers see.
     noise : float
         σ of the frame, intensity; 0 where nothing asks for it.
-    start : ndarray, shape (H, W, 2) or on a coarser grid, or None
+    start : ndarray, float32, shape (H, W, 2) or on a coarser grid, or None
         Flow to it from a reference much like the next, pixels, that its flow can start from.
     """
 
     image: FloatArray
     levels: GreyBytes
     noise: float
-    start: NDArray[np.floating] | None = None
+    start: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ class FlowReference:
     def frame(
         self, number: int, image: FloatArray, prepared: dict[int, FlowFrame] | None, last: bool = False
     ) -> FlowFrame:
-        """Take a frame from those that are prepared already, or prepare it; put it there but for the last time."""
+        """Take a frame from those prepared already, or prepare it; it is kept for the next reference unless last."""
         found = (prepared or {}).pop(number, None) or self.prepare(image)
         if prepared is not None and not last:
             prepared[number] = found
@@ -494,7 +494,7 @@ def _start(frame: FlowFrame, shift: FloatArray) -> FloatArray | None:
     if frame.start is None:
         return None
     height, width = frame.levels.shape
-    return cv2.resize(frame.start.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) - shift
+    return cv2.resize(frame.start, (width, height), interpolation=cv2.INTER_LINEAR) - shift
 
 
 def _shifted(frame: GreyBytes, shift: FloatArray, outside: GreyBytes) -> GreyBytes:

@@ -30,7 +30,7 @@ from .flow_model import FlowDynamics, flow_of, project_deviation
 from .frame_noise import FrameNoise, judge_frame
 from .kalman import Gaussian
 from .parallel import in_batches, map_in_turns
-from .scratch import walk
+from .scratch import release, walk
 from .warp import warp
 
 # Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
@@ -213,7 +213,8 @@ def track_measured(
     prepared : dict of int to FlowFrame
         What has been prepared of frames for an earlier image, by their numbers; the rest is added.
     known : ndarray, float32, shape (K, H, W, 2)
-        Earlier flows to the first frames of all, pixels; flows start from them, and later ones from the last measured.
+        Earlier flows to the first frames of all, pixels.  Flows to these start from them; flows to other frames start
+        from the last that were measured to them, the first ones from nothing.
     tracking : Tracking
 
     Yields
@@ -229,6 +230,7 @@ def track_measured(
     def measure(batch: list[tuple[int, FloatArray | None]]) -> list[_Pair]:
         counted = [(index, prepare(index, frame)) for index, frame in batch if frame is not None]
         flows = reference.solve([frame for _, frame in counted]) if counted else []
+        release(known)
         for (index, frame), flow in zip(counted, flows, strict=True):
             if index >= max(number + done, len(known)):
                 prepared[index] = replace(frame, start=_coarse(flow))
@@ -274,10 +276,10 @@ def _track(
         yield from done
 
 
-def _coarse(flow: FloatArray) -> NDArray[np.float16]:
-    """Flow at half the resolution, a byte a pixel of the image: for a start that is as good as all of it."""
+def _coarse(flow: FloatArray) -> FloatArray:
+    """Flow at half the resolution, two bytes a pixel of the image: for a start that is as good as all of it."""
     height, width = flow.shape[:2]
-    return cv2.resize(flow, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.float16)
+    return cv2.resize(flow, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
 
 
 def _flow_noise(dynamics: FlowDynamics) -> float:

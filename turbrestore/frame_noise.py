@@ -235,7 +235,6 @@ def judge_frame(
         lost *= LOG_DISTRUST
         excess = np.maximum(noise / OUTLIER, 1)
         noise = np.float32(model.image_noise) * excess**3 * np.exp(lost)
-    if model.blur is not None:
         reference, rule = model.blur
         noise = noise_factor(rule, blur_against(registered[None], reference).extra[0]) * noise
     return noise, sharp
@@ -300,13 +299,13 @@ def weigh_pixels(
     (array([0.8], dtype=float32), array([-0.25], dtype=float32))
     """
     one, outlier, largest = np.float32(1), np.float32(OUTLIER), np.float32(LARGEST_SCORE)
-    half, distrust, most = np.float32(0.5), np.float32(LOG_DISTRUST), np.float32(LARGEST_EXPONENT)
+    balance, distrust, most = np.float32(0.5) * beta * beta, np.float32(LOG_DISTRUST), np.float32(LARGEST_EXPONENT)
     for pixel in range(noise.size):
         excess = max(noise[pixel] / outlier, one)
         score = min(max((seen[pixel] - usual[pixel]) * scale[pixel], -largest), largest)
         if score > 0:
             score /= excess * excess
-        exponent = half * beta * beta * variance[pixel] - beta * score + distrust * lost[pixel]
+        exponent = balance * variance[pixel] - beta * score + distrust * lost[pixel]
         lost[pixel] = min(exponent, most)
         noise[pixel] = excess * excess * excess * image_noise
 

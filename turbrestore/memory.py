@@ -185,9 +185,10 @@ class _Work:
             # What threads have in hand comes into memory while it is used.
             stack, modes = min(stack, self.stack(2 * threads + 3)), min(modes, 4.0 * _IN_HAND * threads)
         flow = _FLOW.bytes(*size)
-        prepared = 0.0 if in_file else 1.0 * self.pixels * train
-        # A frame, what flow prepares of it, and half of its flow.
-        block = self.pixels * (4.0 * self.channels + 2.0) * min(self.filter.block, self.shape[0])
+        # From the third iteration on that of the first block is kept even there.
+        prepared = 0.0 if in_file and self.filter.inner_iterations < 3 else 1.0 * self.pixels * train
+        # A frame, what flow prepares of it, and its flow at half the resolution.
+        block = self.pixels * (4.0 * self.channels + 3.0) * min(self.filter.block, self.shape[0])
         judged = 8.0 * self.pixels * train if self.filter.frame_noise == "blur" else 0.0
         later = {
             "centroid": 0.0,

@@ -19,6 +19,8 @@ from .compiled import compiled
 from .errors import DataError
 from .kalman import PixelGaussian, predict_pixels, update_pixels
 
+_UNUSABLE = "noise_variance: expected values above 0 and finite frames, found others; give the noise a floor"
+
 
 class PixelFusion:
     """An image that frames are taken into one after the other.
@@ -64,9 +66,13 @@ class PixelFusion:
         Raises
         ------
         DataError
-            Shapes do not agree, Z is not positive, or the frame is not finite.
+            Shapes do not agree, Z is not positive, or the frame or Z is not finite.
         """
-        if self._loops is None or frame.shape != self.image.mean.shape:
+        if frame.shape != self.image.mean.shape:
+            raise DataError(f"frame: expected shape {self.image.mean.shape}, found {frame.shape}")
+        if self._loops is None:
+            if not np.isfinite(float(np.sum(frame, dtype=np.float64)) + np.sum(noise, dtype=np.float64)):
+                raise DataError(_UNUSABLE)
             prior = predict_pixels(self.image, self._drift) if self._drift else self.image
             self.image, gain = update_pixels(prior, frame, noise)
             return float(gain.mean()), float(np.mean(1 / np.asarray(noise)))
@@ -76,7 +82,7 @@ class PixelFusion:
         self._loops(mean.reshape(pixels), variance.reshape(-1), frame.reshape(pixels), z, drift, sums)
         gain_sum, information, done = sums.tolist()
         if done != variance.size:
-            raise DataError("noise: expected finite frames and values above 0, found others; give the noise a floor")
+            raise DataError(_UNUSABLE)
         return gain_sum / variance.size, information / variance.size
 
 

@@ -47,7 +47,9 @@ RESULTS = ("centroid", "dynamics", "filtered", "blur", "blur_bounds", "deconvolu
 RUN_FILES = (*(f"{name}.npz" for name in RESULTS), IMAGES, RECORD)
 # Where `turbrestore report` writes by default.
 REPORT = "report.html"
-_PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "av", "tifffile", "pillow", "torch")
+_PACKAGES = (
+    *("numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "av", "tifffile", "pillow", "numba", "torch"),
+)
 
 Stage = TypeVar("Stage", bound="DataclassInstance")
 
