@@ -76,7 +76,9 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
 
 @needs_compiler
 @pytest.mark.parametrize(
-    "loops", [add_differences, draw_back, mark_folds, sample_spline, take_in_pixels, weigh_pixels], ids=str
+    "loops",
+    [add_differences, draw_back, mark_folds, sample_spline, take_in_pixels, weigh_pixels],
+    ids=lambda one: one.__name__,
 )
 def test_loops_are_compiled(loops):
     assert compiling.compiled(loops) is not None
