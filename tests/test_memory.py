@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from conftest import make_sequence
 from turbrestore import pipeline
 from turbrestore.centroid import CentroidParams
+from turbrestore.compiled import COMPILER_BYTES
 from turbrestore.deconvolution import DeconvolutionParams
 from turbrestore.deconvolution_memory import NonlocalWork
 from turbrestore.device import TORCH_BYTES
@@ -99,6 +100,23 @@ def test_without_a_limit_nothing_changes():
     assert plan.train == training_share(300, FULL_HD[1:])
 
 
+@pytest.fixture
+def no_compiler(monkeypatch):
+    """What a plan chooses at a limit depends on what Numba takes, and so on whether it is installed."""
+    monkeypatch.setattr("turbrestore.memory.can_compile", lambda: False)
+
+
+def test_the_compiler_counts_where_it_is_installed(monkeypatch):
+    least = []
+    for installed in (False, True):
+        monkeypatch.setattr("turbrestore.memory.can_compile", lambda found=installed: found)
+        with pytest.raises(ConfigurationError) as refusal:
+            plan_memory(FULL_HD, 1e8)
+        least.append(float(str(refusal.value).split("at least ")[1].split(" GB")[0]))
+    assert least[1] - least[0] == pytest.approx(1.01 * COMPILER_BYTES / 1e9, abs=0.02)
+
+
+@pytest.mark.usefixtures("no_compiler")
 def test_what_changes_no_result_comes_first():
     generous, tight, small = (plan_memory(FULL_HD, limit, flow=FlowParams(threads=8)) for limit in (2e10, 2e9, 1.4e9))
     assert (generous.threads, generous.in_file, generous.decisions) == (8, False, ())
@@ -110,6 +128,7 @@ def test_what_changes_no_result_comes_first():
     ]
 
 
+@pytest.mark.usefixtures("no_compiler")
 def test_threads_are_kept_where_a_file_is_enough():
     shape = (100, 480, 640)
     limit = 6.5e8

@@ -179,14 +179,14 @@ class FlowFrame:
         What the solvers see.
     noise : float
         σ of the frame, intensity; 0 where nothing asks for it.
-    start : ndarray, float32, shape (H, W, 2) or on a coarser grid, or None
+    start : ndarray, shape (H, W, 2) or on a coarser grid, or None
         Flow to it from a reference much like the next, pixels, that its flow can start from.
     """
 
     image: FloatArray
     levels: GreyBytes
     noise: float
-    start: FloatArray | None = None
+    start: NDArray[np.floating] | None = None
 
 
 @dataclass(frozen=True)
@@ -494,7 +494,7 @@ def _start(frame: FlowFrame, shift: FloatArray) -> FloatArray | None:
     if frame.start is None:
         return None
     height, width = frame.levels.shape
-    return cv2.resize(frame.start, (width, height), interpolation=cv2.INTER_LINEAR) - shift
+    return cv2.resize(frame.start.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) - shift
 
 
 def _shifted(frame: GreyBytes, shift: FloatArray, outside: GreyBytes) -> GreyBytes:

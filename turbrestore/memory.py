@@ -188,7 +188,7 @@ class _Work:
         # From the third iteration on that of the first block is kept even there.
         prepared = 0.0 if in_file and self.filter.inner_iterations < 3 else 1.0 * self.pixels * train
         # A frame, what flow prepares of it, and its flow at half the resolution.
-        block = self.pixels * (4.0 * self.channels + 3.0) * min(self.filter.block, self.shape[0])
+        block = self.pixels * (4.0 * self.channels + 2.0) * min(self.filter.block, self.shape[0])
         judged = 8.0 * self.pixels * train if self.filter.frame_noise == "blur" else 0.0
         later = {
             "centroid": 0.0,
