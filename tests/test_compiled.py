@@ -145,12 +145,13 @@ def test_the_dual_variable_moves_alike(plain):
     def ascended():
         dual = penalty.dual(guide)
         pulls = [penalty.ascend(dual, image, 3.0, 1.4) for image in images]
-        return dual.values, pulls
+        return dual.values, pulls, [penalty.value(image) for image in images]
 
-    (fast, fast_pulls), (slow, slow_pulls) = both(plain, ascended)
-    assert np.abs(fast[:2]).max() > 0.1
-    assert fast[:2] == pytest.approx(slow[:2], abs=1e-5)
+    (fast, fast_pulls, fast_values), (slow, slow_pulls, slow_values) = both(plain, ascended)
+    assert np.abs(fast).max() > 0.1
+    assert fast == pytest.approx(slow, abs=1e-5)
     assert np.array(fast_pulls) == pytest.approx(np.array(slow_pulls), abs=1e-5)
+    assert fast_values == pytest.approx(slow_values, rel=1e-5)
 
 
 def test_without_the_compiler_everything_runs():

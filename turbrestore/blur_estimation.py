@@ -45,7 +45,7 @@ from scipy import fft
 
 from .arrays import FloatArray, check_image, luminance
 from .errors import require
-from .parallel import available_cores, map_ahead
+from .parallel import one_thread_each
 from .plots import plot_blur
 from .preview import preview
 from .psf import KOLMOGOROV, check_exponent, estimate_noise, half_frequency
@@ -79,8 +79,8 @@ _PREFERENCE = 0.8
 _LARGER_REDUCTION = 0.15
 # Share of the uncertainty that is not removed.
 _CAUTION = 0.5
-# Updates of γ, and conjugate gradient steps in each.
-_UPDATES, _STEPS = 8, 8
+# Updates of γ, and conjugate gradient steps in each, fewer where the residual has fallen by this factor.
+_UPDATES, _STEPS, _TOLERANCE = 8, 8, 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,9 +152,7 @@ class BlurEstimate:
         return max(self.sigma - _CAUTION * self.uncertainty, 0.0) if self.sigma > 0 else 0.0
 
 
-def estimate_blur(
-    image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV, threads: int = 0
-) -> BlurEstimate:
+def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV) -> BlurEstimate:
     """Estimate the width of the blur of an image.
 
     Parameters
@@ -165,9 +163,6 @@ def estimate_blur(
         Standard deviation of the noise, intensity; estimated by default.
     exponent : float
         Shape of the blur, 1 to 2: 5/3 for images fused from turbulent frames, 2 for a Gaussian.
-    threads : int
-        Reductions of the image tried side by side, where there are several each on two levels of noise at a time; 0
-        means one per available core.
 
     Returns
     -------
@@ -197,10 +192,9 @@ def estimate_blur(
     if min(grey.shape) < _SMALLEST_IMAGE or np.ptp(grey) <= _LEAST_NOISE:
         return BlurEstimate(0.0, float("inf"), exponent, noise or 0.0, 1, 0.0, np.zeros(0), np.zeros(0))
     factors = [factor for factor in _REDUCTIONS if factor == 1 or min(grey.shape) >= factor * _SMALLEST_SIDE]
-    # The image itself takes longest and comes first, so that all others run beside it.
-    threads = threads or available_cores()
-    tried = map_ahead(lambda factor: _estimate_reduced(grey, factor, exponent, noise, threads), factors, threads)
-    estimates = [one for _, one in tried]
+    # Transforms of so few pixels take no longer than handing the interpreter lock from thread to thread.
+    with one_thread_each():
+        estimates = [_estimate_reduced(grey, factor, exponent, noise) for factor in factors]
     convincing = [one for one in estimates if np.isfinite(one.uncertainty)]
     if convincing:
         return min(convincing, key=_doubt)
@@ -217,20 +211,17 @@ def _doubt(estimate: BlurEstimate) -> float:
     return preference * estimate.uncertainty / estimate.sigma
 
 
-def _estimate_reduced(
-    grey: FloatArray, factor: int, exponent: float, noise: float | None, threads: int
-) -> BlurEstimate:
+def _estimate_reduced(grey: FloatArray, factor: int, exponent: float, noise: float | None) -> BlurEstimate:
     """Estimate from one reduced image; the uncertainty is infinite where it does not convince."""
     reduced = _reduce(grey, factor)
     gradients, level = _gradients(_most_detailed(reduced)), _effective_noise(reduced, factor, noise)
-    costs = _costs(gradients, exponent, level)
+    costs = _costs(gradients, exponent, level, rises=2)
     evidence, lowest = float(costs[0] - costs.min()), _lowest(costs)
     width, uncertainty = _widen(lowest, factor), float("inf")
     resolved = lowest < _WIDTHS[-1] and (factor == 1 or lowest >= _RESOLVED)
     if resolved and evidence >= (_EVIDENCE if width >= _SOFT else _STRONG_EVIDENCE):
-        levels = (level / 2, 2 * level)
-        sweeps = map_ahead(lambda other: _lowest(_costs(gradients, exponent, other)), levels, min(threads, 2))
-        less, more = (_widen(found, factor) for _, found in sweeps)
+        sweeps = (_costs(gradients, exponent, other, rises=1) for other in (level / 2, 2 * level))
+        less, more = (_widen(_lowest(sweep), factor) for sweep in sweeps)
         uncertainty = abs(more - less) / 2
     tried = factor * _WIDTHS[: len(costs)]
     return BlurEstimate(width, uncertainty, exponent, level, factor, evidence, tried, costs)
@@ -242,8 +233,8 @@ def _effective_noise(reduced: FloatArray, factor: int, noise: float | None) -> f
     return max(float(np.hypot(_NOISE_FACTOR * level, _MISFIT * reduced.std())), _LEAST_NOISE)
 
 
-def _costs(gradients: _Gradients, exponent: float, noise: float) -> Float64Array:
-    """L of widths from the smallest on, until it has risen three times: it has one minimum."""
+def _costs(gradients: _Gradients, exponent: float, noise: float, rises: int) -> Float64Array:
+    """L of widths from the smallest on, until it has risen a few times in a row: it has one minimum."""
     costs: list[float] = []
     scene = gradients.planes
     prior = np.full_like(scene, max(float(np.square(scene).mean()), 1e-10))
@@ -251,7 +242,7 @@ def _costs(gradients: _Gradients, exponent: float, noise: float) -> Float64Array
         # A little more blur asks for a little other scene: from one to the next, fewer updates go further.
         scene, prior, cost = _fit_scene(gradients, scene, prior, blur=(float(width), exponent), noise=noise)
         costs.append(cost)
-        if len(costs) > 3 and costs[-4] < costs[-3] < costs[-2] < costs[-1]:
+        if len(costs) > rises and (np.diff(costs[-rises - 1 :]) > 0).all():
             break
     return np.array(costs)
 
@@ -357,8 +348,9 @@ def _solve(
     preconditioned = preconditioner * residual
     direction = preconditioned.copy()
     decrease = np.vdot(residual, preconditioned)
+    enough = _TOLERANCE * np.vdot(right, np.multiply(preconditioner, right, out=work))
     for _ in range(_STEPS):
-        if decrease <= 0:
+        if decrease <= enough:
             break
         image = apply(direction)
         length = decrease / np.vdot(direction, image)

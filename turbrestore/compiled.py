@@ -45,7 +45,8 @@ def compiled(loops: Loops) -> Loops | None:
     ----------
     loops : callable
         Loops over arrays and numbers, without a result of their own.  Literals have to be ``np.float32``: others are
-        computed with in double precision.
+        computed with in double precision.  Indices that are computed have to be ``np.uintp``: others may count from the
+        end, which is asked at every access and takes as long as all the rest.
 
     Returns
     -------

@@ -65,7 +65,7 @@ class DisParams:
     patch_stride : int
         Distance between patches, pixels.
     refinements : int
-        Iterations of the variational refinement.
+        Iterations of the variational refinement; half as many where a flow starts from an earlier one.
     smoothness : float
         Weight of the smoothness term in the refinement.
     """
@@ -512,11 +512,14 @@ def _dis(params: FlowParams, reference: GreyBytes) -> Solver:
         # A solver object keeps buffers that must not be shared between threads, and is cheap beside a flow.
         solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         solver.setFinestScale(params.dis.finest_scale)
+        refinements = params.dis.refinements
         if start is not None:
+            # The start has been refined; more iterations take half the time of a flow and leave images as they are.
+            refinements -= refinements // 2
             solver.setCoarsestScale(params.dis.finest_scale)
         solver.setPatchSize(params.dis.patch_size)
         solver.setPatchStride(params.dis.patch_stride)
-        solver.setVariationalRefinementIterations(params.dis.refinements)
+        solver.setVariationalRefinementIterations(refinements)
         solver.setVariationalRefinementAlpha(params.dis.smoothness)
         return solver.calc(reference, frame, start)
 

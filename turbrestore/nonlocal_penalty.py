@@ -2,11 +2,14 @@
 
 Symbols as in :mod:`turbrestore.primal_dual`: ``K = ∇_w``, ``Kᵀ = −div_w``.
 
-An iteration reads and writes every value on the edges in two passes: what has been added to p decides |p| everywhere,
-and |p| how far each value is drawn back.  Within a pass a strip stays in the cache of its processor.  With
-``a = p + sKū`` and the factor ``f = 1 / max(|a|, 1)`` of the projection, the over-relaxed update is
+An iteration goes through the values on the edges in two passes: what is added to p decides |p| everywhere, and |p| how
+far each value is drawn back.  Within a pass a strip stays in the cache of its processor.  With ``a = p + sKū`` and the
+factor ``f = 1 / max(|a|, 1)`` of the projection, the over-relaxed update is
 
-    p + ρ(fa − p) = (1 − ρ + ρf) a + (ρ − 1) sKū.
+    p + ρ(fa − p) = ga + Kl,  g = 1 − ρ + ρf,  l = (ρ − 1)sū.
+
+So a is kept in place of p, and g and l, which are images: the second pass writes nothing, and the first of the next
+iteration finds ``a = ga + K(l + sū)``.
 """
 
 from __future__ import annotations
@@ -27,17 +30,21 @@ from .scratch import new_stack, release
 
 @dataclass(frozen=True, eq=False)
 class EdgeDual:
-    """p of one image.
+    """p of one image, ``ga + Kl``.
 
     Attributes
     ----------
-    values : ndarray, float32, shape (3, E)
-        p from tail to head, from head to tail, and what the last iteration added.
+    values : ndarray, float32, shape (2, E)
+        a from tail to head, and from head to tail.
+    factor, lagged : ndarray, float32, shape (H · W,)
+        g and l.
     parts : tuple of slice
         Edges of each strip.
     """
 
     values: FloatArray
+    factor: FloatArray
+    lagged: FloatArray
     parts: tuple[slice, ...]
 
 
@@ -66,65 +73,70 @@ class NonlocalPenalty:
     def dual(self, image: FloatArray) -> EdgeDual:
         """Start from p = 0 for an image of this size."""
         ends = np.cumsum([0] + [len(strip.heads) for strip in self.graph.strips])
-        values = np.asarray(new_stack((3, int(ends[-1])), self.folder))
+        values = np.asarray(new_stack((2, int(ends[-1])), self.folder))
         for part in (parts := tuple(map(slice, ends[:-1], ends[1:]))):
             values[:, part] = 0
             release(values)
-        return EdgeDual(values, parts)
+        return EdgeDual(values, np.ones(image.size, np.float32), np.zeros(image.size, np.float32), parts)
 
     def ascend(self, dual: EdgeDual, image: FloatArray, step: float, relaxation: float) -> FloatArray:
         """Add ``step`` times K of the image to p, project and over-relax, in place; return Kᵀp."""
-        flat, values = image.ravel(), dual.values
-        root_step, drawn = np.float32(step), np.float32(relaxation - 1)
-
-        add_loops, draw_loops = compiled(add_differences), compiled(draw_back)
+        rise, loops = image.ravel() * np.float32(step), compiled(add_differences)
+        change = rise + dual.lagged
 
         def add(number: int, strip: EdgeStrip) -> FloatArray:
-            part = dual.parts[number]
-            there, back, added = values[0, part], values[1, part], values[2, part]
-            if add_loops is not None:
+            own, (there, back) = strip.view(dual.factor), dual.values[:, dual.parts[number]]
+            if loops is not None:
                 squares = np.zeros(strip.window, np.float32)
-                edges = strip.starts, strip.heads, strip.roots
-                add_loops(strip.view(flat), root_step, *edges, there, back, added, squares)
-                release(values)
-                return squares
-            np.multiply(strip.differences(flat), root_step, out=added)
-            there += added
-            back -= added
-            squares = strip.gather((there, there), (back, back))
-            release(values)
+                loops(strip.view(change), own, strip.starts, strip.heads, strip.roots, there, back, squares)
+            else:
+                more = strip.differences(change)
+                there *= strip.at_tails(own)
+                there += more
+                back *= strip.at_heads(own)
+                back -= more
+                squares = strip.gather((there, there), (back, back))
+            release(dual.values)
             return squares
 
-        factor = np.sqrt(sum_strips(self.graph.strips, add, flat.size, self.pool))
+        factor = np.sqrt(sum_strips(self.graph.strips, add, change.size, self.pool))
         np.maximum(factor, 1, out=factor)
-        np.divide(np.float32(relaxation), factor, out=factor)
-        factor -= drawn
+        np.divide(np.float32(relaxation), factor, out=dual.factor)
+        np.subtract(dual.factor, np.float32(relaxation - 1), out=dual.factor)
+        np.multiply(rise, np.float32(relaxation - 1), out=dual.lagged)
+        return self._pull(dual).reshape(image.shape)
+
+    def _pull(self, dual: EdgeDual) -> FloatArray:
+        """Kᵀp."""
+        loops = compiled(draw_back)
 
         def draw(number: int, strip: EdgeStrip) -> FloatArray:
-            part, own = dual.parts[number], strip.view(factor)
-            there, back, added = values[0, part], values[1, part], values[2, part]
-            if draw_loops is not None:
+            own, (there, back) = strip.view(dual.factor), dual.values[:, dual.parts[number]]
+            if loops is not None:
                 pull = np.zeros(strip.window, np.float32)
-                draw_loops(own, drawn, strip.starts, strip.heads, strip.roots, there, back, added, pull)
-                release(values)
-                return pull
-            there *= strip.at_tails(own)
-            back *= strip.at_heads(own)
-            added *= drawn
-            there += added
-            back -= added
-            net = np.subtract(back, there, out=added)
-            pull = strip.gather((net, strip.roots), (net, strip.roots), subtract=True)
-            release(values)
+                loops(own, strip.view(dual.lagged), strip.starts, strip.heads, strip.roots, there, back, pull)
+            else:
+                net = strip.differences(dual.lagged)
+                net *= -2
+                net += strip.at_heads(own) * back
+                net -= strip.at_tails(own) * there
+                pull = strip.gather((net, strip.roots), (net, strip.roots), subtract=True)
+            release(dual.values)
             return pull
 
-        return sum_strips(self.graph.strips, draw, flat.size, self.pool).reshape(image.shape)
+        return sum_strips(self.graph.strips, draw, dual.factor.size, self.pool)
 
     def value(self, image: FloatArray) -> float:
         """J[u]."""
-        flat = image.ravel()
+        flat, loops = image.ravel(), compiled(add_differences)
+        nothing = np.zeros_like(flat)
 
         def squares(_: int, strip: EdgeStrip) -> FloatArray:
+            if loops is not None:
+                found, along = np.zeros(strip.window, np.float32), np.zeros((2, len(strip.heads)), np.float32)
+                own = strip.view(flat), strip.view(nothing)
+                loops(*own, strip.starts, strip.heads, strip.roots, along[0], along[1], found)
+                return found
             along = strip.differences(flat)
             return strip.gather((along, along), (along, along))
 
@@ -133,45 +145,45 @@ class NonlocalPenalty:
 
 
 def add_differences(
-    image: FloatArray,
-    step: np.float32,
+    change: FloatArray,
+    factor: FloatArray,
     starts: NDArray[np.int32],
     heads: NDArray[np.int32],
     roots: FloatArray,
     there: FloatArray,
     back: FloatArray,
-    added: FloatArray,
     squares: FloatArray,
 ) -> None:
-    """Add K of an image to p along the edges of a strip, and the square of |p| to its pixels; to be compiled.
+    """From a to ga + K of an image along the edges of a strip, and the square of it to its pixels; to be compiled.
 
     Parameters
     ----------
-    image : ndarray, float32, shape (window,)
-    step : float32
-        s.
+    change : ndarray, float32, shape (window,)
+        Image that K is applied to.
+    factor : ndarray, float32, shape (window,)
+        g.
     starts, heads, roots : ndarray
         Of the strip, see :class:`turbrestore.edge_strips.EdgeStrip`.
-    there, back, added : ndarray, float32, shape (e,)
-        p from tail to head, from head to tail, and what is added; changed.
+    there, back : ndarray, float32, shape (e,)
+        a from tail to head, and from head to tail; changed.
     squares : ndarray, float32, shape (window,)
         Added to.
 
     Examples
     --------
     >>> edge = np.array([0, 1, 1], np.int32), np.array([1], np.int32), np.ones(1, np.float32)
-    >>> there, back, added, squares = np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(2)
-    >>> add_differences(np.array([3.0, 5.0]), np.float32(10), *edge, there, back, added, squares)
+    >>> there, back, squares = np.ones(1), np.ones(1), np.zeros(2)
+    >>> add_differences(np.array([3.0, 5.0]), np.array([0.5, 1.0]), *edge, there, back, squares)
     >>> there, back, squares
-    (array([20.]), array([-20.]), array([400., 400.]))
+    (array([2.5]), array([-1.]), array([6.25, 1.  ]))
     """
     for tail in range(starts.size - 1):
-        own, total = image[tail], np.float32(0)
-        for edge in range(starts[tail], starts[tail + 1]):
-            head = heads[edge]
-            more = (image[head] - own) * roots[edge] * step
-            forward, backward = there[edge] + more, back[edge] - more
-            there[edge], back[edge], added[edge] = forward, backward, more
+        own, share, total = change[tail], factor[tail], np.float32(0)
+        for edge in range(np.uintp(starts[tail]), np.uintp(starts[tail + 1])):
+            head = np.uintp(heads[edge])
+            more = (change[head] - own) * roots[edge]
+            forward, backward = there[edge] * share + more, back[edge] * factor[head] - more
+            there[edge], back[edge] = forward, backward
             total += forward * forward
             squares[head] += backward * backward
         squares[tail] += total
@@ -179,46 +191,41 @@ def add_differences(
 
 def draw_back(
     factor: FloatArray,
-    drawn: np.float32,
+    lagged: FloatArray,
     starts: NDArray[np.int32],
     heads: NDArray[np.int32],
     roots: FloatArray,
     there: FloatArray,
     back: FloatArray,
-    added: FloatArray,
     pull: FloatArray,
 ) -> None:
-    """Project and over-relax p on the edges of a strip, and add Kᵀp to its pixels; to be compiled.
+    """Kᵀp of the edges of a strip to its pixels, with p = ga + Kl; to be compiled.
 
     Parameters
     ----------
-    factor : ndarray, float32, shape (window,)
-        (1 − ρ + ρf) of each pixel.
-    drawn : float32
-        ρ − 1.
+    factor, lagged : ndarray, float32, shape (window,)
+        g and l.
     starts, heads, roots : ndarray
         Of the strip, see :class:`turbrestore.edge_strips.EdgeStrip`.
-    there, back, added : ndarray, float32, shape (e,)
-        p from tail to head, from head to tail, and what has been added; the first two are changed.
+    there, back : ndarray, float32, shape (e,)
+        a from tail to head, and from head to tail.
     pull : ndarray, float32, shape (window,)
         Added to.
 
     Examples
     --------
     >>> edge = np.array([0, 1, 1], np.int32), np.array([1], np.int32), np.ones(1, np.float32)
-    >>> there, back, added, pull = np.full(1, 20.0), np.full(1, -20.0), np.full(1, 20.0), np.zeros(2)
-    >>> draw_back(np.array([0.05, 0.05]), np.float32(0), *edge, there, back, added, pull)
-    >>> there, back, pull
-    (array([1.]), array([-1.]), array([-2.,  2.]))
+    >>> there, back, pull = np.full(1, 20.0), np.full(1, -20.0), np.zeros(2)
+    >>> draw_back(np.array([0.05, 0.05]), np.array([0.0, 0.5]), *edge, there, back, pull)
+    >>> pull
+    array([-3.,  3.])
     """
     for tail in range(starts.size - 1):
-        own, total = factor[tail], np.float32(0)
-        for edge in range(starts[tail], starts[tail + 1]):
-            head = heads[edge]
-            forward = there[edge] * own + added[edge] * drawn
-            backward = back[edge] * factor[head] - added[edge] * drawn
-            there[edge], back[edge] = forward, backward
-            net = (backward - forward) * roots[edge]
+        own, share, total = lagged[tail], factor[tail], np.float32(0)
+        for edge in range(np.uintp(starts[tail]), np.uintp(starts[tail + 1])):
+            head, root = np.uintp(heads[edge]), roots[edge]
+            more = (lagged[head] - own) * root
+            net = (back[edge] * factor[head] - there[edge] * share - (more + more)) * root
             total += net
             pull[head] -= net
         pull[tail] += total
