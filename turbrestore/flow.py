@@ -418,13 +418,11 @@ def refer_flow(reference: ArrayLike, params: FlowParams | None = None) -> FlowRe
     def prepare(image: FloatArray) -> FlowFrame:
         return FlowFrame(image, _levels(image, params), estimate_noise(image) if confidence is not None else 0.0)
 
-    def shift_of(frame: FlowFrame) -> FloatArray:
-        return np.zeros(2, np.float32) if position is None else _whole_shift(frame.image, position)
-
     def solve(batch: list[FlowFrame]) -> list[FloatArray]:
-        shifts = [shift_of(frame) for frame in batch]
+        starts = [_start(frame) for frame in batch]
+        shifts = [_whole_shift(*pair, position) for pair in zip(batch, starts, strict=True)]
         levels = [_shifted(frame.levels, s, prepared) for frame, s in zip(batch, shifts, strict=True)]
-        starts = [_start(frame, shift) for frame, shift in zip(batch, shifts, strict=True)]
+        starts = [None if start is None else start - s for start, s in zip(starts, shifts, strict=True)]
         flows = list(solver(np.stack(levels), starts))
         if confidence is not None:
             flows = [regularise_flow(f, confidence, frame.noise) for f, frame in zip(flows, batch, strict=True)]
@@ -481,20 +479,21 @@ def _levels(image: FloatArray, params: FlowParams) -> GreyBytes:
     return np.clip(np.rint(levels, out=levels), 0, 255, out=levels).astype(np.uint8)
 
 
-def _whole_shift(frame: FloatArray, position: ShiftReference) -> FloatArray:
+def _whole_shift(frame: FlowFrame, start: FloatArray | None, position: ShiftReference | None) -> FloatArray:
     """Shift of the frame in whole pixels, zero where dense flow needs no help."""
-    shift = shift_against(frame, position)
-    if shift is None or np.abs(shift).max() <= DEAD_ZONE:
-        return np.zeros(2, np.float32)
-    return np.rint(shift).astype(np.float32)
+    none = np.zeros(2, np.float32)
+    if position is None:
+        return none
+    shift = shift_against(frame.image, position) if start is None else np.array(cv2.mean(start)[:2], np.float32)
+    return none if shift is None or np.abs(shift).max() <= DEAD_ZONE else np.rint(shift).astype(np.float32)
 
 
-def _start(frame: FlowFrame, shift: FloatArray) -> FloatArray | None:
-    """Flow to start from, without the shift that is taken out of the frame."""
+def _start(frame: FlowFrame) -> FloatArray | None:
+    """Flow to start from, on the grid of the frame."""
     if frame.start is None:
         return None
     height, width = frame.levels.shape
-    return cv2.resize(frame.start.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) - shift
+    return cv2.resize(frame.start.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _shifted(frame: GreyBytes, shift: FloatArray, outside: GreyBytes) -> GreyBytes:
