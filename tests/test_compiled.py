@@ -11,11 +11,12 @@ from turbrestore.errors import DataError
 from turbrestore.frame_noise import _folded, judge_frame, mark_folds, measure_frame_noise, weigh_pixels
 from turbrestore.kalman import PixelGaussian
 from turbrestore.nonlocal_penalty import NonlocalPenalty, add_differences, draw_back
-from turbrestore.nonlocal_tv import NonlocalParams, nonlocal_weights
+from turbrestore.nonlocal_tv import NonlocalParams, add_sums, nonlocal_weights, search_offsets
+from turbrestore.patch_search import BAND_ROWS, PatchSearch, choose_offsets, search_bands
 from turbrestore.pixel_fusion import PixelFusion, take_in_pixels
 from turbrestore.warp import sample_spline, warp
 
-USERS = ("frame_noise", "nonlocal_penalty", "pixel_fusion", "warp")
+USERS = ("frame_noise", "nonlocal_penalty", "nonlocal_tv", "patch_search", "pixel_fusion", "warp")
 rng = np.random.default_rng(0)
 needs_compiler = pytest.mark.skipif(not compiling.can_compile(), reason="Numba is not installed: nothing to compare")
 
@@ -77,7 +78,7 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
 @needs_compiler
 @pytest.mark.parametrize(
     "loops",
-    [add_differences, draw_back, mark_folds, sample_spline, take_in_pixels, weigh_pixels],
+    [add_differences, add_sums, choose_offsets, draw_back, mark_folds, sample_spline, take_in_pixels, weigh_pixels],
     ids=lambda one: one.__name__,
 )
 def test_loops_are_compiled(loops):
@@ -137,6 +138,26 @@ def test_what_cannot_be_taken_in_is_refused_alike(plain, unusable):
 
 
 @needs_compiler
+@pytest.mark.parametrize("shape", [(1, 9), (30, 41), (BAND_ROWS + 3, 12)])
+@pytest.mark.parametrize("chosen", [(4, 10), (0, 3), (8, 0), (0, 48)])
+def test_offsets_are_chosen_alike(plain, shape, chosen):
+    """In the image, at its border, and where all offsets are chosen, those beyond the border too."""
+    window = np.float32([[0.25], [0.5], [0.25]])
+    guide, search = rng.random(shape, np.float32), PatchSearch(window, search_offsets(7), *chosen)
+    nearest, mask = search.nearest, search.rank_mask
+
+    def choices():
+        return np.concatenate([keys for _, keys in search_bands(guide, search)])
+
+    fast, slow = both(plain, choices)
+    assert fast.shape == slow.shape == (guide.size, sum(chosen))
+    assert np.array_equal(fast[:, :nearest] & mask, slow[:, :nearest] & mask)
+    for part in (np.s_[:, :nearest], np.s_[:, nearest:]):
+        distances = [(np.sort(keys[part], axis=1) & ~mask).view(np.float32) for keys in (fast, slow)]
+        assert distances[0] == pytest.approx(distances[1], rel=1e-4)
+
+
+@needs_compiler
 def test_the_dual_variable_moves_alike(plain):
     guide = rng.random((30, 28), np.float32)
     graph = nonlocal_weights(guide, NonlocalParams(search=7, patch=3))
@@ -147,6 +168,8 @@ def test_the_dual_variable_moves_alike(plain):
         pulls = [penalty.ascend(dual, image, 3.0, 1.4) for image in images]
         return dual.values, pulls, [penalty.value(image) for image in images]
 
+    bounds = both(plain, lambda: nonlocal_weights(guide, NonlocalParams(search=7, patch=3)).norm_squared)
+    assert bounds[0] == pytest.approx(bounds[1], rel=1e-5)
     (fast, fast_pulls, fast_values), (slow, slow_pulls, slow_values) = both(plain, ascended)
     assert np.abs(fast).max() > 0.1
     assert fast == pytest.approx(slow, abs=1e-5)

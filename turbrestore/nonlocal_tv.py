@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from .arrays import FloatArray, check_image, luminance
+from .compiled import compiled
 from .edge_strips import EdgeStrip, sum_strips
 from .errors import DataError, require
 from .parallel import available_cores, one_thread_each
@@ -442,10 +443,14 @@ def _norm_squared_bound(strips: tuple[EdgeStrip, ...], pixels: int, threads: int
     ``‖D‖² = ρ(DᵀD) ≤ ρ(|D|ᵀ|D|)``, and for a non-negative matrix A and any positive x, ``ρ(A) ≤ max_i (Ax)_i / x_i``
     (Collatz–Wielandt). The bound falls with each power of A that is applied to x.
     """
-    x, bound = np.ones(pixels, np.float32), np.inf
+    x, bound, loops = np.ones(pixels, np.float32), np.inf, compiled(add_sums)
 
     def apply(_: int, strip: EdgeStrip) -> FloatArray:
         values = strip.view(x)
+        if loops is not None:
+            found = np.zeros(strip.window, np.float32)
+            loops(values, strip.starts, strip.heads, strip.roots, found)
+            return found
         sums = (strip.at_tails(values) + strip.at_heads(values)) * strip.roots
         return strip.gather((strip.roots, sums), (strip.roots, sums))
 
@@ -457,3 +462,33 @@ def _norm_squared_bound(strips: tuple[EdgeStrip, ...], pixels: int, threads: int
             bound = min(bound, float((image / x).max()))
             x = image
     return 2 * bound
+
+
+def add_sums(
+    image: FloatArray, starts: NDArray[np.int32], heads: NDArray[np.int32], roots: FloatArray, sums: FloatArray
+) -> None:
+    """Add ``|D|ᵀ|D|`` of an image along the edges of a strip; to be compiled.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (window,)
+    starts, heads, roots : ndarray
+        Of the strip, see :class:`turbrestore.edge_strips.EdgeStrip`.
+    sums : ndarray, float32, shape (window,)
+        Added to.
+
+    Examples
+    --------
+    >>> edge, sums = (np.array([0, 1, 1]), np.array([1]), np.array([0.5])), np.zeros(2)
+    >>> add_sums(np.array([3.0, 5.0]), *edge, sums)
+    >>> sums
+    array([2., 2.])
+    """
+    for tail in range(starts.size - 1):
+        own, total = image[tail], np.float32(0)
+        for edge in range(np.uintp(starts[tail]), np.uintp(starts[tail + 1])):
+            head = np.uintp(heads[edge])
+            more = (own + image[head]) * roots[edge] * roots[edge]
+            total += more
+            sums[head] += more
+        sums[tail] += total

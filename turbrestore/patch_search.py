@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import FloatArray
+from .compiled import compiled
 from .parallel import map_ahead
 
 # Rows of a band, and columns of a tile of it: the distances of 64×192 pixels to 440 offsets are 22 MB.  A band has more
@@ -119,12 +120,17 @@ def search_bands(guide: FloatArray, search: PatchSearch, threads: int = 0) -> It
     margin = search.reach + len(search.window) // 2
     padded = cv2.copyMakeBorder(guide, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
     across = tile_columns(len(search.offsets))
-    columns = range(0, width, across)
+    columns, loops = range(0, width, across), compiled(choose_offsets)
 
     def choose(corner: tuple[int, int]) -> NDArray[np.int32]:
         top, left = corner
         rows, wide = min(BAND_ROWS, height - top), min(across, width - left)
-        block = padded[top : top + rows + 2 * margin, left : left + wide + 2 * margin]
+        block = np.ascontiguousarray(padded[top : top + rows + 2 * margin, left : left + wide + 2 * margin])
+        if loops is not None:
+            found = np.empty((rows, wide, search.nearest + search.best), np.int32)
+            edges = np.array([-top, height - top, -left, width - left])
+            loops(block, search.window.ravel(), search.offsets, edges, search.nearest, search.rank_mask, found)
+            return found
         keys = _keys(block, search)
         _exclude_outside(keys, search.offsets, corner, (height, width))
         return _best(keys.reshape(len(keys), -1), search).reshape(rows, wide, -1)
@@ -137,6 +143,77 @@ def search_bands(guide: FloatArray, search: PatchSearch, threads: int = 0) -> It
             band = np.concatenate(tiles, axis=1)
             yield top, band.reshape(-1, band.shape[2])
             tiles = []
+
+
+def choose_offsets(
+    block: FloatArray,
+    window: FloatArray,
+    offsets: NDArray[np.int32],
+    edges: NDArray[np.int64],
+    nearest: int,
+    rank_mask: int,
+    found: Keys,
+) -> None:
+    """Choices of every pixel of a tile; to be compiled.
+
+    Parameters
+    ----------
+    block : ndarray, float32, shape (rows + 2 margin, columns + 2 margin)
+        g of the tile, and around it as far as patches reach.
+    window : ndarray, float32, shape (patch,)
+        G_a along one axis.
+    offsets : ndarray, int32, shape (n, 2)
+        (dy, dx), nearest first.
+    edges : ndarray, int64, shape (4,)
+        First row of the image and the one after its last, and the same of columns, counted from those of the tile.
+    nearest, rank_mask : int
+        See :class:`PatchSearch`.
+    found : ndarray, int32, shape (rows, columns, nearest + best)
+        Filled, the best in order.
+
+    Examples
+    --------
+    >>> offsets, found = np.array([[0, -1], [0, 1]], np.int32), np.empty((1, 3, 1), np.int32)
+    >>> block = np.repeat(np.float32([[0, 0, 0, 1, 1]]), 3, axis=0)
+    >>> choose_offsets(block, np.ones(1, np.float32), offsets, np.array([0, 1, 0, 3]), 0, 3, found)
+    >>> offsets[found[0, :, 0] & 3, 1]
+    array([ 1, -1, -1], dtype=int32)
+    """
+    rows, columns, chosen = found.shape
+    patch, nothing, far = window.size, np.float32(0), np.float32(np.inf)
+    margin = (block.shape[1] - columns) // 2 - patch // 2
+    down, along = np.empty(columns + patch - 1, np.float32), np.empty(columns, np.float32)
+    bits, worst = along.view(np.int32), np.empty(columns, np.int32)
+    for row in range(rows):
+        # Larger than the bits of any distance; smaller than all where none is chosen by its distance.
+        found[row], worst[:] = 2147483647, 2147483647 if chosen > nearest else -1
+        for rank in range(len(offsets)):
+            dy, dx = offsets[rank]
+            down[:], along[:] = nothing, nothing
+            for k in range(patch):
+                here = block[margin + row + k, margin : margin + down.size]
+                there, share = block[margin + row + k + dy, margin + dx : margin + dx + down.size], window[k]
+                for x in range(down.size):
+                    down[x] += (here[x] - there[x]) * (here[x] - there[x]) * share
+            for k in range(patch):
+                part, share = down[k : k + columns], window[k]
+                for x in range(columns):
+                    along[x] += part[x] * share
+            if not edges[0] <= row + dy < edges[1]:
+                along[:] = far
+            along[: max(edges[2] - dx, 0)] = far
+            along[max(edges[3] - dx, 0) :] = far
+            for x in range(columns):
+                key = bits[x] & ~rank_mask | rank
+                if rank < nearest:
+                    found[row, x, rank] = key
+                if key < worst[x]:
+                    place = chosen - 1
+                    while place > nearest and found[row, x, place - 1] > key:
+                        found[row, x, place] = found[row, x, place - 1]
+                        place -= 1
+                    found[row, x, place] = key
+                    worst[x] = found[row, x, chosen - 1]
 
 
 def _keys(block: FloatArray, search: PatchSearch) -> Keys:
