@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 
 from turbrestore.blur_estimation import (
+    _TOLERANCE,
     BlurEstimate,
     _costs,
     _doubt,
     _fit_scene,
     _gradients,
+    _lowest,
     _most_detailed,
     _reduce,
     estimate_blur,
@@ -101,6 +103,16 @@ def test_the_scene_of_a_blur_solves_its_normal_equations():
         scene, prior, _ = _fit_scene(gradients, scene, prior, blur=(1.5, GAUSSIAN), noise=noise)
     gradient = blur(y - blur(scene)) / (2 * noise**2) - scene / before
     assert np.abs(gradient).max() < 0.02 * np.abs(blur(y) / (2 * noise**2)).max()
+
+
+@pytest.mark.parametrize("scene", ["chart", "camera", "brick"])
+def test_steps_that_are_left_out_change_no_width(monkeypatch, scene):
+    gradients, widths = _gradients(blurred(scene, 1.0, 0.002, size=96)), []
+    for tolerance in (0.0, _TOLERANCE, 1e-2):
+        monkeypatch.setattr("turbrestore.blur_estimation._TOLERANCE", tolerance)
+        widths.append(_lowest(_costs(gradients, GAUSSIAN, 0.005, 2)))
+    assert widths[1] == pytest.approx(widths[0], abs=1e-3)
+    assert widths[2] != pytest.approx(widths[0], abs=1e-2)
 
 
 @pytest.mark.parametrize("rises", [1, 2, 3])

@@ -50,6 +50,8 @@ def test_weights_keep_the_plan(image, tmp_path, params, threads):
 def test_threads_are_what_weights_take_most_for(image, tmp_path, monkeypatch):
     monkeypatch.setattr("turbrestore.nonlocal_tv.available_cores", lambda: 8)
     monkeypatch.setattr("turbrestore.parallel.available_cores", lambda: 8)
+    # Compiled, the search keeps no distances.
+    monkeypatch.setattr("turbrestore.patch_search.compiled", lambda loops: None)
     taken = {}
     for threads in (1, 0):
         with traced() as peaks:

@@ -1,5 +1,6 @@
 import threading
 
+import cv2
 import numpy as np
 import pytest
 
@@ -198,6 +199,49 @@ def test_a_start_includes_the_shift_of_the_frame():
     inside = np.s_[0, 30:-30, 30:-30, 0]
     assert np.median(flows[inside]) == pytest.approx(20, abs=0.1)
     assert again[inside] == pytest.approx(flows[inside], abs=0.2)
+
+
+def test_the_shift_of_a_start_is_not_measured_again(monkeypatch):
+    reference = texture(size=128)
+    frame, target = np.roll(reference, 20, axis=1), refer_flow(reference)
+    flows = estimate_flow(reference, frame[None])
+
+    def refuse(*arguments):
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr("turbrestore.flow.shift_against", refuse)
+    before = flows.copy()
+    fill_flows(target, frame[None], flows, again=True)
+    # Without the shift what nobody saw would not stay where the reference has it.
+    assert np.abs(flows[0, :, -18:] - before[0, :, -18:]).max() < 0.05
+
+
+@pytest.mark.parametrize("motion", [6, 12, 20])
+def test_where_half_of_the_scene_moves_the_other_stays(motion):
+    """The mean of such a flow is the shift of nothing."""
+    reference = texture(size=160)
+    frame = reference.copy()
+    frame[:, 80:] = np.roll(reference, motion, axis=1)[:, 80:]
+    flows = estimate_flow(reference, frame[None])
+    for _ in range(2):
+        fill_flows(refer_flow(reference), frame[None], flows, again=True)
+        assert np.abs(flows[0, :, :12]).max() < 0.05
+
+
+@pytest.mark.parametrize(("refinements", "half"), [(8, 4), (5, 3), (1, 1), (0, 0)])
+def test_a_flow_with_a_start_is_refined_half_as_often(refinements, half):
+    image, params = texture(size=64), FlowParams(confidence=False, dis=DisParams(refinements=refinements))
+    frame, start = np.roll(image, 1, axis=1), np.full((1, 64, 64, 2), (1, 0), np.float32)
+    found = start.copy()
+    fill_flows(refer_flow(image, params), frame[None], found, again=True)
+    solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    solver.setCoarsestScale(0)
+    solver.setFinestScale(0)
+    solver.setPatchStride(params.dis.patch_stride)
+    solver.setVariationalRefinementIterations(half)
+    solver.setVariationalRefinementAlpha(params.dis.smoothness)
+    levels = [refer_flow(image, params).prepare(one).levels for one in (image, frame)]
+    assert np.array_equal(found[0], solver.calc(*levels, start[0].copy()))
 
 
 @pytest.mark.parametrize("size", [(8, 8), (15, 64)])

@@ -144,11 +144,12 @@ def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypa
     monkeypatch.setattr("turbrestore.warp._STRIP", 1000)
     monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 700)
     monkeypatch.setattr("turbrestore.flow_subspace._STRIP_BYTES", 1 << 16)
-    monkeypatch.setattr("turbrestore.deconvolution._THREADED_PIXELS", 0)
+    for name in ("_THREADED_TRANSFORM", "_THREADED_PASS"):
+        monkeypatch.setattr(f"turbrestore.deconvolution.{name}", 0)
     frames = make_sequence(seed=3, count=28).frames[:, :64, :80]
 
     def run(threads):
-        for module in ("parallel", "deconvolution", "nonlocal_tv", "blur_estimation", "memory"):
+        for module in ("parallel", "deconvolution", "nonlocal_tv", "memory"):
             monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: threads)
         return restore(frames, RestoreParams(train=12, flow=FlowParams(threads=threads)))
 

@@ -44,6 +44,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from .arrays import FloatArray, check_image, luminance
+from .compiled import compiled
 from .errors import require
 from .parallel import one_thread_each
 from .plots import plot_blur
@@ -79,7 +80,8 @@ _PREFERENCE = 0.8
 _LARGER_REDUCTION = 0.15
 # Share of the uncertainty that is not removed.
 _CAUTION = 0.5
-# Updates of γ, and conjugate gradient steps in each, fewer where the residual has fallen by this factor.
+# Updates of γ, and conjugate gradient steps in each; none where the residual, squared, is this share of the right-hand
+# side: for narrow blurs x hardly changes any more in the last updates.
 _UPDATES, _STEPS, _TOLERANCE = 8, 8, 1e-8
 
 
@@ -334,30 +336,88 @@ def _solve(
     power: FloatArray, precision: FloatArray, right: FloatArray, preconditioner: FloatArray, start: FloatArray
 ) -> FloatArray:
     """Conjugate gradients on ``(KᵀK / λ + 1 / γ) x = Kᵀy / λ``; ``power`` is |K|² / λ in Fourier over the size."""
-    spectrum, work = np.empty_like(start), np.empty_like(start)
+    spectrum, descend = np.empty_like(start), compiled(descend_loops) or _descend
 
-    def apply(v: FloatArray) -> FloatArray:
+    def blurred_twice(v: FloatArray) -> FloatArray:
         cv2.dft(v, dst=spectrum)
         np.multiply(spectrum, power, out=spectrum)
-        found = cv2.dft(spectrum, flags=cv2.DFT_INVERSE)
-        found += np.multiply(precision, v, out=work)
-        return found
+        return cv2.dft(spectrum, flags=cv2.DFT_INVERSE)
 
     x = start.copy()
-    residual = right - apply(x)
-    preconditioned = preconditioner * residual
-    direction = preconditioned.copy()
-    decrease = np.vdot(residual, preconditioned)
-    enough = _TOLERANCE * np.vdot(right, np.multiply(preconditioner, right, out=work))
+    residual = right - blurred_twice(x) - precision * x
+    direction = preconditioner * residual
+    decrease = np.array([np.vdot(residual, direction)], np.float32)
+    enough = _TOLERANCE * np.vdot(right, preconditioner * right)
+    fixed, moving = (precision.ravel(), preconditioner.ravel()), (direction.ravel(), x.ravel(), residual.ravel())
     for _ in range(_STEPS):
-        if decrease <= enough:
+        if decrease[0] <= enough:
             break
-        image = apply(direction)
-        length = decrease / np.vdot(direction, image)
-        x += np.multiply(direction, length, out=work)
-        residual -= np.multiply(image, length, out=image)
-        np.multiply(preconditioner, residual, out=preconditioned)
-        before, decrease = decrease, np.vdot(residual, preconditioned)
-        direction *= decrease / before
-        direction += preconditioned
+        descend(blurred_twice(direction).ravel(), *fixed, *moving, decrease)
     return x
+
+
+def _descend(
+    image: FloatArray,
+    precision: FloatArray,
+    preconditioner: FloatArray,
+    direction: FloatArray,
+    x: FloatArray,
+    residual: FloatArray,
+    decrease: FloatArray,
+) -> None:
+    """:func:`descend_loops` by NumPy."""
+    work = precision * direction
+    image += work
+    length = decrease[0] / np.vdot(direction, image)
+    x += np.multiply(direction, length, out=work)
+    residual -= np.multiply(image, length, out=image)
+    np.multiply(preconditioner, residual, out=work)
+    before, decrease[0] = decrease[0], np.vdot(residual, work)
+    direction *= decrease[0] / before
+    direction += work
+
+
+def descend_loops(
+    image: FloatArray,
+    precision: FloatArray,
+    preconditioner: FloatArray,
+    direction: FloatArray,
+    x: FloatArray,
+    residual: FloatArray,
+    decrease: FloatArray,
+) -> None:
+    """One step of conjugate gradients but for its transforms; to be compiled.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (m,)
+        ``KᵀK / λ`` of the direction; changed.
+    precision, preconditioner : ndarray, float32, shape (m,)
+        1 / γ, and C.
+    direction, x, residual : ndarray, float32, shape (m,)
+        Changed.
+    decrease : ndarray, float32, shape (1,)
+        ⟨residual, C residual⟩; changed.
+
+    Examples
+    --------
+    >>> one = np.ones(1, np.float32)
+    >>> direction, x, residual, decrease = 2 * one, 0 * one, 2 * one, 4 * one
+    >>> descend_loops(2 * one, one, one, direction, x, residual, decrease)
+    >>> x, residual, decrease
+    (array([1.], dtype=float32), array([0.], dtype=float32), array([0.], dtype=float32))
+    """
+    curvature, left = np.float32(0), np.float32(0)
+    for pixel in range(x.size):
+        image[pixel] += precision[pixel] * direction[pixel]
+        curvature += direction[pixel] * image[pixel]
+    length = decrease[0] / curvature
+    for pixel in range(x.size):
+        x[pixel] += direction[pixel] * length
+        rest = residual[pixel] - image[pixel] * length
+        residual[pixel] = rest
+        left += preconditioner[pixel] * rest * rest
+    share = left / decrease[0]
+    decrease[0] = left
+    for pixel in range(x.size):
+        direction[pixel] = direction[pixel] * share + preconditioner[pixel] * residual[pixel]

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from .arrays import FloatArray, check_image, luminance
 from .blur_estimation import BlurEstimate, estimate_blur
 from .deconvolution import Deconvolution
+from .parallel import one_thread_each
 from .psf import estimate_noise
 
 # Tiles of fewer pixels a side say too little.
@@ -91,12 +92,13 @@ def estimate_blur_map(image: ArrayLike, whole: BlurEstimate) -> BlurMap | None:
     noise, shape = estimate_noise(grey), (len(rows), len(columns))
     sigmas, uncertainties = np.full(shape, whole.sigma), np.full(shape, whole.uncertainty)
     spoken = np.zeros(shape, bool)
-    for place in np.ndindex(shape):
-        tile = np.ascontiguousarray(grey[rows[place[0]], columns[place[1]]])
-        estimate = estimate_blur(tile, exponent=whole.exponent)
-        known = np.isfinite(estimate.uncertainty)
-        if known and (estimate.blurred or _fine_detail(tile) > _DETAIL * noise):
-            sigmas[place], uncertainties[place], spoken[place] = estimate.sigma, estimate.uncertainty, True
+    with one_thread_each():
+        for place in np.ndindex(shape):
+            tile = np.ascontiguousarray(grey[rows[place[0]], columns[place[1]]])
+            estimate = estimate_blur(tile, exponent=whole.exponent)
+            known = np.isfinite(estimate.uncertainty)
+            if known and (estimate.blurred or _fine_detail(tile) > _DETAIL * noise):
+                sigmas[place], uncertainties[place], spoken[place] = estimate.sigma, estimate.uncertainty, True
     return BlurMap(sigmas, uncertainties, _clearly_differ(sigmas[spoken], uncertainties[spoken]))
 
 

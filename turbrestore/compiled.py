@@ -45,8 +45,9 @@ def compiled(loops: Loops) -> Loops | None:
     ----------
     loops : callable
         Loops over arrays and numbers, without a result of their own.  Literals have to be ``np.float32``: others are
-        computed with in double precision.  Indices that are computed have to be ``np.uintp``: others may count from the
-        end, which is asked at every access and takes as long as all the rest.
+        computed with in double precision.  In an inner loop an index that is looked up is best made ``np.uintp``, for
+        others may count from the end, which is asked at every access; but an unsigned and a signed integer add up to a
+        float.
 
     Returns
     -------

@@ -70,8 +70,8 @@ METHODS = ("nltv", "tv", "wiener", "tikhonov")
 BOUNDARIES = ("unknown", "periodic")
 CHANNELS = ("luminance", "each")
 
-# Transforms and passes over the pairs of fewer pixels take longer on several threads than on one.
-_THREADED_PIXELS = 1 << 18
+# Transforms, and passes over the pairs, of fewer pixels take no less time on several threads than on one.
+_THREADED_TRANSFORM, _THREADED_PASS = 1 << 18, 1 << 17
 # Least margin, in widths of the blur.
 MARGIN_SIGMAS = 4.0
 # Steps and relative change at which the Wiener solution is good enough to start from.
@@ -360,14 +360,15 @@ def _solve(
         return _iterate(quadratic, problems, [quadratic.start(p) for p in problems], params, progress)
     nonlocal_work = NonlocalWork(problems[0].seen.shape, len(problems), params.weights)
     room = nonlocal_work.room(params.memory if params.method == "nltv" else None, available_cores())
-    workers = room.threads if problems[0].seen.size >= _THREADED_PIXELS else 1
+    pixels = problems[0].seen.size
+    workers = room.threads if pixels >= _THREADED_TRANSFORM else 1
     with one_thread_each(), fft.set_workers(workers), ThreadPoolExecutor(room.threads) as pool:
         starts, guide = _sharpened(problems, guide, params, pool)
         penalty: Penalty = LOCAL_TV
         if params.method == "nltv":
             folder = (scratch or Path(tempfile.gettempdir())) if room.in_file else None
             graph = nonlocal_weights(guide, params.weights, folder, room.threads)
-            penalty = NonlocalPenalty(graph, pool if workers > 1 else None, folder)
+            penalty = NonlocalPenalty(graph, pool if pixels >= _THREADED_PASS else None, folder)
         solver = PrimalDual(penalty)
         states = [solver.start(problem, u) for problem, u in zip(problems, starts, strict=True)]
         return _iterate(solver, problems, states, params, progress)

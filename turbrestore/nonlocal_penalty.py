@@ -58,7 +58,7 @@ class NonlocalPenalty:
     pool : Executor, optional
         Threads that work on strips side by side.
     folder : Path, optional
-        Where p is kept in a file; without it it is in memory.
+        Where a is kept in a file; without it it is in memory.
     """
 
     graph: NonlocalGraph
@@ -116,10 +116,10 @@ class NonlocalPenalty:
                 pull = np.zeros(strip.window, np.float32)
                 loops(own, strip.view(dual.lagged), strip.starts, strip.heads, strip.roots, there, back, pull)
             else:
-                net = strip.differences(dual.lagged)
+                net, heads, tails = strip.differences(dual.lagged), strip.at_heads(own), strip.at_tails(own)
                 net *= -2
-                net += strip.at_heads(own) * back
-                net -= strip.at_tails(own) * there
+                net += np.multiply(heads, back, out=heads)
+                net -= np.multiply(tails, there, out=tails)
                 pull = strip.gather((net, strip.roots), (net, strip.roots), subtract=True)
             release(dual.values)
             return pull
@@ -129,12 +129,13 @@ class NonlocalPenalty:
     def value(self, image: FloatArray) -> float:
         """J[u]."""
         flat, loops = image.ravel(), compiled(add_differences)
-        nothing = np.zeros_like(flat)
+        # From a = 0 the first pass of an iteration finds the squares of K.
+        no_factor = np.zeros_like(flat)
 
         def squares(_: int, strip: EdgeStrip) -> FloatArray:
             if loops is not None:
                 found, along = np.zeros(strip.window, np.float32), np.zeros((2, len(strip.heads)), np.float32)
-                own = strip.view(flat), strip.view(nothing)
+                own = strip.view(flat), strip.view(no_factor)
                 loops(*own, strip.starts, strip.heads, strip.roots, along[0], along[1], found)
                 return found
             along = strip.differences(flat)

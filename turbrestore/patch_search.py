@@ -10,6 +10,9 @@ A choice is one integer: the bits of the distance, whose last ones hold the rank
 sort like the integers of the same bits, so one partial sort finds both the distances and where they were; it is ten
 times faster than a partial sort of indices.  Distances lose the last bits of their mantissa to the rank (relative error
 6e-5 for 21×21), and ties go to the nearer offset.
+
+Compiled, a distance is put into its place among the best as soon as it is known, so that none is kept; where many are
+to be chosen, a partial sort of all is faster.
 """
 
 from __future__ import annotations
@@ -33,8 +36,11 @@ _TILE_COLUMNS, _FEWEST_COLUMNS = 192, 24
 _TILE_DISTANCES = BAND_ROWS * _TILE_COLUMNS * 440
 # Pixels whose distances are sorted at once, so that they stay in the cache.
 _SORTED_PIXELS = 512
-# Bits of a distance that is infinite, because the pixel lies outside the image.
+# Bits of a distance that is infinite, because the pixel lies outside the image; and a number larger than all bits.
 OUTSIDE = int(np.float32(np.inf).view(np.int32))
+_NO_CHOICE = int(np.iinfo(np.int32).max)
+# Most choices by distance that the compiled loop makes.
+_MOST_INSERTED = 32
 
 Keys = NDArray[np.int32]
 
@@ -120,13 +126,15 @@ def search_bands(guide: FloatArray, search: PatchSearch, threads: int = 0) -> It
     margin = search.reach + len(search.window) // 2
     padded = cv2.copyMakeBorder(guide, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
     across = tile_columns(len(search.offsets))
-    columns, loops = range(0, width, across), compiled(choose_offsets)
+    columns, loops = range(0, width, across), compiled(choose_offsets) if search.best <= _MOST_INSERTED else None
 
     def choose(corner: tuple[int, int]) -> NDArray[np.int32]:
         top, left = corner
         rows, wide = min(BAND_ROWS, height - top), min(across, width - left)
-        block = np.ascontiguousarray(padded[top : top + rows + 2 * margin, left : left + wide + 2 * margin])
+        block = padded[top : top + rows + 2 * margin, left : left + wide + 2 * margin]
         if loops is not None:
+            # The compiler makes faster loops of rows whose pixels it knows to be side by side.
+            block = np.ascontiguousarray(block)
             found = np.empty((rows, wide, search.nearest + search.best), np.int32)
             edges = np.array([-top, height - top, -left, width - left])
             loops(block, search.window.ravel(), search.offsets, edges, search.nearest, search.rank_mask, found)
@@ -185,8 +193,8 @@ def choose_offsets(
     down, along = np.empty(columns + patch - 1, np.float32), np.empty(columns, np.float32)
     bits, worst = along.view(np.int32), np.empty(columns, np.int32)
     for row in range(rows):
-        # Larger than the bits of any distance; smaller than all where none is chosen by its distance.
-        found[row], worst[:] = 2147483647, 2147483647 if chosen > nearest else -1
+        # Where none is chosen by its distance, none is small enough.
+        found[row], worst[:] = _NO_CHOICE, _NO_CHOICE if chosen > nearest else -1
         for rank in range(len(offsets)):
             dy, dx = offsets[rank]
             down[:], along[:] = nothing, nothing
