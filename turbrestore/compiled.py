@@ -19,7 +19,7 @@ Loops = TypeVar("Loops", bound=Callable[..., None])
 # they are.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "reassoc"}}
 # What Numba and its compiler take in memory, bytes.
-COMPILER_BYTES = 1.3e8
+COMPILER_BYTES = 1.4e8
 
 
 def can_compile() -> bool:
