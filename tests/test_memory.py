@@ -325,3 +325,30 @@ def test_a_kept_run_goes_on_with_another_limit(frames, in_file, tmp_path, monkey
     found = KeptStages(tmp_path, source, QUICK, resume=True).done
     assert np.array_equal(found.centroid.flows, whole.centroid.flows)
     assert np.array_equal(found.dynamics.C, whole.dynamics.C)
+
+
+@pytest.mark.parametrize("records", [16, 40])
+def test_a_limited_run_interrupted_in_the_filter_ends_the_same(tmp_path, records):
+    frames = make_sequence(seed=52, count=64, size=96, blur=1.0).frames
+    limit = limit_that(frames.shape, lambda plan: plan.in_file, wanted=16, flow=QUICK.flow)
+    params, source = replace(QUICK, memory_limit=limit), FrameSource.from_array(frames)
+    (scratch := tmp_path / "scratch").mkdir()
+    (folder := tmp_path / "kept").mkdir()
+    kept = KeptStages(folder, source, params, every=1)
+
+    def keep(done):
+        kept.keep(done)
+        if done.filtered is None and done.checkpoint is not None and len(done.checkpoint.records) == records:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.restore(source, params, on_result=keep, scratch=scratch)
+    assert not list(scratch.iterdir())
+    done = KeptStages(folder, source, params, resume=True).done
+    assert len(done.checkpoint.records) == records
+    resumed, whole = (pipeline.restore(source, params, done=one, scratch=scratch) for one in (done, None))
+    assert isinstance(whole.centroid.flows, np.memmap)
+    for name in ("image", "variance", "shares", "flow_states"):
+        assert np.array_equal(getattr(resumed.filtered, name), getattr(whole.filtered, name))
+    assert np.array_equal(resumed.image, whole.image)
+    assert not list(scratch.iterdir())
