@@ -124,13 +124,22 @@ def test_the_search_stops_once_the_cost_has_risen_so_many_times(rises):
 
 
 @pytest.mark.parametrize(
-    ("reductions", "uncertainties", "believed"),
-    [((2, 8), (0.27, 0.27), 8), ((2, 8), (0.2, 0.27), 2), ((1, 2), (0.27, 0.25), 1), ((1, 2), (0.4, 0.25), 2)],
+    ("reductions", "uncertainties", "evidence", "believed"),
+    [
+        ((2, 8), (0.27, 0.27), 1.0, 8),
+        ((2, 8), (0.2, 0.27), 1.0, 2),
+        ((1, 2), (0.27, 0.25), 1.0, 1),
+        ((1, 2), (0.4, 0.25), 1.0, 2),
+        ((1, 2), (0.27, 0.25), 0.15, 2),
+        ((1, 2), (0.2, 0.25), 0.15, 1),
+    ],
 )
-def test_of_images_about_as_sure_the_whole_comes_first_and_then_the_smallest(reductions, uncertainties, believed):
+def test_of_images_about_as_sure_a_blurred_whole_comes_first_and_then_the_smallest(
+    reductions, uncertainties, evidence, believed
+):
     pairs = zip(reductions, uncertainties, strict=True)
     none = np.zeros(0)
-    estimates = [BlurEstimate(1.0, doubt, 5 / 3, 0.01, reduction, 1.0, none, none) for reduction, doubt in pairs]
+    estimates = [BlurEstimate(1.0, doubt, 5 / 3, 0.01, reduction, evidence, none, none) for reduction, doubt in pairs]
     assert min(estimates, key=_doubt).reduction == believed
 
 

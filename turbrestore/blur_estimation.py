@@ -24,6 +24,7 @@ A wide blur is looked for in a reduced image, where it is about a pixel wide aga
 which is no blurred scene, averages out.  Reducing by r averages r×r pixels, whose variance (r² − 1) / 12 is taken out
 again.  Of all reductions that resolve a blur, the one decides whose width depends least on the noise assumed; the image
 itself is preferred where the difference is small, for a soft scene such as the Moon looks blurred at every reduction.
+It is not where its evidence is weak: blocks of a codec look like edges hardly blurred at all.
 
 n is more than the noise of the image: no real blur follows the family of k exactly, and a scene of high contrast
 shows that more.  So n² is the noise and a share of the contrast, squared and added.  The width found depends on n,
@@ -204,12 +205,13 @@ def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float 
 
 
 def _doubt(estimate: BlurEstimate) -> float:
-    """How much the width depends on the noise; less for the image itself, which has lost nothing.
+    """How much the width depends on the noise; less for the image itself, which has lost nothing, if it is blurred.
 
-    Of reduced images, stronger reduction is preferred a little: where they contradict each other, blocks of a codec or
-    the grain of a sensor make the others look sharp.
+    Otherwise stronger reduction is preferred a little: where they contradict each other, blocks of a codec or the grain
+    of a sensor make the others look sharp.
     """
-    preference = _PREFERENCE if estimate.reduction == 1 else (estimate.reduction / 2) ** -_LARGER_REDUCTION
+    whole = estimate.reduction == 1 and estimate.evidence >= _STRONG_EVIDENCE
+    preference = _PREFERENCE if whole else (estimate.reduction / 2) ** -_LARGER_REDUCTION
     return preference * estimate.uncertainty / estimate.sigma
 
 
