@@ -1,5 +1,6 @@
 import threading
 
+import cv2
 import numpy as np
 import pytest
 
@@ -225,6 +226,22 @@ def test_where_half_of_the_scene_moves_the_other_stays(motion):
     for _ in range(2):
         fill_flows(refer_flow(reference), frame[None], flows, again=True)
         assert np.abs(flows[0, :, :12]).max() < 0.05
+
+
+@pytest.mark.parametrize(("refinements", "half"), [(8, 4), (5, 3), (1, 1), (0, 0)])
+def test_a_flow_with_a_start_is_refined_half_as_often(refinements, half):
+    image, params = texture(size=64), FlowParams(confidence=False, dis=DisParams(refinements=refinements))
+    frame, start = np.roll(image, 1, axis=1), np.full((1, 64, 64, 2), (1, 0), np.float32)
+    found = start.copy()
+    fill_flows(refer_flow(image, params), frame[None], found, again=True)
+    solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    solver.setCoarsestScale(0)
+    solver.setFinestScale(0)
+    solver.setPatchStride(params.dis.patch_stride)
+    solver.setVariationalRefinementIterations(half)
+    solver.setVariationalRefinementAlpha(params.dis.smoothness)
+    levels = [refer_flow(image, params).prepare(one).levels for one in (image, frame)]
+    assert np.array_equal(found[0], solver.calc(*levels, start[0].copy()))
 
 
 @pytest.mark.parametrize("size", [(8, 8), (15, 64)])
