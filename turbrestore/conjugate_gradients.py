@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy import fft
@@ -31,6 +31,9 @@ class ConjugateGradients:
     """
 
     symbol: FloatArray
+
+    # Iterations that are judged together.
+    window: ClassVar[int] = 1
 
     def start(self, problem: Problem) -> GradientState:
         """Start from the solution for the continued image."""

@@ -41,13 +41,17 @@ class Problem:
         """|k̂|², which BᵀB multiplies by."""
         return np.square(np.abs(self.otf))
 
+    def blurred(self, spectrum: Spectrum) -> FloatArray:
+        """Bu, from the Fourier transform of u."""
+        return fft.irfft2(self.otf * spectrum, s=self.observed.shape, overwrite_x=True)
+
     def gradient_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Fourier transform of the gradient ``λBᵀM(Bu − f)``, from that of u."""
         return self._back(self._residual(spectrum))
 
     def normal_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Fourier transform of ``λBᵀMBu``, from that of u."""
-        blurred = self._blurred(spectrum)
+        blurred = self.blurred(spectrum)
         blurred *= self.seen
         return self._back(blurred)
 
@@ -55,11 +59,8 @@ class Problem:
         """``M(Bu − f)``."""
         return self._residual(fft.rfft2(u))
 
-    def _blurred(self, spectrum: Spectrum) -> FloatArray:
-        return fft.irfft2(self.otf * spectrum, s=self.observed.shape, overwrite_x=True)
-
     def _residual(self, spectrum: Spectrum) -> FloatArray:
-        found = self._blurred(spectrum)
+        found = self.blurred(spectrum)
         found -= self.observed
         found *= self.seen
         return found

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from .arrays import FloatArray
 from .convolution_problem import Problem
 from .device import memory_of
 from .nonlocal_tv import NonlocalParams
-from .primal_dual import PRIMAL_STEP, RELAXATION
+from .primal_dual import LEAST_DATA_STEP, PRIMAL_STEP, RELAXATION, WINDOW
 from .psf import estimate_noise, laplacian_symbol, wiener_fidelity
 from .torch_weights import (
     device_divergence,
@@ -42,7 +42,7 @@ class SolverSettings:
     iterations : int
         Most iterations.
     tolerance : float
-        Relative change below which they stop.
+        Relative change in an iteration below which they stop.
     record_every : int
         Iterations from one record of the energy to the next.
     start_steps, start_tolerance
@@ -83,8 +83,11 @@ class _Problem:
     def gradient_spectrum(self, spectrum: Tensor) -> Tensor:
         return self.fidelity * self.otf.conj() * _forward(self.residual(spectrum))
 
+    def blurred(self, spectrum: Tensor) -> Tensor:
+        return _back(self.otf * spectrum, self.observed)
+
     def residual(self, spectrum: Tensor) -> Tensor:
-        return self.seen * (_back(self.otf * spectrum, self.observed) - self.observed)
+        return self.seen * (self.blurred(spectrum) - self.observed)
 
     def misfit(self, u: Tensor) -> float:
         residual = self.residual(_forward(u))
@@ -104,8 +107,10 @@ class _Penalty(NamedTuple):
 
 class _DualState(NamedTuple):
     image: Tensor
-    spectrum: Tensor
+    blurred: Tensor
+    pressure: Tensor
     dual: Tensor
+    number: int
 
 
 class _GradientState(NamedTuple):
@@ -174,7 +179,8 @@ def _solve(
     starts = [_wiener_image(problem, settings, device) for problem in problems]
     penalty = _local_tv() if settings.method == "tv" else _nonlocal_tv(problems, starts, guide, settings, device)
     solver = _PrimalDual(penalty)
-    return _iterate(solver, loaded, [solver.start(u) for u in starts], settings, progress)
+    states = [solver.start(problem, u) for problem, u in zip(loaded, starts, strict=True)]
+    return _iterate(solver, loaded, states, settings, progress)
 
 
 def _iterate(
@@ -185,13 +191,16 @@ def _iterate(
     progress: Callable[[int], None] | None,
 ) -> DeviceSolution:
     records: list[tuple[int, float, float]] = []
+    before, images, begun = [], [state.image for state in states], 0
     for iteration in range(1, settings.iterations + 1):
-        before = [state.image for state in states]
+        if (iteration - 1) % solver.window == 0:
+            before, begun = images, iteration - 1
         states = [solver.step(problem, state) for problem, state in zip(problems, states, strict=True)]
         images = [state.image for state in states]
-        change = _relative_change(before, images, problems[0].seen)
-        converged = change <= settings.tolerance
-        last = converged or iteration == settings.iterations
+        last = iteration == settings.iterations
+        if last or iteration % solver.window == 0:
+            change = _relative_change(before, images, problems[0].seen) / (iteration - begun)
+            last |= (converged := change <= settings.tolerance)
         if last or iteration % settings.record_every == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
             records.append((iteration, sum(energies), change))
@@ -207,23 +216,37 @@ class _PrimalDual:
     """See :class:`turbrestore.primal_dual.PrimalDual`."""
 
     regulariser: _Penalty
+    window: ClassVar[int] = WINDOW
 
-    def start(self, u: Tensor) -> _DualState:
-        return _DualState(u, _forward(u), self.regulariser.gradient(u) * 0)
+    def start(self, problem: _Problem, u: Tensor) -> _DualState:
+        blurred = problem.blurred(_forward(u))
+        p = self.regulariser.project(self.regulariser.gradient(u) * self._steps[1])
+        return _DualState(u, blurred, _raised(problem, blurred * 0, blurred, 1), p, 1)
 
     def step(self, problem: _Problem, state: _DualState) -> _DualState:
-        norm = self.regulariser.norm_squared**0.5
-        tau, s = PRIMAL_STEP / norm, 1 / (PRIMAL_STEP * norm)
-        u, spectrum, p = state
-        metric = 1 / tau + problem.fidelity * problem.otf.abs() ** 2
-        down = (_forward(self.regulariser.adjoint(p)) + problem.gradient_spectrum(spectrum)) / metric
-        moved = _back(down, u)
+        tau, s = self._steps
+        u, blurred, q, p, number = state
+        share = max(1 / number, LEAST_DATA_STEP)
+        metric = 1 / tau + share * problem.fidelity * problem.otf.abs() ** 2
+        down = (_forward(self.regulariser.adjoint(p)) + problem.otf.conj() * _forward(q)) / metric
+        moved, drop = _back(down, u), problem.blurred(down)
         ascent = self.regulariser.gradient(u - 2 * moved).mul_(s).add_(p)
-        forward = self.regulariser.project(ascent)
-        return _DualState(u - RELAXATION * moved, spectrum - RELAXATION * down, p + RELAXATION * (forward - p))
+        forward, raised = self.regulariser.project(ascent), _raised(problem, q, blurred - 2 * drop, share)
+        u, blurred = u - RELAXATION * moved, blurred - RELAXATION * drop
+        return _DualState(u, blurred, q + RELAXATION * (raised - q), p + RELAXATION * (forward - p), number + 1)
 
     def penalty(self, problem: _Problem, u: Tensor) -> float:
         return self.regulariser.value(u)
+
+    @property
+    def _steps(self) -> tuple[float, float]:
+        norm = self.regulariser.norm_squared**0.5
+        return PRIMAL_STEP / norm, 1 / (PRIMAL_STEP * norm)
+
+
+def _raised(problem: _Problem, q: Tensor, ahead: Tensor, share: float) -> Tensor:
+    """Step of q where Bu is ``ahead``; ``share`` is μ/λ."""
+    return problem.seen * (q + share * problem.fidelity * (ahead - problem.observed)) / (1 + share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +254,7 @@ class _Quadratic:
     """See :class:`turbrestore.conjugate_gradients.ConjugateGradients`."""
 
     symbol: Tensor
+    window: ClassVar[int] = 1
 
     def start(self, problem: _Problem) -> _GradientState:
         m = problem.mean()
