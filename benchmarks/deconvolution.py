@@ -38,15 +38,17 @@ WEIGHTS_BOUND_S, ITERATION_BOUND_MS, EXPONENT_BOUND = 2.5, 25.0, 1.1
 STAGE_BOUNDS_S = {256: 1.0, 512: 4.0}
 # Of a child that removes the blur of a frame of 1920×1080, by the limit it is given; MB.
 MEMORY_BOUNDS = {None: 1200, 6e8: 800}
-NOISE, WIDTH = 0.003, 1.2
+# Of the image; and how much of the scene lies beyond its border, pixels.
+NOISE, WIDTH, BORDER = 0.003, 1.2, 16
 
 
 def make_image(height: int, width: int) -> np.ndarray:
-    """Scene with a blur of turbulence and some noise."""
-    side = max(height, width)
-    scene = SCENES["camera"](side, side)[:height, :width]
+    """Part of a larger scene with a blur of turbulence, and some noise."""
+    side = max(height, width) + 2 * BORDER
+    scene = SCENES["camera"](side, side)[: height + 2 * BORDER, : width + 2 * BORDER]
     blurred = fft.irfft2(fft.rfft2(scene) * blur_otf(scene.shape, WIDTH, KOLMOGOROV), s=scene.shape)
-    return (blurred + np.random.default_rng(0).normal(0, NOISE, scene.shape)).astype(np.float32)
+    seen = blurred[BORDER : BORDER + height, BORDER : BORDER + width]
+    return (seen + np.random.default_rng(0).normal(0, NOISE, seen.shape)).astype(np.float32)
 
 
 def fastest(function: Callable[[], object], runs: int) -> float:

@@ -323,10 +323,14 @@ def _fit_scene(
     kernel = np.repeat((otf / np.float32(otf.size))[..., None], 2, axis=2)
     power = kernel * (otf[..., None] / variance)
     right = cv2.dft(kernel * gradients.spectrum, flags=cv2.DFT_INVERSE) / variance
+    scene = scene.copy()
+    # Of one update to the next γ alone changes, so this part of the residual is not computed again.
+    unexplained = right - cv2.dft(power * cv2.dft(scene), flags=cv2.DFT_INVERSE)
     for _ in range(_UPDATES):
         precision = np.reciprocal(prior)
         posterior = np.reciprocal(energy / variance + precision)
-        scene = _solve(power, precision, right, posterior, scene)
+        enough = _TOLERANCE * float(np.vdot(right, posterior * right))
+        _solve(power, precision, posterior, scene, unexplained, enough)
         prior = scene**2 + posterior
     blurred = cv2.dft(kernel * cv2.dft(scene), flags=cv2.DFT_INVERSE)
     misfit = np.square(gradients.planes - blurred).sum(dtype=np.float64) / variance
@@ -335,27 +339,30 @@ def _fit_scene(
 
 
 def _solve(
-    power: FloatArray, precision: FloatArray, right: FloatArray, preconditioner: FloatArray, start: FloatArray
-) -> FloatArray:
-    """Conjugate gradients on ``(KᵀK / λ + 1 / γ) x = Kᵀy / λ``; ``power`` is |K|² / λ in Fourier over the size."""
-    spectrum, descend = np.empty_like(start), compiled(descend_loops) or _descend
+    power: FloatArray,
+    precision: FloatArray,
+    preconditioner: FloatArray,
+    x: FloatArray,
+    unexplained: FloatArray,
+    enough: float,
+) -> None:
+    """Conjugate gradients on ``(KᵀK / λ + 1 / γ) x = Kᵀy / λ``; ``power`` is |K|² / λ in Fourier over the size.
 
-    def blurred_twice(v: FloatArray) -> FloatArray:
-        cv2.dft(v, dst=spectrum)
-        np.multiply(spectrum, power, out=spectrum)
-        return cv2.dft(spectrum, flags=cv2.DFT_INVERSE)
-
-    x = start.copy()
-    residual = right - blurred_twice(x) - precision * x
+    x and ``unexplained``, ``Kᵀ(y − Kx) / λ``, are changed.
+    """
+    spectrum, descend = np.empty_like(x), compiled(descend_loops) or _descend
+    residual = unexplained
+    residual -= precision * x
     direction = preconditioner * residual
     decrease = np.array([np.vdot(residual, direction)], np.float32)
-    enough = _TOLERANCE * np.vdot(right, preconditioner * right)
     fixed, moving = (precision.ravel(), preconditioner.ravel()), (direction.ravel(), x.ravel(), residual.ravel())
     for _ in range(_STEPS):
         if decrease[0] <= enough:
             break
-        descend(blurred_twice(direction).ravel(), *fixed, *moving, decrease)
-    return x
+        cv2.dft(direction, dst=spectrum)
+        np.multiply(spectrum, power, out=spectrum)
+        descend(cv2.dft(spectrum, flags=cv2.DFT_INVERSE).ravel(), *fixed, *moving, decrease)
+    residual += precision * x
 
 
 def _descend(

@@ -39,6 +39,7 @@ import numpy as np
 from scipy import fft
 
 from .arrays import FloatArray
+from .compiled import compiled
 from .convolution_problem import Problem
 
 # ρ.
@@ -118,8 +119,9 @@ class PrimalDual:
 
     def start(self, problem: Problem, u: FloatArray) -> PrimalDualState:
         """Start from the image ``u``, with p and q one step from 0."""
-        blurred, q, p = problem.blurred(fft.rfft2(u)), np.zeros_like(u), self.regulariser.dual(u)
-        _ascend_data(problem, q, blurred.copy(), 1, 1)
+        blurred, p = problem.blurred(fft.rfft2(u)), self.regulariser.dual(u)
+        # λ/(λ + μ) μ for μ = λ.
+        q = np.float32(problem.fidelity / 2) * problem.seen * (blurred - problem.observed)
         return PrimalDualState(u, blurred, q, p, self.regulariser.ascend(p, u, self._steps[1], 1), 1)
 
     def step(self, problem: Problem, state: PrimalDualState) -> PrimalDualState:
@@ -133,15 +135,11 @@ class PrimalDual:
         down *= np.reciprocal(np.float32(1 / tau) + np.float32(share * problem.fidelity) * problem.power)
         drop = problem.blurred(down)
         moved = fft.irfft2(down, s=u.shape, overwrite_x=True)
-        _ascend_data(problem, q, blurred - 2 * drop, share, RELAXATION)
-        drop *= np.float32(RELAXATION)
-        blurred -= drop
-        moved *= -2
-        moved += u
-        pull = self.regulariser.ascend(p, moved, s, RELAXATION)
-        moved -= u
-        moved *= np.float32(RELAXATION / 2)
-        moved += u
+        follow = compiled(follow_loops) or _follow
+        arrays = (u, moved, blurred, drop, q, problem.observed, problem.seen)
+        steps = np.array([share * problem.fidelity, 1 / (1 + share), RELAXATION], np.float32)
+        follow(*(array.ravel() for array in arrays), steps)
+        pull = self.regulariser.ascend(p, drop, s, RELAXATION)
         return PrimalDualState(moved, blurred, q, p, pull, number + 1)
 
     def penalty(self, problem: Problem, u: FloatArray) -> float:
@@ -155,13 +153,75 @@ class PrimalDual:
         return PRIMAL_STEP / norm, 1 / (PRIMAL_STEP * norm)
 
 
-def _ascend_data(problem: Problem, q: FloatArray, ahead: FloatArray, share: float, relaxation: float) -> None:
-    """Step of q where Bu is ``ahead``, in place of both; ``share`` is μ/λ."""
-    ahead -= problem.observed
-    ahead *= np.float32(share * problem.fidelity)
+def _follow(
+    u: FloatArray,
+    moved: FloatArray,
+    blurred: FloatArray,
+    drop: FloatArray,
+    q: FloatArray,
+    observed: FloatArray,
+    seen: FloatArray,
+    steps: FloatArray,
+) -> None:
+    """:func:`follow_loops` by NumPy."""
+    step, share, relaxation = steps
+    ahead = blurred - 2 * drop
+    ahead -= observed
+    ahead *= step
     ahead += q
-    ahead *= problem.seen
-    ahead *= np.float32(1 / (1 + share))
+    ahead *= seen
+    ahead *= share
     ahead -= q
-    ahead *= np.float32(relaxation)
+    ahead *= relaxation
     q += ahead
+    drop *= relaxation
+    blurred -= drop
+    np.multiply(moved, -2, out=drop)
+    drop += u
+    moved *= -relaxation
+    moved += u
+
+
+def follow_loops(
+    u: FloatArray,
+    moved: FloatArray,
+    blurred: FloatArray,
+    drop: FloatArray,
+    q: FloatArray,
+    observed: FloatArray,
+    seen: FloatArray,
+    steps: FloatArray,
+) -> None:
+    """What follows when u' is known: q, Bu, u, and 2u' − u; to be compiled.
+
+    Parameters
+    ----------
+    u : ndarray, float32, shape (n,)
+    moved : ndarray, float32, shape (n,)
+        u − u'; becomes the next u.
+    blurred, q : ndarray, float32, shape (n,)
+        Bu, and q; become the next ones.
+    drop : ndarray, float32, shape (n,)
+        B(u − u'); becomes 2u' − u.
+    observed, seen : ndarray, float32, shape (n,)
+        f and M.
+    steps : ndarray, float32, shape (3,)
+        μ, λ/(λ + μ) and ρ.
+
+    Examples
+    --------
+    >>> one = np.ones(1, np.float32)
+    >>> moved, blurred, drop, q = 0.5 * one, 4 * one, 1 * one, 2 * one
+    >>> follow_loops(3 * one, moved, blurred, drop, q, one, one, np.float32([4, 0.5, 1.5]))
+    >>> [float(array[0]) for array in (moved, blurred, drop, q)]
+    [2.25, 2.5, 2.0, 3.5]
+    """
+    step, share, relaxation = steps[0], steps[1], steps[2]
+    for pixel in range(u.size):
+        blur, fall, force, down = blurred[pixel], drop[pixel], q[pixel], moved[pixel]
+        ahead = blur - fall - fall - observed[pixel]
+        raised = (force + step * ahead) * seen[pixel] * share
+        q[pixel] = force + relaxation * (raised - force)
+        blurred[pixel] = blur - relaxation * fall
+        drop[pixel] = u[pixel] - down - down
+        moved[pixel] = u[pixel] - relaxation * down
