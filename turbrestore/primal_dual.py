@@ -192,7 +192,7 @@ def follow_loops(
     seen: FloatArray,
     steps: FloatArray,
 ) -> None:
-    """What follows when u' is known: q, Bu, u, and 2u' − u; to be compiled.
+    """Follow u' with q, Bu, u, and 2u' − u; to be compiled.
 
     Parameters
     ----------
