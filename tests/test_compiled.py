@@ -16,10 +16,14 @@ from turbrestore.nonlocal_penalty import NonlocalPenalty, add_differences, draw_
 from turbrestore.nonlocal_tv import NonlocalParams, add_sums, nonlocal_weights, search_offsets
 from turbrestore.patch_search import BAND_ROWS, PatchSearch, choose_offsets, search_bands
 from turbrestore.pixel_fusion import PixelFusion, take_in_pixels
+from turbrestore.primal_dual import _follow, follow_loops
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.warp import sample_spline, warp
 
-USERS = ("blur_estimation", "frame_noise", "nonlocal_penalty", "nonlocal_tv", "patch_search", "pixel_fusion", "warp")
+USERS = (
+    *("blur_estimation", "frame_noise", "nonlocal_penalty", "nonlocal_tv", "patch_search", "pixel_fusion", "warp"),
+    "primal_dual",
+)
 rng = np.random.default_rng(0)
 needs_compiler = pytest.mark.skipif(not compiling.can_compile(), reason="Numba is not installed: nothing to compare")
 
@@ -87,6 +91,7 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
         choose_offsets,
         descend_loops,
         draw_back,
+        follow_loops,
         mark_folds,
         sample_spline,
         take_in_pixels,
@@ -112,6 +117,17 @@ def test_folds_run_without_a_compiler_too():
     flow[:, 2:, 0] = -4
     mark_folds(flow, folded)
     assert folded.tolist() == [[True, True, False]] * 2
+
+
+def test_what_follows_an_iteration_is_alike():
+    """Both without a compiler: the loop itself, and NumPy."""
+    arrays = [*rng.normal(size=(6, 50)).astype(np.float32), rng.integers(0, 2, 50).astype(np.float32)]
+    steps = np.float32([30.0, 0.7, 1.8])
+    fast, slow = [array.copy() for array in arrays], [array.copy() for array in arrays]
+    follow_loops(*fast, steps)
+    _follow(*slow, steps)
+    for one, other in zip(fast, slow, strict=True):
+        assert one == pytest.approx(other, abs=1e-4)
 
 
 @needs_compiler

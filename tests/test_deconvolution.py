@@ -238,6 +238,19 @@ def test_stopping_rule_is_as_good_as_two_thousand_iterations(method, scene, nois
     assert exhaustive.objective[-1] < exhaustive.objective[0]
 
 
+def test_iterations_are_judged_ten_by_ten():
+    _, blurred = camera(64, 1.5, 0.002)
+    images = {n: deconvolve(blurred, 1.5, DeconvolutionParams(iterations=n, tolerance=0)).image for n in (10, 20, 25)}
+    result = deconvolve(blurred, 1.5, DeconvolutionParams(iterations=25, tolerance=0))
+    assert result.recorded.tolist() == [10, 20, 25]
+    for number, (before, after, iterations) in enumerate([(10, 20, 10), (20, 25, 5)], start=1):
+        moved = np.linalg.norm(images[after] - images[before]) / np.linalg.norm(images[after])
+        assert result.changes[number] == pytest.approx(moved / iterations, rel=0.02)
+    between = (result.changes[0] + result.changes[1]) / 2
+    stopped = deconvolve(blurred, 1.5, DeconvolutionParams(iterations=25, tolerance=between))
+    assert (stopped.iterations, stopped.converged) == (20, True)
+
+
 # --- memory and threads ----------------------------------------------------------------------------------------------
 
 
