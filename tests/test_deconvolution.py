@@ -124,32 +124,41 @@ def test_one_step_is_that_of_dense_algebra(margin, number):
         return (old + (new - old) / primal_dual.RELAXATION).ravel()
 
     share = max(1 / number, primal_dual.LEAST_DATA_STEP)
-    tau, mu = primal_dual.PRIMAL_STEP / np.sqrt(TV.norm_squared), 30.0 * share
-    metric = np.eye(64) / tau + mu * blur.T @ blur
+    tau, t = primal_dual.PRIMAL_STEP / np.sqrt(TV.norm_squared), 30.0 * share
+    metric = np.eye(64) / tau + t * blur.T @ blur
     expected = u.ravel() - np.linalg.solve(metric, gradient.T @ p.ravel() + blur.T @ q.ravel())
     assert unrelaxed(after.image, u) == pytest.approx(expected, abs=1e-5)
     assert after.blurred.ravel() == pytest.approx(blur @ after.image.ravel(), abs=1e-5)
-    # Moreau: the proximal step of μh* is what the one of h/μ, a weighted mean of pixels, leaves.
-    ahead, seen, f = q.ravel() + mu * blur @ (2 * expected - u.ravel()), problem.seen.ravel(), problem.observed.ravel()
-    nearest = (30.0 * seen * f + ahead) / (30.0 * seen + mu)
-    assert unrelaxed(after.pressure, q) == pytest.approx(ahead - mu * nearest, abs=2e-4)
+    # Moreau: the proximal step of th* is what the one of h/t, a weighted mean of pixels, leaves.
+    ahead, seen, f = q.ravel() + t * blur @ (2 * expected - u.ravel()), problem.seen.ravel(), problem.observed.ravel()
+    nearest = (30.0 * seen * f + ahead) / (30.0 * seen + t)
+    assert unrelaxed(after.pressure, q) == pytest.approx(ahead - t * nearest, abs=2e-4)
     ascent = (p.ravel() + gradient @ (2 * expected - u.ravel()) / (tau * TV.norm_squared)).reshape(2, 8, 8)
     assert unrelaxed(after.dual, p) == pytest.approx(TV.project(ascent.astype(np.float32)).ravel(), abs=1e-4)
     assert after.pull == pytest.approx(TV.adjoint(after.dual), abs=1e-5)
     assert after.number == number + 1
 
 
+def test_the_start_is_that_of_dense_algebra():
+    problem, u = small_problem(4, 30.0, margin=2), np.random.default_rng(5).random((8, 8)).astype(np.float32)
+    start, blurred = PrimalDual(TV).start(problem, u), dense_blur(problem) @ u.ravel()
+    s = 1 / (primal_dual.PRIMAL_STEP * np.sqrt(TV.norm_squared))
+    assert start.blurred.ravel() == pytest.approx(blurred, abs=1e-5)
+    assert start.pressure == pytest.approx(30.0 * problem.seen * (start.blurred - problem.observed), abs=1e-4)
+    assert start.dual == pytest.approx(TV.project(s * TV.gradient(u)), abs=1e-5)
+    assert start.pull == pytest.approx(TV.adjoint(start.dual), abs=1e-5)
+
+
 def test_where_all_is_seen_the_first_step_solves_the_data_term_exactly():
     problem = small_problem(4, 30.0, margin=0)
     start = PrimalDual(TV).start(problem, np.random.default_rng(5).random((8, 8)).astype(np.float32))
-    pull, blur = TV.adjoint(start.dual), dense_blur(problem)
-    exact = start._replace(pressure=30.0 * (start.blurred - problem.observed))
+    pull, blur = start.pull.copy(), dense_blur(problem)
     tau = primal_dual.PRIMAL_STEP / np.sqrt(TV.norm_squared)
     target = (start.image - tau * pull).ravel()
     # Least squares: ‖(v − target)/√τ‖² + ‖√λ(Bv − f)‖².
     system = np.concatenate([np.eye(64) / np.sqrt(tau), np.sqrt(30.0) * blur])
     right = np.concatenate([target / np.sqrt(tau), np.sqrt(30.0) * problem.observed.ravel()])
-    found = PrimalDual(TV).step(problem, exact).image
+    found = PrimalDual(TV).step(problem, start).image
     relaxed = start.image + (found - start.image) / primal_dual.RELAXATION
     assert relaxed.ravel() == pytest.approx(np.linalg.lstsq(system, right, rcond=None)[0], abs=1e-5)
 

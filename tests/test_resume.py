@@ -211,6 +211,14 @@ def test_another_version_starts_again(ended, monkeypatch, capsys):
     assert "versions.numpy was" in capsys.readouterr().err
 
 
+def test_a_version_with_other_results_starts_again(ended, monkeypatch, capsys):
+    called = spy(monkeypatch)
+    monkeypatch.setattr("turbrestore.resumption._RESULTS", 1000)
+    assert main([*WORDS, "--resume", "--overwrite"]) == 0
+    assert called == list(STAGES)
+    assert "results was" in capsys.readouterr().err
+
+
 def test_a_changed_input_starts_again_and_a_touched_one_does_not(ended, monkeypatch, capsys):
     called = spy(monkeypatch)
     os.utime("clip.mkv", (1, 1))

@@ -65,7 +65,7 @@ _WIDTHS = np.array([0.35, 0.45, 0.55, 0.65, 0.8, 0.95, 1.1, 1.3, 1.55, 1.85, 2.2
 # A blur of this many pixels of the reduced image is resolved in it.
 _RESOLVED = 0.6
 # By how much a blurred scene must be likelier than a sharp one, in units of L; and by how much where the blur found is
-# no wider than photographs are soft, pixels.
+# no wider than photographs are soft, pixels, or where the image itself is to be preferred.
 _EVIDENCE, _STRONG_EVIDENCE = 0.08, 0.2
 _SOFT = 0.8
 # Of the smallest width, pixels.
@@ -75,7 +75,7 @@ _PART, _TAPER = 128, 8
 # n is this many times the noise, and this share of the contrast.
 _NOISE_FACTOR, _MISFIT = 1.5, 0.025
 _LEAST_NOISE = 1e-4
-# A reduced image has to be surer than the image itself by this factor.
+# A reduced image has to be surer than the image itself by this factor, if that has strong evidence.
 _PREFERENCE = 0.8
 # Exponent of the preference for stronger reduction.
 _LARGER_REDUCTION = 0.15
@@ -324,7 +324,7 @@ def _fit_scene(
     power = kernel * (otf[..., None] / variance)
     right = cv2.dft(kernel * gradients.spectrum, flags=cv2.DFT_INVERSE) / variance
     scene = scene.copy()
-    # Of one update to the next γ alone changes, so this part of the residual is not computed again.
+    # From one update to the next only γ changes, so this part of the residual is not computed again.
     unexplained = right - cv2.dft(power * cv2.dft(scene), flags=cv2.DFT_INVERSE)
     for _ in range(_UPDATES):
         precision = np.reciprocal(prior)

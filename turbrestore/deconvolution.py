@@ -99,8 +99,9 @@ class DeconvolutionParams:
     iterations : int
         Largest number of iterations.
     tolerance : float
-        Stop when an iteration changes the image by less than this, relative to its norm; of nltv and tv, whose images
-        swing about the one that they approach, ten iterations by less than ten times this.
+        Stop when an iteration changes the image by less than this, relative to its norm.  Of nltv and tv, whose images
+        swing about the one that they approach, ten iterations are judged together: they change it by less than ten
+        times this.
     boundary : {"unknown", "periodic"}
         What lies beyond the border: pixels to be found, or the image itself.
     channels : {"luminance", "each"}
@@ -116,7 +117,7 @@ class DeconvolutionParams:
     memory : DeconvolutionMemory, optional
         Most that nltv may take, such as 500MB; it has no effect on a device.  Where that is too little for the nonlocal
         pairs and what is known of them, they are kept in a file and worked on in strips of rows, and then by fewer
-        threads, to the same result.  What remains is taken whatever is asked for: 120 bytes per pixel and channel, some
+        threads, to the same result.  What remains is taken whatever is asked for: 132 bytes per pixel and channel, some
         60 MB, and what grows with ``weights``, see :mod:`turbrestore.deconvolution_memory`.  By default there is no
         limit.
     """
@@ -125,7 +126,7 @@ class DeconvolutionParams:
     sigma: float | None = None
     exponent: float | None = None
     fidelity: float | None = None
-    iterations: int = 200
+    iterations: int = 300
     tolerance: float = 1.5e-4
     boundary: Literal["unknown", "periodic"] = "unknown"
     channels: Literal["luminance", "each"] = "luminance"
@@ -288,8 +289,9 @@ def deconvolve(
     widths = margin_widths(planes[0].shape, margin if params.boundary == "unknown" else None)
     shape = tuple(size + sum(width) for size, width in zip(planes[0].shape, widths, strict=True))
     otf = blur_otf(shape, sigma, params.exponent or GAUSSIAN) if psf is None else psf_to_otf(psf, shape)
-    seen = np.pad(np.ones_like(planes[0]), widths)
-    problems = [Problem(np.pad(plane, widths, mode="symmetric"), seen, otf, fidelity) for plane in planes]
+    seen = np.pad(np.ones(planes[0].shape, np.float32), widths)
+    padded = [np.ascontiguousarray(np.pad(plane, widths, mode="symmetric")) for plane in planes]
+    problems = [Problem(plane, seen, otf, fidelity) for plane in padded]
     result = _solve(problems, params, padded_guide(guide, planes[0].shape, widths), progress, scratch)
     inside = tuple(slice(before, before + size) for (before, _), size in zip(widths, planes[0].shape, strict=True))
     restored = join_planes(pixels, [u[inside] for u in result.images], params.channels)
@@ -415,6 +417,7 @@ def _iterate(
     """Step all channels side by side until none changes any more."""
     records: list[tuple[int, float, float]] = []
     before, images, begun = [], [state.image for state in states], 0
+    change, converged = np.inf, False
     for iteration in range(1, params.iterations + 1):
         if (iteration - 1) % solver.window == 0:
             before, begun = images, iteration - 1

@@ -4,7 +4,7 @@ Bytes, for c channels of H × W pixels, each joined to b others of its n neighbo
 found and while the image is iterated, of which the larger counts::
 
     work + H W · (60 + 20 c + 8 pairs) + 60 · 64 W · b + t · 4 · tile · n
-    work + H W · (120 c + (8 + 8 c) pairs) + t · 26 · strip · b
+    work + H W · (132 c + (8 + 8 c) pairs) + t · 26 · strip · b
 
 64 W pixels are the band whose choices become pairs at a time; of a tile a thread has the distances to all neighbours,
 and of a strip the edges; with Numba it needs less.  A pixel has 0.65 b pairs.  They may be kept in a file: their terms
@@ -19,7 +19,7 @@ from .nonlocal_tv import STRIP_PIXELS, NonlocalParams
 from .patch_search import BAND_ROWS, tile_columns
 
 # Of the process; of every pixel while weights are found, once and for a channel; of every channel in an iteration.
-_WORK, _FOUND, _FOUND_CHANNEL, _ITERATED = 2e7, 60.0, 20.0, 120.0
+_WORK, _FOUND, _FOUND_CHANNEL, _ITERATED = 2e7, 60.0, 20.0, 132.0
 # Of a pair: its head and weight, and its dual in every channel.
 _PAIR, _DUAL = 8.0, 8.0
 # Of every choice of a band, and of every choice of a strip for each thread.

@@ -4,26 +4,26 @@ Symbols as in :mod:`turbrestore.deconvolution`, and
 
 K : gradient of the penalty; p : dual variable on its edges.
 q : dual variable of the data, on the pixels, λM(Bu − f) in the end.
-τ, s, μ : steps of u, p and q; ρ : over-relaxation.
+τ, s, t : steps of u, p and q; ρ : over-relaxation.
 
 With ``h(z) = λ/2 ‖M(z − f)‖²`` the problem is the saddle point ``min_u max_{p,q} ⟨Ku, p⟩ + ⟨Bu, q⟩ − h*(q)`` over
-|p|(x) ≤ 1.  Primal-dual splitting (Chambolle and Pock 2011) in the metric P = I/τ + μBᵀB:
+|p|(x) ≤ 1.  Primal-dual splitting (Chambolle and Pock 2011) in the metric P = I/τ + tBᵀB:
 
     u' = u − P⁻¹(Kᵀp + Bᵀq)
     p' = projection of p + sK(2u' − u) on |p|(x) ≤ 1
-    q' = λ/(λ + μ) M [q + μ(B(2u' − u) − f)],  the proximal step of μh*
+    q' = λ/(λ + t) M [q + t(B(2u' − u) − f)],  the proximal step of th*
     (u, p, q) ← (u, p, q) + ρ(u' − u, p' − p, q' − q)
 
-P is diagonal in Fourier.  It converges for sτ‖K‖² ≤ 1 and 0 < ρ < 2, whatever μ is: with steps s and μ for the dual
-variables, the preconditioner of the splitting is positive semidefinite if ``P − sKᵀK − μBᵀB = I/τ − sKᵀK`` is.
+P is diagonal in Fourier.  It converges for sτ‖K‖² ≤ 1 and 0 < ρ < 2, whatever t is: with steps s and t for the dual
+variables, the preconditioner of the splitting is positive semidefinite if ``P − sKᵀK − tBᵀB = I/τ − sKᵀK`` is.
 
-With μ = λ and M = 1, q is λ(Bu − f) from the first step on, and the first line the proximal step of the data term.  A
-margin that nobody saw asks for a smaller μ: there q = 0, and P holds back what u may change by μBᵀB all the same, so
-that what lies in the margin, and what crosses the border, is found slowly.  So μ is λ/k in iteration k, and λ/50 from
+With t = λ and M = 1, q stays λ(Bu − f) if it starts there, and the first line is the proximal step of the data term.  A
+margin that nobody saw asks for a smaller t: there q = 0, and P holds back what u may change by tBᵀB all the same, so
+that what lies in the margin, and what crosses the border, is found slowly.  So t is λ/k in iteration k, and λ/50 from
 the fiftieth on, for which the splitting converges as from any other start.
 
-The start is the Wiener solution by conjugate gradients, which has a good margin already, and the p and q that one step
-from 0 gives there.
+The start is the Wiener solution by conjugate gradients, which has a good margin already, with q = λM(Bu − f) and the p
+that one step from 0 gives.
 
 An iteration transforms four times: Bu follows u without transforms of its own, since what u moves by is found in
 Fourier.
@@ -46,9 +46,9 @@ from .convolution_problem import Problem
 RELAXATION = 1.8
 # τ‖K‖: small primal steps suit images in [0, 1] with fidelities from 300 to 30000.
 PRIMAL_STEP = 0.08
-# μ/λ falls with the number of iterations to this.
+# t/λ falls with the number of iterations to this.
 LEAST_DATA_STEP = 0.02
-# Iterations that are judged together: over as many, what swings cancels and what drifts does not.
+# Iterations that are judged together: over as many, most of what swings cancels, and what drifts does not.
 WINDOW = 10
 
 
@@ -118,10 +118,9 @@ class PrimalDual:
     window: ClassVar[int] = WINDOW
 
     def start(self, problem: Problem, u: FloatArray) -> PrimalDualState:
-        """Start from the image ``u``, with p and q one step from 0."""
+        """Start from the image ``u``, with the q that it asks for and p one step from 0."""
         blurred, p = problem.blurred(fft.rfft2(u)), self.regulariser.dual(u)
-        # λ/(λ + μ) μ for μ = λ.
-        q = np.float32(problem.fidelity / 2) * problem.seen * (blurred - problem.observed)
+        q = np.float32(problem.fidelity) * problem.seen * (blurred - problem.observed)
         return PrimalDualState(u, blurred, q, p, self.regulariser.ascend(p, u, self._steps[1], 1), 1)
 
     def step(self, problem: Problem, state: PrimalDualState) -> PrimalDualState:
@@ -136,9 +135,9 @@ class PrimalDual:
         drop = problem.blurred(down)
         moved = fft.irfft2(down, s=u.shape, overwrite_x=True)
         follow = compiled(follow_loops) or _follow
-        arrays = (u, moved, blurred, drop, q, problem.observed, problem.seen)
         steps = np.array([share * problem.fidelity, 1 / (1 + share), RELAXATION], np.float32)
-        follow(*(array.ravel() for array in arrays), steps)
+        changed = moved.ravel(), blurred.ravel(), drop.ravel(), q.ravel()
+        follow(u.ravel(), *changed, problem.observed.ravel(), problem.seen.ravel(), steps)
         pull = self.regulariser.ascend(p, drop, s, RELAXATION)
         return PrimalDualState(moved, blurred, q, p, pull, number + 1)
 
@@ -164,13 +163,13 @@ def _follow(
     steps: FloatArray,
 ) -> None:
     """:func:`follow_loops` by NumPy."""
-    step, share, relaxation = steps
+    step, shrink, relaxation = steps
     ahead = blurred - 2 * drop
     ahead -= observed
     ahead *= step
     ahead += q
     ahead *= seen
-    ahead *= share
+    ahead *= shrink
     ahead -= q
     ahead *= relaxation
     q += ahead
@@ -206,7 +205,7 @@ def follow_loops(
     observed, seen : ndarray, float32, shape (n,)
         f and M.
     steps : ndarray, float32, shape (3,)
-        μ, λ/(λ + μ) and ρ.
+        t, λ/(λ + t) and ρ.
 
     Examples
     --------
@@ -216,11 +215,11 @@ def follow_loops(
     >>> [float(array[0]) for array in (moved, blurred, drop, q)]
     [2.25, 2.5, 2.0, 3.5]
     """
-    step, share, relaxation = steps[0], steps[1], steps[2]
+    step, shrink, relaxation = steps[0], steps[1], steps[2]
     for pixel in range(u.size):
         blur, fall, force, down = blurred[pixel], drop[pixel], q[pixel], moved[pixel]
         ahead = blur - fall - fall - observed[pixel]
-        raised = (force + step * ahead) * seen[pixel] * share
+        raised = (force + step * ahead) * seen[pixel] * shrink
         q[pixel] = force + relaxation * (raised - force)
         blurred[pixel] = blur - relaxation * fall
         drop[pixel] = u[pixel] - down - down

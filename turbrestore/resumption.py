@@ -61,6 +61,8 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 SCHEMA = 1
+# Raised where the same frames and settings begin to give another image.
+_RESULTS = 1
 STAGES_RECORD, CHECKPOINT, MEAN = "stages.json", "checkpoint.npz", "mean.npy"
 FILES = {
     "centroid": ("centroid.npz",),
@@ -354,6 +356,7 @@ def stage_facts(source: FrameSource, params: RestoreParams) -> dict[str, dict[st
             "flow": flow,
             "centroid": settings["centroid"],
             "versions": versions(),
+            "results": _RESULTS,
         },
         "dynamics": {name: settings[name] for name in ("dynamics", "displacement_cue")},
         "filtered": {"frames": _span(source.numbers), **{name: settings[name] for name in ("keep_best", "filter")}},

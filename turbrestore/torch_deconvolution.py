@@ -44,7 +44,7 @@ class SolverSettings:
     tolerance : float
         Relative change in an iteration below which they stop.
     record_every : int
-        Iterations from one record of the energy to the next.
+        Iterations from one record of the energy to the next, a multiple of those that are judged together.
     start_steps, start_tolerance
         The same of the Wiener solution that nltv and tv start from.
     sharpen_guide : bool
@@ -192,6 +192,7 @@ def _iterate(
 ) -> DeviceSolution:
     records: list[tuple[int, float, float]] = []
     before, images, begun = [], [state.image for state in states], 0
+    change, converged = np.inf, False
     for iteration in range(1, settings.iterations + 1):
         if (iteration - 1) % solver.window == 0:
             before, begun = images, iteration - 1
@@ -221,7 +222,7 @@ class _PrimalDual:
     def start(self, problem: _Problem, u: Tensor) -> _DualState:
         blurred = problem.blurred(_forward(u))
         p = self.regulariser.project(self.regulariser.gradient(u) * self._steps[1])
-        return _DualState(u, blurred, _raised(problem, blurred * 0, blurred, 1), p, 1)
+        return _DualState(u, blurred, problem.fidelity * problem.seen * (blurred - problem.observed), p, 1)
 
     def step(self, problem: _Problem, state: _DualState) -> _DualState:
         tau, s = self._steps
@@ -245,7 +246,7 @@ class _PrimalDual:
 
 
 def _raised(problem: _Problem, q: Tensor, ahead: Tensor, share: float) -> Tensor:
-    """Step of q where Bu is ``ahead``; ``share`` is μ/λ."""
+    """Step of q where Bu is ``ahead``; ``share`` is t/λ."""
     return problem.seen * (q + share * problem.fidelity * (ahead - problem.observed)) / (1 + share)
 
 
