@@ -228,20 +228,28 @@ def test_where_half_of_the_scene_moves_the_other_stays(motion):
         assert np.abs(flows[0, :, :12]).max() < 0.05
 
 
-@pytest.mark.parametrize(("refinements", "half"), [(8, 4), (5, 3), (1, 1), (0, 0)])
-def test_a_flow_with_a_start_is_refined_half_as_often(refinements, half):
+@pytest.mark.parametrize(("refinements", "half", "level"), [(8, 4, 0), (8, 4, 1), (5, 3, 0), (1, 1, 1), (0, 0, 0)])
+def test_a_flow_with_a_start_begins_at_its_level_and_is_refined_half_as_often(refinements, half, level):
     image, params = texture(size=64), FlowParams(confidence=False, dis=DisParams(refinements=refinements))
-    frame, start = np.roll(image, 1, axis=1), np.full((1, 64, 64, 2), (1, 0), np.float32)
+    frame, start = np.roll(image, 2, axis=1), np.full((1, 64, 64, 2), (1, 0), np.float32)
     found = start.copy()
-    fill_flows(refer_flow(image, params), frame[None], found, again=True)
+    fill_flows(refer_flow(image, params, level), frame[None], found, again=True)
     solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    solver.setCoarsestScale(0)
+    solver.setCoarsestScale(level)
     solver.setFinestScale(0)
     solver.setPatchStride(params.dis.patch_stride)
     solver.setVariationalRefinementIterations(half)
     solver.setVariationalRefinementAlpha(params.dis.smoothness)
     levels = [refer_flow(image, params).prepare(one).levels for one in (image, frame)]
     assert np.array_equal(found[0], solver.calc(*levels, start[0].copy()))
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (17, 40)])
+def test_a_start_in_the_smallest_images(shape):
+    image = texture(size=64)[: shape[0], : shape[1]]
+    flows = np.zeros((1, *shape, 2), np.float32)
+    fill_flows(refer_flow(image, start_level=1), image[None], flows, again=True)
+    assert np.abs(flows).max() < 0.1
 
 
 @pytest.mark.parametrize("size", [(8, 8), (15, 64)])
@@ -278,8 +286,8 @@ def test_a_restoration_measures_no_flow_twice(monkeypatch, train):
     """The flows of the last pass of the centroid serve the identification and the first pass of the filter."""
     solved, dis = [], FLOW_METHODS["dis"]
 
-    def counting(params, reference):
-        solve = dis(params, reference)
+    def counting(params, reference, start_level):
+        solve = dis(params, reference, start_level)
 
         def counted(frames, starts):
             solved.extend(frame.tobytes() + reference.tobytes() for frame in frames)

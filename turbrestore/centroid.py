@@ -179,7 +179,9 @@ def find_centroid(
         prepared = {}
     sizes: list[float] = []
     while True:
-        fill_flows(refer_flow(image, flow_params), stack, flows, prepared, progress, again=bool(sizes))
+        # The first image is a blurred mean, so what was measured from it needs a coarser level to be mended.
+        reference = refer_flow(image, flow_params, start_level=1)
+        fill_flows(reference, stack, flows, prepared, progress, again=bool(sizes))
         mean_flow = mean_of(flows)
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
         change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0

@@ -16,7 +16,8 @@ shifted frame the reference stands in, so that what nobody saw moves with the sh
 
 A flow may start from an earlier one of the same frame: dense inverse search then leaves out the coarse levels of its
 pyramid, whose only use is to find a start, and half of its refinements, for what it starts from is smooth; it takes two
-thirds of the time.  The shift is that of the start, if the frame moved as one.  The other methods begin anew.
+thirds of the time.  Where the start was measured from an image much less sharp, the level above the finest has to mend
+it first (``start_level``).  The shift is that of the start, if the frame moved as one.  The other methods begin anew.
 
 Where the texture of the reference tells little of the motion, the flow is drawn towards its neighbourhood
 (:mod:`turbrestore.confidence`); flat regions move as what surrounds them.
@@ -381,7 +382,7 @@ def iterate_flows(
         yield from zip(batch, flows, strict=True)
 
 
-def refer_flow(reference: ArrayLike, params: FlowParams | None = None) -> FlowReference:
+def refer_flow(reference: ArrayLike, params: FlowParams | None = None, start_level: int = 0) -> FlowReference:
     """Prepare the image that flows start from.
 
     Parameters
@@ -389,6 +390,8 @@ def refer_flow(reference: ArrayLike, params: FlowParams | None = None) -> FlowRe
     reference : array_like, shape (H, W) or (H, W, 3)
     params : FlowParams, optional
         Method and settings.
+    start_level : int
+        Level of the pyramid, counted from the finest that is used, at which flows that have a start begin.
 
     Returns
     -------
@@ -417,7 +420,7 @@ def refer_flow(reference: ArrayLike, params: FlowParams | None = None) -> FlowRe
     prepared = _levels(target, params)
     position = refer_shift(target) if params.global_shift else None
     confidence = flow_confidence(target) if params.confidence else None
-    solver = FLOW_METHODS[params.method](params, prepared)
+    solver = FLOW_METHODS[params.method](params, prepared, start_level)
 
     def prepare(image: FloatArray) -> FlowFrame:
         return FlowFrame(image, _levels(image, params), estimate_noise(image) if confidence is not None else 0.0)
@@ -519,7 +522,7 @@ def _shifted(frame: GreyBytes, shift: FloatArray, outside: GreyBytes) -> GreyByt
     return result
 
 
-def _dis(params: FlowParams, reference: GreyBytes) -> Solver:
+def _dis(params: FlowParams, reference: GreyBytes, start_level: int) -> Solver:
     def solve(frame: GreyBytes, start: FloatArray | None) -> FloatArray:
         # A solver object keeps buffers that must not be shared between threads, and is cheap beside a flow.
         solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -528,7 +531,7 @@ def _dis(params: FlowParams, reference: GreyBytes) -> Solver:
         if start is not None:
             # Images made of such flows differ by hundredths of a dB from those of all refinements.
             refinements -= refinements // 2
-            solver.setCoarsestScale(params.dis.finest_scale)
+            solver.setCoarsestScale(params.dis.finest_scale + start_level)
         solver.setPatchSize(params.dis.patch_size)
         solver.setPatchStride(params.dis.patch_stride)
         solver.setVariationalRefinementIterations(refinements)
@@ -538,7 +541,7 @@ def _dis(params: FlowParams, reference: GreyBytes) -> Solver:
     return _one_by_one(solve)
 
 
-def _tvl1(params: FlowParams, reference: GreyBytes) -> Solver:
+def _tvl1(params: FlowParams, reference: GreyBytes, _start_level: int) -> Solver:
     device = find_device(params.device or PROCESSOR)
 
     def solve(frames: GreyBytes, _: list[FloatArray | None]) -> FloatArray:
@@ -550,7 +553,7 @@ def _tvl1(params: FlowParams, reference: GreyBytes) -> Solver:
     return solve
 
 
-def _farneback(params: FlowParams, reference: GreyBytes) -> Solver:
+def _farneback(params: FlowParams, reference: GreyBytes, _start_level: int) -> Solver:
     settings = params.farneback
     spread = {5: 1.1, 7: 1.5}[settings.neighbourhood]
 
@@ -575,7 +578,7 @@ def _one_by_one(solve: FrameSolver) -> Solver:
     return lambda frames, starts: np.stack([solve(*pair) for pair in zip(frames, starts, strict=True)])
 
 
-FLOW_METHODS: dict[str, Callable[[FlowParams, GreyBytes], Solver]] = {
+FLOW_METHODS: dict[str, Callable[[FlowParams, GreyBytes, int], Solver]] = {
     "dis": _dis,
     "tvl1": _tvl1,
     "farneback": _farneback,
