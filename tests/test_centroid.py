@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from conftest import natural_scene
+from turbrestore import centroid
 from turbrestore.centroid import CentroidParams, find_centroid, mean_registered
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.flow import FlowParams
@@ -137,3 +138,16 @@ def test_bad_input_is_refused(sequence):
     for bad in ({"mode": "median"}, {"iterations": 0}, {"tolerance": -1.0}, {"start": -1}):
         with pytest.raises(ConfigurationError, match=f"^{next(iter(bad))}: expected"):
             CentroidParams(**bad)
+
+
+def test_starts_from_a_blurred_mean_are_mended_a_level_above_the_finest(monkeypatch):
+    levels, refer = [], centroid.refer_flow
+
+    def spied(image, params, start_level=0):
+        levels.append(start_level)
+        return refer(image, params, start_level)
+
+    monkeypatch.setattr(centroid, "refer_flow", spied)
+    frames = np.random.default_rng(0).random((3, 32, 32)).astype(np.float32)
+    centroid.find_centroid(frames, centroid.CentroidParams(iterations=2))
+    assert set(levels) == {1}
