@@ -34,7 +34,8 @@ from .compiled import compiled
 from .edge_strips import EdgeStrip, sum_strips
 from .errors import DataError, require
 from .parallel import available_cores, one_thread_each
-from .patch_search import BAND_ROWS, OUTSIDE, Keys, PatchSearch, search_bands
+from .patch_pairs import pairs_of_band
+from .patch_search import BAND_ROWS, PatchSearch, search_bands
 from .psf import estimate_noise
 from .scratch import new_stack, release
 
@@ -375,52 +376,18 @@ def _strips(
     bands = search_bands(grey, search, threads)
     top, keys = next(bands)
     for following, below in chain(bands, [(grey.shape[0], keys[:0])]):
-        tails, heads, distances = _pairs(keys, below, grey.shape[1], search)
-        stack = np.asarray(new_stack((2, len(tails)), folder))
+        degrees, heads, distances = pairs_of_band(keys, below, grey.shape[1], search)
+        stack = np.asarray(new_stack((2, len(heads)), folder))
         np.exp(-distances / np.float32(h**2), out=stack[0])
         np.sqrt(np.maximum(stack[0], np.float32(SMALLEST_WEIGHT)), out=stack[0])
         stack[1].view(np.int32)[:] = heads
-        yield from _cut(tails, stack, (top, following), grey.shape, search.reach)
+        yield from _cut(degrees, stack, (top, following), grey.shape, search.reach)
         release(stack)
         top, keys = following, below
 
 
-def _pairs(
-    keys: Keys, below: Keys, width: int, search: PatchSearch
-) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """Tail, head and distance of the pairs whose tails are in a band, by tail and head.
-
-    Pixels count from the first of the band.  A pixel chooses some of its pairs as their tail and others as their head,
-    so the choices of the rows below are needed too.
-    """
-    offsets = search.offsets.astype(np.int64)
-    forward = (offsets[:, 0] > 0) | ((offsets[:, 0] == 0) & (offsets[:, 1] > 0))
-    steps = offsets[:, 0] * width + offsets[:, 1]
-    order = np.lexsort((offsets[forward][:, 1], offsets[forward][:, 0]))
-    halves = offsets[forward][order]
-    place = {(int(dy), int(dx)): number for number, (dy, dx) in enumerate(halves)}
-    half = np.array([place[max((dy, dx), (-dy, -dx))] for dy, dx in offsets.tolist()])
-    # Number of the pair among all of the band, less that of the first pair of the pixel that chose it.
-    ahead = np.where(forward, 0, steps) * len(halves) + half
-    own, mask, bits = len(keys), search.rank_mask, np.uint64(31)
-    found = []
-    for first, part in ((0, keys), (own, below[: search.reach * width])):
-        numbers = ahead[part & mask]
-        numbers += (np.arange(first, first + len(part)) * len(halves))[:, None]
-        useful = (part < OUTSIDE) & (numbers >= 0) & (numbers < own * len(halves))
-        found.append((numbers[useful].view(np.uint64) << bits) | part[useful].view(np.uint32))
-    # Runs are sorted already, which this kind of sort makes use of.
-    codes = np.sort(np.concatenate(found), kind="stable")
-    pairs = (codes >> bits).view(np.int64)
-    kept = np.ones(len(pairs), bool)
-    np.not_equal(pairs[1:], pairs[:-1], out=kept[1:])
-    tails, numbers = np.divmod(pairs[kept], len(halves))
-    distances = (codes[kept] & np.uint64(np.iinfo(np.int32).max - mask)).astype(np.int32).view(np.float32)
-    return tails, tails + (halves[:, 0] * width + halves[:, 1])[numbers], distances
-
-
 def _cut(
-    tails: NDArray[np.int64], stack: FloatArray, rows: tuple[int, int], shape: tuple[int, int], reach: int
+    degrees: NDArray[np.intp], stack: FloatArray, rows: tuple[int, int], shape: tuple[int, int], reach: int
 ) -> Iterator[EdgeStrip]:
     """Cut a band into strips; ``stack`` holds √w of its pairs and, as integers, their heads from its first pixel on."""
     (top, stop), (height, width) = rows, shape
@@ -428,13 +395,14 @@ def _cut(
     count = -(-(stop - top) // max(4, min(BAND_ROWS, STRIP_PIXELS // width)))
     step = -(-(stop - top) // count)
     heads, order = stack[1].view(np.int32), np.arange(stack.shape[1] + 1, dtype=np.int32)
+    end = 0
     for row in range(top, stop, step):
         first, own = (row - top) * width, (min(row + step, stop) - row) * width
-        part = slice(*np.searchsorted(tails, (first, first + own)))
+        of_tails = degrees[first : first + own]
+        part = slice(end, end := end + int(of_tails.sum()))
         heads[part] -= np.int32(first)
         window = min(own + reach * (width + 1), (height - row) * width)
-        degrees = np.bincount(tails[part] - first, minlength=own).astype(np.intp)
-        yield EdgeStrip(row * width, window, degrees, heads[part], stack[0, part], order)
+        yield EdgeStrip(row * width, window, of_tails, heads[part], stack[0, part], order)
 
 
 def _norm_squared_bound(strips: tuple[EdgeStrip, ...], pixels: int, threads: int, iterations: int = 10) -> float:
