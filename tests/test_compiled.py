@@ -14,6 +14,7 @@ from turbrestore.frame_noise import _folded, judge_frame, mark_folds, measure_fr
 from turbrestore.kalman import PixelGaussian
 from turbrestore.nonlocal_penalty import NonlocalPenalty, add_differences, draw_back
 from turbrestore.nonlocal_tv import NonlocalParams, add_sums, nonlocal_weights, search_offsets
+from turbrestore.patch_pairs import pairs_of_band
 from turbrestore.patch_search import BAND_ROWS, PatchSearch, choose_offsets, search_bands
 from turbrestore.pixel_fusion import PixelFusion, take_in_pixels
 from turbrestore.primal_dual import _follow, follow_loops
@@ -22,7 +23,7 @@ from turbrestore.warp import sample_spline, warp
 
 USERS = (
     *("blur_estimation", "frame_noise", "nonlocal_penalty", "nonlocal_tv", "patch_search", "pixel_fusion", "warp"),
-    "primal_dual",
+    *("patch_pairs", "primal_dual"),
 )
 rng = np.random.default_rng(0)
 needs_compiler = pytest.mark.skipif(not compiling.can_compile(), reason="Numba is not installed: nothing to compare")
@@ -187,6 +188,23 @@ def test_offsets_are_chosen_alike(plain, shape, chosen):
     # Which they are, but where two are about as far.
     same = (np.sort(fast & mask, axis=1) == np.sort(slow & mask, axis=1)).all(axis=1)
     assert same.mean() > 0.98
+
+
+@needs_compiler
+@pytest.mark.parametrize("shape", [(1, 9), (5, 1), (4, 9), (9, 9), (30, 41)])
+@pytest.mark.parametrize("chosen", [(4, 6), (0, 1), (8, 0), (0, 20)])
+def test_pairs_are_joined_alike(plain, shape, chosen):
+    """In a band that is the image, in one with rows below it, and where equal patches make pairs chosen twice."""
+    search = PatchSearch(np.ones((1, 1), np.float32), search_offsets(7), *chosen)
+    for guide in (rng.random(shape, np.float32), np.zeros(shape, np.float32)):
+        [(_, keys)] = search_bands(guide, search)
+        for rows in {shape[0], max(shape[0] // 2, 1), 1}:
+            band = keys[: rows * shape[1]], keys[rows * shape[1] :]
+            fast, slow = both(plain, lambda band=band: pairs_of_band(*band, shape[1], search))
+            assert len(fast.heads) == fast.degrees.sum()
+            for one, other in zip(fast, slow, strict=True):
+                assert one.dtype == other.dtype
+                assert np.array_equal(one, other)
 
 
 @needs_compiler

@@ -97,14 +97,15 @@ def _join(keys: Keys, below: Keys, steps: Codes, ranks: tuple[Codes, Codes, int]
         numbers = ahead[part & mask]
         numbers += (np.arange(first, first + len(part)) * len(steps))[:, None]
         useful = (part < OUTSIDE) & (numbers >= 0) & (numbers < own * len(steps))
-        codes.append((numbers[useful] << _BITS) | part[useful])
+        # Many offsets of a wide image need every bit.
+        codes.append((numbers[useful].view(np.uint64) << np.uint64(_BITS)) | part[useful].view(np.uint32))
     # Runs are sorted already, which this kind of sort makes use of.
     joined = np.sort(np.concatenate(codes), kind="stable")
-    pairs, kept = joined >> _BITS, np.ones(len(joined), bool)
+    pairs, kept = (joined >> np.uint64(_BITS)).view(np.int64), np.ones(len(joined), bool)
     np.not_equal(pairs[1:], pairs[:-1], out=kept[1:])
     tails, numbers = np.divmod(pairs[kept], len(steps))
-    heads = tails + steps[numbers]
-    return _pairs(np.bincount(tails, minlength=own), (heads << _BITS) | (joined[kept] & _CHOICE), mask)
+    choices = (joined[kept] & np.uint64(_CHOICE)).view(np.int64)
+    return _pairs(np.bincount(tails, minlength=own), ((tails + steps[numbers]) << _BITS) | choices, mask)
 
 
 def _pairs(degrees: NDArray[np.intp], codes: Codes, rank_mask: int) -> Pairs:
