@@ -16,19 +16,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 from scipy import fft
 
 from turbrestore.blind import remove_blur
-from turbrestore.convolution_problem import Problem
-from turbrestore.deconvolution import DeconvolutionParams, automatic_fidelity, deconvolve
-from turbrestore.nonlocal_penalty import NonlocalPenalty
+from turbrestore.deconvolution import MARGIN_SIGMAS, DeconvolutionParams, deconvolve
 from turbrestore.nonlocal_tv import nonlocal_weights
-from turbrestore.parallel import available_cores, one_thread_each
-from turbrestore.primal_dual import PrimalDual
 from turbrestore.psf import KOLMOGOROV, blur_otf
 from turbrestore.synthesis.scenes import SCENES
 
@@ -76,26 +71,15 @@ def weigh(image: np.ndarray) -> tuple[float, float]:
     return fastest(lambda: nonlocal_weights(image), 3), fastest(lambda: compare_shifts(image), 3)
 
 
-def iterate(image: np.ndarray, runs: int = 8) -> tuple[float, float]:
-    """Seconds of an iteration on the padded domain, and of four transforms of that size."""
-    margin = int(np.ceil(4 * WIDTH))
-    shape = tuple(fft.next_fast_len(size + 2 * margin, real=True) for size in image.shape)
-    widths = [
-        ((padded - size) // 2, padded - size - (padded - size) // 2)
-        for padded, size in zip(shape, image.shape, strict=True)
-    ]
-    padded = np.pad(image, widths, mode="symmetric")
-    problem = Problem(
-        padded,
-        np.pad(np.ones_like(image), widths),
-        blur_otf(shape, WIDTH, KOLMOGOROV),
-        automatic_fidelity("nltv", image, NOISE),
-    )
-    with one_thread_each(), ThreadPoolExecutor(available_cores()) as pool:
-        solver = PrimalDual(NonlocalPenalty(nonlocal_weights(padded), pool))
-        state = solver.start(problem, padded)
-        step = fastest(lambda: solver.step(problem, state), runs)
-    return step, fastest(lambda: [fft.irfft2(fft.rfft2(padded), s=shape) for _ in range(2)], runs)
+def iterate(image: np.ndarray, iterations: int = 12) -> tuple[float, float]:
+    """Seconds of an iteration of the stage, on the threads that it takes, and of four transforms on one thread."""
+    ends: list[float] = []
+    params = DeconvolutionParams(exponent=KOLMOGOROV, iterations=iterations, tolerance=0)
+    deconvolve(image, WIDTH, params, progress=lambda _: ends.append(time.perf_counter()))
+    shape = tuple(fft.next_fast_len(size + 2 * int(np.ceil(MARGIN_SIGMAS * WIDTH)), real=True) for size in image.shape)
+    spectrum = fft.rfft2(np.ones(shape, np.float32))
+    transforms = fastest(lambda: [fft.rfft2(fft.irfft2(spectrum, s=shape)) for _ in range(2)], iterations)
+    return float(np.diff(ends).min()), transforms
 
 
 def exponent(seconds: list[float]) -> float:

@@ -14,8 +14,8 @@ from turbrestore.frame_noise import _folded, judge_frame, mark_folds, measure_fr
 from turbrestore.kalman import PixelGaussian
 from turbrestore.nonlocal_penalty import NonlocalPenalty, add_differences, draw_back
 from turbrestore.nonlocal_tv import NonlocalParams, add_sums, nonlocal_weights, search_offsets
-from turbrestore.patch_pairs import pairs_of_band
-from turbrestore.patch_search import BAND_ROWS, PatchSearch, choose_offsets, search_bands
+from turbrestore.patch_pairs import join_choices, pairs_of_band
+from turbrestore.patch_search import BAND_ROWS, OUTSIDE, PatchSearch, choose_offsets, search_bands
 from turbrestore.pixel_fusion import PixelFusion, take_in_pixels
 from turbrestore.primal_dual import _follow, follow_loops
 from turbrestore.synthesis.scenes import SCENES
@@ -93,6 +93,7 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
         descend_loops,
         draw_back,
         follow_loops,
+        join_choices,
         mark_folds,
         sample_spline,
         take_in_pixels,
@@ -195,16 +196,30 @@ def test_offsets_are_chosen_alike(plain, shape, chosen):
 @pytest.mark.parametrize("chosen", [(4, 6), (0, 1), (8, 0), (0, 20)])
 def test_pairs_are_joined_alike(plain, shape, chosen):
     """In a band that is the image, in one with rows below it, and where equal patches make pairs chosen twice."""
-    search = PatchSearch(np.ones((1, 1), np.float32), search_offsets(7), *chosen)
+    search, width = PatchSearch(np.ones((1, 1), np.float32), search_offsets(7), *chosen), shape[1]
     for guide in (rng.random(shape, np.float32), np.zeros(shape, np.float32)):
         [(_, keys)] = search_bands(guide, search)
-        for rows in {shape[0], max(shape[0] // 2, 1), 1}:
-            band = keys[: rows * shape[1]], keys[rows * shape[1] :]
-            fast, slow = both(plain, lambda band=band: pairs_of_band(*band, shape[1], search))
+        # The same pair has two distances that differ by rounding, as with larger patches.
+        keys[keys < OUTSIDE] += rng.integers(0, 3, np.count_nonzero(keys < OUTSIDE), np.int32) * (search.rank_mask + 1)
+        for top, stop in {(0, shape[0]), (0, 1), (shape[0] // 3, shape[0] // 2 + 1)}:
+            band = keys[top * width : stop * width], keys[stop * width :]
+            fast, slow = both(plain, lambda band=band: pairs_of_band(*band, width, search))
             assert len(fast.heads) == fast.degrees.sum()
             for one, other in zip(fast, slow, strict=True):
                 assert one.dtype == other.dtype
                 assert np.array_equal(one, other)
+
+
+@needs_compiler
+def test_pairs_of_the_widest_images_have_their_numbers(plain):
+    """Each pixel takes the 5100th offset: numbers of pairs need 33 bits and more."""
+    search = PatchSearch(np.ones((1, 1), np.float32), search_offsets(101), nearest=1, best=0)
+    farthest = int(np.abs(search.offsets @ [51, 1]).argmax())
+    keys = np.full((64 * 30_000, 1), 1 << 30 | farthest, np.int32)
+    fast, slow = both(plain, lambda: pairs_of_band(keys, keys[:0], 30_000, search))
+    assert fast.heads.size > 0
+    for one, other in zip(fast, slow, strict=True):
+        assert np.array_equal(one, other)
 
 
 @needs_compiler

@@ -41,7 +41,10 @@ def traced():
         (NonlocalParams(search=9, best=60), 1),
     ],
 )
-def test_weights_keep_the_plan(image, tmp_path, params, threads):
+@pytest.mark.parametrize("join", ["compiled", "numpy"])
+def test_weights_keep_the_plan(image, tmp_path, monkeypatch, params, threads, join):
+    if join == "numpy":
+        monkeypatch.setattr("turbrestore.patch_pairs.compiled", lambda loops: None)
     with traced() as peaks:
         nonlocal_weights(image, params, tmp_path, threads)
     assert peaks[0] < NonlocalWork(SHAPE, 1, params).peak(Room(threads, True))

@@ -6,8 +6,11 @@ choice : see :mod:`turbrestore.patch_search`.
 tail, head : the pixels x < y of a pair, in the order of the image.
 halves : offsets from a tail to its heads, from the first to the last in the order of the image.
 
-A pixel chooses some of its pairs as their tail and others as their head, and a pair may be chosen from both sides: then
-it counts once, with the smaller of the two distances, which differ by rounding.
+A pixel chooses some of its pairs as their tail and others as their head.  A pair that is chosen from both sides, or as
+near and as similar, counts once, with the smallest of its distances, which differ by rounding.
+
+All choices of a band could be sorted, which is what NumPy can do.  Compiled, they are counted first, so that each tail
+has its place, and what is sorted is as little as a pixel has.
 """
 
 from __future__ import annotations
@@ -21,11 +24,11 @@ from .arrays import FloatArray
 from .compiled import compiled
 from .patch_search import OUTSIDE, Keys, PatchSearch
 
-# Bits of a choice, below the number of its half in what is sorted.
+# Bits of a choice, below the number of its half, or its head.
 _BITS = 31
 _CHOICE = (1 << _BITS) - 1
 
-Codes = NDArray[np.int64]
+Numbers = NDArray[np.int64]
 
 
 class Pairs(NamedTuple):
@@ -38,7 +41,7 @@ class Pairs(NamedTuple):
     heads : ndarray, int32, shape (e,)
         Where each pair ends, pixels from the first of the band on.
     distances : ndarray, float32, shape (e,)
-        d.
+        d, intensity squared, without the last bits that a choice gives to its rank.
     """
 
     degrees: NDArray[np.intp]
@@ -54,7 +57,8 @@ def pairs_of_band(keys: Keys, below: Keys, width: int, search: PatchSearch) -> P
     keys : ndarray, int32, shape (n, nearest + best)
         Choices of the pixels of the band.
     below : ndarray, int32, shape (m, nearest + best)
-        Choices of the pixels of the next band, whose heads may be tails in this one.
+        Choices of the pixels of the next band, some of which are heads of pairs whose tails are in this one; none below
+        the last band.
     width : int
         Columns of the image.
     search : PatchSearch
@@ -80,47 +84,51 @@ def pairs_of_band(keys: Keys, below: Keys, width: int, search: PatchSearch) -> P
     to_tail = np.where(forward, 0, -steps[half])
     loops = compiled(join_choices)
     if loops is None:
-        return _join(keys, below, steps, (half, to_tail, search.rank_mask))
+        return _join(keys, below, half, to_tail, search.rank_mask, steps)
     codes, degrees = np.empty(keys.size + below.size, np.int64), np.empty(len(keys), np.intp)
+    # The compiler takes a row from one or the other only where it knows that both lie alike.
     rows = np.ascontiguousarray(keys), np.ascontiguousarray(below)
     loops(*rows, half, to_tail, search.rank_mask, steps, codes, degrees)
-    return _pairs(degrees, codes[: degrees.sum()], search.rank_mask)
+    codes = codes[: degrees.sum()]
+    distances = (codes & (_CHOICE - search.rank_mask)).astype(np.int32).view(np.float32)
+    return Pairs(degrees, (codes >> _BITS).astype(np.int32), distances)
 
 
-def _join(keys: Keys, below: Keys, steps: Codes, ranks: tuple[Codes, Codes, int]) -> Pairs:
+def _join(keys: Keys, below: Keys, half: Numbers, to_tail: Numbers, rank_mask: int, steps: Numbers) -> Pairs:
     """:func:`join_choices` by NumPy."""
-    half, to_tail, mask = ranks
     own, codes = len(keys), []
-    # Number of the pair among all of the band, less that of the first pair of the pixel that chose it.
-    ahead = to_tail * len(steps) + half
+    # What is sorted are pairs, numbered through the band, and below them distances without the rank: that leaves enough
+    # bits for many offsets of a wide image.
+    ranks = rank_mask.bit_length()
+    bits, ahead = _BITS - ranks, to_tail * len(steps) + half
     for first, part in ((0, keys), (own, below)):
-        numbers = ahead[part & mask]
+        numbers = ahead[part & rank_mask]
         numbers += (np.arange(first, first + len(part)) * len(steps))[:, None]
         useful = (part < OUTSIDE) & (numbers >= 0) & (numbers < own * len(steps))
-        # Many offsets of a wide image need every bit.
-        codes.append((numbers[useful].view(np.uint64) << np.uint64(_BITS)) | part[useful].view(np.uint32))
+        codes.append((numbers[useful] << bits) | (part[useful] >> ranks))
+    joined = np.concatenate(codes)
+    del codes, numbers, useful
     # Runs are sorted already, which this kind of sort makes use of.
-    joined = np.sort(np.concatenate(codes), kind="stable")
-    pairs, kept = (joined >> np.uint64(_BITS)).view(np.int64), np.ones(len(joined), bool)
-    np.not_equal(pairs[1:], pairs[:-1], out=kept[1:])
-    tails, numbers = np.divmod(pairs[kept], len(steps))
-    choices = (joined[kept] & np.uint64(_CHOICE)).view(np.int64)
-    return _pairs(np.bincount(tails, minlength=own), ((tails + steps[numbers]) << _BITS) | choices, mask)
-
-
-def _pairs(degrees: NDArray[np.intp], codes: Codes, rank_mask: int) -> Pairs:
-    distances = (codes & (_CHOICE - rank_mask)).astype(np.int32).view(np.float32)
-    return Pairs(degrees, (codes >> _BITS).astype(np.int32), distances)
+    joined.sort(kind="stable")
+    kept = np.ones(len(joined), bool)
+    np.not_equal(joined[1:] >> bits, joined[:-1] >> bits, out=kept[1:])
+    joined = joined[kept]
+    distances = ((joined & ((1 << bits) - 1)) << ranks).astype(np.int32).view(np.float32)
+    joined >>= bits
+    heads, numbers = np.divmod(joined, len(steps))
+    degrees = np.bincount(heads, minlength=own)
+    heads += steps[numbers]
+    return Pairs(degrees, heads.astype(np.int32), distances)
 
 
 def join_choices(
     keys: Keys,
     below: Keys,
-    half: Codes,
-    to_tail: Codes,
+    half: Numbers,
+    to_tail: Numbers,
     rank_mask: int,
-    steps: Codes,
-    codes: Codes,
+    steps: Numbers,
+    codes: Numbers,
     degrees: NDArray[np.intp],
 ) -> None:
     """Sort the choices of a band by tail and half, and leave out those made twice; to be compiled.
@@ -128,15 +136,16 @@ def join_choices(
     Parameters
     ----------
     keys, below : ndarray, int32, shape (n, nearest + best) and (m, nearest + best)
-        Choices of the band, and of pixels below it.
+        Choices of the band, and of the pixels below it that offsets reach.
     half, to_tail : ndarray, int64, shape (offsets,)
-        Half of each offset, and the way from the pixel that chose it to the tail.
+        Number of the half of each offset, and the way from the pixel that chose it to the tail, pixels of the flattened
+        image.
     rank_mask : int
         See :class:`turbrestore.patch_search.PatchSearch`.
     steps : ndarray, int64, shape (halves,)
-        Way from the tail to the head.
+        Way from the tail to the head, pixels of the flattened image.
     codes : ndarray, int64, shape (choices of band and pixels below,)
-        Filled from the first entry on: head, and below its bits the choice.
+        One entry for a pair, from the first on: head, and below its bits the choice.  The rest is worked in.
     degrees : ndarray, intp, shape (n,)
         Filled: pairs of each tail.
 
@@ -165,7 +174,7 @@ def join_choices(
             rank = np.uintp(row[place] & rank_mask)
             tail = pixel + to_tail[rank]
             if row[place] < OUTSIDE and 0 <= tail < own:
-                # A pixel has few pairs: each goes to its place as it comes.
+                # Those from below come in order, so that a choice passes few on the way to its place.
                 code, last = (half[rank] << _BITS) | row[place], ends[np.uintp(tail)]
                 while last > starts[np.uintp(tail)] and codes[np.uintp(last - 1)] > code:
                     codes[np.uintp(last)] = codes[np.uintp(last - 1)]
