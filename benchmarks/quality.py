@@ -6,6 +6,9 @@ writes the images side by side, ``--json`` the figures, ``--write`` the document
 
 ``--bounds`` instead restores a few simulated clips with the blur given by hand, and exits with 1 when a bound is
 broken or a stage is worse than the one before; without the data it says so and exits with 0.
+
+``--before`` names a revision of this repository, restores the clips with truth or text by its defaults and by those of
+the present tree, and exits with 1 where the filtered image or the result is worse by more than 0.05 dB.
 """
 
 from __future__ import annotations
@@ -14,14 +17,17 @@ import argparse
 import dataclasses
 import json
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable
 from itertools import accumulate
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from clips import COUNT, LARGEST_SIDE, MOST_FRAMES, SCREEN_SIDE, SMOOTH_SIDE, Clip, data_folder, find_clips
+from revisions import child, revision
 from words import can_read, share_read
 
 from turbrestore.alternating import FilterParams
@@ -59,10 +65,13 @@ BOUNDS = {
     "purdue1_chart_medium": (1.2, 19.5),
     "ao_brick_weak": (0.8, 33.0),
 }
+# What a clip may lose against an earlier revision, dB.
+LOSS_BOUND = 0.05
 PANEL_COLUMNS, LABEL_HEIGHT = 3, 18
 
 Figures = dict[str, float]
 Results = dict[str, dict[str, Figures]]
+Result = TypeVar("Result")
 
 
 def main() -> int:
@@ -70,29 +79,43 @@ def main() -> int:
     options = _options()
     if options.bounds:
         return check_bounds()
+    if options.child is not None:
+        print(json.dumps(restore_into(**json.loads(options.child))))
+        return 0
     results: Results = {}
+    lost = False
     try:
-        for name, load in find_clips(options.clips).items():
-            started = time.perf_counter()
-            clip = load()
-            restored = restorations(clip)
-            results[name] = {method: figures(image, clip, s) for method, (image, s) in restored.items()}
-            if clip.words and clip.peers and can_read():
-                results[name]["peers"] = {"words": max(share_read(peer, clip.words) for peer in clip.peers.values())}
-            if options.images is not None:
-                options.images.mkdir(parents=True, exist_ok=True)
-                write_image(options.images / f"{name}.png", panel(restored, clip), 8, overwrite=True)
-            print(f"{name}: {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
+        if options.before is not None:
+            text, lost = compare_with(options.before, options.clips)
+        else:
+            results = measure_all(options.clips, options.images)
+            text = document(results)
     except TurbrestoreError as error:
         print(f"quality: {error}", file=sys.stderr)
         return error.exit_code
-    text = document(results)
     print(text, end="")
     if options.write is not None:
         atomic_write(options.write, text.encode(), overwrite=True)
     if options.json is not None:
         atomic_write(options.json, (json.dumps(results, indent=2) + "\n").encode(), overwrite=True)
-    return 0
+    return int(lost)
+
+
+def measure_all(patterns: list[str], folder: Path | None) -> Results:
+    """Figures of every clip by every method; their images go into a folder."""
+    results: Results = {}
+    for name, load in find_clips(patterns).items():
+        started = time.perf_counter()
+        clip = load()
+        restored = restorations(clip)
+        results[name] = {method: figures(image, clip, s) for method, (image, s) in restored.items()}
+        if clip.words and clip.peers and can_read():
+            results[name]["peers"] = {"words": max(share_read(peer, clip.words) for peer in clip.peers.values())}
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_image(folder / f"{name}.png", panel(restored, clip), 8, overwrite=True)
+        print(f"{name}: {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
+    return results
 
 
 def restorations(clip: Clip) -> dict[str, tuple[FloatArray, float]]:
@@ -199,6 +222,56 @@ def check_bounds() -> int:
     return int(failed)
 
 
+def restore_into(clip: str, file: str) -> Figures:
+    """Write the filtered image and the result of a clip into a file, and say how long that took."""
+    (load,) = find_clips([clip]).values()
+    restored, seconds = _timed(lambda: restore(load().frames))
+    np.savez(file, filtered=_filtered(restored), result=restored.image)
+    return {"seconds": seconds}
+
+
+def compare_with(before: str, patterns: list[str]) -> tuple[str, bool]:
+    """Markdown of what has changed since a revision, and whether a clip has lost more than the bound."""
+    lines = [
+        f"# Quality against {before}\n",
+        f"What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --before {before}` measures: PSNR, dB, of the clips "
+        "of `docs/quality.md` with truth, and the share of the words that tesseract reads of those with text. It ends "
+        f"with 1 where an image loses more than {LOSS_BOUND} dB.\n",
+        "| clip | filtered: before | now | change | result: before | now | change | words: before | now |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    changes = []
+    with revision(before) as tree:
+        for name, load in find_clips(patterns).items():
+            clip = load()
+            if clip.truth is None and not clip.words:
+                continue
+            old, new = restored_by(name, tree), restored_by(name, None)
+            cells = [name]
+            for stage in old:
+                if clip.truth is None:
+                    cells += ["–"] * 3
+                    continue
+                was, now = (compare(images[stage], clip.truth).psnr for images in (old, new))
+                cells += [f"{was:.2f}", f"{now:.2f}", f"{now - was:+.3f}"]
+                changes.append(now - was)
+            read = clip.words and can_read()
+            cells += [f"{share_read(images['result'], clip.words):.2f}" if read else "–" for images in (old, new)]
+            lines.append(f"| {' | '.join(cells)} |")
+    if changes:
+        lines.append(f"\nChanges: {min(changes):+.3f} to {max(changes):+.3f} dB; may not be below −{LOSS_BOUND}.")
+    return "\n".join(lines) + "\n", bool(changes) and min(changes) < -LOSS_BOUND
+
+
+def restored_by(clip: str, tree: Path | None) -> dict[str, FloatArray]:
+    """Return the filtered image and the result of a clip by the package in a folder, or by the present one."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = str(Path(folder, "images.npz"))
+        child(__file__, {"clip": clip, "file": file}, tree)
+        with np.load(file) as images:
+            return {stage: images[stage] for stage in ("filtered", "result")}
+
+
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="names or patterns; all by default")
@@ -206,13 +279,18 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
     parser.add_argument("--bounds", action="store_true", help="check PSNR with the blur given by hand")
-    return parser.parse_args()
+    parser.add_argument("--before", metavar="REVISION", help="restore by this revision too, and compare")
+    parser.add_argument("--child", metavar="JSON", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.before is not None and (options.json or options.images or options.bounds):
+        parser.error("--before goes with --clips and --write only")
+    return options
 
 
-def _timed(action: Callable[[], FloatArray]) -> tuple[FloatArray, float]:
+def _timed(action: Callable[[], Result]) -> tuple[Result, float]:
     started = time.perf_counter()
-    image = action()
-    return image, time.perf_counter() - started
+    result = action()
+    return result, time.perf_counter() - started
 
 
 def _filtered(restoration: Restoration) -> FloatArray:

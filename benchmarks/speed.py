@@ -13,27 +13,26 @@ revision of this repository that is measured beside the present tree, row by row
 from __future__ import annotations
 
 import argparse
-import io
 import json
-import os
 import resource
 import subprocess
 import sys
-import tarfile
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
+import deconvolution
 import numpy as np
+import tvl1
+from revisions import Figures, child, revision
 
 from turbrestore.centroid import CentroidParams
 from turbrestore.flow import FlowParams, iterate_flows
 from turbrestore.frame_source import FrameSource
 from turbrestore.images import atomic_write
+from turbrestore.nonlocal_tv import nonlocal_weights
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
@@ -59,7 +58,7 @@ SAMPLE, LEAST_SAMPLE, LARGEST_SAMPLE = 2, 8, 200
 # Benchmarks of parts whose tables are part of the document.
 PARTS = ("tvl1", "deconvolution")
 
-Figures = dict[str, Any]
+_WEIGHTS, _ITERATION = f"nonlocal weights of {deconvolution.STATED}², s", f"an iteration at {deconvolution.STATED}², ms"
 Result = TypeVar("Result")
 
 
@@ -84,23 +83,6 @@ def main() -> int:
     return int(bool(broken))
 
 
-@contextmanager
-def revision(name: str | None) -> Iterator[Path | None]:
-    """Lay out the files of a revision in a folder that goes away afterwards."""
-    if name is None:
-        yield None
-        return
-    root = Path(__file__).resolve().parent.parent
-    command = ["git", "archive", "--format=tar", name, "turbrestore"]
-    packed = subprocess.run(command, cwd=root, capture_output=True, check=False)
-    if packed.returncode:
-        sys.exit(f"speed: {packed.stderr.decode().strip()}")
-    with tempfile.TemporaryDirectory() as folder:
-        with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
-            archive.extractall(folder, filter="data")
-        yield Path(folder)
-
-
 def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, list[str]]:
     """Markdown of the tables, and the bounds that are broken."""
     broken: list[str] = []
@@ -120,6 +102,10 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
         "Exponent of the time of a restoration, fitted to four clips each, with two passes of the centroid and "
         f"{TRAINED} frames to train.\n",
         *_growth_table(tree, broken),
+        "\n## Parts\n",
+        f"Smallest of a few runs. TV-L1: processor time a frame of {tvl1.SIDE}×{tvl1.SIDE}, {THREADS} threads, on the "
+        "sets of `benchmarks/tvl1.py`; the rest: clock, on the image of `benchmarks/deconvolution.py`.\n",
+        *_parts_table(tree, broken),
         "\n## Memory\n",
         f"Peak resident memory of a process that restores frames of 128×128, {TRAINED} of them to train.\n",
         *_memory_table(tree, broken),
@@ -148,8 +134,8 @@ def _time_table(rows: tuple[tuple[int, int, int], ...], tree: Path | None, broke
     for count, height, width in rows:
         task = {"kind": "time", "frames": count, "height": height, "width": width}
         runs = RUNS if count * height * width <= REPEATED else 1
-        old = child(task, tree) if tree else None
-        new = sorted((child(task | {"made": True}) for _ in range(runs)), key=_ratio)[runs // 2]
+        old = child(__file__, task, tree) if tree else None
+        new = sorted((child(__file__, task | {"made": True}) for _ in range(runs)), key=_ratio)[runs // 2]
         ratio, work = _ratio(new), new["whole_work"] / new["bare_work"]
         if new["bare"] >= SHORTEST_BOUND and max(ratio, work) > TIME_BOUND:
             broken.append(f"{count} frames of {width}×{height}: ratio {max(ratio, work):.3f}, bound {TIME_BOUND}")
@@ -165,6 +151,38 @@ def _time_table(rows: tuple[tuple[int, int, int], ...], tree: Path | None, broke
 
 def _ratio(figures: Figures) -> float:
     return float(figures["whole"] / figures["bare"])
+
+
+def _parts_table(tree: Path | None, broken: list[str]) -> list[str]:
+    task = {"kind": "parts"}
+    old, new = child(__file__, task, tree) if tree else None, child(__file__, task)
+    bounds = {_WEIGHTS: deconvolution.WEIGHTS_BOUND_S, _ITERATION: deconvolution.ITERATION_BOUND_MS}
+    bounds |= {_stage_name(size): bound for size, bound in deconvolution.STAGE_BOUNDS_S.items()}
+    lines = [f"| |{' before |' if old else ''} now | bound |", f"|---|{'---:|' * (2 + bool(old))}"]
+    for name, found in new.items():
+        earlier = f" {old[name]:.3g} |" if old else ""
+        lines.append(f"| {name} |{earlier} {found:.3g} | {bounds.get(name, '–')} |")
+        if found > bounds.get(name, np.inf):
+            broken.append(f"{name}: {found:.3g}, bound {bounds[name]}")
+    return lines
+
+
+def measure_parts() -> Figures:
+    """Return times of what a restoration is made of, by name."""
+    figures: Figures = {}
+    solve = tvl1.methods()[tvl1.OURS]
+    for name, make in tvl1.SETS.items():
+        motion = make(8)
+        seconds = min(clocked(lambda motion=motion: solve(motion))[0][1] for _ in range(3))
+        figures[f"TV-L1, {name.lower()}, ms a frame"] = 1e3 * seconds / len(motion.frames)
+    image = deconvolution.make_image(deconvolution.STATED, deconvolution.STATED)
+    figures[_WEIGHTS] = deconvolution.fastest(lambda: nonlocal_weights(image), 3)
+    figures[_ITERATION] = 1e3 * deconvolution.iterate(image)[0]
+    return figures | {_stage_name(size): deconvolution.whole_stage(size) for size in deconvolution.STAGE_BOUNDS_S}
+
+
+def _stage_name(size: int) -> str:
+    return f"deblurring of {size}², s"
 
 
 def part_tables(name: str) -> tuple[str, bool]:
@@ -197,7 +215,7 @@ def _memory_table(tree: Path | None, broken: list[str]) -> list[str]:
     ]
     for name, where in ((("before", tree),) if tree else ()) + (("now", None),):
         few, many = (
-            child({"kind": "memory", "frames": count, "height": 128, "width": 128}, where)["peak"]
+            child(__file__, {"kind": "memory", "frames": count, "height": 128, "width": 128}, where)["peak"]
             for count in (FEW, MANY)
         )
         lines.append(f"| {name} | {few:.0f} MB | {many:.0f} MB | {many - few:.1f} | {MEMORY_BOUND_MB:.0f} |")
@@ -209,25 +227,18 @@ def _memory_table(tree: Path | None, broken: list[str]) -> list[str]:
 def exponent(clips: list[tuple[int, int]], tree: Path | None = None) -> float:
     """Slope of log time over log size of clips, given as frames and side, that differ in one of them."""
     tasks = [{"kind": "growth", "frames": count, "height": side, "width": side} for count, side in clips]
-    seconds = [child(task, tree)["whole"] for task in tasks]
+    seconds = [child(__file__, task, tree)["whole"] for task in tasks]
     sizes = [count * side * side for count, side in clips]
     return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
 
 
-def child(task: Figures, tree: Path | None = None) -> Figures:
-    """Measure in a process of its own, of the present tree or another one."""
-    paths = [str(tree)] if tree else []
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*paths, os.environ.get("PYTHONPATH", "")]).strip(":")}
-    command = [sys.executable, __file__, "--child", json.dumps(task)]
-    with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=folder, env=environment)
-    figures: Figures = json.loads(done.stdout)
-    print(f"{'before' if tree else 'now'}: {task} {figures}", file=sys.stderr, flush=True)
-    return figures
-
-
 def run_child(task: Figures) -> Figures:
-    """Restore a clip and say how long it took, how long its flow calls take alone, and the peak memory, MB."""
+    """Restore a clip and say how long it took, how long its flow calls take alone, and the peak memory, MB.
+
+    A task of the kind ``parts`` restores nothing.
+    """
+    if task["kind"] == "parts":
+        return measure_parts()
     source, sample = repeated(task["frames"], task["height"], task["width"])
     train = None if task["kind"] == "time" else TRAINED
     centroid = CentroidParams() if task["kind"] == "time" else CentroidParams(iterations=2)

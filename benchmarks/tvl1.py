@@ -87,6 +87,9 @@ def dynamic_texture(count: int) -> KnownMotion:
     return _distorted(scene, np.stack(list(texture.flows)), rng)
 
 
+SETS = {"Phase screens": phase_screens, "Smooth flows": smooth_motion, "Dynamic texture": dynamic_texture}
+
+
 def methods() -> dict[str, Callable[[KnownMotion], FloatArray]]:
     """Return what is compared: from a set to its flows."""
     plain = FlowParams(threads=THREADS, global_shift=False, confidence=False)
@@ -125,11 +128,7 @@ def main() -> int:
     options = parser.parse_args()
     count, runs = (4, 1) if options.quick else (8, 3)
     good = True
-    for name, make in (
-        ("Phase screens", phase_screens),
-        ("Smooth flows", smooth_motion),
-        ("Dynamic texture", dynamic_texture),
-    ):
+    for name, make in SETS.items():
         motion = make(count)
         scores = measure(motion, runs)
         base, ours = scores[BASELINE], scores[OURS]
