@@ -8,6 +8,9 @@ and over the half with the larger gradients.
 Every method solves the frames of a set on two threads.  Time is processor time of the process, which a busy machine
 disturbs less than the clock; the methods take turns, and the smallest of the runs counts.  Ends with 1 if the flow is
 less than five times faster than OpenCV's on any set, or its error is larger.
+
+``--starts`` compares what a flow may start from instead: nothing, the flow to the frame before, the one-step prediction
+of a dynamic texture that was identified on 40 earlier frames, and for a bound the flow to the frame itself.
 """
 
 from __future__ import annotations
@@ -22,7 +25,9 @@ import cv2
 import numpy as np
 
 from turbrestore.arrays import FloatArray, luminance
+from turbrestore.dynamics import identify
 from turbrestore.flow import FlowParams, iterate_flows, normalise_contrast
+from turbrestore.flow_model import predict_flow, project
 from turbrestore.metrics import endpoint_error
 from turbrestore.parallel import map_ahead
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
@@ -30,9 +35,11 @@ from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import synthesize_like
 from turbrestore.synthesis.scenes import SCENES, resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
-from turbrestore.tvl1 import TvL1Params
+from turbrestore.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
 
 SIDE, THREADS, LEAST_RATIO = 192, 2, 5.0
+# Frames that a dynamic texture is identified on, later frames that flows are started for, and levels of the pyramid.
+IDENTIFIED, STARTED, STARTED_LEVELS = 40, 12, (5, 3, 2, 1)
 BASELINE, OURS = "DualTVL1, its defaults", "tvl1"
 
 
@@ -125,7 +132,11 @@ def main() -> int:
     """Measure, print, and judge."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="half of the frames, one run")
+    parser.add_argument("--starts", action="store_true", help="compare what flows start from")
     options = parser.parse_args()
+    if options.starts:
+        compare_starts()
+        return 0
     count, runs = (4, 1) if options.quick else (8, 3)
     good = True
     for name, make in SETS.items():
@@ -145,6 +156,32 @@ def main() -> int:
         good &= ours.everywhere <= base.everywhere and ours.textured <= base.textured
     print(f"At least {LEAST_RATIO:g} times faster at no larger error: {'yes' if good else 'NO'}.")
     return int(not good)
+
+
+def compare_starts() -> None:
+    """Print time and error of flows by what they start from, and how far off that is."""
+    for name, make in SETS.items():
+        motion = make(IDENTIFIED + STARTED)
+        frames = np.stack([_grey_levels(frame) for frame in motion.frames]).astype(np.float32)
+        reference, truth = _grey_levels(motion.reference).astype(np.float32), motion.truth[IDENTIFIED:]
+        found = tvl1_flows(frames, refer_tvl1(reference)).flows
+        dynamics = identify(found[:IDENTIFIED])
+        before, own = found[IDENTIFIED - 1 : -1], found[IDENTIFIED:]
+        predicted = np.stack([predict_flow(dynamics, project(dynamics, flow)) for flow in before])
+        starts = {"nothing": np.zeros_like(own), "frame before": before, "prediction": predicted, "frame itself": own}
+        print(f"## {name}\n\n| levels | start | its error, px | processor, ms a frame | error, px |")
+        print("|---:|---|---:|---:|---:|")
+        for levels in STARTED_LEVELS:
+            referred = refer_tvl1(reference, TvL1Params(levels=levels))
+            for label, start in starts.items():
+                seconds, flows = [], own
+                for _ in range(3):
+                    begun = time.process_time()
+                    flows = tvl1_flows(frames[IDENTIFIED:], referred, start).flows
+                    seconds.append(time.process_time() - begun)
+                cells = f"{endpoint_error(start, truth):.2f} | {1e3 * min(seconds) / STARTED:.1f}"
+                print(f"| {levels} | {label} | {cells} | {endpoint_error(flows, truth):.3f} |")
+        print()
 
 
 def _distorted(scene: FloatArray, flows: FloatArray, rng: np.random.Generator) -> KnownMotion:
