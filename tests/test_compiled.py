@@ -9,6 +9,7 @@ import pytest
 
 from turbrestore import compiled as compiling
 from turbrestore.blur_estimation import descend_loops, estimate_blur
+from turbrestore.confidence import draw_pixels, flow_confidence, regularise_flow
 from turbrestore.errors import DataError
 from turbrestore.frame_noise import _folded, judge_frame, mark_folds, measure_frame_noise, weigh_pixels
 from turbrestore.kalman import PixelGaussian
@@ -23,7 +24,7 @@ from turbrestore.warp import sample_spline, warp
 
 USERS = (
     *("blur_estimation", "frame_noise", "nonlocal_penalty", "nonlocal_tv", "patch_search", "pixel_fusion", "warp"),
-    *("patch_pairs", "primal_dual"),
+    *("patch_pairs", "primal_dual", "confidence"),
 )
 rng = np.random.default_rng(0)
 needs_compiler = pytest.mark.skipif(not compiling.can_compile(), reason="Numba is not installed: nothing to compare")
@@ -76,6 +77,23 @@ def test_a_frame_is_judged_alike(plain, amplitude):
 
 
 @needs_compiler
+@pytest.mark.parametrize("contrast", [0.0, 0.01, 0.5])
+@pytest.mark.parametrize("shape", [(16, 16), (33, 50)])
+def test_a_flow_is_drawn_alike(plain, shape, contrast):
+    """Without texture, with little, and with much; edges among it, whose tensors have no inverse."""
+    image = 0.5 + contrast * rng.uniform(-1, 1, shape).astype(np.float32)
+    image[:, shape[1] // 2 :] = 0.5
+    image[:, -5:] += np.float32(contrast)
+    flow = rng.normal(0, 2, (*shape, 2)).astype(np.float32)
+    for noise in (0.0, 0.02):
+        fast, slow = both(plain, lambda n=noise: regularise_flow(flow, flow_confidence(image), n))
+        assert fast.dtype == slow.dtype == np.float32
+        assert fast == pytest.approx(slow, abs=2e-4)
+        assert np.abs(fast - slow).mean() < 1e-5
+        assert (np.abs(slow).max() > 0.01) == (contrast > 0)
+
+
+@needs_compiler
 def test_folds_are_found_where_the_jacobian_vanishes(plain):
     flow = rng.normal(0, 3.0, (33, 21, 2)).astype(np.float32)
     fast, slow = both(plain, lambda: _folded(flow))
@@ -92,6 +110,7 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
         choose_offsets,
         descend_loops,
         draw_back,
+        draw_pixels,
         follow_loops,
         join_choices,
         mark_folds,

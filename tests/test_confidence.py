@@ -21,7 +21,7 @@ def test_one_window_is_the_posterior_mean():
     image, rng = texture(12), np.random.default_rng(1)
     flow, noise = rng.normal(0, 2, (12, 12, 2)).astype(np.float32), 0.05
     confidence = FlowConfidence(flow_confidence(image).tensors[:1])
-    xx, xy, yy = np.moveaxis(confidence.tensors[0].astype(np.float64), -1, 0)
+    xx, xy, yy = confidence.tensors[0].astype(np.float64)
     tensor = np.moveaxis(np.array([[xx, xy], [xy, yy]]), (0, 1), (2, 3))
     # The covariance of a displacement is ten times σ² / (A J) within A = 16 π pixels, and that of the prior 0.5²; the
     # tensor is known to a hundredth of its mean eigenvalue.
@@ -33,7 +33,7 @@ def test_one_window_is_the_posterior_mean():
 
 def test_each_window_draws_towards_the_next_wider_one():
     # Equal tensors and flow everywhere: each window moves what the next wider one expects towards the flow.
-    tensors = tuple(np.full((side, side, 3), (1e-5, 0, 2e-5), np.float32) for side in (16, 8, 4))
+    tensors = tuple(np.full((side, side, 3), (1e-5, 0, 2e-5), np.float32).transpose(2, 0, 1) for side in (16, 8, 4))
     noise = 0.05
     found = regularise_flow(np.ones((16, 16, 2), np.float32), FlowConfidence(tensors), noise)
     prior, expected = 10 * noise**2 / (16 * np.pi * 0.25) + 0.01 * 1.5e-5, np.zeros(2)

@@ -194,8 +194,8 @@ def _as_float(values: ArrayLike, name: str) -> FloatArray:
 def _finite(array: FloatArray, name: str) -> FloatArray:
     if array.size == 0:
         raise DataError(f"{name}: expected at least one pixel, found shape {array.shape}")
-    # One pass without a temporary of the array's size: a NaN or infinity anywhere makes the sum non-finite.
-    if not np.isfinite(sum(float(np.sum(part, dtype=np.float64)) for part in parts(array))):
+    # In parts, without a temporary of the array's size.
+    if not all(np.isfinite(part).all() for part in parts(array)):
         bad = int(array.size - np.count_nonzero(np.isfinite(array)))
         raise DataError(f"{name}: expected finite values, found {bad} NaN or infinite ones")
     return array

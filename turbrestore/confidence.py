@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_flow, check_image, luminance
+from .compiled import compiled
 from .errors import DataError, require
 from .psf import estimate_noise
 
@@ -59,9 +60,9 @@ class FlowConfidence:
 
     Attributes
     ----------
-    tensors : tuple of ndarray, float32, shape (h, w, 3)
-        J as (xx, xy, yy), squared intensity per squared pixel: of the image, then of windows and grids twice as wide
-        each.
+    tensors : tuple of ndarray, float32, shape (3, h, w)
+        J as planes xx, xy and yy, squared intensity per squared pixel: of the image, then of windows and grids twice
+        as wide each.
     """
 
     tensors: tuple[FloatArray, ...]
@@ -88,7 +89,7 @@ def flow_confidence(reference: ArrayLike) -> FlowConfidence:
     --------
     >>> import numpy as np
     >>> edges = np.tile(np.arange(32) // 8 % 2, (32, 1)).astype(np.float32)
-    >>> along_x, _, along_y = flow_confidence(edges).tensors[0][16, 16]
+    >>> along_x, _, along_y = flow_confidence(edges).tensors[0][:, 16, 16]
     >>> bool(along_x > 0.01), bool(along_y < 1e-6)
     (True, True)
     """
@@ -98,8 +99,8 @@ def flow_confidence(reference: ArrayLike) -> FlowConfidence:
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW) for product in (dx * dx, dx * dy, dy * dy))
     noise = np.float32(_NOISE_MARGIN * _GRADIENT_NOISE * estimate_noise(image) ** 2)
     tensors = [_without_noise(xx, xy, yy, noise)]
-    while min(tensors[-1].shape[:2]) > 1:
-        tensors.append(cv2.pyrDown(tensors[-1]))
+    while min(tensors[-1].shape[1:]) > 1:
+        tensors.append(np.stack([cv2.pyrDown(plane) for plane in tensors[-1]]))
     return FlowConfidence(tuple(tensors))
 
 
@@ -137,8 +138,8 @@ def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -
     measured = check_flow(flow)
     require(0 <= noise < np.inf, f"noise: expected a finite number of 0 or more, found {noise}")
     tensors = confidence.tensors
-    if measured.ndim != 3 or measured.shape[:2] != tensors[0].shape[:2]:
-        raise DataError(f"flow: expected shape {(*tensors[0].shape[:2], 2)}, found {measured.shape}")
+    if measured.ndim != 3 or measured.shape[:2] != tensors[0].shape[1:]:
+        raise DataError(f"flow: expected shape {(*tensors[0].shape[1:], 2)}, found {measured.shape}")
     planes = cv2.split(measured)
     weighted = [_apply(tensors[0], *planes)]
     for _ in tensors[1:]:
@@ -146,7 +147,7 @@ def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -
     prior = _METHOD_ERROR * max(noise, _LEAST_NOISE) ** 2 / (_AREA * _DEVIATION**2)
     u, v = (np.zeros_like(part) for part in weighted[-1])
     for level in range(len(tensors) - 1, -1, -1):
-        height, width = tensors[level].shape[:2]
+        height, width = tensors[level].shape[1:]
         if u.shape != (height, width):
             u, v = (cv2.pyrUp(part, dstsize=(width, height)) for part in (u, v))
         u, v = _solve(tensors[level], weighted[level], (u, v), prior)
@@ -163,11 +164,11 @@ def _without_noise(xx: FloatArray, xy: FloatArray, yy: FloatArray, noise: np.flo
     larger, smaller = np.maximum(half + spread - noise, 0), np.maximum(half - spread - noise, 0)
     kept = (larger - smaller) / np.maximum(2 * spread, np.finfo(np.float32).tiny)
     mean, tilt = (larger + smaller) / 2, kept * tilt
-    return cv2.merge([mean + tilt, kept * xy, mean - tilt])
+    return np.stack([mean + tilt, kept * xy, mean - tilt])
 
 
 def _apply(tensor: FloatArray, dx: FloatArray, dy: FloatArray) -> Planes:
-    xx, xy, yy = cv2.split(tensor)
+    xx, xy, yy = tensor
     return _sum_of_products(xx, dx, xy, dy), _sum_of_products(xy, dx, yy, dy)
 
 
@@ -183,13 +184,62 @@ def _solve(tensor: FloatArray, weighted: Planes, expected: Planes, noise: float)
     Where J is singular, along an edge, its determinant is what cancellation leaves; as ε is at least κ tr(J) / 2,
     single precision keeps four digits and a half of the flow there.
     """
-    xx, xy, yy = cv2.split(tensor)
+    draw = compiled(draw_pixels)
+    if draw is not None:
+        result = np.empty_like(expected[0]), np.empty_like(expected[1])
+        planes = *tensor, *weighted, *expected, *result
+        draw(np.float32(noise), *(plane.reshape(-1) for plane in planes))
+        return result
+    xx, xy, yy = tensor
     prior = xx + yy
     prior *= np.float32(_TILT / 2)
     prior += np.float32(noise)
     u, v = (prior * mean + part for mean, part in zip(expected, weighted, strict=True))
-    xx += prior
-    yy += prior
+    xx, yy = xx + prior, yy + prior
     determinant = xx * yy
     determinant -= xy * xy
     return (yy * u - xy * v) / determinant, (xx * v - xy * u) / determinant
+
+
+def draw_pixels(
+    noise: np.float32,
+    xx: FloatArray,
+    xy: FloatArray,
+    yy: FloatArray,
+    weighted_x: FloatArray,
+    weighted_y: FloatArray,
+    expected_x: FloatArray,
+    expected_y: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+) -> None:
+    """``(J + ε)⁻¹ (J W + ε W̄)`` of each pixel; to be compiled.
+
+    Parameters
+    ----------
+    noise : float32
+        ``m σ² / (A τ²)``.
+    xx, xy, yy : ndarray, float32, shape (P,)
+        J.
+    weighted_x, weighted_y, expected_x, expected_y : ndarray, float32, shape (P,)
+        J W and W̄.
+    x, y : ndarray, float32, shape (P,)
+        Filled.
+
+    Examples
+    --------
+    >>> one, zero, x, y = np.float32([1]), np.float32([0]), np.empty(1, np.float32), np.empty(1, np.float32)
+    >>> draw_pixels(np.float32(1), one, zero, zero, 3 * one, zero, zero, 5 * one, x, y)
+    >>> x.round(2), y
+    (array([1.5], dtype=float32), array([5.], dtype=float32))
+    """
+    half = np.float32(_TILT / 2)
+    for pixel in range(x.size):
+        a, b, c = xx[pixel], xy[pixel], yy[pixel]
+        prior = (a + c) * half + noise
+        u, v = prior * expected_x[pixel] + weighted_x[pixel], prior * expected_y[pixel] + weighted_y[pixel]
+        a += prior
+        c += prior
+        scale = np.float32(1) / (a * c - b * b)
+        x[pixel] = (c * u - b * v) * scale
+        y[pixel] = (a * v - b * u) * scale

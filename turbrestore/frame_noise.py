@@ -384,7 +384,8 @@ def _lost(flow: FloatArray) -> FloatArray:
         return lost
     # Faded out: an abrupt change of weights would show as an edge.
     side = 2 * AROUND_FOLD + 1
-    fade = _smooth(cv2.dilate(folded.astype(np.float32), np.ones((side, side), np.uint8)), FOLD_FADE)
+    around = cv2.dilate(folded.view(np.uint8), np.ones((side, side), np.uint8))
+    fade = _smooth(around.astype(np.float32), FOLD_FADE)
     return np.maximum(fade, lost, out=lost)
 
 
