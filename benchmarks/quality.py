@@ -67,6 +67,7 @@ BOUNDS = {
 }
 # What a clip may lose against an earlier revision, dB.
 LOSS_BOUND = 0.05
+FRAMES, IMAGES = "frames.npy", "images.npz"
 PANEL_COLUMNS, LABEL_HEIGHT = 3, 18
 
 Figures = dict[str, float]
@@ -222,11 +223,11 @@ def check_bounds() -> int:
     return int(failed)
 
 
-def restore_into(clip: str, file: str) -> Figures:
-    """Write the filtered image and the result of a clip into a file, and say how long that took."""
-    (load,) = find_clips([clip]).values()
-    restored, seconds = _timed(lambda: restore(load().frames))
-    np.savez(file, filtered=_filtered(restored), result=restored.image)
+def restore_into(folder: str) -> Figures:
+    """Put the filtered image and the result of the frames in a folder beside them, and say how long that took."""
+    frames = np.load(Path(folder, FRAMES))
+    restored, seconds = _timed(lambda: restore(frames))
+    np.savez(Path(folder, IMAGES), filtered=_filtered(restored), result=restored.image)
     return {"seconds": seconds}
 
 
@@ -236,7 +237,7 @@ def compare_with(before: str, patterns: list[str]) -> tuple[str, bool]:
         f"# Quality against {before}\n",
         f"What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --before {before}` measures: PSNR, dB, of the clips "
         "of `docs/quality.md` with truth, and the share of the words that tesseract reads of those with text. It ends "
-        f"with 1 where an image loses more than {LOSS_BOUND} dB.\n",
+        f"with 1 where an image loses more than {LOSS_BOUND} dB. Both restore the same frames.\n",
         "| clip | filtered: before | now | change | result: before | now | change | words: before | now |",
         "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
@@ -246,7 +247,8 @@ def compare_with(before: str, patterns: list[str]) -> tuple[str, bool]:
             clip = load()
             if clip.truth is None and not clip.words:
                 continue
-            old, new = restored_by(name, tree), restored_by(name, None)
+            print(name, file=sys.stderr)
+            old, new = restored_by(clip.frames, tree), restored_by(clip.frames, None)
             cells = [name]
             for stage in old:
                 if clip.truth is None:
@@ -263,12 +265,15 @@ def compare_with(before: str, patterns: list[str]) -> tuple[str, bool]:
     return "\n".join(lines) + "\n", bool(changes) and min(changes) < -LOSS_BOUND
 
 
-def restored_by(clip: str, tree: Path | None) -> dict[str, FloatArray]:
-    """Return the filtered image and the result of a clip by the package in a folder, or by the present one."""
+def restored_by(frames: FloatArray, tree: Path | None) -> dict[str, FloatArray]:
+    """Return the filtered image and the result of frames by the package in a folder, or by the present one.
+
+    Both are given the same frames: a synthesizer that rounds otherwise draws other noise.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        file = str(Path(folder, "images.npz"))
-        child(__file__, {"clip": clip, "file": file}, tree)
-        with np.load(file) as images:
+        np.save(Path(folder, FRAMES), frames)
+        child(__file__, {"folder": folder}, tree)
+        with np.load(Path(folder, IMAGES)) as images:
             return {stage: images[stage] for stage in ("filtered", "result")}
 
 
