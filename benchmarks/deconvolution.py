@@ -37,7 +37,7 @@ STAGE_BOUNDS_S = {256: 1.0, 512: 4.0}
 MEMORY_BOUNDS = {None: 1200, 6e8: 800}
 # Of the image; and how much of the scene lies beyond its border, pixels.
 NOISE, WIDTH, BORDER = 0.003, 1.2, 16
-# What the stage adds to the image on each side, in widths of the blur.
+# What the stage adds to the image on each side, in widths of the blur; not imported, for earlier trees are measured.
 MARGIN_SIGMAS = 4.0
 
 

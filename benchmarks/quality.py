@@ -7,8 +7,8 @@ writes the images side by side, ``--json`` the figures, ``--write`` the document
 ``--bounds`` instead restores a few simulated clips with the blur given by hand, and exits with 1 when a bound is
 broken or a stage is worse than the one before; without the data it says so and exits with 0.
 
-``--before`` names a revision of this repository, restores the clips with truth or text by its defaults and by those of
-the present tree, and exits with 1 where the filtered image or the result is worse by more than 0.05 dB.
+``--before`` instead restores the clips with truth or text by an earlier revision too, and exits with 1 where the
+filtered image or the result has lost more than 0.05 dB.
 """
 
 from __future__ import annotations
@@ -17,17 +17,15 @@ import argparse
 import dataclasses
 import json
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable
 from itertools import accumulate
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
 from clips import COUNT, LARGEST_SIDE, MOST_FRAMES, SCREEN_SIDE, SMOOTH_SIDE, Clip, data_folder, find_clips
-from revisions import child, revision
+from quality_change import compare_with
 from words import can_read, share_read
 
 from turbrestore.alternating import FilterParams
@@ -65,14 +63,10 @@ BOUNDS = {
     "purdue1_chart_medium": (1.2, 19.5),
     "ao_brick_weak": (0.8, 33.0),
 }
-# What a clip may lose against an earlier revision, dB.
-LOSS_BOUND = 0.05
-FRAMES, IMAGES = "frames.npy", "images.npz"
 PANEL_COLUMNS, LABEL_HEIGHT = 3, 18
 
 Figures = dict[str, float]
 Results = dict[str, dict[str, Figures]]
-Result = TypeVar("Result")
 
 
 def main() -> int:
@@ -80,11 +74,7 @@ def main() -> int:
     options = _options()
     if options.bounds:
         return check_bounds()
-    if options.child is not None:
-        print(json.dumps(restore_into(**json.loads(options.child))))
-        return 0
-    results: Results = {}
-    lost = False
+    results, lost = Results(), False
     try:
         if options.before is not None:
             text, lost = compare_with(options.before, options.clips)
@@ -223,60 +213,6 @@ def check_bounds() -> int:
     return int(failed)
 
 
-def restore_into(folder: str) -> Figures:
-    """Put the filtered image and the result of the frames in a folder beside them, and say how long that took."""
-    frames = np.load(Path(folder, FRAMES))
-    restored, seconds = _timed(lambda: restore(frames))
-    np.savez(Path(folder, IMAGES), filtered=_filtered(restored), result=restored.image)
-    return {"seconds": seconds}
-
-
-def compare_with(before: str, patterns: list[str]) -> tuple[str, bool]:
-    """Markdown of what has changed since a revision, and whether a clip has lost more than the bound."""
-    lines = [
-        f"# Quality against {before}\n",
-        f"What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --before {before}` measures: PSNR, dB, of the clips "
-        "of `docs/quality.md` with truth, and the share of the words that tesseract reads of those with text. It ends "
-        f"with 1 where an image loses more than {LOSS_BOUND} dB. Both restore the same frames.\n",
-        "| clip | filtered: before | now | change | result: before | now | change | words: before | now |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
-    ]
-    changes = []
-    with revision(before) as tree:
-        for name, load in find_clips(patterns).items():
-            clip = load()
-            if clip.truth is None and not clip.words:
-                continue
-            print(name, file=sys.stderr)
-            old, new = restored_by(clip.frames, tree), restored_by(clip.frames, None)
-            cells = [name]
-            for stage in old:
-                if clip.truth is None:
-                    cells += ["–"] * 3
-                    continue
-                was, now = (compare(images[stage], clip.truth).psnr for images in (old, new))
-                cells += [f"{was:.2f}", f"{now:.2f}", f"{now - was:+.3f}"]
-                changes.append(now - was)
-            read = clip.words and can_read()
-            cells += [f"{share_read(images['result'], clip.words):.2f}" if read else "–" for images in (old, new)]
-            lines.append(f"| {' | '.join(cells)} |")
-    if changes:
-        lines.append(f"\nChanges: {min(changes):+.3f} to {max(changes):+.3f} dB; may not be below −{LOSS_BOUND}.")
-    return "\n".join(lines) + "\n", bool(changes) and min(changes) < -LOSS_BOUND
-
-
-def restored_by(frames: FloatArray, tree: Path | None) -> dict[str, FloatArray]:
-    """Return the filtered image and the result of frames by the package in a folder, or by the present one.
-
-    Both are given the same frames: a synthesizer that rounds otherwise draws other noise.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        np.save(Path(folder, FRAMES), frames)
-        child(__file__, {"folder": folder}, tree)
-        with np.load(Path(folder, IMAGES)) as images:
-            return {stage: images[stage] for stage in ("filtered", "result")}
-
-
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="names or patterns; all by default")
@@ -284,18 +220,17 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
     parser.add_argument("--bounds", action="store_true", help="check PSNR with the blur given by hand")
-    parser.add_argument("--before", metavar="REVISION", help="restore by this revision too, and compare")
-    parser.add_argument("--child", metavar="JSON", help=argparse.SUPPRESS)
+    parser.add_argument("--before", metavar="REVISION", help="compare with what this revision makes of the clips")
     options = parser.parse_args()
     if options.before is not None and (options.json or options.images or options.bounds):
         parser.error("--before goes with --clips and --write only")
     return options
 
 
-def _timed(action: Callable[[], Result]) -> tuple[Result, float]:
+def _timed(action: Callable[[], FloatArray]) -> tuple[FloatArray, float]:
     started = time.perf_counter()
-    result = action()
-    return result, time.perf_counter() - started
+    image = action()
+    return image, time.perf_counter() - started
 
 
 def _filtered(restoration: Restoration) -> FloatArray:

@@ -1,7 +1,7 @@
 """Measure the present tree and an earlier revision of it by the same script, each in a process of its own.
 
-A script that is measured by names itself and reads a task, which is JSON, after ``--child``; it prints its figures as
-JSON.  It may use nothing that the earlier revision lacks.
+A script that measures is started again as the child: it finds a task after ``--child`` and prints figures, both JSON.
+What it imports must be there in the earlier revision too.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from turbrestore.errors import ConfigurationError, TurbrestoreError
+
 Figures = dict[str, Any]
 
 
@@ -31,7 +33,8 @@ def revision(name: str | None) -> Iterator[Path | None]:
     command = ["git", "archive", "--format=tar", name, "turbrestore"]
     packed = subprocess.run(command, cwd=root, capture_output=True, check=False)
     if packed.returncode:
-        sys.exit(f"{Path(sys.argv[0]).stem}: {packed.stderr.decode().strip()}")
+        said = packed.stderr.decode().strip().splitlines()[-1:]
+        raise ConfigurationError(f"--before: expected a revision of this repository, found {name!r}: {''.join(said)}")
     with tempfile.TemporaryDirectory() as folder:
         with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
             archive.extractall(folder, filter="data")
@@ -44,7 +47,9 @@ def child(script: str, task: Figures, tree: Path | None = None) -> Figures:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*paths, os.environ.get("PYTHONPATH", "")]).strip(":")}
     command = [sys.executable, script, "--child", json.dumps(task)]
     with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=folder, env=environment)
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False, cwd=folder, env=environment)
+    if done.returncode:
+        raise TurbrestoreError(f"{Path(script).name}: expected figures of {task}, found exit status {done.returncode}")
     figures: Figures = json.loads(done.stdout)
     print(f"{'before' if tree else 'now'}: {task} {figures}", file=sys.stderr, flush=True)
     return figures

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from turbrestore import compiled as compiling
 from turbrestore.blur_estimation import descend_loops, estimate_blur
 from turbrestore.confidence import draw_pixels, flow_confidence, regularise_flow
+from turbrestore.dynamics import identify
 from turbrestore.errors import DataError
+from turbrestore.flow_model import SUMMED, add_products, project_deviation
 from turbrestore.frame_noise import _folded, judge_frame, mark_folds, measure_frame_noise, weigh_pixels
 from turbrestore.kalman import PixelGaussian
 from turbrestore.nonlocal_penalty import NonlocalPenalty, add_differences, draw_back
@@ -24,7 +27,7 @@ from turbrestore.warp import sample_spline, warp
 
 USERS = (
     *("blur_estimation", "frame_noise", "nonlocal_penalty", "nonlocal_tv", "patch_search", "pixel_fusion", "warp"),
-    *("patch_pairs", "primal_dual", "confidence"),
+    *("patch_pairs", "primal_dual", "confidence", "flow_model"),
 )
 rng = np.random.default_rng(0)
 needs_compiler = pytest.mark.skipif(not compiling.can_compile(), reason="Numba is not installed: nothing to compare")
@@ -81,16 +84,37 @@ def test_a_frame_is_judged_alike(plain, amplitude):
 @pytest.mark.parametrize("shape", [(16, 16), (33, 50)])
 def test_a_flow_is_drawn_alike(plain, shape, contrast):
     """Without texture, with little, and with much; edges among it, whose tensors have no inverse."""
-    image = 0.5 + contrast * rng.uniform(-1, 1, shape).astype(np.float32)
+    random = np.random.default_rng(21)
+    image = 0.5 + contrast * random.uniform(-1, 1, shape).astype(np.float32)
     image[:, shape[1] // 2 :] = 0.5
     image[:, -5:] += np.float32(contrast)
-    flow = rng.normal(0, 2, (*shape, 2)).astype(np.float32)
+    flow, confidence = random.normal(0, 2, (*shape, 2)).astype(np.float32), flow_confidence(image)
+    tensors = [tensor.copy() for tensor in confidence.tensors]
     for noise in (0.0, 0.02):
-        fast, slow = both(plain, lambda n=noise: regularise_flow(flow, flow_confidence(image), n))
+        fast, slow = both(plain, lambda n=noise: regularise_flow(flow, confidence, n))
         assert fast.dtype == slow.dtype == np.float32
         assert fast == pytest.approx(slow, abs=2e-4)
         assert np.abs(fast - slow).mean() < 1e-5
         assert (np.abs(slow).max() > 0.01) == (contrast > 0)
+    # Threads share them.
+    assert all(map(np.array_equal, confidence.tensors, tensors))
+
+
+@needs_compiler
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("shape", [(2, 3), (16, SUMMED // 32), (31, 45)])
+@pytest.mark.parametrize("rank", [0, 1, 7])
+def test_a_flow_is_projected_alike(plain, shape, rank, order):
+    """On fewer products than are summed at once, on as many, and on more; modes in rows and in columns."""
+    random, size = np.random.default_rng(22), 2 * shape[0] * shape[1]
+    modes = np.asarray(random.normal(0, size**-0.5, (size, rank)), np.float32, order)
+    dynamics = replace(identify(np.zeros((3, *shape, 2))), C=modes)
+    flow = random.normal(0, 2, (*shape, 2)).astype(np.float32)
+    fast, slow = both(plain, lambda: project_deviation(dynamics, flow))
+    exact = flow.reshape(-1).astype(np.float64) @ modes.astype(np.float64)
+    assert fast.dtype == slow.dtype == np.float64
+    assert fast == pytest.approx(exact, abs=1e-4)
+    assert slow == pytest.approx(exact, abs=1e-4)
 
 
 @needs_compiler
@@ -106,6 +130,7 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
     "loops",
     [
         add_differences,
+        add_products,
         add_sums,
         choose_offsets,
         descend_loops,

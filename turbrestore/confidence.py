@@ -184,13 +184,13 @@ def _solve(tensor: FloatArray, weighted: Planes, expected: Planes, noise: float)
     Where J is singular, along an edge, its determinant is what cancellation leaves; as ε is at least κ tr(J) / 2,
     single precision keeps four digits and a half of the flow there.
     """
+    xx, xy, yy = tensor
     draw = compiled(draw_pixels)
     if draw is not None:
-        result = np.empty_like(expected[0]), np.empty_like(expected[1])
-        planes = *tensor, *weighted, *expected, *result
+        result = np.empty(xx.shape, np.float32), np.empty(xx.shape, np.float32)
+        planes = xx, xy, yy, *weighted, *expected, *result
         draw(np.float32(noise), *(plane.reshape(-1) for plane in planes))
         return result
-    xx, xy, yy = tensor
     prior = xx + yy
     prior *= np.float32(_TILT / 2)
     prior += np.float32(noise)
@@ -230,7 +230,7 @@ def draw_pixels(
     --------
     >>> one, zero, x, y = np.float32([1]), np.float32([0]), np.empty(1, np.float32), np.empty(1, np.float32)
     >>> draw_pixels(np.float32(1), one, zero, zero, 3 * one, zero, zero, 5 * one, x, y)
-    >>> x.round(2), y
+    >>> x.round(2), y.round(2)
     (array([1.5], dtype=float32), array([5.], dtype=float32))
     """
     half = np.float32(_TILT / 2)

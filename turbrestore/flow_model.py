@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, check_flow
+from .compiled import compiled
 from .errors import DataError
 from .plots import plot_dynamics
 from .preview import preview
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Float64Array = NDArray[np.float64]
+
+# Products that are summed in single precision, before their sum is added in double; they stay in the first cache.
+SUMMED = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,14 +209,44 @@ def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64A
     >>> project_deviation(dynamics, dynamics.mean_flow)
     array([], dtype=float64)
     """
-    rest, done = deviation.reshape(-1), 0
-    state = np.zeros(dynamics.C.shape[1])
-    # C may be mapped: all of it at once would come into memory.
-    for part in parts(dynamics.C):
-        # Unlike @, which is the same sum, it leaves the interpreter lock to other threads.
-        state += np.dot(rest[done : done + len(part)], part)
-        done += len(part)
+    rest, state, done = deviation.reshape(-1), np.zeros(dynamics.C.shape[1]), 0
+    # NumPy's product of a vector and a matrix keeps the interpreter lock.
+    project_part = compiled(add_products)
+    # C may be mapped: all of it at once would come into memory.  Its columns lie one after the other.
+    for modes in parts(dynamics.C.T):
+        found = state[done : done + len(modes)]
+        if project_part is not None:
+            project_part(modes, rest, found)
+        else:
+            found += modes @ rest
+        done += len(modes)
     return state
+
+
+def add_products(modes: FloatArray, deviation: FloatArray, state: Float64Array) -> None:
+    """Add the inner products of some flows and one; to be compiled.
+
+    Parameters
+    ----------
+    modes : ndarray, float32, shape (n, P)
+    deviation : ndarray, float32, shape (P,)
+    state : ndarray, float64, shape (n,)
+        Added to.
+
+    Examples
+    --------
+    >>> state = np.zeros(2)
+    >>> add_products(np.eye(2, dtype=np.float32), np.float32([3, 5]), state)
+    >>> state
+    array([3., 5.])
+    """
+    for start in range(0, deviation.size, SUMMED):
+        stop = min(start + SUMMED, deviation.size)
+        for mode in range(modes.shape[0]):
+            total = np.float32(0)
+            for place in range(np.uintp(start), np.uintp(stop)):
+                total += modes[mode, place] * deviation[place]
+            state[mode] += total
 
 
 def flow_of(dynamics: FlowDynamics, state: ArrayLike) -> FloatArray:

@@ -214,8 +214,8 @@ def tvl1_flows(frames: ArrayLike, reference: TvL1Reference, start: ArrayLike | N
     start : array_like, shape (T, H, W, 2), optional
         Flows to begin with on the coarsest level, zero by default.  A good prediction helps where a frame shows
         little, more so with fewer levels, which forget less of it; it saves hardly any time, because coarse levels
-        are cheap.  Neither the flow of the frame before nor the prediction of a dynamic texture is a better start
-        than zero.
+        are cheap.  With all levels, neither the flow of the frame before nor the prediction of a dynamic texture is a
+        better start than zero.
 
     Returns
     -------
