@@ -13,7 +13,7 @@ from flow_systems import (
 
 from turbrestore.dynamics import DynamicsParams, identify
 from turbrestore.errors import DataError
-from turbrestore.flow_model import flow_of, predict_flow, project
+from turbrestore.flow_model import flow_of, predict_flow, project, project_deviation
 from turbrestore.scratch import new_stack, release
 from turbrestore.simulation import simulate, stable_system
 
@@ -82,28 +82,32 @@ def test_flow_variance_is_that_of_the_flows_whatever_the_rank(noise_flows, rank)
     np.testing.assert_allclose(found, noise_flows.var(axis=0, ddof=1).mean(axis=-1), rtol=1e-4)
 
 
-def test_a_state_is_the_same_from_a_file_and_piece_by_piece(noise_flows, tmp_path, monkeypatch):
-    whole = identify(noise_flows, DynamicsParams(rank=7))
+def test_a_state_is_the_same_from_a_file_and_piece_by_piece(rng, tmp_path, monkeypatch):
+    flows = rng.normal(size=(20, 60, 70, 2)).astype(np.float32)
+    whole = identify(flows, DynamicsParams(rank=7))
     mapped = new_stack(whole.C.shape[::-1], tmp_path).T
     mapped[:] = whole.C
-    at_once = project(whole, noise_flows[3])
-    monkeypatch.setattr("turbrestore.scratch._PART", 70)
-    kept, filed = project(whole, noise_flows[3]), project(replace(whole, C=mapped), noise_flows[3])
+    at_once = project(whole, flows[3])
+    monkeypatch.setattr("turbrestore.flow_model.PIECE", 70)
+    kept, filed = project(whole, flows[3]), project(replace(whole, C=mapped), flows[3])
     np.testing.assert_array_equal(kept, filed)
     np.testing.assert_allclose(kept, at_once, atol=1e-5)
 
 
 # Pages of a mapped file that are resident are counted by the system alone, and only Linux tells them.
 @pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
-def test_a_state_takes_a_piece_of_the_modes_at_a_time(rng, tmp_path):
-    dynamics = identify(rng.normal(size=(4, 256, 512, 2)).astype(np.float32), DynamicsParams(rank=2))
-    modes = new_stack((80, len(dynamics.C)), tmp_path).T
+@pytest.mark.parametrize(("count", "shape"), [(80, (256, 512)), (2, (2048, 2560))])
+def test_a_state_takes_a_piece_of_the_modes_at_a_time(tmp_path, count, shape):
+    modes = new_stack((count, 2 * shape[0] * shape[1]), tmp_path).T
     modes[:] = 1e-3
     release(modes)
+    dynamics = replace(identify(np.zeros((3, 2, 2, 2))), C=modes)
+    deviation = np.ones((*shape, 2), np.float32)
     before = resident()
-    project(replace(dynamics, C=modes), np.ones((256, 512, 2), np.float32))
+    state = project_deviation(dynamics, deviation)
     # All of them are 84 MB.
     assert resident() - before < 40e6
+    assert state == pytest.approx(np.full(count, 1e-3 * deviation.size), rel=1e-4)
 
 
 def resident() -> int:

@@ -23,7 +23,7 @@ from .compiled import compiled
 from .errors import DataError
 from .plots import plot_dynamics
 from .preview import preview
-from .scratch import parts
+from .scratch import parts, release
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,6 +32,8 @@ Float64Array = NDArray[np.float64]
 
 # Products that are summed in single precision, before their sum is added in double; they stay in the first cache.
 SUMMED = 2048
+# Numbers of the modes that are in hand at a time.
+PIECE = 1 << 22
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,39 +211,43 @@ def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64A
     >>> project_deviation(dynamics, dynamics.mean_flow)
     array([], dtype=float64)
     """
-    rest, state, done = deviation.reshape(-1), np.zeros(dynamics.C.shape[1]), 0
+    # Columns of C lie one after the other.
+    modes, rest, state = dynamics.C.T, deviation.reshape(-1), np.zeros(dynamics.C.shape[1])
     # NumPy's product of a vector and a matrix keeps the interpreter lock.
     project_part = compiled(add_products)
-    # C may be mapped: all of it at once would come into memory.  Its columns lie one after the other.
-    for modes in parts(dynamics.C.T):
-        found = state[done : done + len(modes)]
+    # C may be mapped: all of it at once would come into memory.
+    step = SUMMED * max(1, PIECE // (SUMMED * max(1, len(modes))))
+    for start in range(0, rest.size, step):
+        stop = min(start + step, rest.size)
         if project_part is not None:
-            project_part(modes, rest, found)
+            project_part(modes, rest, start, stop, state)
         else:
-            found += modes @ rest
-        done += len(modes)
+            state += modes[:, start:stop] @ rest[start:stop]
+        release(modes)
     return state
 
 
-def add_products(modes: FloatArray, deviation: FloatArray, state: Float64Array) -> None:
-    """Add the inner products of some flows and one; to be compiled.
+def add_products(modes: FloatArray, deviation: FloatArray, first: int, end: int, state: Float64Array) -> None:
+    """Add the inner products of some flows and one, over a range of pixels; to be compiled.
 
     Parameters
     ----------
     modes : ndarray, float32, shape (n, P)
     deviation : ndarray, float32, shape (P,)
+    first, end : int
+        Range in P, the end left out.
     state : ndarray, float64, shape (n,)
         Added to.
 
     Examples
     --------
     >>> state = np.zeros(2)
-    >>> add_products(np.eye(2, dtype=np.float32), np.float32([3, 5]), state)
+    >>> add_products(np.eye(2, dtype=np.float32), np.float32([3, 5]), 0, 2, state)
     >>> state
     array([3., 5.])
     """
-    for start in range(0, deviation.size, SUMMED):
-        stop = min(start + SUMMED, deviation.size)
+    for start in range(first, end, SUMMED):
+        stop = min(start + SUMMED, end)
         for mode in range(modes.shape[0]):
             total = np.float32(0)
             for place in range(np.uintp(start), np.uintp(stop)):
