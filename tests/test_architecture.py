@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "turbrestore"
 ORDER = [
     "errors", "memory_size", "scratch", "arrays", "compiled", "decision", "device", "plots", "preview",
     "parallel", "pixels", "limits", "input_files", "tiff_pages", "image_headers",
-    "images", "npy", "frame_source", "stuck_pixels",
+    "images", "npy", "halo_tiles", "frame_source", "stuck_pixels",
     "scene_cuts", "content", "integrity", "ser", "tiff", "container", "encoding", "video",
     "image_stacks", "warp", "psf", "stabilisation", "confidence", "tvl1_sweeps", "tvl1", "flow",
     "centroid", "flow_model", "flow_subspace", "dynamics", "displacement", "simulation", "kalman",
@@ -21,7 +21,7 @@ ORDER = [
     "patch_search", "patch_pairs", "edge_strips", "nonlocal_tv", "nonlocal_penalty", "deconvolution_memory",
     "convolution_problem",
     "conjugate_gradients", "primal_dual", "local_tv", "planes", "torch_weights", "torch_deconvolution", "deconvolution",
-    "blur_map", "guards", "blind", "border", "frame_selection", "explanation", "synthesis", "metrics",
+    "tiled_stages", "blur_map", "guards", "blind", "border", "frame_selection", "explanation", "synthesis", "metrics",
     "memory", "restoration", "pipeline",
     "artifact_fields", "artifacts", "record_fields", "run_record", "checkpoint", "folder_lock",
     "digests", "resumption", "report",

@@ -5,6 +5,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -50,6 +51,13 @@ def limit_that(shape, holds, **settings):
         if holds(plan):
             return float(limit)
     raise AssertionError("no limit has such a plan")
+
+
+def least_limit(shape, **settings):
+    """Return the limit that a refusal names."""
+    with pytest.raises(ConfigurationError) as refusal:
+        plan_memory(shape, 1e8, **settings)
+    return MemorySize(str(refusal.value).split("at least ")[1].split(" for frames")[0])
 
 
 @pytest.fixture(scope="module")
@@ -110,10 +118,8 @@ def test_the_compiler_counts_where_it_is_installed(monkeypatch):
     least = []
     for installed in (False, True):
         monkeypatch.setattr("turbrestore.memory.can_compile", lambda found=installed: found)
-        with pytest.raises(ConfigurationError) as refusal:
-            plan_memory(FULL_HD, 1e8)
-        least.append(float(str(refusal.value).split("at least ")[1].split(" GB")[0]))
-    assert least[1] - least[0] == pytest.approx(1.01 * COMPILER_BYTES / 1e9, abs=0.02)
+        least.append(least_limit(FULL_HD))
+    assert least[1] - least[0] == pytest.approx(1.01 * COMPILER_BYTES, abs=1e7)
 
 
 @pytest.mark.usefixtures("no_compiler")
@@ -136,6 +142,27 @@ def test_threads_are_kept_where_a_file_is_enough():
     three = plan_memory(shape, limit, flow=FlowParams(threads=3))
     assert (three.threads, three.in_file) == (3, True)
     assert (alone.threads, alone.in_file) == (1, False)
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_frames_too_large_for_memory_are_worked_on_in_tiles():
+    shape, four = (300, 2160, 3840), {"flow": FlowParams(threads=4)}
+    whole, tiled, small = (plan_memory(shape, limit, **four) for limit in (6e9, 3e9, 1.2e9))
+    assert whole.tile is None
+    assert tiled.train == small.train == training_share(*shape[:1], shape[1:])
+    assert tiled.in_file and tiled.tight
+    # Tiles are as large as there is room for, and threads are kept as long as they are not tiny.
+    assert tiled.tile > small.tile and tiled.threads >= small.threads
+    assert plan_memory(shape, 3e9, flow=FlowParams(threads=1)).tile > tiled.tile
+    assert tiled.decisions[0].choice.endswith("pixels, training frames kept in a file")
+    assert "of 3.00 GB allowed" in tiled.decisions[0].reason
+
+
+@pytest.mark.usefixtures("no_compiler")
+@pytest.mark.parametrize("colour", [(), (3,)])
+def test_two_gigabytes_are_enough_for_4k(colour):
+    for threads in (1, 2, 16):
+        assert plan_memory((300, 2160, 3840, *colour), 2e9, flow=FlowParams(threads=threads)).train >= 9
 
 
 @given(
@@ -237,8 +264,8 @@ def test_more_memory_is_never_worse():
 
 
 def test_training_frames_asked_for_are_not_made_fewer():
-    with pytest.raises(ConfigurationError, match=r"of 1920×1080 and 300 training frames, found 700 MB; allow more"):
-        plan_memory(FULL_HD, 7e8, wanted=300)
+    with pytest.raises(ConfigurationError, match=r"of 1920×1080 and 300 training frames, found 400 MB; allow more"):
+        plan_memory(FULL_HD, 4e8, wanted=300)
     assert plan_memory(FULL_HD, 2e9, wanted=300).train == 300
 
 
@@ -285,6 +312,31 @@ def test_a_limit_changes_nothing_that_a_stage_depends_on(frames, in_file):
         replace(QUICK, train=None, dynamics=DynamicsParams(rank=20), memory_limit=limit) for limit in (4e8, fewer)
     )
     assert stage_facts(source, loose) != stage_facts(source, strict)
+
+
+def test_a_stage_depends_on_the_size_of_the_tiles():
+    source = FrameSource.from_array(np.zeros((12, 600, 800)))
+    loose, strict = (stage_facts(source, replace(QUICK, train=None, memory_limit=limit)) for limit in (1e9, 5e8))
+    assert "tile" not in loose["centroid"] and strict["centroid"].pop("tile") >= 384
+    assert strict == loose
+
+
+def test_the_command_restores_large_frames_in_tiles(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    # Wide frames, so that the whole is out of reach at a size that a test has time for.
+    frames = np.tile(make_sequence(seed=53, count=4, size=200, blur=1.0).frames, (1, 2, 5))
+    np.save("clip.npy", frames)
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    quick = ["--centroid.iterations=2", "--sigma=1", "--deconvolution.iterations=10", "--quiet"]
+    limit = f"--memory-limit={least_limit(frames.shape)}"
+    assert main(["restore", "clip.npy", "tiled.png", limit, "--json", *quick]) == 0
+    assert "tiles of up to" in json.loads(capsys.readouterr().out)["decisions"][0]["choice"]
+    assert main(["restore", "clip.npy", "whole.png", *quick]) == 0
+    found, usual = (cv2.imread(name, cv2.IMREAD_GRAYSCALE).astype(float) for name in ("tiled.png", "whole.png"))
+    assert found.shape == usual.shape == (400, 1000)
+    assert np.sqrt(np.mean((found - usual) ** 2)) < 6
+    assert not list((tmp_path / "temporary").iterdir())
 
 
 def test_the_command_says_what_the_limit_caused_and_leaves_no_file(frames, tmp_path, monkeypatch, capsys):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +13,9 @@ from .blur_map import BlurMap, deconvolve_varying, estimate_blur_map, sigma_map
 from .decision import Decision
 from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve
 from .guards import GuardParams, GuardReading, deconvolve_guarded, judge
+from .halo_tiles import HaloTile
 from .psf import KOLMOGOROV
+from .tiled_stages import deconvolve_tiles
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ def remove_blur(
     bounds: BlurBounds | None = None,
     progress: Callable[[int], None] | None = None,
     scratch: Path | None = None,
+    parts: Sequence[HaloTile] = (),
 ) -> Deblurred:
     """Deblur an image by the width asked for, else by the width estimated, as far as the guards allow.
 
@@ -71,6 +74,8 @@ def remove_blur(
         Called with the number of iterations done.
     scratch : Path, optional
         Folder of the file for what memory does not hold; by default that of temporary files.
+    parts : sequence of HaloTile, optional
+        Deblur these one after the other; by default the whole image at once.
 
     Returns
     -------
@@ -101,12 +106,15 @@ def remove_blur(
         widths = sigma_map(tiles.removable, image.shape[:2])
         sigma = float(widths.max())
 
+    def remove(width: float, progress: Callable[[int], None] | None = None) -> Deconvolution:
+        if parts and width > 0:
+            return deconvolve_tiles(image, width, settings, guide, parts, progress, scratch)
+        return deconvolve(image, width, settings, guide, progress, scratch)
+
     def attempt(width: float) -> Deconvolution:
         if tiles is None or not tiles.varies or width == 0:
-            return deconvolve(image, width, settings, guide, progress, scratch)
-        return deconvolve_varying(
-            lambda part: deconvolve(image, part, settings, guide, scratch=scratch), widths * (width / sigma)
-        )
+            return remove(width, progress)
+        return deconvolve_varying(remove, widths * (width / sigma))
 
     if blind:
         result, readings = deconvolve_guarded(attempt, image, sigma, guards)

@@ -161,13 +161,13 @@ def deconvolve_varying(attempt: Callable[[float], Deconvolution], sigmas: FloatA
     count = min(steps + 1, _MOST_WIDTHS)
     widths = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, _MOST_WIDTHS)
     widths = np.unique(widths) if high > low else np.array([high])
-    results = [attempt(float(width)) for width in widths]
-    image = np.zeros_like(results[-1].image)
-    for index, result in enumerate(results):
+    image = np.zeros((), np.float32)
+    for index, width in enumerate(widths):
+        result = attempt(float(width))
         # Hat functions: one at their width, zero at its neighbours'.
         share = np.interp(sigmas, widths, np.eye(len(widths))[index]).astype(np.float32)
-        image += result.image * (share if image.ndim == 2 else share[..., None])
-    return dataclasses.replace(results[-1], image=image, sigma=float(sigmas.mean()))
+        image = image + result.image * (share if result.image.ndim == 2 else share[..., None])
+    return dataclasses.replace(result, image=image, sigma=float(sigmas.mean()))
 
 
 def _spans(length: int) -> list[slice]:

@@ -281,8 +281,7 @@ def deconvolve(
         sigma_or_psf = sigma_or_psf.removable
     psf, sigma, margin = _read_blur(sigma_or_psf)
     planes = split_planes(pixels, params.channels)
-    noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))
-    fidelity = params.fidelity or automatic_fidelity(params.method, planes[0], noise)
+    noise, fidelity = _noise_and_fidelity(planes, params)
     nothing = np.zeros(0)
     if sigma == 0:
         return Deconvolution(pixels, 0.0, fidelity, noise, 0, True, nothing.astype(np.int64), nothing, nothing)
@@ -296,6 +295,36 @@ def deconvolve(
     inside = tuple(slice(before, before + size) for (before, _), size in zip(widths, planes[0].shape, strict=True))
     restored = join_planes(pixels, [u[inside] for u in result.images], params.channels)
     return Deconvolution(np.clip(restored, 0, 1), sigma, fidelity, noise, *result[1:])
+
+
+def noise_and_fidelity(image: ArrayLike, params: DeconvolutionParams) -> tuple[float, float]:
+    """Noise of a blurred image, and the weight λ that a deconvolution of it takes.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W) or (H, W, 3)
+    params : DeconvolutionParams
+
+    Returns
+    -------
+    noise : float
+        Standard deviation, intensity.
+    fidelity : float
+        The one asked for, else that of :func:`automatic_fidelity`.
+
+    Raises
+    ------
+    DataError
+        Wrong shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> noise, fidelity = noise_and_fidelity(np.full((32, 32), 0.5), DeconvolutionParams())
+    >>> round(fidelity)
+    5000
+    """
+    return _noise_and_fidelity(split_planes(check_image(image), params.channels), params)
 
 
 def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
@@ -468,6 +497,11 @@ def _sharpened(
     elif guide is None:
         guide = np.mean(starts if params.sharpen_guide else [p.observed for p in problems], axis=0, dtype=np.float32)
     return starts, guide
+
+
+def _noise_and_fidelity(planes: list[FloatArray], params: DeconvolutionParams) -> tuple[float, float]:
+    noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))
+    return noise, params.fidelity or automatic_fidelity(params.method, planes[0], noise)
 
 
 def _read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:

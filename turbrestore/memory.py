@@ -13,17 +13,24 @@ and for the deconvolution what :mod:`turbrestore.deconvolution_memory` says.
 Stack and modes may be kept in a file; what the threads have in hand of it then still counts.  Where they are in
 memory, what flow prepares of the training frames is kept too, τ HW bytes until the filter has passed over them.
 
+Where even that is too much for whole frames, they are worked on in tiles that overlap
+(:mod:`turbrestore.tiled_stages`).  A tile takes what a clip of its size takes; beside it there are images of the whole,
+in files, and what is made of them::
+
+    base + HW · (whole + c · colour) + what the tile takes
+
 The constants are those of ``python benchmarks/memory.py --stages`` at 1280×720, grey and in colour, with one, two and
 four threads, and a tenth added.  torch counts where a device is asked for, but not what a stage holds there, on the
 processor or not.  The deconvolution is told what is left, and works in strips and fewer threads where that is little;
 the other stages need what they need.  So the training frames go to a file first, then fewer threads work side by side,
-and at last fewer frames are trained on.  Only the last changes the result.
+then fewer frames are trained on, and at last frames are worked on in tiles, as large ones as there is room for.  Only
+the last two change the result.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,6 +43,7 @@ from .device import TORCH_BYTES
 from .dynamics import DynamicsParams
 from .errors import ConfigurationError, DataError, require
 from .flow import MIN_SIDE, FlowParams
+from .halo_tiles import HALO, halo_tiles, largest_tile
 from .memory_size import size_text
 from .parallel import available_cores
 
@@ -93,6 +101,10 @@ class StageMemory:
 _FLOW = StageMemory(120, 5, 185, 10)
 # While frames are registered and weighed beside that.
 _FILTER = StageMemory(10, 5, 10, 5)
+# Images and maps of the whole that there are beside tiles.
+_WHOLE = StageMemory(40, 16, 0, 0)
+# Shortest side of a tile that is worth a thread less, pixels, and the step in which sides are tried.
+_WORTH, _SIDE_STEP = 640, 32
 # Images and maps that earlier stages leave, and what is made of them while the width of the blur is found.
 _HELD, _BLUR = StageMemory(60, 40, 0, 0), StageMemory(40, 0, 0, 0)
 # Width of the blur where it is not known yet, pixels.
@@ -115,6 +127,8 @@ class MemoryPlan:
         Frames worked on side by side, as in :class:`turbrestore.flow.FlowParams`.
     in_file : bool
         Whether training frames and flows are kept in a file.
+    tile : int or None
+        Longest side of the tiles that frames are worked on in, pixels; None for whole frames.
     file_bytes : int
         Size of all files, with those of the deconvolution.
     deconvolution : float or None
@@ -128,6 +142,7 @@ class MemoryPlan:
     train: int
     threads: int
     in_file: bool = False
+    tile: int | None = None
     file_bytes: int = 0
     deconvolution: float | None = None
     tight: bool = False
@@ -198,6 +213,22 @@ class _Work:
         }
         stages = list(later)[: list(later).index(self.until) + 1]
         return self.base + stack + max(flow + prepared, modes + max(later[stage] for stage in stages))
+
+    def part(self, side: int) -> _Work:
+        """Return the work on one tile, up to where the whole is needed."""
+        until = "centroid" if self.until in ("centroid", "identify") else "filter"
+        largest = largest_tile((self.shape[1], self.shape[2]), side)
+        return replace(self, shape=(self.shape[0], *largest, *self.shape[3:]), until=until)
+
+    def peak_in_tiles(self, train: int, threads: int, side: int) -> float:
+        """Largest need of any stage where frames are worked on in tiles."""
+        part, whole = self.part(side), _WHOLE.bytes(self.pixels, self.channels, 0)
+        modes = min(self.modes(train), 4.0 * _IN_HAND * threads)
+        strips = min(_STRIPS, _STRIP_NUMBER * self.pixels * train)
+        blur = max(_BLUR.bytes(self.pixels, self.channels, 0), part.pairs.peak(Room(1, True)))
+        later = {"centroid": 0.0, "identify": modes + strips, "filter": 0.0, "deconvolve": blur}
+        stages = list(later)[: list(later).index(self.until) + 1]
+        return whole + max(part.peak(train, threads, True), self.base + max(later[stage] for stage in stages))
 
     def held(self) -> float:
         """Results of the stages before the deconvolution."""
@@ -277,9 +308,14 @@ def plan_memory(
             choices = ((threads, in_file) for threads in range(most, 0, -1) for in_file in (False, True))
             chosen = next(choice for choice in choices if work.peak(count, *choice) <= limit)
             return _plan(work, limit, (train, most), (count, *chosen))
+    for threads in range(most, 0, -1):
+        for side in range(max(shape[1:3]), (4 * HALO if threads == 1 else _WORTH) - 1, -_SIDE_STEP):
+            if work.peak_in_tiles(train, threads, side) <= limit:
+                return _plan_in_tiles(work, limit, (train, most), threads, side)
+    least = min(work.peak(fewest, 1, True), work.peak_in_tiles(train, 1, 4 * HALO))
     asked = f" and {train} training frames" if wanted is not None else ""
     raise ConfigurationError(
-        f"--memory-limit: expected at least {size_text(1.01 * work.peak(fewest, 1, True))} for frames of "
+        f"--memory-limit: expected at least {size_text(1.01 * least)} for frames of "
         f"{shape[2]}×{shape[1]}{asked}, found {size_text(limit)}; allow more, or use a --roi"
     )
 
@@ -337,7 +373,35 @@ def _plan(work: _Work, limit: float, wanted: tuple[int, int], chosen: tuple[int,
     files = (kept if in_file else 0) + (work.pairs.pairs() if room.in_file else 0)
     decisions = tuple(_decisions(work, limit, wanted, chosen, room))
     tight = bool(decisions) or work.peak(*chosen) > _ROOMY * limit
-    return MemoryPlan(count, threads, in_file, int(files), left, tight, decisions)
+    return MemoryPlan(count, threads, in_file, None, int(files), left, tight, decisions)
+
+
+def _plan_in_tiles(work: _Work, limit: float, wanted: tuple[int, int], threads: int, side: int) -> MemoryPlan:
+    """Training frames and threads are wanted; tiles are of this side."""
+    train, most = wanted
+    part = work.part(side)
+    left = work.left(limit, _WHOLE.bytes(work.pixels, work.channels, 0) - work.held())
+    room = replace(part, until=work.until).room(left)
+    images = 4.0 * work.pixels * (1 + 3 * work.channels)
+    files = work.modes(train) + work.stack(train) + part.modes(train) + part.stack(train) + images
+    decisions = tuple(_decisions_in_tiles(work, limit, part, (threads, most), side))
+    files += part.pairs.pairs() if room.in_file else 0
+    return MemoryPlan(train, threads, True, side, int(files), left, True, decisions)
+
+
+def _decisions_in_tiles(
+    work: _Work, limit: float, part: _Work, threads: tuple[int, int], side: int
+) -> Iterator[Decision]:
+    """Put into words what the limit has changed; threads are those that work, and those that there are."""
+    allowed = f"of {size_text(limit)} allowed"
+    height, width = part.shape[1:3]
+    tiles = len(halo_tiles((work.shape[1], work.shape[2]), side))
+    needed = size_text(work.peak(_FEWEST_IN_NEED, 1, True))
+    words = f"{tiles} tiles of up to {width}×{height} pixels, training frames kept in a file"
+    yield Decision("memory", words, f"whole frames would take {needed} {allowed}")
+    if threads[0] < threads[1]:
+        reason = f"with all of them tiles of {_WORTH} pixels would take more than the {size_text(limit)} allowed"
+        yield Decision("memory", f"{threads[0]} of {threads[1]} threads", reason)
 
 
 def _decisions(

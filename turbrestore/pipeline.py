@@ -37,12 +37,14 @@ from .flow import MIN_SIDE, FlowFrame
 from .flow_model import FlowDynamics
 from .frame_selection import best_frames, frame_quality
 from .frame_source import FrameSource
+from .halo_tiles import HaloTile, cut_tile, halo_tiles
 from .images import check_space
 from .memory import MemoryPlan, plan_memory
 from .memory_size import DeconvolutionMemory
 from .psf import KOLMOGOROV
 from .restoration import STAGES, Restoration, RestoreParams, StageResults, explain_devices, place_stages
 from .scratch import mean_of, new_stack, release, returning_freed, walk
+from .tiled_stages import filter_tiles, find_tiled_centroid
 
 # Share of the training frames that show every pixel of a cropped image.
 _SEEN = 0.9
@@ -114,7 +116,7 @@ def restore(
     folder = scratch or Path(tempfile.gettempdir())
     if plan.file_bytes:
         check_space(folder / "what memory does not hold", plan.file_bytes)
-    run = _Run(source, _within(plan, params), progress, done or StageResults(), on_result, folder, plan.in_file)
+    run = _Run(source, _within(plan, params), progress, done or StageResults(), on_result, folder, plan)
     with returning_freed(plan.tight):
         return _restored(run, plan)
 
@@ -236,14 +238,16 @@ class _Run:
         done: StageResults,
         on_result: Callable[[StageResults], None] | None,
         folder: Path,
-        in_file: bool,
+        plan: MemoryPlan,
     ) -> None:
         self.source, self.params, self.progress = source, params, progress
         self.done = done
         self.clock = _Clock()
-        self.folder, self.scratch = folder, folder if in_file else None
+        self.folder, self.scratch = folder, folder if plan.in_file else None
         # Where even the frames are in a file, what is prepared of them is not kept.
-        self.prepared: dict[int, FlowFrame] | None = None if in_file else {}
+        self.prepared: dict[int, FlowFrame] | None = None if plan.in_file else {}
+        height, width = source.shape[1:3]
+        self.tiles = () if plan.tile is None else halo_tiles((height, width), plan.tile)
         self._on_result = on_result
 
     def finish(self, done: StageResults, stage: str | None = None) -> None:
@@ -300,8 +304,13 @@ def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
     if run.done.centroid is not None:
         return run.done.centroid
     params = run.params
-    counter = stage_counter(run.progress, "centroid", len(training) * params.centroid.iterations)
-    centroid = find_centroid(training, params.centroid, params.flow, counter, run.scratch, run.prepared)
+    steps = len(training) * params.centroid.iterations
+    if run.tiles:
+        counter = stage_counter(run.progress, "centroid", len(run.tiles) * steps)
+        centroid = find_tiled_centroid(training, run.tiles, params.centroid, params.flow, counter, run.scratch)
+    else:
+        counter = stage_counter(run.progress, "centroid", steps)
+        centroid = find_centroid(training, params.centroid, params.flow, counter, run.scratch, run.prepared)
     run.finish(replace(run.done, centroid=centroid), "centroid")
     return centroid
 
@@ -309,11 +318,14 @@ def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
 def _identify(run: _Run, centroid: Centroid, training: FloatArray) -> FlowDynamics:
     if run.done.dynamics is not None:
         return run.done.dynamics
-    dynamics = identify(centroid.flows, run.params.dynamics, run.scratch, run.params.flow.threads)
-    if run.params.displacement_cue:
-        dynamics = with_displacement(dynamics, *displacement_maps(training))
+    dynamics = _flow_model(run, centroid.flows, training)
     run.finish(replace(run.done, dynamics=dynamics), "identify")
     return dynamics
+
+
+def _flow_model(run: _Run, flows: FloatArray, training: FloatArray) -> FlowDynamics:
+    dynamics = identify(flows, run.params.dynamics, run.scratch, run.params.flow.threads)
+    return with_displacement(dynamics, *displacement_maps(training)) if run.params.displacement_cue else dynamics
 
 
 def _filter(
@@ -324,23 +336,42 @@ def _filter(
         return run.done.filtered, run.done.mean
     params, source = run.params, run.source
     counted = None if params.keep_best == 1 else best_frames(frame_quality(source), params.keep_best)
-    summed = _Sum(training, rest)
-    filtered = filter_frames(
-        summed,
-        centroid.image,
-        dynamics,
-        params.filter,
-        params.flow,
-        centroid.flows,
-        stage_counter(run.progress, "filter", len(source) * params.filter.inner_iterations - len(training)),
-        counted,
-        run.done.checkpoint,
-        lambda checkpoint: run.finish(replace(run.done, checkpoint=checkpoint)),
-        run.prepared,
-    )
-    mean = summed.mean()
+    steps = len(source) * params.filter.inner_iterations - len(training)
+    counter = stage_counter(run.progress, "filter", max(len(run.tiles), 1) * steps)
+
+    def filter_part(tile: HaloTile) -> tuple[Filtered, FloatArray]:
+        frames, flows = (cut_tile(stack, tile, run.scratch) for stack in (training, centroid.flows))
+        summed = _Sum(frames, _rest_of(source, len(training), tile))
+        image = centroid.image[tile.rows, tile.columns].copy()
+        model = _flow_model(run, flows, frames)
+        filtered = filter_frames(summed, image, model, params.filter, params.flow, flows, counter, counted)
+        return filtered, summed.mean()
+
+    if run.tiles:
+        filtered, mean = filter_tiles(filter_part, run.tiles, source.shape[1:], run.scratch)
+    else:
+        summed = _Sum(training, rest)
+        filtered = filter_frames(
+            summed,
+            centroid.image,
+            dynamics,
+            params.filter,
+            params.flow,
+            centroid.flows,
+            counter,
+            counted,
+            run.done.checkpoint,
+            lambda checkpoint: run.finish(replace(run.done, checkpoint=checkpoint)),
+            run.prepared,
+        )
+        mean = summed.mean()
     run.finish(replace(run.done, checkpoint=None, filtered=filtered, mean=mean), "filter")
     return filtered, mean
+
+
+def _rest_of(source: FrameSource, start: int, tile: HaloTile) -> Iterator[FloatArray]:
+    """Frames from a number on, cropped to a tile."""
+    return iter(source.select(frames=(start, None), roi=tile.roi)) if start < len(source) else iter(())
 
 
 def _deblur(run: _Run, image: FloatArray, mean: FloatArray, centroid: Centroid, training: FloatArray) -> Deblurred:
@@ -350,8 +381,10 @@ def _deblur(run: _Run, image: FloatArray, mean: FloatArray, centroid: Centroid, 
     if params.blur_bounds:
         exponent = params.deconvolution.exponent or KOLMOGOROV
         bounds = bound_blur(image, mean, training, len(run.source), exponent)
-    counter = stage_counter(run.progress, "deconvolve", params.deconvolution.iterations)
-    deblurred = remove_blur(image, centroid.image, params.deconvolution, params.guards, bounds, counter, run.folder)
+    counter = stage_counter(run.progress, "deconvolve", max(len(run.tiles), 1) * params.deconvolution.iterations)
+    deblurred = remove_blur(
+        image, centroid.image, params.deconvolution, params.guards, bounds, counter, run.folder, run.tiles
+    )
     run.finish(replace(run.done, blur_bounds=bounds, deblurred=deblurred), "deconvolve")
     return deblurred
 

@@ -81,7 +81,8 @@ class RestoreParams:
         allows.
     memory_limit : float, optional
         Most memory to take, such as 2GB: training frames then go to a file, and fewer threads work, where that is
-        needed.  The result is the same unless even so fewer frames have to be trained on.
+        needed.  The result is the same unless even so fewer frames have to be trained on, or frames are too large and
+        have to be worked on in tiles that overlap.
     device : str
         Where flow (tvl1), warps, fusion and deconvolution are computed: cpu, cuda, or auto for a GPU where torch sees
         one.  It holds for the stages that have no ``device`` of their own.

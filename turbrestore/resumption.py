@@ -14,7 +14,7 @@ deblurred   the filtered image, settings of deconvolution and guards, the bounds
 ==========  =========================================================================================================
 
 Neither the number of threads nor a memory limit changes a result, so nothing depends on them; but where a limit leaves
-fewer training frames, the centroid depends on those.
+fewer training frames, or whole frames do not fit, the centroid depends on those frames and on the size of the tiles.
 
 The content of the input is a checksum of all its bytes: of a folder, the names and bytes of its images.  Reading a file
 takes a few thousandths of the time of measuring flow in it, and no time stamp is believed.  Only where there are
@@ -341,10 +341,11 @@ def stage_facts(source: FrameSource, params: RestoreParams) -> dict[str, dict[st
     (['centroid', 'dynamics', 'filtered', 'deblurred'], [0, 5, 1])
     """
     settings = dataclasses.asdict(place_stages(params))
-    # The number of threads changes nothing but the time, and a memory limit nothing but the training frames.
+    # The number of threads changes nothing but the time; a memory limit, training frames and tiles at most.
     flow = {name: value for name, value in settings["flow"].items() if name != "threads"}
     del settings["deconvolution"]["memory"]
-    training = source.numbers[: memory_plan(source, params).train]
+    plan = memory_plan(source, params)
+    training = source.numbers[: plan.train]
     rows, columns = source.window
     facts = {
         "centroid": {
@@ -352,6 +353,7 @@ def stage_facts(source: FrameSource, params: RestoreParams) -> dict[str, dict[st
             "training_frames": _span(training),
             # What is repaired is found by looking at all frames.
             "repaired": None if source.repair is None else [_span(source.numbers), *source.warnings],
+            **({} if plan.tile is None else {"tile": plan.tile}),
             "region": [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start],
             "flow": flow,
             "centroid": settings["centroid"],

@@ -1,0 +1,156 @@
+"""Stages in tiles: close to those of the whole, the same where there is one tile, and records that add up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conftest import make_sequence
+from turbrestore import pipeline
+from turbrestore.alternating import Filtered
+from turbrestore.blind import remove_blur
+from turbrestore.centroid import CentroidParams, find_centroid
+from turbrestore.deconvolution import DeconvolutionParams, deconvolve
+from turbrestore.dynamics import DynamicsParams
+from turbrestore.frame_source import FrameSource
+from turbrestore.halo_tiles import halo_tiles
+from turbrestore.metrics import psnr
+from turbrestore.restoration import RestoreParams
+from turbrestore.tiled_stages import deconvolve_tiles, filter_tiles, find_tiled_centroid
+
+HALO = 24
+TILES = halo_tiles((128, 128), 112, HALO)
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return make_sequence(seed=61, count=12, size=128, blur=1.2)
+
+
+@pytest.fixture(scope="module")
+def blurred(sequence):
+    return find_centroid(sequence.frames).image
+
+
+def test_there_are_four_tiles():
+    assert len(TILES) == 4
+
+
+def test_a_centroid_in_tiles_is_as_good_as_that_of_the_whole(sequence, tmp_path):
+    whole = find_centroid(sequence.frames)
+    tiled = find_tiled_centroid(sequence.frames, TILES, scratch=tmp_path)
+    assert isinstance(tiled.flows, np.memmap) and isinstance(tiled.image, np.memmap)
+    inner = slice(8, -8)
+    found, usual = (psnr(centroid.image[inner, inner], sequence.scene[inner, inner]) for centroid in (tiled, whole))
+    assert abs(found - usual) < 0.3
+    assert np.median(np.abs(tiled.flows - whole.flows)) < 0.05
+    assert tiled.converged == whole.converged
+
+
+def test_one_tile_is_the_whole(sequence, blurred):
+    tiles = halo_tiles((128, 128), 128, HALO)
+    whole, tiled = find_centroid(sequence.frames), find_tiled_centroid(sequence.frames, tiles)
+    for name in ("image", "flows", "mean_flow_sizes"):
+        assert np.array_equal(getattr(whole, name), getattr(tiled, name))
+    params = DeconvolutionParams(iterations=30)
+    deblurred, parts = deconvolve(blurred, 1.2, params, blurred), deconvolve_tiles(blurred, 1.2, params, blurred, tiles)
+    for name in ("image", "noise", "fidelity", "iterations", "recorded", "objective", "changes"):
+        assert np.array_equal(getattr(deblurred, name), getattr(parts, name))
+
+
+@pytest.mark.parametrize("method", ["nltv", "tv", "wiener"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_deconvolution_in_tiles_is_that_of_the_whole(blurred, method, channels):
+    image = blurred if channels == 1 else np.stack([blurred, blurred[::-1], blurred.T], axis=-1)
+    params = DeconvolutionParams(method=method, iterations=100, tolerance=0)
+    whole, tiled = deconvolve(image, 1.2, params, image), deconvolve_tiles(image, 1.2, params, image, TILES)
+    assert tiled.image.shape == image.shape
+    assert (tiled.noise, tiled.fidelity, tiled.sigma) == (whole.noise, whole.fidelity, whole.sigma)
+    difference = np.abs(tiled.image - whole.image)
+    # The Wiener images that the others start from have the noise of the tile, and at the border of the frame, where
+    # nothing tells what lies beyond, a solution is slow to settle.
+    assert np.sqrt(np.mean(difference**2)) < (0.002 if method == "wiener" else 0.01)
+    # Where tiles meet no more than elsewhere.
+    assert difference[60:68].mean() < 1.5 * difference.mean()
+
+
+def test_records_of_a_deconvolution_add_up(blurred):
+    params = DeconvolutionParams(method="tv", tolerance=1e-4)
+    parts = [
+        deconvolve(blurred[t.rows, t.columns], 1.2, replace(params, fidelity=900.0), blurred[t.rows, t.columns])
+        for t in TILES
+    ]
+    tiled = deconvolve_tiles(blurred, 1.2, replace(params, fidelity=900.0), blurred, TILES)
+    assert len({part.iterations for part in parts}) > 1
+    assert tiled.iterations == max(part.iterations for part in parts)
+    assert tiled.objective[-1] == pytest.approx(sum(part.objective[-1] for part in parts))
+    assert tiled.objective[0] == pytest.approx(sum(part.objective[0] for part in parts))
+    assert tiled.recorded.size == tiled.objective.size == tiled.changes.size
+    assert tiled.converged == all(part.converged for part in parts)
+
+
+def test_a_blur_is_removed_in_tiles_by_one_width(blurred):
+    whole, tiled = (remove_blur(blurred, blurred, parts=parts) for parts in ((), TILES))
+    assert tiled.blur.sigma == whole.blur.sigma
+    assert tiled.deconvolution.sigma == whole.deconvolution.sigma > 0
+    assert np.sqrt(np.mean((tiled.deconvolution.image - whole.deconvolution.image) ** 2)) < 0.01
+
+
+def test_figures_of_the_filter_are_means_over_tiles():
+    tiles = halo_tiles((40, 64), 44, 8)
+    values = iter((1.0, 2.0, 6.0))
+
+    def part(tile):
+        value, image = next(values), np.full(tile.shape, 0.5, np.float32)
+        one = np.array([value, np.nan])
+        share = np.array([0.25, 0.75])
+        return Filtered(image, 2 * image, np.ones((2, 3)), one, one, one, share, value, value), 3 * image
+
+    filtered, mean = filter_tiles(part, tiles, (40, 64))
+    weights = [tile.row_weights.sum() * tile.column_weights.sum() for tile in tiles]
+    expected = np.average([1, 2, 6], weights=weights)
+    for name in ("gains", "sharpness"):
+        assert getattr(filtered, name)[0] == pytest.approx(expected)
+        assert np.isnan(getattr(filtered, name)[1])
+    assert filtered.innovations[0] == pytest.approx(np.average([1, 4, 36], weights=weights) ** 0.5)
+    assert filtered.image_noise == filtered.motion_share == pytest.approx(expected)
+    assert filtered.shares == pytest.approx([0.25, 0.75])
+    assert filtered.flow_states.shape == (2, 9)
+    for image, level in ((filtered.image, 0.5), (filtered.variance, 1.0), (mean, 1.5)):
+        np.testing.assert_allclose(image, level, atol=1e-6)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, tmp_path, monkeypatch, channels):
+    frames = sequence.frames if channels == 1 else np.stack([sequence.frames] * 3, axis=-1)
+    params = RestoreParams(
+        train=9,
+        centroid=CentroidParams(iterations=2),
+        dynamics=DynamicsParams(rank=2),
+        displacement_cue=True,
+        deconvolution=DeconvolutionParams(sigma=1.0, iterations=30),
+    )
+    source = FrameSource.from_array(frames)
+    whole = pipeline.restore(source, params)
+    plan = replace(pipeline.memory_plan(source, params), in_file=True, tile=112)
+    monkeypatch.setattr(pipeline, "memory_plan", lambda *_: plan)
+    monkeypatch.setattr(pipeline, "halo_tiles", lambda shape, side: halo_tiles(shape, side, HALO))
+    told = []
+    tiled = pipeline.restore(
+        source, params, progress=lambda stage, done, total: told.append((stage, done, total)), scratch=tmp_path
+    )
+    inner = slice(8, -8)
+    truth = sequence.scene if channels == 1 else np.stack([sequence.scene] * 3, axis=-1)
+    for name in ("mean", "image"):
+        found, usual = (psnr(getattr(run, name)[inner, inner], truth[inner, inner]) for run in (tiled, whole))
+        assert abs(found - usual) < 0.3
+    np.testing.assert_allclose(tiled.mean, whole.mean, atol=1e-6)
+    assert tiled.filtered.shares.sum() == pytest.approx(1)
+    assert tiled.filtered.gains.shape == (12,)
+    assert tiled.frame_count == 12
+    assert not list(tmp_path.iterdir())
+    for stage in ("centroid", "filter", "deconvolve"):
+        done = [count for name, count, _ in told if name == stage]
+        totals = {total for name, _, total in told if name == stage}
+        assert done == sorted(done) and len(totals) == 1 and done[-1] <= totals.pop()
+    assert [done for name, done, total in told if name == "filter"][-1] == 4 * (2 * 12 - 9)

@@ -1,0 +1,225 @@
+"""Stages of a restoration whose frames are too large for memory, in tiles that overlap (:mod:`turbrestore.halo_tiles`).
+
+A tile is a clip of its own: it has its own centroid iterations, flow model and filter, and what they leave fades into
+what the neighbours leave.  That is not the result of the whole frame, though close to it: what is taken from all pixels
+at once, such as the flow model, the noise of the frames and the motion of flat regions far from any texture, is taken
+from those of the tile.  In a deconvolution weight and width are those of the whole image.
+
+A frame that is shifted by more than the halo, 96 pixels, leaves a part of its tile unseen, as at the border of a frame.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .alternating import Filtered
+from .arrays import FloatArray
+from .centroid import Centroid, CentroidParams, find_centroid
+from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve, noise_and_fidelity
+from .flow import FlowParams
+from .halo_tiles import HaloTile, add_tile, cut_tile, new_mosaic
+from .scratch import release, walk
+
+Float64Array = NDArray[np.float64]
+
+
+def find_tiled_centroid(
+    frames: FloatArray,
+    tiles: Sequence[HaloTile],
+    params: CentroidParams | None = None,
+    flow_params: FlowParams | None = None,
+    progress: Callable[[int], None] | None = None,
+    scratch: Path | None = None,
+) -> Centroid:
+    """Iterate to the centroid of every tile.
+
+    Parameters
+    ----------
+    frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
+        At least two frames, in memory or in a mapped file.
+    tiles : sequence of HaloTile
+        Of these frames.
+    params : CentroidParams, optional
+    flow_params : FlowParams, optional
+    progress : callable, optional
+        Called with 1 after each flow of each tile.
+    scratch : Path, optional
+        Folder of files that hold images and flows; by default they are in memory.
+
+    Returns
+    -------
+    Centroid
+        It has converged if all tiles have; the mean flow of an iteration is the mean over the tiles, of which those
+        that have stopped keep their last.
+
+    Raises
+    ------
+    DataError, ConfigurationError
+        As :func:`turbrestore.centroid.find_centroid`.
+
+    Examples
+    --------
+    >>> from turbrestore.halo_tiles import halo_tiles
+    >>> tiles = halo_tiles((40, 64), side=44, halo=8)
+    >>> centroid = find_tiled_centroid(np.ones((2, 40, 64), np.float32), tiles)
+    >>> len(tiles), centroid.flows.shape
+    (3, (2, 40, 64, 2))
+    """
+    image = new_mosaic(frames.shape[1:], scratch)
+    flows = new_mosaic((*frames.shape[:3], 2), scratch)
+    sizes, converged = list[Float64Array](), True
+    for tile in tiles:
+        part = find_centroid(cut_tile(frames, tile, scratch), params, flow_params, progress, scratch)
+        add_tile(image, tile, part.image)
+        for whole, flow in zip(flows, walk(part.flows), strict=True):
+            add_tile(whole, tile, flow)
+        sizes.append(part.mean_flow_sizes)
+        converged &= part.converged
+    longest = max(map(len, sizes))
+    lasting = [np.pad(found, (0, longest - len(found)), mode="edge") for found in sizes]
+    return Centroid(image, flows, np.average(lasting, axis=0, weights=_areas(tiles)), converged)
+
+
+def filter_tiles(
+    filter_tile: Callable[[HaloTile], tuple[Filtered, FloatArray]],
+    tiles: Sequence[HaloTile],
+    shape: tuple[int, ...],
+    scratch: Path | None = None,
+) -> tuple[Filtered, FloatArray]:
+    """Filter tile after tile, and put their images and records together.
+
+    Parameters
+    ----------
+    filter_tile : callable
+        Gives what the filter makes of a tile, and the mean of its frames.
+    tiles : sequence of HaloTile
+    shape : tuple of int
+        Of a frame, (H, W) or (H, W, 3).
+    scratch : Path, optional
+        Folder of files that hold the images; by default they are in memory.
+
+    Returns
+    -------
+    filtered : Filtered
+        Flow states are those of all tiles, one tile after the other; the other figures are means over the tiles.
+    mean : ndarray, float32, shape of a frame
+
+    Examples
+    --------
+    >>> from turbrestore.halo_tiles import halo_tiles
+    >>> def stand_still(tile):
+    ...     one, image = np.ones(2), np.ones(tile.shape, np.float32)
+    ...     return Filtered(image, image, one[:, None], one, one, one, one / 2, 1e-4, 1.0), image
+    >>> filtered, _ = filter_tiles(stand_still, halo_tiles((40, 64), side=44, halo=8), (40, 64))
+    >>> filtered.image.shape, filtered.flow_states.shape, filtered.shares
+    ((40, 64), (2, 3), array([0.5, 0.5]))
+    """
+    image, mean, variance = (new_mosaic(size, scratch) for size in (shape, shape, shape[:2]))
+    parts = list[Filtered]()
+    for tile in tiles:
+        part, usual = filter_tile(tile)
+        for whole, found in ((image, part.image), (mean, usual), (variance, part.variance)):
+            add_tile(whole, tile, found)
+        nothing = np.zeros((0, 0), np.float32)
+        parts.append(dataclasses.replace(part, image=nothing, variance=nothing))
+    areas = _areas(tiles)
+
+    def average(name: str) -> Float64Array:
+        return np.average([getattr(part, name) for part in parts], axis=0, weights=areas)
+
+    return Filtered(
+        image=image,
+        variance=variance,
+        flow_states=np.concatenate([part.flow_states for part in parts], axis=1),
+        gains=average("gains"),
+        innovations=np.sqrt(np.average([part.innovations**2 for part in parts], axis=0, weights=areas)),
+        sharpness=average("sharpness"),
+        shares=average("shares"),
+        image_noise=float(average("image_noise")),
+        motion_share=float(average("motion_share")),
+    ), mean
+
+
+def deconvolve_tiles(
+    image: FloatArray,
+    sigma: float,
+    params: DeconvolutionParams,
+    guide: FloatArray,
+    tiles: Sequence[HaloTile],
+    progress: Callable[[int], None] | None = None,
+    scratch: Path | None = None,
+) -> Deconvolution:
+    """Deblur tile after tile by one width and one weight of the data.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        Blurred image.
+    sigma : float
+        Width of the blur, pixels.
+    params : DeconvolutionParams
+    guide : ndarray, float32, shape of ``image``
+        What nonlocal weights are taken from.
+    tiles : sequence of HaloTile
+    progress : callable, optional
+        Called with 1 after each iteration of each tile.
+    scratch : Path, optional
+        Folder of the file for what memory does not hold; by default that of temporary files.
+
+    Returns
+    -------
+    Deconvolution
+        Iterations are those of the tile that took most; energies are sums over the tiles, whose overlaps count twice,
+        and of those that have stopped the last counts on; changes are the largest of any tile.
+
+    Raises
+    ------
+    DataError, ConfigurationError, StorageError
+        As :func:`turbrestore.deconvolution.deconvolve`.
+
+    Examples
+    --------
+    >>> from turbrestore.halo_tiles import halo_tiles
+    >>> image = np.full((40, 64), 0.5, np.float32)
+    >>> tiles = halo_tiles(image.shape, side=44, halo=8)
+    >>> deconvolve_tiles(image, 1.0, DeconvolutionParams(method="wiener"), image, tiles).image.shape
+    (40, 64)
+    """
+    noise, fidelity = noise_and_fidelity(image, params)
+    params = dataclasses.replace(params, fidelity=fidelity)
+    mosaic = new_mosaic(image.shape, scratch)
+    parts = list[Deconvolution]()
+    for tile in tiles:
+        window = tile.rows, tile.columns
+        part = deconvolve(image[window].copy(), sigma, params, guide[window].copy(), progress, scratch)
+        release(image)
+        release(guide)
+        add_tile(mosaic, tile, part.image)
+        parts.append(dataclasses.replace(part, image=np.zeros((0, 0), np.float32)))
+    recorded = np.unique(np.concatenate([part.recorded for part in parts]))
+    last = [np.searchsorted(part.recorded, recorded, side="right") - 1 for part in parts]
+    energies, changes = (
+        [getattr(part, name)[np.maximum(at, 0)] for part, at in zip(parts, last, strict=True)]
+        for name in ("objective", "changes")
+    )
+    return Deconvolution(
+        mosaic,
+        sigma,
+        fidelity,
+        noise,
+        iterations=max(part.iterations for part in parts),
+        converged=all(part.converged for part in parts),
+        recorded=recorded,
+        objective=np.sum(energies, axis=0),
+        changes=np.max(changes, axis=0),
+    )
+
+
+def _areas(tiles: Sequence[HaloTile]) -> Float64Array:
+    """Weight of each tile, in pixels."""
+    return np.array([tile.row_weights.sum(dtype=np.float64) * tile.column_weights.sum() for tile in tiles])
