@@ -276,9 +276,11 @@ def _reduce(grey: FloatArray, factor: int) -> FloatArray:
 def _most_detailed(image: FloatArray) -> FloatArray:
     """Part with the largest energy of the Laplacian, of a size whose gradients transform fast."""
     height, width = (_fast_size(min(_PART, size - 1)) + 1 for size in image.shape)
-    energy = np.square(cv2.Laplacian(cv2.GaussianBlur(image, (0, 0), 1.0), cv2.CV_32F))
-    total = cv2.integral(energy)
-    inside = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
+    energy = cv2.Laplacian(cv2.GaussianBlur(image, (0, 0), 1.0), cv2.CV_32F)
+    total = cv2.integral(np.square(energy, out=energy))
+    inside = total[height:, width:] - total[:-height, width:]
+    inside -= total[height:, :-width]
+    inside += total[:-height, :-width]
     top, left = np.unravel_index(int(inside.argmax()), inside.shape)
     return image[top : top + height, left : left + width]
 

@@ -32,6 +32,7 @@ from .errors import require_between
 from .flow_model import Float64Array, FlowDynamics
 from .flow_subspace import FlowStrips, gram_matrix, singular_vectors, spatial_modes
 from .parallel import one_thread_each
+from .scratch import new_stack, release
 
 # Flows are float32, so singular values below this share of the norm of all flows are rounding.
 _ROUNDING = 1e-6
@@ -100,7 +101,7 @@ def identify(
         take as float64, which is free for a list of arrays and dear for flows made on the fly.
     params : DynamicsParams, optional
     scratch : Path, optional
-        Folder of a file that holds C; by default it is in memory.
+        Folder of files that hold C and the maps; by default they are in memory.
     threads : int
         Parts of the image worked on side by side; 0 means one per available core.
 
@@ -143,15 +144,25 @@ def identify(
         C=C,
         Q=Q,
         R=float(residual_variance.mean()),
-        residual_variance=residual_variance.astype(np.float32),
-        mean_flow=mean,
+        residual_variance=_kept(residual_variance.astype(np.float32), scratch),
+        mean_flow=_kept(mean, scratch),
         states=states,
         singular_values=singular_values,
         energy_share=float(np.sum(singular_values[:n] ** 2)) / energy if energy else 1.0,
         overfitted=overfitted,
         notes=_notes(A, strips.count, n, present, overfitted, params),
-        motion_factor=np.ones(mean.shape[:2], np.float32),
+        motion_factor=_kept(np.ones(mean.shape[:2], np.float32), scratch),
     )
+
+
+def _kept(values: FloatArray, folder: Path | None) -> FloatArray:
+    """Move an array to a file, if there is one."""
+    if folder is None:
+        return values
+    stack = new_stack(values.shape, folder)
+    stack[...] = values
+    release(stack)
+    return stack
 
 
 def _rank(singular_values: Float64Array, present: int, pixels: int, params: DynamicsParams) -> int:

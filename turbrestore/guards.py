@@ -9,7 +9,7 @@ the two apart; see ``docs/decisions/guards.md`` for what it is on right and wron
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -116,11 +116,9 @@ def judge(result: ArrayLike, blurred: ArrayLike, sigma: float, params: GuardPara
     after, before = check_image(result, "result"), check_image(blurred, "blurred")
     if after.shape != before.shape:
         raise DataError(f"result: expected the shape {before.shape} of the blurred image, found {after.shape}")
-    pairs = [(luminance(after), luminance(before))]
-    if after.ndim == 3:
-        pairs += [(after[..., channel].copy(), before[..., channel].copy()) for channel in range(3)]
-    overshoot = max(_overshoot(*pair, sigma) for pair in pairs)
-    gain = max(_noise_gain(*pair) for pair in pairs)
+    # One pair of planes at a time: of a large image they are a good part of what memory holds.
+    seen = [(_overshoot(*pair, sigma), _noise_gain(*pair)) for pair in _planes(after, before)]
+    overshoot, gain = (max(figures) for figures in zip(*seen, strict=True))
     return GuardReading(float(sigma), overshoot, gain, overshoot <= params.overshoot and gain <= params.noise_gain)
 
 
@@ -172,19 +170,33 @@ def deconvolve_guarded(
     return attempt(0.0), tuple(readings)
 
 
+def _planes(after: FloatArray, before: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield luminance and every channel of both."""
+    yield luminance(after), luminance(before)
+    if after.ndim == 3:
+        for channel in range(3):
+            yield after[..., channel].copy(), before[..., channel].copy()
+
+
 def _overshoot(after: FloatArray, before: FloatArray, sigma: float) -> float:
     radius = max(_SMALLEST_WINDOW, round(_WINDOW_SIGMAS * sigma))
     window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     high, low = cv2.dilate(before, window), cv2.erode(before, window)
     contrast = float(np.subtract(*np.percentile(before, (99, 1))))
-    margin = _BEYOND * np.maximum(high - low, _LEAST_RANGE * contrast)
-    return float(np.mean(np.maximum(after - high, low - after) > margin))
+    margin = high - low
+    np.maximum(margin, _LEAST_RANGE * contrast, out=margin)
+    margin *= _BEYOND
+    np.subtract(after, high, out=high)
+    np.subtract(low, after, out=low)
+    return float(np.mean(np.maximum(high, low, out=high) > margin))
 
 
 def _noise_gain(after: FloatArray, before: FloatArray) -> float:
-    energy = sum(np.square(cv2.Sobel(before, cv2.CV_32F, *axis)) for axis in ((1, 0), (0, 1)))
+    energy = np.square(cv2.Sobel(before, cv2.CV_32F, 1, 0))
+    energy += np.square(cv2.Sobel(before, cv2.CV_32F, 0, 1))
     energy = cv2.GaussianBlur(energy, (0, 0), _DETAIL_WINDOW)
     flat = energy <= np.quantile(energy, _FLAT_SHARE)
+    del energy
     deviations = [
         float(np.std((image - cv2.GaussianBlur(image, (0, 0), _DETAIL_WINDOW))[flat])) for image in (after, before)
     ]

@@ -101,8 +101,8 @@ class StageMemory:
 _FLOW = StageMemory(120, 5, 185, 10)
 # While frames are registered and weighed beside that.
 _FILTER = StageMemory(10, 5, 10, 5)
-# Images and maps of the whole that there are beside tiles.
-_WHOLE = StageMemory(40, 16, 0, 0)
+# Of the whole beside tiles: images in hand, and what is made of them while the flow model is found, and the blur.
+_WHOLE, _WHOLE_MODEL, _WHOLE_BLUR = StageMemory(4, 8, 0, 0), StageMemory(32, 0, 0, 0), StageMemory(32, 5, 0, 0)
 # Shortest side of a tile that is worth a thread less, pixels, and the step in which sides are tried.
 _WORTH, _SIDE_STEP = 640, 32
 # Images and maps that earlier stages leave, and what is made of them while the width of the blur is found.
@@ -222,13 +222,15 @@ class _Work:
 
     def peak_in_tiles(self, train: int, threads: int, side: int) -> float:
         """Largest need of any stage where frames are worked on in tiles."""
-        part, whole = self.part(side), _WHOLE.bytes(self.pixels, self.channels, 0)
-        modes = min(self.modes(train), 4.0 * _IN_HAND * threads)
-        strips = min(_STRIPS, _STRIP_NUMBER * self.pixels * train)
-        blur = max(_BLUR.bytes(self.pixels, self.channels, 0), part.pairs.peak(Room(1, True)))
-        later = {"centroid": 0.0, "identify": modes + strips, "filter": 0.0, "deconvolve": blur}
+        part, size = self.part(side), (self.pixels, self.channels, 0)
+        model = _WHOLE_MODEL.bytes(*size) + min(self.modes(train), 4.0 * _IN_HAND * threads)
+        model += min(_STRIPS, _STRIP_NUMBER * self.pixels * train)
+        blur = max(_WHOLE_BLUR.bytes(*size), part.pairs.peak(Room(1, True)))
+        later = {"centroid": 0.0, "identify": model, "filter": 0.0, "deconvolve": blur}
         stages = list(later)[: list(later).index(self.until) + 1]
-        return whole + max(part.peak(train, threads, True), self.base + max(later[stage] for stage in stages))
+        return _WHOLE.bytes(*size) + max(
+            part.peak(train, threads, True), self.base + max(later[stage] for stage in stages)
+        )
 
     def held(self) -> float:
         """Results of the stages before the deconvolution."""
@@ -308,11 +310,13 @@ def plan_memory(
             choices = ((threads, in_file) for threads in range(most, 0, -1) for in_file in (False, True))
             chosen = next(choice for choice in choices if work.peak(count, *choice) <= limit)
             return _plan(work, limit, (train, most), (count, *chosen))
-    for threads in range(most, 0, -1):
-        for side in range(max(shape[1:3]), (4 * HALO if threads == 1 else _WORTH) - 1, -_SIDE_STEP):
-            if work.peak_in_tiles(train, threads, side) <= limit:
-                return _plan_in_tiles(work, limit, (train, most), threads, side)
-    least = min(work.peak(fewest, 1, True), work.peak_in_tiles(train, 1, 4 * HALO))
+    # In a file there is room for more frames than without a limit.
+    train = train if wanted is not None else max(train, min(_FEWEST_IN_NEED, shape[0]))
+    for threads, side in _tilings(shape, most):
+        if work.peak_in_tiles(train, threads, side) <= limit:
+            return _plan_in_tiles(work, limit, (train, most), threads, side)
+    smallest = list(_tilings(shape, 1))[-1:]
+    least = min([work.peak(fewest, 1, True), *(work.peak_in_tiles(train, *tiling) for tiling in smallest)])
     asked = f" and {train} training frames" if wanted is not None else ""
     raise ConfigurationError(
         f"--memory-limit: expected at least {size_text(1.01 * least)} for frames of "
@@ -362,6 +366,13 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
     share = min(max(frame_count // 2, _FEWEST_TRAINED), _MOST_TRAINED)
     frame_bytes = 4 * (int(np.prod(frame_shape)) + 2 * frame_shape[0] * frame_shape[1])
     return min(frame_count, max(2, min(share, int(_TRAINING_BYTES // frame_bytes))))
+
+
+def _tilings(shape: tuple[int, ...], most: int) -> Iterator[tuple[int, int]]:
+    """Yield numbers of threads and sides of tiles, the best ones first."""
+    for threads in range(most, 0, -1):
+        least = 4 * HALO if threads == 1 else _WORTH
+        yield from ((threads, side) for side in reversed(range(least, max(shape[1:3]), _SIDE_STEP)))
 
 
 def _plan(work: _Work, limit: float, wanted: tuple[int, int], chosen: tuple[int, int, bool]) -> MemoryPlan:

@@ -323,7 +323,7 @@ def estimate_noise(image: ArrayLike) -> float:
         return 0.0
     mask = np.array([1, -2, 1], np.float32)
     residual = cv2.sepFilter2D(grey, cv2.CV_32F, mask, mask)[1:-1, 1:-1] / 6
-    return float(np.median(np.abs(residual)) / 0.6745)
+    return float(np.median(np.abs(residual, out=residual), overwrite_input=True) / 0.6745)
 
 
 def _frequencies(shape: tuple[int, ...]) -> tuple[Float64Array, Float64Array]:
