@@ -6,16 +6,19 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore import pipeline
+from turbrestore import pipeline, resumption
 from turbrestore.alternating import Filtered
 from turbrestore.blind import remove_blur
 from turbrestore.centroid import CentroidParams, find_centroid
+from turbrestore.checkpoint import load_tiles, save_tiles
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.dynamics import DynamicsParams
+from turbrestore.errors import DataError
 from turbrestore.frame_source import FrameSource
 from turbrestore.halo_tiles import halo_tiles
 from turbrestore.metrics import psnr
 from turbrestore.restoration import RestoreParams
+from turbrestore.resumption import KeptStages
 from turbrestore.tiled_stages import deconvolve_tiles, filter_tiles, find_tiled_centroid
 
 HALO = 24
@@ -120,27 +123,41 @@ def test_figures_of_the_filter_are_means_over_tiles():
         np.testing.assert_allclose(image, level, atol=1e-6)
 
 
+QUICK = RestoreParams(
+    train=9,
+    centroid=CentroidParams(iterations=2),
+    dynamics=DynamicsParams(rank=2),
+    displacement_cue=True,
+    deconvolution=DeconvolutionParams(sigma=1.0, iterations=30),
+)
+
+
+@pytest.fixture
+def in_tiles(monkeypatch):
+    """Restore in tiles from now on, whatever the limit."""
+
+    def begin(source):
+        plan = replace(pipeline.memory_plan(source, QUICK), in_file=True, tile=112)
+        for module in (pipeline, resumption):
+            monkeypatch.setattr(module, "memory_plan", lambda *_: plan)
+        monkeypatch.setattr(pipeline, "halo_tiles", lambda shape, side: halo_tiles(shape, side, HALO))
+
+    return begin
+
+
 @pytest.mark.parametrize("channels", [1, 3])
-def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, tmp_path, monkeypatch, channels):
-    frames = sequence.frames if channels == 1 else np.stack([sequence.frames] * 3, axis=-1)
-    params = RestoreParams(
-        train=9,
-        centroid=CentroidParams(iterations=2),
-        dynamics=DynamicsParams(rank=2),
-        displacement_cue=True,
-        deconvolution=DeconvolutionParams(sigma=1.0, iterations=30),
+def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, tmp_path, in_tiles, channels):
+    frames, truth = (
+        image if channels == 1 else np.stack([image] * 3, axis=-1) for image in (sequence.frames, sequence.scene)
     )
     source = FrameSource.from_array(frames)
-    whole = pipeline.restore(source, params)
-    plan = replace(pipeline.memory_plan(source, params), in_file=True, tile=112)
-    monkeypatch.setattr(pipeline, "memory_plan", lambda *_: plan)
-    monkeypatch.setattr(pipeline, "halo_tiles", lambda shape, side: halo_tiles(shape, side, HALO))
+    whole = pipeline.restore(source, QUICK)
+    in_tiles(source)
     told = []
     tiled = pipeline.restore(
-        source, params, progress=lambda stage, done, total: told.append((stage, done, total)), scratch=tmp_path
+        source, QUICK, progress=lambda stage, done, total: told.append((stage, done, total)), scratch=tmp_path
     )
     inner = slice(8, -8)
-    truth = sequence.scene if channels == 1 else np.stack([sequence.scene] * 3, axis=-1)
     for name in ("mean", "image"):
         found, usual = (psnr(getattr(run, name)[inner, inner], truth[inner, inner]) for run in (tiled, whole))
         assert abs(found - usual) < 0.3
@@ -154,3 +171,66 @@ def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, tmp
         totals = {total for name, _, total in told if name == stage}
         assert done == sorted(done) and len(totals) == 1 and done[-1] <= totals.pop()
     assert [done for name, done, total in told if name == "filter"][-1] == 4 * (2 * 12 - 9)
+
+
+def test_frames_that_do_not_count_do_not_in_any_tile(sequence, in_tiles):
+    source = FrameSource.from_array(sequence.frames)
+    in_tiles(source)
+    restored = pipeline.restore(source, replace(QUICK, keep_best=0.5))
+    assert np.count_nonzero(restored.filtered.shares) == 6
+    assert np.isnan(restored.filtered.sharpness).sum() == 6
+    assert np.isfinite(restored.image).all()
+
+
+@pytest.mark.parametrize("finished", [1, 3])
+def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tmp_path, in_tiles, finished):
+    source = FrameSource.from_array(sequence.frames)
+    in_tiles(source)
+    whole = pipeline.restore(source, QUICK)
+    kept = KeptStages(tmp_path, source, QUICK)
+
+    def keep(done):
+        kept.keep(done)
+        if done.filtered is None and done.tiles is not None and len(done.tiles.records) == finished:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.restore(source, QUICK, on_result=keep)
+    later = KeptStages(tmp_path, source, QUICK, resume=True)
+    assert later.notes == (f"goes on after the flow model and {finished} tiles of the filter",)
+    told = []
+    resumed = pipeline.restore(
+        source, QUICK, lambda stage, done, _: told.append((stage, done)), later.done, later.keep, tmp_path
+    )
+    for name in ("image", "variance", "flow_states", "gains", "innovations", "sharpness", "shares"):
+        assert np.array_equal(getattr(resumed.filtered, name), getattr(whole.filtered, name))
+    assert resumed.filtered.image_noise == whole.filtered.image_noise
+    assert np.array_equal(resumed.image, whole.image) and np.array_equal(resumed.mean, whole.mean)
+    assert next(done for stage, done in told if stage == "filter") == finished * (2 * 12 - 9)
+    assert not (tmp_path / "checkpoint.npz").exists()
+
+
+def test_tiles_of_another_run_are_not_taken_over(sequence, tmp_path, in_tiles):
+    source = FrameSource.from_array(sequence.frames)
+    in_tiles(source)
+    kept = KeptStages(tmp_path, source, QUICK)
+    found = []
+
+    def keep(done):
+        kept.keep(done)
+        if done.tiles is not None:
+            found.append(done.tiles)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.restore(source, QUICK, on_result=keep)
+    path = tmp_path / "checkpoint.npz"
+    save_tiles(path, found[0], "another")
+    notes = KeptStages(tmp_path, source, QUICK, resume=True).notes
+    assert notes[0].startswith(f"{path}: expected a checkpoint of this run")
+    save_tiles(path, found[0], "another")
+    with np.load(path) as arrays:
+        kept_ones = {name: arrays[name] for name in arrays if name != "shares"}
+    np.savez(path, **kept_ones)
+    with pytest.raises(DataError, match="expected a checkpoint of the filter, found something else"):
+        load_tiles(path, "another")

@@ -1,4 +1,4 @@
-"""The state of the filter on disk, between two blocks of frames."""
+"""The state of the filter on disk: between two blocks of frames, or between two tiles."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from .alternating import FilterCheckpoint, FilterState, FrameRecord
+from .alternating import FilterCheckpoint, Filtered, FilterState, FrameRecord
 from .errors import DataError, InputNotFoundError
 from .images import atomic_output
 from .kalman import Gaussian, PixelGaussian
 from .npy import read_npz
+from .tiled_stages import FilteredTiles
 
 _FIGURES = ("gain", "innovation", "sharpness", "information")
+_SERIES = ("gains", "innovations", "sharpness", "shares")
+_IMAGES = ("image", "mean", "variance")
 _ARRAYS = ("image", "variance", "flow", "covariance", "reference", "flow_states", *_FIGURES)
 
 
@@ -80,18 +83,118 @@ def load_checkpoint(path: str | os.PathLike[str], key: str) -> FilterCheckpoint:
     turbrestore.errors.InputNotFoundError: missing.npz: no such file
     """
     source = Path(path)
-    if not source.is_file():
-        raise InputNotFoundError(f"{source}: no such file")
     try:
-        kept = read_npz(source)
-        arrays, found = {name: kept[name] for name in _ARRAYS}, str(kept["key"])
+        kept = _read(source, key)
+        arrays = {name: kept[name] for name in _ARRAYS}
         states, figures = arrays["flow_states"], np.stack([arrays[name] for name in _FIGURES], axis=-1)
         records = tuple(FrameRecord(state, *map(float, row)) for state, row in zip(states, figures, strict=True))
         state = FilterState(
             PixelGaussian(arrays["image"], arrays["variance"]), Gaussian(arrays["flow"], arrays["covariance"])
         )
-    except (DataError, KeyError, ValueError, AttributeError, TypeError) as error:
-        raise DataError(f"{source}: expected a checkpoint of the filter, found something else or damage") from error
-    if found != key:
-        raise DataError(f"{source}: expected a checkpoint of this run, found one of other frames or settings")
+    except (KeyError, ValueError, AttributeError, TypeError) as error:
+        raise _something_else(source) from error
     return FilterCheckpoint(state, records, arrays["reference"])
+
+
+def save_tiles(path: str | os.PathLike[str], tiles: FilteredTiles, key: str) -> None:
+    """Write what the filter has made of some tiles; an older file is replaced when the new one is complete.
+
+    Parameters
+    ----------
+    path : path
+    tiles : FilteredTiles
+    key : str
+        As in :func:`save_checkpoint`.
+
+    Raises
+    ------
+    OutputError, StorageError
+        The file cannot be created or completed; the older one is left.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> image, one = np.ones((2, 3), np.float32), np.ones(4)
+    >>> record = Filtered(image[:0], image[:0], one[:, None], one, one, one, one, 1e-4, 1.0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_tiles(folder + "/c.npz", FilteredTiles(image, image, image, (record, record)), "A")
+    ...     len(load_tiles(folder + "/c.npz", "A").records)
+    2
+    """
+    arrays = {name: getattr(tiles, name) for name in _IMAGES}
+    arrays |= {
+        name: np.array([getattr(record, name) for record in tiles.records])
+        for name in (*_SERIES, "image_noise", "motion_share")
+    }
+    arrays["ranks"] = np.array([record.flow_states.shape[1] for record in tiles.records])
+    arrays["flow_states"] = np.concatenate([record.flow_states for record in tiles.records], axis=1)
+    with atomic_output(path, overwrite=True) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, key=np.array(key), **arrays)
+
+
+def load_tiles(path: str | os.PathLike[str], key: str, scratch: Path | None = None) -> FilteredTiles:
+    """Read back what the filter has made of some tiles.
+
+    Parameters
+    ----------
+    path : path
+        File written by :func:`save_tiles`.
+    key : str
+        What it was written with.
+    scratch : Path, optional
+        Folder of a file for large images; by default they are in memory.
+
+    Returns
+    -------
+    FilteredTiles
+
+    Raises
+    ------
+    InputNotFoundError
+        There is no such file.
+    DataError
+        It is damaged, something else or has another key.
+
+    Examples
+    --------
+    >>> load_tiles("missing.npz", "A")
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.InputNotFoundError: missing.npz: no such file
+    """
+    source = Path(path)
+    try:
+        kept = _read(source, key, scratch)
+        nothing = np.zeros((0, 0), np.float32)
+        states = np.split(kept["flow_states"], np.cumsum(kept["ranks"])[:-1], axis=1)
+        records = tuple(
+            Filtered(
+                image=nothing,
+                variance=nothing,
+                flow_states=state,
+                image_noise=float(kept["image_noise"][number]),
+                motion_share=float(kept["motion_share"][number]),
+                **{name: kept[name][number] for name in _SERIES},
+            )
+            for number, state in enumerate(states)
+        )
+        return FilteredTiles(kept["image"], kept["mean"], kept["variance"], records)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise _something_else(source) from error
+
+
+def _read(source: Path, key: str, scratch: Path | None = None) -> dict[str, np.ndarray]:
+    """Read the arrays of a checkpoint that has the key."""
+    if not source.is_file():
+        raise InputNotFoundError(f"{source}: no such file")
+    try:
+        kept = read_npz(source, scratch=scratch)
+    except DataError as error:
+        raise _something_else(source) from error
+    if str(kept.get("key")) != key:
+        raise DataError(f"{source}: expected a checkpoint of this run, found one of other frames or settings")
+    return kept
+
+
+def _something_else(source: Path) -> DataError:
+    return DataError(f"{source}: expected a checkpoint of the filter, found something else or damage")

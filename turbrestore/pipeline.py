@@ -348,7 +348,17 @@ def _filter(
         return filtered, summed.mean()
 
     if run.tiles:
-        filtered, mean = filter_tiles(filter_part, run.tiles, source.shape[1:], run.scratch)
+        start = run.done.tiles
+        if start is not None and counter is not None:
+            counter(len(start.records) * steps)
+        filtered, mean = filter_tiles(
+            filter_part,
+            run.tiles,
+            source.shape[1:],
+            run.scratch,
+            start,
+            lambda tiles: run.finish(replace(run.done, tiles=tiles)),
+        )
     else:
         summed = _Sum(training, rest)
         filtered = filter_frames(
@@ -365,7 +375,7 @@ def _filter(
             run.prepared,
         )
         mean = summed.mean()
-    run.finish(replace(run.done, checkpoint=None, filtered=filtered, mean=mean), "filter")
+    run.finish(replace(run.done, checkpoint=None, tiles=None, filtered=filtered, mean=mean), "filter")
     return filtered, mean
 
 

@@ -24,6 +24,7 @@ from .guards import GuardParams, GuardReading
 from .memory_size import MemorySize
 from .plots import plot_images
 from .preview import preview
+from .tiled_stages import FilteredTiles
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,7 +43,9 @@ class StageResults:
     centroid : Centroid or None
     dynamics : FlowDynamics or None
     checkpoint : FilterCheckpoint or None
-        Where the filter stands; None before and after it.
+        Where the filter stands; None before and after it, and where it works in tiles.
+    tiles : FilteredTiles or None
+        Where a filter that works in tiles stands.
     filtered : Filtered or None
     mean : ndarray, float32, shape (H, W) or (H, W, 3), or None
         Temporal mean of the frames that were filtered.
@@ -53,6 +56,7 @@ class StageResults:
     centroid: Centroid | None = None
     dynamics: FlowDynamics | None = None
     checkpoint: FilterCheckpoint | None = None
+    tiles: FilteredTiles | None = None
     filtered: Filtered | None = None
     mean: FloatArray | None = None
     blur_bounds: BlurBounds | None = None

@@ -43,7 +43,7 @@ from .blind import Deblurred
 from .blur_cues import BlurBounds
 from .blur_estimation import BlurEstimate
 from .centroid import Centroid
-from .checkpoint import load_checkpoint, save_checkpoint
+from .checkpoint import load_checkpoint, load_tiles, save_checkpoint, save_tiles
 from .deconvolution import Deconvolution
 from .digests import content_digest, file_digest
 from .errors import DataError, OutputError, require
@@ -138,7 +138,8 @@ class KeptStages:
         require(every >= 1, f"checkpoint_every: expected at least 1 frame, found {every}")
         self.folder, self._every, self._block = Path(folder), every, params.filter.block
         self._facts = stage_facts(source, params)
-        self._scratch = self.folder if memory_plan(source, params).in_file else None
+        plan = memory_plan(source, params)
+        self._scratch, self._in_tiles = self.folder if plan.in_file else None, plan.tile is not None
         self._key = _key(self._facts)
         self._files: dict[str, str] = {}
         self._verdict: dict[str, Any] = {}
@@ -178,7 +179,7 @@ class KeptStages:
         if done.filtered is not None:
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
             self._written = 0
-        elif _frames(done) + self._block > self._written + self._every:
+        elif self._in_tiles or _steps(done) + self._block > self._written + self._every:
             self.flush()
 
     def flush(self) -> None:
@@ -189,11 +190,14 @@ class KeptStages:
         OutputError, StorageError
             It cannot be written.
         """
-        checkpoint = self.done.checkpoint
-        if checkpoint is None or _frames(self.done) <= self._written:
+        checkpoint, tiles = self.done.checkpoint, self.done.tiles
+        if _steps(self.done) <= self._written:
             return
-        save_checkpoint(self.folder / CHECKPOINT, checkpoint, self._key)
-        self._written = _frames(self.done)
+        if checkpoint is not None:
+            save_checkpoint(self.folder / CHECKPOINT, checkpoint, self._key)
+        elif tiles is not None:
+            save_tiles(self.folder / CHECKPOINT, tiles, self._key)
+        self._written = _steps(self.done)
 
     def expect(self, *outputs: Path) -> None:
         """Note which files are about to be written, so that a run that dies meanwhile may replace its own ones.
@@ -216,7 +220,8 @@ class KeptStages:
         stages = itertools.takewhile(self._holds, FILES)
         last = [TITLES[stage] for stage in stages][-1:]
         words = f"after the {last[0]}" if last else "from the start"
-        return f"{words} and {self._written} frames of the filter" if self._written else words
+        steps = "tiles" if self._in_tiles else "frames"
+        return f"{words} and {self._written} {steps} of the filter" if self._written else words
 
     def withdraw(self) -> None:
         """Leave no record of a run that has failed before it had anything to keep."""
@@ -249,10 +254,14 @@ class KeptStages:
         self.done = self._load()
         if "filtered" in holds and self.done.filtered is None and (self.folder / CHECKPOINT).exists():
             try:
-                self.done = replace(self.done, checkpoint=load_checkpoint(self.folder / CHECKPOINT, self._key))
+                if self._in_tiles:
+                    tiles = load_tiles(self.folder / CHECKPOINT, self._key, self._scratch)
+                    self.done = replace(self.done, tiles=tiles)
+                else:
+                    self.done = replace(self.done, checkpoint=load_checkpoint(self.folder / CHECKPOINT, self._key))
             except DataError as error:
                 notes.append(str(error))
-        self._written = _frames(self.done)
+        self._written = _steps(self.done)
         self.notes = (*notes, *([] if notes and not self._files else [f"goes on {self.progress()}"]))
 
     def _load(self) -> StageResults:
@@ -278,7 +287,7 @@ class KeptStages:
 
     def _drop_the_rest(self) -> None:
         """Remove what does not belong to this run: nobody must take it for a part of it."""
-        kept = {*self._files, *([CHECKPOINT] if self.done.checkpoint is not None else [])}
+        kept = {*self._files, *([CHECKPOINT] if _steps(self.done) else [])}
         try:
             for name in {RUN_RECORD, *_ALL_FILES, CHECKPOINT} - kept:
                 (self.folder / name).unlink(missing_ok=True)
@@ -469,8 +478,10 @@ def _changes(before: Any, now: Any, name: str = "") -> Iterator[str]:
         yield f"{name} was {before} and is {now}"
 
 
-def _frames(done: StageResults) -> int:
-    return 0 if done.checkpoint is None else len(done.checkpoint.records)
+def _steps(done: StageResults) -> int:
+    """Frames that the filter has passed over, or tiles."""
+    standing = done.checkpoint or done.tiles
+    return 0 if standing is None else len(standing.records)
 
 
 def _load_mean(path: Path) -> FloatArray:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,26 @@ from .halo_tiles import HaloTile, add_tile, cut_tile, new_mosaic
 from .scratch import release, walk
 
 Float64Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FilteredTiles:
+    """What the filter has made of the first tiles of several; it goes on with the next one.
+
+    Attributes
+    ----------
+    image, mean : ndarray, float32, shape (H, W) or (H, W, 3)
+        Sums of the tiles so far, by their weights.  Later tiles are added to the same arrays.
+    variance : ndarray, float32, shape (H, W)
+        Likewise.
+    records : tuple of Filtered
+        One of each tile, whose images are empty.
+    """
+
+    image: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    records: tuple[Filtered, ...]
 
 
 def find_tiled_centroid(
@@ -90,6 +111,8 @@ def filter_tiles(
     tiles: Sequence[HaloTile],
     shape: tuple[int, ...],
     scratch: Path | None = None,
+    start: FilteredTiles | None = None,
+    on_tile: Callable[[FilteredTiles], None] | None = None,
 ) -> tuple[Filtered, FloatArray]:
     """Filter tile after tile, and put their images and records together.
 
@@ -102,6 +125,11 @@ def filter_tiles(
         Of a frame, (H, W) or (H, W, 3).
     scratch : Path, optional
         Folder of files that hold the images; by default they are in memory.
+    start : FilteredTiles, optional
+        What an earlier run has made of the first tiles; they are passed over, and the result is that of one run, bit
+        for bit.
+    on_tile : callable, optional
+        Called with what there is after each tile.
 
     Returns
     -------
@@ -119,30 +147,22 @@ def filter_tiles(
     >>> filtered.image.shape, filtered.flow_states.shape, filtered.shares
     ((40, 64), (2, 3), array([0.5, 0.5]))
     """
-    image, mean, variance = (new_mosaic(size, scratch) for size in (shape, shape, shape[:2]))
-    parts = list[Filtered]()
-    for tile in tiles:
+    image, mean, variance = sums = [new_mosaic(size, scratch) for size in (shape, shape, shape[:2])]
+    records = list(start.records if start is not None else ())
+    if start is not None:
+        for whole, earlier in zip(sums, (start.image, start.mean, start.variance), strict=True):
+            whole[...] = earlier
+            release(whole)
+            release(earlier)
+    for tile in tiles[len(records) :]:
         part, usual = filter_tile(tile)
-        for whole, found in ((image, part.image), (mean, usual), (variance, part.variance)):
+        for whole, found in zip(sums, (part.image, usual, part.variance), strict=True):
             add_tile(whole, tile, found)
         nothing = np.zeros((0, 0), np.float32)
-        parts.append(dataclasses.replace(part, image=nothing, variance=nothing))
-    areas = _areas(tiles)
-
-    def average(name: str) -> Float64Array:
-        return np.average([getattr(part, name) for part in parts], axis=0, weights=areas)
-
-    return Filtered(
-        image=image,
-        variance=variance,
-        flow_states=np.concatenate([part.flow_states for part in parts], axis=1),
-        gains=average("gains"),
-        innovations=np.sqrt(np.average([part.innovations**2 for part in parts], axis=0, weights=areas)),
-        sharpness=average("sharpness"),
-        shares=average("shares"),
-        image_noise=float(average("image_noise")),
-        motion_share=float(average("motion_share")),
-    ), mean
+        records.append(dataclasses.replace(part, image=nothing, variance=nothing))
+        if on_tile is not None:
+            on_tile(FilteredTiles(image, mean, variance, tuple(records)))
+    return _joined(image, variance, records, _areas(tiles)), mean
 
 
 def deconvolve_tiles(
@@ -217,6 +237,25 @@ def deconvolve_tiles(
         recorded=recorded,
         objective=np.sum(energies, axis=0),
         changes=np.max(changes, axis=0),
+    )
+
+
+def _joined(image: FloatArray, variance: FloatArray, records: Sequence[Filtered], areas: Float64Array) -> Filtered:
+    """Put the records of all tiles together."""
+
+    def average(name: str) -> Float64Array:
+        return np.average([getattr(record, name) for record in records], axis=0, weights=areas)
+
+    return Filtered(
+        image=image,
+        variance=variance,
+        flow_states=np.concatenate([record.flow_states for record in records], axis=1),
+        gains=average("gains"),
+        innovations=np.sqrt(np.average([record.innovations**2 for record in records], axis=0, weights=areas)),
+        sharpness=average("sharpness"),
+        shares=average("shares"),
+        image_noise=float(average("image_noise")),
+        motion_share=float(average("motion_share")),
     )
 
 
