@@ -87,7 +87,7 @@ def limited_rows(quick: bool, largest: bool) -> Iterator[tuple[Clip, float, list
     yield Clip(40 if quick else 300, 1080, 1920), 2000, train
     yield Clip(24, 540, 960), 700, []
     yield Clip(24, 540, 960, 3), 900, []
-    # Whole frames do not fit in what follows.
+    # Here and from 3840×2160 on whole frames do not fit.
     yield Clip(24, 1080, 1920, 3), 1000, []
     if not quick:
         yield Clip(24, 1080, 1920, 3), 3000, []

@@ -45,6 +45,18 @@ def test_what_is_cut_is_put_together_again(tmp_path, channels):
         np.testing.assert_allclose(mosaic, stack, atol=1e-6)
 
 
+@given(st.integers(1, 700), st.integers(1, 40), st.integers(0, 300))
+@settings(max_examples=200, deadline=None)
+def test_there_are_as_few_tiles_as_there_can_be(width, halo, more):
+    side = 4 * halo + more
+    tiles = halo_tiles((1, width), side, halo)
+    fewer = len(tiles) - 1
+    # Cores of equal size: the largest of fewer would not fit with its halos.
+    if fewer:
+        halos = {1: 0, 2: 1}.get(fewer, 2)
+        assert -(-width // fewer) + halos * halo > side
+
+
 def test_a_frame_no_larger_than_a_tile_is_one():
     (tile,) = halo_tiles((384, 300), 384)
     assert tile.roi == (0, 0, 300, 384)

@@ -151,11 +151,49 @@ def test_frames_too_large_for_memory_are_worked_on_in_tiles():
     assert whole.tile is None
     assert tiled.train == small.train == training_share(300, shape[1:]) == 15
     assert tiled.in_file and tiled.tight
-    # Tiles are as large as there is room for, and threads are kept as long as they are not tiny.
-    assert tiled.tile > small.tile and tiled.threads >= small.threads
-    assert plan_memory(shape, 3e9, flow=FlowParams(threads=1)).tile > tiled.tile
+    assert tiled.tile > small.tile
     assert tiled.decisions[0].choice.endswith("pixels, training frames kept in a file")
-    assert "of 3.00 GB allowed" in tiled.decisions[0].reason
+    assert "the 3.00 GB allowed" in tiled.decisions[0].reason
+
+
+@pytest.mark.usefixtures("no_compiler")
+@pytest.mark.parametrize("limit", [8e8, 1.2e9, 3e9])
+def test_the_size_of_tiles_does_not_follow_from_the_number_of_threads(limit):
+    plans = [plan_memory((300, 2160, 3840), limit, flow=FlowParams(threads=threads)) for threads in (1, 2, 4, 16)]
+    assert len({plan.tile for plan in plans}) == 1
+    assert [plan.threads for plan in plans] == sorted(plan.threads for plan in plans)
+    assert plans[0].threads == 1 and plans[-1].threads >= (1 if limit < 1e9 else 2)
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_limits_with_the_same_tiles_have_the_same_side():
+    plans = [plan_memory((300, 2160, 3840), limit) for limit in np.arange(1.5e9, 4e9, 2e7)]
+    sides = {}
+    for plan in plans:
+        sides.setdefault(plan.decisions[0].choice, set()).add(plan.tile)
+    assert len(sides) > 3
+    assert all(len(found) == 1 for found in sides.values())
+    assert [plan.tile for plan in plans] == sorted(plan.tile for plan in plans)
+
+
+def test_a_periodic_image_is_not_cut_into_tiles():
+    periodic = {"deconvolution": DeconvolutionParams(boundary="periodic")}
+    assert least_limit((300, 2160, 3840), **periodic) > 4e9 > least_limit((300, 2160, 3840))
+    assert least_limit((300, 2160, 3840), until="filter", **periodic) < 1e9
+
+
+def test_bounds_on_the_blur_count_in_tiles():
+    assert least_limit((300, 2160, 3840), blur_bounds=True) > 1.3 * least_limit((300, 2160, 3840))
+
+
+def test_a_blur_too_wide_for_the_halo_of_tiles_is_refused():
+    frames = np.random.default_rng(0).random((2, 600, 800), dtype=np.float32)
+    wide = RestoreParams(deconvolution=DeconvolutionParams(sigma=25.0))
+    limit = least_limit(frames.shape, deconvolution=wide.deconvolution)
+    with pytest.raises(
+        ConfigurationError, match="^sigma: expected at most 24 pixels where the memory limit allows tiles"
+    ):
+        pipeline.restore(frames, replace(wide, memory_limit=limit))
 
 
 @pytest.mark.usefixtures("no_compiler")

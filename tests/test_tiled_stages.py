@@ -100,7 +100,7 @@ def test_a_blur_is_removed_in_tiles_by_one_width(blurred):
 
 
 def test_figures_of_the_filter_are_means_over_tiles():
-    tiles = halo_tiles((40, 64), 44, 8)
+    tiles = halo_tiles((40, 80), 44, 8)
     values = iter((1.0, 2.0, 6.0))
 
     def part(tile):
@@ -109,7 +109,7 @@ def test_figures_of_the_filter_are_means_over_tiles():
         share = np.array([0.25, 0.75])
         return Filtered(image, 2 * image, np.ones((2, 3)), one, one, one, share, value, value), 3 * image
 
-    filtered, mean = filter_tiles(part, tiles, (40, 64))
+    filtered, mean = filter_tiles(part, tiles, (40, 80))
     weights = [tile.row_weights.sum() * tile.column_weights.sum() for tile in tiles]
     expected = np.average([1, 2, 6], weights=weights)
     for name in ("gains", "sharpness"):
@@ -191,7 +191,7 @@ def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tmp_path, in
 
     def keep(done):
         kept.keep(done)
-        if done.filtered is None and done.tiles is not None and len(done.tiles.records) == finished:
+        if done.filtered is None and done.tiles is not None and len(done.tiles.parts) == finished:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -230,7 +230,7 @@ def test_tiles_of_another_run_are_not_taken_over(sequence, tmp_path, in_tiles):
     assert notes[0].startswith(f"{path}: expected a checkpoint of this run")
     save_tiles(path, found[0], "another")
     with np.load(path) as arrays:
-        kept_ones = {name: arrays[name] for name in arrays if name != "shares"}
+        kept_ones = {name: arrays[name] for name in arrays if name != "shares_0"}
     np.savez(path, **kept_ones)
     with pytest.raises(DataError, match="expected a checkpoint of the filter, found something else"):
         load_tiles(path, "another")

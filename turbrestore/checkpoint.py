@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,11 @@ from .alternating import FilterCheckpoint, Filtered, FilterState, FrameRecord
 from .errors import DataError, InputNotFoundError
 from .images import atomic_output
 from .kalman import Gaussian, PixelGaussian
-from .npy import read_npz
+from .npy import read_npz, write_npz
 from .tiled_stages import FilteredTiles
 
 _FIGURES = ("gain", "innovation", "sharpness", "information")
-_SERIES = ("gains", "innovations", "sharpness", "shares")
-_IMAGES = ("image", "mean", "variance")
+_PART = tuple(field.name for field in fields(Filtered))
 _ARRAYS = ("image", "variance", "flow", "covariance", "reference", "flow_states", *_FIGURES)
 
 
@@ -83,15 +83,15 @@ def load_checkpoint(path: str | os.PathLike[str], key: str) -> FilterCheckpoint:
     turbrestore.errors.InputNotFoundError: missing.npz: no such file
     """
     source = Path(path)
+    kept = _read(source, key)
     try:
-        kept = _read(source, key)
         arrays = {name: kept[name] for name in _ARRAYS}
         states, figures = arrays["flow_states"], np.stack([arrays[name] for name in _FIGURES], axis=-1)
         records = tuple(FrameRecord(state, *map(float, row)) for state, row in zip(states, figures, strict=True))
         state = FilterState(
             PixelGaussian(arrays["image"], arrays["variance"]), Gaussian(arrays["flow"], arrays["covariance"])
         )
-    except (KeyError, ValueError, AttributeError, TypeError) as error:
+    except (DataError, KeyError, ValueError, AttributeError, TypeError) as error:
         raise _something_else(source) from error
     return FilterCheckpoint(state, records, arrays["reference"])
 
@@ -117,19 +117,16 @@ def save_tiles(path: str | os.PathLike[str], tiles: FilteredTiles, key: str) -> 
     >>> image, one = np.ones((2, 3), np.float32), np.ones(4)
     >>> record = Filtered(image[:0], image[:0], one[:, None], one, one, one, one, 1e-4, 1.0)
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     save_tiles(folder + "/c.npz", FilteredTiles(image, image, image, (record, record)), "A")
-    ...     len(load_tiles(folder + "/c.npz", "A").records)
+    ...     save_tiles(folder + "/c.npz", FilteredTiles((record, record), (image, image)), "A")
+    ...     len(load_tiles(folder + "/c.npz", "A").parts)
     2
     """
-    arrays = {name: getattr(tiles, name) for name in _IMAGES}
-    arrays |= {
-        name: np.array([getattr(record, name) for record in tiles.records])
-        for name in (*_SERIES, "image_noise", "motion_share")
-    }
-    arrays["ranks"] = np.array([record.flow_states.shape[1] for record in tiles.records])
-    arrays["flow_states"] = np.concatenate([record.flow_states for record in tiles.records], axis=1)
+    arrays: dict[str, np.ndarray] = {"key": np.array(key), "count": np.array(len(tiles.parts))}
+    for number, (part, mean) in enumerate(zip(tiles.parts, tiles.means, strict=True)):
+        arrays |= {f"{name}_{number}": np.asanyarray(getattr(part, name)) for name in _PART}
+        arrays[f"mean_{number}"] = mean
     with atomic_output(path, overwrite=True) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, allow_pickle=False, key=np.array(key), **arrays)
+        write_npz(stream, arrays)
 
 
 def load_tiles(path: str | os.PathLike[str], key: str, scratch: Path | None = None) -> FilteredTiles:
@@ -163,24 +160,19 @@ def load_tiles(path: str | os.PathLike[str], key: str, scratch: Path | None = No
     turbrestore.errors.InputNotFoundError: missing.npz: no such file
     """
     source = Path(path)
+    kept = _read(source, key, scratch)
     try:
-        kept = _read(source, key, scratch)
-        nothing = np.zeros((0, 0), np.float32)
-        states = np.split(kept["flow_states"], np.cumsum(kept["ranks"])[:-1], axis=1)
-        records = tuple(
-            Filtered(
-                image=nothing,
-                variance=nothing,
-                flow_states=state,
-                image_noise=float(kept["image_noise"][number]),
-                motion_share=float(kept["motion_share"][number]),
-                **{name: kept[name][number] for name in _SERIES},
-            )
-            for number, state in enumerate(states)
-        )
-        return FilteredTiles(kept["image"], kept["mean"], kept["variance"], records)
-    except (KeyError, ValueError, IndexError, TypeError) as error:
+        numbers = range(int(kept["count"]))
+        parts = tuple(_part(kept, number) for number in numbers)
+        return FilteredTiles(parts, tuple(kept[f"mean_{number}"] for number in numbers))
+    except (KeyError, ValueError, TypeError) as error:
         raise _something_else(source) from error
+
+
+def _part(kept: dict[str, np.ndarray], number: int) -> Filtered:
+    found = {name: kept[f"{name}_{number}"] for name in _PART}
+    image_noise, motion_share = float(found.pop("image_noise")), float(found.pop("motion_share"))
+    return Filtered(**found, image_noise=image_noise, motion_share=motion_share)
 
 
 def _read(source: Path, key: str, scratch: Path | None = None) -> dict[str, np.ndarray]:
@@ -189,9 +181,10 @@ def _read(source: Path, key: str, scratch: Path | None = None) -> dict[str, np.n
         raise InputNotFoundError(f"{source}: no such file")
     try:
         kept = read_npz(source, scratch=scratch)
-    except DataError as error:
+        found = str(kept["key"])
+    except (DataError, KeyError) as error:
         raise _something_else(source) from error
-    if str(kept.get("key")) != key:
+    if found != key:
         raise DataError(f"{source}: expected a checkpoint of this run, found one of other frames or settings")
     return kept
 

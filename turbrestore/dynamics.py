@@ -32,7 +32,7 @@ from .errors import require_between
 from .flow_model import Float64Array, FlowDynamics
 from .flow_subspace import FlowStrips, gram_matrix, singular_vectors, spatial_modes
 from .parallel import one_thread_each
-from .scratch import new_stack, release
+from .scratch import kept_in
 
 # Flows are float32, so singular values below this share of the norm of all flows are rounding.
 _ROUNDING = 1e-6
@@ -144,25 +144,15 @@ def identify(
         C=C,
         Q=Q,
         R=float(residual_variance.mean()),
-        residual_variance=_kept(residual_variance.astype(np.float32), scratch),
-        mean_flow=_kept(mean, scratch),
+        residual_variance=kept_in(residual_variance.astype(np.float32), scratch),
+        mean_flow=kept_in(mean, scratch),
         states=states,
         singular_values=singular_values,
         energy_share=float(np.sum(singular_values[:n] ** 2)) / energy if energy else 1.0,
         overfitted=overfitted,
         notes=_notes(A, strips.count, n, present, overfitted, params),
-        motion_factor=_kept(np.ones(mean.shape[:2], np.float32), scratch),
+        motion_factor=kept_in(np.ones(mean.shape[:2], np.float32), scratch),
     )
-
-
-def _kept(values: FloatArray, folder: Path | None) -> FloatArray:
-    """Move an array to a file, if there is one."""
-    if folder is None:
-        return values
-    stack = new_stack(values.shape, folder)
-    stack[...] = values
-    release(stack)
-    return stack
 
 
 def _rank(singular_values: Float64Array, present: int, pixels: int, params: DynamicsParams) -> int:

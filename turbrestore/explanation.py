@@ -111,7 +111,7 @@ def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
     >>> explain_motion(np.full((2, 24, 24, 2), 3.0, np.float32))[0].choice
     'taken as measured'
     """
-    squares = sum(float(np.mean(np.square(flow, dtype=np.float64))) for flow in walk(flows))
+    squares = sum(float(np.mean(np.square(flow), dtype=np.float64)) for flow in walk(flows))
     size = float(np.sqrt(2 * squares / len(flows)))
     side = min(flows.shape[1:3])
     if size < _FAR * side:

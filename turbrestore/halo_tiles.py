@@ -18,11 +18,10 @@ from .arrays import FloatArray
 from .errors import require
 from .scratch import new_stack, release
 
-# Four times this is the shortest side of a tile where there is more than one.
 HALO = 96
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HaloTile:
     """A part of the frames.
 
@@ -160,9 +159,9 @@ def new_mosaic(shape: tuple[int, ...], folder: Path | None = None) -> FloatArray
     array([[0., 0., 0.]], dtype=float32)
     """
     mosaic = new_stack(shape, folder)
-    for part in mosaic:
-        part[...] = 0
-        release(mosaic)
+    # A new file has zeros already.
+    if folder is None:
+        mosaic[...] = 0
     return mosaic
 
 
@@ -203,7 +202,10 @@ def _spans(length: int, side: int, halo: int) -> list[tuple[slice, FloatArray]]:
 
 
 def _count(length: int, side: int, halo: int) -> int:
-    return 1 if length <= side else -(-length // (side - 2 * halo))
+    if length <= side:
+        return 1
+    # Of two tiles each has one halo.
+    return 2 if -(-length // 2) + halo <= side else -(-length // (side - 2 * halo))
 
 
 def _rise(places: np.ndarray, edge: int, halo: int) -> np.ndarray:

@@ -19,12 +19,12 @@ in files, and what is made of them::
 
     base + HW · (whole + c · colour) + what the tile takes
 
-The constants are those of ``python benchmarks/memory.py --stages`` at 1280×720, grey and in colour, with one, two and
-four threads, and a tenth added.  torch counts where a device is asked for, but not what a stage holds there, on the
-processor or not.  The deconvolution is told what is left, and works in strips and fewer threads where that is little;
-the other stages need what they need.  So the training frames go to a file first, then fewer threads work side by side,
-then fewer frames are trained on, and at last frames are worked on in tiles, as large ones as there is room for.  Only
-the last two change the result.
+The constants of a tile, as of whole frames, are those of ``python benchmarks/memory.py --stages`` at 1280×720, grey and
+in colour, with one, two and four threads, and a tenth added.  torch counts where a device is asked for, but not what a
+stage holds there, on the processor or not.  The deconvolution is told what is left, and works in strips and fewer
+threads where that is little; the other stages need what they need.  So the training frames go to a file first, then
+fewer threads work side by side, then fewer frames are trained on, and at last frames are worked on in tiles, as large
+ones as there is room for with two threads.  Only the last two change the result.
 """
 
 from __future__ import annotations
@@ -101,10 +101,14 @@ class StageMemory:
 _FLOW = StageMemory(120, 5, 185, 10)
 # While frames are registered and weighed beside that.
 _FILTER = StageMemory(10, 5, 10, 5)
-# Of the whole beside tiles: images in hand, and what is made of them while the flow model is found, and the blur.
-_WHOLE, _WHOLE_MODEL, _WHOLE_BLUR = StageMemory(4, 8, 0, 0), StageMemory(32, 0, 0, 0), StageMemory(32, 5, 0, 0)
+# Of the whole beside tiles, of 3840×2160: images in hand, and what is made of them while the flow model is found, the
+# blur, and bounds on it, and while the result is put into words.
+_WHOLE, _WHOLE_MODEL, _WHOLE_RESULT = StageMemory(4, 8, 0, 0), StageMemory(32, 0, 0, 0), StageMemory(24, 4, 0, 0)
+_WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(32, 5, 0, 0), StageMemory(80, 10, 0, 0)
 # Shortest side of a tile that is worth a thread less, pixels, and the step in which sides are tried.
 _WORTH, _SIDE_STEP = 640, 32
+# The size of tiles changes the result, so it must not follow from the number of cores.
+_THREADS_OF_TILES = 2
 # Images and maps that earlier stages leave, and what is made of them while the width of the blur is found.
 _HELD, _BLUR = StageMemory(60, 40, 0, 0), StageMemory(40, 0, 0, 0)
 # Width of the blur where it is not known yet, pixels.
@@ -158,6 +162,7 @@ class _Work:
     dynamics: DynamicsParams
     deconvolution: DeconvolutionParams
     until: str
+    blur_bounds: bool
     on_device: bool
 
     @property
@@ -225,8 +230,10 @@ class _Work:
         part, size = self.part(side), (self.pixels, self.channels, 0)
         model = _WHOLE_MODEL.bytes(*size) + min(self.modes(train), 4.0 * _IN_HAND * threads)
         model += min(_STRIPS, _STRIP_NUMBER * self.pixels * train)
-        blur = max(_WHOLE_BLUR.bytes(*size), part.pairs.peak(Room(1, True)))
-        later = {"centroid": 0.0, "identify": model, "filter": 0.0, "deconvolve": blur}
+        whole_blur = _WHOLE_BOUNDS if self.blur_bounds else _WHOLE_BLUR
+        blur = max(whole_blur.bytes(*size), part.pairs.peak(Room(1, True)))
+        result = _WHOLE_RESULT.bytes(*size)
+        later = {"centroid": result, "identify": max(result, model), "filter": result, "deconvolve": blur}
         stages = list(later)[: list(later).index(self.until) + 1]
         return _WHOLE.bytes(*size) + max(
             part.peak(train, threads, True), self.base + max(later[stage] for stage in stages)
@@ -257,6 +264,7 @@ def plan_memory(
     dynamics: DynamicsParams | None = None,
     deconvolution: DeconvolutionParams | None = None,
     until: str = "deconvolve",
+    blur_bounds: bool = False,
     on_device: bool = False,
 ) -> MemoryPlan:
     """Decide how many frames are trained on, where they are kept, and how many threads work.
@@ -275,6 +283,8 @@ def plan_memory(
     deconvolution : DeconvolutionParams, optional
     until : str
         Last stage.
+    blur_bounds : bool
+        Whether bounds on the width of the blur are found.
     on_device : bool
         Whether any stage may compute with torch.
 
@@ -299,7 +309,7 @@ def plan_memory(
     """
     flow, filter, dynamics = flow or FlowParams(), filter or FilterParams(), dynamics or DynamicsParams()
     train = training_share(shape[0], shape[1:], wanted)
-    work = _Work(shape, filter, dynamics, deconvolution or DeconvolutionParams(), until, on_device)
+    work = _Work(shape, filter, dynamics, deconvolution or DeconvolutionParams(), until, blur_bounds, on_device)
     if limit is None:
         room = work.room(work.deconvolution.memory)
         return MemoryPlan(train, flow.threads, file_bytes=int(work.pairs.pairs()) if room.in_file else 0)
@@ -312,10 +322,10 @@ def plan_memory(
             return _plan(work, limit, (train, most), (count, *chosen))
     # In a file there is room for more frames than without a limit.
     train = train if wanted is not None else max(train, min(_FEWEST_IN_NEED, shape[0]))
-    for threads, side in _tilings(shape, most):
+    for threads, side in _tilings(work):
         if work.peak_in_tiles(train, threads, side) <= limit:
-            return _plan_in_tiles(work, limit, (train, most), threads, side)
-    smallest = list(_tilings(shape, 1))[-1:]
+            return _plan_in_tiles(work, limit, (train, most), side)
+    smallest = list(_tilings(work))[-1:]
     least = min([work.peak(fewest, 1, True), *(work.peak_in_tiles(train, *tiling) for tiling in smallest)])
     asked = f" and {train} training frames" if wanted is not None else ""
     raise ConfigurationError(
@@ -368,11 +378,14 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
     return min(frame_count, max(2, min(share, int(_TRAINING_BYTES // frame_bytes))))
 
 
-def _tilings(shape: tuple[int, ...], most: int) -> Iterator[tuple[int, int]]:
+def _tilings(work: _Work) -> Iterator[tuple[int, int]]:
     """Yield numbers of threads and sides of tiles, the best ones first."""
-    for threads in range(most, 0, -1):
+    if work.deconvolution.boundary == "periodic" and work.until == "deconvolve":
+        # The other side of the image is in another tile.
+        return
+    for threads in range(_THREADS_OF_TILES, 0, -1):
         least = 4 * HALO if threads == 1 else _WORTH
-        yield from ((threads, side) for side in reversed(range(least, max(shape[1:3]), _SIDE_STEP)))
+        yield from ((threads, side) for side in reversed(range(least, max(work.shape[1:3]), _SIDE_STEP)))
 
 
 def _plan(work: _Work, limit: float, wanted: tuple[int, int], chosen: tuple[int, int, bool]) -> MemoryPlan:
@@ -381,22 +394,27 @@ def _plan(work: _Work, limit: float, wanted: tuple[int, int], chosen: tuple[int,
     kept = work.modes(count) + work.stack(count)
     left = work.left(limit, 0 if in_file else kept)
     room = work.room(left)
-    files = (kept if in_file else 0) + (work.pairs.pairs() if room.in_file else 0)
+    maps = 16.0 * work.pixels if work.modes(count) else 0.0
+    files = (kept + maps if in_file else 0) + (work.pairs.pairs() if room.in_file else 0)
     decisions = tuple(_decisions(work, limit, wanted, chosen, room))
     tight = bool(decisions) or work.peak(*chosen) > _ROOMY * limit
     return MemoryPlan(count, threads, in_file, None, int(files), left, tight, decisions)
 
 
-def _plan_in_tiles(work: _Work, limit: float, wanted: tuple[int, int], threads: int, side: int) -> MemoryPlan:
-    """Training frames and threads are wanted; tiles are of this side."""
+def _plan_in_tiles(work: _Work, limit: float, wanted: tuple[int, int], side: int) -> MemoryPlan:
+    """Training frames and threads are wanted; tiles of this side fit with one thread at least."""
     train, most = wanted
+    # Of all sides with the same tiles, the same one, for results that are kept are told apart by it.
+    side = max(*largest_tile((work.shape[1], work.shape[2]), side), 4 * HALO)
+    threads = next(count for count in range(most, 0, -1) if work.peak_in_tiles(train, count, side) <= limit)
     part = work.part(side)
     left = work.left(limit, _WHOLE.bytes(work.pixels, work.channels, 0) - work.held())
     room = replace(part, until=work.until).room(left)
-    images = 4.0 * work.pixels * (1 + 3 * work.channels)
+    # Maps of the flow models; centroid, sums of the tiles and what they are made of, results of two tries of the blur.
+    images = 16.0 * (work.pixels + part.pixels) + 4.0 * work.pixels * (3 + 8 * work.channels)
     files = work.modes(train) + work.stack(train) + part.modes(train) + part.stack(train) + images
-    decisions = tuple(_decisions_in_tiles(work, limit, part, (threads, most), side))
     files += part.pairs.pairs() if room.in_file else 0
+    decisions = tuple(_decisions_in_tiles(work, limit, part, (threads, most), side))
     return MemoryPlan(train, threads, True, side, int(files), left, True, decisions)
 
 
@@ -404,15 +422,12 @@ def _decisions_in_tiles(
     work: _Work, limit: float, part: _Work, threads: tuple[int, int], side: int
 ) -> Iterator[Decision]:
     """Put into words what the limit has changed; threads are those that work, and those that there are."""
-    allowed = f"of {size_text(limit)} allowed"
     height, width = part.shape[1:3]
     tiles = len(halo_tiles((work.shape[1], work.shape[2]), side))
-    needed = size_text(work.peak(_FEWEST_IN_NEED, 1, True))
     words = f"{tiles} tiles of up to {width}×{height} pixels, training frames kept in a file"
-    yield Decision("memory", words, f"whole frames would take {needed} {allowed}")
+    yield Decision("memory", words, f"whole frames would take more than the {size_text(limit)} allowed")
     if threads[0] < threads[1]:
-        reason = f"with all of them tiles of {_WORTH} pixels would take more than the {size_text(limit)} allowed"
-        yield Decision("memory", f"{threads[0]} of {threads[1]} threads", reason)
+        yield Decision("memory", f"{threads[0]} of {threads[1]} threads", "more of them would need smaller tiles")
 
 
 def _decisions(

@@ -23,7 +23,7 @@ from .limits import DEFAULT_LIMITS, Limits
 from .scratch import new_stack, parts
 
 # Arrays of more bytes may be put in a file.
-_LARGE = 1 << 26
+_LARGE = 1 << 22
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -83,7 +83,7 @@ def read_npz(
     limits : Limits
         Most bytes that are read.
     scratch : Path, optional
-        Folder of a file for arrays of more than 64 MiB; by default they are in memory.
+        Folder of a file for arrays of more than 4 MiB; by default they are in memory.
 
     Returns
     -------

@@ -37,7 +37,7 @@ from .flow import MIN_SIDE, FlowFrame
 from .flow_model import FlowDynamics
 from .frame_selection import best_frames, frame_quality
 from .frame_source import FrameSource
-from .halo_tiles import HaloTile, cut_tile, halo_tiles
+from .halo_tiles import HALO, HaloTile, cut_tile, halo_tiles
 from .images import check_space
 from .memory import MemoryPlan, plan_memory
 from .memory_size import DeconvolutionMemory
@@ -52,6 +52,8 @@ _SEEN = 0.9
 _LEAST_CONTRAST = 1 / 255
 # A blur wider than this share of the image leaves nothing to restore.
 _SIGMAS_A_SIDE = 8
+# Beyond this share of the halo of a tile what lies outside would count.
+_SIGMAS_A_HALO = 4
 
 Progress = Callable[[str, int, int], None]
 
@@ -66,8 +68,9 @@ def restore(
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
-    The frames are read from the first to the last, once (twice where only the best are kept); only the training frames
-    stay in memory, or in a file where a memory limit is given and they do not fit.
+    The frames are read from the first to the last, once (twice where only the best are kept, and those after the
+    training frames once for every tile where whole frames are too large for a memory limit); only the training frames
+    stay in memory, or in a file where they do not fit.
 
     Parameters
     ----------
@@ -112,7 +115,7 @@ def restore(
     params = place_stages(params or RestoreParams())
     source = frames if isinstance(frames, FrameSource) else FrameSource.from_array(frames)
     plan = memory_plan(source, params)
-    _check_sigma(params.deconvolution.sigma, source.shape)
+    _check_sigma(params.deconvolution.sigma, source.shape, plan)
     folder = scratch or Path(tempfile.gettempdir())
     if plan.file_bytes:
         check_space(folder / "what memory does not hold", plan.file_bytes)
@@ -157,6 +160,7 @@ def memory_plan(source: FrameSource, params: RestoreParams) -> MemoryPlan:
         params.dynamics,
         params.deconvolution,
         params.until,
+        blur_bounds=params.blur_bounds,
         on_device=any(map(needs_torch, (params.device, *placed))),
     )
 
@@ -264,6 +268,9 @@ def _restored(run: _Run, plan: MemoryPlan) -> Restoration:
     stages = STAGES[: STAGES.index(params.until) + 1]
     stream = iter(source)
     training = _read_training(stream, plan.train, source.shape, run.scratch)
+    if run.tiles:
+        # Tiles read for themselves; nothing but this holds the decoder.
+        stream = iter(())
     run.clock.lap("read")
     centroid = _find_centroid(run, training)
     image, mean = centroid.image, mean_of(training)
@@ -318,7 +325,11 @@ def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
 def _identify(run: _Run, centroid: Centroid, training: FloatArray) -> FlowDynamics:
     if run.done.dynamics is not None:
         return run.done.dynamics
-    dynamics = _flow_model(run, centroid.flows, training)
+    if run.tiles:
+        # Every tile has a model of its own; that of the whole is for the record.
+        dynamics = identify(centroid.flows, run.params.dynamics, run.scratch, run.params.flow.threads)
+    else:
+        dynamics = _flow_model(run, centroid.flows, training)
     run.finish(replace(run.done, dynamics=dynamics), "identify")
     return dynamics
 
@@ -350,7 +361,7 @@ def _filter(
     if run.tiles:
         start = run.done.tiles
         if start is not None and counter is not None:
-            counter(len(start.records) * steps)
+            counter(len(start.parts) * steps)
         filtered, mean = filter_tiles(
             filter_part,
             run.tiles,
@@ -450,12 +461,11 @@ def _within(plan: MemoryPlan, params: RestoreParams) -> RestoreParams:
     )
 
 
-def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
-    largest = min(shape[1:3]) / _SIGMAS_A_SIDE
-    require(
-        sigma is None or sigma <= largest,
-        f"sigma: expected at most {largest:g} pixels for frames of {shape[2]}×{shape[1]}, found {sigma}",
-    )
+def _check_sigma(sigma: float | None, shape: tuple[int, ...], plan: MemoryPlan) -> None:
+    largest, where = min(shape[1:3]) / _SIGMAS_A_SIDE, f"for frames of {shape[2]}×{shape[1]}"
+    if plan.tile is not None and largest > HALO / _SIGMAS_A_HALO:
+        largest, where = HALO / _SIGMAS_A_HALO, "where the memory limit allows tiles only"
+    require(sigma is None or sigma <= largest, f"sigma: expected at most {largest:g} pixels {where}, found {sigma}")
 
 
 def _read_training(stream: Iterator[FloatArray], train: int, shape: tuple[int, ...], folder: Path | None) -> FloatArray:

@@ -209,6 +209,7 @@ class Restoration:
         training frames.
     centroid : Centroid
     dynamics : FlowDynamics or None
+        Where frames are worked on in tiles it is for the record: the filter has a model of each tile.
     filtered : Filtered or None
     blur : BlurEstimate or None
         Estimated blur of the filtered image; None where sigma was given.

@@ -179,7 +179,11 @@ class KeptStages:
         if done.filtered is not None:
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
             self._written = 0
-        elif self._in_tiles or _steps(done) + self._block > self._written + self._every:
+        elif self._in_tiles:
+            # Every tile is written again with each, so the further it is, the rarer.
+            if _steps(done) > self._written + self._written // 8:
+                self.flush()
+        elif _steps(done) + self._block > self._written + self._every:
             self.flush()
 
     def flush(self) -> None:
@@ -480,8 +484,9 @@ def _changes(before: Any, now: Any, name: str = "") -> Iterator[str]:
 
 def _steps(done: StageResults) -> int:
     """Frames that the filter has passed over, or tiles."""
-    standing = done.checkpoint or done.tiles
-    return 0 if standing is None else len(standing.records)
+    if done.tiles is not None:
+        return len(done.tiles.parts)
+    return 0 if done.checkpoint is None else len(done.checkpoint.records)
 
 
 def _load_mean(path: Path) -> FloatArray:

@@ -78,6 +78,38 @@ def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.
         raise StorageError(f"{folder}: cannot hold a file of {size / 1e9:.1f} GB ({error.strerror})") from error
 
 
+def kept_in(array: NDArray[np.float32], folder: Path | None = None) -> NDArray[np.float32]:
+    """Move an array to a file, if there is a folder for it.
+
+    Parameters
+    ----------
+    array : ndarray, float32
+    folder : Path, optional
+        Where the file lies; without it nothing happens.
+
+    Returns
+    -------
+    ndarray, float32
+        A :class:`numpy.memmap` where it is in a file.
+
+    Raises
+    ------
+    StorageError
+        The folder has no room for it, or cannot be written to.
+
+    Examples
+    --------
+    >>> kept_in(np.ones((2, 3), np.float32)).sum()
+    np.float32(6.0)
+    """
+    if folder is None:
+        return array
+    stack = new_stack(array.shape, folder)
+    stack[...] = array
+    release(stack)
+    return stack
+
+
 def release(array: object) -> None:
     """Hand back the memory that the pages of a mapped file take; they are read again when they are needed.
 

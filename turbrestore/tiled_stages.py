@@ -24,7 +24,7 @@ from .centroid import Centroid, CentroidParams, find_centroid
 from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve, noise_and_fidelity
 from .flow import FlowParams
 from .halo_tiles import HaloTile, add_tile, cut_tile, new_mosaic
-from .scratch import release, walk
+from .scratch import kept_in, release, walk
 
 Float64Array = NDArray[np.float64]
 
@@ -35,18 +35,14 @@ class FilteredTiles:
 
     Attributes
     ----------
-    image, mean : ndarray, float32, shape (H, W) or (H, W, 3)
-        Sums of the tiles so far, by their weights.  Later tiles are added to the same arrays.
-    variance : ndarray, float32, shape (H, W)
-        Likewise.
-    records : tuple of Filtered
-        One of each tile, whose images are empty.
+    parts : tuple of Filtered
+        One of each tile.
+    means : tuple of ndarray, float32, shape (h, w) or (h, w, 3)
+        Means of its frames.
     """
 
-    image: FloatArray
-    mean: FloatArray
-    variance: FloatArray
-    records: tuple[Filtered, ...]
+    parts: tuple[Filtered, ...] = ()
+    means: tuple[FloatArray, ...] = ()
 
 
 def find_tiled_centroid(
@@ -89,7 +85,7 @@ def find_tiled_centroid(
     >>> tiles = halo_tiles((40, 64), side=44, halo=8)
     >>> centroid = find_tiled_centroid(np.ones((2, 40, 64), np.float32), tiles)
     >>> len(tiles), centroid.flows.shape
-    (3, (2, 40, 64, 2))
+    (2, (2, 40, 64, 2))
     """
     image = new_mosaic(frames.shape[1:], scratch)
     flows = new_mosaic((*frames.shape[:3], 2), scratch)
@@ -101,6 +97,8 @@ def find_tiled_centroid(
             add_tile(whole, tile, flow)
         sizes.append(part.mean_flow_sizes)
         converged &= part.converged
+        # Its flows would stay while the next tile has its own.
+        del part, flow
     longest = max(map(len, sizes))
     lasting = [np.pad(found, (0, longest - len(found)), mode="edge") for found in sizes]
     return Centroid(image, flows, np.average(lasting, axis=0, weights=_areas(tiles)), converged)
@@ -134,7 +132,8 @@ def filter_tiles(
     Returns
     -------
     filtered : Filtered
-        Flow states are those of all tiles, one tile after the other; the other figures are means over the tiles.
+        Flow states are those of all tiles, one tile after the other; the other figures are means over the tiles by
+        their areas.
     mean : ndarray, float32, shape of a frame
 
     Examples
@@ -145,24 +144,21 @@ def filter_tiles(
     ...     return Filtered(image, image, one[:, None], one, one, one, one / 2, 1e-4, 1.0), image
     >>> filtered, _ = filter_tiles(stand_still, halo_tiles((40, 64), side=44, halo=8), (40, 64))
     >>> filtered.image.shape, filtered.flow_states.shape, filtered.shares
-    ((40, 64), (2, 3), array([0.5, 0.5]))
+    ((40, 64), (2, 2), array([0.5, 0.5]))
     """
-    image, mean, variance = sums = [new_mosaic(size, scratch) for size in (shape, shape, shape[:2])]
-    records = list(start.records if start is not None else ())
-    if start is not None:
-        for whole, earlier in zip(sums, (start.image, start.mean, start.variance), strict=True):
-            whole[...] = earlier
-            release(whole)
-            release(earlier)
-    for tile in tiles[len(records) :]:
+    done = start or FilteredTiles()
+    for tile in tiles[len(done.parts) :]:
         part, usual = filter_tile(tile)
-        for whole, found in zip(sums, (part.image, usual, part.variance), strict=True):
-            add_tile(whole, tile, found)
-        nothing = np.zeros((0, 0), np.float32)
-        records.append(dataclasses.replace(part, image=nothing, variance=nothing))
+        part = dataclasses.replace(part, image=kept_in(part.image, scratch), variance=kept_in(part.variance, scratch))
+        done = FilteredTiles((*done.parts, part), (*done.means, kept_in(usual, scratch)))
         if on_tile is not None:
-            on_tile(FilteredTiles(image, mean, variance, tuple(records)))
-    return _joined(image, variance, records, _areas(tiles)), mean
+            on_tile(done)
+    image, mean, variance = (new_mosaic(size, scratch) for size in (shape, shape, shape[:2]))
+    for tile, part, usual in zip(tiles, done.parts, done.means, strict=True):
+        for whole, found in ((image, part.image), (mean, usual), (variance, part.variance)):
+            add_tile(whole, tile, found)
+            release(found)
+    return _joined(image, variance, done.parts, _areas(tiles)), mean
 
 
 def deconvolve_tiles(
@@ -221,6 +217,7 @@ def deconvolve_tiles(
         release(guide)
         add_tile(mosaic, tile, part.image)
         parts.append(dataclasses.replace(part, image=np.zeros((0, 0), np.float32)))
+        del part
     recorded = np.unique(np.concatenate([part.recorded for part in parts]))
     last = [np.searchsorted(part.recorded, recorded, side="right") - 1 for part in parts]
     energies, changes = (
@@ -240,18 +237,18 @@ def deconvolve_tiles(
     )
 
 
-def _joined(image: FloatArray, variance: FloatArray, records: Sequence[Filtered], areas: Float64Array) -> Filtered:
+def _joined(image: FloatArray, variance: FloatArray, parts: Sequence[Filtered], areas: Float64Array) -> Filtered:
     """Put the records of all tiles together."""
 
     def average(name: str) -> Float64Array:
-        return np.average([getattr(record, name) for record in records], axis=0, weights=areas)
+        return np.average([getattr(part, name) for part in parts], axis=0, weights=areas)
 
     return Filtered(
         image=image,
         variance=variance,
-        flow_states=np.concatenate([record.flow_states for record in records], axis=1),
+        flow_states=np.concatenate([part.flow_states for part in parts], axis=1),
         gains=average("gains"),
-        innovations=np.sqrt(np.average([record.innovations**2 for record in records], axis=0, weights=areas)),
+        innovations=np.sqrt(np.average([part.innovations**2 for part in parts], axis=0, weights=areas)),
         sharpness=average("sharpness"),
         shares=average("shares"),
         image_noise=float(average("image_noise")),
