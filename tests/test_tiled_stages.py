@@ -77,6 +77,16 @@ def test_a_deconvolution_in_tiles_is_that_of_the_whole(blurred, method, channels
     assert difference[60:68].mean() < 1.5 * difference.mean()
 
 
+def test_the_weight_of_the_data_is_that_of_the_whole(blurred):
+    noise = np.random.default_rng(0).normal(0, 0.05, blurred.shape).astype(np.float32)
+    noise[:, :64] = 0
+    params = DeconvolutionParams(method="tv", iterations=100, tolerance=0)
+    whole = deconvolve(blurred + noise, 1.2, params)
+    tiled = deconvolve_tiles(blurred + noise, 1.2, params, blurred, TILES)
+    # By weights of their own tiles would differ by 0.06.
+    assert np.sqrt(np.mean((tiled.image - whole.image) ** 2)) < 0.01
+
+
 def test_records_of_a_deconvolution_add_up(blurred):
     params = DeconvolutionParams(method="tv", tolerance=1e-4)
     parts = [
