@@ -208,6 +208,7 @@ def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tmp_path, in
         pipeline.restore(source, QUICK, on_result=keep)
     later = KeptStages(tmp_path, source, QUICK, resume=True)
     assert later.notes == (f"goes on after the flow model and {finished} tiles of the filter",)
+    assert all(isinstance(part.image, np.memmap) for part in later.done.tiles.parts)
     told = []
     resumed = pipeline.restore(
         source, QUICK, lambda stage, done, _: told.append((stage, done)), later.done, later.keep, tmp_path

@@ -180,7 +180,8 @@ def _read(source: Path, key: str, scratch: Path | None = None) -> dict[str, np.n
     if not source.is_file():
         raise InputNotFoundError(f"{source}: no such file")
     try:
-        kept = read_npz(source, scratch=scratch)
+        # Many small images take as much memory as one that is large.
+        kept = read_npz(source, scratch=scratch, large=0)
         found = str(kept["key"])
     except (DataError, KeyError) as error:
         raise _something_else(source) from error

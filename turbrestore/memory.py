@@ -24,7 +24,7 @@ in colour, with one, two and four threads, and a tenth added.  torch counts wher
 stage holds there, on the processor or not.  The deconvolution is told what is left, and works in strips and fewer
 threads where that is little; the other stages need what they need.  So the training frames go to a file first, then
 fewer threads work side by side, then fewer frames are trained on, and at last frames are worked on in tiles, as large
-ones as there is room for with two threads.  Only the last two change the result.
+ones as there is room for with two threads, or below 640 pixels with one.  Only the last two change the result.
 """
 
 from __future__ import annotations
@@ -109,6 +109,8 @@ _WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(32, 5, 0, 0), StageMemory(80, 10, 0, 0)
 _WORTH, _SIDE_STEP = 640, 32
 # The size of tiles changes the result, so it must not follow from the number of cores.
 _THREADS_OF_TILES = 2
+# Widths of the blur that the halo of a tile holds.
+_SIGMAS_A_HALO = 4
 # Images and maps that earlier stages leave, and what is made of them while the width of the blur is found.
 _HELD, _BLUR = StageMemory(60, 40, 0, 0), StageMemory(40, 0, 0, 0)
 # Width of the blur where it is not known yet, pixels.
@@ -220,10 +222,9 @@ class _Work:
         return self.base + stack + max(flow + prepared, modes + max(later[stage] for stage in stages))
 
     def part(self, side: int) -> _Work:
-        """Return the work on one tile, up to where the whole is needed."""
-        until = "centroid" if self.until in ("centroid", "identify") else "filter"
+        """Return the work on one tile: all that tiles are for, so that a run which goes further has the same."""
         largest = largest_tile((self.shape[1], self.shape[2]), side)
-        return replace(self, shape=(self.shape[0], *largest, *self.shape[3:]), until=until)
+        return replace(self, shape=(self.shape[0], *largest, *self.shape[3:]), until="filter")
 
     def peak_in_tiles(self, train: int, threads: int, side: int) -> float:
         """Largest need of any stage where frames are worked on in tiles."""
@@ -380,12 +381,13 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
 
 def _tilings(work: _Work) -> Iterator[tuple[int, int]]:
     """Yield numbers of threads and sides of tiles, the best ones first."""
-    if work.deconvolution.boundary == "periodic" and work.until == "deconvolve":
-        # The other side of the image is in another tile.
+    blur, largest = work.deconvolution, max(work.shape[1:3])
+    # What a pixel is deblurred from must not lie in another tile, as does the other side of a periodic image.
+    far = blur.boundary == "periodic" or (blur.sigma or 0.0) > HALO / _SIGMAS_A_HALO
+    if far and work.until == "deconvolve":
         return
-    for threads in range(_THREADS_OF_TILES, 0, -1):
-        least = 4 * HALO if threads == 1 else _WORTH
-        yield from ((threads, side) for side in reversed(range(least, max(work.shape[1:3]), _SIDE_STEP)))
+    yield from ((_THREADS_OF_TILES, side) for side in reversed(range(_WORTH, largest, _SIDE_STEP)))
+    yield from ((1, side) for side in reversed(range(4 * HALO, min(_WORTH, largest), _SIDE_STEP)))
 
 
 def _plan(work: _Work, limit: float, wanted: tuple[int, int], chosen: tuple[int, int, bool]) -> MemoryPlan:

@@ -72,7 +72,10 @@ def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
 
 
 def read_npz(
-    path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, scratch: Path | None = None
+    path: str | os.PathLike[str],
+    limits: Limits = DEFAULT_LIMITS,
+    scratch: Path | None = None,
+    large: int | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Read all arrays of an uncompressed ``.npz`` file.
 
@@ -83,7 +86,9 @@ def read_npz(
     limits : Limits
         Most bytes that are read.
     scratch : Path, optional
-        Folder of a file for arrays of more than 4 MiB; by default they are in memory.
+        Folder of a file for large arrays; by default they are in memory.
+    large : int, optional
+        Bytes from which an array is large; by default 4 MiB.
 
     Returns
     -------
@@ -117,7 +122,8 @@ def read_npz(
             # Members are not compressed; they hold more than the file only where they lie within each other.
             if sum(member.file_size for member in members) > size:
                 raise ValueError(f"its members hold more than its {size} bytes")
-            return {name: _member(archive, member, scratch) for name, member in zip(names, members, strict=True)}
+            least = _LARGE if large is None else large
+            return {name: _member(archive, member, scratch, least) for name, member in zip(names, members, strict=True)}
     except TurbrestoreError:
         raise
     except Exception as error:  # neither NumPy nor zipfile documents a closed list of exceptions for damaged files
@@ -153,12 +159,12 @@ def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
                     np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | None) -> NDArray[Any]:
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | None, large: int) -> NDArray[Any]:
     if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
         raise ValueError(f"{member.filename} is compressed; expected it as numpy.savez writes it")
     with archive.open(member) as stream:
         shape, is_fortran, dtype = _header(stream)
-        if scratch is not None and member.file_size > _LARGE and dtype == np.float32:
+        if scratch is not None and member.file_size > large and dtype == np.float32:
             stack = _stack_of(stream, shape[::-1] if is_fortran else shape, member, scratch)
             return stack.T if is_fortran else stack
         # Reading to the end lets zipfile compare the checksum.

@@ -37,7 +37,7 @@ from .flow import MIN_SIDE, FlowFrame
 from .flow_model import FlowDynamics
 from .frame_selection import best_frames, frame_quality
 from .frame_source import FrameSource
-from .halo_tiles import HALO, HaloTile, cut_tile, halo_tiles
+from .halo_tiles import HaloTile, cut_tile, halo_tiles
 from .images import check_space
 from .memory import MemoryPlan, plan_memory
 from .memory_size import DeconvolutionMemory
@@ -52,8 +52,6 @@ _SEEN = 0.9
 _LEAST_CONTRAST = 1 / 255
 # A blur wider than this share of the image leaves nothing to restore.
 _SIGMAS_A_SIDE = 8
-# Beyond this share of the halo of a tile what lies outside would count.
-_SIGMAS_A_HALO = 4
 
 Progress = Callable[[str, int, int], None]
 
@@ -84,7 +82,7 @@ def restore(
         What an earlier run of the same frames and settings has done already; the result is the same, bit for bit.
         Nothing is checked: :mod:`turbrestore.resumption` keeps results on disk and tells which still hold.
     on_result : callable, optional
-        Called with all that is done after each stage, and after each block of frames in the filter.
+        Called with all that is done after each stage, and in the filter after each block of frames, or each tile.
     scratch : Path, optional
         Folder of the file for what memory does not hold; by default that of temporary files.
 
@@ -115,7 +113,7 @@ def restore(
     params = place_stages(params or RestoreParams())
     source = frames if isinstance(frames, FrameSource) else FrameSource.from_array(frames)
     plan = memory_plan(source, params)
-    _check_sigma(params.deconvolution.sigma, source.shape, plan)
+    _check_sigma(params.deconvolution.sigma, source.shape)
     folder = scratch or Path(tempfile.gettempdir())
     if plan.file_bytes:
         check_space(folder / "what memory does not hold", plan.file_bytes)
@@ -461,11 +459,12 @@ def _within(plan: MemoryPlan, params: RestoreParams) -> RestoreParams:
     )
 
 
-def _check_sigma(sigma: float | None, shape: tuple[int, ...], plan: MemoryPlan) -> None:
-    largest, where = min(shape[1:3]) / _SIGMAS_A_SIDE, f"for frames of {shape[2]}×{shape[1]}"
-    if plan.tile is not None and largest > HALO / _SIGMAS_A_HALO:
-        largest, where = HALO / _SIGMAS_A_HALO, "where the memory limit allows tiles only"
-    require(sigma is None or sigma <= largest, f"sigma: expected at most {largest:g} pixels {where}, found {sigma}")
+def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
+    largest = min(shape[1:3]) / _SIGMAS_A_SIDE
+    require(
+        sigma is None or sigma <= largest,
+        f"sigma: expected at most {largest:g} pixels for frames of {shape[2]}×{shape[1]}, found {sigma}",
+    )
 
 
 def _read_training(stream: Iterator[FloatArray], train: int, shape: tuple[int, ...], folder: Path | None) -> FloatArray:

@@ -209,7 +209,8 @@ class Restoration:
         training frames.
     centroid : Centroid
     dynamics : FlowDynamics or None
-        Where frames are worked on in tiles it is for the record: the filter has a model of each tile.
+        Where frames are worked on in tiles it is for the record, without the displacement cue: the filter has a model
+        of each tile.
     filtered : Filtered or None
     blur : BlurEstimate or None
         Estimated blur of the filtered image; None where sigma was given.

@@ -181,7 +181,7 @@ class KeptStages:
             self._written = 0
         elif self._in_tiles:
             # Every tile is written again with each, so the further it is, the rarer.
-            if _steps(done) > self._written + self._written // 8:
+            if _steps(done) >= self._written + max(1, self._written // 8):
                 self.flush()
         elif _steps(done) + self._block > self._written + self._every:
             self.flush()
