@@ -1,7 +1,7 @@
 """Coverage of an image by frames that move, and the rectangle that is well seen."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.border import coverage, well_seen
@@ -18,6 +18,7 @@ def test_a_shift_to_the_left_uncovers_the_left_columns():
 
 
 @given(st.lists(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), min_size=1, max_size=6))
+@settings(deadline=None)
 def test_whole_shifts_leave_the_intersection_of_the_frames(displacements):
     x, y, width, height = well_seen(coverage(shifts(displacements)), least=1.0)
     dx, dy = np.array(displacements).T
@@ -27,6 +28,7 @@ def test_whole_shifts_leave_the_intersection_of_the_frames(displacements):
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 1.0))
+@settings(deadline=None)
 def test_what_is_left_is_seen_well_enough_or_small(seed, least):
     seen = np.random.default_rng(seed).uniform(0.5, 1, (30, 34))
     x, y, width, height = well_seen(seen, least)

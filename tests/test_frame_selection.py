@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.errors import ConfigurationError, DataError
@@ -22,6 +22,7 @@ def test_quality_falls_with_blur_and_ignores_gain():
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=40), st.floats(0.01, 1))
+@settings(deadline=None)
 def test_exactly_the_share_is_kept_and_none_left_out_is_better(quality, share):
     kept = best_frames(quality, share)
     assert kept.sum() == np.ceil(round(share * len(quality), 9))

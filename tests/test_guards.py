@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.arrays import luminance
@@ -73,6 +73,7 @@ def test_rings_of_colour_without_luminance_are_found():
 
 
 @given(gain=st.floats(0.1, 1.0), offset=st.floats(-0.2, 0.2))
+@settings(deadline=None)
 def test_the_reading_depends_on_neither_gain_nor_offset(gain, offset):
     scene, image = blurred("camera", 2.0, side=48)
     first = judge(scene, image, 2.0)

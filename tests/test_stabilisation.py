@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 import skimage.data
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.errors import DataError
@@ -110,6 +110,7 @@ def test_what_no_frame_saw_is_the_plain_mean():
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(-12, 12), st.integers(-12, 12))
+@settings(deadline=None)
 def test_overlap_holds_the_same_pixels(height, width, dx, dy):
     y, x = np.mgrid[:height, :width]
     to, origin = overlap((height, width), (dx, dy))
