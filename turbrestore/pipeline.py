@@ -10,7 +10,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .alternating import Filtered, filter_frames
 from .arrays import FloatArray
@@ -44,7 +44,7 @@ from .memory_size import DeconvolutionMemory
 from .psf import KOLMOGOROV
 from .restoration import STAGES, Restoration, RestoreParams, StageResults, explain_devices, place_stages
 from .scratch import mean_of, new_stack, release, returning_freed, walk
-from .tiled_stages import filter_tiles, find_tiled_centroid
+from .tiled_stages import FilteredTiles, filter_tiles, find_tiled_centroid
 
 # Share of the training frames that show every pixel of a cropped image.
 _SEEN = 0.9
@@ -347,27 +347,10 @@ def _filter(
     counted = None if params.keep_best == 1 else best_frames(frame_quality(source), params.keep_best)
     steps = len(source) * params.filter.inner_iterations - len(training)
     counter = stage_counter(run.progress, "filter", max(len(run.tiles), 1) * steps)
-
-    def filter_part(tile: HaloTile) -> tuple[Filtered, FloatArray]:
-        frames, flows = (cut_tile(stack, tile, run.scratch) for stack in (training, centroid.flows))
-        summed = _Sum(frames, _rest_of(source, len(training), tile))
-        image = centroid.image[tile.rows, tile.columns].copy()
-        model = _flow_model(run, flows, frames)
-        filtered = filter_frames(summed, image, model, params.filter, params.flow, flows, counter, counted)
-        return filtered, summed.mean()
-
+    if run.done.tiles is not None and counter is not None:
+        counter(len(run.done.tiles.parts) * steps)
     if run.tiles:
-        start = run.done.tiles
-        if start is not None and counter is not None:
-            counter(len(start.parts) * steps)
-        filtered, mean = filter_tiles(
-            filter_part,
-            run.tiles,
-            source.shape[1:],
-            run.scratch,
-            start,
-            lambda tiles: run.finish(replace(run.done, tiles=tiles)),
-        )
+        filtered, mean = _filter_in_tiles(run, centroid, training, counted, counter)
     else:
         summed = _Sum(training, rest)
         filtered = filter_frames(
@@ -386,6 +369,29 @@ def _filter(
         mean = summed.mean()
     run.finish(replace(run.done, checkpoint=None, tiles=None, filtered=filtered, mean=mean), "filter")
     return filtered, mean
+
+
+def _filter_in_tiles(
+    run: _Run,
+    centroid: Centroid,
+    training: FloatArray,
+    counted: NDArray[np.bool_] | None,
+    counter: Callable[[int], None] | None,
+) -> tuple[Filtered, FloatArray]:
+    params, source = run.params, run.source
+
+    def filter_part(tile: HaloTile) -> tuple[Filtered, FloatArray]:
+        frames, flows = (cut_tile(stack, tile, run.scratch) for stack in (training, centroid.flows))
+        summed = _Sum(frames, _rest_of(source, len(training), tile))
+        image = centroid.image[tile.rows, tile.columns].copy()
+        model = _flow_model(run, flows, frames)
+        filtered = filter_frames(summed, image, model, params.filter, params.flow, flows, counter, counted)
+        return filtered, summed.mean()
+
+    def keep(tiles: FilteredTiles) -> None:
+        run.finish(replace(run.done, tiles=tiles))
+
+    return filter_tiles(filter_part, run.tiles, source.shape[1:], run.scratch, run.done.tiles, keep)
 
 
 def _rest_of(source: FrameSource, start: int, tile: HaloTile) -> Iterator[FloatArray]:
