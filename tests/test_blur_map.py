@@ -1,5 +1,7 @@
 """Blur that differs over the image: found by tiles where it does, not where it does not."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -96,3 +98,23 @@ def test_a_sharp_part_beside_a_blurred_one_stays_sharp():
 def test_small_images_have_no_tiles():
     small = np.random.default_rng(0).random((600, 300)).astype(np.float32)
     assert estimate_blur_map(small, estimate_blur(small)) is None
+
+
+@pytest.mark.parametrize(("right", "calls"), [(1.4, 1), (2.6, None)])
+def test_widths_are_found_beside_a_deconvolution_that_is_used_where_they_agree(monkeypatch, right, calls):
+    _, image, _ = blurred("brick", 1.4 if calls else 0.8, right)
+    widths = []
+
+    def counted(image, width, *rest):
+        widths.append(width)
+        return deconvolve(image, width, *rest)
+
+    monkeypatch.setattr("turbrestore.blind.deconvolve", counted)
+    result = remove_blur(image, image, WIENER)
+    tried = widths.copy()
+    in_turn = remove_blur(image, image, replace(WIENER, memory=1e9))
+    assert np.array_equal(result.deconvolution.image, in_turn.deconvolution.image)
+    assert result.decisions == in_turn.decisions
+    assert result.tiles.varies == (calls is None)
+    # Where they differ the one beside them is in vain.
+    assert len(tried) == (calls or 1 + len(widths) - len(tried))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -101,20 +102,27 @@ def remove_blur(
     blind = deconvolution.sigma is None
     blur = estimate_blur(image, exponent=deconvolution.exponent or KOLMOGOROV) if blind else None
     sigma, settings = blur_to_remove(blur, deconvolution, bounds)
-    tiles = estimate_blur_map(image, blur) if blur is not None and blur.blurred and bounds is None else None
-    if tiles is not None and tiles.varies:
-        widths = sigma_map(tiles.removable, image.shape[:2])
-        sigma = float(widths.max())
 
     def remove(width: float, progress: Callable[[int], None] | None = None) -> Deconvolution:
         if parts and width > 0:
             return deconvolve_tiles(image, width, settings, guide, parts, progress, scratch)
         return deconvolve(image, width, settings, guide, progress, scratch)
 
+    tiles, first = None, None
+    if blur is not None and blur.blurred and bounds is None:
+        if parts or settings.memory is not None:
+            tiles = estimate_blur_map(image, blur)
+        else:
+            tiles, first = _map_meanwhile(image, blur, lambda: remove(sigma, progress))
+    varies = tiles is not None and tiles.varies
+    if tiles is not None and varies:
+        widths, first = sigma_map(tiles.removable, image.shape[:2]), None
+        sigma = float(widths.max())
+
     def attempt(width: float) -> Deconvolution:
-        if tiles is None or not tiles.varies or width == 0:
-            return remove(width, progress)
-        return deconvolve_varying(remove, widths * (width / sigma))
+        if varies and width > 0:
+            return deconvolve_varying(remove, widths * (width / sigma))
+        return first if first is not None and first.sigma == width else remove(width, progress)
 
     if blind:
         result, readings = deconvolve_guarded(attempt, image, sigma, guards)
@@ -157,6 +165,19 @@ def blur_to_remove(
     if bounds is not None and sigma > 0:
         sigma = min(max(sigma, bounds.low), bounds.high)
     return sigma, replace(deconvolution, exponent=estimate.exponent)
+
+
+def _map_meanwhile(
+    image: FloatArray, blur: BlurEstimate, remove: Callable[[], Deconvolution]
+) -> tuple[BlurMap | None, Deconvolution]:
+    """Widths of tiles, and the image without a blur of one width.
+
+    Widths keep one core busy, the deconvolution all of them but for pauses; and seldom does the blur vary.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        tiles = pool.submit(estimate_blur_map, image, blur)
+        result = remove()
+        return tiles.result(), result
 
 
 def _on_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None) -> Decision:

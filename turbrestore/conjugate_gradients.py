@@ -14,12 +14,19 @@ from .psf import Spectrum
 
 
 class GradientState(NamedTuple):
-    """u, and of u − m in Fourier: residual of the normal equations, search direction; ⟨residual, preconditioned⟩."""
+    """m; in Fourier u − m, residual of the normal equations and search direction; ⟨residual, preconditioned⟩."""
 
-    image: FloatArray
+    mean: np.float32
+    deviation: Spectrum
     residual: Spectrum
     direction: Spectrum
     decrease: float
+    shape: tuple[int, int]
+
+    @property
+    def image(self) -> FloatArray:
+        """u, transformed anew whenever it is asked for."""
+        return self.mean + fft.irfft2(self.deviation, s=self.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,21 +47,21 @@ class ConjugateGradients:
         m, shape = seen_mean(problem), problem.observed.shape
         deviation = fft.rfft2(problem.observed - m) * problem.otf.conj()
         deviation *= np.float32(problem.fidelity) * self._inverse(problem)
-        u = m + fft.irfft2(deviation, s=shape)
-        residual = -self.symbol * deviation
-        deviation[0, 0] += m * u.size
-        residual -= problem.gradient_spectrum(deviation)
+        residual, u = -self.symbol * deviation, deviation.copy()
+        u[0, 0] += m * problem.observed.size
+        residual -= problem.gradient_spectrum(u)
         direction = residual * self._inverse(problem)
-        return GradientState(u, residual, direction, spectral_inner(residual, direction, shape))
+        decrease = spectral_inner(residual, direction, shape)
+        return GradientState(m, deviation, residual, direction, decrease, shape)
 
     def step(self, problem: Problem, state: GradientState) -> GradientState:
         """One iteration of preconditioned conjugate gradients.
 
-        Inner products are those of the images, by Parseval, so that only u and what was seen of it are transformed.
+        Inner products are those of the images, by Parseval, so that only what was seen of the direction is transformed.
         """
         if state.decrease <= 0:
             return state
-        direction, shape = state.direction, state.image.shape
+        direction, shape = state.direction, state.shape
         image = problem.normal_spectrum(direction)
         image += self.symbol * direction
         length = np.float32(state.decrease / spectral_inner(direction, image, shape))
@@ -62,11 +69,10 @@ class ConjugateGradients:
         image += state.residual
         preconditioned = image * self._inverse(problem)
         decrease = spectral_inner(image, preconditioned, shape)
-        u = fft.irfft2(direction, s=shape)
-        u *= length
-        u += state.image
         preconditioned += np.float32(decrease / state.decrease) * direction
-        return GradientState(u, image, preconditioned, decrease)
+        deviation = length * direction
+        deviation += state.deviation
+        return GradientState(state.mean, deviation, image, preconditioned, decrease, shape)
 
     def penalty(self, problem: Problem, u: FloatArray) -> float:
         """½⟨u − m, R(u − m)⟩."""

@@ -74,9 +74,8 @@ CHANNELS = ("luminance", "each")
 _THREADED_TRANSFORM, _THREADED_PASS = 1 << 18, 1 << 17
 # Least margin, in widths of the blur.
 MARGIN_SIGMAS = 4.0
-# Steps and relative change at which the Wiener solution is good enough to start from.
+# Steps to the Wiener solution that is started from: from the first on only what lies near the border changes.
 _START_STEPS = 40
-_START_TOLERANCE = 1e-4
 # A multiple of the iterations that solvers have judged together.
 _RECORD_EVERY = 10
 
@@ -419,7 +418,6 @@ def _solve_on_device(
         params.tolerance,
         _RECORD_EVERY,
         _START_STEPS,
-        _START_TOLERANCE,
         params.sharpen_guide,
         params.weights,
     )
@@ -477,9 +475,7 @@ def _wiener_image(problem: Problem) -> FloatArray:
     solver = _wiener_solver(problem)
     state = solver.start(problem)
     for _ in range(_START_STEPS):
-        before, state = state.image, solver.step(problem, state)
-        if _relative_change([before], [state.image], problem.seen) <= _START_TOLERANCE:
-            break
+        state = solver.step(problem, state)
     return state.image
 
 

@@ -45,8 +45,8 @@ class SolverSettings:
         Relative change in an iteration below which they stop.
     record_every : int
         Iterations from one record of the energy to the next, a multiple of those that are judged together.
-    start_steps, start_tolerance
-        The same of the Wiener solution that nltv and tv start from.
+    start_steps : int
+        Of the Wiener solution that nltv and tv start from.
     sharpen_guide : bool
         Compare patches of the guide after a Wiener deconvolution.
     weights : NonlocalParams
@@ -57,7 +57,6 @@ class SolverSettings:
     tolerance: float
     record_every: int
     start_steps: int
-    start_tolerance: float
     sharpen_guide: bool
     weights: NonlocalParams
 
@@ -294,9 +293,7 @@ def _wiener_image(problem: Problem, settings: SolverSettings, device: str) -> Te
     solver = _Quadratic(_tensor(_laplacian(problem), device))
     state = solver.start(loaded)
     for _ in range(settings.start_steps):
-        before, state = state.image, solver.step(loaded, state)
-        if _relative_change([before], [state.image], loaded.seen) <= settings.start_tolerance:
-            break
+        state = solver.step(loaded, state)
     return state.image
 
 
