@@ -53,8 +53,9 @@ def compare_clip(name: str, clip: Clip) -> float:
     """Likewise of the filtered image of a clip, with the centroid as guide."""
     done = restore(clip.frames, RestoreParams(until="filter"))
     seen, blur = done.filtered.image, estimate_blur(done.filtered.image)
-    case = f"nltv | {name} | {seen.shape[1]}×{seen.shape[0]} | {blur.removable:.2f} | as filtered"
-    return _compare(case, clip.truth, seen, blur, DeconvolutionParams(), done.centroid.image)
+    params = DeconvolutionParams()
+    case = f"{params.method} | {name} | {seen.shape[1]}×{seen.shape[0]} | {blur.removable:.2f} | as filtered"
+    return _compare(case, clip.truth, seen, blur, params, done.centroid.image)
 
 
 def _compare(
@@ -85,6 +86,9 @@ def main() -> int:
     if asked.clips is not None:
         loaded = ((name, load()) for name, load in find_clips(asked.clips).items())
         stated = differences = [abs(compare_clip(name, clip)) for name, clip in loaded if clip.truth is not None]
+        if not differences:
+            print("stopping: no clip that matches has a truth; name others", file=sys.stderr)
+            return 2
         where = "of these"
     else:
         cases = itertools.product(METHODS, NAMES, asked.sizes, asked.widths, NOISES)
@@ -92,7 +96,7 @@ def main() -> int:
         differences = list(found.values())
         stated = [value for case, value in found.items() if case[2] in SIZES and case[3] in WIDTHS]
         where = "at 64², 128² and 1.5 px"
-    print(f"\nLargest difference {max(differences, default=0):.3f} dB; bound {where}: {BOUND_DB}")
+    print(f"\nLargest difference {max(differences):.3f} dB; bound {where}: {BOUND_DB}")
     return int(any(value > BOUND_DB for value in stated))
 
 

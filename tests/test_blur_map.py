@@ -1,5 +1,6 @@
 """Blur that differs over the image: found by tiles where it does, not where it does not."""
 
+import threading
 from dataclasses import replace
 
 import cv2
@@ -118,3 +119,43 @@ def test_widths_are_found_beside_a_deconvolution_that_is_used_where_they_agree(m
     assert result.tiles.varies == (calls is None)
     # Where they differ the one beside them is in vain.
     assert len(tried) == (calls or 1 + len(widths) - len(tried))
+
+
+def test_widths_and_deconvolution_do_not_wait_for_each_other(monkeypatch):
+    _, image, _ = blurred("brick", 1.4, 1.4)
+    both = threading.Barrier(2, timeout=20)
+
+    def waiting(function):
+        def wait(*arguments):
+            both.wait()
+            return function(*arguments)
+
+        return wait
+
+    monkeypatch.setattr("turbrestore.blind.deconvolve", waiting(deconvolve))
+    monkeypatch.setattr("turbrestore.blind.estimate_blur_map", waiting(estimate_blur_map))
+    assert remove_blur(image, image, WIENER).tiles is not None
+
+
+def test_after_an_interrupt_nobody_waits_for_all_tiles(monkeypatch):
+    _, image, _ = blurred("brick", 1.4, 1.4)
+    tiles, whole = [], estimate_blur(image, exponent=2.0)
+    begun = threading.Event()
+
+    def estimated(tile, **settings):
+        tiles.append(tile)
+        begun.set()
+        interrupted.wait(20)
+        return whole
+
+    def interrupt(*_):
+        begun.wait(20)
+        threading.Timer(0.2, interrupted.set).start()
+        raise KeyboardInterrupt
+
+    interrupted = threading.Event()
+    monkeypatch.setattr("turbrestore.blur_map.estimate_blur", estimated)
+    monkeypatch.setattr("turbrestore.blind.deconvolve", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        remove_blur(image, image, WIENER)
+    assert len(tiles) == 1

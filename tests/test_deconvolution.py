@@ -1,6 +1,7 @@
 """Solvers against dense algebra, brute force and the Euler–Lagrange equations; the border; stopping; settings."""
 
 import dataclasses
+import itertools
 
 import cv2
 import numpy as np
@@ -349,6 +350,15 @@ def test_conjugate_gradients_stay_where_they_are_when_solved():
     for _ in range(20):
         state = solver.step(problem, state)
     assert state.image == pytest.approx(0.5, abs=1e-5)
+
+
+@pytest.mark.parametrize("side", [16, 24])
+@pytest.mark.parametrize("method", ["nltv", "tv"])
+def test_a_start_that_is_solved_at_once_is_not_divided_by_nothing(method, side):
+    params = DeconvolutionParams(method=method, boundary="periodic", iterations=20)
+    for name, width, noise in itertools.product(("camera", "brick", "grass"), (0.5, 1.0, 2.5), (0.0, 0.01)):
+        scene = SCENES[name](side, side) + np.random.default_rng(0).normal(0, noise, (side, side))
+        assert np.isfinite(deconvolve(scene, width, params).image).all()
 
 
 # --- the whole stage -------------------------------------------------------------------------------------------------

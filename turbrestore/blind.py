@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -55,7 +56,8 @@ def remove_blur(
 ) -> Deblurred:
     """Deblur an image by the width asked for, else by the width estimated, as far as the guards allow.
 
-    Where the blur clearly differs between tiles of the image, every pixel gets a width of its own.
+    Where the blur clearly differs between tiles of the image, every pixel gets a width of its own.  Tiles are looked at
+    in another thread while the image is deblurred by one width, or before that where memory is limited.
 
     A width asked for is removed whatever the guards say; they are heard all the same.
 
@@ -72,7 +74,7 @@ def remove_blur(
     bounds : BlurBounds, optional
         What an estimated width is kept within.
     progress : callable, optional
-        Called with the number of iterations done.
+        Called with the number of iterations done, in an attempt by one width.
     scratch : Path, optional
         Folder of the file for what memory does not hold; by default that of temporary files.
     parts : sequence of HaloTile, optional
@@ -110,17 +112,17 @@ def remove_blur(
 
     tiles, first = None, None
     if blur is not None and blur.blurred and bounds is None:
-        if parts or settings.memory is not None:
+        if settings.memory is not None:
+            # Both at once may take more than is allowed.
             tiles = estimate_blur_map(image, blur)
         else:
             tiles, first = _map_meanwhile(image, blur, lambda: remove(sigma, progress))
-    varies = tiles is not None and tiles.varies
-    if tiles is not None and varies:
-        widths, first = sigma_map(tiles.removable, image.shape[:2]), None
+    widths = None if tiles is None or not tiles.varies else sigma_map(tiles.removable, image.shape[:2])
+    if widths is not None:
         sigma = float(widths.max())
 
     def attempt(width: float) -> Deconvolution:
-        if varies and width > 0:
+        if widths is not None and width > 0:
             return deconvolve_varying(remove, widths * (width / sigma))
         return first if first is not None and first.sigma == width else remove(width, progress)
 
@@ -174,10 +176,15 @@ def _map_meanwhile(
 
     Widths keep one core busy, the deconvolution all of them but for pauses; and seldom does the blur vary.
     """
+    ended = threading.Event()
     with ThreadPoolExecutor(1) as pool:
-        tiles = pool.submit(estimate_blur_map, image, blur)
-        result = remove()
-        return tiles.result(), result
+        tiles = pool.submit(estimate_blur_map, image, blur, ended.is_set)
+        try:
+            result = remove()
+            return tiles.result(), result
+        finally:
+            # After an error or an interrupt nobody waits for all tiles.
+            ended.set()
 
 
 def _on_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None) -> Decision:

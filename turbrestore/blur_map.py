@@ -57,7 +57,9 @@ class BlurMap:
         return np.maximum(self.sigmas - 0.5 * self.uncertainties, 0.0)
 
 
-def estimate_blur_map(image: ArrayLike, whole: BlurEstimate) -> BlurMap | None:
+def estimate_blur_map(
+    image: ArrayLike, whole: BlurEstimate, given_up: Callable[[], bool] | None = None
+) -> BlurMap | None:
     """Estimate the blur of overlapping tiles, two or three along each side.
 
     Parameters
@@ -66,11 +68,13 @@ def estimate_blur_map(image: ArrayLike, whole: BlurEstimate) -> BlurMap | None:
         Blurred image.
     whole : BlurEstimate
         Of the whole image.
+    given_up : callable, optional
+        Asked before each tile whether the rest is of no use any more.
 
     Returns
     -------
     BlurMap or None
-        None if the image is too small for tiles of 240 pixels.
+        None if the image is too small for tiles of 240 pixels, or if it was given up.
 
     Raises
     ------
@@ -94,6 +98,8 @@ def estimate_blur_map(image: ArrayLike, whole: BlurEstimate) -> BlurMap | None:
     spoken = np.zeros(shape, bool)
     with one_thread_each():
         for place in np.ndindex(shape):
+            if given_up is not None and given_up():
+                return None
             tile = np.ascontiguousarray(grey[rows[place[0]], columns[place[1]]])
             estimate = estimate_blur(tile, exponent=whole.exponent)
             known = np.isfinite(estimate.uncertainty)

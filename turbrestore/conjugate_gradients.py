@@ -12,15 +12,22 @@ from .arrays import FloatArray
 from .convolution_problem import Problem, inner, seen_mean, spectral_inner
 from .psf import Spectrum
 
+# Share of the energy of the data below which the residual is one of rounding.
+ROUNDING = 1e-14
+
 
 class GradientState(NamedTuple):
-    """m; in Fourier u − m, residual of the normal equations and search direction; ⟨residual, preconditioned⟩."""
+    """m; in Fourier u − m, residual of the normal equations and search direction; ⟨residual, preconditioned⟩.
+
+    ``enough`` is that of a solution; from there on steps stay where they are.
+    """
 
     mean: np.float32
     deviation: Spectrum
     residual: Spectrum
     direction: Spectrum
     decrease: float
+    enough: float
     shape: tuple[int, int]
 
     @property
@@ -52,14 +59,15 @@ class ConjugateGradients:
         residual -= problem.gradient_spectrum(u)
         direction = residual * self._inverse(problem)
         decrease = spectral_inner(residual, direction, shape)
-        return GradientState(m, deviation, residual, direction, decrease, shape)
+        enough = ROUNDING * problem.fidelity * inner(problem.observed, problem.observed)
+        return GradientState(m, deviation, residual, direction, decrease, enough, shape)
 
     def step(self, problem: Problem, state: GradientState) -> GradientState:
         """One iteration of preconditioned conjugate gradients.
 
         Inner products are those of the images, by Parseval, so that only what was seen of the direction is transformed.
         """
-        if state.decrease <= 0:
+        if state.decrease <= state.enough:
             return state
         direction, shape = state.direction, state.shape
         image = problem.normal_spectrum(direction)
@@ -72,7 +80,7 @@ class ConjugateGradients:
         preconditioned += np.float32(decrease / state.decrease) * direction
         deviation = length * direction
         deviation += state.deviation
-        return GradientState(state.mean, deviation, image, preconditioned, decrease, shape)
+        return state._replace(deviation=deviation, residual=image, direction=preconditioned, decrease=decrease)
 
     def penalty(self, problem: Problem, u: FloatArray) -> float:
         """½⟨u − m, R(u − m)⟩."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 
 from .arrays import FloatArray
+from .conjugate_gradients import ROUNDING
 from .convolution_problem import Problem
 from .device import memory_of
 from .nonlocal_tv import NonlocalParams
@@ -117,6 +118,7 @@ class _GradientState(NamedTuple):
     residual: Tensor
     direction: Tensor
     decrease: float
+    enough: float
 
 
 def solve_on_device(
@@ -154,7 +156,7 @@ def solve_on_device(
     >>> import numpy as np
     >>> flat = np.full((16, 16), 0.5, np.float32)
     >>> problem = Problem(flat, np.ones_like(flat), np.ones((16, 9), np.float32), 100.0)
-    >>> settings = SolverSettings("tv", 50, 1e-4, 10, 40, 1e-4, True, NonlocalParams())
+    >>> settings = SolverSettings("tv", 50, 1e-4, 10, 40, True, NonlocalParams())
     >>> solution = solve_on_device([problem], None, settings, "cpu")
     >>> solution.converged, bool(np.allclose(solution.images[0], 0.5, atol=1e-5))
     (True, True)
@@ -261,10 +263,11 @@ class _Quadratic:
         u = m + self._precondition(problem, _forward(problem.observed - m) * problem.otf.conj() * problem.fidelity)
         residual = -_back(problem.gradient_spectrum(_forward(u)) + self.symbol * _forward(u - m), u)
         direction = self._precondition(problem, _forward(residual))
-        return _GradientState(u, residual, direction, _inner(residual, direction))
+        enough = ROUNDING * problem.fidelity * _inner(problem.observed, problem.observed)
+        return _GradientState(u, residual, direction, _inner(residual, direction), enough)
 
     def step(self, problem: _Problem, state: _GradientState) -> _GradientState:
-        if state.decrease <= 0:
+        if state.decrease <= state.enough:
             return state
         spectrum = _forward(state.direction)
         blurred = problem.seen * _back(problem.otf * spectrum, state.image)
@@ -275,7 +278,7 @@ class _Quadratic:
         preconditioned = self._precondition(problem, _forward(residual))
         decrease = _inner(residual, preconditioned)
         direction = preconditioned + (decrease / state.decrease) * state.direction
-        return _GradientState(state.image + length * state.direction, residual, direction, decrease)
+        return _GradientState(state.image + length * state.direction, residual, direction, decrease, state.enough)
 
     def penalty(self, problem: _Problem, u: Tensor) -> float:
         deviation = u - problem.mean()
