@@ -3,6 +3,7 @@ import pytest
 
 from turbrestore.arrays import check_flow, check_frames, check_image, from_unit, luminance
 from turbrestore.errors import DataError
+from turbrestore.scratch import kept_in
 
 
 def test_integers_are_scaled_by_their_type():
@@ -45,6 +46,17 @@ def test_frames_and_flows_of_wrong_shape_are_refused():
         check_image([["a", "b"]])
     with pytest.raises(DataError, match="expected real numbers"):
         check_flow("text")
+
+
+@pytest.mark.parametrize("shape", [(50, 40, 3), (7, 10, 12, 3)])
+def test_a_large_image_in_parts_is_the_same(shape, tmp_path, monkeypatch):
+    image = np.random.default_rng(0).random(shape, dtype=np.float32)
+    grey, levels = luminance(image), from_unit(image, 12)
+    assert np.array_equal(levels, np.rint(image * np.float64(4095)))
+    monkeypatch.setattr("turbrestore.scratch._PART", 500)
+    for kept in (image, kept_in(image, tmp_path)):
+        assert np.array_equal(luminance(kept), grey)
+        assert np.array_equal(from_unit(kept, 12), levels)
 
 
 def test_luminance_weighs_green_most():

@@ -154,7 +154,12 @@ def luminance(image: FloatArray) -> FloatArray:
     """
     if image.ndim < 3 or image.shape[-1] not in CHANNELS:
         return image
-    return image @ _LUMA
+    grey, done = np.empty(image.shape[:-1], np.result_type(image, _LUMA)), 0
+    # In parts, so that of a mapped image little is in memory.
+    for part in parts(image):
+        np.matmul(part, _LUMA, out=grey[done : done + len(part)])
+        done += len(part)
+    return grey
 
 
 def from_unit(image: FloatArray, bit_depth: int) -> NDArray[np.unsignedinteger]:
@@ -179,7 +184,12 @@ def from_unit(image: FloatArray, bit_depth: int) -> NDArray[np.unsignedinteger]:
     """
     top = 2**bit_depth - 1
     dtype = np.uint8 if bit_depth <= 8 else np.uint16
-    return np.rint(np.clip(image, 0.0, 1.0) * np.float64(top)).astype(dtype)
+    levels, done = np.empty(image.shape, dtype), 0
+    # In parts, for they are computed in double precision.
+    for part in parts(image):
+        levels[done : done + len(part)] = np.rint(np.clip(part, 0.0, 1.0) * np.float64(top))
+        done += len(part)
+    return levels
 
 
 def _as_float(values: ArrayLike, name: str) -> FloatArray:
