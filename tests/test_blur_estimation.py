@@ -27,6 +27,22 @@ def blurred(name, sigma, noise, seed=0, size=256):
     return (scene + np.random.default_rng(seed).normal(0, noise, scene.shape)).astype(np.float32)
 
 
+@pytest.mark.parametrize("shape", [(16, 40), (130, 300), (257, 140), (700, 300)])
+@pytest.mark.parametrize("kind", ["noise", "repeated", "flat"])
+def test_the_part_with_most_detail_is_that_of_sums_over_the_whole_image(shape, kind):
+    image = np.random.default_rng(0).random(shape, dtype=np.float32)
+    if kind != "noise":
+        # Many parts have the same detail, but for rounding.
+        image = np.tile(image[:16, :16], (45, 20))[: shape[0], : shape[1]] if kind == "repeated" else 0 * image
+    part = _most_detailed(image)
+    height, width = part.shape
+    energy = cv2.Laplacian(cv2.GaussianBlur(image, (0, 0), 1.0), cv2.CV_32F)
+    total = cv2.integral(np.square(energy))
+    inside = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
+    top, left = np.unravel_index(int(inside.argmax()), inside.shape)
+    assert part.ctypes.data == image[top:, left:].ctypes.data
+
+
 @pytest.mark.parametrize("name", ["camera", "chart", "words", "grass"])
 @pytest.mark.parametrize(("sigma", "noise"), [(1.0, 0.002), (2.0, 0.01), (4.0, 0.005)])
 def test_the_width_of_a_gaussian_is_found(name, sigma, noise):

@@ -72,6 +72,8 @@ _SOFT = 0.8
 _PIXEL_UNCERTAINTY = 0.1
 # Side of the part that is looked at, the one with most detail, and of its taper; pixels.
 _PART, _TAPER = 128, 8
+# Rows of the image that detail is looked for in at a time, no fewer than that part has, and how far it reaches beyond.
+_STRIP_ROWS, _REACH = 256, 5
 # A power of five: transforms take almost twice as long as those of 120×120 or of 128×128 pixels.
 _SLOW_SIZE = 125
 # n is this many times the noise, and this share of the contrast.
@@ -269,6 +271,8 @@ def _lowest(costs: Float64Array) -> float:
 
 
 def _reduce(grey: FloatArray, factor: int) -> FloatArray:
+    if factor == 1:
+        return grey
     height, width = (size // factor for size in grey.shape)
     return cv2.resize(grey[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
 
@@ -276,13 +280,34 @@ def _reduce(grey: FloatArray, factor: int) -> FloatArray:
 def _most_detailed(image: FloatArray) -> FloatArray:
     """Part with the largest energy of the Laplacian, of a size whose gradients transform fast."""
     height, width = (_fast_size(min(_PART, size - 1)) + 1 for size in image.shape)
-    energy = cv2.Laplacian(cv2.GaussianBlur(image, (0, 0), 1.0), cv2.CV_32F)
-    total = cv2.integral(np.square(energy, out=energy))
-    inside = total[height:, width:] - total[:-height, width:]
-    inside -= total[height:, :-width]
-    inside += total[:-height, :-width]
-    top, left = np.unravel_index(int(inside.argmax()), inside.shape)
+    most, top, left = -np.inf, 0, 0
+    # What lies above each of the last rows, as :func:`cv2.integral` sums it up, bit for bit.
+    sums = np.zeros((1, image.shape[1] + 1))
+    for start in range(0, image.shape[0], _STRIP_ROWS):
+        sums = _integral(_detail(image, start), sums[-height:])
+        inside = sums[height:, width:] - sums[:-height, width:]
+        inside -= sums[height:, :-width]
+        inside += sums[:-height, :-width]
+        row, column = divmod(int(inside.argmax()), inside.shape[1])
+        if inside[row, column] > most:
+            most, top, left = inside[row, column], max(start + 1 - height, 0) + row, column
     return image[top : top + height, left : left + width]
+
+
+def _detail(image: FloatArray, start: int) -> FloatArray:
+    """Energy of the Laplacian in a strip of rows."""
+    above = min(start, _REACH)
+    rows = image[start - above : start + _STRIP_ROWS + _REACH]
+    energy = cv2.Laplacian(cv2.GaussianBlur(rows, (0, 0), 1.0), cv2.CV_32F)[above : above + _STRIP_ROWS]
+    return np.square(energy, out=energy)
+
+
+def _integral(strip: FloatArray, above: Float64Array) -> Float64Array:
+    """Sum up all above and to the left, from the sums of the rows before, which come first."""
+    rows = np.pad(np.cumsum(strip, axis=1, dtype=np.float64), ((0, 0), (1, 0)))
+    sums = np.vstack([above, rows])
+    np.cumsum(sums[len(above) - 1 :], axis=0, out=sums[len(above) - 1 :])
+    return sums
 
 
 def _fast_size(size: int) -> int:
