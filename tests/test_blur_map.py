@@ -65,6 +65,17 @@ def test_true_widths_beat_every_single_width(brick):
     assert by_pixel.sigma == pytest.approx(1.5, abs=0.02)
 
 
+def test_images_in_strips_and_in_a_file_are_the_same(brick, tmp_path, monkeypatch):
+    _, image, widths = brick
+    colour = np.stack([image, image[::-1], image.T], axis=-1)
+    results = []
+    for rows, folder in ((1000, None), (100, tmp_path)):
+        monkeypatch.setattr("turbrestore.blur_map._STRIP_ROWS", rows)
+        results.append(deconvolve_varying(lambda width: deconvolve(colour, width, WIENER), widths, folder).image)
+    assert np.array_equal(*results)
+    assert isinstance(results[1], np.memmap)
+
+
 def test_interpolation_keeps_plateaus_and_is_monotone():
     widths = sigma_map([[1.0, 2.0, 4.0]] * 2, (500, 760))
     assert widths.shape == (500, 760)

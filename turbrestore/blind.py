@@ -123,7 +123,7 @@ def remove_blur(
 
     def attempt(width: float) -> Deconvolution:
         if widths is not None and width > 0:
-            return deconvolve_varying(remove, widths * (width / sigma))
+            return deconvolve_varying(remove, widths * (width / sigma), scratch if parts else None)
         return first if first is not None and first.sigma == width else remove(width, progress)
 
     if blind:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,8 +19,10 @@ from numpy.typing import ArrayLike
 from .arrays import FloatArray, check_image, luminance
 from .blur_estimation import BlurEstimate, estimate_blur
 from .deconvolution import Deconvolution
+from .halo_tiles import new_mosaic
 from .parallel import one_thread_each
 from .psf import estimate_noise
+from .scratch import release
 
 # Tiles of fewer pixels a side say too little.
 _LEAST_TILE, _MOST_TILES = 240, 3
@@ -31,6 +34,8 @@ _CLEAR_FACTOR, _CLEAR_DEVIATIONS = 1.5, 3.0
 _DETAIL = 2.0
 # Neighbouring widths that images are interpolated between differ by this factor, or more where there would be too many.
 _STEP, _MOST_WIDTHS = 1.35, 5
+# Rows that images are interpolated in at a time.
+_STRIP_ROWS = 256
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,9 @@ def sigma_map(tiles: ArrayLike, shape: tuple[int, int]) -> FloatArray:
     return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def deconvolve_varying(attempt: Callable[[float], Deconvolution], sigmas: FloatArray) -> Deconvolution:
+def deconvolve_varying(
+    attempt: Callable[[float], Deconvolution], sigmas: FloatArray, scratch: Path | None = None
+) -> Deconvolution:
     """Deconvolve by a width per pixel: by a few widths, and interpolate between their images.
 
     Parameters
@@ -146,6 +153,8 @@ def deconvolve_varying(attempt: Callable[[float], Deconvolution], sigmas: FloatA
         Deconvolves the whole image by one width in pixels.
     sigmas : ndarray, float32, shape (H, W)
         Width for every pixel.
+    scratch : Path, optional
+        Folder of a file that holds the image; by default it is in memory.
 
     Returns
     -------
@@ -167,12 +176,17 @@ def deconvolve_varying(attempt: Callable[[float], Deconvolution], sigmas: FloatA
     count = min(steps + 1, _MOST_WIDTHS)
     widths = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, _MOST_WIDTHS)
     widths = np.unique(widths) if high > low else np.array([high])
-    image = np.zeros((), np.float32)
     for index, width in enumerate(widths):
         result = attempt(float(width))
-        # Hat functions: one at their width, zero at its neighbours'.
-        share = np.interp(sigmas, widths, np.eye(len(widths))[index]).astype(np.float32)
-        image = image + result.image * (share if result.image.ndim == 2 else share[..., None])
+        if index == 0:
+            image = new_mosaic(result.image.shape, scratch)
+        for start in range(0, len(image), _STRIP_ROWS):
+            rows = slice(start, start + _STRIP_ROWS)
+            # Hat functions: one at their width, zero at its neighbours'.
+            share = np.interp(sigmas[rows], widths, np.eye(len(widths))[index]).astype(np.float32)
+            image[rows] += result.image[rows] * (share if image.ndim == 2 else share[..., None])
+            release(result.image)
+            release(image)
     return dataclasses.replace(result, image=image, sigma=float(sigmas.mean()))
 
 
