@@ -10,6 +10,7 @@ from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.guards import GuardParams, deconvolve_guarded, judge
 from turbrestore.psf import blur_otf
+from turbrestore.scratch import kept_in
 from turbrestore.synthesis.scenes import SCENES
 
 WIENER = DeconvolutionParams(method="wiener", exponent=2.0)
@@ -61,6 +62,13 @@ def test_grey_as_colour_reads_the_same():
     _, image = blurred("camera", 1.0)
     colour = np.repeat(image[..., None], 3, axis=2)
     assert judge(colour, colour, 1.0) == judge(image, image, 1.0)
+
+
+def test_images_of_a_file_read_the_same(tmp_path):
+    _, image = blurred("chart", 2.0)
+    colour = np.stack([image, image[::-1], image.T], axis=-1)
+    sharp = deconvolve(colour, 2.0, WIENER).image
+    assert judge(kept_in(sharp, tmp_path), kept_in(colour, tmp_path), 2.0) == judge(sharp, colour, 2.0)
 
 
 def test_rings_of_colour_without_luminance_are_found():

@@ -135,7 +135,7 @@ def identify(
     n = _rank(singular_values, present, pixels, params)
     states = singular_values[:n, None] * V[:, :n].T
     C, residual_energy = spatial_modes(strips, mean, singular_values[:n], V[:, :n], scratch)
-    residual_variance = residual_energy / max(strips.count - 1 - n, 1)
+    residual_variance = np.divide(residual_energy, max(strips.count - 1 - n, 1), out=residual_energy)
     A, Q = _transition(states, params.ridge)
     energy = float(np.sum(singular_values[:present] ** 2))
     overfitted = strips.count < params.frames_per_state * n

@@ -9,7 +9,7 @@ the two apart; see ``docs/decisions/guards.md`` for what it is on right and wron
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from .arrays import FloatArray, check_image, luminance
 from .deconvolution import Deconvolution
 from .errors import DataError, require_between
+from .scratch import release
 
 _WINDOW_SIGMAS = 4.0
 _SMALLEST_WINDOW = 8
@@ -117,7 +118,8 @@ def judge(result: ArrayLike, blurred: ArrayLike, sigma: float, params: GuardPara
     if after.shape != before.shape:
         raise DataError(f"result: expected the shape {before.shape} of the blurred image, found {after.shape}")
     # One pair of planes at a time: of a large image they are a good part of what memory holds.
-    seen = [(_overshoot(*pair, sigma), _noise_gain(*pair)) for pair in _planes(after, before)]
+    channels = [None, *range(3)] if after.ndim == 3 else [None]
+    seen = [_figures(_plane(after, channel), _plane(before, channel), sigma) for channel in channels]
     overshoot, gain = (max(figures) for figures in zip(*seen, strict=True))
     return GuardReading(float(sigma), overshoot, gain, overshoot <= params.overshoot and gain <= params.noise_gain)
 
@@ -170,12 +172,18 @@ def deconvolve_guarded(
     return attempt(0.0), tuple(readings)
 
 
-def _planes(after: FloatArray, before: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield luminance and every channel of both."""
-    yield luminance(after), luminance(before)
-    if after.ndim == 3:
-        for channel in range(3):
-            yield after[..., channel].copy(), before[..., channel].copy()
+def _plane(image: FloatArray, channel: int | None) -> FloatArray:
+    """Channel of an image, or luminance."""
+    if channel is None:
+        return luminance(image)
+    plane = image[..., channel].copy()
+    # All channels of a mapped image came into memory.
+    release(image)
+    return plane
+
+
+def _figures(after: FloatArray, before: FloatArray, sigma: float) -> tuple[float, float]:
+    return _overshoot(after, before, sigma), _noise_gain(after, before)
 
 
 def _overshoot(after: FloatArray, before: FloatArray, sigma: float) -> float:

@@ -28,6 +28,7 @@ from .image_headers import check_still
 from .input_files import check_input, input_errors
 from .limits import DEFAULT_LIMITS, Limits
 from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit
+from .scratch import release
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
 IMAGE_OUTPUT_SUFFIXES = (".png", ".tif", ".tiff")
@@ -354,6 +355,7 @@ def _encode(path: Path, image: FloatArray, depth: int) -> bytes:
     is_tiff = path.suffix.lower() != ".png"
     if depth == 32 and is_tiff:
         pixels: PixelArray = np.clip(image, 0, 1)
+        release(image)
     else:
         pixels = from_unit(image, 8 if depth <= 8 else 16)
     if is_tiff:

@@ -14,6 +14,7 @@ from scipy import fft
 
 from .arrays import FloatArray, check_image, luminance
 from .errors import DataError
+from .scratch import release
 
 
 def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:
@@ -36,7 +37,9 @@ def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:
     3
     """
     if image.ndim == 3 and channels == "each":
-        return [np.ascontiguousarray(image[..., index]) for index in range(image.shape[2])]
+        planes = [np.ascontiguousarray(image[..., index]) for index in range(image.shape[2])]
+        release(image)
+        return planes
     return [luminance(image)]
 
 

@@ -63,8 +63,10 @@ class StuckPixels:
         return none if len(stuck) > _MOST_STUCK * self._size else stuck
 
     def _look_everywhere(self, values: FloatArray) -> None:
-        high = values - cv2.dilate(values, _RING) > self._excess
-        low = cv2.erode(values, _RING) - values > self._excess
+        around = cv2.dilate(values, _RING)
+        high = np.subtract(values, around, out=around) > self._excess
+        around = cv2.erode(values, _RING, dst=around)
+        low = np.subtract(around, values, out=around) > self._excess
         self._high = high if self._high is None else self._high & high
         self._low = low if self._low is None else self._low & low
         count = np.count_nonzero(self._high) + np.count_nonzero(self._low)
