@@ -6,7 +6,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -271,13 +270,15 @@ def _restored(run: _Run, plan: MemoryPlan) -> Restoration:
         stream = iter(())
     run.clock.lap("read")
     centroid = _find_centroid(run, training)
-    image, mean = centroid.image, mean_of(training)
+    image = centroid.image
     dynamics = filtered = deblurred = None
     if "identify" in stages:
         dynamics = _identify(run, centroid, training)
     if "filter" in stages and dynamics is not None:
         filtered, mean = _filter(run, centroid, dynamics, training, stream)
         image = filtered.image
+    else:
+        mean = mean_of(training)
     if "deconvolve" in stages:
         deblurred = _deblur(run, image, mean, centroid, training)
         image = deblurred.deconvolution.image
@@ -384,6 +385,7 @@ def _filter_in_tiles(
         frames, flows = (cut_tile(stack, tile, run.scratch) for stack in (training, centroid.flows))
         summed = _Sum(frames, _rest_of(source, len(training), tile))
         image = centroid.image[tile.rows, tile.columns].copy()
+        release(centroid.image)
         model = _flow_model(run, flows, frames)
         filtered = filter_frames(summed, image, model, params.filter, params.flow, flows, counter, counted)
         return filtered, summed.mean()
@@ -475,8 +477,9 @@ def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
 
 def _read_training(stream: Iterator[FloatArray], train: int, shape: tuple[int, ...], folder: Path | None) -> FloatArray:
     training = new_stack((train, *shape[1:]), folder)
-    for index, frame in enumerate(islice(stream, train)):
-        training[index] = frame
+    for index in range(train):
+        # In a loop over frames, one would stay while the next is read.
+        training[index] = next(stream)
         release(training)
     contrast = float(np.ptp(mean_of(training)))
     if contrast < _LEAST_CONTRAST:
