@@ -16,7 +16,7 @@ from turbrestore import pipeline
 from turbrestore.centroid import CentroidParams
 from turbrestore.compiled import COMPILER_BYTES
 from turbrestore.deconvolution import DeconvolutionParams
-from turbrestore.deconvolution_memory import NonlocalWork
+from turbrestore.deconvolution_memory import NonlocalWork, Room
 from turbrestore.device import TORCH_BYTES
 from turbrestore.dynamics import DynamicsParams
 from turbrestore.errors import ConfigurationError, StorageError
@@ -176,10 +176,23 @@ def test_limits_with_the_same_tiles_have_the_same_side():
     assert [plan.tile for plan in plans] == sorted(plan.tile for plan in plans)
 
 
-def test_a_periodic_image_is_not_cut_into_tiles():
-    periodic = {"deconvolution": DeconvolutionParams(boundary="periodic")}
-    assert least_limit((300, 2160, 3840), **periodic) > 4e9 > least_limit((300, 2160, 3840))
-    assert least_limit((300, 2160, 3840), until="filter", **periodic) < 1e9
+@pytest.mark.parametrize("blur", [{"sigma": 24.0}, {"sigma": 60.0}, {"boundary": "periodic"}])
+def test_frames_are_cut_into_tiles_whatever_the_blur(blur):
+    shape, blur = (300, 2160, 3840), {"deconvolution": DeconvolutionParams(**blur)}
+    assert least_limit(shape, **blur) < 1.2 * least_limit(shape)
+    assert least_limit(shape, until="filter", **blur) <= least_limit(shape)
+    assert plan_memory(shape, 1.5e9, **blur).tile == plan_memory(shape, 1.5e9).tile
+
+
+@pytest.mark.usefixtures("no_compiler")
+@pytest.mark.parametrize("boundary", ["unknown", "periodic"])
+def test_the_halo_of_a_wide_blur_counts(boundary):
+    shape = (300, 4320, 7680)
+    least = [least_limit(shape, deconvolution=DeconvolutionParams(sigma=s, boundary=boundary)) for s in (24, 200, 300)]
+    assert least[0] < 0.8 * least[1] < 0.6 * least[2]
+    # Tiles of four halos, each with a margin of four widths.
+    tile = NonlocalWork((6 * 4 * 300, 6 * 4 * 300), 1, NonlocalParams()).peak(Room(1, True))
+    assert least[2] > (tile if boundary == "periodic" else 0.5 * tile)
 
 
 @pytest.mark.usefixtures("no_compiler")
@@ -189,14 +202,6 @@ def test_a_run_that_goes_further_has_the_same_tiles():
 
 def test_bounds_on_the_blur_count_in_tiles():
     assert least_limit((300, 2160, 3840), blur_bounds=True) > 1.3 * least_limit((300, 2160, 3840))
-
-
-def test_a_blur_too_wide_for_the_halo_is_not_removed_in_tiles():
-    least = least_limit((300, 2160, 3840))
-    assert least_limit((300, 2160, 3840), deconvolution=DeconvolutionParams(sigma=24.0)) < 1.2 * least
-    wide = {"deconvolution": DeconvolutionParams(sigma=25.0)}
-    assert least_limit((300, 2160, 3840), **wide) > 4e9
-    assert least_limit((300, 2160, 3840), until="filter", **wide) <= least
 
 
 @given(
@@ -209,13 +214,15 @@ def test_a_blur_too_wide_for_the_halo_is_not_removed_in_tiles():
     st.sampled_from(STAGES),
     st.none() | st.integers(2, 3000),
     st.booleans(),
+    st.sampled_from([{}, {"sigma": 30.0}, {"sigma": 90.0, "boundary": "periodic"}]),
 )
 @settings(max_examples=100, deadline=None)
 def test_a_plan_keeps_the_limit_or_names_one_that_can_be_kept(
-    count, height, width, colour, limit, method, until, wanted, on_device
+    count, height, width, colour, limit, method, until, wanted, on_device, blur
 ):
     shape, wanted = (count, height, width, *colour), wanted if wanted is None else min(wanted, count)
     rest = {"flow": FlowParams(method=method, threads=4), "wanted": wanted, "until": until, "on_device": on_device}
+    rest["deconvolution"] = DeconvolutionParams(**blur)
     try:
         plan = plan_memory(shape, limit, **rest)
     except ConfigurationError as error:

@@ -15,10 +15,12 @@ from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.dynamics import DynamicsParams
 from turbrestore.errors import DataError
 from turbrestore.frame_source import FrameSource
-from turbrestore.halo_tiles import halo_tiles
+from turbrestore.halo_tiles import halo_tiles, sizes_to_deblur
 from turbrestore.metrics import psnr
+from turbrestore.psf import blur_otf
 from turbrestore.restoration import RestoreParams
 from turbrestore.resumption import KeptStages
+from turbrestore.synthesis.scenes import SCENES
 from turbrestore.tiled_stages import deconvolve_tiles, filter_tiles, find_tiled_centroid
 
 HALO = 24
@@ -75,6 +77,52 @@ def test_a_deconvolution_in_tiles_is_that_of_the_whole(blurred, method, channels
     assert np.sqrt(np.mean(difference**2)) < (0.002 if method == "wiener" else 0.01)
     # Where tiles meet no more than elsewhere.
     assert difference[60:68].mean() < 1.5 * difference.mean()
+
+
+def rms(image):
+    return np.sqrt(np.mean(np.square(image)))
+
+
+def soft_scene(shape, sigma):
+    """Scene whose two sides go on in each other, blurred and with noise."""
+    scene = np.roll(SCENES["camera"](*shape), (11, 17), (0, 1))
+    image = np.fft.irfft2(np.fft.rfft2(scene) * blur_otf(shape, sigma), s=shape)
+    return (image + np.random.default_rng(0).normal(0, 0.002, shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("method", ["tv", "wiener"])
+@pytest.mark.parametrize("shape", [(128, 160), (192, 112)])
+def test_a_periodic_image_is_deblurred_in_tiles_that_see_its_other_side(method, shape):
+    image = soft_scene(shape, 3.0)
+    image = np.stack([image, image[::-1], image[:, ::-1]], axis=-1)
+    params = DeconvolutionParams(method=method, boundary="periodic", iterations=100, tolerance=0)
+    tiles = halo_tiles(shape, 112, HALO)
+    whole, tiled = deconvolve(image, 3.0, params, image), deconvolve_tiles(image, 3.0, params, image, tiles)
+    blind = deconvolve_tiles(image, 3.0, replace(params, boundary="unknown"), image, tiles)
+    assert len(tiles) > 1
+    for edge in (np.s_[:6], np.s_[-6:], np.s_[:, :6], np.s_[:, -6:]):
+        assert rms((tiled.image - whole.image)[edge]) < 0.001
+        assert rms((blind.image - whole.image)[edge]) > 0.003
+    assert np.abs(tiled.image - whole.image).max() < 0.01
+
+
+@pytest.mark.parametrize("boundary", ["unknown", "periodic"])
+def test_one_tile_keeps_its_boundary(blurred, boundary):
+    params = DeconvolutionParams(method="tv", boundary=boundary, iterations=10)
+    (tile,) = halo_tiles(blurred.shape, 128, HALO)
+    tiled = deconvolve_tiles(blurred, 2.0, params, blurred, [tile])
+    assert np.array_equal(tiled.image, deconvolve(blurred, 2.0, params, blurred).image)
+
+
+def test_a_halo_of_four_widths_is_enough():
+    image, inner = soft_scene((192, 192), 4.0), np.s_[24:-24, 24:-24]
+    params = DeconvolutionParams(method="wiener", iterations=100, tolerance=0)
+    whole = deconvolve(image, 4.0, params).image
+    narrow, enough = (
+        rms((deconvolve_tiles(image, 4.0, params, image, halo_tiles(image.shape, 80, halo)).image - whole)[inner])
+        for halo in (4, 16)
+    )
+    assert enough < 0.002 and narrow > 3 * enough
 
 
 def test_the_weight_of_the_data_is_that_of_the_whole(blurred):
@@ -150,7 +198,8 @@ def in_tiles(monkeypatch):
         plan = replace(pipeline.memory_plan(source, QUICK), in_file=True, tile=112)
         for module in (pipeline, resumption):
             monkeypatch.setattr(module, "memory_plan", lambda *_: plan)
-        monkeypatch.setattr(pipeline, "halo_tiles", lambda shape, side: halo_tiles(shape, side, HALO))
+        monkeypatch.setattr(pipeline, "halo_tiles", lambda shape, side, halo=HALO: halo_tiles(shape, side, halo))
+        monkeypatch.setattr(pipeline, "sizes_to_deblur", lambda side, sigma: (side, HALO))
 
     return begin
 
@@ -181,6 +230,28 @@ def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, tmp
         totals = {total for name, _, total in told if name == stage}
         assert done == sorted(done) and len(totals) == 1 and done[-1] <= totals.pop()
     assert [done for name, done, total in told if name == "filter"][-1] == 4 * (2 * 12 - 9)
+
+
+def test_only_the_deconvolution_has_a_wider_halo(sequence, in_tiles, monkeypatch):
+    source = FrameSource.from_array(sequence.frames)
+    monkeypatch.setattr("turbrestore.halo_tiles.HALO", HALO)
+    in_tiles(source)
+    monkeypatch.setattr(pipeline, "sizes_to_deblur", sizes_to_deblur)
+    given = []
+
+    def find(frames, tiles, *_):
+        given.append({tile.halo for tile in tiles})
+        return find_tiled_centroid(frames, tiles, QUICK.centroid)
+
+    def remove(*arguments):
+        given.append({tile.halo for tile in arguments[-1]})
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "find_tiled_centroid", find)
+    monkeypatch.setattr(pipeline, "remove_blur", remove)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.restore(source, replace(QUICK, deconvolution=DeconvolutionParams(sigma=6.75)))
+    assert given == [{HALO}, {27}]
 
 
 def test_frames_that_do_not_count_do_not_in_any_tile(sequence, in_tiles):

@@ -43,7 +43,7 @@ from .device import TORCH_BYTES
 from .dynamics import DynamicsParams
 from .errors import ConfigurationError, DataError, require
 from .flow import MIN_SIDE, FlowParams
-from .halo_tiles import HALO, halo_tiles, largest_tile
+from .halo_tiles import HALO, halo_tiles, largest_tile, sizes_to_deblur
 from .memory_size import size_text
 from .parallel import available_cores
 
@@ -101,16 +101,14 @@ class StageMemory:
 _FLOW = StageMemory(120, 5, 185, 10)
 # While frames are registered and weighed beside that.
 _FILTER = StageMemory(10, 5, 10, 5)
-# Of the whole beside tiles, of 3840×2160: images in hand, and what is made of them while the flow model is found, the
-# blur, and bounds on it, and while the result is put into words.
-_WHOLE, _WHOLE_MODEL, _WHOLE_RESULT = StageMemory(4, 8, 0, 0), StageMemory(32, 0, 0, 0), StageMemory(24, 4, 0, 0)
-_WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(32, 5, 0, 0), StageMemory(80, 10, 0, 0)
+# Of the whole beside tiles: while frames are looked through and read, and the result is put into words and written;
+# while the flow model is found; widths of the blur, and beside them what is made while it is found, or bounds on it.
+_WHOLE_RESULT, _WHOLE_MODEL = StageMemory(7, 11, 0, 0), StageMemory(27, 0, 0, 0)
+_WHOLE_WIDTHS, _WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(9, 0, 0, 0), StageMemory(22, 2, 0, 0), StageMemory(95, 0, 0, 0)
 # Shortest side of a tile that is worth a thread less, pixels, and the step in which sides are tried.
 _WORTH, _SIDE_STEP = 640, 32
 # The size of tiles changes the result, so it must not follow from the number of cores.
 _THREADS_OF_TILES = 2
-# Widths of the blur that the halo of a tile holds.
-_SIGMAS_A_HALO = 4
 # Images and maps that earlier stages leave, and what is made of them while the width of the blur is found.
 _HELD, _BLUR = StageMemory(60, 40, 0, 0), StageMemory(40, 0, 0, 0)
 # Width of the blur where it is not known yet, pixels.
@@ -226,19 +224,24 @@ class _Work:
         largest = largest_tile((self.shape[1], self.shape[2]), side)
         return replace(self, shape=(self.shape[0], *largest, *self.shape[3:]), until="filter")
 
+    def part_to_deblur(self, side: int) -> _Work:
+        """Return the work on one tile of the deconvolution."""
+        sizes, around = sizes_to_deblur(side, self.deconvolution.sigma), self.deconvolution.boundary == "periodic"
+        largest = largest_tile((self.shape[1], self.shape[2]), *sizes, around)
+        return replace(self, shape=(self.shape[0], *largest, *self.shape[3:]))
+
     def peak_in_tiles(self, train: int, threads: int, side: int) -> float:
         """Largest need of any stage where frames are worked on in tiles."""
         part, size = self.part(side), (self.pixels, self.channels, 0)
         model = _WHOLE_MODEL.bytes(*size) + min(self.modes(train), 4.0 * _IN_HAND * threads)
         model += min(_STRIPS, _STRIP_NUMBER * self.pixels * train)
         whole_blur = _WHOLE_BOUNDS if self.blur_bounds else _WHOLE_BLUR
-        blur = max(whole_blur.bytes(*size), part.pairs.peak(Room(1, True)))
+        blur = max(whole_blur.bytes(*size), self.part_to_deblur(side).pairs.peak(Room(1, True)))
+        blur += _WHOLE_WIDTHS.bytes(*size)
         result = _WHOLE_RESULT.bytes(*size)
         later = {"centroid": result, "identify": max(result, model), "filter": result, "deconvolve": blur}
         stages = list(later)[: list(later).index(self.until) + 1]
-        return _WHOLE.bytes(*size) + max(
-            part.peak(train, threads, True), self.base + max(later[stage] for stage in stages)
-        )
+        return max(part.peak(train, threads, True), self.base + max(later[stage] for stage in stages))
 
     def held(self) -> float:
         """Results of the stages before the deconvolution."""
@@ -381,11 +384,7 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
 
 def _tilings(work: _Work) -> Iterator[tuple[int, int]]:
     """Yield numbers of threads and sides of tiles, the best ones first."""
-    blur, largest = work.deconvolution, max(work.shape[1:3])
-    # What a pixel is deblurred from must not lie in another tile, as does the other side of a periodic image.
-    far = blur.boundary == "periodic" or (blur.sigma or 0.0) > HALO / _SIGMAS_A_HALO
-    if far and work.until == "deconvolve":
-        return
+    largest = max(work.shape[1:3])
     yield from ((_THREADS_OF_TILES, side) for side in reversed(range(_WORTH, largest, _SIDE_STEP)))
     yield from ((1, side) for side in reversed(range(4 * HALO, min(_WORTH, largest), _SIDE_STEP)))
 
@@ -409,13 +408,13 @@ def _plan_in_tiles(work: _Work, limit: float, wanted: tuple[int, int], side: int
     # Of all sides with the same tiles, the same one, for results that are kept are told apart by it.
     side = max(*largest_tile((work.shape[1], work.shape[2]), side), 4 * HALO)
     threads = next(count for count in range(most, 0, -1) if work.peak_in_tiles(train, count, side) <= limit)
-    part = work.part(side)
-    left = work.left(limit, _WHOLE.bytes(work.pixels, work.channels, 0) - work.held())
-    room = replace(part, until=work.until).room(left)
+    part, to_deblur = work.part(side), work.part_to_deblur(side)
+    left = work.left(limit, _WHOLE_WIDTHS.bytes(work.pixels, work.channels, 0) - work.held())
+    room = to_deblur.room(left)
     # Maps of the flow models; centroid, sums of the tiles and what they are made of, results of two tries of the blur.
     images = 16.0 * (work.pixels + part.pixels) + 4.0 * work.pixels * (3 + 8 * work.channels)
     files = work.modes(train) + work.stack(train) + part.modes(train) + part.stack(train) + images
-    files += part.pairs.pairs() if room.in_file else 0
+    files += to_deblur.pairs.pairs() if room.in_file else 0
     decisions = tuple(_decisions_in_tiles(work, limit, part, (threads, most), side))
     return MemoryPlan(train, threads, True, side, int(files), left, True, decisions)
 

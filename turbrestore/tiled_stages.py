@@ -3,7 +3,8 @@
 A tile is a clip of its own: it has its own centroid iterations, flow model and filter, and what they leave fades into
 what the neighbours leave.  That is not the result of the whole frame, though close to it: what is taken from all pixels
 at once, such as the flow model, the noise of the frames and the motion of flat regions far from any texture, is taken
-from those of the tile.  In a deconvolution weight and width are those of the whole image.
+from those of the tile.  In a deconvolution weight and width are those of the whole image, and the halo of its tiles is
+as wide as the blur asks for.
 
 A frame that is shifted by more than the halo, 96 pixels, leaves a part of its tile unseen, as at the border of a frame.
 """
@@ -23,7 +24,7 @@ from .arrays import FloatArray
 from .centroid import Centroid, CentroidParams, find_centroid
 from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve, noise_and_fidelity
 from .flow import FlowParams
-from .halo_tiles import HaloTile, add_tile, cut_tile, new_mosaic
+from .halo_tiles import HaloTile, add_tile, cut_around, cut_tile, new_mosaic
 from .scratch import kept_in, release, walk
 
 Float64Array = NDArray[np.float64]
@@ -172,6 +173,8 @@ def deconvolve_tiles(
 ) -> Deconvolution:
     """Deblur tile after tile by one width and one weight of the data.
 
+    A tile at the edge of a periodic image has a halo there too: the other side of the image.
+
     Parameters
     ----------
     image : ndarray, float32, shape (H, W) or (H, W, 3)
@@ -182,6 +185,7 @@ def deconvolve_tiles(
     guide : ndarray, float32, shape of ``image``
         What nonlocal weights are taken from.
     tiles : sequence of HaloTile
+        Their halo holds the blur.
     progress : callable, optional
         Called with 1 after each iteration of each tile.
     scratch : Path, optional
@@ -208,14 +212,18 @@ def deconvolve_tiles(
     """
     noise, fidelity = noise_and_fidelity(image, params)
     params = dataclasses.replace(params, fidelity=fidelity)
+    around = params.boundary == "periodic" and len(tiles) > 1
+    if around:
+        params = dataclasses.replace(params, boundary="unknown")
     mosaic = new_mosaic(image.shape, scratch)
     parts = list[Deconvolution]()
     for tile in tiles:
-        window = tile.rows, tile.columns
-        part = deconvolve(image[window].copy(), sigma, params, guide[window].copy(), progress, scratch)
+        window, inside = cut_around(image, tile, tile.halo if around else 0)
         release(image)
+        surroundings, _ = cut_around(guide, tile, tile.halo if around else 0)
         release(guide)
-        add_tile(mosaic, tile, part.image)
+        part = deconvolve(window, sigma, params, surroundings, progress, scratch)
+        add_tile(mosaic, tile, part.image[inside])
         parts.append(dataclasses.replace(part, image=np.zeros((0, 0), np.float32)))
         del part
     recorded = np.unique(np.concatenate([part.recorded for part in parts]))
