@@ -4,8 +4,9 @@
 300 grey frames of 1920×1080 within 2 GB, every other limit kept, and 2,000 frames no more than 20 MB above 200.
 ``--quick`` takes 40 frames of that size, with the same training frames, and no larger ones: a quarter of the time.
 ``--largest`` adds frames of 7680×4320.
-``--stages`` prints the peak of every stage without a limit, in bytes a pixel: what the plan of
-``turbrestore/memory.py`` rests on.  Memory is the largest resident set, mapped files included.
+``--stages`` prints the peak of every stage without a limit, in bytes a pixel, and of what is made of the whole image
+where frames are worked on in tiles: what the plan of ``turbrestore/memory.py`` rests on.  Memory is the largest
+resident set, mapped files included.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,8 +52,7 @@ class Clip:
         scene = np.clip(0.5 + 2.5 * (scene - scene.mean()), 0, 1)
         y, x = np.mgrid[: self.height, : self.width].astype(np.float32)
         for index in range(self.count):
-            coarse = rng.normal(0, 1.5, (max(self.height // 24, 2), max(self.width // 24, 2), 2)).astype(np.float32)
-            flow = cv2.resize(coarse, (self.width, self.height), interpolation=cv2.INTER_CUBIC)
+            flow = self.flow(rng)
             moved = cv2.remap(
                 scene, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
             )
@@ -60,11 +60,20 @@ class Clip:
             frames[index] = np.clip(255 * (moved + noise), 0, 255).astype(np.uint8)
             frames.flush()
 
+    def flow(self, rng: np.random.Generator) -> np.ndarray:
+        """Smooth random motion, pixels."""
+        coarse = rng.normal(0, 1.5, (max(self.height // 24, 2), max(self.width // 24, 2), 2)).astype(np.float32)
+        return cv2.resize(coarse, (self.width, self.height), interpolation=cv2.INTER_CUBIC)
+
 
 def write_apart(clip: Clip, path: Path) -> None:
     """Write a clip in a process of its own."""
-    code = f"from pathlib import Path; from memory import Clip; {clip!r}.write(Path({str(path)!r}))"
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent)
+    run_apart(f"{clip!r}.write(Path({str(path)!r}))")
+
+
+def run_apart(call: str) -> None:
+    """Run a call of this module in a process of its own."""
+    subprocess.run([sys.executable, "-c", f"from memory import *; {call}"], check=True, cwd=Path(__file__).parent)
 
 
 def restore_peak(clip: Path, options: list[str]) -> tuple[float, float]:
@@ -89,12 +98,14 @@ def limited_rows(quick: bool, largest: bool) -> Iterator[tuple[Clip, float, list
     yield Clip(24, 540, 960, 3), 900, []
     # Here and from 3840×2160 on whole frames do not fit.
     yield Clip(24, 1080, 1920, 3), 1000, []
+    yield Clip(8, 1080, 1920), 900, ["--sigma=30"]
     if not quick:
         yield Clip(24, 1080, 1920, 3), 3000, []
         yield Clip(16, 2160, 3840), 2000, []
         yield Clip(16, 2160, 3840, 3), 2000, []
     if largest:
         yield Clip(12, 4320, 7680), 2000, []
+        yield Clip(12, 4320, 7680, 3), 2000, []
 
 
 def check_limits(folder: Path, quick: bool, largest: bool, extra: list[str]) -> bool:
@@ -124,20 +135,18 @@ def check_growth(folder: Path, extra: list[str]) -> bool:
     return growth <= GROWTH_BOUND_MB
 
 
-class StageWatch:
-    """Largest resident set of every stage, above what was there when it began; bytes."""
+class Watch:
+    """Largest resident set between laps, above what was there when they began; bytes."""
 
     def __init__(self) -> None:
-        self.taken: dict[str, float] = {}
         self._floor = self._peak = self._resident()
         threading.Thread(target=self._look, daemon=True).start()
 
-    def result(self, done: object) -> None:
-        """Take the call of a restoration that a stage, or a block of frames, is done."""
-        name = next(name for name in ("filtered", "checkpoint", "dynamics", "centroid") if getattr(done, name))
-        if name != "checkpoint" and name not in self.taken:
-            self.taken[name] = self._peak - self._floor
-            self._floor = self._peak = self._resident()
+    def lap(self) -> float:
+        """Begin anew, and return what was taken."""
+        taken = max(self._peak, self._resident()) - self._floor
+        self._floor = self._peak = self._resident()
+        return taken
 
     def _look(self) -> None:
         while True:
@@ -146,6 +155,20 @@ class StageWatch:
 
     def _resident(self) -> float:
         return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+class StageWatch(Watch):
+    """What every stage takes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.taken: dict[str, float] = {}
+
+    def result(self, done: object) -> None:
+        """Take the call of a restoration that a stage, or a block of frames, is done."""
+        name = next(name for name in ("filtered", "checkpoint", "dynamics", "centroid") if getattr(done, name))
+        if name != "checkpoint" and name not in self.taken:
+            self.taken[name] = self.lap()
 
 
 def measure_stages(clip: Clip, threads: int, method: str) -> None:
@@ -175,6 +198,75 @@ def measure_stages(clip: Clip, threads: int, method: str) -> None:
     print(f"{clip} {method:9} {threads} threads: {words} bytes a pixel", flush=True)
 
 
+def measure_whole(clip: Clip) -> None:
+    """Print what is made of the whole image beside tiles, bytes a pixel; in a process of its own."""
+    from turbrestore.scratch import release, returning_freed
+
+    pixels = clip.height * clip.width
+    with returning_freed(), tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        clip.write(folder / "clip.npy")
+        taken: dict[str, float] = {}
+        watch = Watch()
+        for constant, calls in whole_calls(clip, folder):
+            for call in calls:
+                watch.lap()
+                release(call())
+                taken[constant] = max(taken.get(constant, 0), watch.lap())
+    words = "  ".join(f"{constant} {size / pixels:4.0f}" for constant, size in taken.items())
+    print(f"{clip} beside tiles: {words} bytes a pixel", flush=True)
+
+
+def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[], object]]]]:
+    """Constants of the plan, and calls that they are for."""
+    from turbrestore import pipeline
+    from turbrestore.blur_cues import bound_blur
+    from turbrestore.blur_estimation import estimate_blur
+    from turbrestore.blur_map import estimate_blur_map, sigma_map
+    from turbrestore.content import check_content
+    from turbrestore.deconvolution import DeconvolutionParams, noise_and_fidelity
+    from turbrestore.dynamics import identify
+    from turbrestore.explanation import explain_input, explain_motion
+    from turbrestore.frame_source import FrameSource
+    from turbrestore.guards import judge
+    from turbrestore.images import write_image
+    from turbrestore.scratch import new_stack, release, walk
+
+    source = FrameSource.from_array(np.load(folder / "clip.npy", mmap_mode="r"))
+    training = pipeline._read_training(iter(source), clip.count, source.shape, folder)
+    flows, rng = new_stack((clip.count, clip.height, clip.width, 2), folder), np.random.default_rng(SEED)
+    for flow in walk(flows):
+        flow[...] = clip.flow(rng)
+    # A file each, as the images of a run have.
+    image, other = (pipeline._read_training(iter(source), 1, source.shape, folder)[0] for _ in range(2))
+    yield (
+        "_WHOLE_RESULT",
+        [
+            lambda: check_content(source),
+            lambda: pipeline._read_training(iter(source), clip.count, source.shape, folder),
+            lambda: explain_input(training),
+            lambda: explain_motion(flows),
+            lambda: pipeline._crop(image, flows, "crop", None)[0],
+            lambda: write_image(folder / "image.png", image, 8),
+            lambda: write_image(folder / "image.tif", image, 32),
+        ],
+    )
+    yield "_WHOLE_MODEL", [lambda: identify(flows, scratch=folder, threads=1)]
+    blur = estimate_blur(image)
+    release(image)
+    yield (
+        "_WHOLE_BLUR",
+        [
+            lambda: estimate_blur(image),
+            lambda: estimate_blur_map(image, blur),
+            lambda: sigma_map([[1.0, 1.5, 2.0]] * 3, image.shape[:2]),
+            lambda: noise_and_fidelity(image, DeconvolutionParams(channels="each")),
+            lambda: judge(image, other, 2.0),
+        ],
+    )
+    yield "_WHOLE_BOUNDS", [lambda: bound_blur(image, other, training, clip.count)]
+
+
 def print_stages() -> None:
     """Run every combination in a process of its own."""
     for channels, threads, method in (
@@ -188,9 +280,9 @@ def print_stages() -> None:
         (1, 1, "tvl1"),
         (1, 2, "tvl1"),
     ):
-        call = f"measure_stages(Clip(16, 720, 1280, {channels}), {threads}, {method!r})"
-        code = f"from memory import Clip, measure_stages; {call}"
-        subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent)
+        run_apart(f"measure_stages(Clip(16, 720, 1280, {channels}), {threads}, {method!r})")
+    for channels in (1, 3):
+        run_apart(f"measure_whole(Clip(3, 2160, 3840, {channels}))")
 
 
 def main() -> int:

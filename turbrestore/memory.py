@@ -14,17 +14,18 @@ Stack and modes may be kept in a file; what the threads have in hand of it then 
 memory, what flow prepares of the training frames is kept too, τ HW bytes until the filter has passed over them.
 
 Where even that is too much for whole frames, they are worked on in tiles that overlap
-(:mod:`turbrestore.tiled_stages`).  A tile takes what a clip of its size takes; beside it there are images of the whole,
-in files, and what is made of them::
+(:mod:`turbrestore.tiled_stages`).  A tile takes what a clip of its size takes, or in the deconvolution one with a halo
+as wide as the blur asks for.  Before, between and after tiles the whole images are worked on, which lie in files::
 
-    base + HW · (whole + c · colour) + what the tile takes
+    base + HW · (whole + c · colour)
 
-The constants of a tile, as of whole frames, are those of ``python benchmarks/memory.py --stages`` at 1280×720, grey and
-in colour, with one, two and four threads, and a tenth added.  torch counts where a device is asked for, but not what a
-stage holds there, on the processor or not.  The deconvolution is told what is left, and works in strips and fewer
-threads where that is little; the other stages need what they need.  So the training frames go to a file first, then
-fewer threads work side by side, then fewer frames are trained on, and at last frames are worked on in tiles, as large
-ones as there is room for with two threads, or below 640 pixels with one.  Only the last two change the result.
+All constants are those of ``python benchmarks/memory.py --stages``, and a tenth added: of tiles, as of whole frames, at
+1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at 3840×2160.  torch counts
+where a device is asked for, but not what a stage holds there, on the processor or not.  The deconvolution is told what
+is left, and works in strips and fewer threads where that is little; the other stages need what they need.  So the
+training frames go to a file first, then fewer threads work side by side, then fewer frames are trained on, and at last
+frames are worked on in tiles, as large ones as there is room for with two threads, or below 640 pixels with one.  Only
+the last two change the result.
 """
 
 from __future__ import annotations
@@ -102,9 +103,11 @@ _FLOW = StageMemory(120, 5, 185, 10)
 # While frames are registered and weighed beside that.
 _FILTER = StageMemory(10, 5, 10, 5)
 # Of the whole beside tiles: while frames are looked through and read, and the result is put into words and written;
-# while the flow model is found; widths of the blur, and beside them what is made while it is found, or bounds on it.
+# while the flow model is found, the blur, and bounds on it.
 _WHOLE_RESULT, _WHOLE_MODEL = StageMemory(7, 11, 0, 0), StageMemory(27, 0, 0, 0)
-_WHOLE_WIDTHS, _WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(9, 0, 0, 0), StageMemory(22, 2, 0, 0), StageMemory(95, 0, 0, 0)
+_WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(22, 2, 0, 0), StageMemory(95, 0, 0, 0)
+# Two maps of the widths of the blur.
+_WHOLE_WIDTHS = StageMemory(8, 0, 0, 0)
 # Shortest side of a tile that is worth a thread less, pixels, and the step in which sides are tried.
 _WORTH, _SIDE_STEP = 640, 32
 # The size of tiles changes the result, so it must not follow from the number of cores.
