@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from turbrestore.errors import ConfigurationError
@@ -72,6 +72,7 @@ def test_a_frame_no_larger_than_a_tile_is_one():
 
 
 @given(st.integers(1, 300), st.integers(1, 300), st.integers(1, 40), st.integers(0, 200), st.sampled_from([(), (3,)]))
+@example(1, 7, 1, 0, ())
 @settings(max_examples=100, deadline=None)
 def test_beyond_the_frame_is_the_other_side_of_a_periodic_image(height, width, halo, more, channels):
     side, image = 4 * halo + more, np.random.default_rng(0).random((height, width, *channels), dtype=np.float32)

@@ -201,9 +201,11 @@ def cut_around(image: FloatArray, tile: HaloTile, beyond: int) -> tuple[FloatArr
     ([98.0, 99.0, 0.0, 1.0], (5, 62), (1, 60))
     """
     before, places = [], list[NDArray[np.int64]]()
-    for span, length in zip((tile.rows, tile.columns), image.shape, strict=False):
-        before.append(beyond if span.start == 0 else 0)
-        stop = span.stop + (beyond if span.stop == length else 0)
+    weights = tile.row_weights, tile.column_weights
+    for span, counts, length in zip((tile.rows, tile.columns), weights, image.shape, strict=False):
+        # The outermost pixels of a tile count at the edge of the frame alone.
+        before.append(beyond if counts[0] > 0 else 0)
+        stop = span.stop + (beyond if counts[-1] > 0 else 0)
         places.append(np.arange(span.start - before[-1], stop) % length)
     top, left = before
     return image[np.ix_(*places)], (slice(top, top + tile.shape[0]), slice(left, left + tile.shape[1]))
