@@ -98,7 +98,7 @@ def limited_rows(quick: bool, largest: bool) -> Iterator[tuple[Clip, float, list
     yield Clip(24, 540, 960, 3), 900, []
     # Here and from 3840×2160 on whole frames do not fit.
     yield Clip(24, 1080, 1920, 3), 1000, []
-    yield Clip(8, 1080, 1920), 900, ["--sigma=30"]
+    yield Clip(8, 1080, 1920), 900, ["--sigma=30", "--deconvolution.iterations=30"]
     if not quick:
         yield Clip(24, 1080, 1920, 3), 3000, []
         yield Clip(16, 2160, 3840), 2000, []
