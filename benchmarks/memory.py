@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -59,6 +60,22 @@ class Clip:
             noise = cv2.randn(np.empty(moved.shape, np.float32), 0, 0.01)
             frames[index] = np.clip(255 * (moved + noise), 0, 255).astype(np.uint8)
             frames.flush()
+
+    def encode(self, folder: Path) -> tuple[Path, Path]:
+        """Write the frames of ``clip.npy`` as H.264 and as a folder of images of 16 bits."""
+        import av
+
+        frames, video, images = np.load(folder / "clip.npy", mmap_mode="r"), folder / "clip.mkv", folder / "images"
+        images.mkdir()
+        with av.open(str(video), "w") as output:
+            stream = output.add_stream("libx264", rate=25)
+            stream.width, stream.height, stream.pix_fmt = self.width, self.height, "yuv420p"
+            for index, pixels in enumerate(frames):
+                cv2.imwrite(str(images / f"{index:04}.png"), pixels.astype(np.uint16) * 257)
+                frame = av.VideoFrame.from_ndarray(pixels, "rgb24" if self.channels == 3 else "gray")
+                output.mux(stream.encode(frame))
+            output.mux(stream.encode())
+        return video, images
 
     def flow(self, rng: np.random.Generator) -> np.ndarray:
         """Smooth random motion, pixels."""
@@ -205,7 +222,8 @@ def measure_whole(clip: Clip) -> None:
     pixels = clip.height * clip.width
     with returning_freed(), tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        clip.write(folder / "clip.npy")
+        write_apart(clip, folder / "clip.npy")
+        run_apart(f"{clip!r}.encode(Path({name!r}))")
         taken: dict[str, float] = {}
         watch = Watch()
         for constant, calls in whole_calls(clip, folder):
@@ -231,7 +249,11 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     from turbrestore.guards import judge
     from turbrestore.images import write_image
     from turbrestore.scratch import new_stack, release, walk
+    from turbrestore.video import open_frames
 
+    # Video is always read in colour.
+    encoded = [folder / "images", *([folder / "clip.mkv"] if clip.channels == 3 else [])]
+    yield "_READING", [partial(read_corners, path) for path in encoded]
     source = FrameSource.from_array(np.load(folder / "clip.npy", mmap_mode="r"))
     training = pipeline._read_training(iter(source), clip.count, source.shape, folder)
     flows, rng = new_stack((clip.count, clip.height, clip.width, 2), folder), np.random.default_rng(SEED)
@@ -242,7 +264,7 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     yield (
         "_WHOLE_RESULT",
         [
-            lambda: check_content(source),
+            *(partial(check_content, open_frames(path)) for path in encoded),
             lambda: pipeline._read_training(iter(source), clip.count, source.shape, folder),
             lambda: explain_input(training),
             lambda: explain_motion(flows),
@@ -264,7 +286,16 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
             lambda: judge(image, other, 2.0),
         ],
     )
+    # With what tiles that are fitted together take, and each of the frames.
     yield "_WHOLE_BOUNDS", [lambda: bound_blur(image, other, training, clip.count)]
+
+
+def read_corners(path: Path) -> None:
+    """Read a corner of each frame, as a tile does."""
+    from turbrestore.video import open_frames
+
+    for _ in open_frames(path, roi=(0, 0, 64, 64)):
+        pass
 
 
 def print_stages() -> None:

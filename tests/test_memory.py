@@ -13,16 +13,18 @@ from hypothesis import strategies as st
 
 from conftest import make_sequence
 from turbrestore import pipeline
+from turbrestore.alternating import FilterParams
 from turbrestore.centroid import CentroidParams
 from turbrestore.compiled import COMPILER_BYTES
-from turbrestore.deconvolution import DeconvolutionParams
+from turbrestore.deconvolution import BOUNDARIES, DeconvolutionParams
 from turbrestore.deconvolution_memory import NonlocalWork, Room
 from turbrestore.device import TORCH_BYTES
 from turbrestore.dynamics import DynamicsParams
 from turbrestore.errors import ConfigurationError, StorageError
 from turbrestore.flow import FlowParams
 from turbrestore.frame_source import FrameSource
-from turbrestore.memory import StageMemory, plan_memory, training_share
+from turbrestore.halo_tiles import cut_around, halo_tiles, sizes_to_deblur
+from turbrestore.memory import StageMemory, _Work, plan_memory, training_share
 from turbrestore.memory_size import MemorySize
 from turbrestore.nonlocal_tv import NonlocalParams
 from turbrestore.restoration import STAGES, RestoreParams
@@ -200,8 +202,30 @@ def test_a_run_that_goes_further_has_the_same_tiles():
     assert len({plan_memory((300, 2160, 3840), 1.3e9, until=stage).tile for stage in STAGES}) == 1
 
 
-def test_bounds_on_the_blur_count_in_tiles():
-    assert least_limit((300, 2160, 3840), blur_bounds=True) > 1.3 * least_limit((300, 2160, 3840))
+def test_bounds_on_the_blur_count_in_tiles_and_so_do_the_frames_that_they_are_found_from():
+    few, many = (least_limit((300, 2160, 3840), wanted=count, blur_bounds=True) for count in (10, 60))
+    assert few > 1.3 * least_limit((300, 2160, 3840), wanted=10)
+    assert many > few + 50 * 3 * 2160 * 3840
+
+
+@given(
+    st.integers(400, 1200),
+    st.integers(400, 1200),
+    st.integers(384, 900),
+    st.none() | st.floats(0.1, 60),
+    st.sampled_from(BOUNDARIES),
+)
+@settings(max_examples=50, deadline=None)
+def test_no_tile_that_is_deblurred_is_larger_than_the_plan_has_it(height, width, side, sigma, boundary):
+    blur = DeconvolutionParams(sigma=sigma, boundary=boundary)
+    work = _Work((3, height, width), FilterParams(), DynamicsParams(), blur, "deconvolve", False, False)
+    image, planned = np.zeros((height, width), np.float32), work.part_to_deblur(side).shape[1:]
+    tiles = halo_tiles((height, width), *sizes_to_deblur(side, sigma))
+    for tile in tiles:
+        around = tile.halo if boundary == "periodic" and len(tiles) > 1 else 0
+        window, _ = cut_around(image, tile, around)
+        assert window.shape[0] <= planned[0]
+        assert window.shape[1] <= planned[1]
 
 
 @given(

@@ -272,7 +272,7 @@ def _lowest(costs: Float64Array) -> float:
 
 def _reduce(grey: FloatArray, factor: int) -> FloatArray:
     if factor == 1:
-        return grey
+        return np.ascontiguousarray(grey)
     height, width = (size // factor for size in grey.shape)
     return cv2.resize(grey[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
 
@@ -281,7 +281,7 @@ def _most_detailed(image: FloatArray) -> FloatArray:
     """Part with the largest energy of the Laplacian, of a size whose gradients transform fast."""
     height, width = (_fast_size(min(_PART, size - 1)) + 1 for size in image.shape)
     most, top, left = -np.inf, 0, 0
-    # What lies above each of the last rows, as :func:`cv2.integral` sums it up, bit for bit.
+    # What lies above and to the left, up to each of the last rows.
     sums = np.zeros((1, image.shape[1] + 1))
     for start in range(0, image.shape[0], _STRIP_ROWS):
         sums = _integral(_detail(image, start), sums[-height:])

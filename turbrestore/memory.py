@@ -19,13 +19,15 @@ as wide as the blur asks for.  Before, between and after tiles the whole images 
 
     base + HW · (whole + c · colour)
 
-All constants are those of ``python benchmarks/memory.py --stages``, and a tenth added: of tiles, as of whole frames, at
-1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at 3840×2160.  torch counts
-where a device is asked for, but not what a stage holds there, on the processor or not.  The deconvolution is told what
-is left, and works in strips and fewer threads where that is little; the other stages need what they need.  So the
-training frames go to a file first, then fewer threads work side by side, then fewer frames are trained on, and at last
-frames are worked on in tiles, as large ones as there is room for with two threads, or below 640 pixels with one.  Only
-the last two change the result.
+and while a tile is worked on, so does what is decoded of the frame that it is cut from.
+
+The constants of stages are those of ``python benchmarks/memory.py --stages``, and a tenth added: of tiles, as of whole
+frames, at 1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at 3840×2160.
+torch counts where a device is asked for, but not what a stage holds there, on the processor or not.  The deconvolution
+is told what is left, and works in strips and fewer threads where that is little; the other stages need what they need.
+So the training frames go to a file first, then fewer threads work side by side, then fewer frames are trained on, and
+at last frames are worked on in tiles, as large ones as there is room for with two threads, or below 640 pixels with
+one.  Only the last two change the result.
 """
 
 from __future__ import annotations
@@ -104,8 +106,12 @@ _FLOW = StageMemory(120, 5, 185, 10)
 _FILTER = StageMemory(10, 5, 10, 5)
 # Of the whole beside tiles: while frames are looked through and read, and the result is put into words and written;
 # while the flow model is found, the blur, and bounds on it.
-_WHOLE_RESULT, _WHOLE_MODEL = StageMemory(7, 11, 0, 0), StageMemory(27, 0, 0, 0)
-_WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(22, 2, 0, 0), StageMemory(95, 0, 0, 0)
+_WHOLE_RESULT, _WHOLE_MODEL = StageMemory(3, 15, 0, 0), StageMemory(27, 0, 0, 0)
+_WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(22, 2, 0, 0), StageMemory(29, 5, 0, 0)
+# Beside that, what bounds take of tiles that are fitted together, and for each frame that they are found from.
+_BOUNDS_FIT, _BOUNDS_FRAME = 200e6, 4.7
+# What is decoded of a frame while tiles are cut from it.
+_READING = StageMemory(0, 10.5, 0, 0)
 # Two maps of the widths of the blur.
 _WHOLE_WIDTHS = StageMemory(8, 0, 0, 0)
 # Shortest side of a tile that is worth a thread less, pixels, and the step in which sides are tried.
@@ -116,6 +122,8 @@ _THREADS_OF_TILES = 2
 _HELD, _BLUR = StageMemory(60, 40, 0, 0), StageMemory(40, 0, 0, 0)
 # Width of the blur where it is not known yet, pixels.
 _SIGMA = 3.0
+# The widest that is found, in tiles, where it hardly matters.
+_WIDEST = 21.0
 # From this share of the limit on, what freed arrays leave in the heap counts.
 _ROOMY = 0.5
 # The largest limit that means anything, bytes.
@@ -217,7 +225,7 @@ class _Work:
             "centroid": 0.0,
             "identify": min(_STRIPS, _STRIP_NUMBER * self.pixels * train) + prepared,
             "filter": flow + _FILTER.bytes(*size) + max(block, prepared) + judged,
-            "deconvolve": self.held() + _BLUR.bytes(*size) + self.pairs.peak(Room(1, True)),
+            "deconvolve": self.held() + max(_BLUR.bytes(*size) + self.pairs.peak(Room(1, True)), self.bounds(train)),
         }
         stages = list(later)[: list(later).index(self.until) + 1]
         return self.base + stack + max(flow + prepared, modes + max(later[stage] for stage in stages))
@@ -231,20 +239,33 @@ class _Work:
         """Return the work on one tile of the deconvolution."""
         sizes, around = sizes_to_deblur(side, self.deconvolution.sigma), self.deconvolution.boundary == "periodic"
         largest = largest_tile((self.shape[1], self.shape[2]), *sizes, around)
-        return replace(self, shape=(self.shape[0], *largest, *self.shape[3:]))
+        blur = (
+            self.deconvolution if self.deconvolution.sigma is not None else replace(self.deconvolution, sigma=_WIDEST)
+        )
+        return replace(self, shape=(self.shape[0], *largest, *self.shape[3:]), deconvolution=blur)
 
     def peak_in_tiles(self, train: int, threads: int, side: int) -> float:
         """Largest need of any stage where frames are worked on in tiles."""
         part, size = self.part(side), (self.pixels, self.channels, 0)
         model = _WHOLE_MODEL.bytes(*size) + min(self.modes(train), 4.0 * _IN_HAND * threads)
         model += min(_STRIPS, _STRIP_NUMBER * self.pixels * train)
-        whole_blur = _WHOLE_BOUNDS if self.blur_bounds else _WHOLE_BLUR
-        blur = max(whole_blur.bytes(*size), self.part_to_deblur(side).pairs.peak(Room(1, True)))
-        blur += _WHOLE_WIDTHS.bytes(*size)
+        to_deblur = self.part_to_deblur(side)
+        tile = to_deblur.pairs.peak(Room(1, True)) + to_deblur.cut()
+        blur = max(_WHOLE_BLUR.bytes(*size), self.bounds(train), tile) + _WHOLE_WIDTHS.bytes(*size)
         result = _WHOLE_RESULT.bytes(*size)
         later = {"centroid": result, "identify": max(result, model), "filter": result, "deconvolve": blur}
         stages = list(later)[: list(later).index(self.until) + 1]
-        return max(part.peak(train, threads, True), self.base + max(later[stage] for stage in stages))
+        reading = part.peak(train, threads, True) + _READING.bytes(*size)
+        return max(reading, self.base + max(later[stage] for stage in stages))
+
+    def bounds(self, train: int) -> float:
+        """Bounds on the width of the blur."""
+        fit = _BOUNDS_FIT + _BOUNDS_FRAME * train * self.pixels
+        return _WHOLE_BOUNDS.bytes(self.pixels, self.channels, 0) + fit if self.blur_bounds else 0.0
+
+    def cut(self) -> float:
+        """Image and guide of a tile that is deblurred."""
+        return 8.0 * self.pixels * self.channels
 
     def held(self) -> float:
         """Results of the stages before the deconvolution."""
@@ -412,10 +433,11 @@ def _plan_in_tiles(work: _Work, limit: float, wanted: tuple[int, int], side: int
     side = max(*largest_tile((work.shape[1], work.shape[2]), side), 4 * HALO)
     threads = next(count for count in range(most, 0, -1) if work.peak_in_tiles(train, count, side) <= limit)
     part, to_deblur = work.part(side), work.part_to_deblur(side)
-    left = work.left(limit, _WHOLE_WIDTHS.bytes(work.pixels, work.channels, 0) - work.held())
+    left = work.left(limit, _WHOLE_WIDTHS.bytes(work.pixels, work.channels, 0) + to_deblur.cut() - work.held())
     room = to_deblur.room(left)
-    # Maps of the flow models; centroid, sums of the tiles and what they are made of, results of two tries of the blur.
-    images = 16.0 * (work.pixels + part.pixels) + 4.0 * work.pixels * (3 + 8 * work.channels)
+    # Maps of the flow models; results of two tries of the blur, centroid, sums of the tiles, and the tiles themselves,
+    # which overlap fourfold where they are small.
+    images = 16.0 * (work.pixels + part.pixels) + 4.0 * work.pixels * (6 + 14 * work.channels)
     files = work.modes(train) + work.stack(train) + part.modes(train) + part.stack(train) + images
     files += to_deblur.pairs.pairs() if room.in_file else 0
     decisions = tuple(_decisions_in_tiles(work, limit, part, (threads, most), side))

@@ -42,7 +42,7 @@ from .memory import MemoryPlan, plan_memory
 from .memory_size import DeconvolutionMemory
 from .psf import KOLMOGOROV
 from .restoration import STAGES, Restoration, RestoreParams, StageResults, explain_devices, place_stages
-from .scratch import mean_of, new_stack, release, returning_freed, walk
+from .scratch import kept_in, mean_of, new_stack, release, returning_freed, walk
 from .tiled_stages import FilteredTiles, filter_tiles, find_tiled_centroid
 
 # Share of the training frames that show every pixel of a cropped image.
@@ -283,7 +283,7 @@ def _restored(run: _Run, plan: MemoryPlan) -> Restoration:
         filtered, mean = _filter(run, centroid, dynamics, training, stream)
         image = filtered.image
     else:
-        mean = mean_of(training)
+        mean = kept_in(mean_of(training), run.scratch)
     if "deconvolve" in stages:
         deblurred = _deblur(run, image, mean, centroid, training)
         image = deblurred.deconvolution.image

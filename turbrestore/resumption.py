@@ -56,6 +56,7 @@ from .record_fields import RecordFields
 from .restoration import RestoreParams, StageResults, place_stages
 from .run_record import RECORD as RUN_RECORD
 from .run_record import versions
+from .scratch import release
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -310,6 +311,7 @@ class KeptStages:
             paths.append(self.folder / MEAN)
             with atomic_output(paths[0], overwrite=True) as temporary, temporary.open("wb") as stream:
                 np.save(stream, np.asarray(self.done.mean), allow_pickle=False)
+            release(self.done.mean)
         deblurred = self.done.deblurred
         if stage == "deblurred" and deblurred is not None:
             results = {"deconvolution": deblurred.deconvolution, "blur": deblurred.blur}

@@ -200,7 +200,7 @@ def mean_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
     total = np.zeros(stack.shape[1:], np.float32)
     for part in walk(stack):
         total += part
-    return total / np.float32(len(stack))
+    return np.divide(total, np.float32(len(stack)), out=total)
 
 
 def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -222,8 +222,10 @@ def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
     """
     mean, total = mean_of(stack), np.zeros(stack.shape[1:], np.float32)
     for part in walk(stack):
-        total += np.square(part - mean)
-    return total / np.float32(len(stack))
+        for start in range(0, part.size, _PART):
+            some = slice(start, start + _PART)
+            total.ravel()[some] += np.square(part.ravel()[some] - mean.ravel()[some])
+    return np.divide(total, np.float32(len(stack)), out=total)
 
 
 @contextlib.contextmanager
