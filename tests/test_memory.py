@@ -208,6 +208,12 @@ def test_bounds_on_the_blur_count_in_tiles_and_so_do_the_frames_that_they_are_fo
     assert many > few + 50 * 3 * 2160 * 3840
 
 
+def test_bounds_on_the_blur_count_for_whole_frames():
+    blur = DeconvolutionParams()
+    work = _Work((300, 1080, 1920), FilterParams(), DynamicsParams(), blur, "deconvolve", False, False)
+    assert replace(work, blur_bounds=True).peak(200, 1, True) > work.peak(200, 1, True) + 200 * 1080 * 1920
+
+
 @given(
     st.integers(400, 1200),
     st.integers(400, 1200),

@@ -239,9 +239,8 @@ class _Work:
         """Return the work on one tile of the deconvolution."""
         sizes, around = sizes_to_deblur(side, self.deconvolution.sigma), self.deconvolution.boundary == "periodic"
         largest = largest_tile((self.shape[1], self.shape[2]), *sizes, around)
-        blur = (
-            self.deconvolution if self.deconvolution.sigma is not None else replace(self.deconvolution, sigma=_WIDEST)
-        )
+        sigma = _WIDEST if self.deconvolution.sigma is None else self.deconvolution.sigma
+        blur = replace(self.deconvolution, sigma=sigma)
         return replace(self, shape=(self.shape[0], *largest, *self.shape[3:]), deconvolution=blur)
 
     def peak_in_tiles(self, train: int, threads: int, side: int) -> float:
