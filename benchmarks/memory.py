@@ -286,7 +286,7 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
             lambda: judge(image, other, 2.0),
         ],
     )
-    # With what tiles that are fitted together take, and each of the frames.
+    # The plan counts apart what each frame takes, and what is fitted together.
     yield "_WHOLE_BOUNDS", [lambda: bound_blur(image, other, training, clip.count)]
 
 

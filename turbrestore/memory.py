@@ -19,7 +19,7 @@ as wide as the blur asks for.  Before, between and after tiles the whole images 
 
     base + HW · (whole + c · colour)
 
-and while a tile is worked on, so does what is decoded of the frame that it is cut from.
+and while a tile is worked on, what is decoded of the frame that it is cut from is in memory beside it.
 
 The constants of stages are those of ``python benchmarks/memory.py --stages``, and a tenth added: of tiles, as of whole
 frames, at 1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at 3840×2160.
