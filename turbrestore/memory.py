@@ -107,9 +107,9 @@ _FILTER = StageMemory(10, 5, 10, 5)
 # Of the whole beside tiles: while frames are looked through and read, and the result is put into words and written;
 # while the flow model is found, the blur, and bounds on it.
 _WHOLE_RESULT, _WHOLE_MODEL = StageMemory(3, 15, 0, 0), StageMemory(27, 0, 0, 0)
-_WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(22, 2, 0, 0), StageMemory(29, 5, 0, 0)
+_WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(22, 2, 0, 0), StageMemory(17, 0, 0, 0)
 # Beside that, what bounds take of tiles that are fitted together, and for each frame that they are found from.
-_BOUNDS_FIT, _BOUNDS_FRAME = 200e6, 4.7
+_BOUNDS_FIT, _BOUNDS_FRAME = 200e6, 0.4
 # What is decoded of a frame while tiles are cut from it.
 _READING = StageMemory(0, 10.5, 0, 0)
 # Two maps of the widths of the blur.

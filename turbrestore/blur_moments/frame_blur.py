@@ -20,10 +20,14 @@ from ..scratch import walk
 from .exponent_fit import LARGEST_EXPONENT, PRIOR, fit_relative
 from .tiles import CORRELATED, CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
 
+# Relative blur variance of frames in some tiles, its deviation, and its best estimate above the sharpest; (T, tiles).
+_Judged = tuple[Float64Array, Float64Array, Float64Array]
 # Rounds of frames against reference, reference from frames.
 _ROUNDS = 3
 # Rings that fit worse than expected count less, within these limits.
 _SMALLEST_MISFIT, _LARGEST_MISFIT = 0.3, 100.0
+# Spectra, of all frames in some tiles, that are fitted together.
+_FITTED = 1 << 16
 # Share of s by which the correction for the window may be wrong.
 _WINDOW_ERROR = 0.05
 
@@ -152,20 +156,16 @@ def refer_blur(frames: ArrayLike, noise: float, params: CueParams | None = None)
     """
     params = params or CueParams()
     stack = check_frames(frames, at_least=2)
-    floor = noise_floor(noise)
     spectra = TileSpectra.of(stack.shape[1:3], params)
     averaging, k2, counts = spectra.cells()
+    fit = _Fit(spectra, k2, counts, noise_floor(noise), params)
     power = _ring_power(stack, spectra, averaging)
-    spectrum, misfit = _common_spectrum(power, floor, k2, counts, spectra, params)
-    s, gathered, residual = _score(power, spectrum, misfit, floor, (k2, counts), spectra, params)
-    size, offset = residual.mean(axis=0), s.mean(axis=0)
-    s = s - offset
-    deviation = _deviation(s, gathered, size)
-    spread = np.maximum((s**2 - deviation**2).mean(axis=0), 0.0)
-    estimate = _posterior(s, deviation, spread)
-    least = estimate.min(axis=0)
+    spectrum, misfit = _common_spectrum(power, fit)
+    design = fit.design(spectrum)
+    own = [_own_scores(power[:, some], spectrum[some], misfit[some], design, fit) for some in _batches(power)]
+    size, offset, spread, least = (np.concatenate(parts) for parts in zip(*(scores for scores, _ in own), strict=True))
     reference = BlurReference(spectrum, misfit, size, offset, spread, least, noise, spectra.grid.shape, params)
-    return reference, _frame_blur(s, deviation, estimate - least, spectra.grid)
+    return reference, _frame_blur([found for _, found in own], spectra.grid)
 
 
 def blur_against(frames: ArrayLike, reference: BlurReference, noise: float | None = None) -> FrameBlur:
@@ -207,64 +207,97 @@ def blur_against(frames: ArrayLike, reference: BlurReference, noise: float | Non
     stack = check_frames(frames)
     if stack.shape[1:3] != reference.shape:
         raise DataError(f"frames: expected the size {reference.shape} of the reference, found {stack.shape[1:3]}")
-    floor = noise_floor(reference.noise if noise is None else noise)
     spectra = TileSpectra.of(reference.shape, reference.params)
     averaging, k2, counts = spectra.cells()
-    power = _ring_power(stack, spectra, averaging)
-    s, gathered, _ = _score(power, reference.spectrum, reference.misfit, floor, (k2, counts), spectra, reference.params)
-    s = s - reference.offset
-    deviation = _deviation(s, gathered, reference.size)
-    estimate = _posterior(s, deviation, reference.spread)
-    return _frame_blur(s, deviation, np.maximum(estimate - reference.least, 0.0), spectra.grid)
+    floor = noise_floor(reference.noise if noise is None else noise)
+    fit = _Fit(spectra, k2, counts, floor, reference.params)
+    power, design = _ring_power(stack, spectra, averaging), fit.design(reference.spectrum)
+    judged: list[_Judged] = []
+    for some in _batches(power):
+        s, gathered, _ = _score(power[:, some], reference.spectrum[some], reference.misfit[some], design, fit)
+        s = s - reference.offset[some]
+        deviation = _deviation(s, gathered, reference.size[some])
+        estimate = _posterior(s, deviation, reference.spread[some])
+        judged.append((s, deviation, np.maximum(estimate - reference.least[some], 0.0)))
+    return _frame_blur(judged, spectra.grid)
 
 
-def _ring_power(frames: FloatArray, spectra: TileSpectra, averaging: FloatArray) -> Float64Array:
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """What spectra are fitted with: k² of the rings, how many independent values each holds, and n."""
+
+    spectra: TileSpectra
+    k2: Float64Array
+    counts: Float64Array
+    floor: float
+    params: CueParams
+
+    def design(self, spectrum: Float64Array) -> Float64Array:
+        """k² as the window shows it in the mean of all tiles, shape (rings,)."""
+        return self.k2 * self.spectra.widening(2 * [spectrum.mean(axis=0)], self.k2)
+
+
+def _ring_power(frames: FloatArray, spectra: TileSpectra, averaging: FloatArray) -> FloatArray:
     """Power of frames in rings, shape (T, tiles, rings)."""
-    return np.stack([spectra.power(luminance(frame)) @ averaging for frame in walk(frames)]).astype(np.float64)
+    return np.stack([spectra.power(luminance(frame)) @ averaging for frame in walk(frames)])
 
 
-def _common_spectrum(
-    power: Float64Array,
-    floor: float,
-    k2: Float64Array,
-    counts: Float64Array,
-    spectra: TileSpectra,
-    params: CueParams,
-) -> tuple[Float64Array, Float64Array]:
+def _batches(power: FloatArray) -> list[slice]:
+    """Tiles that are fitted together: a fit takes some twenty times what spectra take."""
+    tiles = max(_FITTED // len(power), 1)
+    return [slice(start, start + tiles) for start in range(0, power.shape[1], tiles)]
+
+
+def _common_spectrum(power: FloatArray, fit: _Fit) -> tuple[Float64Array, Float64Array]:
     """Spectrum that the frames are blurred versions of, and misfit of each ring, from power (T, tiles, rings)."""
-    reference = np.maximum(power.mean(axis=0) - floor, 0.0)
-    s = np.zeros(power.shape[:2])
-    misfit = np.ones(power.shape[1:])
+    reference = np.maximum(power.mean(axis=0, dtype=np.float64) - fit.floor, 0.0)
+    s, misfit = np.zeros(power.shape[:2]), np.ones(power.shape[1:])
     for _ in range(_ROUNDS - 1):
-        design = k2 * spectra.widening(2 * [reference.mean(axis=0)], k2)
-        s, _, residual = fit_relative(power - floor, reference, floor, design, counts, s, misfit, params)
-        # The slope of the logarithm of a spectrum, and with it the smear by the window, depends on s itself.
-        s = s + 2 * spectra.smear * s**2
-        s -= s.mean(axis=0)
-        decay = np.exp(-np.clip(s[..., None] * design, -LARGEST_EXPONENT, LARGEST_EXPONENT))
-        reference = np.maximum(((power - floor) * decay).sum(axis=0) / (decay**2).sum(axis=0), 0.0)
-        misfit = np.clip(misfit * residual.mean(axis=0), _SMALLEST_MISFIT, _LARGEST_MISFIT)
+        design = fit.design(reference)
+        for some in _batches(power):
+            known = reference[some], misfit[some]
+            s[:, some], reference[some], misfit[some] = _refit(power[:, some], *known, design, s[:, some], fit)
     return reference, misfit
 
 
+def _refit(
+    power: FloatArray, reference: Float64Array, misfit: Float64Array, design: Float64Array, s: Float64Array, fit: _Fit
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """One round over some tiles: frames against reference, reference from frames; s, reference and misfit."""
+    signal = power.astype(np.float64) - fit.floor
+    s, _, residual = fit_relative(signal, reference, fit.floor, design, fit.counts, s, misfit, fit.params)
+    # The slope of the logarithm of a spectrum, and with it the smear by the window, depends on s itself.
+    s = s + 2 * fit.spectra.smear * s**2
+    s -= s.mean(axis=0)
+    decay = np.exp(-np.clip(s[..., None] * design, -LARGEST_EXPONENT, LARGEST_EXPONENT))
+    refitted = np.maximum((signal * decay).sum(axis=0) / (decay**2).sum(axis=0), 0.0)
+    return s, refitted, np.clip(misfit * residual.mean(axis=0), _SMALLEST_MISFIT, _LARGEST_MISFIT)
+
+
+def _own_scores(
+    power: FloatArray, spectrum: Float64Array, misfit: Float64Array, design: Float64Array, fit: _Fit
+) -> tuple[tuple[Float64Array, Float64Array, Float64Array, Float64Array], _Judged]:
+    """Judge the frames of the reference in some tiles: its size, offset, spread and least, and their blur."""
+    s, gathered, residual = _score(power, spectrum, misfit, design, fit)
+    size, offset = residual.mean(axis=0), s.mean(axis=0)
+    s = s - offset
+    deviation = _deviation(s, gathered, size)
+    spread = np.maximum((s**2 - deviation**2).mean(axis=0), 0.0)
+    estimate = _posterior(s, deviation, spread)
+    least = estimate.min(axis=0)
+    return (size, offset, spread, least), (s, deviation, estimate - least)
+
+
 def _score(
-    power: Float64Array,
-    spectrum: Float64Array,
-    misfit: Float64Array,
-    floor: float,
-    rings: tuple[Float64Array, Float64Array],
-    spectra: TileSpectra,
-    params: CueParams,
+    power: FloatArray, spectrum: Float64Array, misfit: Float64Array, design: Float64Array, fit: _Fit
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Fit s, shape (T, tiles), to a known spectrum; also information about s and squared residual of every ring."""
-    k2, counts = rings
-    design = k2 * spectra.widening(2 * [spectrum.mean(axis=0)], k2)
-    s = np.zeros(power.shape[:2])
+    s, signal = np.zeros(power.shape[:2]), power.astype(np.float64) - fit.floor
     for _ in range(2):
-        s, information, residual = fit_relative(power - floor, spectrum, floor, design, counts, s, misfit, params)
+        s, information, residual = fit_relative(signal, spectrum, fit.floor, design, fit.counts, s, misfit, fit.params)
     gathered = information * design**2
     leverage = gathered / (gathered.sum(axis=-1, keepdims=True) + 1 / PRIOR**2)
-    return s + 2 * spectra.smear * s**2, gathered, residual / np.maximum(1 - leverage, 0.1)
+    return s + 2 * fit.spectra.smear * s**2, gathered, residual / np.maximum(1 - leverage, 0.1)
 
 
 def _deviation(s: Float64Array, gathered: Float64Array, size: Float64Array) -> Float64Array:
@@ -279,7 +312,9 @@ def _posterior(s: Float64Array, deviation: Float64Array, spread: Float64Array) -
     return s * spread / np.maximum(spread + deviation**2, 1e-30)
 
 
-def _frame_blur(s: Float64Array, deviation: Float64Array, extra: Float64Array, grid: TileGrid) -> FrameBlur:
-    shape = (len(s), len(grid.rows), len(grid.columns))
-    relative, deviations, extras = (part.reshape(shape).astype(np.float32) for part in (s, deviation, extra))
-    return FrameBlur(relative, deviations, extras, grid)
+def _frame_blur(judged: list[_Judged], grid: TileGrid) -> FrameBlur:
+    """Join what is said of tiles that were fitted together."""
+    shape = (-1, len(grid.rows), len(grid.columns))
+    joined = (np.concatenate(parts, axis=1) for parts in zip(*judged, strict=True))
+    relative, deviation, extra = (part.reshape(shape).astype(np.float32) for part in joined)
+    return FrameBlur(relative, deviation, extra, grid)
