@@ -123,7 +123,7 @@ def limited_rows(quick: bool, largest: bool) -> Iterator[tuple[Clip, float, list
     if largest:
         yield Clip(12, 4320, 7680), 2000, []
         yield Clip(12, 4320, 7680, 3), 2000, []
-        yield Clip(3, 4320, 7680, 3), 2000, ["--blur-bounds"]
+        yield Clip(12, 4320, 7680), 1600, ["--blur-bounds"]
 
 
 def check_limits(folder: Path, quick: bool, largest: bool, extra: list[str]) -> bool:

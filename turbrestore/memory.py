@@ -108,8 +108,9 @@ _FILTER = StageMemory(10, 5, 10, 5)
 # while the flow model is found, the blur, and bounds on it.
 _WHOLE_RESULT, _WHOLE_MODEL = StageMemory(3, 15, 0, 0), StageMemory(27, 0, 0, 0)
 _WHOLE_BLUR, _WHOLE_BOUNDS = StageMemory(22, 2, 0, 0), StageMemory(17, 0, 0, 0)
-# Beside that, what bounds take of tiles that are fitted together, and for each frame that they are found from.
-_BOUNDS_FIT, _BOUNDS_FRAME = 200e6, 0.4
+# Beside that, what bounds take for each frame that they are found from, a pixel; and of tiles that are fitted together,
+# at most and a pixel, two images or for each frame.
+_BOUNDS_FRAME, _BOUNDS_FIT, _PAIR_FIT, _FRAME_FIT = 0.25, 200e6, 80.0, 4.7
 # What is decoded of a frame while tiles are cut from it.
 _READING = StageMemory(0, 10.5, 0, 0)
 # Two maps of the widths of the blur.
@@ -259,8 +260,10 @@ class _Work:
 
     def bounds(self, train: int) -> float:
         """Bounds on the width of the blur."""
-        fit = _BOUNDS_FIT + _BOUNDS_FRAME * train * self.pixels
-        return _WHOLE_BOUNDS.bytes(self.pixels, self.channels, 0) + fit if self.blur_bounds else 0.0
+        if not self.blur_bounds:
+            return 0.0
+        fit = min(_BOUNDS_FIT, (_PAIR_FIT + _FRAME_FIT * train) * self.pixels)
+        return _WHOLE_BOUNDS.bytes(self.pixels, self.channels, 0) + fit + _BOUNDS_FRAME * train * self.pixels
 
     def cut(self) -> float:
         """Image and guide of a tile that is deblurred."""
