@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_flow, check_image
 from .errors import DataError
+from .scratch import walk
 
 BORDER = 30
 # A margin that the sub-pixel shift may pull in from outside, cut off after it.
@@ -319,7 +320,7 @@ def sharpness(image: ArrayLike, reference: ArrayLike) -> float:
     """
     gradients = [
         float(np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)).mean())
-        for grey in (_grey(image, "image"), _grey(reference, "reference"))
+        for grey in map(_grey, walk((image, reference)), ("image", "reference"))
     ]
     if gradients[1] == 0:
         raise DataError("reference: expected an image with some contrast, found one colour")

@@ -19,6 +19,7 @@ from ..images import atomic_write, check_output
 from ..plots import new_figure
 from ..restoration import Restoration
 from ..run_record import RunRecord
+from ..scratch import returning_freed
 from .facts import findings, headline, laps, remarks, settings
 from .panels import draw_panels
 from .pictures import encode_gallery, stages
@@ -103,6 +104,7 @@ def write_report(
     atomic_write(path, render_report(restoration, run).encode(errors="replace"), overwrite)
 
 
+@returning_freed()
 def render_report(restoration: Restoration, run: RunRecord) -> str:
     """HTML of a restoration.
 

@@ -21,6 +21,7 @@ from ..plots import (
 )
 from ..restoration import Restoration
 from ..run_record import RunRecord
+from ..scratch import release
 from .vector import inline_svg
 
 
@@ -73,9 +74,11 @@ def _motion(restoration: Restoration, run: RunRecord) -> Iterator[Panel]:
     figure = plot_flow(centroid.flows[number], centroid.image, f"Displacement of training frame {number}")
     caption = "From the centroid to one frame. The image shows through."
     yield Panel(inline_svg(figure, "flow", "Map of the displacement of one frame"), caption)
+    release(centroid.flows)
     figure = plot_displacements(centroid.flows, centroid.image)
     caption = "Over the training frames. Strokes lie along the axis that moves most."
     yield Panel(inline_svg(figure, "spread", "Map of the standard deviation of the displacement"), caption)
+    release(centroid.image)
     tolerance = run.settings.get("centroid", {}).get("tolerance")
     figure = plot_convergence(centroid.mean_flow_sizes, tolerance)
     caption = "At the centre of the motion the mean flow vanishes; what is left is the bias of the flow method."
