@@ -24,10 +24,11 @@ from turbrestore.errors import ConfigurationError, DataError, InputNotFoundError
 from turbrestore.frame_source import FrameSource
 from turbrestore.guards import GuardReading
 from turbrestore.pipeline import RestoreParams, restore
-from turbrestore.plots import plot_flow
-from turbrestore.report import check_report, facts, pictures, render_report, write_report
+from turbrestore.plots import plot_displacements, plot_flow
+from turbrestore.report import check_report, facts, panels, pictures, render_report, write_report
 from turbrestore.report.vector import inline_svg
 from turbrestore.run_record import RUN_FILES, RunRecord, describe_run, load_run, save_run
+from turbrestore.scratch import new_stack
 from turbrestore.video import write_video
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.application import build
@@ -60,6 +61,44 @@ def run(frames):
 @pytest.fixture(scope="module")
 def page(whole, run):
     return render_report(whole, run)
+
+
+def mapped(array, folder):
+    """Copy an array to a file and map it."""
+    copy = new_stack(array.shape, folder)
+    copy[...] = array
+    return copy
+
+
+def test_a_report_of_mapped_images_is_the_same_and_hands_all_of_them_back(whole, run, page, tmp_path, monkeypatch):
+    centroid = dataclasses.replace(
+        whole.centroid, image=mapped(whole.centroid.image, tmp_path), flows=mapped(whole.centroid.flows, tmp_path)
+    )
+    filtered = dataclasses.replace(whole.filtered, image=mapped(whole.filtered.image, tmp_path))
+    result, mean = mapped(whole.image, tmp_path), mapped(whole.mean, tmp_path)
+    in_files = dataclasses.replace(whole, image=result, mean=mean, centroid=centroid, filtered=filtered)
+    touched = {}
+
+    def release(array):
+        touched.pop(id(base(array)), None)
+
+    def base(array):
+        while isinstance(array.base, np.ndarray):
+            array = array.base
+        return array
+
+    def touch(array):
+        touched[id(base(array))] = array
+        return array.copy()
+
+    for place in ("scratch", "report.panels"):
+        monkeypatch.setattr(f"turbrestore.{place}.release", release)
+    monkeypatch.setattr(pictures, "_reduced", touch)
+    monkeypatch.setattr(panels, "plot_displacements", lambda flows, image: plot_displacements(flows, touch(image)))
+    for array in (result, mean, centroid.image, centroid.flows, filtered.image):
+        touch(array)
+    assert render_report(in_files, run) == page
+    assert not touched
 
 
 class Elements(HTMLParser):

@@ -74,7 +74,6 @@ def _motion(restoration: Restoration, run: RunRecord) -> Iterator[Panel]:
     figure = plot_flow(centroid.flows[number], centroid.image, f"Displacement of training frame {number}")
     caption = "From the centroid to one frame. The image shows through."
     yield Panel(inline_svg(figure, "flow", "Map of the displacement of one frame"), caption)
-    release(centroid.flows)
     figure = plot_displacements(centroid.flows, centroid.image)
     caption = "Over the training frames. Strokes lie along the axis that moves most."
     yield Panel(inline_svg(figure, "spread", "Map of the standard deviation of the displacement"), caption)

@@ -15,7 +15,7 @@ import cv2
 from ..arrays import FloatArray
 from ..preview import data_uri, encode_image
 from ..restoration import Restoration
-from ..scratch import parts, release, walk
+from ..scratch import parts, walk
 
 # All images together, bytes before base64, which with half a megabyte of plots and text stays below 2 MB; quality
 # beyond it; longest side that is shown, pixels.
@@ -85,9 +85,6 @@ def stages(restoration: Restoration, frame: FloatArray) -> dict[str, FloatArray]
     if restoration.filtered is not None:
         images["filtered"] = restoration.filtered.image
     images = {key: image[y : y + height, x : x + width] for key, image in images.items()}
-    # Of mapped images, what was looked at before is still in memory.
-    for image in (restoration.image, *images.values()):
-        release(image)
     last = next(reversed(images))
     if all((one == other).all() for one, other in zip(parts(restoration.image), parts(images[last]), strict=True)):
         del images[last]
