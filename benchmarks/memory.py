@@ -28,6 +28,7 @@ import numpy as np
 
 GROWTH_BOUND_MB = 20.0
 SEED = 0
+EVERYTHING = ["--report={folder}/report.html", "--keep={folder}/stages", "--bit-depth=32"]
 # A process takes over the peak of the one that starts it, so this one stays small and leaves clips to others to write.
 STATM = Path("/proc/self/statm")
 
@@ -95,7 +96,8 @@ def run_apart(call: str) -> None:
 
 def restore_peak(clip: Path, options: list[str]) -> tuple[float, float]:
     """Largest resident set, MB, and seconds of ``turbrestore restore``."""
-    output = clip.with_suffix(".png")
+    output = clip.with_suffix(".tif")
+    options = [option.format(folder=clip.parent) for option in options]
     words = ["restore", str(clip), str(output), "--quiet", "--overwrite", *options]
     code = f"import sys; from turbrestore_cli.__main__ import main; sys.exit(main({words!r}))"
     begun = time.perf_counter()
@@ -116,10 +118,13 @@ def limited_rows(quick: bool, largest: bool) -> Iterator[tuple[Clip, float, list
     # Here and from 3840×2160 on whole frames do not fit.
     yield Clip(24, 1080, 1920, 3), 1000, []
     yield Clip(8, 1080, 1920), 900, ["--sigma=30", "--deconvolution.iterations=30"]
+    # With all that a run can write, near the least limits.
+    yield Clip(8, 1080, 1920, 3), 560, EVERYTHING
     if not quick:
         yield Clip(24, 1080, 1920, 3), 3000, []
         yield Clip(16, 2160, 3840), 2000, []
         yield Clip(16, 2160, 3840, 3), 2000, []
+        yield Clip(8, 2160, 3840, 3), 720, EVERYTHING
     if largest:
         yield Clip(12, 4320, 7680), 2000, []
         yield Clip(12, 4320, 7680, 3), 2000, []
@@ -249,6 +254,9 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     from turbrestore.frame_source import FrameSource
     from turbrestore.guards import judge
     from turbrestore.images import write_image
+    from turbrestore.metrics import compare
+    from turbrestore.report import render_report
+    from turbrestore.run_record import describe_run
     from turbrestore.scratch import new_stack, release, walk
     from turbrestore.video import open_frames
 
@@ -289,6 +297,29 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     )
     # The plan counts apart what each frame takes, and what is fitted together.
     yield "_WHOLE_BOUNDS", [lambda: bound_blur(image, other, training, clip.count)]
+    release(training)
+    # With matplotlib and what is coded, which the plan counts apart.
+    yield "_REPORT", [lambda: render_report(until_centroid(image, other, flows), describe_run(source))]
+    yield "_COMPARISON", [lambda: compare(other, image[:].copy())]
+
+
+def until_centroid(image: np.ndarray, mean: np.ndarray, flows: np.ndarray) -> object:
+    """Return a restoration that ended with the centroid."""
+    from turbrestore.centroid import Centroid
+    from turbrestore.restoration import Restoration
+
+    return Restoration(
+        image=image,
+        crop=(0, 0, image.shape[1], image.shape[0]),
+        mean=mean,
+        centroid=Centroid(image, flows, np.ones(2), True),
+        **dict.fromkeys(("dynamics", "filtered", "blur", "blur_bounds", "deconvolution")),
+        guard_readings=(),
+        decisions=(),
+        train=len(flows),
+        frame_count=len(flows),
+        seconds={"read": 1.0},
+    )
 
 
 def read_corners(path: Path) -> None:

@@ -10,12 +10,14 @@ from cyclopts import Parameter
 
 from turbrestore.errors import require
 from turbrestore.images import check_output, write_image
+from turbrestore.memory import check_comparison
 from turbrestore.metrics import comparable
 from turbrestore.pipeline import restore as run_pipeline
 from turbrestore.pixels import check_depth
 from turbrestore.report import check_report, write_report
-from turbrestore.restoration import RestoreParams
+from turbrestore.restoration import RestoreParams, uses_torch
 from turbrestore.run_record import describe_run
+from turbrestore.scratch import returning_freed
 
 from .inputs import open_input, read_input_image
 from .kept import check_room, kept_stages, own_outputs
@@ -99,30 +101,34 @@ def restore(
         check_report(report, inputs, overwrite or report.absolute() in left)
     outputs = [path for path in (output, settings_path, report) if path is not None]
     check_keep(keep, [input, *outputs], overwrite, resume)
-    scene = None if truth is None else comparable(read_input_image(truth, selection.limits()), "truth")
+    scene_shape = None if truth is None else comparable(read_input_image(truth, selection.limits()), "truth").shape
     source = open_input(input, selection, quiet)
-    if scene is not None:
+    if scene_shape is not None:
         comparable(source.read(0, 1)[0], source.name)
+        check_comparison(settings.memory_limit, source.shape[1:], scene_shape, uses_torch(settings))
     check_room(source, settings, output, keep)
     with kept_stages(keep, source, settings, resume, checkpoint_every, quiet) as stages:
         with progress_bars(quiet) as progress:
             done, on_result = (None, None) if stages is None else (stages.done, stages.keep)
             restoration = run_pipeline(source, settings, progress, done, on_result, keep)
-        record = settings_record(settings, selection, bit_depth)
-        run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
-        depth = source.bit_depth if bit_depth is None else bit_depth
-        if stages is not None and run is not None:
-            save_stages(stages, restoration, run, depth)
-            stages.expect(*outputs)
-        # Whatever else is there has been refused above.
-        write_image(output, restoration.image, depth, overwrite=overwrite or output.absolute() in left)
-        write_settings(settings_path, record)
-        if report is not None and run is not None:
-            write_report(report, restoration, run, overwrite=overwrite or report.absolute() in left)
+        with returning_freed(settings.memory_limit is not None):
+            record = settings_record(settings, selection, bit_depth)
+            run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
+            depth = source.bit_depth if bit_depth is None else bit_depth
+            if stages is not None and run is not None:
+                save_stages(stages, restoration, run, depth)
+                stages.expect(*outputs)
+            # Whatever else is there has been refused above.
+            write_image(output, restoration.image, depth, overwrite=overwrite or output.absolute() in left)
+            write_settings(settings_path, record)
+            if report is not None and run is not None:
+                write_report(report, restoration, run, overwrite=overwrite or report.absolute() in left)
         if stages is not None:
             stages.expect()
     if json:
-        facts = describe(restoration, scene)
+        with returning_freed(settings.memory_limit is not None):
+            # Read again, for all that works in between has no room for it.
+            facts = describe(restoration, None if truth is None else read_input_image(truth, selection.limits()))
         print_json({"input": str(input), "output": str(output), "settings": str(settings_path), **facts})
     else:
         say(summary(output, restoration), quiet)

@@ -1,6 +1,7 @@
 """Restorations within a memory limit: the plan, and that the result is the same."""
 
 import json
+import weakref
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -15,7 +16,7 @@ from conftest import make_sequence
 from turbrestore import pipeline
 from turbrestore.alternating import FilterParams
 from turbrestore.centroid import CentroidParams
-from turbrestore.compiled import COMPILER_BYTES
+from turbrestore.compiled import COMPILER_BYTES, can_compile
 from turbrestore.deconvolution import BOUNDARIES, DeconvolutionParams
 from turbrestore.deconvolution_memory import NonlocalWork, Room
 from turbrestore.device import TORCH_BYTES
@@ -24,12 +25,14 @@ from turbrestore.errors import ConfigurationError, StorageError
 from turbrestore.flow import FlowParams
 from turbrestore.frame_source import FrameSource
 from turbrestore.halo_tiles import cut_around, halo_tiles, sizes_to_deblur
-from turbrestore.memory import StageMemory, _Work, plan_memory, training_share
+from turbrestore.memory import _SHOWN_SIDE, StageMemory, _Work, plan_memory, training_share
 from turbrestore.memory_size import MemorySize
 from turbrestore.nonlocal_tv import NonlocalParams
+from turbrestore.report.pictures import _LONGEST
 from turbrestore.restoration import STAGES, RestoreParams
 from turbrestore.resumption import KeptStages, stage_facts
 from turbrestore_cli.__main__ import main
+from turbrestore_cli.inputs import read_input_image
 
 FULL_HD = (300, 1080, 1920)
 QUICK = RestoreParams(
@@ -224,6 +227,60 @@ def test_bounds_on_the_blur_count_for_whole_frames():
 def test_bounds_on_the_blur_of_a_small_image_take_little():
     bounded, plain = (least_limit((300, 128, 128), blur_bounds=bounds) for bounds in (True, False))
     assert bounded < 1.1 * plain
+
+
+@pytest.mark.parametrize("until", ["centroid", "deconvolve"])
+@pytest.mark.parametrize("shape", [(40, 64, 64), (40, 512, 512, 3), (9, 4320, 7680), (9, 2160, 3840, 3)])
+def test_a_report_fits_into_every_limit(shape, until):
+    work = _Work(shape, FilterParams(), DynamicsParams(), DeconvolutionParams(), until, False, False)
+    assert least_limit(shape, until=until) >= work.base + work.report()
+
+
+def test_room_for_a_report_is_for_the_images_that_it_shows():
+    assert _SHOWN_SIDE == _LONGEST
+    small, large = (
+        _Work((9, side, side, 3), FilterParams(), DynamicsParams(), DeconvolutionParams(), "deconvolve", False, False)
+        for side in (2048, 8192)
+    )
+    # Levels of five images, one as float beside the frame, and what codes one image.
+    assert small.report() > 2048**2 * (5 * 3 + 2 * 12 + 28)
+    # Gradients of one image beside the frame and the image that they are of.
+    assert large.report() > 8192**2 * (2 * 12 + 3 * 4)
+
+
+def test_a_comparison_with_the_truth_that_breaks_the_limit_is_refused_before_the_work(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("truth.png", np.tile(np.arange(256, dtype=np.uint8), (6000, 12)))
+    np.save("clip.npy", np.random.default_rng(0).random((4, 96, 96), np.float32))
+    words = ["restore", "clip.npy", "image.png", "--truth=truth.png", "--json", "--quiet"]
+    limit = MemorySize("400MB") + (COMPILER_BYTES if can_compile() else 0)
+    assert main([*words, f"--memory-limit={limit}"]) == 2
+    assert "--truth: expected a --memory-limit of at least 1." in capsys.readouterr().err
+    assert not (tmp_path / "image.png").exists()
+
+
+def test_the_truth_is_not_in_memory_while_others_work(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    sequence = make_sequence(seed=51, count=4, size=96, blur=1.0)
+    cv2.imwrite("truth.png", (255 * sequence.scene).astype(np.uint8))
+    np.save("clip.npy", sequence.frames)
+    truths = []
+
+    def read(*words):
+        image = read_input_image(*words)
+        truths.append(weakref.ref(image))
+        return image
+
+    def run(*words):
+        assert [truth() for truth in truths] == [None]
+        return pipeline.restore(*words)
+
+    monkeypatch.setattr("turbrestore_cli.restore.read_input_image", read)
+    monkeypatch.setattr("turbrestore_cli.restore.run_pipeline", run)
+    quick = ["--centroid.iterations=1", "--sigma=1", "--deconvolution.iterations=2", "--quiet"]
+    assert main(["restore", "clip.npy", "image.png", "--truth=truth.png", "--json", *quick]) == 0
+    assert "psnr" in json.loads(capsys.readouterr().out)["stages"]["deconvolved"]
+    assert len(truths) == 2
 
 
 @given(

@@ -93,7 +93,8 @@ def test_a_report_of_mapped_images_is_the_same_and_hands_all_of_them_back(whole,
 
     for place in ("scratch", "report.panels"):
         monkeypatch.setattr(f"turbrestore.{place}.release", release)
-    monkeypatch.setattr(pictures, "_reduced", touch)
+    levels = pictures._levels
+    monkeypatch.setattr(pictures, "_levels", lambda image: levels(touch(image)))
     monkeypatch.setattr(panels, "plot_displacements", lambda flows, image: plot_displacements(flows, touch(image)))
     for array in (result, mean, centroid.image, centroid.flows, filtered.image):
         touch(array)

@@ -88,6 +88,13 @@ def test_walking_a_stack_takes_one_frame_at_a_time(tmp_path):
     assert resident() - before > 70e6
 
 
+def test_who_leaves_a_walk_early_hands_back_what_was_seen_last(tmp_path, monkeypatch):
+    released = []
+    monkeypatch.setattr("turbrestore.scratch.release", lambda array: released.append(float(array[0])))
+    assert any(frame[0] == 1 for frame in walk(np.arange(3.0)[:, None]))
+    assert released == [0, 1]
+
+
 def test_changes_of_a_private_map_are_kept(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros(10_000, np.float32))
     private = np.load(tmp_path / "a.npy", mmap_mode="c")
@@ -116,7 +123,7 @@ def test_a_full_disk_is_a_clear_error(tmp_path, monkeypatch):
 
 def test_the_allocator_gets_back_what_it_had(monkeypatch):
     calls = []
-    library = SimpleNamespace(mallopt=lambda *setting: calls.append(setting))
+    library = SimpleNamespace(mallopt=lambda *setting: calls.append(setting), malloc_trim=calls.append)
     monkeypatch.setattr("ctypes.CDLL", lambda name: library)
     monkeypatch.setattr("platform.libc_ver", lambda: ("glibc", "2.36"))
     with returning_freed(False):
@@ -125,7 +132,7 @@ def test_the_allocator_gets_back_what_it_had(monkeypatch):
     with pytest.raises(KeyError), returning_freed():
         assert calls == [(-3, 1 << 20)]
         raise KeyError
-    assert calls[1:] == [(-3, 32 << 20), (-1, 64 << 20)]
+    assert calls[1:] == [(-3, 32 << 20), (-1, 64 << 20), 0]
     monkeypatch.setattr("platform.libc_ver", lambda: ("", ""))
     with returning_freed():
-        assert len(calls) == 3
+        assert len(calls) == 4

@@ -321,14 +321,14 @@ def atomic_output(path: str | os.PathLike[str], overwrite: bool = False) -> Iter
         temporary.unlink(missing_ok=True)
 
 
-def atomic_write(path: str | os.PathLike[str], data: bytes, overwrite: bool = False) -> None:
+def atomic_write(path: str | os.PathLike[str], data: bytes | memoryview, overwrite: bool = False) -> None:
     """Write a whole file or nothing.
 
     Parameters
     ----------
     path : path-like
         The file to be written.
-    data : bytes
+    data : bytes or memoryview of bytes
         Its content.
     overwrite : bool
         Replace an existing file.
@@ -351,7 +351,7 @@ def atomic_write(path: str | os.PathLike[str], data: bytes, overwrite: bool = Fa
         temporary.write_bytes(data)
 
 
-def _encode(path: Path, image: FloatArray, depth: int) -> bytes:
+def _encode(path: Path, image: FloatArray, depth: int) -> memoryview:
     is_tiff = path.suffix.lower() != ".png"
     if depth == 32 and is_tiff:
         pixels: PixelArray = np.clip(image, 0, 1)
@@ -364,11 +364,11 @@ def _encode(path: Path, image: FloatArray, depth: int) -> bytes:
         buffer = io.BytesIO()
         photometric = "minisblack" if image.ndim == 2 else "rgb"
         tifffile.imwrite(buffer, pixels, photometric=photometric, metadata=None)
-        return buffer.getvalue()
+        return buffer.getbuffer()
     done, data = cv2.imencode(".png", pixels if image.ndim == 2 else pixels[..., ::-1])
     if not done:
         raise StorageError(f"{path}: the PNG encoder failed on an image of shape {image.shape}")
-    return data.tobytes()
+    return data.data
 
 
 def _check_not_input(path: Path, folder: Path, source: Path) -> None:

@@ -115,6 +115,12 @@ _BOUNDS_FRAME, _BOUNDS_FIT, _PAIR_FIT, _FRAME_FIT = 0.25, 200e6, 80.0, 4.7
 _READING = StageMemory(0, 10.5, 0, 0)
 # Two maps of the widths of the blur.
 _WHOLE_WIDTHS = StageMemory(8, 0, 0, 0)
+# Of a report, the frame that it shows included: matplotlib and text; maps of the motion and figures of the images; the
+# images, one after the other, and for each pixel that is shown those that are coded, and one that is.
+_REPORT_TEXT, _REPORT, _SHOWN = 60e6, StageMemory(23, 5, 0, 0), StageMemory(0, 8.8, 0, 0)
+_CODING, _SHOWN_SIDE = StageMemory(31, 5.5, 0, 0), 2048
+# A comparison with the true scene, both images included.
+_COMPARISON = StageMemory(75, 15, 0, 0)
 # Shortest side of a tile that is worth a thread less, pixels, and the step in which sides are tried.
 _WORTH, _SIDE_STEP = 640, 32
 # The size of tiles changes the result, so it must not follow from the number of cores.
@@ -187,7 +193,7 @@ class _Work:
 
     @property
     def base(self) -> float:
-        return _BASE + (TORCH_BYTES if self.on_device else 0) + (COMPILER_BYTES if can_compile() else 0)
+        return _base(self.on_device)
 
     @property
     def pairs(self) -> NonlocalWork:
@@ -229,7 +235,8 @@ class _Work:
             "deconvolve": self.held() + max(_BLUR.bytes(*size) + self.pairs.peak(Room(1, True)), self.bounds(train)),
         }
         stages = list(later)[: list(later).index(self.until) + 1]
-        return self.base + stack + max(flow + prepared, modes + max(later[stage] for stage in stages))
+        report = self.held() + self.report()
+        return self.base + stack + max(flow + prepared, modes + max(report, *(later[stage] for stage in stages)))
 
     def part(self, side: int) -> _Work:
         """Return the work on one tile: all that tiles are for, so that a run which goes further has the same."""
@@ -256,7 +263,7 @@ class _Work:
         later = {"centroid": result, "identify": max(result, model), "filter": result, "deconvolve": blur}
         stages = list(later)[: list(later).index(self.until) + 1]
         reading = part.peak(train, threads, True) + _READING.bytes(*size)
-        return max(reading, self.base + max(later[stage] for stage in stages))
+        return max(reading, self.base + max(self.report(), *(later[stage] for stage in stages)))
 
     def bounds(self, train: int) -> float:
         """Bounds on the width of the blur."""
@@ -264,6 +271,12 @@ class _Work:
             return 0.0
         fit = min(_BOUNDS_FIT, (_PAIR_FIT + _FRAME_FIT * train) * self.pixels)
         return _WHOLE_BOUNDS.bytes(self.pixels, self.channels, 0) + fit + _BOUNDS_FRAME * train * self.pixels
+
+    def report(self) -> float:
+        """Room for a report, whether or not there will be one: the result must not follow from that."""
+        shown = self.pixels * min(1.0, _SHOWN_SIDE / max(self.shape[1:3])) ** 2
+        coding = _SHOWN.bytes(self.pixels, self.channels, 0) + _CODING.bytes(int(shown), self.channels, 0)
+        return _REPORT_TEXT + max(_REPORT.bytes(self.pixels, self.channels, 0), coding)
 
     def cut(self) -> float:
         """Image and guide of a tile that is deblurred."""
@@ -364,6 +377,44 @@ def plan_memory(
     )
 
 
+def check_comparison(
+    limit: float | None, frame_shape: tuple[int, ...], truth_shape: tuple[int, ...], on_device: bool = False
+) -> None:
+    """Refuse a comparison with the true scene that would take more memory than is allowed.
+
+    Parameters
+    ----------
+    limit : float or None
+        Most memory of the process, bytes; that :func:`plan_memory` has a plan for.
+    frame_shape, truth_shape : tuple of int
+        (H, W) or (H, W, 3).
+    on_device : bool
+        Whether any stage computes with torch.
+
+    Raises
+    ------
+    ConfigurationError
+        It would.
+
+    Examples
+    --------
+    >>> check_comparison(2e9, (2160, 3840, 3), (2160, 3840, 3))
+    >>> check_comparison(2e9, (4320, 7680), (4320, 7680))
+    Traceback (most recent call last):
+    ...
+    turbrestore.errors.ConfigurationError: --truth: ...
+    """
+    pixels = max(shape[0] * shape[1] for shape in (frame_shape, truth_shape))
+    channels = 3 if max(len(frame_shape), len(truth_shape)) == 3 else 1
+    least = _base(on_device) + _COMPARISON.bytes(pixels, channels, 0)
+    require(
+        limit is None or limit >= least,
+        f"--truth: expected a --memory-limit of at least {size_text(1.01 * least)} to compare images of "
+        f"{truth_shape[1]}×{truth_shape[0]}, found {size_text(limit or 0)}; allow more, or compare the result with "
+        "turbrestore evaluate",
+    )
+
+
 def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int | None = None) -> int:
     """How many frames the centroid and the flow dynamics are taken from, if memory is not limited.
 
@@ -406,6 +457,10 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
     share = min(max(frame_count // 2, _FEWEST_TRAINED), _MOST_TRAINED)
     frame_bytes = 4 * (int(np.prod(frame_shape)) + 2 * frame_shape[0] * frame_shape[1])
     return min(frame_count, max(2, min(share, int(_TRAINING_BYTES // frame_bytes))))
+
+
+def _base(on_device: bool) -> float:
+    return _BASE + (TORCH_BYTES if on_device else 0) + (COMPILER_BYTES if can_compile() else 0)
 
 
 def _tilings(work: _Work) -> Iterator[tuple[int, int]]:

@@ -318,10 +318,7 @@ def sharpness(image: ArrayLike, reference: ArrayLike) -> float:
     >>> round(sharpness(ramp, 0.5 * ramp), 3)
     2.0
     """
-    gradients = [
-        float(np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)).mean())
-        for grey in map(_grey, walk((image, reference)), ("image", "reference"))
-    ]
+    gradients = [_gradient(grey) for grey in map(_grey, walk((image, reference)), ("image", "reference"))]
     if gradients[1] == 0:
         raise DataError("reference: expected an image with some contrast, found one colour")
     return gradients[0] / gradients[1]
@@ -394,6 +391,11 @@ def endpoint_error(flow: ArrayLike, truth: ArrayLike) -> float:
 
 def _length(flow: np.ndarray) -> float:
     return float(np.hypot(flow[..., 0], flow[..., 1]).mean())
+
+
+def _gradient(grey: FloatArray) -> float:
+    across, down = cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    return float(np.hypot(across, down, out=across).mean())
 
 
 def _grey(image: ArrayLike, name: str) -> FloatArray:

@@ -9,6 +9,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from .arrays import FloatArray, from_unit
 from .errors import DataError
@@ -44,14 +45,42 @@ def encode_image(image: FloatArray, kind: Literal["png", "webp"] = "png", qualit
     >>> encode_image(np.zeros((4, 4), np.float32))[1:4]
     b'PNG'
     """
-    pixels = from_unit(image, 8)
+    return encode_levels(from_unit(image, 8), kind, quality)
+
+
+def encode_levels(
+    pixels: NDArray[np.unsignedinteger], kind: Literal["png", "webp"] = "png", quality: int | None = None
+) -> bytes:
+    """Image file of 8 bits, from levels.
+
+    Parameters
+    ----------
+    pixels : ndarray, uint8, shape (H, W) or (H, W, 3)
+    kind : {"png", "webp"}
+    quality : int, optional
+        Of WebP, 1 to 100; lossless by default.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    DataError
+        The image cannot be encoded, for example because it is larger than the format allows.
+
+    Examples
+    --------
+    >>> encode_levels(np.zeros((4, 4), np.uint8))[1:4]
+    b'PNG'
+    """
     settings = [] if kind == "png" else [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS if quality is None else quality]
     try:
-        done, data = cv2.imencode(f".{kind}", pixels if image.ndim == 2 else pixels[..., ::-1], settings)
+        done, data = cv2.imencode(f".{kind}", pixels if pixels.ndim == 2 else pixels[..., ::-1], settings)
     except cv2.error:
         done = False
     if not done:
-        raise DataError(f"image: expected a size that {kind} can hold, found {image.shape[1]}×{image.shape[0]}")
+        raise DataError(f"image: expected a size that {kind} can hold, found {pixels.shape[1]}×{pixels.shape[0]}")
     return data.tobytes()
 
 

@@ -17,8 +17,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
-
 from turbrestore import __version__
 
 from .alternating import Filtered
@@ -33,7 +31,7 @@ from .errors import DataError, InputNotFoundError, OutputError
 from .flow_model import FlowDynamics
 from .frame_source import FrameSource
 from .images import atomic_output, atomic_write
-from .npy import read_npz
+from .npy import read_npz, write_npz
 from .record_fields import RecordFields
 from .restoration import Restoration, RestoreParams
 
@@ -211,7 +209,7 @@ def save_run(
         elif name not in stored:
             save_artifact(place / f"{name}.npz", result, overwrite=True)
     with atomic_output(place / IMAGES, overwrite=True) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, allow_pickle=False, frame=run.frame, mean=restoration.mean, image=restoration.image)
+        write_npz(stream, {"frame": run.frame, "mean": restoration.mean, "image": restoration.image})
     record = {
         "schema": SCHEMA,
         "run": {item.name: getattr(run, item.name) for item in dataclasses.fields(run) if item.name != "frame"},

@@ -154,8 +154,11 @@ def walk(items: Iterable[Item]) -> Iterator[Item]:
     [1.0, 1.0]
     """
     for item in items:
-        yield item
-        release(item)
+        try:
+            yield item
+        finally:
+            # Also where whoever walks has seen enough.
+            release(item)
 
 
 def parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
@@ -220,12 +223,17 @@ def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
     >>> variance_of(np.array([[1.0, 2.0], [3.0, 6.0]], np.float32))
     array([1., 4.], dtype=float32)
     """
-    mean, total = mean_of(stack), np.zeros(stack.shape[1:], np.float32)
-    for part in walk(stack):
-        for start in range(0, part.size, _PART):
-            some = slice(start, start + _PART)
-            total.ravel()[some] += np.square(part.ravel()[some] - mean.ravel()[some])
-    return np.divide(total, np.float32(len(stack)), out=total)
+    variance = np.zeros(stack.shape[1:], np.float32)
+    rows = np.atleast_1d(variance)
+    step = max(1, len(rows) * _PART // max(rows.size, 1))
+    for start in range(0, len(rows), step):
+        strip = rows[start : start + step]
+        some = stack.reshape(-1, 1) if stack.ndim == 1 else stack[:, start : start + step]
+        mean = mean_of(some)
+        for part in walk(some):
+            strip += np.square(part - mean)
+        strip /= np.float32(len(stack))
+    return variance
 
 
 @contextlib.contextmanager
@@ -258,6 +266,8 @@ def returning_freed(wanted: bool = True) -> Iterator[None]:
             # The first ends the adjustment by itself for good, so both are set to where it ends.
             ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGEST)
             ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, 2 * _LARGEST)
+            # Of small arrays, and of all threads.
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def _another(folder: Path) -> str:

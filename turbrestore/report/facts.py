@@ -13,7 +13,7 @@ import numpy as np
 from ..metrics import sharpness
 from ..restoration import Restoration, RestoreParams
 from ..run_record import RunRecord
-from ..scratch import variance_of
+from ..scratch import release, variance_of
 
 _STAGE_NAMES = {
     "read": "Reading",
@@ -94,7 +94,9 @@ def headline(restoration: Restoration) -> list[Fact]:
     ]
     x, y, width, height = restoration.crop
     mean = restoration.mean[y : y + height, x : x + width]
-    if np.ptp(mean) > 0:
+    contrast = np.ptp(mean)
+    release(mean)
+    if contrast > 0:
         facts.append(Fact("Sharpness", f"×{sharpness(restoration.image, mean):.2f}", "that of the mean"))
     if restoration.deconvolution is not None:
         sigma = restoration.deconvolution.sigma

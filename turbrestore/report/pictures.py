@@ -11,9 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
-from ..arrays import FloatArray
-from ..preview import data_uri, encode_image
+from ..arrays import FloatArray, from_unit
+from ..preview import data_uri, encode_levels
 from ..restoration import Restoration
 from ..scratch import parts, walk
 
@@ -105,11 +107,11 @@ def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
     -------
     Gallery
     """
-    shown = dict(zip(images, map(_reduced, walk(images.values())), strict=True))
+    shown = dict(zip(images, map(_levels, walk(images.values())), strict=True))
     coding = "8 bits, lossless"
-    files = {key: encode_image(image, "webp") for key, image in shown.items()}
+    files = {key: encode_levels(levels, "webp") for key, levels in shown.items()}
     if sum(map(len, files.values())) > _LOSSLESS_BYTES:
-        files = {key: encode_image(image, "webp", _QUALITY) for key, image in shown.items()}
+        files = {key: encode_levels(levels, "webp", _QUALITY) for key, levels in shown.items()}
         coding = f"8 bits, WebP of quality {_QUALITY}"
     if max(images["result"].shape[:2]) > _LONGEST:
         coding += f", reduced to {_LONGEST} pixels"
@@ -121,9 +123,9 @@ def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
     return Gallery(tuple(pictures), coding)
 
 
-def _reduced(image: FloatArray) -> FloatArray:
+def _levels(image: FloatArray) -> NDArray[np.unsignedinteger]:
     factor = _LONGEST / max(image.shape[:2])
-    if factor >= 1:
-        return image
-    height, width = (max(round(side * factor), 1) for side in image.shape[:2])
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    if factor < 1:
+        height, width = (max(round(side * factor), 1) for side in image.shape[:2])
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return from_unit(image, 8)
