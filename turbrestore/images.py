@@ -9,7 +9,6 @@ before (:mod:`turbrestore.image_headers`).
 
 from __future__ import annotations
 
-import io
 import os
 import secrets
 import shutil
@@ -28,7 +27,7 @@ from .image_headers import check_still
 from .input_files import check_input, input_errors
 from .limits import DEFAULT_LIMITS, Limits
 from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit
-from .scratch import release
+from .scratch import parts
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
 IMAGE_OUTPUT_SUFFIXES = (".png", ".tif", ".tiff")
@@ -174,8 +173,15 @@ def write_image(
     path = Path(path)
     check_output(path, overwrite=overwrite)
     depth = check_depth(32 if bit_depth is None else bit_depth)
-    data = _encode(path, check_image(image, "image"), depth)
-    atomic_write(path, data, overwrite=overwrite)
+    pixels = _stored(check_image(image, "image"), depth, is_tiff=path.suffix.lower() != ".png")
+    if path.suffix.lower() == ".png":
+        atomic_write(path, _encode_png(path, pixels), overwrite)
+        return
+    import tifffile
+
+    check_space(path, pixels.nbytes)
+    with atomic_output(path, overwrite) as temporary:
+        tifffile.imwrite(temporary, pixels, photometric="minisblack" if pixels.ndim == 2 else "rgb", metadata=None)
 
 
 def check_output(
@@ -351,23 +357,21 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | memoryview, overwri
         temporary.write_bytes(data)
 
 
-def _encode(path: Path, image: FloatArray, depth: int) -> memoryview:
-    is_tiff = path.suffix.lower() != ".png"
-    if depth == 32 and is_tiff:
-        pixels: PixelArray = np.clip(image, 0, 1)
-        release(image)
-    else:
-        pixels = from_unit(image, 8 if depth <= 8 else 16)
-    if is_tiff:
-        import tifffile
+def _stored(image: FloatArray, depth: int, is_tiff: bool) -> PixelArray:
+    """Pixels as they lie in the file."""
+    if depth != 32 or not is_tiff:
+        return from_unit(image, 8 if depth <= 8 else 16)
+    pixels, done = np.empty(image.shape, np.float32), 0
+    for part in parts(image):
+        np.clip(part, 0, 1, out=pixels[done : done + len(part)])
+        done += len(part)
+    return pixels
 
-        buffer = io.BytesIO()
-        photometric = "minisblack" if image.ndim == 2 else "rgb"
-        tifffile.imwrite(buffer, pixels, photometric=photometric, metadata=None)
-        return buffer.getbuffer()
-    done, data = cv2.imencode(".png", pixels if image.ndim == 2 else pixels[..., ::-1])
+
+def _encode_png(path: Path, pixels: PixelArray) -> memoryview:
+    done, data = cv2.imencode(".png", pixels if pixels.ndim == 2 else pixels[..., ::-1])
     if not done:
-        raise StorageError(f"{path}: the PNG encoder failed on an image of shape {image.shape}")
+        raise StorageError(f"{path}: the PNG encoder failed on an image of shape {pixels.shape}")
     return data.data
 
 
