@@ -124,7 +124,7 @@ def limited_rows(quick: bool, largest: bool) -> Iterator[tuple[Clip, float, list
         yield Clip(24, 1080, 1920, 3), 3000, []
         yield Clip(16, 2160, 3840), 2000, []
         yield Clip(16, 2160, 3840, 3), 2000, []
-        yield Clip(8, 2160, 3840, 3), 720, EVERYTHING
+        yield Clip(3, 2160, 3840, 3), 720, EVERYTHING
     if largest:
         yield Clip(12, 4320, 7680), 2000, []
         yield Clip(12, 4320, 7680, 3), 2000, []
