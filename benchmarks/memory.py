@@ -29,6 +29,7 @@ import numpy as np
 GROWTH_BOUND_MB = 20.0
 SEED = 0
 EVERYTHING = ["--report={folder}/report.html", "--keep={folder}/stages", "--bit-depth=32"]
+COMPARED = ["--truth={folder}/scene.png", "--json"]
 # A process takes over the peak of the one that starts it, so this one stays small and leaves clips to others to write.
 STATM = Path("/proc/self/statm")
 
@@ -52,6 +53,7 @@ class Clip:
         frames = np.lib.format.open_memmap(path, "w+", np.uint8, shape)
         scene = cv2.GaussianBlur(rng.random(shape[1:], dtype=np.float32), (0, 0), 2)
         scene = np.clip(0.5 + 2.5 * (scene - scene.mean()), 0, 1)
+        cv2.imwrite(str(path.with_name("scene.png")), (255 * scene).astype(np.uint8))
         y, x = np.mgrid[: self.height, : self.width].astype(np.float32)
         for index in range(self.count):
             flow = self.flow(rng)
@@ -101,7 +103,7 @@ def restore_peak(clip: Path, options: list[str]) -> tuple[float, float]:
     words = ["restore", str(clip), str(output), "--quiet", "--overwrite", *options]
     code = f"import sys; from turbrestore_cli.__main__ import main; sys.exit(main({words!r}))"
     begun = time.perf_counter()
-    child = subprocess.Popen([sys.executable, "-c", code])
+    child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:
@@ -119,12 +121,13 @@ def limited_rows(quick: bool, largest: bool) -> Iterator[tuple[Clip, float, list
     yield Clip(24, 1080, 1920, 3), 1000, []
     yield Clip(8, 1080, 1920), 900, ["--sigma=30", "--deconvolution.iterations=30"]
     # With all that a run can write, near the least limits.
-    yield Clip(8, 1080, 1920, 3), 560, EVERYTHING
+    yield Clip(8, 1080, 1920, 3), 560, [*EVERYTHING, *COMPARED]
     if not quick:
         yield Clip(24, 1080, 1920, 3), 3000, []
         yield Clip(16, 2160, 3840), 2000, []
         yield Clip(16, 2160, 3840, 3), 2000, []
         yield Clip(3, 2160, 3840, 3), 720, EVERYTHING
+        yield Clip(3, 2160, 3840, 3), 1320, [*EVERYTHING, *COMPARED]
     if largest:
         yield Clip(12, 4320, 7680), 2000, []
         yield Clip(12, 4320, 7680, 3), 2000, []
@@ -256,6 +259,7 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     from turbrestore.images import write_image
     from turbrestore.metrics import compare
     from turbrestore.report import render_report
+    from turbrestore.report.pictures import encode_gallery, stages
     from turbrestore.run_record import describe_run
     from turbrestore.scratch import new_stack, release, walk
     from turbrestore.video import open_frames
@@ -298,8 +302,10 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     # The plan counts apart what each frame takes, and what is fitted together.
     yield "_WHOLE_BOUNDS", [lambda: bound_blur(image, other, training, clip.count)]
     release(training)
+    shown = until_centroid(image, other, flows)
     # With matplotlib and what is coded, which the plan counts apart.
-    yield "_REPORT", [lambda: render_report(until_centroid(image, other, flows), describe_run(source))]
+    yield "_REPORT", [lambda: render_report(shown, describe_run(source))]
+    yield "_SHOWN, _CODING", [lambda: encode_gallery(stages(shown, describe_run(source).frame), 0)]
     yield "_COMPARISON", [lambda: compare(other, image[:].copy())]
 
 
@@ -346,6 +352,7 @@ def print_stages() -> None:
         run_apart(f"measure_stages(Clip(16, 720, 1280, {channels}), {threads}, {method!r})")
     for channels in (1, 3):
         run_apart(f"measure_whole(Clip(3, 2160, 3840, {channels}))")
+        run_apart(f"measure_whole(Clip(3, 1080, 1920, {channels}))")
 
 
 def main() -> int:

@@ -21,6 +21,7 @@ from turbrestore.metrics import compare
 from turbrestore.restoration import Restoration, RestoreParams
 from turbrestore.resumption import STAGE_FILES, KeptStages, is_part, read_stages
 from turbrestore.run_record import RUN_FILES, RunRecord, save_run
+from turbrestore.scratch import walk
 
 from .options import Selection
 from .streams import put
@@ -76,8 +77,9 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
     record["crop"] = list(restoration.crop)
     record["decisions"] = [dataclasses.asdict(decision) for decision in restoration.decisions]
     if truth is not None:
-        stages = {name: dataclasses.asdict(compare(image, truth)) for name, image in stage_images(restoration).items()}
-        record["stages"] = stages
+        images = stage_images(restoration)
+        figures = (dataclasses.asdict(compare(image, truth)) for image in walk(images.values()))
+        record["stages"] = dict(zip(images, figures, strict=True))
     return record
 
 

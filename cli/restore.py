@@ -12,10 +12,11 @@ from turbrestore.errors import require
 from turbrestore.images import check_output, write_image
 from turbrestore.memory import check_comparison
 from turbrestore.metrics import comparable
+from turbrestore.pipeline import memory_plan
 from turbrestore.pipeline import restore as run_pipeline
 from turbrestore.pixels import check_depth
 from turbrestore.report import check_report, write_report
-from turbrestore.restoration import RestoreParams, uses_torch
+from turbrestore.restoration import RestoreParams
 from turbrestore.run_record import describe_run
 from turbrestore.scratch import returning_freed
 
@@ -100,18 +101,22 @@ def restore(
     if report is not None:
         check_report(report, inputs, overwrite or report.absolute() in left)
     outputs = [path for path in (output, settings_path, report) if path is not None]
-    check_keep(keep, [input, *outputs], overwrite, resume)
-    scene_shape = None if truth is None else comparable(read_input_image(truth, selection.limits()), "truth").shape
+    check_keep(keep, [*inputs, *outputs], overwrite, resume)
+    limited = settings.memory_limit is not None
+    with returning_freed(limited):
+        scene_shape = None if truth is None else comparable(read_input_image(truth, selection.limits()), "truth").shape
     source = open_input(input, selection, quiet)
     if scene_shape is not None:
         comparable(source.read(0, 1)[0], source.name)
-        check_comparison(settings.memory_limit, source.shape[1:], scene_shape, uses_torch(settings))
+        if json:
+            plan = memory_plan(source, settings)
+            check_comparison(plan, settings.memory_limit, source.shape[1:], scene_shape)
     check_room(source, settings, output, keep)
     with kept_stages(keep, source, settings, resume, checkpoint_every, quiet) as stages:
         with progress_bars(quiet) as progress:
             done, on_result = (None, None) if stages is None else (stages.done, stages.keep)
             restoration = run_pipeline(source, settings, progress, done, on_result, keep)
-        with returning_freed(settings.memory_limit is not None):
+        with returning_freed(limited):
             record = settings_record(settings, selection, bit_depth)
             run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
             depth = source.bit_depth if bit_depth is None else bit_depth
@@ -123,10 +128,12 @@ def restore(
             write_settings(settings_path, record)
             if report is not None and run is not None:
                 write_report(report, restoration, run, overwrite=overwrite or report.absolute() in left)
+            # A frame is in it.
+            del run
         if stages is not None:
             stages.expect()
     if json:
-        with returning_freed(settings.memory_limit is not None):
+        with returning_freed(limited):
             # Read again, for all that works in between has no room for it.
             facts = describe(restoration, None if truth is None else read_input_image(truth, selection.limits()))
         print_json({"input": str(input), "output": str(output), "settings": str(settings_path), **facts})

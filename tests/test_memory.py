@@ -25,7 +25,7 @@ from turbrestore.errors import ConfigurationError, StorageError
 from turbrestore.flow import FlowParams
 from turbrestore.frame_source import FrameSource
 from turbrestore.halo_tiles import cut_around, halo_tiles, sizes_to_deblur
-from turbrestore.memory import _SHOWN_SIDE, StageMemory, _Work, plan_memory, training_share
+from turbrestore.memory import _SHOWN_SIDE, StageMemory, _Work, check_comparison, plan_memory, training_share
 from turbrestore.memory_size import MemorySize
 from turbrestore.nonlocal_tv import NonlocalParams
 from turbrestore.report.pictures import _LONGEST
@@ -33,6 +33,7 @@ from turbrestore.restoration import STAGES, RestoreParams
 from turbrestore.resumption import KeptStages, stage_facts
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.inputs import read_input_image
+from turbrestore_cli.output import describe
 
 FULL_HD = (300, 1080, 1920)
 QUICK = RestoreParams(
@@ -257,6 +258,35 @@ def test_a_comparison_with_the_truth_that_breaks_the_limit_is_refused_before_the
     assert main([*words, f"--memory-limit={limit}"]) == 2
     assert "--truth: expected a --memory-limit of at least 1." in capsys.readouterr().err
     assert not (tmp_path / "image.png").exists()
+
+
+def test_a_comparison_counts_what_whole_frames_keep_in_memory():
+    shape, limit = (200, 720, 1280), 2.6e9
+    plan = plan_memory(shape, limit)
+    assert not plan.in_file and plan.results > 8 * plan.train * 720 * 1280
+    with pytest.raises(ConfigurationError, match="--truth"):
+        check_comparison(plan, limit, shape[1:], (5000, 3750))
+    check_comparison(replace(plan, results=3e8), limit, shape[1:], (5000, 3750))
+    check_comparison(plan_memory(shape), None, shape[1:], (50_000, 50_000))
+
+
+def test_images_are_handed_back_as_they_are_compared(frames, tmp_path, monkeypatch):
+    restoration = pipeline.restore(frames[:4], replace(QUICK, train=4))
+    seen, released = [], []
+    monkeypatch.setattr("turbrestore_cli.output.compare", lambda image, truth: seen.append(id(image)) or QUICK.guards)
+    monkeypatch.setattr("turbrestore.scratch.release", lambda image: released.append(id(image)))
+    describe(restoration, frames[0])
+    assert len(seen) == 4 and released == seen
+
+
+def test_a_truth_in_the_folder_of_the_stages_is_refused(frames, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.save("clip.npy", frames[:4])
+    (tmp_path / "stages").mkdir()
+    cv2.imwrite("stages/mean.png", np.zeros((96, 96), np.uint8))
+    words = ["restore", "clip.npy", "image.png", "--truth=stages/mean.png", "--keep=stages", "--overwrite", "--quiet"]
+    assert main(words) != 0
+    assert "stages/mean.png: is an input or output already" in capsys.readouterr().err
 
 
 def test_the_truth_is_not_in_memory_while_others_work(tmp_path, monkeypatch, capsys):

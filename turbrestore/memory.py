@@ -22,7 +22,8 @@ as wide as the blur asks for.  Before, between and after tiles the whole images 
 and while a tile is worked on, what is decoded of the frame that it is cut from is in memory beside it.
 
 The constants of stages are those of ``python benchmarks/memory.py --stages``, and a tenth added: of tiles, as of whole
-frames, at 1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at 3840×2160.
+frames, at 1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at 3840×2160; of
+what codes the images of a report at 1920×1080.
 torch counts where a device is asked for, but not what a stage holds there, on the processor or not.  The deconvolution
 is told what is left, and works in strips and fewer threads where that is little; the other stages need what they need.
 So the training frames go to a file first, then fewer threads work side by side, then fewer frames are trained on, and
@@ -119,7 +120,7 @@ _WHOLE_WIDTHS = StageMemory(8, 0, 0, 0)
 # images, one after the other, and for each pixel that is shown those that are coded, and one that is.
 _REPORT_TEXT, _REPORT, _SHOWN = 60e6, StageMemory(23, 5, 0, 0), StageMemory(0, 8.8, 0, 0)
 _CODING, _SHOWN_SIDE = StageMemory(31, 5.5, 0, 0), 2048
-# A comparison with the true scene, both images included.
+# A comparison with the true scene, with both images.
 _COMPARISON = StageMemory(75, 15, 0, 0)
 # Shortest side of a tile that is worth a thread less, pixels, and the step in which sides are tried.
 _WORTH, _SIDE_STEP = 640, 32
@@ -157,6 +158,8 @@ class MemoryPlan:
         Bytes that are left for the deconvolution; None where there is no limit, or no deconvolution.
     tight : bool
         Whether memory that is freed has to go back to the system.
+    results : float
+        Bytes of the process when all is done; 0 where there is no limit.
     decisions : tuple of Decision
         What the limit has caused.
     """
@@ -168,6 +171,7 @@ class MemoryPlan:
     file_bytes: int = 0
     deconvolution: float | None = None
     tight: bool = False
+    results: float = 0.0
     decisions: tuple[Decision, ...] = ()
 
 
@@ -193,7 +197,7 @@ class _Work:
 
     @property
     def base(self) -> float:
-        return _base(self.on_device)
+        return _BASE + (TORCH_BYTES if self.on_device else 0) + (COMPILER_BYTES if can_compile() else 0)
 
     @property
     def pairs(self) -> NonlocalWork:
@@ -378,18 +382,17 @@ def plan_memory(
 
 
 def check_comparison(
-    limit: float | None, frame_shape: tuple[int, ...], truth_shape: tuple[int, ...], on_device: bool = False
+    plan: MemoryPlan, limit: float | None, frame_shape: tuple[int, ...], truth_shape: tuple[int, ...]
 ) -> None:
-    """Refuse a comparison with the true scene that would take more memory than is allowed.
+    """Refuse a comparison with the true scene, after a restoration, that would take more memory than is allowed.
 
     Parameters
     ----------
+    plan : MemoryPlan
     limit : float or None
-        Most memory of the process, bytes; that :func:`plan_memory` has a plan for.
+        What the plan is for, bytes.
     frame_shape, truth_shape : tuple of int
         (H, W) or (H, W, 3).
-    on_device : bool
-        Whether any stage computes with torch.
 
     Raises
     ------
@@ -398,20 +401,22 @@ def check_comparison(
 
     Examples
     --------
-    >>> check_comparison(2e9, (2160, 3840, 3), (2160, 3840, 3))
-    >>> check_comparison(2e9, (4320, 7680), (4320, 7680))
+    >>> plan = plan_memory((9, 4320, 7680), 2e9)
+    >>> check_comparison(plan, 2e9, (4320, 7680), (4320, 7680))
     Traceback (most recent call last):
     ...
     turbrestore.errors.ConfigurationError: --truth: ...
     """
+    if limit is None:
+        return
     pixels = max(shape[0] * shape[1] for shape in (frame_shape, truth_shape))
     channels = 3 if max(len(frame_shape), len(truth_shape)) == 3 else 1
-    least = _base(on_device) + _COMPARISON.bytes(pixels, channels, 0)
+    least = plan.results + _COMPARISON.bytes(pixels, channels, 0)
     require(
-        limit is None or limit >= least,
+        limit >= least,
         f"--truth: expected a --memory-limit of at least {size_text(1.01 * least)} to compare images of "
-        f"{truth_shape[1]}×{truth_shape[0]}, found {size_text(limit or 0)}; allow more, or compare the result with "
-        "turbrestore evaluate",
+        f"{truth_shape[1]}×{truth_shape[0]}, found {size_text(limit)}; allow more, or leave it out and compare the "
+        "result with turbrestore evaluate",
     )
 
 
@@ -459,10 +464,6 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
     return min(frame_count, max(2, min(share, int(_TRAINING_BYTES // frame_bytes))))
 
 
-def _base(on_device: bool) -> float:
-    return _BASE + (TORCH_BYTES if on_device else 0) + (COMPILER_BYTES if can_compile() else 0)
-
-
 def _tilings(work: _Work) -> Iterator[tuple[int, int]]:
     """Yield numbers of threads and sides of tiles, the best ones first."""
     largest = max(work.shape[1:3])
@@ -480,7 +481,8 @@ def _plan(work: _Work, limit: float, wanted: tuple[int, int], chosen: tuple[int,
     files = (kept + maps if in_file else 0) + (work.pairs.pairs() if room.in_file else 0)
     decisions = tuple(_decisions(work, limit, wanted, chosen, room))
     tight = bool(decisions) or work.peak(*chosen) > _ROOMY * limit
-    return MemoryPlan(count, threads, in_file, None, int(files), left, tight, decisions)
+    results = work.base + work.held() + (0 if in_file else kept)
+    return MemoryPlan(count, threads, in_file, None, int(files), left, tight, results, decisions)
 
 
 def _plan_in_tiles(work: _Work, limit: float, wanted: tuple[int, int], side: int) -> MemoryPlan:
@@ -498,7 +500,7 @@ def _plan_in_tiles(work: _Work, limit: float, wanted: tuple[int, int], side: int
     files = work.modes(train) + work.stack(train) + part.modes(train) + part.stack(train) + images
     files += to_deblur.pairs.pairs() if room.in_file else 0
     decisions = tuple(_decisions_in_tiles(work, limit, part, (threads, most), side))
-    return MemoryPlan(train, threads, True, side, int(files), left, True, decisions)
+    return MemoryPlan(train, threads, True, side, int(files), left, True, work.base, decisions)
 
 
 def _decisions_in_tiles(

@@ -150,11 +150,11 @@ def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
     with zipfile.ZipFile(stream, "w", allowZip64=True) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                in_order = array if array.flags.c_contiguous else array.T
-                if isinstance(array, np.memmap) and array.ndim and in_order.flags.c_contiguous:
-                    np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(array))
-                    for part in parts(in_order):
-                        member.write(part.data)
+                if isinstance(array, np.memmap) and array.ndim:
+                    header = np.lib.format.header_data_from_array_1_0(array)
+                    np.lib.format.write_array_header_1_0(member, header)
+                    for part in parts(array.T if header["fortran_order"] else array):
+                        member.write(np.ascontiguousarray(part).data)
                 else:
                     np.lib.format.write_array(member, array, allow_pickle=False)
 

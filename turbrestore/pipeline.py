@@ -18,6 +18,7 @@ from .blur_cues import bound_blur, displacement_maps
 from .border import Rectangle, coverage, well_seen
 from .centroid import Centroid, find_centroid
 from .decision import Decision
+from .device import needs_torch
 from .displacement import with_displacement
 from .dynamics import identify
 from .errors import DataError, require
@@ -40,15 +41,7 @@ from .images import check_space
 from .memory import MemoryPlan, plan_memory
 from .memory_size import DeconvolutionMemory
 from .psf import KOLMOGOROV
-from .restoration import (
-    STAGES,
-    Restoration,
-    RestoreParams,
-    StageResults,
-    explain_devices,
-    place_stages,
-    uses_torch,
-)
+from .restoration import STAGES, Restoration, RestoreParams, StageResults, explain_devices, place_stages
 from .scratch import kept_in, mean_of, new_stack, release, returning_freed, walk
 from .tiled_stages import FilteredTiles, filter_tiles, find_tiled_centroid
 
@@ -153,6 +146,8 @@ def memory_plan(source: FrameSource, params: RestoreParams) -> MemoryPlan:
     >>> plan.train, plan.in_file
     (9, False)
     """
+    params = place_stages(params)
+    placed = params.flow.device, params.filter.device, params.deconvolution.device
     return plan_memory(
         source.shape,
         params.memory_limit,
@@ -163,7 +158,7 @@ def memory_plan(source: FrameSource, params: RestoreParams) -> MemoryPlan:
         params.deconvolution,
         params.until,
         blur_bounds=params.blur_bounds,
-        on_device=uses_torch(params),
+        on_device=any(map(needs_torch, (params.device, *placed))),
     )
 
 

@@ -14,7 +14,7 @@ from .border import Rectangle
 from .centroid import Centroid, CentroidParams
 from .decision import Decision
 from .deconvolution import Deconvolution, DeconvolutionParams
-from .device import FLOW, PROCESSOR, check_device, explain_device, find_device, needs_torch
+from .device import FLOW, PROCESSOR, check_device, explain_device, find_device
 from .dynamics import DynamicsParams
 from .errors import require
 from .flow import FlowParams
@@ -170,32 +170,6 @@ def place_stages(params: RestoreParams) -> RestoreParams:
         filter=replace(fusion, device=find_device(fusion.device or params.device)),
         deconvolution=replace(deconvolution, device=find_device(deconvolution.device or params.device)),
     )
-
-
-def uses_torch(params: RestoreParams) -> bool:
-    """Whether any stage may compute with torch.
-
-    Parameters
-    ----------
-    params : RestoreParams
-
-    Returns
-    -------
-    bool
-
-    Raises
-    ------
-    ConfigurationError
-        A device is not there.
-
-    Examples
-    --------
-    >>> uses_torch(RestoreParams())
-    False
-    """
-    placed = place_stages(params)
-    devices = params.device, placed.flow.device, placed.filter.device, placed.deconvolution.device
-    return any(map(needs_torch, devices))
 
 
 def explain_devices(params: RestoreParams) -> tuple[Decision, ...]:

@@ -241,9 +241,10 @@ def returning_freed(wanted: bool = True) -> Iterator[None]:
     """Have large arrays given back to the system as soon as they are freed, meanwhile.
 
     The allocator of glibc otherwise raises the size from which it does so with every large array that is freed, and
-    what lies between those that are in use stays with the process: a third of the peak at 1920×1080.  Afterwards it
-    keeps arrays up to the size that it would have come to by itself.  The setting is that of the process: where two
-    work at the same time, it is that of the one that came or left last, which costs one of them time or memory.
+    what lies between those that are in use stays with the process: a third of the peak at 1920×1080.  Afterwards small
+    ones have been given back too, and it keeps arrays up to the size that it would have come to by itself.  The setting
+    is that of the process: where two work at the same time, it is that of the one that came or left last, which costs
+    one of them time or memory.
 
     Parameters
     ----------
@@ -259,6 +260,7 @@ def returning_freed(wanted: bool = True) -> Iterator[None]:
     adjustable = wanted and platform.libc_ver()[0] == "glibc"
     if adjustable:
         ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGE)
+        ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, 2 * _LARGE)
     try:
         yield
     finally:

@@ -12,11 +12,11 @@ import os
 import shlex
 from collections.abc import Iterable
 from importlib.resources import files
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from ..errors import ConfigurationError
 from ..images import atomic_write, check_output
-from ..plots import new_figure
 from ..restoration import Restoration
 from ..run_record import RunRecord
 from ..scratch import returning_freed
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import jinja2
 
 _SUFFIXES = (".html", ".htm")
+_PACKAGES = ("matplotlib", "jinja2")
 
 
 def check_report(
@@ -59,8 +60,10 @@ def check_report(
     turbrestore.errors.ConfigurationError: report.txt: expected a name that ends in .html or .htm, found .txt
     """
     check_output(path, inputs, overwrite, _SUFFIXES)
-    new_figure()
-    _environment()
+    # They are loaded when they are used: a restoration has no room for them.
+    for package in _PACKAGES:
+        if find_spec(package) is None:
+            raise _missing(package)
 
 
 def write_report(
@@ -161,10 +164,14 @@ def _environment() -> jinja2.Environment:
     try:
         import jinja2
     except ImportError as error:
-        raise ConfigurationError(
-            "report: expected jinja2, which is not installed; run pip install 'turbrestore[report]'"
-        ) from error
+        raise _missing("jinja2") from error
     return jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+
+
+def _missing(package: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"report: expected {package}, which is not installed; run pip install 'turbrestore[report]'"
+    )
 
 
 def _policy(style: str, script: str) -> str:
