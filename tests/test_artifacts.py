@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from turbrestore.deconvolution import Deconvolution
 from turbrestore.errors import ConfigurationError, DataError, InputNotFoundError, OutputError
 from turbrestore.flow_model import FlowDynamics
 from turbrestore.images import write_image
+from turbrestore.npy import write_npz
 from turbrestore.pipeline import RestoreParams, restore
+from turbrestore.scratch import new_stack
 
 
 @pytest.fixture(scope="module")
@@ -198,3 +201,27 @@ def test_odd_headers_are_refused(tmp_path, header):
 def test_bounds_may_be_open(tmp_path):
     save_artifact(tmp_path / "a.npz", BlurBounds(0.0, float("inf")))
     assert load_artifact(tmp_path / "a.npz", BlurBounds) == BlurBounds(0.0, float("inf"))
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        lambda stack: stack,
+        lambda stack: stack.T,
+        lambda stack: stack[:, 1:-1, 2:],
+        lambda stack: stack[::-1],
+        lambda stack: stack[:0],
+    ],
+)
+def test_mapped_arrays_are_written_part_by_part_as_numpy_writes_them(tmp_path, monkeypatch, view):
+    stack = new_stack((5, 6, 7), tmp_path)
+    stack[...] = np.arange(210).reshape(5, 6, 7)
+    monkeypatch.setattr("turbrestore.scratch._PART", 20)
+    largest = []
+    monkeypatch.setattr("turbrestore.scratch.release", lambda part: largest.append(part.size))
+    with (tmp_path / "a.npz").open("wb") as stream:
+        write_npz(stream, {"x": view(stack)})
+    np.savez(tmp_path / "b.npz", x=view(np.asarray(stack)))
+    contents = [zipfile.ZipFile(tmp_path / name).read("x.npy") for name in ("a.npz", "b.npz")]
+    assert contents[0] == contents[1]
+    assert max(largest, default=0) <= 42
