@@ -234,4 +234,4 @@ class TestResults:
 
     def test_an_image_that_a_format_cannot_hold(self):
         with pytest.raises(DataError, match="webp can hold, found 20000×2"):
-            encode_image(np.zeros((2, 20_000), np.float32), "webp")
+            encode_image(np.zeros((2, 20_000), np.uint8), "webp")

@@ -19,39 +19,10 @@ _LOSSLESS = 101
 _THUMBNAIL = 224
 
 
-def encode_image(image: FloatArray, kind: Literal["png", "webp"] = "png", quality: int | None = None) -> bytes:
-    """Image file of 8 bits.
-
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Clipped to [0, 1].
-    kind : {"png", "webp"}
-    quality : int, optional
-        Of WebP, 1 to 100; lossless by default.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    DataError
-        The image cannot be encoded, for example because it is larger than the format allows.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> encode_image(np.zeros((4, 4), np.float32))[1:4]
-    b'PNG'
-    """
-    return encode_levels(from_unit(image, 8), kind, quality)
-
-
-def encode_levels(
+def encode_image(
     pixels: NDArray[np.unsignedinteger], kind: Literal["png", "webp"] = "png", quality: int | None = None
 ) -> bytes:
-    """Image file of 8 bits, from levels.
+    """Image file of 8 bits.
 
     Parameters
     ----------
@@ -71,7 +42,7 @@ def encode_levels(
 
     Examples
     --------
-    >>> encode_levels(np.zeros((4, 4), np.uint8))[1:4]
+    >>> encode_image(np.zeros((4, 4), np.uint8))[1:4]
     b'PNG'
     """
     settings = [] if kind == "png" else [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS if quality is None else quality]
@@ -132,9 +103,8 @@ def preview(title: str, facts: Iterable[tuple[str, str]], image: FloatArray | No
         f"<td style='text-align:left;padding:1px 0;font-variant-numeric:tabular-nums'>{html.escape(value)}</td></tr>"
         for name, value in facts
     )
-    picture = (
-        "" if image is None else f"<img alt='' style='flex:none' src='{data_uri(encode_image(_thumbnail(image)))}'>"
-    )
+    address = "" if image is None else data_uri(encode_image(from_unit(_thumbnail(image), 8)))
+    picture = f"<img alt='' style='flex:none' src='{address}'>" if address else ""
     return (
         f"<div style='display:flex;flex-wrap:wrap;gap:16px;align-items:flex-start'>{picture}"
         f"<div><strong>{html.escape(title)}</strong><table style='border:0;margin:4px 0 0'>{rows}</table></div></div>"

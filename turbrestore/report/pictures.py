@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, from_unit
-from ..preview import data_uri, encode_levels
+from ..preview import data_uri, encode_image
 from ..restoration import Restoration
 from ..scratch import parts, walk
 
@@ -109,9 +109,9 @@ def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
     """
     shown = dict(zip(images, map(_levels, walk(images.values())), strict=True))
     coding = "8 bits, lossless"
-    files = {key: encode_levels(levels, "webp") for key, levels in shown.items()}
+    files = {key: encode_image(levels, "webp") for key, levels in shown.items()}
     if sum(map(len, files.values())) > _LOSSLESS_BYTES:
-        files = {key: encode_levels(levels, "webp", _QUALITY) for key, levels in shown.items()}
+        files = {key: encode_image(levels, "webp", _QUALITY) for key, levels in shown.items()}
         coding = f"8 bits, WebP of quality {_QUALITY}"
     if max(images["result"].shape[:2]) > _LONGEST:
         coding += f", reduced to {_LONGEST} pixels"
