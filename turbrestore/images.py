@@ -173,8 +173,9 @@ def write_image(
     path = Path(path)
     check_output(path, overwrite=overwrite)
     depth = check_depth(32 if bit_depth is None else bit_depth)
-    pixels = _stored(check_image(image, "image"), depth, is_tiff=path.suffix.lower() != ".png")
-    if path.suffix.lower() == ".png":
+    is_tiff = path.suffix.lower() != ".png"
+    pixels = _stored(check_image(image, "image"), depth, is_tiff)
+    if not is_tiff:
         atomic_write(path, _encode_png(path, pixels), overwrite)
         return
     import tifffile
