@@ -14,6 +14,7 @@ from turbrestore.blur_estimation import (
     _lowest,
     _most_detailed,
     _reduce,
+    _widen,
     estimate_blur,
 )
 from turbrestore.errors import ConfigurationError, DataError
@@ -119,6 +120,15 @@ def test_the_scene_of_a_blur_solves_its_normal_equations():
         scene, prior, _ = _fit_scene(gradients, scene, prior, blur=(1.5, GAUSSIAN), noise=noise)
     gradient = blur(y - blur(scene)) / (2 * noise**2) - scene / before
     assert np.abs(gradient).max() < 0.02 * np.abs(blur(y) / (2 * noise**2)).max()
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
+def test_the_uncertainty_is_half_of_what_half_and_twice_the_noise_differ_by(sigma):
+    image = blurred("camera", sigma, 0.005)
+    found = estimate_blur(image)
+    gradients = _gradients(_most_detailed(_reduce(image, found.reduction)))
+    less, more = (_lowest(_costs(gradients, KOLMOGOROV, share * found.noise, 1)) for share in (0.5, 2.0))
+    assert found.uncertainty == abs(_widen(more, found.reduction) - _widen(less, found.reduction)) / 2
 
 
 @pytest.mark.parametrize("scene", ["chart", "camera", "brick"])
