@@ -44,6 +44,8 @@ THREADS = 2
 # Frames, height and width.
 ROWS = ((50, 128, 128), (120, 256, 256), (300, 256, 256), (200, 512, 512))
 FULL_ROWS = ((1000, 256, 256), (25, 1080, 1920))
+# Restored without Numba too.
+PLAIN_ROW = (120, 256, 256)
 # Clips of so many pixels in all are restored three times.
 REPEATED, RUNS = 25_000_000, 3
 # What the exponents are fitted to: two passes of the centroid, and so many frames to train, whatever the clip.
@@ -96,9 +98,11 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
         "## Against the flow calls\n",
         "Seconds of a whole restoration with the default settings, and of the optical flow alone that it asks for, "
         f"each call by itself from a frame. The bound of both ratios is {TIME_BOUND}. Clips whose flow alone takes a "
-        "second break it, by what is done once, above all the deconvolution. As made, most calls start from an earlier "
-        "flow of the frame, which has been prepared already, and are cheaper: no bound holds for the ratio to these.\n",
+        "second or less break it, by what is done once, above all the deconvolution. As made, most calls start from an "
+        "earlier flow of the frame, which has been prepared already, and are cheaper: no bound holds for the ratio to "
+        "these.\n",
         *_time_table((*ROWS, *FULL_ROWS) if full else ROWS, tree, broken),
+        *_plain_lines(),
         "\n## Growth\n",
         "Exponent of the time of a restoration, fitted to four clips each, with two passes of the centroid and "
         f"{TRAINED} frames to train.\n",
@@ -157,11 +161,29 @@ def _ratio(figures: Figures) -> float:
     return float(figures["whole"] / figures["bare"])
 
 
+def _plain_lines() -> list[str]:
+    """Sentence on the ratio without a compiler, which no bound holds for."""
+    if find_spec("numba") is None:
+        return []
+    count, height, width = PLAIN_ROW
+    task = {"kind": "time", "frames": count, "height": height, "width": width, "plain": True}
+    found = sorted((child(__file__, task) for _ in range(RUNS)), key=_ratio)[RUNS // 2]
+    ratio, work = _ratio(found), found["whole_work"] / found["bare_work"]
+    return [
+        f"\nBounds are those with Numba, the extra `fast`. Without it {count} frames of {width}×{height} take "
+        f"{found['whole']:.1f} s, {ratio:.2f} times their flow calls, and {work:.2f} times their processor time."
+    ]
+
+
 def _parts_table(tree: Path | None) -> list[str]:
     task = {"kind": "parts"}
-    old, new = child(__file__, task, tree) if tree else None, child(__file__, task)
-    lines = [f"| |{' before |' if old else ''} now |", f"|---|{'---:|' * (1 + bool(old))}"]
-    lines += [f"| {name} |{f' {old[name]:.3g} |' if old else ''} {found:.3g} |" for name, found in new.items()]
+    columns = {"before": child(__file__, task, tree)} if tree else {}
+    columns |= {"now": child(__file__, task)}
+    if find_spec("numba"):
+        columns |= {"now, without Numba": child(__file__, task | {"plain": True})}
+    lines = [f"| | {' | '.join(columns)} |", f"|---|{'---:|' * len(columns)}"]
+    for name in columns["now"]:
+        lines.append(f"| {name} | {' | '.join(f'{column[name]:.3g}' for column in columns.values())} |")
     return lines
 
 
@@ -233,8 +255,11 @@ def exponent(clips: list[tuple[int, int]], tree: Path | None = None) -> float:
 def run_child(task: Figures) -> Figures:
     """Restore a clip and say how long it took, how long its flow calls take alone, and the peak memory, MB.
 
-    A task of the kind ``parts`` restores nothing.
+    A task of the kind ``parts`` restores nothing.  One that is ``plain`` does without Numba.
     """
+    if task.get("plain"):
+        # What is None here cannot be found, nor imported.
+        sys.modules["numba"] = None  # type: ignore[assignment]
     if task["kind"] == "parts":
         return measure_parts()
     source, sample = repeated(task["frames"], task["height"], task["width"])

@@ -23,11 +23,12 @@ from turbrestore.patch_search import BAND_ROWS, OUTSIDE, PatchSearch, choose_off
 from turbrestore.pixel_fusion import PixelFusion, take_in_pixels
 from turbrestore.primal_dual import _follow, follow_loops
 from turbrestore.synthesis.scenes import SCENES
+from turbrestore.tvl1_sweeps import FlowProblem, SweepParams, sweep, sweep_frame
 from turbrestore.warp import sample_spline, warp
 
 USERS = (
     *("blur_estimation", "frame_noise", "nonlocal_penalty", "nonlocal_tv", "patch_search", "pixel_fusion", "warp"),
-    *("patch_pairs", "primal_dual", "confidence", "flow_model"),
+    *("patch_pairs", "primal_dual", "confidence", "flow_model", "tvl1_sweeps"),
 )
 rng = np.random.default_rng(0)
 needs_compiler = pytest.mark.skipif(not compiling.can_compile(), reason="Numba is not installed: nothing to compare")
@@ -118,6 +119,28 @@ def test_a_flow_is_projected_alike(plain, shape, rank, order):
 
 
 @needs_compiler
+@pytest.mark.parametrize("huber", [0.0, 0.3])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (9, 1), (2, 2), (31, 45)])
+def test_flows_are_swept_alike(plain, shape, huber):
+    """From any start, the same flow and dual variable; each frame of a batch by itself."""
+    random = np.random.default_rng(23)
+    angle, offset, bound = random.uniform(0, 6, (3, 2, *shape)).astype(np.float32)
+    problem = FlowProblem(np.stack([np.cos(angle), np.sin(angle)], 1), 2 * offset - 6, bound / 3)
+    start, pull = random.normal(0, 1, (2, 2, *shape)), random.normal(0, 0.5, (2, 2, 2, *shape))
+    pull[:, 0, :, :, -1] = pull[:, 1, :, -1, :] = 0
+
+    def swept():
+        dual = pull.astype(np.float32)
+        return sweep(problem, start.astype(np.float32), dual, SweepParams(15, 0.7, huber), np), dual
+
+    (fast, fast_dual), (slow, slow_dual) = both(plain, swept)
+    assert fast.dtype == slow.dtype == np.float32
+    assert fast == pytest.approx(slow, abs=2e-5)
+    assert fast_dual == pytest.approx(slow_dual, abs=2e-5)
+    assert np.abs(slow - start).max() > 0.1
+
+
+@needs_compiler
 def test_folds_are_found_where_the_jacobian_vanishes(plain):
     flow = rng.normal(0, 3.0, (33, 21, 2)).astype(np.float32)
     fast, slow = both(plain, lambda: _folded(flow))
@@ -140,6 +163,7 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
         join_choices,
         mark_folds,
         sample_spline,
+        sweep_frame,
         take_in_pixels,
         weigh_pixels,
     ],

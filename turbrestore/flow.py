@@ -140,8 +140,8 @@ class FlowParams:
     threads : int
         Frames solved side by side; 0 means one per available core.
     device : str, optional
-        Where ``tvl1`` runs: cpu, cuda or auto; the other methods are OpenCV's and run on the processor.  By
-        default where the whole chain is computed, and cpu for this stage alone.
+        Where ``tvl1`` runs, and frames are warped for the centroid: cpu, cuda or auto; the other methods are OpenCV's
+        and run on the processor.  By default where the whole chain is computed, and cpu for this stage alone.
     dis : DisParams
         Settings of dense inverse search.
     tvl1 : TvL1Params
