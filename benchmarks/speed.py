@@ -7,7 +7,8 @@ prints a Markdown document, writes it, and exits with 1 when a bound is broken. 
 process, flow calls before and after the restoration, because machines differ and drift; of the shorter clips three
 times, and the run whose ratio is in the middle counts.  Peak memory is that of a child process.  ``--before`` names a
 revision of this repository that is measured beside the present tree, row by row; ``--full`` adds 1,000 frames,
-1920×1080, and what ``benchmarks/tvl1.py`` and ``benchmarks/deconvolution.py`` print.
+1920×1080, and what ``benchmarks/tvl1.py`` and ``benchmarks/deconvolution.py`` print.  Where Numba is installed, some
+figures are taken without it too.
 """
 
 from __future__ import annotations

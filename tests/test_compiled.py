@@ -122,7 +122,7 @@ def test_a_flow_is_projected_alike(plain, shape, rank, order):
 @pytest.mark.parametrize("huber", [0.0, 0.3])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (9, 1), (2, 2), (31, 45)])
 def test_flows_are_swept_alike(plain, shape, huber):
-    """From any start, the same flow and dual variable; each frame of a batch by itself."""
+    """The same flow and dual variable, from any that vanishes across the border; each frame of a batch by itself."""
     random = np.random.default_rng(23)
     angle, offset, bound = random.uniform(0, 6, (3, 2, *shape)).astype(np.float32)
     problem = FlowProblem(np.stack([np.cos(angle), np.sin(angle)], 1), 2 * offset - 6, bound / 3)

@@ -57,6 +57,14 @@ def energy(problem, flow, huber):
 
 
 class TestSweeps:
+    @pytest.fixture(params=["compiled", "arrays"], scope="class", autouse=True)
+    def way(self, request):
+        """Both ways to sweep, where there is a compiler."""
+        with pytest.MonkeyPatch.context() as patch:
+            if request.param == "arrays":
+                patch.setattr("turbrestore.tvl1_sweeps.compiled", lambda loops: None)
+            yield
+
     @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (6, 1), (8, 13)])
     def test_divergence_is_the_negative_adjoint_of_the_differences(self, shape):
         rng = np.random.default_rng(1)

@@ -98,7 +98,8 @@ def sweep(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams, a
     flow : stack, shape (B, 2, H, W)
         u to begin with; overwritten.
     dual : stack, shape (B, 2, 2, H, W)
-        p: axis (x, y), component; overwritten by what it ends as.
+        p: axis (x, y), component; overwritten by what it ends as.  Its x vanishes in the last column, its y in the
+        last row.
     params : SweepParams
         Step and count.
     arrays : module
@@ -107,7 +108,7 @@ def sweep(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams, a
     Returns
     -------
     stack, shape (B, 2, H, W)
-        u.
+        u; perhaps ``flow`` itself.
 
     Examples
     --------
@@ -177,7 +178,7 @@ def sweep_frame(
     flow, ahead : ndarray, float32, shape (2, H, W)
         u and ū; overwritten.
     dual : ndarray, float32, shape (2, 2, H, W)
-        p: axis (x, y), component; overwritten.
+        p, as for :func:`sweep`; overwritten.
     steps : ndarray, float32, shape (4,)
         τ, σ, ``1 / (1 + σα)`` and the number of sweeps.
 
