@@ -132,7 +132,7 @@ def strips_difference() -> float:
 
 
 def tiles_difference() -> tuple[float, float, float]:
-    """Differences between an image deblurred in tiles with halos and the whole: rms, largest, and that further inside."""
+    """Differences between an image deblurred in tiles with halos and the whole: rms, largest, largest inside."""
     # Earlier trees, which are measured by this module too, have none of these.
     from turbrestore.halo_tiles import halo_tiles
     from turbrestore.tiled_stages import deconvolve_tiles

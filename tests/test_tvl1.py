@@ -56,15 +56,18 @@ def energy(problem, flow, huber):
     return data.sum() + np.where(length <= huber, length**2 / (2 * huber), length - huber / 2).sum()
 
 
-class TestSweeps:
-    @pytest.fixture(params=["compiled", "arrays"], scope="class", autouse=True)
-    def way(self, request):
-        """Both ways to sweep, where there is a compiler."""
-        with pytest.MonkeyPatch.context() as patch:
-            if request.param == "arrays":
-                patch.setattr("turbrestore.tvl1_sweeps.compiled", lambda loops: None)
-            yield
+both_ways = pytest.mark.parametrize("way", ["compiled", "arrays"])
 
+
+def sweep_by(way, problem, flow, dual, params):
+    """Sweep compiled, where there is a compiler, or by array operations."""
+    with pytest.MonkeyPatch.context() as patch:
+        if way == "arrays":
+            patch.setattr("turbrestore.tvl1_sweeps.compiled", lambda loops: None)
+        return sweep(problem, flow, dual, params, np)
+
+
+class TestSweeps:
     @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (6, 1), (8, 13)])
     def test_divergence_is_the_negative_adjoint_of_the_differences(self, shape):
         rng = np.random.default_rng(1)
@@ -86,17 +89,17 @@ class TestSweeps:
         params = SweepParams(1, 0.7, 0.3)
         assert 0.97 < params.step * params.dual_step * np.linalg.norm(u) < 1
 
+    @both_ways
     @given(st.floats(0, 6.28), st.floats(-5, 5), st.floats(0, 4), st.floats(0.1, 2), st.floats(-3, 3), st.floats(-3, 3))
     @settings(max_examples=60, deadline=None)
-    def test_primal_step_is_the_proximal_map(self, angle, offset, bound, step, a, b):
+    def test_primal_step_is_the_proximal_map(self, way, angle, offset, bound, step, a, b):
         direction = np.array([np.cos(angle), np.sin(angle)])
         one = np.ones((1, 1, 1))
         problem = FlowProblem(direction[None, :, None, None], offset * one, bound * one)
         start = np.array([a, b])
         # A single pixel has no differences: the sweep is the proximal map alone.
-        found = sweep(
-            problem, start[None, :, None, None].copy(), np.zeros((1, 2, 2, 1, 1)), SweepParams(1, step, 0), np
-        )
+        dual, params = np.zeros((1, 2, 2, 1, 1)), SweepParams(1, step, 0)
+        found = sweep_by(way, problem, start[None, :, None, None].copy(), dual, params)
 
         def objective(v):
             return bound * np.abs(offset + v @ direction) + ((v - start) ** 2).sum(-1) / (2 * step)
@@ -106,17 +109,19 @@ class TestSweeps:
         best = objective(start - along * direction).min()
         assert objective(found[0, :, 0, 0]) <= best + 1e-12
 
-    def test_sweeps_do_what_plain_loops_do(self):
+    @both_ways
+    def test_sweeps_do_what_plain_loops_do(self, way):
         problem, flow, dual = problem_of(2)
         params = SweepParams(7, 0.6, 0.2)
         slow_flow, slow_dual = slow_sweeps(problem, flow[0], dual[0], params)
-        found = sweep(problem, flow.copy(), dual, params, np)
+        found = sweep_by(way, problem, flow.copy(), dual, params)
         assert np.abs(found[0] - slow_flow).max() < 1e-12
         assert np.abs(dual[0] - slow_dual).max() < 1e-12
 
-    def test_dual_variable_stays_admissible(self):
+    @both_ways
+    def test_dual_variable_stays_admissible(self, way):
         problem, flow, dual = problem_of(3)
-        sweep(problem, flow, dual, SweepParams(20, 0.7, 0.1), np)
+        sweep_by(way, problem, flow, dual, SweepParams(20, 0.7, 0.1))
         assert np.hypot(dual[:, 0], dual[:, 1]).max() <= 1 + 1e-12
         assert not dual[:, 0, :, :, -1].any()
         assert not dual[:, 1, :, -1, :].any()
@@ -129,13 +134,14 @@ class TestSweeps:
         assert np.abs(out.sum((-1, -2))).max() < 1e-4
         assert np.hypot(finer[:, 0], finer[:, 1]).max() < 1
 
-    def test_energy_falls_to_the_minimum(self):
+    @both_ways
+    def test_energy_falls_to_the_minimum(self, way):
         problem, flow, _ = problem_of(4, (7, 8))
         huber = 0.3
         energies = []
         for count in (0, 10, 40, 160, 3000):
             u, p = flow.copy(), np.zeros((1, 2, 2, 7, 8))
-            energies.append(energy(problem, sweep(problem, u, p, SweepParams(count, 0.7, huber), np), huber))
+            energies.append(energy(problem, sweep_by(way, problem, u, p, SweepParams(count, 0.7, huber)), huber))
         assert all(a > b for a, b in pairwise(energies))
 
         def smoothed(values):
