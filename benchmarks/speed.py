@@ -260,7 +260,7 @@ def run_child(task: Figures) -> Figures:
     """
     if task.get("plain"):
         # What is None here cannot be found, nor imported.
-        sys.modules["numba"] = None  # type: ignore[assignment]
+        sys.modules["numba"] = None
     if task["kind"] == "parts":
         return measure_parts()
     source, sample = repeated(task["frames"], task["height"], task["width"])
