@@ -11,6 +11,9 @@ less than five times faster than OpenCV's on any set, or its error is larger.
 
 ``--starts`` compares what a flow may start from instead: nothing, the flow to the frame before, the one-step prediction
 of a dynamic texture that was identified on 40 earlier frames, and for a bound the flow to the frame itself.
+
+``--clips`` restores the clips with truth instead, among them those under the folder that ``TURBRESTORE_DATA`` names: by
+TV-L1 that begins every flow anew, that starts from earlier flows, and by dense inverse search.
 """
 
 from __future__ import annotations
@@ -21,12 +24,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from turbrestore.arrays import FloatArray, luminance
-from turbrestore.flow import FlowParams, iterate_flows, normalise_contrast
+from turbrestore.flow import FlowParams, Solver, iterate_flows, normalise_contrast
 from turbrestore.metrics import endpoint_error
 from turbrestore.parallel import map_ahead
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
@@ -34,11 +39,12 @@ from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import synthesize_like
 from turbrestore.synthesis.scenes import SCENES, resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
-from turbrestore.tvl1 import TvL1Flows, TvL1Params, refer_tvl1, tvl1_flows
+from turbrestore.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
 
 SIDE, THREADS, LEAST_RATIO = 192, 2, 5.0
 # Frames that a dynamic texture is identified on, later frames that flows are started for, and levels of the pyramid.
 IDENTIFIED, STARTED, STARTED_LEVELS = 40, 12, (4, 3, 2, 1)
+Found = TypeVar("Found")
 BASELINE, OURS = "DualTVL1, its defaults", "tvl1"
 
 
@@ -133,9 +139,10 @@ def main() -> int:
     choice = parser.add_mutually_exclusive_group()
     choice.add_argument("--quick", action="store_true", help="half of the frames, one run")
     choice.add_argument("--starts", action="store_true", help="compare what flows start from")
+    choice.add_argument("--clips", action="store_true", help="restore clips with and without starts")
     options = parser.parse_args()
-    if options.starts:
-        compare_starts()
+    if options.starts or options.clips:
+        (compare_starts if options.starts else compare_clips)()
         return 0
     count, runs = (4, 1) if options.quick else (8, 3)
     good = True
@@ -187,8 +194,38 @@ def compare_starts() -> None:
         print()
 
 
-def _clocked(call: Callable[[], TvL1Flows]) -> tuple[TvL1Flows, float]:
-    """Flows, and the processor time that they took, s."""
+def compare_clips() -> None:
+    """Print the processor time of whole restorations, and PSNR of the filtered and the deblurred image."""
+    from clips import find_clips
+
+    from turbrestore.flow import FLOW_METHODS
+    from turbrestore.metrics import compare
+    from turbrestore.pipeline import RestoreParams, restore
+
+    started = FLOW_METHODS["tvl1"]
+
+    def begin_anew(params: FlowParams, reference: NDArray[np.uint8], start_level: int) -> Solver:
+        solve = started(params, reference, start_level)
+        return lambda frames, starts: solve(frames, [None] * len(starts))
+
+    # What the others take is not to be that of the compiler.
+    restore(phase_screens(12).frames, RestoreParams(flow=FlowParams(method="tvl1")))
+    ways = {"tvl1, begun anew": ("tvl1", begin_anew), "tvl1": ("tvl1", started), "dis": ("dis", started)}
+    print(f"| clip | {' | '.join(f'{way}: s, filtered, deblurred' for way in ways)} |\n|---|{'---|' * len(ways)}")
+    for name, load in find_clips([]).items():
+        clip, cells = load(), []
+        if clip.truth is None:
+            continue
+        for method, FLOW_METHODS["tvl1"] in ways.values():
+            call = partial(restore, clip.frames, RestoreParams(flow=FlowParams(method=method)))
+            found, spent = _clocked(call)
+            images = found.filtered.image, found.deconvolution.image
+            cells.append(f"{spent:.1f}, " + ", ".join(f"{compare(image, clip.truth).psnr:.3f}" for image in images))
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+def _clocked(call: Callable[[], Found]) -> tuple[Found, float]:
+    """Return what a call gives, and the processor time that it took, s."""
     begun = time.process_time()
     return call(), time.process_time() - begun
 

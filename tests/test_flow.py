@@ -1,4 +1,5 @@
 import threading
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from turbrestore.flow import (
 from turbrestore.metrics import endpoint_error
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
+from turbrestore.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
 from turbrestore.warp import warp
 
 
@@ -168,9 +170,10 @@ def test_what_is_prepared_of_a_frame_serves_every_reference():
     assert np.array_equal(flows, estimate_flow(other, stack))
 
 
-def test_a_flow_from_a_good_start_is_as_good_as_one_from_none():
+@pytest.mark.parametrize("method", ["dis", "tvl1"])
+def test_a_flow_from_a_good_start_is_as_good_as_one_from_none(method):
     reference, frame, truth = pair(rms=2.0)
-    params, found = FlowParams(confidence=False), (truth + np.float32(0.5))[None]
+    params, found = FlowParams(method=method, confidence=False), (truth + np.float32(0.5))[None]
     anew = estimate_flow(reference, frame[None], params)[0]
     fill_flows(refer_flow(reference, params), frame[None], found, again=True)
     errors = [endpoint_error(one[8:-8, 8:-8], truth[8:-8, 8:-8]) for one in (found[0], anew)]
@@ -190,21 +193,23 @@ def test_a_flow_begins_at_its_start(finest):
     assert errors[1] > 2
 
 
-def test_a_start_includes_the_shift_of_the_frame():
-    reference, frame = texture(size=128), texture(size=128)
+@pytest.mark.parametrize("method", ["dis", "tvl1"])
+def test_a_start_includes_the_shift_of_the_frame(method):
+    reference, frame, params = texture(size=128), texture(size=128), FlowParams(method=method)
     frame = np.roll(frame, 20, axis=1)
-    flows = estimate_flow(reference, frame[None])
+    flows = estimate_flow(reference, frame[None], params)
     again = flows.copy()
-    fill_flows(refer_flow(reference), frame[None], again, again=True)
+    fill_flows(refer_flow(reference, params), frame[None], again, again=True)
     inside = np.s_[0, 30:-30, 30:-30, 0]
     assert np.median(flows[inside]) == pytest.approx(20, abs=0.1)
     assert again[inside] == pytest.approx(flows[inside], abs=0.2)
 
 
-def test_the_shift_of_a_start_is_not_measured_again(monkeypatch):
-    reference = texture(size=128)
-    frame, target = np.roll(reference, 20, axis=1), refer_flow(reference)
-    flows = estimate_flow(reference, frame[None])
+@pytest.mark.parametrize(("method", "most"), [("dis", 0.05), ("tvl1", 0.5)])
+def test_the_shift_of_a_start_is_not_measured_again(monkeypatch, method, most):
+    reference, params = texture(size=128), FlowParams(method=method)
+    frame, target = np.roll(reference, 20, axis=1), refer_flow(reference, params)
+    flows = estimate_flow(reference, frame[None], params)
 
     def refuse(*arguments):
         raise AssertionError("measured again")
@@ -213,7 +218,7 @@ def test_the_shift_of_a_start_is_not_measured_again(monkeypatch):
     before = flows.copy()
     fill_flows(target, frame[None], flows, again=True)
     # Without the shift what nobody saw would not stay where the reference has it.
-    assert np.abs(flows[0, :, -18:] - before[0, :, -18:]).max() < 0.05
+    assert np.abs(flows[0, :, -18:] - before[0, :, -18:]).max() < most
 
 
 @pytest.mark.parametrize("motion", [6, 12, 20])
@@ -244,11 +249,35 @@ def test_a_flow_with_a_start_begins_at_its_level_and_is_refined_half_as_often(re
     assert np.array_equal(found[0], solver.calc(*levels, start[0].copy()))
 
 
+@pytest.mark.parametrize("level", [0, 1])
+def test_tvl1_with_a_start_goes_through_two_levels(level):
+    reference, frame, truth = pair(rms=2.0)
+    params, found = FlowParams(method="tvl1", confidence=False), truth[None].copy()
+    fill_flows(refer_flow(reference, params, level), frame[None], found, again=True)
+    grey = [refer_flow(reference, params).prepare(image).levels.astype(np.float32) for image in (reference, frame)]
+    anew = refer_tvl1(grey[0], TvL1Params(levels=2))
+    assert np.array_equal(found[0], tvl1_flows(grey[1][None], anew, truth[None]).flows[0])
+
+
+@pytest.mark.parametrize("method", ["dis", "tvl1"])
+def test_of_a_batch_some_have_a_start_and_some_have_none(method):
+    params = FlowParams(method=method)
+    reference, _, _ = pair(0)
+    target = refer_flow(reference, params)
+    frames = [target.prepare(pair(seed)[1]) for seed in range(4)]
+    for number in (1, 2):
+        frames[number] = replace(frames[number], start=pair(number)[2])
+    alone = [target.solve([frame])[0] for frame in frames]
+    assert np.array_equal(target.solve(frames), alone)
+    assert not np.array_equal(alone[1], target.solve([replace(frames[1], start=None)])[0])
+
+
+@pytest.mark.parametrize("method", ["dis", "tvl1"])
 @pytest.mark.parametrize("shape", [(16, 16), (17, 40)])
-def test_a_start_in_the_smallest_images(shape):
+def test_a_start_in_the_smallest_images(shape, method):
     image = texture(size=64)[: shape[0], : shape[1]]
-    flows = np.zeros((1, *shape, 2), np.float32)
-    fill_flows(refer_flow(image, start_level=1), image[None], flows, again=True)
+    flows, params = np.zeros((1, *shape, 2), np.float32), FlowParams(method=method)
+    fill_flows(refer_flow(image, params, start_level=1), image[None], flows, again=True)
     assert np.abs(flows).max() < 0.1
 
 

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from importlib.util import find_spec
 from itertools import pairwise
 
@@ -280,17 +279,29 @@ class TestEnd:
         params = TvL1Params(warps=20, tolerance=0.01)
         cold = tvl1_flows(frames, refer_tvl1(reference, params)).flows
         for levels, start in ((5, truth), (5, np.zeros_like(truth) + 1), (2, truth * 0.8)):
-            warm = tvl1_flows(frames, refer_tvl1(reference, replace(params, levels=levels)), start)
+            warm = tvl1_flows(frames, refer_tvl1(reference, params), start, levels)
             assert median_length(warm.flows - cold) < 0.02
 
     def test_good_start_replaces_the_pyramid(self):
         frame, flow = texture(12), np.full((SIZE, SIZE, 2), (8.0, -5.0), np.float32)
-        flat = refer_tvl1(warp(frame, flow), TvL1Params(levels=1))
-        cold = tvl1_flows(frame[None], flat)
-        warm = tvl1_flows(frame[None], flat, flow[None] + 0.4)
+        referred = refer_tvl1(warp(frame, flow))
+        cold = tvl1_flows(frame[None], referred, levels=1)
+        warm = tvl1_flows(frame[None], referred, flow[None] + 0.4, levels=1)
         assert median_length((cold.flows[0] - flow)[12:-12, 12:-12]) > 2
         assert median_length((warm.flows[0] - flow)[12:-12, 12:-12]) < 0.05
         assert warm.settled.all()
+
+    @pytest.mark.parametrize("levels", [1, 2, 9])
+    def test_levels_left_out_are_those_of_a_smaller_pyramid(self, levels):
+        reference, frames, truth = pairs(2, seed=12)
+        fewer = tvl1_flows(frames, refer_tvl1(reference), truth, levels).flows
+        small = tvl1_flows(frames, refer_tvl1(reference, TvL1Params(levels=levels)), truth).flows
+        assert fewer.tobytes() == small.tobytes()
+
+    def test_no_level_is_refused(self):
+        reference, frames, _ = pairs(1)
+        with pytest.raises(ConfigurationError, match="^levels: expected"):
+            tvl1_flows(frames, refer_tvl1(reference), levels=0)
 
 
 class TestManyToOne:
