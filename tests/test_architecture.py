@@ -17,7 +17,7 @@ ORDER = [
     "image_stacks", "warp", "psf", "stabilisation", "confidence", "tvl1_sweeps", "tvl1", "flow",
     "centroid", "flow_model", "flow_subspace", "dynamics", "displacement", "simulation", "kalman",
     "blur_moments", "frame_noise", "torch_fusion", "flow_tracking", "pixel_fusion", "alternating",
-    "blur_estimation", "blur_cues",
+    "blur_estimation", "blur_cues", "strip_grid",
     "patch_search", "patch_pairs", "edge_strips", "nonlocal_tv", "nonlocal_penalty", "deconvolution_memory",
     "convolution_problem",
     "conjugate_gradients", "primal_dual", "local_tv", "planes", "torch_weights", "torch_deconvolution", "deconvolution",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.deconvolution_memory import NonlocalWork, Room
+from turbrestore.deconvolution_memory import DeconvolutionWork, Room
 from turbrestore.nonlocal_tv import NonlocalParams, nonlocal_weights
 
 SHAPE = (256, 400)
@@ -49,7 +49,7 @@ def test_weights_keep_the_plan(image, tmp_path, monkeypatch, params, threads, jo
     nonlocal_weights(image[:16, :16])
     with traced() as peaks:
         nonlocal_weights(image, params, tmp_path, threads)
-    assert peaks[0] < NonlocalWork(SHAPE, 1, params).peak(Room(threads, True))
+    assert peaks[0] < DeconvolutionWork(SHAPE, 1, "nltv", params).peak(Room(threads, True))
 
 
 def test_threads_are_what_weights_take_most_for(image, tmp_path, monkeypatch):
@@ -69,7 +69,7 @@ def test_threads_are_what_weights_take_most_for(image, tmp_path, monkeypatch):
 def test_a_deconvolution_keeps_its_limit_on_many_cores(image, tmp_path, monkeypatch):
     for module in ("deconvolution", "nonlocal_tv", "parallel"):
         monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: 8)
-    limit = NonlocalWork((280, 420), 1, NonlocalParams()).peak(Room(1, True))
+    limit = DeconvolutionWork((280, 420), 1, "nltv", NonlocalParams()).peak(Room(1, True))
     with traced() as peaks:
         deconvolve(image, 1.5, DeconvolutionParams(iterations=2, memory=limit), scratch=tmp_path)
     assert peaks[0] < limit
@@ -78,15 +78,15 @@ def test_a_deconvolution_keeps_its_limit_on_many_cores(image, tmp_path, monkeypa
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("params", [NonlocalParams(), NonlocalParams(search=61, best=40)])
 def test_more_memory_is_never_worse(channels, params):
-    work = NonlocalWork((1080, 1920), channels, params)
+    work = DeconvolutionWork((1080, 1920), channels, "nltv", params)
     rooms = [work.room(memory, 8) for memory in np.geomspace(1e8, 1e11, 200)]
-    assert rooms[0] == Room(1, True)
+    assert rooms[0] == Room(1, True, True)
     assert rooms[-1] == work.room(None, 8) == Room(8, False)
     assert all(before.threads <= after.threads for before, after in pairwise(rooms))
     assert {room.in_file for room in rooms if room.threads == 8} == {True, False}
 
 
 def test_large_windows_and_many_neighbours_count():
-    least = NonlocalWork((540, 960), 1, NonlocalParams()).peak(Room(1, True))
+    least = DeconvolutionWork((540, 960), 1, "nltv", NonlocalParams()).peak(Room(1, True))
     for more in (NonlocalParams(search=101), NonlocalParams(best=60)):
-        assert NonlocalWork((540, 960), 1, more).peak(Room(1, True)) > least + 3e7
+        assert DeconvolutionWork((540, 960), 1, "nltv", more).peak(Room(1, True)) > least + 3e7

@@ -2,18 +2,16 @@
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.errors import ConfigurationError
 from turbrestore.halo_tiles import (
     add_tile,
-    cut_around,
     cut_tile,
     halo_tiles,
     largest_tile,
     new_mosaic,
-    sizes_to_deblur,
 )
 
 
@@ -69,32 +67,6 @@ def test_a_frame_no_larger_than_a_tile_is_one():
     (tile,) = halo_tiles((384, 300), 384)
     assert tile.roi == (0, 0, 300, 384)
     assert tile.row_weights.min() == tile.column_weights.min() == 1
-
-
-@given(st.integers(1, 300), st.integers(1, 300), st.integers(1, 40), st.integers(0, 200), st.sampled_from([(), (3,)]))
-@example(1, 7, 1, 0, ())
-@settings(max_examples=100, deadline=None)
-def test_beyond_the_frame_is_the_other_side_of_a_periodic_image(height, width, halo, more, channels):
-    side, image = 4 * halo + more, np.random.default_rng(0).random((height, width, *channels), dtype=np.float32)
-    tiles = halo_tiles((height, width), side, halo)
-    around = np.pad(image, [(halo, halo)] * 2 + [(0, 0)] * len(channels), mode="wrap")
-    largest = largest_tile((height, width), side, halo, around=True)
-    for tile in tiles:
-        part, inside = cut_around(image, tile, halo)
-        assert np.array_equal(part[inside], image[tile.rows, tile.columns])
-        top, left = tile.rows.start - inside[0].start + halo, tile.columns.start - inside[1].start + halo
-        assert np.array_equal(part, around[top : top + part.shape[0], left : left + part.shape[1]])
-        # A core has its halo on every side.
-        assert len(tiles) == 1 or (part.shape[0] <= largest[0] and part.shape[1] <= largest[1])
-        assert np.array_equal(cut_around(image, tile, 0)[0], image[tile.rows, tile.columns])
-    assert len(tiles) > 1 or largest == (height, width)
-
-
-@pytest.mark.parametrize(
-    ("sigma", "sizes"), [(None, (400, 96)), (24.0, (400, 96)), (24.1, (400, 97)), (40, (640, 160))]
-)
-def test_the_halo_holds_four_widths_of_the_blur(sigma, sizes):
-    assert sizes_to_deblur(400, sigma) == sizes
 
 
 def test_a_tile_has_room_for_its_halo():

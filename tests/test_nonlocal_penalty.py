@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from regulariser import Regulariser
 
 from turbrestore.nonlocal_penalty import NonlocalPenalty
 from turbrestore.nonlocal_tv import (
@@ -15,7 +16,7 @@ from turbrestore.nonlocal_tv import (
     nonlocal_weights,
     project_to_unit,
 )
-from turbrestore.primal_dual import Regulariser
+from turbrestore.strip_grid import StripGrid
 
 
 def by_operators(graph: NonlocalGraph) -> Regulariser:
@@ -28,10 +29,20 @@ def by_operators(graph: NonlocalGraph) -> Regulariser:
     )
 
 
+def penalty_of(graph: NonlocalGraph) -> NonlocalPenalty:
+    return NonlocalPenalty(graph, StripGrid(graph.shape))
+
+
+def ascended(penalty, dual, image: np.ndarray, step: float, relaxation: float) -> np.ndarray:
+    pull = np.full_like(image, np.nan)
+    penalty.ascend(dual, image.copy(), step, relaxation, pull)
+    return pull
+
+
 def p_of(graph, dual):
     """``ga + Kl``, as the docstring of the module has it."""
-    factors = np.stack([dual.factor[graph.tails], dual.factor[graph.heads]])
-    return factors * dual.values + nonlocal_gradient(graph, dual.lagged.reshape(graph.shape))
+    factors = np.stack([dual.factor.ravel()[graph.tails], dual.factor.ravel()[graph.heads]])
+    return factors * dual.values + nonlocal_gradient(graph, dual.lagged)
 
 
 @pytest.fixture(params=[1, 10_000], ids=["strips", "whole"])
@@ -43,31 +54,32 @@ def graph(request, monkeypatch):
 
 def test_the_value_is_that_of_the_operators(graph):
     image = np.random.default_rng(1).random(graph.shape).astype(np.float32)
-    assert NonlocalPenalty(graph).value(image) == pytest.approx(nonlocal_total_variation(graph, image), rel=1e-5)
+    assert penalty_of(graph).value(image) == pytest.approx(nonlocal_total_variation(graph, image), rel=1e-5)
 
 
 @pytest.mark.parametrize("relaxation", [1.0, 1.4])
 def test_steps_are_those_of_the_operators(graph, relaxation):
     rng = np.random.default_rng(2)
-    found, expected = NonlocalPenalty(graph), by_operators(graph)
+    found, expected = penalty_of(graph), by_operators(graph)
     image = rng.random(graph.shape).astype(np.float32)
     dual, reference = found.dual(image), expected.dual(image)
     for _ in range(5):
         image = rng.normal(size=graph.shape).astype(np.float32)
-        pull = found.ascend(dual, image, 0.7, relaxation)
-        assert pull == pytest.approx(expected.ascend(reference, image, 0.7, relaxation), abs=2e-5)
+        pull = ascended(found, dual, image, 0.7, relaxation)
+        assert pull == pytest.approx(ascended(expected, reference, image, 0.7, relaxation), abs=2e-5)
         assert p_of(graph, dual) == pytest.approx(reference, abs=2e-5)
     assert np.abs(reference).max() > 0.5
 
 
-def test_threads_and_files_change_nothing(graph, tmp_path):
+def test_threads_and_files_change_nothing(graph, tmp_path, monkeypatch):
     image = np.random.default_rng(3).normal(size=graph.shape).astype(np.float32)
     pulls = []
+    monkeypatch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
     for workers, folder in ((None, None), (1, None), (4, tmp_path)):
         pool = ThreadPoolExecutor(workers) if workers else None
-        penalty = NonlocalPenalty(graph, pool, folder)
+        penalty = NonlocalPenalty(graph, StripGrid(graph.shape, pool, folder), folder)
         dual = penalty.dual(image)
-        pulls.append(b"".join(penalty.ascend(dual, image, 0.7, 1.4).tobytes() for _ in range(3)))
+        pulls.append(b"".join(ascended(penalty, dual, image, 0.7, 1.4).tobytes() for _ in range(3)))
         if pool is not None:
             pool.shutdown()
     assert len(set(pulls)) == 1

@@ -144,8 +144,9 @@ def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypa
     monkeypatch.setattr("turbrestore.warp._STRIP", 1000)
     monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 700)
     monkeypatch.setattr("turbrestore.flow_subspace._STRIP_BYTES", 1 << 16)
-    for name in ("_THREADED_TRANSFORM", "_THREADED_PASS"):
-        monkeypatch.setattr(f"turbrestore.deconvolution.{name}", 0)
+    for name in ("deconvolution._THREADED_PASS", "strip_grid._ONE_STRIP"):
+        monkeypatch.setattr(f"turbrestore.{name}", 1)
+    monkeypatch.setattr("turbrestore.strip_grid._STRIP", 700)
     frames = make_sequence(seed=3, count=28).frames[:, :64, :80]
 
     def run(threads):

@@ -8,20 +8,17 @@ import pytest
 from conftest import make_sequence
 from turbrestore import pipeline, resumption
 from turbrestore.alternating import Filtered
-from turbrestore.blind import remove_blur
 from turbrestore.centroid import CentroidParams, find_centroid
 from turbrestore.checkpoint import load_tiles, save_tiles
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.dynamics import DynamicsParams
 from turbrestore.errors import DataError
 from turbrestore.frame_source import FrameSource
-from turbrestore.halo_tiles import halo_tiles, sizes_to_deblur
+from turbrestore.halo_tiles import halo_tiles
 from turbrestore.metrics import psnr
-from turbrestore.psf import blur_otf
 from turbrestore.restoration import RestoreParams
 from turbrestore.resumption import KeptStages
-from turbrestore.synthesis.scenes import SCENES
-from turbrestore.tiled_stages import deconvolve_tiles, filter_tiles, find_tiled_centroid
+from turbrestore.tiled_stages import filter_tiles, find_tiled_centroid
 
 HALO = 24
 TILES = halo_tiles((128, 128), 112, HALO)
@@ -57,104 +54,6 @@ def test_one_tile_is_the_whole(sequence, blurred):
     whole, tiled = find_centroid(sequence.frames), find_tiled_centroid(sequence.frames, tiles)
     for name in ("image", "flows", "mean_flow_sizes"):
         assert np.array_equal(getattr(whole, name), getattr(tiled, name))
-    params = DeconvolutionParams(iterations=30)
-    deblurred, parts = deconvolve(blurred, 1.2, params, blurred), deconvolve_tiles(blurred, 1.2, params, blurred, tiles)
-    for name in ("image", "noise", "fidelity", "iterations", "recorded", "objective", "changes"):
-        assert np.array_equal(getattr(deblurred, name), getattr(parts, name))
-
-
-@pytest.mark.parametrize("method", ["nltv", "tv", "wiener"])
-@pytest.mark.parametrize("channels", [1, 3])
-def test_a_deconvolution_in_tiles_is_that_of_the_whole(blurred, method, channels):
-    image = blurred if channels == 1 else np.stack([blurred, blurred[::-1], blurred.T], axis=-1)
-    params = DeconvolutionParams(method=method, iterations=100, tolerance=0)
-    whole, tiled = deconvolve(image, 1.2, params, image), deconvolve_tiles(image, 1.2, params, image, TILES)
-    assert tiled.image.shape == image.shape
-    assert (tiled.noise, tiled.fidelity, tiled.sigma) == (whole.noise, whole.fidelity, whole.sigma)
-    difference = np.abs(tiled.image - whole.image)
-    # The Wiener images that the others start from have the noise of the tile, and at the border of the frame, where
-    # nothing tells what lies beyond, a solution is slow to settle.
-    assert np.sqrt(np.mean(difference**2)) < (0.002 if method == "wiener" else 0.01)
-    # Where tiles meet no more than elsewhere.
-    assert difference[60:68].mean() < 1.5 * difference.mean()
-
-
-def rms(image):
-    return np.sqrt(np.mean(np.square(image)))
-
-
-def soft_scene(shape, sigma):
-    """Scene whose two sides go on in each other, blurred and with noise."""
-    scene = np.roll(SCENES["camera"](*shape), (11, 17), (0, 1))
-    image = np.fft.irfft2(np.fft.rfft2(scene) * blur_otf(shape, sigma), s=shape)
-    return (image + np.random.default_rng(0).normal(0, 0.002, shape)).astype(np.float32)
-
-
-@pytest.mark.parametrize("method", ["tv", "wiener"])
-@pytest.mark.parametrize("shape", [(128, 160), (192, 112)])
-def test_a_periodic_image_is_deblurred_in_tiles_that_see_its_other_side(method, shape):
-    image = soft_scene(shape, 3.0)
-    image = np.stack([image, image[::-1], image[:, ::-1]], axis=-1)
-    params = DeconvolutionParams(method=method, boundary="periodic", iterations=100, tolerance=0)
-    tiles = halo_tiles(shape, 112, HALO)
-    whole, tiled = deconvolve(image, 3.0, params, image), deconvolve_tiles(image, 3.0, params, image, tiles)
-    blind = deconvolve_tiles(image, 3.0, replace(params, boundary="unknown"), image, tiles)
-    assert len(tiles) > 1
-    for edge in (np.s_[:6], np.s_[-6:], np.s_[:, :6], np.s_[:, -6:]):
-        assert rms((tiled.image - whole.image)[edge]) < 0.001
-        assert rms((blind.image - whole.image)[edge]) > 0.003
-    assert np.abs(tiled.image - whole.image).max() < 0.01
-
-
-@pytest.mark.parametrize("boundary", ["unknown", "periodic"])
-def test_one_tile_keeps_its_boundary(blurred, boundary):
-    params = DeconvolutionParams(method="tv", boundary=boundary, iterations=10)
-    (tile,) = halo_tiles(blurred.shape, 128, HALO)
-    tiled = deconvolve_tiles(blurred, 2.0, params, blurred, [tile])
-    assert np.array_equal(tiled.image, deconvolve(blurred, 2.0, params, blurred).image)
-
-
-def test_a_halo_of_four_widths_is_enough():
-    image, inner = soft_scene((192, 192), 4.0), np.s_[24:-24, 24:-24]
-    params = DeconvolutionParams(method="wiener", iterations=100, tolerance=0)
-    whole = deconvolve(image, 4.0, params).image
-    narrow, enough = (
-        rms((deconvolve_tiles(image, 4.0, params, image, halo_tiles(image.shape, 80, halo)).image - whole)[inner])
-        for halo in (4, 16)
-    )
-    assert enough < 0.002 and narrow > 3 * enough
-
-
-def test_the_weight_of_the_data_is_that_of_the_whole(blurred):
-    noise = np.random.default_rng(0).normal(0, 0.05, blurred.shape).astype(np.float32)
-    noise[:, :64] = 0
-    params = DeconvolutionParams(method="tv", iterations=100, tolerance=0)
-    whole = deconvolve(blurred + noise, 1.2, params)
-    tiled = deconvolve_tiles(blurred + noise, 1.2, params, blurred, TILES)
-    # By weights of their own tiles would differ by 0.06.
-    assert np.sqrt(np.mean((tiled.image - whole.image) ** 2)) < 0.01
-
-
-def test_records_of_a_deconvolution_add_up(blurred):
-    params = DeconvolutionParams(method="tv", tolerance=1e-4)
-    parts = [
-        deconvolve(blurred[t.rows, t.columns], 1.2, replace(params, fidelity=900.0), blurred[t.rows, t.columns])
-        for t in TILES
-    ]
-    tiled = deconvolve_tiles(blurred, 1.2, replace(params, fidelity=900.0), blurred, TILES)
-    assert len({part.iterations for part in parts}) > 1
-    assert tiled.iterations == max(part.iterations for part in parts)
-    assert tiled.objective[-1] == pytest.approx(sum(part.objective[-1] for part in parts))
-    assert tiled.objective[0] == pytest.approx(sum(part.objective[0] for part in parts))
-    assert tiled.recorded.size == tiled.objective.size == tiled.changes.size
-    assert tiled.converged == all(part.converged for part in parts)
-
-
-def test_a_blur_is_removed_in_tiles_by_one_width(blurred):
-    whole, tiled = (remove_blur(blurred, blurred, parts=parts) for parts in ((), TILES))
-    assert tiled.blur.sigma == whole.blur.sigma
-    assert tiled.deconvolution.sigma == whole.deconvolution.sigma > 0
-    assert np.sqrt(np.mean((tiled.deconvolution.image - whole.deconvolution.image) ** 2)) < 0.01
 
 
 def test_figures_of_the_filter_are_means_over_tiles():
@@ -199,7 +98,6 @@ def in_tiles(monkeypatch):
         for module in (pipeline, resumption):
             monkeypatch.setattr(module, "memory_plan", lambda *_: plan)
         monkeypatch.setattr(pipeline, "halo_tiles", lambda shape, side, halo=HALO: halo_tiles(shape, side, halo))
-        monkeypatch.setattr(pipeline, "sizes_to_deblur", lambda side, sigma: (side, HALO))
 
     return begin
 
@@ -232,26 +130,15 @@ def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, tmp
     assert [done for name, done, total in told if name == "filter"][-1] == 4 * (2 * 12 - 9)
 
 
-def test_only_the_deconvolution_has_a_wider_halo(sequence, in_tiles, monkeypatch):
+@pytest.mark.parametrize("memory", [None, 1e6])
+def test_a_restoration_in_tiles_is_deblurred_as_a_whole(sequence, in_tiles, tmp_path, memory):
     source = FrameSource.from_array(sequence.frames)
-    monkeypatch.setattr("turbrestore.halo_tiles.HALO", HALO)
     in_tiles(source)
-    monkeypatch.setattr(pipeline, "sizes_to_deblur", sizes_to_deblur)
-    given = []
-
-    def find(frames, tiles, *_):
-        given.append({tile.halo for tile in tiles})
-        return find_tiled_centroid(frames, tiles, QUICK.centroid)
-
-    def remove(*arguments):
-        given.append({tile.halo for tile in arguments[-1]})
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(pipeline, "find_tiled_centroid", find)
-    monkeypatch.setattr(pipeline, "remove_blur", remove)
-    with pytest.raises(KeyboardInterrupt):
-        pipeline.restore(source, replace(QUICK, deconvolution=DeconvolutionParams(sigma=6.75)))
-    assert given == [{HALO}, {27}]
+    params = replace(QUICK, deconvolution=replace(QUICK.deconvolution, memory=memory))
+    tiled = pipeline.restore(source, params, scratch=tmp_path)
+    whole = deconvolve(tiled.filtered.image, 1.0, QUICK.deconvolution, tiled.centroid.image)
+    assert isinstance(tiled.deconvolution.image, np.memmap)
+    assert np.array_equal(tiled.deconvolution.image, whole.image)
 
 
 def test_frames_that_do_not_count_do_not_in_any_tile(sequence, in_tiles):

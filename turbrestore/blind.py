@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,9 +16,8 @@ from .blur_map import BlurMap, deconvolve_varying, estimate_blur_map, sigma_map
 from .decision import Decision
 from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve
 from .guards import GuardParams, GuardReading, deconvolve_guarded, judge
-from .halo_tiles import HaloTile
 from .psf import KOLMOGOROV
-from .tiled_stages import deconvolve_tiles
+from .scratch import kept_in
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def remove_blur(
     bounds: BlurBounds | None = None,
     progress: Callable[[int], None] | None = None,
     scratch: Path | None = None,
-    parts: Sequence[HaloTile] = (),
+    in_file: bool = False,
 ) -> Deblurred:
     """Deblur an image by the width asked for, else by the width estimated, as far as the guards allow.
 
@@ -77,8 +77,8 @@ def remove_blur(
         Called with the number of iterations done, in an attempt by one width.
     scratch : Path, optional
         Folder of the file for what memory does not hold; by default that of temporary files.
-    parts : sequence of HaloTile, optional
-        Deblur these one after the other; by default the whole image at once.
+    in_file : bool
+        Whether deblurred images are kept in files.
 
     Returns
     -------
@@ -100,15 +100,15 @@ def remove_blur(
     >>> result.decisions
     (Decision(subject='blur', choice='none removed', reason='asked for'),)
     """
+    folder = (scratch or Path(tempfile.gettempdir())) if in_file else None
     deconvolution, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
     blind = deconvolution.sigma is None
     blur = estimate_blur(image, exponent=deconvolution.exponent or KOLMOGOROV) if blind else None
     sigma, settings = blur_to_remove(blur, deconvolution, bounds)
 
     def remove(width: float, progress: Callable[[int], None] | None = None) -> Deconvolution:
-        if parts and width > 0:
-            return deconvolve_tiles(image, width, settings, guide, parts, progress, scratch)
-        return deconvolve(image, width, settings, guide, progress, scratch)
+        result = deconvolve(image, width, settings, guide, progress, scratch)
+        return replace(result, image=kept_in(result.image, folder))
 
     tiles, first = None, None
     if blur is not None and blur.blurred and bounds is None:
@@ -123,7 +123,7 @@ def remove_blur(
 
     def attempt(width: float) -> Deconvolution:
         if widths is not None and width > 0:
-            return deconvolve_varying(remove, widths * (width / sigma), scratch if parts else None)
+            return deconvolve_varying(remove, widths * (width / sigma), folder)
         return first if first is not None and first.sigma == width else remove(width, progress)
 
     if blind:

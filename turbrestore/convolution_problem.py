@@ -5,6 +5,7 @@ Symbols as in :mod:`turbrestore.deconvolution`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +14,7 @@ from scipy import fft
 
 from .arrays import FloatArray
 from .psf import Spectrum
+from .strip_grid import Found, StripGrid
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,51 +31,57 @@ class Problem:
         Transfer function of k.
     fidelity : float
         λ.
+    grid : StripGrid
+        Of these.
     """
 
     observed: FloatArray
     seen: FloatArray
     otf: Spectrum
     fidelity: float
+    grid: StripGrid
 
-    @cached_property
-    def power(self) -> FloatArray:
-        """|k̂|², which BᵀB multiplies by."""
-        return np.square(np.abs(self.otf))
+    def blurred(self, u: FloatArray) -> FloatArray:
+        """Bu, a new image."""
+        blurred = self.grid.image()
 
-    def blurred(self, spectrum: Spectrum) -> FloatArray:
-        """Bu, from the Fourier transform of u."""
-        return fft.irfft2(self.otf * spectrum, s=self.observed.shape, overwrite_x=True)
+        def put(rows: slice, strip: FloatArray) -> None:
+            blurred[rows] = strip
 
-    def gradient_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Fourier transform of the gradient ``λBᵀM(Bu − f)``, from that of u."""
-        return self._back(self._residual(spectrum))
-
-    def normal_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Fourier transform of ``λBᵀMBu``, from that of u."""
-        blurred = self.blurred(spectrum)
-        blurred *= self.seen
-        return self._back(blurred)
-
-    def residual(self, u: FloatArray) -> FloatArray:
-        """``M(Bu − f)``."""
-        return self._residual(fft.rfft2(u))
-
-    def _residual(self, spectrum: Spectrum) -> FloatArray:
-        found = self.blurred(spectrum)
-        found -= self.observed
-        found *= self.seen
-        return found
-
-    def _back(self, residual: FloatArray) -> Spectrum:
-        found = fft.rfft2(residual, overwrite_x=True)
-        found *= self.otf.conj()
-        found *= np.float32(self.fidelity)
-        return found
+        self._blur(u, put, blurred)
+        return blurred
 
     def misfit(self, u: FloatArray) -> float:
         """``λ/2 ‖M(Bu − f)‖²``."""
-        return self.fidelity / 2 * float(np.square(self.residual(u)).sum(dtype=np.float64))
+
+        def squares(rows: slice, strip: FloatArray) -> float:
+            strip -= self.observed[rows]
+            strip *= self.seen[rows]
+            return float(np.square(strip, out=strip).sum(dtype=np.float64))
+
+        return self.fidelity / 2 * sum(self._blur(u, squares, self.observed, self.seen))
+
+    @cached_property
+    def transfer(self) -> Spectrum:
+        """k̂ in blocks."""
+        return self.grid.in_blocks(self.otf)
+
+    def power(self, block: int) -> FloatArray:
+        """|k̂|², which BᵀB multiplies by, of a block."""
+        return np.square(np.abs(self.transfer[block]))
+
+    def _blur(self, u: FloatArray, work: Callable[[slice, FloatArray], Found], *touched: object) -> list[Found]:
+        """Do something to every strip of Bu."""
+        grid, (spectrum, _), transfer = self.grid, self.grid.spectra, self.transfer
+
+        def multiply(block: int) -> None:
+            found = fft.fft(spectrum[block], axis=0)
+            found *= transfer[block]
+            spectrum[block] = fft.ifft(found, axis=0, overwrite_x=True)
+
+        grid.over_rows(lambda rows: grid.transform_strip(u[rows], spectrum, rows), spectrum, u)
+        grid.over_blocks(multiply, spectrum, transfer)
+        return grid.over_rows(lambda rows: work(rows, grid.strip_of(spectrum, rows)), spectrum, *touched)
 
 
 def seen_mean(problem: Problem) -> np.float32:
@@ -89,53 +97,9 @@ def seen_mean(problem: Problem) -> np.float32:
 
     Examples
     --------
-    >>> float(seen_mean(Problem(np.float32([[1, 2, 9]]), np.float32([[1, 1, 0]]), np.ones((1, 2)), 1.0)))
+    >>> grid = StripGrid((1, 3))
+    >>> float(seen_mean(Problem(np.float32([[1, 2, 9]]), np.float32([[1, 1, 0]]), np.ones((1, 2)), 1.0, grid)))
     1.5
     """
-    return np.float32(inner(problem.seen, problem.observed) / problem.seen.sum(dtype=np.float64))
-
-
-def inner(a: FloatArray, b: FloatArray) -> float:
-    """Inner product, summed in double precision.
-
-    Parameters
-    ----------
-    a, b : ndarray, float32, equal shapes
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> inner(np.float32([1, 2]), np.float32([3, 4]))
-    11.0
-    """
-    return float(np.sum(a * b, dtype=np.float64))
-
-
-def spectral_inner(a: Spectrum, b: Spectrum, shape: tuple[int, int]) -> float:
-    """Inner product of two real images from their half-spectra (Parseval), summed in double precision.
-
-    Parameters
-    ----------
-    a, b : ndarray, complex64, shape (P, Q // 2 + 1)
-    shape : (int, int)
-        P and Q.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> a, b = np.float32([[1, 0, 2]]), np.float32([[3, 7, 4]])
-    >>> round(spectral_inner(fft.rfft2(a), fft.rfft2(b), (1, 3)), 4)
-    11.0
-    """
-    products = a.real * b.real
-    products += a.imag * b.imag
-    columns = products.sum(axis=0, dtype=np.float64)
-    # The other half repeats every column but the first and, of an even number, the middle one.
-    twice = columns[1 : (shape[1] + 1) // 2].sum()
-    return float((columns.sum() + twice) / (shape[0] * shape[1]))
+    inner = problem.grid.inner
+    return np.float32(inner(problem.seen, problem.observed) / inner(problem.seen, problem.seen))

@@ -28,21 +28,21 @@ import tempfile
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
 
 from .arrays import FloatArray, check_image
 from .blur_estimation import BlurEstimate
 from .conjugate_gradients import ConjugateGradients
-from .convolution_problem import Problem, inner
-from .deconvolution_memory import NonlocalWork
+from .convolution_problem import Problem
+from .deconvolution_memory import DeconvolutionWork, Room
 from .device import PROCESSOR, check_device, find_device
 from .errors import require, require_between
-from .local_tv import LOCAL_TV
+from .local_tv import LocalPenalty
 from .memory_size import DeconvolutionMemory
 from .nonlocal_penalty import NonlocalPenalty
 from .nonlocal_tv import NonlocalParams, nonlocal_weights
@@ -61,6 +61,8 @@ from .psf import (
     psf_to_otf,
     wiener_fidelity,
 )
+from .scratch import kept_in, new_stack
+from .strip_grid import StripGrid, inner
 from .torch_deconvolution import SolverSettings, solve_on_device
 
 if TYPE_CHECKING:
@@ -70,8 +72,8 @@ METHODS = ("nltv", "tv", "wiener", "tikhonov")
 BOUNDARIES = ("unknown", "periodic")
 CHANNELS = ("luminance", "each")
 
-# Transforms, and passes over the pairs, of fewer pixels take no less time on several threads than on one.
-_THREADED_TRANSFORM, _THREADED_PASS = 1 << 18, 1 << 17
+# Passes over the pairs of fewer pixels take no less time on several threads than on one.
+_THREADED_PASS = 1 << 17
 # Least margin, in widths of the blur.
 MARGIN_SIGMAS = 4.0
 # Steps to the Wiener solution that is started from: from the first on only what lies near the border changes.
@@ -114,11 +116,10 @@ class DeconvolutionParams:
         Where weights and image are computed: cpu, cuda or auto.  By default where the whole chain is computed, and cpu
         for this stage alone.
     memory : DeconvolutionMemory, optional
-        Most that nltv may take, such as 500MB; it has no effect on a device.  Where that is too little for the nonlocal
-        pairs and what is known of them, they are kept in a file and worked on in strips of rows, and then by fewer
-        threads, to the same result.  What remains is taken whatever is asked for: 132 bytes per pixel and channel, some
-        60 MB, and what grows with ``weights``, see :mod:`turbrestore.deconvolution_memory`.  By default there is no
-        limit.
+        Most that may be taken, such as 500MB; it has no effect on a device.  Where that is too little, the nonlocal
+        pairs and what is known of them are kept in a file, then images too, and all is worked on in strips, and then by
+        fewer threads, to the same result.  What remains is taken whatever is asked for, see
+        :mod:`turbrestore.deconvolution_memory`.  By default there is no limit.
     """
 
     method: Literal["nltv", "tv", "wiener", "tikhonov"] = "nltv"
@@ -284,46 +285,32 @@ def deconvolve(
     nothing = np.zeros(0)
     if sigma == 0:
         return Deconvolution(pixels, 0.0, fidelity, noise, 0, True, nothing.astype(np.int64), nothing, nothing)
-    widths = margin_widths(planes[0].shape, margin if params.boundary == "unknown" else None)
-    shape = tuple(size + sum(width) for size, width in zip(planes[0].shape, widths, strict=True))
+    size = planes[0].shape
+    widths = margin_widths(size, margin if params.boundary == "unknown" else None)
+    shape = size[0] + sum(widths[0]), size[1] + sum(widths[1])
     otf = blur_otf(shape, sigma, params.exponent or GAUSSIAN) if psf is None else psf_to_otf(psf, shape)
-    seen = np.pad(np.ones(planes[0].shape, np.float32), widths)
-    padded = [np.ascontiguousarray(np.pad(plane, widths, mode="symmetric")) for plane in planes]
-    problems = [Problem(plane, seen, otf, fidelity) for plane in padded]
-    result = _solve(problems, params, padded_guide(guide, planes[0].shape, widths), progress, scratch)
-    inside = tuple(slice(before, before + size) for (before, _), size in zip(widths, planes[0].shape, strict=True))
-    restored = join_planes(pixels, [u[inside] for u in result.images], params.channels)
-    return Deconvolution(np.clip(restored, 0, 1), sigma, fidelity, noise, *result[1:])
+    memory = params.memory if find_device(params.device or PROCESSOR) == PROCESSOR else None
+    room = DeconvolutionWork(shape, len(planes), params.method, params.weights).room(memory, available_cores())
+    folder = scratch or Path(tempfile.gettempdir())
+    with one_thread_each(), ThreadPoolExecutor(room.threads) as pool:
+        threaded = shape[0] * shape[1] >= _THREADED_PASS
+        grid = StripGrid(shape, pool if threaded else None, folder if room.images_in_file else None)
+        seen = kept_in(np.pad(np.ones(size, np.float32), widths), grid.folder)
+        observed = [kept_in(np.pad(plane, widths, mode="symmetric"), grid.folder) for plane in planes]
+        del planes
+        problems = [Problem(plane, seen, otf, fidelity, grid) for plane in observed]
+        around = padded_guide(guide, size, widths)
+        around = None if around is None else kept_in(around, grid.folder)
+        result = _solve(problems, params, around, progress, _Workshop(pool, room, folder))
+    inside = tuple(slice(before, before + length) for (before, _), length in zip(widths, size, strict=True))
+    restored = new_stack(pixels.shape, grid.folder)
 
+    def join(rows: slice) -> None:
+        found = join_planes(pixels[rows], [u[inside][rows] for u in result.images], params.channels)
+        np.clip(found, 0, 1, out=restored[rows])
 
-def noise_and_fidelity(image: ArrayLike, params: DeconvolutionParams) -> tuple[float, float]:
-    """Noise of a blurred image, and the weight λ that a deconvolution of it takes.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-    params : DeconvolutionParams
-
-    Returns
-    -------
-    noise : float
-        Standard deviation, intensity.
-    fidelity : float
-        The one asked for, else that of :func:`automatic_fidelity`.
-
-    Raises
-    ------
-    DataError
-        Wrong shape, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> noise, fidelity = noise_and_fidelity(np.full((32, 32), 0.5), DeconvolutionParams())
-    >>> round(fidelity)
-    5000
-    """
-    return _noise_and_fidelity(split_planes(check_image(image), params.channels), params)
+    StripGrid(size, None, grid.folder).over_rows(join, pixels, restored, *result.images)
+    return Deconvolution(restored, sigma, fidelity, noise, *result[1:])
 
 
 def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
@@ -375,35 +362,38 @@ class _Solution(NamedTuple):
     changes: NDArray[np.float64]
 
 
+class _Workshop(NamedTuple):
+    """Threads, what there is room for, and the folder for the rest."""
+
+    pool: Executor
+    room: Room
+    folder: Path
+
+
 def _solve(
     problems: list[Problem],
     params: DeconvolutionParams,
     guide: FloatArray | None,
     progress: Callable[[int], None] | None,
-    scratch: Path | None,
+    workshop: _Workshop,
 ) -> _Solution:
     if find_device(params.device or PROCESSOR) != PROCESSOR:
         return _solve_on_device(problems, params, guide, progress)
-    if params.method == "tikhonov":
-        quadratic = ConjugateGradients(np.ones((1, 1), np.float32))
+    if params.method in ("wiener", "tikhonov"):
+        shared = np.ones((1, 1), np.float32)
+        quadratic = _wiener_solver(problems[0]) if params.method == "wiener" else ConjugateGradients(shared)
         return _iterate(quadratic, problems, [quadratic.start(p) for p in problems], params, progress)
-    if params.method == "wiener":
-        quadratic = _wiener_solver(problems[0])
-        return _iterate(quadratic, problems, [quadratic.start(p) for p in problems], params, progress)
-    nonlocal_work = NonlocalWork(problems[0].seen.shape, len(problems), params.weights)
-    room = nonlocal_work.room(params.memory if params.method == "nltv" else None, available_cores())
-    pixels = problems[0].seen.size
-    workers = room.threads if pixels >= _THREADED_TRANSFORM else 1
-    with one_thread_each(), fft.set_workers(workers), ThreadPoolExecutor(room.threads) as pool:
-        starts, guide = _sharpened(problems, guide, params, pool)
-        penalty: Penalty = LOCAL_TV
-        if params.method == "nltv":
-            folder = (scratch or Path(tempfile.gettempdir())) if room.in_file else None
-            graph = nonlocal_weights(guide, params.weights, folder, room.threads)
-            penalty = NonlocalPenalty(graph, pool if pixels >= _THREADED_PASS else None, folder)
-        solver = PrimalDual(penalty)
-        states = [solver.start(problem, u) for problem, u in zip(problems, starts, strict=True)]
-        return _iterate(solver, problems, states, params, progress)
+    starts, guide = _sharpened(problems, guide, params, workshop.pool)
+    penalty: Penalty = LocalPenalty(problems[0].grid)
+    if params.method == "nltv":
+        folder = workshop.folder if workshop.room.in_file else None
+        graph = nonlocal_weights(guide, params.weights, folder, workshop.room.threads)
+        penalty = NonlocalPenalty(graph, problems[0].grid, folder)
+    del guide
+    solver = PrimalDual(penalty)
+    states = [solver.start(problem, u) for problem, u in zip(problems, starts, strict=True)]
+    del starts
+    return _iterate(solver, problems, states, params, progress)
 
 
 def _solve_on_device(
@@ -443,16 +433,18 @@ def _iterate(
 ) -> _Solution:
     """Step all channels side by side until none changes any more."""
     records: list[tuple[int, float, float]] = []
-    before, images, begun = [], [state.image for state in states], 0
+    grid = problems[0].grid
+    before, images, begun = list[FloatArray](), [state.image for state in states], 0
     change, converged = np.inf, False
     for iteration in range(1, params.iterations + 1):
         if (iteration - 1) % solver.window == 0:
-            before, begun = images, iteration - 1
+            # Those of a window are changed in place.
+            before, begun = images if solver.window == 1 else [grid.copied(u) for u in images], iteration - 1
         states = [solver.step(problem, state) for problem, state in zip(problems, states, strict=True)]
         images = [state.image for state in states]
         last = iteration == params.iterations
         if last or iteration % solver.window == 0:
-            change = _relative_change(before, images, problems[0].seen) / (iteration - begun)
+            change = _relative_change(before, images, problems[0]) / (iteration - begun)
             last |= (converged := change <= params.tolerance)
         if last or iteration % _RECORD_EVERY == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
@@ -483,10 +475,15 @@ def _sharpened(
     problems: list[Problem], guide: FloatArray | None, params: DeconvolutionParams, pool: Executor
 ) -> tuple[list[FloatArray], FloatArray]:
     """Wiener solutions to start from, and the guide of the weights: by default the mean of what is deblurred."""
-    blurred = list(problems)
+    blurred, grid = list(problems), problems[0].grid
     if params.method == "nltv" and params.sharpen_guide and guide is not None:
         blurred.append(dataclasses.replace(problems[0], observed=guide))
-    sharp = list(pool.map(_wiener_image, blurred))
+    if grid.one_strip or grid.folder is None:
+        # Side by side, each with what it works with.
+        apart = [dataclasses.replace(problem, grid=StripGrid(grid.shape)) for problem in blurred]
+        sharp = list(pool.map(_wiener_image, apart))
+    else:
+        sharp = [_wiener_image(problem) for problem in blurred]
     starts, further = sharp[: len(problems)], sharp[len(problems) :]
     if further:
         guide = further[0]
@@ -515,8 +512,18 @@ def _read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | N
     return psf, float(np.sqrt(squares / 2)), max(psf.shape) // 2
 
 
-def _relative_change(before: list[FloatArray], after: list[FloatArray], seen: FloatArray) -> float:
+def _relative_change(before: list[FloatArray], after: list[FloatArray], problem: Problem) -> float:
     """Change relative to the norm, both over the pixels that were seen: the margin drifts for long and is cut off."""
-    moved = sum(inner(seen, np.square(b - a)) for a, b in zip(before, after, strict=True))
-    size = sum(inner(seen, np.square(u)) for u in after)
+    seen, grid = problem.seen, problem.grid
+
+    def sums(rows: slice, old: FloatArray, new: FloatArray) -> tuple[float, float]:
+        change = new[rows] - old[rows]
+        return inner(seen[rows], np.square(change, out=change)), inner(seen[rows], np.square(new[rows]))
+
+    parts = [
+        part
+        for old, new in zip(before, after, strict=True)
+        for part in grid.over_rows(partial(sums, old=old, new=new), old, new, seen)
+    ]
+    moved, size = map(sum, zip(*parts, strict=True))
     return float(np.sqrt(moved / size)) if size > 0 else float(moved > 0)

@@ -36,7 +36,7 @@ class EdgeStrip:
         First pixel, row · W + column.
     window : int
         Pixels of the window.
-    degrees : ndarray, intp, shape (n,)
+    degrees : ndarray, int32, shape (n,)
         Pairs of each of the n pixels of the strip, of which it is the tail.
     heads : ndarray, int32, shape (e,)
         Where each pair ends, pixels from the first on; ordered by tail, then by head.
@@ -48,7 +48,7 @@ class EdgeStrip:
 
     first: int
     window: int
-    degrees: NDArray[np.intp]
+    degrees: NDArray[np.int32]
     heads: NDArray[np.int32]
     roots: FloatArray
     order: NDArray[np.int32]
@@ -119,9 +119,9 @@ class EdgeStrip:
 def sum_strips(
     strips: Sequence[EdgeStrip],
     part: Callable[[int, EdgeStrip], FloatArray],
-    pixels: int,
+    total: FloatArray,
     pool: Executor | None = None,
-) -> FloatArray:
+) -> None:
     """Add up what every strip gives its window.
 
     Parameters
@@ -129,19 +129,17 @@ def sum_strips(
     strips : sequence of EdgeStrip
     part : callable
         From the number of a strip and the strip to values over its window.
-    pixels : int
-        Pixels of the image.
+    total : ndarray, float32, shape (H · W,)
+        Becomes the sum.
     pool : Executor, optional
         Threads that work on strips side by side.
-
-    Returns
-    -------
-    ndarray, float32, shape (pixels,)
 
     Examples
     --------
     >>> strip = EdgeStrip(1, 2, np.array([1]), np.array([1], np.int32), np.ones(1, np.float32), np.arange(2))
-    >>> sum_strips([strip], lambda number, strip: np.float32([5, 7]), 3)
+    >>> total = np.ones(3, np.float32)
+    >>> sum_strips([strip], lambda number, strip: np.float32([5, 7]), total)
+    >>> total
     array([0., 5., 7.], dtype=float32)
     """
 
@@ -150,8 +148,12 @@ def sum_strips(
         release(strips[number].roots)
         return values
 
-    numbers = range(len(strips))
-    total = np.zeros(pixels, np.float32)
+    numbers, clear = range(len(strips)), 0
     for strip, values in zip(strips, map(work, numbers) if pool is None else pool.map(work, numbers), strict=True):
-        strip.view(total)[:] += values
-    return total
+        stop = strip.first + strip.window
+        # What no strip before has reached.
+        total[clear:stop] = 0
+        clear = max(clear, stop)
+        total[strip.first : stop] += values
+        release(total)
+    total[clear:] = 0

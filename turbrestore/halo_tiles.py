@@ -8,21 +8,17 @@ away, so the edge of a tile leaves no trace.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .arrays import FloatArray
 from .errors import require
 from .scratch import new_stack, release
 
 HALO = 96
-# Widths of a blur that a halo holds.
-_SIGMAS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,31 +86,7 @@ def halo_tiles(shape: tuple[int, int], side: int, halo: int = HALO) -> tuple[Hal
     return tuple(HaloTile(row, column, down, across, halo) for row, down in rows for column, across in columns)
 
 
-def sizes_to_deblur(side: int, sigma: float | None) -> tuple[int, int]:
-    """Side and halo of the tiles that a blur is removed in: the halo holds four widths of it.
-
-    Parameters
-    ----------
-    side : int
-        Longest side of the tiles of other stages, pixels.
-    sigma : float or None
-        Width of the blur, pixels; one that is estimated is never too wide for the halo of other stages.
-
-    Returns
-    -------
-    side, halo : int
-        Pixels.
-
-    Examples
-    --------
-    >>> sizes_to_deblur(448, 24.0), sizes_to_deblur(448, 30.0)
-    ((448, 96), (480, 120))
-    """
-    halo = max(HALO, math.ceil(_SIGMAS * (sigma or 0.0)))
-    return max(side, 4 * halo), halo
-
-
-def largest_tile(shape: tuple[int, int], side: int, halo: int = HALO, around: bool = False) -> tuple[int, int]:
+def largest_tile(shape: tuple[int, int], side: int, halo: int = HALO) -> tuple[int, int]:
     """Height and width that no tile exceeds.
 
     Parameters
@@ -123,8 +95,6 @@ def largest_tile(shape: tuple[int, int], side: int, halo: int = HALO, around: bo
         Height and width of the frames.
     side, halo : int
         As in :func:`halo_tiles`.
-    around : bool
-        Whether tiles have a halo beyond the edges of the frame too.
 
     Returns
     -------
@@ -133,13 +103,10 @@ def largest_tile(shape: tuple[int, int], side: int, halo: int = HALO, around: bo
 
     Examples
     --------
-    >>> largest_tile((100, 300), side=140, halo=20), largest_tile((100, 300), side=140, halo=20, around=True)
-    ((100, 140), (140, 140))
+    >>> largest_tile((100, 300), side=140, halo=20)
+    (100, 140)
     """
     counts = [_count(length, side, halo) for length in shape]
-    if around and max(counts) > 1:
-        height, width = (-(-length // count) + 2 * halo for length, count in zip(shape, counts, strict=True))
-        return height, width
     tallest, widest = (
         length if count == 1 else min(-(-length // count) + (1 if count == 2 else 2) * halo, length)
         for length, count in zip(shape, counts, strict=True)
@@ -174,41 +141,6 @@ def cut_tile(stack: FloatArray, tile: HaloTile, folder: Path | None = None) -> F
         release(stack)
         release(part)
     return part
-
-
-def cut_around(image: FloatArray, tile: HaloTile, beyond: int) -> tuple[FloatArray, tuple[slice, slice]]:
-    """Copy a tile of a periodic image, and where the frame ends what lies beyond: its other side.
-
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        In memory or in a mapped file.
-    tile : HaloTile
-    beyond : int
-        Pixels beyond each edge of the frame that the tile has; 0 for an image that is not periodic.
-
-    Returns
-    -------
-    part : ndarray, float32, shape (h, w) or (h, w, 3)
-    inside : tuple of slice
-        Rows and columns of it that are the tile.
-
-    Examples
-    --------
-    >>> tile = halo_tiles((1, 100), side=60, halo=10)[0]
-    >>> part, inside = cut_around(np.arange(100, dtype=np.float32)[None], tile, 2)
-    >>> part[0, :4].tolist(), part.shape, part[inside].shape
-    ([98.0, 99.0, 0.0, 1.0], (5, 62), (1, 60))
-    """
-    before, places = [], list[NDArray[np.int64]]()
-    weights = tile.row_weights, tile.column_weights
-    for span, counts, length in zip((tile.rows, tile.columns), weights, image.shape, strict=False):
-        # The outermost pixels of a tile count at the edge of the frame alone.
-        before.append(beyond if counts[0] > 0 else 0)
-        stop = span.stop + (beyond if counts[-1] > 0 else 0)
-        places.append(np.arange(span.start - before[-1], stop) % length)
-    top, left = before
-    return image[np.ix_(*places)], (slice(top, top + tile.shape[0]), slice(left, left + tile.shape[1]))
 
 
 def new_mosaic(shape: tuple[int, ...], folder: Path | None = None) -> FloatArray:

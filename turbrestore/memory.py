@@ -14,8 +14,8 @@ Stack and modes may be kept in a file; what the threads have in hand of it then 
 memory, what flow prepares of the training frames is kept too, τ HW bytes until the filter has passed over them.
 
 Where even that is too much for whole frames, they are worked on in tiles that overlap
-(:mod:`turbrestore.tiled_stages`).  A tile takes what a clip of its size takes, or in the deconvolution one with a halo
-as wide as the blur asks for.  Before, between and after tiles the whole images are worked on, which lie in files::
+(:mod:`turbrestore.tiled_stages`).  A tile takes what a clip of its size takes.  Before, between and after tiles the
+whole images are worked on, which lie in files::
 
     base + HW · (whole + c · colour)
 
@@ -25,7 +25,8 @@ The constants of stages are those of ``python benchmarks/memory.py --stages``, a
 frames, at 1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at 3840×2160; of
 what codes the images of a report at 1920×1080.
 torch counts where a device is asked for, but not what a stage holds there, on the processor or not.  The deconvolution
-is told what is left, and works in strips and fewer threads where that is little; the other stages need what they need.
+is told what is left, of whole frames as of tiles, and works in strips of files and fewer threads where that is little;
+the other stages need what they need.
 So the training frames go to a file first, then fewer threads work side by side, then fewer frames are trained on, and
 at last frames are worked on in tiles, as large ones as there is room for with two threads, or below 640 pixels with
 one.  Only the last two change the result.
@@ -42,12 +43,12 @@ from .alternating import FilterParams
 from .compiled import COMPILER_BYTES, can_compile
 from .decision import Decision
 from .deconvolution import MARGIN_SIGMAS, DeconvolutionParams
-from .deconvolution_memory import NonlocalWork, Room
+from .deconvolution_memory import DeconvolutionWork, Room
 from .device import TORCH_BYTES
 from .dynamics import DynamicsParams
 from .errors import ConfigurationError, DataError, require
 from .flow import MIN_SIDE, FlowParams
-from .halo_tiles import HALO, halo_tiles, largest_tile, sizes_to_deblur
+from .halo_tiles import HALO, halo_tiles, largest_tile
 from .memory_size import size_text
 from .parallel import available_cores
 
@@ -128,9 +129,7 @@ _WORTH, _SIDE_STEP = 640, 32
 _THREADS_OF_TILES = 2
 # Images and maps that earlier stages leave, and what is made of them while the width of the blur is found.
 _HELD, _BLUR = StageMemory(60, 40, 0, 0), StageMemory(40, 0, 0, 0)
-# Width of the blur where it is not known yet, pixels.
-_SIGMA = 3.0
-# The widest that is found, in tiles, where it hardly matters.
+# Width of the blur where it is not known yet: the widest that is found, pixels.
 _WIDEST = 21.0
 # From this share of the limit on, what freed arrays leave in the heap counts.
 _ROOMY = 0.5
@@ -200,14 +199,13 @@ class _Work:
         return _BASE + (TORCH_BYTES if self.on_device else 0) + (COMPILER_BYTES if can_compile() else 0)
 
     @property
-    def pairs(self) -> NonlocalWork:
+    def deblurring(self) -> DeconvolutionWork:
         """The deconvolution, with its margin."""
-        sigma = _SIGMA if self.deconvolution.sigma is None else self.deconvolution.sigma
-        margin = int(np.ceil(MARGIN_SIGMAS * sigma))
+        sigma = _WIDEST if self.deconvolution.sigma is None else self.deconvolution.sigma
+        margin = 2 * int(np.ceil(MARGIN_SIGMAS * sigma)) if self.deconvolution.boundary == "unknown" else 0
         channels = self.channels if self.deconvolution.channels == "each" else 1
-        return NonlocalWork(
-            (self.shape[1] + 2 * margin, self.shape[2] + 2 * margin), channels, self.deconvolution.weights
-        )
+        shape = self.shape[1] + margin, self.shape[2] + margin
+        return DeconvolutionWork(shape, channels, self.deconvolution.method, self.deconvolution.weights)
 
     def stack(self, train: int) -> float:
         return train * self.pixels * (4.0 * self.channels + 8.0)
@@ -232,11 +230,12 @@ class _Work:
         # A frame, what flow prepares of it, and its flow at half the resolution.
         block = self.pixels * (4.0 * self.channels + 2.0) * min(self.filter.block, self.shape[0])
         judged = 8.0 * self.pixels * train if self.filter.frame_noise == "blur" else 0.0
+        deblurred = _BLUR.bytes(*size) + self.deblurring.peak(Room(1, True, True))
         later = {
             "centroid": 0.0,
             "identify": min(_STRIPS, _STRIP_NUMBER * self.pixels * train) + prepared,
             "filter": flow + _FILTER.bytes(*size) + max(block, prepared) + judged,
-            "deconvolve": self.held() + max(_BLUR.bytes(*size) + self.pairs.peak(Room(1, True)), self.bounds(train)),
+            "deconvolve": self.held() + max(deblurred, self.bounds(train)),
         }
         stages = list(later)[: list(later).index(self.until) + 1]
         report = self.held() + self.report()
@@ -247,22 +246,13 @@ class _Work:
         largest = largest_tile((self.shape[1], self.shape[2]), side)
         return replace(self, shape=(self.shape[0], *largest, *self.shape[3:]), until="filter")
 
-    def part_to_deblur(self, side: int) -> _Work:
-        """Return the work on one tile of the deconvolution."""
-        sizes, around = sizes_to_deblur(side, self.deconvolution.sigma), self.deconvolution.boundary == "periodic"
-        largest = largest_tile((self.shape[1], self.shape[2]), *sizes, around)
-        sigma = _WIDEST if self.deconvolution.sigma is None else self.deconvolution.sigma
-        blur = replace(self.deconvolution, sigma=sigma)
-        return replace(self, shape=(self.shape[0], *largest, *self.shape[3:]), deconvolution=blur)
-
     def peak_in_tiles(self, train: int, threads: int, side: int) -> float:
         """Largest need of any stage where frames are worked on in tiles."""
         part, size = self.part(side), (self.pixels, self.channels, 0)
         model = _WHOLE_MODEL.bytes(*size) + min(self.modes(train), 4.0 * _IN_HAND * threads)
         model += min(_STRIPS, _STRIP_NUMBER * self.pixels * train)
-        to_deblur = self.part_to_deblur(side)
-        tile = to_deblur.pairs.peak(Room(1, True)) + to_deblur.cut()
-        blur = max(_WHOLE_BLUR.bytes(*size), self.bounds(train), tile) + _WHOLE_WIDTHS.bytes(*size)
+        deblurred = self.deblurring.peak(Room(1, True, True))
+        blur = max(_WHOLE_BLUR.bytes(*size), self.bounds(train), deblurred) + _WHOLE_WIDTHS.bytes(*size)
         result = _WHOLE_RESULT.bytes(*size)
         later = {"centroid": result, "identify": max(result, model), "filter": result, "deconvolve": blur}
         stages = list(later)[: list(later).index(self.until) + 1]
@@ -282,10 +272,6 @@ class _Work:
         coding = _SHOWN.bytes(self.pixels, self.channels, 0) + _CODING.bytes(int(shown), self.channels, 0)
         return _REPORT_TEXT + max(_REPORT.bytes(self.pixels, self.channels, 0), coding)
 
-    def cut(self) -> float:
-        """Image and guide of a tile that is deblurred."""
-        return 8.0 * self.pixels * self.channels
-
     def held(self) -> float:
         """Results of the stages before the deconvolution."""
         return _HELD.bytes(self.pixels, self.channels, 0)
@@ -298,8 +284,7 @@ class _Work:
 
     def room(self, memory: float | None) -> Room:
         """How the deconvolution works."""
-        nonlocal_ = self.until == "deconvolve" and self.deconvolution.method == "nltv"
-        return self.pairs.room(memory if nonlocal_ else None, available_cores())
+        return self.deblurring.room(memory if self.until == "deconvolve" else None, available_cores())
 
 
 def plan_memory(
@@ -359,7 +344,7 @@ def plan_memory(
     work = _Work(shape, filter, dynamics, deconvolution or DeconvolutionParams(), until, blur_bounds, on_device)
     if limit is None:
         room = work.room(work.deconvolution.memory)
-        return MemoryPlan(train, flow.threads, file_bytes=int(work.pairs.pairs()) if room.in_file else 0)
+        return MemoryPlan(train, flow.threads, file_bytes=int(work.deblurring.files(room)))
     most = flow.threads or available_cores()
     fewest = train if wanted is not None else min(train, _FEWEST_IN_NEED)
     for count in range(train, fewest - 1, -1):
@@ -478,7 +463,7 @@ def _plan(work: _Work, limit: float, wanted: tuple[int, int], chosen: tuple[int,
     left = work.left(limit, 0 if in_file else kept)
     room = work.room(left)
     maps = 16.0 * work.pixels if work.modes(count) else 0.0
-    files = (kept + maps if in_file else 0) + (work.pairs.pairs() if room.in_file else 0)
+    files = (kept + maps if in_file else 0) + work.deblurring.files(room)
     decisions = tuple(_decisions(work, limit, wanted, chosen, room))
     tight = bool(decisions) or work.peak(*chosen) > _ROOMY * limit
     results = work.base + work.held() + (0 if in_file else kept)
@@ -491,14 +476,13 @@ def _plan_in_tiles(work: _Work, limit: float, wanted: tuple[int, int], side: int
     # Of all sides with the same tiles, the same one, for results that are kept are told apart by it.
     side = max(*largest_tile((work.shape[1], work.shape[2]), side), 4 * HALO)
     threads = next(count for count in range(most, 0, -1) if work.peak_in_tiles(train, count, side) <= limit)
-    part, to_deblur = work.part(side), work.part_to_deblur(side)
-    left = work.left(limit, _WHOLE_WIDTHS.bytes(work.pixels, work.channels, 0) + to_deblur.cut() - work.held())
-    room = to_deblur.room(left)
+    part, widths = work.part(side), _WHOLE_WIDTHS.bytes(work.pixels, work.channels, 0)
+    left = work.left(limit, widths - work.held())
     # Maps of the flow models; results of two tries of the blur, centroid, sums of the tiles, and the tiles themselves,
     # which overlap fourfold where they are small.
     images = 16.0 * (work.pixels + part.pixels) + 4.0 * work.pixels * (6 + 14 * work.channels)
     files = work.modes(train) + work.stack(train) + part.modes(train) + part.stack(train) + images
-    files += to_deblur.pairs.pairs() if room.in_file else 0
+    files += work.deblurring.files(work.room(left))
     decisions = tuple(_decisions_in_tiles(work, limit, part, (threads, most), side))
     return MemoryPlan(train, threads, True, side, int(files), left, True, work.base, decisions)
 
@@ -531,5 +515,7 @@ def _decisions(
         needed = size_text(work.peak(count, most, in_file))
         yield Decision("memory", f"{threads} of {most} threads", f"all of them would take {needed} {allowed}")
     if room.in_file:
-        size = size_text(work.pairs.pairs())
-        yield Decision("memory", "nonlocal pairs kept in a file", f"they take {size} {allowed}")
+        kept = ["nonlocal pairs"] if work.deblurring.pairs() else []
+        kept += ["images of the deconvolution"] if room.images_in_file else []
+        size = size_text(work.deblurring.files(room))
+        yield Decision("memory", f"{' and '.join(kept)} kept in files", f"they take {size} {allowed}")

@@ -9,12 +9,12 @@ factor ``f = 1 / max(|a|, 1)`` of the projection, the over-relaxed update is
     p + ρ(fa − p) = ga + Kl,  g = 1 − ρ + ρf,  l = (ρ − 1)sū.
 
 So a is kept in place of p, and g and l, which are images: the second pass writes nothing, and the first of the next
-iteration finds ``a = ga + K(l + sū)``.
+iteration finds ``a = ga + K(l + sū)``.  Images are changed in place: between the passes l has ``l + sū``, and the image
+that is to be Kᵀp has |a|².
 """
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from .compiled import compiled
 from .edge_strips import EdgeStrip, sum_strips
 from .nonlocal_tv import NonlocalGraph
 from .scratch import new_stack, release
+from .strip_grid import StripGrid
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,7 @@ class EdgeDual:
     ----------
     values : ndarray, float32, shape (2, E)
         a from tail to head, and from head to tail.
-    factor, lagged : ndarray, float32, shape (H · W,)
+    factor, lagged : ndarray, float32, shape (H, W)
         g and l.
     parts : tuple of slice
         Edges of each strip.
@@ -55,14 +56,14 @@ class NonlocalPenalty:
     Attributes
     ----------
     graph : NonlocalGraph
-    pool : Executor, optional
-        Threads that work on strips side by side.
+    grid : StripGrid
+        Of its images; its threads work on strips side by side.
     folder : Path, optional
         Where a is kept in a file; without it it is in memory.
     """
 
     graph: NonlocalGraph
-    pool: Executor | None = None
+    grid: StripGrid
     folder: Path | None = None
 
     @property
@@ -73,19 +74,30 @@ class NonlocalPenalty:
     def dual(self, image: FloatArray) -> EdgeDual:
         """Start from p = 0 for an image of this size."""
         ends = np.cumsum([0] + [len(strip.heads) for strip in self.graph.strips])
-        values = np.asarray(new_stack((2, int(ends[-1])), self.folder))
+        values, factor, lagged = np.asarray(new_stack((2, int(ends[-1])), self.folder)), *self._images(2)
         for part in (parts := tuple(map(slice, ends[:-1], ends[1:]))):
             values[:, part] = 0
             release(values)
-        return EdgeDual(values, np.ones(image.size, np.float32), np.zeros(image.size, np.float32), parts)
 
-    def ascend(self, dual: EdgeDual, image: FloatArray, step: float, relaxation: float) -> FloatArray:
-        """Add ``step`` times K of the image to p, project and over-relax, in place; return Kᵀp."""
-        rise, loops = image.ravel() * np.float32(step), compiled(add_differences)
-        change = rise + dual.lagged
+        def begin(rows: slice) -> None:
+            factor[rows], lagged[rows] = 1, 0
+
+        self.grid.over_rows(begin, factor, lagged)
+        return EdgeDual(values, factor, lagged, parts)
+
+    def ascend(self, dual: EdgeDual, image: FloatArray, step: float, relaxation: float, pull: FloatArray) -> None:
+        """Add ``step`` times K of the image to p, project and over-relax, in place; ``pull`` becomes Kᵀp.
+
+        What is in the image is lost.
+        """
+        loops, factor, change = compiled(add_differences), dual.factor.ravel(), dual.lagged.ravel()
+
+        def rise(rows: slice) -> None:
+            image[rows] *= np.float32(step)
+            dual.lagged[rows] += image[rows]
 
         def add(number: int, strip: EdgeStrip) -> FloatArray:
-            own, (there, back) = strip.view(dual.factor), dual.values[:, dual.parts[number]]
+            own, (there, back) = strip.view(factor), dual.values[:, dual.parts[number]]
             if loops is not None:
                 squares = np.zeros(strip.window, np.float32)
                 loops(strip.view(change), own, strip.starts, strip.heads, strip.roots, there, back, squares)
@@ -96,53 +108,64 @@ class NonlocalPenalty:
                 back *= strip.at_heads(own)
                 back -= more
                 squares = strip.gather((there, there), (back, back))
-            release(dual.values)
+            for array in (dual.values, factor, change):
+                release(array)
             return squares
 
-        factor = np.sqrt(sum_strips(self.graph.strips, add, change.size, self.pool))
-        np.maximum(factor, 1, out=factor)
-        np.divide(np.float32(relaxation), factor, out=dual.factor)
-        np.subtract(dual.factor, np.float32(relaxation - 1), out=dual.factor)
-        np.multiply(rise, np.float32(relaxation - 1), out=dual.lagged)
-        return self._pull(dual).reshape(image.shape)
+        def project(rows: slice) -> None:
+            found = np.sqrt(pull[rows])
+            np.maximum(found, 1, out=found)
+            np.divide(np.float32(relaxation), found, out=found)
+            np.subtract(found, np.float32(relaxation - 1), out=dual.factor[rows])
+            np.multiply(image[rows], np.float32(relaxation - 1), out=dual.lagged[rows])
 
-    def _pull(self, dual: EdgeDual) -> FloatArray:
+        self.grid.over_rows(rise, image, dual.lagged)
+        sum_strips(self.graph.strips, add, pull.ravel(), self.grid.pool)
+        self.grid.over_rows(project, image, pull, dual.factor, dual.lagged)
+        self._pull(dual, pull.ravel())
+
+    def _pull(self, dual: EdgeDual, pull: FloatArray) -> None:
         """Kᵀp."""
-        loops = compiled(draw_back)
+        loops, factor, lagged = compiled(draw_back), dual.factor.ravel(), dual.lagged.ravel()
 
         def draw(number: int, strip: EdgeStrip) -> FloatArray:
-            own, (there, back) = strip.view(dual.factor), dual.values[:, dual.parts[number]]
+            own, (there, back) = strip.view(factor), dual.values[:, dual.parts[number]]
             if loops is not None:
-                pull = np.zeros(strip.window, np.float32)
-                loops(own, strip.view(dual.lagged), strip.starts, strip.heads, strip.roots, there, back, pull)
+                found = np.zeros(strip.window, np.float32)
+                loops(own, strip.view(lagged), strip.starts, strip.heads, strip.roots, there, back, found)
             else:
-                net, heads, tails = strip.differences(dual.lagged), strip.at_heads(own), strip.at_tails(own)
+                net, heads, tails = strip.differences(lagged), strip.at_heads(own), strip.at_tails(own)
                 net *= -2
                 net += np.multiply(heads, back, out=heads)
                 net -= np.multiply(tails, there, out=tails)
-                pull = strip.gather((net, strip.roots), (net, strip.roots), subtract=True)
-            release(dual.values)
-            return pull
+                found = strip.gather((net, strip.roots), (net, strip.roots), subtract=True)
+            for array in (dual.values, factor, lagged):
+                release(array)
+            return found
 
-        return sum_strips(self.graph.strips, draw, dual.factor.size, self.pool)
+        sum_strips(self.graph.strips, draw, pull, self.grid.pool)
 
     def value(self, image: FloatArray) -> float:
         """J[u]."""
-        flat, loops = image.ravel(), compiled(add_differences)
-        # From a = 0 the first pass of an iteration finds the squares of K.
-        no_factor = np.zeros_like(flat)
+        flat, loops, (total,) = image.ravel(), compiled(add_differences), self._images(1)
 
         def squares(_: int, strip: EdgeStrip) -> FloatArray:
+            values = strip.view(flat)
             if loops is not None:
                 found, along = np.zeros(strip.window, np.float32), np.zeros((2, len(strip.heads)), np.float32)
-                own = strip.view(flat), strip.view(no_factor)
-                loops(*own, strip.starts, strip.heads, strip.roots, along[0], along[1], found)
-                return found
-            along = strip.differences(flat)
-            return strip.gather((along, along), (along, along))
+                # From a = 0 the first pass of an iteration finds the squares of K, whatever the factor.
+                loops(values, values, strip.starts, strip.heads, strip.roots, along[0], along[1], found)
+            else:
+                differences = strip.differences(flat)
+                found = strip.gather((differences, differences), (differences, differences))
+            release(flat)
+            return found
 
-        total = sum_strips(self.graph.strips, squares, flat.size, self.pool)
-        return float(np.sqrt(total).sum(dtype=np.float64))
+        sum_strips(self.graph.strips, squares, total.ravel(), self.grid.pool)
+        return sum(self.grid.over_rows(lambda rows: float(np.sqrt(total[rows]).sum(dtype=np.float64)), total))
+
+    def _images(self, count: int) -> list[FloatArray]:
+        return [self.grid.image() for _ in range(count)]
 
 
 def add_differences(

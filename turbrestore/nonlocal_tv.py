@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -189,6 +189,9 @@ def nonlocal_weights(
     h = params.h if params.h is not None else automatic_h(grey)
     threads = threads or available_cores()
     strips = tuple(_strips(grey, params, h, folder, threads))
+    release(grey)
+    order = np.arange(max(len(strip.heads) for strip in strips) + 1, dtype=np.int32)
+    strips = tuple(replace(strip, order=order) for strip in strips)
     return NonlocalGraph(grey.shape, strips, _norm_squared_bound(strips, grey.size, threads), h)
 
 
@@ -394,15 +397,15 @@ def _cut(
     # Strips of a band as equal as they can be: a short one at its end would cost as much as a long one.
     count = -(-(stop - top) // max(4, min(BAND_ROWS, STRIP_PIXELS // width)))
     step = -(-(stop - top) // count)
-    heads, order = stack[1].view(np.int32), np.arange(stack.shape[1] + 1, dtype=np.int32)
-    end = 0
+    # All strips share one order, once the longest of them is known.
+    heads, end, none = stack[1].view(np.int32), 0, np.zeros(0, np.int32)
     for row in range(top, stop, step):
         first, own = (row - top) * width, (min(row + step, stop) - row) * width
-        of_tails = degrees[first : first + own]
+        of_tails = degrees[first : first + own].astype(np.int32)
         part = slice(end, end := end + int(of_tails.sum()))
         heads[part] -= np.int32(first)
         window = min(own + reach * (width + 1), (height - row) * width)
-        yield EdgeStrip(row * width, window, of_tails, heads[part], stack[0, part], order)
+        yield EdgeStrip(row * width, window, of_tails, heads[part], stack[0, part], none)
 
 
 def _norm_squared_bound(strips: tuple[EdgeStrip, ...], pixels: int, threads: int, iterations: int = 10) -> float:
@@ -425,9 +428,11 @@ def _norm_squared_bound(strips: tuple[EdgeStrip, ...], pixels: int, threads: int
     with one_thread_each(), ThreadPoolExecutor(threads) as pool:
         for _ in range(iterations):
             # Pixels without edges do not take part.
-            x = np.maximum(x / x.max(), np.float32(1e-6))
-            image = sum_strips(strips, apply, pixels, pool)
-            bound = min(bound, float((image / x).max()))
+            x /= x.max()
+            np.maximum(x, np.float32(1e-6), out=x)
+            image = np.empty_like(x)
+            sum_strips(strips, apply, image, pool)
+            bound = min(bound, float(np.divide(image, x, out=x).max()))
             x = image
     return 2 * bound
 

@@ -36,7 +36,7 @@ from .flow import MIN_SIDE, FlowFrame
 from .flow_model import FlowDynamics
 from .frame_selection import best_frames, frame_quality
 from .frame_source import FrameSource
-from .halo_tiles import HaloTile, cut_tile, halo_tiles, sizes_to_deblur
+from .halo_tiles import HaloTile, cut_tile, halo_tiles
 from .images import check_space
 from .memory import MemoryPlan, plan_memory
 from .memory_size import DeconvolutionMemory
@@ -249,11 +249,8 @@ class _Run:
         self.prepared: dict[int, FlowFrame] | None = None if plan.in_file else {}
         height, width = source.shape[1:3]
         self.tiles: tuple[HaloTile, ...] = ()
-        self.tiles_to_deblur: tuple[HaloTile, ...] = ()
         if plan.tile is not None:
             self.tiles = halo_tiles((height, width), plan.tile)
-            sizes = sizes_to_deblur(plan.tile, params.deconvolution.sigma)
-            self.tiles_to_deblur = halo_tiles((height, width), *sizes)
         self._on_result = on_result
 
     def finish(self, done: StageResults, stage: str | None = None) -> None:
@@ -413,10 +410,9 @@ def _deblur(run: _Run, image: FloatArray, mean: FloatArray, centroid: Centroid, 
     if params.blur_bounds:
         exponent = params.deconvolution.exponent or KOLMOGOROV
         bounds = bound_blur(image, mean, training, len(run.source), exponent)
-    parts = run.tiles_to_deblur
-    counter = stage_counter(run.progress, "deconvolve", max(len(parts), 1) * params.deconvolution.iterations)
+    counter = stage_counter(run.progress, "deconvolve", params.deconvolution.iterations)
     deblurred = remove_blur(
-        image, centroid.image, params.deconvolution, params.guards, bounds, counter, run.folder, parts
+        image, centroid.image, params.deconvolution, params.guards, bounds, counter, run.folder, bool(run.tiles)
     )
     run.finish(replace(run.done, blur_bounds=bounds, deblurred=deblurred), "deconvolve")
     return deblurred

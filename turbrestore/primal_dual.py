@@ -31,7 +31,6 @@ Fourier.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -64,8 +63,11 @@ class Penalty(Protocol):
         """Start from p = 0 for an image of this size."""
         ...
 
-    def ascend(self, dual: Any, image: FloatArray, step: float, relaxation: float) -> FloatArray:
-        """Add ``step`` times K of the image to p, project and over-relax, in place; return Kᵀp."""
+    def ascend(self, dual: Any, image: FloatArray, step: float, relaxation: float, pull: FloatArray) -> None:
+        """Add ``step`` times K of the image to p, project and over-relax, in place; ``pull`` becomes Kᵀp.
+
+        What is in the image is lost.
+        """
         ...
 
     def value(self, image: FloatArray) -> float:
@@ -73,33 +75,8 @@ class Penalty(Protocol):
         ...
 
 
-class Regulariser(NamedTuple):
-    """Penalty of four functions: K, Kᵀ, the projection on |p|(x) ≤ 1, and J; with a bound of ‖K‖²."""
-
-    gradient: Callable[[FloatArray], FloatArray]
-    adjoint: Callable[[FloatArray], FloatArray]
-    project: Callable[[FloatArray], FloatArray]
-    value: Callable[[FloatArray], float]
-    norm_squared: float
-
-    def dual(self, image: FloatArray) -> FloatArray:
-        """Start from p = 0 for an image of this size."""
-        return np.zeros_like(self.gradient(image))
-
-    def ascend(self, dual: FloatArray, image: FloatArray, step: float, relaxation: float) -> FloatArray:
-        """Add ``step`` times K of the image to p, project and over-relax, in place; return Kᵀp."""
-        forward = self.gradient(image)
-        forward *= np.float32(step)
-        forward += dual
-        forward = self.project(forward)
-        forward -= dual
-        forward *= np.float32(relaxation)
-        dual += forward
-        return self.adjoint(dual)
-
-
 class PrimalDualState(NamedTuple):
-    """u, Bu, q, p, Kᵀp, and the number of the next iteration.  A step changes all arrays but u in place."""
+    """u, Bu, q, p, Kᵀp, and the number of the next iteration.  A step changes all arrays in place."""
 
     image: FloatArray
     blurred: FloatArray
@@ -119,27 +96,49 @@ class PrimalDual:
 
     def start(self, problem: Problem, u: FloatArray) -> PrimalDualState:
         """Start from the image ``u``, with the q that it asks for and p one step from 0."""
-        blurred, p = problem.blurred(fft.rfft2(u)), self.regulariser.dual(u)
-        q = np.float32(problem.fidelity) * problem.seen * (blurred - problem.observed)
-        return PrimalDualState(u, blurred, q, p, self.regulariser.ascend(p, u, self._steps[1], 1), 1)
+        grid, p, u = problem.grid, self.regulariser.dual(u), problem.grid.copied(u)
+        blurred, q, pull, ahead = problem.blurred(u), grid.image(), grid.image(), grid.spare
+        weight = np.float32(problem.fidelity)
+
+        def press(rows: slice) -> None:
+            q[rows] = weight * problem.seen[rows] * (blurred[rows] - problem.observed[rows])
+            ahead[rows] = u[rows]
+
+        grid.over_rows(press, q, blurred, ahead, u, problem.seen, problem.observed)
+        self.regulariser.ascend(p, ahead, self._steps[1], 1, pull)
+        return PrimalDualState(u, blurred, q, p, pull, 1)
 
     def step(self, problem: Problem, state: PrimalDualState) -> PrimalDualState:
         """One iteration, over-relaxed."""
-        tau, s = self._steps
-        u, blurred, q, p, pull, number = state
-        share = max(1 / number, LEAST_DATA_STEP)
-        down = fft.rfft2(q)
-        down *= problem.otf.conj()
-        down += fft.rfft2(pull, overwrite_x=True)
-        down *= np.reciprocal(np.float32(1 / tau) + np.float32(share * problem.fidelity) * problem.power)
-        drop = problem.blurred(down)
-        moved = fft.irfft2(down, s=u.shape, overwrite_x=True)
+        grid, (falls, moves) = problem.grid, problem.grid.spectra
+        (tau, s), share = self._steps, max(1 / state.number, LEAST_DATA_STEP)
+        (u, blurred, q, p, pull, _), transfer = state, problem.transfer
         follow = compiled(follow_loops) or _follow
         steps = np.array([share * problem.fidelity, 1 / (1 + share), RELAXATION], np.float32)
-        changed = moved.ravel(), blurred.ravel(), drop.ravel(), q.ravel()
-        follow(u.ravel(), *changed, problem.observed.ravel(), problem.seen.ravel(), steps)
-        pull = self.regulariser.ascend(p, drop, s, RELAXATION)
-        return PrimalDualState(moved, blurred, q, p, pull, number + 1)
+
+        def transform(rows: slice) -> None:
+            grid.transform_strip(q[rows], falls, rows)
+            grid.transform_strip(pull[rows], moves, rows)
+
+        def solve(block: int) -> None:
+            down, otf = fft.fft(falls[block], axis=0), transfer[block]
+            down *= otf.conj()
+            down += fft.fft(moves[block], axis=0)
+            down *= np.reciprocal(np.float32(1 / tau) + np.float32(share * problem.fidelity) * problem.power(block))
+            falls[block] = fft.ifft(down * otf, axis=0, overwrite_x=True)
+            moves[block] = fft.ifft(down, axis=0, overwrite_x=True)
+
+        def move(rows: slice) -> None:
+            moved, drop = grid.strip_of(moves, rows), grid.strip_of(falls, rows)
+            changed = moved.ravel(), blurred[rows].reshape(-1), drop.ravel(), q[rows].reshape(-1)
+            follow(u[rows].ravel(), *changed, problem.observed[rows].ravel(), problem.seen[rows].ravel(), steps)
+            u[rows], grid.spare[rows] = moved, drop
+
+        grid.over_rows(transform, falls, moves, q, pull)
+        grid.over_blocks(solve, falls, moves, transfer)
+        grid.over_rows(move, falls, moves, u, blurred, q, grid.spare, problem.observed, problem.seen)
+        self.regulariser.ascend(p, grid.spare, s, RELAXATION, pull)
+        return state._replace(number=state.number + 1)
 
     def penalty(self, problem: Problem, u: FloatArray) -> float:
         """J(u)."""

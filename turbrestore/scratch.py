@@ -79,7 +79,7 @@ def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.
 
 
 def kept_in(array: NDArray[np.float32], folder: Path | None = None) -> NDArray[np.float32]:
-    """Move an array to a file, if there is a folder for it.
+    """Move an array to a file, if there is a folder for it and the array is in none.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def kept_in(array: NDArray[np.float32], folder: Path | None = None) -> NDArray[n
     >>> kept_in(np.ones((2, 3), np.float32)).sum()
     np.float32(6.0)
     """
-    if folder is None:
+    if folder is None or isinstance(array, np.memmap):
         return array
     stack = new_stack(array.shape, folder)
     stack[...] = array

@@ -3,8 +3,7 @@
 A tile is a clip of its own: it has its own centroid iterations, flow model and filter, and what they leave fades into
 what the neighbours leave.  That is not the result of the whole frame, though close to it: what is taken from all pixels
 at once, such as the flow model, the noise of the frames and the motion of flat regions far from any texture, is taken
-from those of the tile.  In a deconvolution weight and width are those of the whole image, and the halo of its tiles is
-as wide as the blur asks for.
+from those of the tile.  The deconvolution needs no tiles: it works in strips of files, to the same result.
 
 A frame that is shifted by more than the halo, 96 pixels, leaves a part of its tile unseen, as at the border of a frame.
 """
@@ -22,9 +21,8 @@ from numpy.typing import NDArray
 from .alternating import Filtered
 from .arrays import FloatArray
 from .centroid import Centroid, CentroidParams, find_centroid
-from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve, noise_and_fidelity
 from .flow import FlowParams
-from .halo_tiles import HaloTile, add_tile, cut_around, cut_tile, new_mosaic
+from .halo_tiles import HaloTile, add_tile, cut_tile, new_mosaic
 from .scratch import kept_in, release, walk
 
 Float64Array = NDArray[np.float64]
@@ -160,89 +158,6 @@ def filter_tiles(
             add_tile(whole, tile, found)
             release(found)
     return _joined(image, variance, done.parts, _areas(tiles)), mean
-
-
-def deconvolve_tiles(
-    image: FloatArray,
-    sigma: float,
-    params: DeconvolutionParams,
-    guide: FloatArray,
-    tiles: Sequence[HaloTile],
-    progress: Callable[[int], None] | None = None,
-    scratch: Path | None = None,
-) -> Deconvolution:
-    """Deblur tile after tile by one width and one weight of the data.
-
-    A tile at the edge of a periodic image has a halo there too: the other side of the image.
-
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Blurred image.
-    sigma : float
-        Width of the blur, pixels.
-    params : DeconvolutionParams
-    guide : ndarray, float32, shape of ``image``
-        What nonlocal weights are taken from.
-    tiles : sequence of HaloTile
-        Their halo holds the blur.
-    progress : callable, optional
-        Called with 1 after each iteration of each tile.
-    scratch : Path, optional
-        Folder of the file for what memory does not hold; by default that of temporary files.
-
-    Returns
-    -------
-    Deconvolution
-        Iterations are those of the tile that took most; energies are sums over the tiles, whose overlaps count twice,
-        and of those that have stopped the last counts on; changes are the largest of any tile.
-
-    Raises
-    ------
-    DataError, ConfigurationError, StorageError
-        As :func:`turbrestore.deconvolution.deconvolve`.
-
-    Examples
-    --------
-    >>> from turbrestore.halo_tiles import halo_tiles
-    >>> image = np.full((40, 64), 0.5, np.float32)
-    >>> tiles = halo_tiles(image.shape, side=44, halo=8)
-    >>> deconvolve_tiles(image, 1.0, DeconvolutionParams(method="wiener"), image, tiles).image.shape
-    (40, 64)
-    """
-    noise, fidelity = noise_and_fidelity(image, params)
-    params = dataclasses.replace(params, fidelity=fidelity)
-    around = params.boundary == "periodic" and len(tiles) > 1
-    if around:
-        params = dataclasses.replace(params, boundary="unknown")
-    mosaic = new_mosaic(image.shape, scratch)
-    parts = list[Deconvolution]()
-    for tile in tiles:
-        window, inside = cut_around(image, tile, tile.halo if around else 0)
-        release(image)
-        surroundings, _ = cut_around(guide, tile, tile.halo if around else 0)
-        release(guide)
-        part = deconvolve(window, sigma, params, surroundings, progress, scratch)
-        add_tile(mosaic, tile, part.image[inside])
-        parts.append(dataclasses.replace(part, image=np.zeros((0, 0), np.float32)))
-        del part
-    recorded = np.unique(np.concatenate([part.recorded for part in parts]))
-    last = [np.searchsorted(part.recorded, recorded, side="right") - 1 for part in parts]
-    energies, changes = (
-        [getattr(part, name)[np.maximum(at, 0)] for part, at in zip(parts, last, strict=True)]
-        for name in ("objective", "changes")
-    )
-    return Deconvolution(
-        mosaic,
-        sigma,
-        fidelity,
-        noise,
-        iterations=max(part.iterations for part in parts),
-        converged=all(part.converged for part in parts),
-        recorded=recorded,
-        objective=np.sum(energies, axis=0),
-        changes=np.max(changes, axis=0),
-    )
 
 
 def _joined(image: FloatArray, variance: FloatArray, parts: Sequence[Filtered], areas: Float64Array) -> Filtered:

@@ -154,8 +154,9 @@ def solve_on_device(
     Examples
     --------
     >>> import numpy as np
+    >>> from turbrestore.strip_grid import StripGrid
     >>> flat = np.full((16, 16), 0.5, np.float32)
-    >>> problem = Problem(flat, np.ones_like(flat), np.ones((16, 9), np.float32), 100.0)
+    >>> problem = Problem(flat, np.ones_like(flat), np.ones((16, 9), np.float32), 100.0, StripGrid((16, 16)))
     >>> settings = SolverSettings("tv", 50, 1e-4, 10, 40, True, NonlocalParams())
     >>> solution = solve_on_device([problem], None, settings, "cpu")
     >>> solution.converged, bool(np.allclose(solution.images[0], 0.5, atol=1e-5))
