@@ -7,9 +7,9 @@ largest of these counts, of the time when its start is found, its weights, and w
     work + H W · (35 + 10 c + 8 pairs) + 60 · 64 W · b + t · 4 · tile · n
     work + H W · (50 + 36 c + (8 + 8 c) pairs) + t · 26 · strip · b
 
-64 W pixels are the band whose choices become pairs at a time; of a tile a thread has the distances to all neighbours,
-and of a strip the edges; with Numba it needs less.  A pixel has 0.65 b pairs.  They may be kept in a file: their terms
-are 0 then.  Where images are kept in files too, H W · 25 and H W · 20 remain of the last two lines.
+64 W pixels are the band whose choices become pairs at a time, which compiled takes 30 instead of 60; of a tile a thread
+has the distances to all neighbours, and of a strip the edges; compiled it needs less.  A pixel has 0.65 b pairs.  They may be kept in a file: their terms
+are 0 then.  Where images are kept in files too, H W · 20 remains of each of the last two lines.
 
 tv takes H W · (40 + 36 c) and the linear methods H W · (35 + 32 c), in files H W · 20.
 """
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from .compiled import can_compile
 from .nonlocal_tv import STRIP_PIXELS, NonlocalParams
 from .patch_search import BAND_ROWS, tile_columns
 
@@ -27,12 +28,12 @@ _WORK = 2e7
 _TV, _LINEAR, _IN_FILE = (40.0, 36.0), (35.0, 32.0), (20.0, 0.0)
 # Of nltv: while the start is found, and for a thread; while weights are found; in an iteration.
 _STARTED, _STARTED_THREAD = (20.0, 10.0), 32.0
-_FOUND, _FOUND_IN_FILE = (35.0, 10.0), (25.0, 0.0)
+_FOUND, _FOUND_IN_FILE = (35.0, 10.0), (20.0, 0.0)
 _ITERATED, _ITERATED_IN_FILE = (50.0, 36.0), (20.0, 0.0)
 # Of a pair: its head and weight, and its dual in every channel.
 _PAIR, _DUAL = 8.0, 8.0
-# Of every choice of a band, and of every choice of a strip for each thread.
-_BAND_CHOICE, _STRIP_CHOICE = 60.0, 26.0
+# Of every choice of a band, by NumPy and compiled, and of every choice of a strip for each thread.
+_BAND_CHOICE, _BAND_CHOICE_COMPILED, _STRIP_CHOICE = 60.0, 30.0, 26.0
 # Pairs per pixel over those that a pixel chooses: many are chosen from both sides.
 _SHARE_OF_PAIRS = 0.65
 # Pairs in files, and images: what is tried, one after the other.
@@ -148,7 +149,7 @@ class DeconvolutionWork:
             started, found, iterated = 0.0, self._all(_FOUND_IN_FILE), self._all(_ITERATED_IN_FILE)
         if not room.in_file:
             found, iterated = found + self.pixels * self._pairs * _PAIR, iterated + self.pairs()
-        found += _BAND_CHOICE * rows * width * self._choices
+        found += (_BAND_CHOICE_COMPILED if can_compile() else _BAND_CHOICE) * rows * width * self._choices
         found += room.threads * 4 * rows * min(tile_columns(offsets), width) * offsets
         iterated += room.threads * _STRIP_CHOICE * min(self.pixels, max(STRIP_PIXELS, 4 * width)) * self._choices
         return _WORK + max(started, found, iterated)
