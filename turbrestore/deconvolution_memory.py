@@ -7,9 +7,10 @@ largest of these counts, of the time when its start is found, its weights, and w
     work + H W · (35 + 10 c + 8 pairs) + 60 · 64 W · b + t · 4 · tile · n
     work + H W · (50 + 36 c + (8 + 8 c) pairs) + t · 26 · strip · b
 
-64 W pixels are the band whose choices become pairs at a time, which compiled takes 30 instead of 60; of a tile a thread
-has the distances to all neighbours, and of a strip the edges; compiled it needs less.  A pixel has 0.65 b pairs.  They may be kept in a file: their terms
-are 0 then.  Where images are kept in files too, H W · 20 remains of each of the last two lines.
+64 W pixels are the band whose choices become pairs at a time, which takes 30 instead of 60 with Numba; of a tile a
+thread has the distances to all neighbours, and of a strip the edges; with Numba it needs less.  A pixel has 0.65 b
+pairs.  They may be kept in a file: their terms are 0 then.  Where images are kept in files too, H W · 20 remains of
+each of the last two lines.
 
 tv takes H W · (40 + 36 c) and the linear methods H W · (35 + 32 c), in files H W · 20.
 """
