@@ -251,13 +251,14 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     from turbrestore.blur_estimation import estimate_blur
     from turbrestore.blur_map import estimate_blur_map, sigma_map
     from turbrestore.content import check_content
-    from turbrestore.deconvolution import DeconvolutionParams, noise_and_fidelity
     from turbrestore.dynamics import identify
     from turbrestore.explanation import explain_input, explain_motion
     from turbrestore.frame_source import FrameSource
     from turbrestore.guards import judge
     from turbrestore.images import write_image
     from turbrestore.metrics import compare
+    from turbrestore.planes import split_planes
+    from turbrestore.psf import estimate_noise
     from turbrestore.report import render_report
     from turbrestore.report.pictures import encode_gallery, stages
     from turbrestore.run_record import describe_run
@@ -295,7 +296,7 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
             lambda: estimate_blur(image),
             lambda: estimate_blur_map(image, blur),
             lambda: sigma_map([[1.0, 1.5, 2.0]] * 3, image.shape[:2]),
-            lambda: noise_and_fidelity(image, DeconvolutionParams(channels="each")),
+            lambda: [estimate_noise(plane) for plane in split_planes(image, "each")],
             lambda: judge(image, other, 2.0),
         ],
     )

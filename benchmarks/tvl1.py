@@ -13,7 +13,8 @@ less than five times faster than OpenCV's on any set, or its error is larger.
 of a dynamic texture that was identified on 40 earlier frames, and for a bound the flow to the frame itself.
 
 ``--clips`` restores the clips with truth instead, among them those under the folder that ``TURBRESTORE_DATA`` names: by
-TV-L1 that begins every flow anew, that starts from earlier flows, and by dense inverse search.
+TV-L1 that begins every flow anew, but for the shift of its frame, that starts from earlier flows, and by dense inverse
+search.
 """
 
 from __future__ import annotations

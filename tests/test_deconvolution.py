@@ -15,6 +15,7 @@ from turbrestore.blur_estimation import BlurEstimate
 from turbrestore.conjugate_gradients import ConjugateGradients
 from turbrestore.convolution_problem import Problem
 from turbrestore.deconvolution import BOUNDARIES, METHODS, DeconvolutionParams, automatic_fidelity, deconvolve
+from turbrestore.deconvolution_memory import Room
 from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.local_tv import LocalPenalty, local_divergence, local_gradient
 from turbrestore.nonlocal_penalty import NonlocalPenalty
@@ -42,7 +43,8 @@ def small_problem(seed: int, fidelity: float, shape: tuple[int, int] = (8, 8), m
     rng = np.random.default_rng(seed)
     seen = np.zeros(shape, np.float32)
     seen[margin : shape[0] - margin, margin : shape[1] - margin] = 1
-    return Problem(rng.random(shape).astype(np.float32), seen, gaussian_otf(shape, 0.7), fidelity, StripGrid(shape))
+    grid = StripGrid(shape)
+    return Problem(rng.random(shape).astype(np.float32), seen, grid.in_blocks(gaussian_otf(shape, 0.7)), fidelity, grid)
 
 
 def dense(operator, shape: tuple[int, int]) -> np.ndarray:
@@ -52,7 +54,7 @@ def dense(operator, shape: tuple[int, int]) -> np.ndarray:
 
 def dense_blur(problem: Problem) -> np.ndarray:
     shape = problem.seen.shape
-    return dense(lambda u: fft.irfft2(problem.otf * fft.rfft2(u), s=shape), shape)
+    return dense(lambda u: fft.irfft2(problem.transfer[0] * fft.rfft2(u), s=shape), shape)
 
 
 def solve(solver: PrimalDual, problem: Problem, iterations: int) -> np.ndarray:
@@ -118,8 +120,8 @@ def test_total_variation_in_strips_is_that_of_its_operators(monkeypatch, tmp_pat
 def test_the_residual_of_conjugate_gradients_is_the_slope_of_the_energy(method, steps):
     # An asymmetric kernel, for which a convolution and its adjoint differ.
     psf = np.random.default_rng(1).random((3, 3))
-    problem = dataclasses.replace(small_problem(1, 7.0), otf=psf_to_otf(psf, (8, 8)))
-    solver = ConjugateGradients(laplacian_symbol(8, 8) if method == "wiener" else np.ones((1, 1), np.float32))
+    problem = dataclasses.replace(small_problem(1, 7.0), transfer=psf_to_otf(psf, (8, 8))[None])
+    solver = ConjugateGradients(laplacian_symbol(8, 8)[None] if method == "wiener" else np.ones((1, 1, 1), np.float32))
     state = solver.start(problem)
     for _ in range(steps):
         state = solver.step(problem, state)
@@ -312,7 +314,7 @@ def test_pairs_in_a_file_give_the_same_image(monkeypatch, tmp_path):
     whole = deconvolve(colour, 1.5, params)
     assert not any(isinstance(values.base, np.memmap) for values in held)
     parts = deconvolve(colour, 1.5, dataclasses.replace(params, memory=1e7), scratch=tmp_path)
-    assert any(isinstance(values.base, np.memmap) for values in held)
+    assert any(isinstance(values.base, np.memmap) and values.shape[0] == 2 for values in held)
     assert np.abs(parts.image - whole.image).max() < 1e-5
     assert list(tmp_path.iterdir()) == []
 
@@ -350,6 +352,19 @@ def test_images_in_files_are_the_same_bytes(monkeypatch, tmp_path, method, chann
     assert parts.image.tobytes() == whole.image.tobytes()
     for name in ("recorded", "objective", "changes"):
         assert np.array_equal(getattr(parts, name), getattr(whole, name))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_threads_that_share_images_in_files_give_the_same_bytes(monkeypatch, tmp_path, method):
+    in_strips(monkeypatch)
+    monkeypatch.setattr("turbrestore.deconvolution._THREADED_PASS", 1)
+    _, blurred = camera(72, 1.5, 0.002)
+    colour, images = blurred[..., None] * np.array([0.9, 0.6, 0.3], np.float32), []
+    params = DeconvolutionParams(method=method, iterations=8, channels="each")
+    for room in (Room(1, False), Room(4, False), Room(4, True, True)):
+        monkeypatch.setattr("turbrestore.deconvolution.DeconvolutionWork.room", lambda *_, room=room: room)
+        images.append(deconvolve(colour, 1.5, params, scratch=tmp_path).image.tobytes())
+    assert len(set(images)) == 1
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -408,9 +423,22 @@ def test_masked_solution_is_that_of_dense_least_squares(method):
     assert result.objective[-1] == pytest.approx(residual @ residual / 2, rel=1e-3)
 
 
+def test_directions_are_conjugate_and_residuals_orthogonal():
+    """The normal equations have few unknowns here: a step in a direction is never taken twice."""
+    problem, solver = small_problem(10, 10.0), ConjugateGradients(laplacian_symbol(8, 8)[None] + np.float32(0.1))
+    blur, state, found = dense_blur(problem), solver.start(problem), []
+    system = 10.0 * blur.T @ np.diag(problem.seen.ravel()) @ blur
+    system += dense(lambda u: fft.irfft2(solver.symbol[0] * fft.rfft2(u), s=(8, 8)), (8, 8))
+    for _ in range(3):
+        state = solver.step(problem, state)
+        found.append(fft.irfft2(state.direction[0], s=(8, 8)).ravel().astype(np.float64))
+    products = np.array(found) @ system @ np.array(found).T
+    assert np.abs(products - np.diag(np.diag(products))).max() < 1e-3 * np.diag(products).min()
+
+
 def test_conjugate_gradients_stay_where_they_are_when_solved():
     problem = dataclasses.replace(small_problem(10, 10.0), observed=np.full((8, 8), 0.5, np.float32))
-    solver = ConjugateGradients(laplacian_symbol(8, 8))
+    solver = ConjugateGradients(laplacian_symbol(8, 8)[None])
     state = solver.start(problem)
     for _ in range(20):
         state = solver.step(problem, state)

@@ -1,4 +1,4 @@
-"""What a nonlocal deconvolution takes, against what is planned for it."""
+"""What a deconvolution takes, against what is planned for it."""
 
 import tracemalloc
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.deconvolution import DeconvolutionParams, deconvolve
+from turbrestore.deconvolution import METHODS, DeconvolutionParams, deconvolve
 from turbrestore.deconvolution_memory import DeconvolutionWork, Room
 from turbrestore.nonlocal_tv import NonlocalParams, nonlocal_weights
 
@@ -73,6 +73,21 @@ def test_a_deconvolution_keeps_its_limit_on_many_cores(image, tmp_path, monkeypa
     with traced() as peaks:
         deconvolve(image, 1.5, DeconvolutionParams(iterations=2, memory=limit), scratch=tmp_path)
     assert peaks[0] < limit
+
+
+@pytest.mark.parametrize("room", [Room(1, False), Room(8, True), Room(1, True, True), Room(8, True, True)])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_every_method_keeps_what_is_planned(monkeypatch, tmp_path, room, method, channels):
+    """Of an image of many strips; mapped pages are not seen here, but by benchmarks/memory.py."""
+    image = np.random.default_rng(0).random((600, 800, 3)[: 2 + (channels == 3)], np.float32)
+    params = DeconvolutionParams(method=method, iterations=2, channels="each")
+    work = DeconvolutionWork((640, 840), channels, method, NonlocalParams())
+    monkeypatch.setattr("turbrestore.deconvolution.DeconvolutionWork.room", lambda *_: room)
+    deconvolve(image[:48, :48], 1.5, params)
+    with traced() as peaks:
+        deconvolve(image, 1.5, params, scratch=tmp_path)
+    assert peaks[0] < work.peak(room)
 
 
 @pytest.mark.parametrize("channels", [1, 3])

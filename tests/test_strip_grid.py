@@ -113,10 +113,10 @@ def test_functions_of_the_frequency_are_put_into_blocks(strips, in_file, tmp_pat
 @pytest.mark.parametrize("shape", [(8, 8), (33, 40), (24, 41)])
 def test_a_blur_by_strips_is_that_of_the_whole(strips, shape):
     # An asymmetric kernel, for which a convolution and its adjoint differ.
-    otf = psf_to_otf(rng.random((3, 5)), shape)
+    grid, otf = StripGrid(shape), psf_to_otf(rng.random((3, 5)), shape)
     image, seen, observed = rng.random((3, *shape)).astype(np.float32)
     seen = (seen > 0.3).astype(np.float32)
-    problem = Problem(observed, seen, otf, 7.0, StripGrid(shape))
+    problem = Problem(observed, seen, grid.in_blocks(otf), 7.0, grid)
     expected = fft.irfft2(otf * fft.rfft2(image), s=shape)
     assert problem.blurred(image) == pytest.approx(expected, abs=1e-5)
     assert problem.misfit(image) == pytest.approx(3.5 * (seen * (expected - observed) ** 2).sum(), rel=1e-5)

@@ -76,7 +76,7 @@ def remove_blur(
     progress : callable, optional
         Called with the number of iterations done, in an attempt by one width.
     scratch : Path, optional
-        Folder of the file for what memory does not hold; by default that of temporary files.
+        Folder of files for what memory does not hold; by default that of temporary files.
     in_file : bool
         Whether deblurred images are kept in files.
 

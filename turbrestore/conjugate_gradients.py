@@ -18,7 +18,7 @@ ROUNDING = 1e-14
 
 
 class GradientState(NamedTuple):
-    """m; in Fourier u − m, residual of the normal equations, search direction, R and preconditioner, all in blocks.
+    """m; in Fourier u − m, residual of the normal equations, search direction and preconditioner, in blocks.
 
     ``decrease`` is ⟨residual, preconditioned⟩ and ``enough`` that of a solution, from which on steps stay where they
     are; ``turn`` is the share of the direction in the next one.  A step changes the spectra in place.
@@ -28,7 +28,6 @@ class GradientState(NamedTuple):
     deviation: Spectrum
     residual: Spectrum
     direction: Spectrum
-    symbol: FloatArray
     inverse: FloatArray
     turn: float
     decrease: float
@@ -55,8 +54,8 @@ class GradientState(NamedTuple):
 class ConjugateGradients:
     """Solver for wiener and tikhonov: ``(λBᵀMB + R)(u − m) = λBᵀM(f − m)``, m the mean of what was seen.
 
-    R is diagonal in Fourier (``symbol``), and ``(λBᵀB + R)⁻¹`` is the preconditioner. With M = 1 it is the solution.
-    Both penalties are unaware of m or defined relative to it, so that a constant image stays what it is.
+    R is diagonal in Fourier (``symbol``, in blocks), and ``(λBᵀB + R)⁻¹`` is the preconditioner.  With M = 1 it is the
+    solution.  Both penalties are unaware of m or defined relative to it, so that a constant image stays what it is.
     """
 
     symbol: FloatArray
@@ -68,7 +67,7 @@ class ConjugateGradients:
         """Start from the solution for the continued image."""
         grid, m, (work, _), transfer = problem.grid, seen_mean(problem), problem.grid.spectra, problem.transfer
         deviation, residual, direction, inverse = grid.spectrum(), grid.spectrum(), grid.spectrum(), grid.multiplier()
-        weight, symbol = np.float32(problem.fidelity), self._symbol(problem)
+        weight, symbol = np.float32(problem.fidelity), self.symbol
 
         def solve(block: int) -> None:
             found = fft.fft(deviation[block], axis=0)
@@ -99,7 +98,7 @@ class ConjugateGradients:
         grid.over_rows(compare, work, observed, seen)
         decrease = sum(grid.over_blocks(descend, deviation, work, residual, inverse, symbol, transfer))
         enough = ROUNDING * problem.fidelity * grid.inner(observed, observed)
-        return GradientState(m, deviation, residual, direction, symbol, inverse, 0.0, decrease, enough, grid)
+        return GradientState(m, deviation, residual, direction, inverse, 0.0, decrease, enough, grid)
 
     def step(self, problem: Problem, state: GradientState) -> GradientState:
         """One iteration of preconditioned conjugate gradients.
@@ -109,7 +108,7 @@ class ConjugateGradients:
         if state.decrease <= state.enough:
             return state
         grid, (work, _), transfer = problem.grid, problem.grid.spectra, problem.transfer
-        _, deviation, residual, direction, symbol, inverse, *_ = state
+        (_, deviation, residual, direction, inverse, *_), symbol = state, self.symbol
 
         def turn(block: int) -> None:
             found = inverse[block] * residual[block]
@@ -145,7 +144,7 @@ class ConjugateGradients:
 
     def penalty(self, problem: Problem, u: FloatArray) -> float:
         """½⟨u − m, R(u − m)⟩."""
-        grid, m, (work, _), symbol = problem.grid, seen_mean(problem), problem.grid.spectra, self._symbol(problem)
+        grid, m, (work, _), symbol = problem.grid, seen_mean(problem), problem.grid.spectra, self.symbol
 
         def share(block: int) -> float:
             found = fft.fft(work[block], axis=0)
@@ -153,8 +152,3 @@ class ConjugateGradients:
 
         grid.over_rows(lambda rows: grid.transform_strip(u[rows] - m, work, rows), work, u)
         return sum(grid.over_blocks(share, work, symbol)) / 2
-
-    def _symbol(self, problem: Problem) -> FloatArray:
-        """R in blocks."""
-        found: FloatArray = problem.grid.in_blocks(np.broadcast_to(self.symbol, problem.otf.shape))
-        return found

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy import fft
@@ -27,8 +26,8 @@ class Problem:
         f, continued by reflection where nothing was seen.
     seen : ndarray, float32, shape (P, Q)
         M.
-    otf : ndarray, shape (P, Q // 2 + 1)
-        Transfer function of k.
+    transfer : ndarray, shape (B, P, C)
+        Transfer function of k, in blocks.
     fidelity : float
         λ.
     grid : StripGrid
@@ -37,7 +36,7 @@ class Problem:
 
     observed: FloatArray
     seen: FloatArray
-    otf: Spectrum
+    transfer: Spectrum
     fidelity: float
     grid: StripGrid
 
@@ -60,11 +59,6 @@ class Problem:
             return float(np.square(strip, out=strip).sum(dtype=np.float64))
 
         return self.fidelity / 2 * sum(self._blur(u, squares, self.observed, self.seen))
-
-    @cached_property
-    def transfer(self) -> Spectrum:
-        """k̂ in blocks."""
-        return self.grid.in_blocks(self.otf)
 
     def power(self, block: int) -> FloatArray:
         """|k̂|², which BᵀB multiplies by, of a block."""
@@ -98,7 +92,7 @@ def seen_mean(problem: Problem) -> np.float32:
     Examples
     --------
     >>> grid = StripGrid((1, 3))
-    >>> float(seen_mean(Problem(np.float32([[1, 2, 9]]), np.float32([[1, 1, 0]]), np.ones((1, 2)), 1.0, grid)))
+    >>> float(seen_mean(Problem(np.float32([[1, 2, 9]]), np.float32([[1, 1, 0]]), np.ones((1, 1, 2)), 1.0, grid)))
     1.5
     """
     inner = problem.grid.inner

@@ -61,7 +61,7 @@ from .psf import (
     psf_to_otf,
     wiener_fidelity,
 )
-from .scratch import kept_in, new_stack
+from .scratch import kept_in, new_stack, release
 from .strip_grid import StripGrid, inner
 from .torch_deconvolution import SolverSettings, solve_on_device
 
@@ -117,8 +117,8 @@ class DeconvolutionParams:
         for this stage alone.
     memory : DeconvolutionMemory, optional
         Most that may be taken, such as 500MB; it has no effect on a device.  Where that is too little, the nonlocal
-        pairs and what is known of them are kept in a file, then images too, and all is worked on in strips, and then by
-        fewer threads, to the same result.  What remains is taken whatever is asked for, see
+        pairs and what is known of them are kept in a file, then images too, also the one that is returned, and then
+        fewer threads work, to the same result.  What remains is taken whatever is asked for, see
         :mod:`turbrestore.deconvolution_memory`.  By default there is no limit.
     """
 
@@ -164,7 +164,7 @@ class Deconvolution:
     Attributes
     ----------
     image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Clipped to [0, 1].
+        Clipped to [0, 1]; of a file without a name where memory was limited to less than it takes.
     sigma : float
         Standard deviation of the blur that was removed, pixels (root mean square over x and y of a given PSF).
     fidelity : float
@@ -250,7 +250,7 @@ def deconvolve(
     progress : callable, optional
         Called with 1 after each iteration. Channels are solved side by side.
     scratch : Path, optional
-        Folder of the file for what ``params.memory`` does not allow in memory; by default that of temporary files.
+        Folder of files for what ``params.memory`` does not allow in memory; by default that of temporary files.
 
     Returns
     -------
@@ -288,6 +288,7 @@ def deconvolve(
     size = planes[0].shape
     widths = margin_widths(size, margin if params.boundary == "unknown" else None)
     shape = size[0] + sum(widths[0]), size[1] + sum(widths[1])
+    inside = tuple(slice(before, before + length) for (before, _), length in zip(widths, size, strict=True))
     otf = blur_otf(shape, sigma, params.exponent or GAUSSIAN) if psf is None else psf_to_otf(psf, shape)
     memory = params.memory if find_device(params.device or PROCESSOR) == PROCESSOR else None
     room = DeconvolutionWork(shape, len(planes), params.method, params.weights).room(memory, available_cores())
@@ -295,14 +296,17 @@ def deconvolve(
     with one_thread_each(), ThreadPoolExecutor(room.threads) as pool:
         threaded = shape[0] * shape[1] >= _THREADED_PASS
         grid = StripGrid(shape, pool if threaded else None, folder if room.images_in_file else None)
-        seen = kept_in(np.pad(np.ones(size, np.float32), widths), grid.folder)
-        observed = [kept_in(np.pad(plane, widths, mode="symmetric"), grid.folder) for plane in planes]
-        del planes
-        problems = [Problem(plane, seen, otf, fidelity, grid) for plane in observed]
+        transfer, seen, observed = grid.in_blocks(otf), grid.image(), list[FloatArray]()
+        del otf
+        seen[:], seen[inside] = 0, 1
+        while planes:
+            observed.append(kept_in(np.pad(planes.pop(0), widths, mode="symmetric"), grid.folder))
+        problems = [Problem(plane, seen, transfer, fidelity, grid) for plane in observed]
         around = padded_guide(guide, size, widths)
         around = None if around is None else kept_in(around, grid.folder)
+        for array in (pixels, guide, seen):
+            release(array)
         result = _solve(problems, params, around, progress, _Workshop(pool, room, folder))
-    inside = tuple(slice(before, before + length) for (before, _), length in zip(widths, size, strict=True))
     restored = new_stack(pixels.shape, grid.folder)
 
     def join(rows: slice) -> None:
@@ -380,10 +384,10 @@ def _solve(
     if find_device(params.device or PROCESSOR) != PROCESSOR:
         return _solve_on_device(problems, params, guide, progress)
     if params.method in ("wiener", "tikhonov"):
-        shared = np.ones((1, 1), np.float32)
-        quadratic = _wiener_solver(problems[0]) if params.method == "wiener" else ConjugateGradients(shared)
+        one = np.ones((len(problems[0].grid.blocks), 1, 1), np.float32)
+        quadratic = _wiener_solver(problems[0].grid) if params.method == "wiener" else ConjugateGradients(one)
         return _iterate(quadratic, problems, [quadratic.start(p) for p in problems], params, progress)
-    starts, guide = _sharpened(problems, guide, params, workshop.pool)
+    starts, guide = _sharpened(problems, guide, params, workshop)
     penalty: Penalty = LocalPenalty(problems[0].grid)
     if params.method == "nltv":
         folder = workshop.folder if workshop.room.in_file else None
@@ -457,14 +461,14 @@ def _iterate(
     return _Solution(images, iteration, converged, np.array(recorded), np.array(objective), np.array(changes))
 
 
-def _wiener_solver(problem: Problem) -> ConjugateGradients:
-    return ConjugateGradients(laplacian_symbol(problem.seen.shape[0], problem.seen.shape[1]))
+def _wiener_solver(grid: StripGrid) -> ConjugateGradients:
+    return ConjugateGradients(grid.in_blocks(laplacian_symbol(*grid.shape)))
 
 
 def _wiener_image(problem: Problem) -> FloatArray:
     """Wiener solution with its own fidelity."""
     problem = dataclasses.replace(problem, fidelity=wiener_fidelity(problem.observed, estimate_noise(problem.observed)))
-    solver = _wiener_solver(problem)
+    solver = _wiener_solver(problem.grid)
     state = solver.start(problem)
     for _ in range(_START_STEPS):
         state = solver.step(problem, state)
@@ -472,24 +476,34 @@ def _wiener_image(problem: Problem) -> FloatArray:
 
 
 def _sharpened(
-    problems: list[Problem], guide: FloatArray | None, params: DeconvolutionParams, pool: Executor
+    problems: list[Problem], guide: FloatArray | None, params: DeconvolutionParams, workshop: _Workshop
 ) -> tuple[list[FloatArray], FloatArray]:
     """Wiener solutions to start from, and the guide of the weights: by default the mean of what is deblurred."""
     blurred, grid = list(problems), problems[0].grid
     if params.method == "nltv" and params.sharpen_guide and guide is not None:
         blurred.append(dataclasses.replace(problems[0], observed=guide))
-    if grid.one_strip or grid.folder is None:
+    if grid.one_strip or (grid.folder is None and len(blurred) >= workshop.room.threads):
         # Side by side, each with what it works with.
         apart = [dataclasses.replace(problem, grid=StripGrid(grid.shape)) for problem in blurred]
-        sharp = list(pool.map(_wiener_image, apart))
+        sharp = list(workshop.pool.map(_wiener_image, apart))
     else:
         sharp = [_wiener_image(problem) for problem in blurred]
     starts, further = sharp[: len(problems)], sharp[len(problems) :]
     if further:
         guide = further[0]
     elif guide is None:
-        guide = np.mean(starts if params.sharpen_guide else [p.observed for p in problems], axis=0, dtype=np.float32)
+        guide = _mean_image(starts if params.sharpen_guide else [p.observed for p in problems], grid)
     return starts, guide
+
+
+def _mean_image(images: list[FloatArray], grid: StripGrid) -> FloatArray:
+    mean = grid.image()
+
+    def put(rows: slice) -> None:
+        np.mean([image[rows] for image in images], axis=0, dtype=np.float32, out=mean[rows])
+
+    grid.over_rows(put, mean, *images)
+    return mean
 
 
 def _noise_and_fidelity(planes: list[FloatArray], params: DeconvolutionParams) -> tuple[float, float]:

@@ -3,16 +3,17 @@
 Bytes, for c channels of H × W pixels and t threads.  Of nltv each pixel is joined to b others of its n neighbours; the
 largest of these counts, of the time when its start is found, its weights, and while it is iterated::
 
-    work + H W · (20 + 10 c + 32 min(t, c + 1))
+    work + H W · (20 + 10 c + 32 min(t, c + 1)) + 8 MB · t
     work + H W · (35 + 10 c + 8 pairs) + 60 · 64 W · b + t · 4 · tile · n
-    work + H W · (50 + 36 c + (8 + 8 c) pairs) + t · 26 · strip · b
+    work + H W · (50 + 36 c + (8 + 8 c) pairs) + t · max(26 · strip · b, 8 MB)
 
 64 W pixels are the band whose choices become pairs at a time, which takes 30 instead of 60 with Numba; of a tile a
 thread has the distances to all neighbours, and of a strip the edges; with Numba it needs less.  A pixel has 0.65 b
-pairs.  They may be kept in a file: their terms are 0 then.  Where images are kept in files too, H W · 20 remains of
-each of the last two lines.
+pairs.  They may be kept in a file: their terms are 0 then.  Where images are kept in files too, H W · (50 + 40 c)
+bytes of them, H W · (14 + 4 c) remains of the first line and H W · 20 of each of the others.
 
-tv takes H W · (40 + 36 c) and the linear methods H W · (35 + 32 c), in files H W · 20.
+tv takes H W · (40 + 36 c) and the linear methods H W · (35 + 32 c), in files H W · (14 + 4 c), and 8 MB · t.
+The blur is one that is known by its width: a sampled point spread function takes more.
 """
 
 from __future__ import annotations
@@ -26,13 +27,15 @@ from .patch_search import BAND_ROWS, tile_columns
 # Of the process.
 _WORK = 2e7
 # Of every pixel, and for a channel: of tv and of the linear methods, in memory and where images are in files.
-_TV, _LINEAR, _IN_FILE = (40.0, 36.0), (35.0, 32.0), (20.0, 0.0)
+_TV, _LINEAR, _IN_FILE = (40.0, 36.0), (35.0, 32.0), (14.0, 4.0)
 # Of nltv: while the start is found, and for a thread; while weights are found; in an iteration.
 _STARTED, _STARTED_THREAD = (20.0, 10.0), 32.0
 _FOUND, _FOUND_IN_FILE = (35.0, 10.0), (20.0, 0.0)
 _ITERATED, _ITERATED_IN_FILE = (50.0, 36.0), (20.0, 0.0)
 # Of a pair: its head and weight, and its dual in every channel.
 _PAIR, _DUAL = 8.0, 8.0
+# Of a thread: strips and blocks of images.
+_THREAD = 8e6
 # Of every choice of a band, by NumPy and compiled, and of every choice of a strip for each thread.
 _BAND_CHOICE, _BAND_CHOICE_COMPILED, _STRIP_CHOICE = 60.0, 30.0, 26.0
 # Pairs per pixel over those that a pixel chooses: many are chosen from both sides.
@@ -135,25 +138,26 @@ class DeconvolutionWork:
 
         Examples
         --------
-        >>> work = DeconvolutionWork((1080, 1920), 1, "nltv", NonlocalParams())
-        >>> [round(work.peak(Room(2, *files)) / 1e6) for files in ((False, False), (True, False), (True, True))]
-        [529, 260, 218]
+        >>> work = DeconvolutionWork((1080, 1920), 1, "tv", NonlocalParams())
+        >>> [round(work.peak(Room(2, False, in_file)) / 1e6) for in_file in (False, True)]
+        [194, 73]
         """
         if self.method != "nltv":
             in_memory = _TV if self.method == "tv" else _LINEAR
-            return _WORK + self._all(_IN_FILE if room.images_in_file else in_memory)
+            return _WORK + self._all(_IN_FILE if room.images_in_file else in_memory) + room.threads * _THREAD
         height, width = self.shape
         offsets, rows = self.weights.search**2 - 1, min(BAND_ROWS, height)
         found, iterated = self._all(_FOUND), self._all(_ITERATED)
         started = self._all(_STARTED) + self.pixels * _STARTED_THREAD * min(room.threads, self.channels + 1)
         if room.images_in_file:
-            started, found, iterated = 0.0, self._all(_FOUND_IN_FILE), self._all(_ITERATED_IN_FILE)
+            started = self._all(_IN_FILE)
+            found, iterated = self._all(_FOUND_IN_FILE), self._all(_ITERATED_IN_FILE)
         if not room.in_file:
             found, iterated = found + self.pixels * self._pairs * _PAIR, iterated + self.pairs()
         found += (_BAND_CHOICE_COMPILED if can_compile() else _BAND_CHOICE) * rows * width * self._choices
         found += room.threads * 4 * rows * min(tile_columns(offsets), width) * offsets
-        iterated += room.threads * _STRIP_CHOICE * min(self.pixels, max(STRIP_PIXELS, 4 * width)) * self._choices
-        return _WORK + max(started, found, iterated)
+        strip = _STRIP_CHOICE * min(self.pixels, max(STRIP_PIXELS, 4 * width)) * self._choices
+        return _WORK + max(started + room.threads * _THREAD, found, iterated + room.threads * max(strip, _THREAD))
 
     def room(self, memory: float | None, threads: int) -> Room:
         """Choose what keeps within memory: files before fewer threads; where nothing does, what takes least.

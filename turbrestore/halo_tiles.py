@@ -32,15 +32,12 @@ class HaloTile:
     row_weights : ndarray, float32, shape (h,)
     column_weights : ndarray, float32, shape (w,)
         What the tile counts in the whole is the product of both.
-    halo : int
-        Pixels on each side of its core that does not lie at the edge of the frame.
     """
 
     rows: slice
     columns: slice
     row_weights: FloatArray
     column_weights: FloatArray
-    halo: int
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -83,7 +80,7 @@ def halo_tiles(shape: tuple[int, int], side: int, halo: int = HALO) -> tuple[Hal
     require(halo >= 1, f"halo: expected at least 1 pixel, found {halo}")
     require(side >= 4 * halo, f"side: expected at least four halos ({4 * halo} pixels), found {side}")
     rows, columns = (_spans(length, side, halo) for length in shape)
-    return tuple(HaloTile(row, column, down, across, halo) for row, down in rows for column, across in columns)
+    return tuple(HaloTile(row, column, down, across) for row, down in rows for column, across in columns)
 
 
 def largest_tile(shape: tuple[int, int], side: int, halo: int = HALO) -> tuple[int, int]:

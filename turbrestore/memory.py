@@ -518,4 +518,6 @@ def _decisions(
         kept = ["nonlocal pairs"] if work.deblurring.pairs() else []
         kept += ["images of the deconvolution"] if room.images_in_file else []
         size = size_text(work.deblurring.files(room))
-        yield Decision("memory", f"{' and '.join(kept)} kept in files", f"they take {size} {allowed}")
+        # What is not known yet is taken to be the widest blur that may be found.
+        words = "kept in files" if work.deconvolution.sigma is not None else "kept in files where the blur is wide"
+        yield Decision("memory", f"{' and '.join(kept)} {words}", f"they take up to {size} {allowed}")

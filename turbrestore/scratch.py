@@ -102,7 +102,7 @@ def kept_in(array: NDArray[np.float32], folder: Path | None = None) -> NDArray[n
     >>> kept_in(np.ones((2, 3), np.float32)).sum()
     np.float32(6.0)
     """
-    if folder is None or isinstance(array, np.memmap):
+    if folder is None or _is_mapped(array):
         return array
     stack = new_stack(array.shape, folder)
     stack[...] = array
@@ -134,6 +134,12 @@ def release(array: object) -> None:
         # A map that is locked in memory cannot be handed back, and need not be.
         with contextlib.suppress(OSError):
             array.madvise(mmap.MADV_DONTNEED)
+
+
+def _is_mapped(array: object) -> bool:
+    while isinstance(array, np.ndarray):
+        array = array.base
+    return isinstance(array, mmap.mmap)
 
 
 def walk(items: Iterable[Item]) -> Iterator[Item]:

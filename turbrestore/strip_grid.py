@@ -34,7 +34,7 @@ Item = TypeVar("Item")
 Found = TypeVar("Found")
 # Smaller images are one strip: threads would wait for each other longer than they save.
 _ONE_STRIP = 1 << 18
-# Pixels of a strip, about; what numbers of strips, and widths of blocks, are multiples of.
+# Pixels of a strip, about; what numbers of strips of rows, and widths of blocks, are multiples of.
 _STRIP, _EVEN, _ALIGNED = 1 << 18, 4, 16
 
 

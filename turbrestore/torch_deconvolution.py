@@ -156,7 +156,7 @@ def solve_on_device(
     >>> import numpy as np
     >>> from turbrestore.strip_grid import StripGrid
     >>> flat = np.full((16, 16), 0.5, np.float32)
-    >>> problem = Problem(flat, np.ones_like(flat), np.ones((16, 9), np.float32), 100.0, StripGrid((16, 16)))
+    >>> problem = Problem(flat, np.ones_like(flat), np.ones((1, 16, 9), np.float32), 100.0, StripGrid((16, 16)))
     >>> settings = SolverSettings("tv", 50, 1e-4, 10, 40, True, NonlocalParams())
     >>> solution = solve_on_device([problem], None, settings, "cpu")
     >>> solution.converged, bool(np.allclose(solution.images[0], 0.5, atol=1e-5))
@@ -344,7 +344,8 @@ def _laplacian(problem: Problem) -> FloatArray:
 
 
 def _load(problem: Problem, device: str) -> _Problem:
-    observed, seen, otf = (_tensor(array, device) for array in (problem.observed, problem.seen, problem.otf))
+    whole = np.concatenate(problem.transfer, axis=1)[:, : problem.seen.shape[1] // 2 + 1]
+    observed, seen, otf = (_tensor(array, device) for array in (problem.observed, problem.seen, whole))
     return _Problem(observed, seen, otf, problem.fidelity)
 
 
