@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.errors import StorageError
-from turbrestore.scratch import mean_of, new_stack, parts, release, returning_freed, variance_of, walk
+from turbrestore.scratch import kept_in, mean_of, new_stack, parts, release, returning_freed, variance_of, walk
 
 STATM = Path("/proc/self/statm")
 SHAPES = st.lists(st.integers(1, 7), min_size=1, max_size=4).map(tuple)
@@ -144,3 +144,15 @@ def test_the_allocator_gets_back_what_it_had(monkeypatch):
     monkeypatch.setattr("platform.libc_ver", lambda: ("", ""))
     with returning_freed():
         assert len(calls) == 5
+
+
+def test_an_array_is_moved_to_a_file_once(tmp_path):
+    array = np.arange(6, dtype=np.float32).reshape(2, 3)
+    kept = kept_in(array, tmp_path)
+    assert isinstance(kept, np.memmap) and np.array_equal(kept, array)
+    for there in (kept, kept[1:], np.asarray(kept).reshape(-1)):
+        assert kept_in(there, tmp_path) is there
+    # Of the class of mapped arrays, but in memory.
+    copy = kept.copy()
+    assert kept_in(copy, tmp_path) is not copy
+    assert kept_in(array) is array

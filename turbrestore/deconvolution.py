@@ -53,6 +53,7 @@ from .preview import preview
 from .primal_dual import Penalty, PrimalDual
 from .psf import (
     GAUSSIAN,
+    Spectrum,
     blur_otf,
     check_exponent,
     check_psf,
@@ -296,15 +297,10 @@ def deconvolve(
     with one_thread_each(), ThreadPoolExecutor(room.threads) as pool:
         threaded = shape[0] * shape[1] >= _THREADED_PASS
         grid = StripGrid(shape, pool if threaded else None, folder if room.images_in_file else None)
-        transfer, seen, observed = grid.in_blocks(otf), grid.image(), list[FloatArray]()
-        del otf
-        seen[:], seen[inside] = 0, 1
-        while planes:
-            observed.append(kept_in(np.pad(planes.pop(0), widths, mode="symmetric"), grid.folder))
-        problems = [Problem(plane, seen, transfer, fidelity, grid) for plane in observed]
+        problems = _pose(planes, widths, inside, grid, otf, fidelity)
         around = padded_guide(guide, size, widths)
         around = None if around is None else kept_in(around, grid.folder)
-        for array in (pixels, guide, seen):
+        for array in (pixels, guide):
             release(array)
         result = _solve(problems, params, around, progress, _Workshop(pool, room, folder))
     restored = new_stack(pixels.shape, grid.folder)
@@ -364,6 +360,24 @@ class _Solution(NamedTuple):
     recorded: NDArray[np.int64]
     objective: NDArray[np.float64]
     changes: NDArray[np.float64]
+
+
+def _pose(
+    planes: list[FloatArray],
+    widths: list[tuple[int, int]],
+    inside: tuple[slice, ...],
+    grid: StripGrid,
+    otf: Spectrum,
+    fidelity: float,
+) -> list[Problem]:
+    """Continue planes into the margin, one after the other: none is left in the list."""
+    transfer, seen, problems = grid.in_blocks(otf), grid.image(), list[Problem]()
+    seen[:], seen[inside] = 0, 1
+    release(seen)
+    while planes:
+        observed = kept_in(np.pad(planes.pop(0), widths, mode="symmetric"), grid.folder)
+        problems.append(Problem(observed, seen, transfer, fidelity, grid))
+    return problems
 
 
 class _Workshop(NamedTuple):
