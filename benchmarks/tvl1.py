@@ -26,6 +26,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -217,9 +218,10 @@ def compare_clips() -> None:
         clip, cells = load(), []
         if clip.truth is None:
             continue
-        for method, FLOW_METHODS["tvl1"] in ways.values():
+        for method, solver in ways.values():
             call = partial(restore, clip.frames, RestoreParams(flow=FlowParams(method=method)))
-            found, spent = _clocked(call)
+            with mock.patch.dict(FLOW_METHODS, tvl1=solver):
+                found, spent = _clocked(call)
             images = found.filtered.image, found.deconvolution.image
             cells.append(f"{spent:.1f}, " + ", ".join(f"{compare(image, clip.truth).psnr:.3f}" for image in images))
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
