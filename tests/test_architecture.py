@@ -19,7 +19,7 @@ ORDER = [
     "blur_moments", "frame_noise", "torch_fusion", "flow_tracking", "pixel_fusion", "alternating",
     "blur_estimation", "blur_cues", "strip_grid",
     "patch_search", "patch_pairs", "edge_strips", "nonlocal_tv", "nonlocal_penalty", "deconvolution_memory",
-    "convolution_problem",
+    "convergence", "convolution_problem",
     "conjugate_gradients", "primal_dual", "local_tv", "planes", "torch_weights", "torch_deconvolution", "deconvolution",
     "tiled_stages", "blur_map", "guards", "blind", "border", "frame_selection", "explanation", "synthesis", "metrics",
     "memory", "restoration", "pipeline",

@@ -13,6 +13,7 @@ from skimage import data
 from turbrestore import primal_dual
 from turbrestore.blur_estimation import BlurEstimate
 from turbrestore.conjugate_gradients import ConjugateGradients
+from turbrestore.convergence import still_to_come
 from turbrestore.convolution_problem import Problem
 from turbrestore.deconvolution import BOUNDARIES, METHODS, DeconvolutionParams, automatic_fidelity, deconvolve
 from turbrestore.deconvolution_memory import Room
@@ -258,20 +259,22 @@ def test_optimum_solves_the_euler_lagrange_equation_of_the_paper():
 
 
 @pytest.mark.parametrize(
-    ("method", "scene", "noise", "size"),
+    ("method", "scene", "noise", "size", "most"),
     [
-        ("nltv", "camera", 0.01, 64),
-        ("nltv", "chart", 0.03, 64),
-        ("nltv", "words", 0.002, 64),
+        ("nltv", "camera", 0.01, 64, 60),
+        ("nltv", "chart", 0.03, 64, 60),
+        ("nltv", "words", 0.002, 64, 100),
         # The border cuts letters in two.
-        ("nltv", "words", 0.002, 128),
-        ("nltv", "brick", 0.002, 128),
-        ("tv", "camera", 0.002, 64),
-        ("tv", "words", 0.03, 64),
-        ("tv", "words", 0.002, 128),
+        ("nltv", "words", 0.002, 128, 130),
+        ("nltv", "brick", 0.002, 128, 130),
+        # Bars that the blur has all but extinguished.
+        ("nltv", "chart", 0.002, 256, 350),
+        ("tv", "camera", 0.002, 64, 60),
+        ("tv", "words", 0.03, 64, 60),
+        ("tv", "words", 0.002, 128, 60),
     ],
 )
-def test_stopping_rule_is_as_good_as_two_thousand_iterations(method, scene, noise, size):
+def test_stopping_rule_is_as_good_as_two_thousand_iterations(method, scene, noise, size, most):
     sigma, params = 1.5, DeconvolutionParams(method=method, exponent=KOLMOGOROV)
     larger = SCENES[scene](size + 32, size + 32)
     blurred = fft.irfft2(blur_otf(larger.shape, sigma, KOLMOGOROV) * fft.rfft2(larger), s=larger.shape)
@@ -281,23 +284,34 @@ def test_stopping_rule_is_as_good_as_two_thousand_iterations(method, scene, nois
     stopped = deconvolve(seen, sigma, params)
     exhaustive = deconvolve(seen, sigma, dataclasses.replace(params, iterations=2000, tolerance=0))
     assert stopped.converged
-    assert stopped.iterations < 150
+    assert stopped.iterations <= most
     assert not exhaustive.converged
     assert abs(psnr(stopped.image, truth) - psnr(exhaustive.image, truth)) < 0.05
     assert exhaustive.objective[-1] < exhaustive.objective[0]
 
 
-def test_iterations_are_judged_ten_by_ten():
-    _, blurred = camera(64, 1.5, 0.002)
-    images = {n: deconvolve(blurred, 1.5, DeconvolutionParams(iterations=n, tolerance=0)).image for n in (10, 20, 25)}
-    result = deconvolve(blurred, 1.5, DeconvolutionParams(iterations=25, tolerance=0))
-    assert result.recorded.tolist() == [10, 20, 25]
-    for number, (before, after, iterations) in enumerate([(10, 20, 10), (20, 25, 5)], start=1):
-        moved = np.linalg.norm(images[after] - images[before]) / np.linalg.norm(images[after])
-        assert result.changes[number] == pytest.approx(moved / iterations, rel=0.02)
-    between = (result.changes[0] + result.changes[1]) / 2
-    stopped = deconvolve(blurred, 1.5, DeconvolutionParams(iterations=25, tolerance=between))
-    assert (stopped.iterations, stopped.converged) == (20, True)
+@pytest.mark.parametrize("strips", [False, True])
+def test_ten_iterations_are_judged_together_where_they_change_most(monkeypatch, strips):
+    if strips:
+        in_strips(monkeypatch)
+    # Without a margin, so that tiles are those of the image, and in a range where it is not clipped.
+    blurred = np.random.default_rng(1).normal(0.5, 0.01, (128, 128)).astype(np.float32)
+    blurred[8:56, 72:120] += 0.1 * (camera(48, 1.5, 0.002)[1] - 0.5)
+    params, numbers = DeconvolutionParams(boundary="periodic", tolerance=0), (40, 50, 55)
+    images = {n: deconvolve(blurred, 1.5, dataclasses.replace(params, iterations=n)).image for n in numbers}
+    result = deconvolve(blurred, 1.5, dataclasses.replace(params, iterations=55))
+    assert result.recorded.tolist() == [10, 20, 30, 40, 50, 55]
+    tiles = [(slice(y, y + 64), slice(x, x + 64)) for y in (0, 64) for x in (0, 64)]
+    for number, (before, after) in zip((4, 5), itertools.pairwise(numbers), strict=True):
+        moved = max(np.linalg.norm((images[after] - images[before])[tile]) for tile in tiles)
+        size = max(np.linalg.norm(images[after][tile]) for tile in tiles)
+        assert result.changes[number] == pytest.approx(moved / size / (after - before), rel=0.02)
+    foreseen = np.array([still_to_come(10 * result.changes[:count]) for count in range(1, 6)])
+    for tolerance in (1.001 * foreseen.min(), 0.999 * foreseen.min(), np.median(foreseen)):
+        stopped = deconvolve(blurred, 1.5, dataclasses.replace(params, iterations=50, tolerance=tolerance))
+        enough = foreseen <= tolerance
+        assert stopped.converged == enough.any()
+        assert stopped.iterations == (10 * (1 + int(enough.argmax())) if enough.any() else 50)
 
 
 # --- memory and threads ----------------------------------------------------------------------------------------------

@@ -38,6 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from .arrays import FloatArray, check_image
 from .blur_estimation import BlurEstimate
 from .conjugate_gradients import ConjugateGradients
+from .convergence import relative_change, still_to_come, tile_sums
 from .convolution_problem import Problem
 from .deconvolution_memory import DeconvolutionWork, Room
 from .device import PROCESSOR, check_device, find_device
@@ -63,7 +64,7 @@ from .psf import (
     wiener_fidelity,
 )
 from .scratch import kept_in, new_stack, release
-from .strip_grid import StripGrid, inner
+from .strip_grid import StripGrid
 from .torch_deconvolution import SolverSettings, solve_on_device
 
 if TYPE_CHECKING:
@@ -101,9 +102,9 @@ class DeconvolutionParams:
     iterations : int
         Largest number of iterations.
     tolerance : float
-        Stop when an iteration changes the image by less than this, relative to its norm.  Of nltv and tv, whose images
-        swing about the one that they approach, ten iterations are judged together: they change it by less than ten
-        times this.
+        Stop when less than this is still to come, by what is foreseen from the changes until then, in the tile that
+        changes most and relative to the brightest tile (:mod:`turbrestore.convergence`).  Of nltv and tv, whose images
+        swing about the one that they approach, ten iterations are judged together.
     boundary : {"unknown", "periodic"}
         What lies beyond the border: pixels to be found, or the image itself.
     channels : {"luminance", "each"}
@@ -127,8 +128,8 @@ class DeconvolutionParams:
     sigma: float | None = None
     exponent: float | None = None
     fidelity: float | None = None
-    iterations: int = 300
-    tolerance: float = 1.5e-4
+    iterations: int = 400
+    tolerance: float = 3.5e-3
     boundary: Literal["unknown", "periodic"] = "unknown"
     channels: Literal["luminance", "each"] = "luminance"
     sharpen_guide: bool = True
@@ -175,13 +176,13 @@ class Deconvolution:
     iterations : int
         Iterations that were run.
     converged : bool
-        Whether the last ones changed the image by less than the tolerance.
+        Whether less than the tolerance was still to come.
     recorded : ndarray, int64, shape (n,)
         Iterations at which the next two were recorded.
     objective : ndarray, float64, shape (n,)
         Value of the minimised energy, summed over channels.
     changes : ndarray, float64, shape (n,)
-        Relative change of the image in an iteration, as ``tolerance`` bounds it.
+        Change in an iteration of the tile that changes most, relative to the brightest tile.
     """
 
     image: FloatArray
@@ -453,7 +454,7 @@ def _iterate(
     records: list[tuple[int, float, float]] = []
     grid = problems[0].grid
     before, images, begun = list[FloatArray](), [state.image for state in states], 0
-    change, converged = np.inf, False
+    moved, converged = list[float](), False
     for iteration in range(1, params.iterations + 1):
         if (iteration - 1) % solver.window == 0:
             # Those of a window are changed in place.
@@ -462,11 +463,11 @@ def _iterate(
         images = [state.image for state in states]
         last = iteration == params.iterations
         if last or iteration % solver.window == 0:
-            change = _relative_change(before, images, problems[0]) / (iteration - begun)
-            last |= (converged := change <= params.tolerance)
+            moved.append(_change(before, images, problems[0]))
+            last |= (converged := still_to_come(moved) <= params.tolerance)
         if last or iteration % _RECORD_EVERY == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
-            records.append((iteration, sum(energies), change))
+            records.append((iteration, sum(energies), moved[-1] / (iteration - begun)))
         if progress is not None:
             progress(1)
         if last:
@@ -540,18 +541,18 @@ def _read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | N
     return psf, float(np.sqrt(squares / 2)), max(psf.shape) // 2
 
 
-def _relative_change(before: list[FloatArray], after: list[FloatArray], problem: Problem) -> float:
-    """Change relative to the norm, both over the pixels that were seen: the margin drifts for long and is cut off."""
+def _change(before: list[FloatArray], after: list[FloatArray], problem: Problem) -> float:
+    """Of the pixels that were seen: the margin drifts for long and is cut off."""
     seen, grid = problem.seen, problem.grid
 
-    def sums(rows: slice, old: FloatArray, new: FloatArray) -> tuple[float, float]:
-        change = new[rows] - old[rows]
-        return inner(seen[rows], np.square(change, out=change)), inner(seen[rows], np.square(new[rows]))
+    def squares(rows: slice, old: FloatArray, new: FloatArray) -> NDArray[np.float64]:
+        both = new[rows] - old[rows], new[rows]
+        return np.array([tile_sums(seen[rows] * np.square(part), rows.start, len(seen)) for part in both])
 
-    parts = [
-        part
+    strips = [
+        strip
         for old, new in zip(before, after, strict=True)
-        for part in grid.over_rows(partial(sums, old=old, new=new), old, new, seen)
+        for strip in grid.over_rows(partial(squares, old=old, new=new), old, new, seen)
     ]
-    moved, size = map(sum, zip(*parts, strict=True))
-    return float(np.sqrt(moved / size)) if size > 0 else float(moved > 0)
+    moved, size = np.sum(strips, axis=0)
+    return relative_change(moved, size)

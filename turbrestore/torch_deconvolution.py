@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .arrays import FloatArray
 from .conjugate_gradients import ROUNDING
+from .convergence import TILE, relative_change, still_to_come
 from .convolution_problem import Problem
 from .device import memory_of
 from .nonlocal_tv import NonlocalParams
@@ -43,7 +45,7 @@ class SolverSettings:
     iterations : int
         Most iterations.
     tolerance : float
-        Relative change in an iteration below which they stop.
+        They stop when less than this is still to come (:mod:`turbrestore.convergence`).
     record_every : int
         Iterations from one record of the energy to the next, a multiple of those that are judged together.
     start_steps : int
@@ -194,7 +196,7 @@ def _iterate(
 ) -> DeviceSolution:
     records: list[tuple[int, float, float]] = []
     before, images, begun = [], [state.image for state in states], 0
-    change, converged = np.inf, False
+    moved, converged = list[float](), False
     for iteration in range(1, settings.iterations + 1):
         if (iteration - 1) % solver.window == 0:
             before, begun = images, iteration - 1
@@ -202,11 +204,11 @@ def _iterate(
         images = [state.image for state in states]
         last = iteration == settings.iterations
         if last or iteration % solver.window == 0:
-            change = _relative_change(before, images, problems[0].seen) / (iteration - begun)
-            last |= (converged := change <= settings.tolerance)
+            moved.append(_change(before, images, problems[0].seen))
+            last |= (converged := still_to_come(moved) <= settings.tolerance)
         if last or iteration % settings.record_every == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
-            records.append((iteration, sum(energies), change))
+            records.append((iteration, sum(energies), moved[-1] / (iteration - begun)))
         if progress is not None:
             progress(1)
         if last:
@@ -377,7 +379,17 @@ def _total(values: Tensor) -> float:
     return float(values.sum(dtype=torch.float64))
 
 
-def _relative_change(before: list[Tensor], after: list[Tensor], seen: Tensor) -> float:
-    moved = sum(_inner(seen, (b - a).square()) for a, b in zip(before, after, strict=True))
-    size = sum(_inner(seen, u.square()) for u in after)
-    return float(np.sqrt(moved / size)) if size > 0 else float(moved > 0)
+def _change(before: list[Tensor], after: list[Tensor], seen: Tensor) -> float:
+    moved = [_tile_sums(seen * (b - a).square()) for a, b in zip(before, after, strict=True)]
+    return relative_change(np.sum(moved, axis=0), np.sum([_tile_sums(seen * u.square()) for u in after], axis=0))
+
+
+def _tile_sums(image: Tensor) -> NDArray[np.float64]:
+    """See :func:`turbrestore.convergence.tile_sums`."""
+    import torch
+
+    down, right = (-(-length // TILE) for length in image.shape)
+    room = image.new_zeros((down * TILE, right * TILE))
+    room[: image.shape[0], : image.shape[1]] = image
+    sums: NDArray[np.float64] = room.view(down, TILE, right, TILE).sum((1, 3), dtype=torch.float64).cpu().numpy()
+    return sums

@@ -1,0 +1,108 @@
+"""When an iteration has come near enough to where it goes.
+
+A photograph is deblurred after some fifty iterations, the finest bars of a chart after hundreds.  A bound for the last
+change of the whole tells them apart badly: what changes slowly may have far to go, and a few letters on a large page
+change little of it.  So changes are looked at where they are largest, and what follows them is foreseen.
+
+Symbols
+-------
+d : change of the image in a window of iterations, relative.
+q : ratio of the changes of two windows in succession, the mean of the last ones.
+
+The changes to come are continued as a geometric series, ``d (q + q² + …) = d q / (1 − q)``.  A q near 1 is known too
+badly for that: no more is foreseen than ``MOST`` times the last change, and that much as long as q is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import FloatArray
+
+# Pixels a side of the tiles that changes are compared in.
+TILE = 64
+# Steps from window to window that q is taken from, of which there must be FEWEST; and how many times the last change is
+# foreseen at most.
+SPAN, FEWEST, MOST = 5, 4, 6.0
+
+
+def still_to_come(changes: Sequence[float]) -> float:
+    """Sum of the changes that follow.
+
+    Parameters
+    ----------
+    changes : sequence of float
+        Of all windows until now.
+
+    Returns
+    -------
+    float
+        In the unit of the changes; the most that is foreseen as long as there are too few to tell.
+
+    Examples
+    --------
+    >>> still_to_come([0.8, 0.4, 0.2, 0.1, 0.05])
+    0.05
+    >>> still_to_come([0.8, 0.5])
+    3.0
+    """
+    last, span = changes[-1], min(SPAN, len(changes) - 1)
+    if span < FEWEST or not last < changes[-1 - span]:
+        return last * MOST
+    ratio = (last / changes[-1 - span]) ** (1 / span)
+    return last * min(ratio / (1 - ratio), MOST)
+
+
+def tile_sums(strip: FloatArray, first: int, height: int) -> NDArray[np.float64]:
+    """Sum some rows of an image over tiles.
+
+    Parameters
+    ----------
+    strip : ndarray, float32, shape (h, W)
+        Rows.
+    first : int
+        Number of the first of them.
+    height : int
+        Of the image, pixels.
+
+    Returns
+    -------
+    ndarray, float64, shape (ceil(height / TILE), ceil(W / TILE))
+        Of all tiles of the image; 0 where no row reaches.
+
+    Examples
+    --------
+    >>> tile_sums(np.ones((2, 65), np.float32), 63, 130)
+    array([[64.,  1.],
+           [64.,  1.],
+           [ 0.,  0.]])
+    """
+    across = np.add.reduceat(strip, np.arange(0, strip.shape[1], TILE), axis=1, dtype=np.float64)
+    sums = np.zeros((-(-height // TILE), across.shape[1]))
+    np.add.at(sums, (first + np.arange(len(strip))) // TILE, across)
+    return sums
+
+
+def relative_change(moved: NDArray[np.float64], size: NDArray[np.float64]) -> float:
+    """Change of the tile that changed most, relative to the brightest.
+
+    Parameters
+    ----------
+    moved, size : ndarray, float64, equal shapes
+        Squares of the change and of the image, summed over tiles.
+
+    Returns
+    -------
+    float
+        Of their roots.
+
+    Examples
+    --------
+    >>> relative_change(np.array([0.0, 4.0]), np.array([100.0, 1.0]))
+    0.2
+    """
+    most, brightest = float(moved.max()), float(size.max())
+    return float(np.sqrt(most / brightest)) if brightest > 0 else float(most > 0)
