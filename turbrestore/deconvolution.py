@@ -129,7 +129,7 @@ class DeconvolutionParams:
     exponent: float | None = None
     fidelity: float | None = None
     iterations: int = 400
-    tolerance: float = 3.5e-3
+    tolerance: float = 3e-3
     boundary: Literal["unknown", "periodic"] = "unknown"
     channels: Literal["luminance", "each"] = "luminance"
     sharpen_guide: bool = True
