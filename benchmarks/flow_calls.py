@@ -165,23 +165,31 @@ def draw(measured: dict[str, Curves], path: Path) -> None:
 
 
 def _verdict(measured: dict[str, Curves], mean: Curves) -> list[str]:
-    """Which settings cost no clip more than is tolerated, and what they save."""
+    """Say what a second buys on either side of the default, and which settings cost no clip more than is tolerated."""
     lines = [
         "\n## The knee\n",
-        f"A default may change where it costs no clip more than {TOLERATED} dB.\n",
-        "| setting | largest loss on a clip, dB | mean change, dB | flow calls |",
-        "|---|---:|---:|---:|",
+        "What a second of flow calls buys from a cheaper setting to the default, and from the default to a dearer one. "
+        f"A default may also change where it costs no clip more than {TOLERATED} dB.\n",
+        "| setting | largest loss on a clip, dB | mean change, dB | flow calls | dB a second |",
+        "|---|---:|---:|---:|---:|",
     ]
-    default, cheaper = mean["default"], list[str]()
+    default, rates, harmless = mean["default"], dict[str, float](), list[str]()
     for name, point in mean.items():
         loss = max(curves["default"].restored - curves[name].restored for curves in measured.values())
         change, calls = point.restored - default.restored, point.calls / default.calls - 1
-        lines.append(f"| {name} | {max(loss, 0.0):.2f} | {change:+.2f} | {100 * calls:+.0f} % |")
+        if calls:
+            rates[name] = change / (point.seconds - default.seconds)
+        rate = f"{rates[name]:+.2f}" if name in rates else ""
+        lines.append(f"| {name} | {max(loss, 0.0):.2f} | {change:+.2f} | {100 * calls:+.0f} % | {rate} |")
         if calls < 0 and loss <= TOLERATED:
-            cheaper.append(name)
-    names = ", ".join(cheaper)
-    found = f"With fewer flow calls this holds for: {names}."
-    return [*lines, f"\n{found if cheaper else 'No setting with fewer flow calls holds this: the defaults stay.'}"]
+            harmless.append(name)
+    cheaper = min(rate for name, rate in rates.items() if mean[name].calls < default.calls)
+    dearer = max(rate for name, rate in rates.items() if mean[name].calls > default.calls)
+    text = f"A second more buys {cheaper:+.2f} dB or more up to the default, and {dearer:+.2f} or less beyond it"
+    text += ": the default is at the knee." if cheaper > max(dearer, 0) else ": the default is not at the knee."
+    few = f"With fewer flow calls, no clip loses more than {TOLERATED} dB by {', '.join(harmless)}."
+    none = f"Every setting with fewer flow calls costs some clip more than {TOLERATED} dB."
+    return [*lines, f"\n{text} {few if harmless else none}"]
 
 
 def _row(name: str, point: Point, before: Point | None) -> str:
