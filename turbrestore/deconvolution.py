@@ -102,9 +102,9 @@ class DeconvolutionParams:
     iterations : int
         Largest number of iterations.
     tolerance : float
-        Stop when less than this is still to come, by what is foreseen from the changes until then, in the tile that
-        changes most and relative to the brightest tile (:mod:`turbrestore.convergence`).  Of nltv and tv, whose images
-        swing about the one that they approach, ten iterations are judged together.
+        Stop when no tile of 64×64 pixels is foreseen to change by this any more, relative to the brightest tile; see
+        ``turbrestore.convergence``.  Of nltv and tv, whose images swing about the one that they approach, ten
+        iterations are judged together.
     boundary : {"unknown", "periodic"}
         What lies beyond the border: pixels to be found, or the image itself.
     channels : {"luminance", "each"}
