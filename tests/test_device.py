@@ -389,6 +389,7 @@ class TestDeconvolution:
         assert there.converged == here.converged
         assert there.objective[-1] == pytest.approx(here.objective[-1], rel=1e-4)
         assert there.recorded[0] == here.recorded[0]
+        assert there.changes[0] == pytest.approx(here.changes[0], rel=1e-2, abs=1e-6)
 
     @pytest.mark.parametrize("channels", ["luminance", "each"])
     def test_colour_and_a_guide(self, device, channels):

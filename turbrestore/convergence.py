@@ -52,38 +52,34 @@ def still_to_come(changes: Sequence[float]) -> float:
     last, span = changes[-1], min(SPAN, len(changes) - 1)
     if span < FEWEST or not last < changes[-1 - span]:
         return last * MOST
-    ratio = (last / changes[-1 - span]) ** (1 / span)
-    return last * min(ratio / (1 - ratio), MOST)
+    ratio = min((last / changes[-1 - span]) ** (1 / span), MOST / (1 + MOST))
+    return last * ratio / (1 - ratio)
 
 
-def tile_sums(strip: FloatArray, first: int, height: int) -> NDArray[np.float64]:
+def tile_sums(strip: FloatArray, first: int) -> NDArray[np.float64]:
     """Sum some rows of an image over tiles.
 
     Parameters
     ----------
     strip : ndarray, float32, shape (h, W)
-        Rows.
+        Rows, at least one.
     first : int
-        Number of the first of them.
-    height : int
-        Of the image, pixels.
+        Number of the first of them in the image.
 
     Returns
     -------
-    ndarray, float64, shape (ceil(height / TILE), ceil(W / TILE))
-        Of all tiles of the image; 0 where no row reaches.
+    ndarray, float64, shape (n, ceil(W / TILE))
+        Of the n rows of tiles that they belong to, from row ``first // TILE`` of tiles on.
 
     Examples
     --------
-    >>> tile_sums(np.ones((2, 65), np.float32), 63, 130)
+    >>> tile_sums(np.ones((2, 65), np.float32), 63)
     array([[64.,  1.],
-           [64.,  1.],
-           [ 0.,  0.]])
+           [64.,  1.]])
     """
     across = np.add.reduceat(strip, np.arange(0, strip.shape[1], TILE), axis=1, dtype=np.float64)
-    sums = np.zeros((-(-height // TILE), across.shape[1]))
-    np.add.at(sums, (first + np.arange(len(strip))) // TILE, across)
-    return sums
+    begins = np.arange(-(-(first + 1) // TILE) * TILE, first + len(strip), TILE) - first
+    return np.add.reduceat(across, np.concatenate([[0], begins]))
 
 
 def relative_change(moved: NDArray[np.float64], size: NDArray[np.float64]) -> float:
@@ -105,4 +101,4 @@ def relative_change(moved: NDArray[np.float64], size: NDArray[np.float64]) -> fl
     0.2
     """
     most, brightest = float(moved.max()), float(size.max())
-    return float(np.sqrt(most / brightest)) if brightest > 0 else float(most > 0)
+    return float(most > 0) if brightest == 0 else float(np.sqrt(most / brightest))

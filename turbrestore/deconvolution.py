@@ -38,7 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from .arrays import FloatArray, check_image
 from .blur_estimation import BlurEstimate
 from .conjugate_gradients import ConjugateGradients
-from .convergence import relative_change, still_to_come, tile_sums
+from .convergence import TILE, relative_change, still_to_come, tile_sums
 from .convolution_problem import Problem
 from .deconvolution_memory import DeconvolutionWork, Room
 from .device import PROCESSOR, check_device, find_device
@@ -182,7 +182,8 @@ class Deconvolution:
     objective : ndarray, float64, shape (n,)
         Value of the minimised energy, summed over channels.
     changes : ndarray, float64, shape (n,)
-        Change in an iteration of the tile that changes most, relative to the brightest tile.
+        Change of the tile that changes most over the iterations that are judged together, divided by their number, and
+        relative to the brightest tile.
     """
 
     image: FloatArray
@@ -463,11 +464,11 @@ def _iterate(
         images = [state.image for state in states]
         last = iteration == params.iterations
         if last or iteration % solver.window == 0:
-            moved.append(_change(before, images, problems[0]))
+            moved.append(_change(before, images, problems[0]) * solver.window / (iteration - begun))
             last |= (converged := still_to_come(moved) <= params.tolerance)
         if last or iteration % _RECORD_EVERY == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
-            records.append((iteration, sum(energies), moved[-1] / (iteration - begun)))
+            records.append((iteration, sum(energies), moved[-1] / solver.window))
         if progress is not None:
             progress(1)
         if last:
@@ -542,17 +543,16 @@ def _read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | N
 
 
 def _change(before: list[FloatArray], after: list[FloatArray], problem: Problem) -> float:
-    """Of the pixels that were seen: the margin drifts for long and is cut off."""
+    """Of what is shown: the margin, which is cut off, drifts for long, and so may what is clipped."""
     seen, grid = problem.seen, problem.grid
+    sums = np.zeros((2, *(-(-length // TILE) for length in grid.shape)))
 
-    def squares(rows: slice, old: FloatArray, new: FloatArray) -> NDArray[np.float64]:
-        both = new[rows] - old[rows], new[rows]
-        return np.array([tile_sums(seen[rows] * np.square(part), rows.start, len(seen)) for part in both])
+    def squares(rows: slice, old: FloatArray, new: FloatArray) -> tuple[int, NDArray[np.float64]]:
+        then, now = (np.clip(image[rows], 0, 1) for image in (old, new))
+        both = (tile_sums(seen[rows] * np.square(part), rows.start) for part in (now - then, now))
+        return rows.start // TILE, np.array(list(both))
 
-    strips = [
-        strip
-        for old, new in zip(before, after, strict=True)
-        for strip in grid.over_rows(partial(squares, old=old, new=new), old, new, seen)
-    ]
-    moved, size = np.sum(strips, axis=0)
-    return relative_change(moved, size)
+    for old, new in zip(before, after, strict=True):
+        for first, found in grid.over_rows(partial(squares, old=old, new=new), old, new, seen):
+            sums[:, first : first + found.shape[1]] += found
+    return relative_change(*sums)

@@ -1,7 +1,7 @@
 """The solvers of deconvolution in torch: primal-dual splitting (nltv, tv) and conjugate gradients (wiener, tikhonov).
 
 Symbols, problems, steps and stopping as in :mod:`turbrestore.deconvolution`, :mod:`turbrestore.primal_dual` and
-:mod:`turbrestore.conjugate_gradients`; nothing leaves the device between iterations but the change that they stop by.
+:mod:`turbrestore.conjugate_gradients`; nothing leaves the device between iterations but the sums that they stop by.
 Sums that decide are taken in double precision, as they are there.
 """
 
@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .arrays import FloatArray
 from .conjugate_gradients import ROUNDING
@@ -204,11 +203,11 @@ def _iterate(
         images = [state.image for state in states]
         last = iteration == settings.iterations
         if last or iteration % solver.window == 0:
-            moved.append(_change(before, images, problems[0].seen))
+            moved.append(_change(before, images, problems[0].seen) * solver.window / (iteration - begun))
             last |= (converged := still_to_come(moved) <= settings.tolerance)
         if last or iteration % settings.record_every == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
-            records.append((iteration, sum(energies), moved[-1] / (iteration - begun)))
+            records.append((iteration, sum(energies), moved[-1] / solver.window))
         if progress is not None:
             progress(1)
         if last:
@@ -380,16 +379,21 @@ def _total(values: Tensor) -> float:
 
 
 def _change(before: list[Tensor], after: list[Tensor], seen: Tensor) -> float:
-    moved = [_tile_sums(seen * (b - a).square()) for a, b in zip(before, after, strict=True)]
-    return relative_change(np.sum(moved, axis=0), np.sum([_tile_sums(seen * u.square()) for u in after], axis=0))
+    import torch
+
+    sums = []
+    for old, new in zip(before, after, strict=True):
+        then, now = old.clamp(0, 1), new.clamp(0, 1)
+        sums.append(torch.stack([_tile_sums(seen * part.square()) for part in (now - then, now)]))
+    moved, size = torch.stack(sums).sum(0).cpu().numpy()
+    return relative_change(moved, size)
 
 
-def _tile_sums(image: Tensor) -> NDArray[np.float64]:
-    """See :func:`turbrestore.convergence.tile_sums`."""
+def _tile_sums(image: Tensor) -> Tensor:
+    """Sum the whole image over tiles."""
     import torch
 
     down, right = (-(-length // TILE) for length in image.shape)
     room = image.new_zeros((down * TILE, right * TILE))
     room[: image.shape[0], : image.shape[1]] = image
-    sums: NDArray[np.float64] = room.view(down, TILE, right, TILE).sum((1, 3), dtype=torch.float64).cpu().numpy()
-    return sums
+    return room.view(down, TILE, right, TILE).sum((1, 3), dtype=torch.float64)
