@@ -116,7 +116,8 @@ def document(measured: dict[str, Curves]) -> str:
         "PSNR, dB, of the fused image (after the filter) and of the restored one; seconds of the flow calls; and what "
         "one more repetition adds. The number of passes of the centroid is the largest allowed, without tolerance: it "
         "stops by itself where its mean flow no longer shrinks. The default stops as soon as that is below the "
-        "tolerance, after two passes at least.\n",
+        "tolerance, after two passes at least. What has not converged recentres its flows once more at the end, so two "
+        "passes without tolerance are not the two of the default.\n",
         "| setting | calls | seconds | fused | restored | one more adds: fused | restored | dB a second, restored |",
         "|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
@@ -169,7 +170,7 @@ def _verdict(measured: dict[str, Curves], mean: Curves) -> list[str]:
     lines = [
         "\n## The knee\n",
         "What a second of flow calls buys from a cheaper setting to the default, and from the default to a dearer one. "
-        f"A default may also change where it costs no clip more than {TOLERATED} dB.\n",
+        f"A default may change only where it costs no clip more than {TOLERATED} dB.\n",
         "| setting | largest loss on a clip, dB | mean change, dB | flow calls | dB a second |",
         "|---|---:|---:|---:|---:|",
     ]
