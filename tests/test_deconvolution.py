@@ -373,7 +373,6 @@ def test_images_in_files_are_the_same_bytes(monkeypatch, tmp_path, method, chann
 @pytest.mark.parametrize("method", METHODS)
 def test_threads_that_share_images_in_files_give_the_same_bytes(monkeypatch, tmp_path, method):
     in_strips(monkeypatch)
-    monkeypatch.setattr("turbrestore.deconvolution._THREADED_PASS", 1)
     _, blurred = camera(72, 1.5, 0.002)
     colour, images = blurred[..., None] * np.array([0.9, 0.6, 0.3], np.float32), []
     params = DeconvolutionParams(method=method, iterations=8, channels="each")
@@ -386,7 +385,6 @@ def test_threads_that_share_images_in_files_give_the_same_bytes(monkeypatch, tmp
 @pytest.mark.parametrize("method", METHODS)
 def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch, method):
     in_strips(monkeypatch)
-    monkeypatch.setattr("turbrestore.deconvolution._THREADED_PASS", 1)
     _, blurred = camera(72, 1.5, 0.002)
     images = []
     for threads in (1, 2, 5):

@@ -1,7 +1,5 @@
 """Nonlocal TV by strips against its operators on all edges at once."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 from regulariser import Regulariser
@@ -16,6 +14,7 @@ from turbrestore.nonlocal_tv import (
     nonlocal_weights,
     project_to_unit,
 )
+from turbrestore.parallel import Crew
 from turbrestore.strip_grid import StripGrid
 
 
@@ -75,11 +74,9 @@ def test_threads_and_files_change_nothing(graph, tmp_path, monkeypatch):
     image = np.random.default_rng(3).normal(size=graph.shape).astype(np.float32)
     pulls = []
     monkeypatch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
-    for workers, folder in ((None, None), (1, None), (4, tmp_path)):
-        pool = ThreadPoolExecutor(workers) if workers else None
-        penalty = NonlocalPenalty(graph, StripGrid(graph.shape, pool, folder), folder)
-        dual = penalty.dual(image)
-        pulls.append(b"".join(ascended(penalty, dual, image, 0.7, 1.4).tobytes() for _ in range(3)))
-        if pool is not None:
-            pool.shutdown()
+    for workers, folder in ((1, None), (2, None), (4, tmp_path)):
+        with Crew(workers) as crew:
+            penalty = NonlocalPenalty(graph, StripGrid(graph.shape, crew, folder), folder)
+            dual = penalty.dual(image)
+            pulls.append(b"".join(ascended(penalty, dual, image, 0.7, 1.4).tobytes() for _ in range(3)))
     assert len(set(pulls)) == 1

@@ -11,7 +11,7 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore.flow import FlowParams
-from turbrestore.parallel import map_ahead, map_in_turns, sum_side_by_side
+from turbrestore.parallel import Crew, map_ahead, map_in_turns, sum_side_by_side
 from turbrestore.pipeline import RestoreParams, restore
 
 
@@ -139,13 +139,77 @@ def test_sums_do_not_depend_on_the_number_of_threads(count):
     assert all(a.tobytes() == b.tobytes() for other in others for a, b in zip(one, other, strict=True))
 
 
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("count", [0, 1, 2, 7])
+def test_a_crew_hands_results_over_in_order(threads, count):
+    with Crew(threads) as crew:
+        for _ in range(20):
+            assert list(crew.map(lambda n, text: (n, text), range(count), "abcdefg"[:count])) == [
+                (n, "abcdefg"[n]) for n in range(count)
+            ]
+
+
+def test_a_crew_is_so_many_threads_and_the_caller_one_of_them():
+    together, names = threading.Barrier(3, timeout=10), set()
+
+    def meet(_):
+        together.wait()
+        names.add(threading.current_thread())
+
+    with Crew(3) as crew:
+        list(crew.map(meet, range(3)))
+    assert len(names) == 3 and threading.current_thread() in names
+
+
+@pytest.mark.parametrize("bad", range(3))
+def test_an_error_in_a_crew_ends_the_work(bad):
+    together, done = threading.Barrier(2, timeout=10), []
+
+    def work(number):
+        if number < 2:
+            # Both threads have begun.
+            together.wait()
+        if number == bad:
+            raise ZeroDivisionError
+        time.sleep(0.05)
+        done.append(number)
+
+    with Crew(2) as crew:
+        with pytest.raises(ZeroDivisionError):
+            list(crew.map(work, range(50)))
+        assert len(done) < 10
+        before = len(done)
+        time.sleep(0.1)
+        assert len(done) == before
+        assert list(crew.map(abs, [-1, -2, -3])) == [1, 2, 3]
+
+
+def test_a_crew_has_ended_where_its_results_are_left():
+    running = []
+
+    def work(number):
+        running.append(number)
+        time.sleep(0.02)
+        running.remove(number)
+
+    with Crew(3) as crew:
+        results = crew.map(work, range(50))
+        next(results)
+        results.close()
+        assert not running
+
+
+def test_a_crew_may_be_called_within_itself():
+    with Crew(2) as crew:
+        assert list(crew.map(lambda n: sum(crew.map(abs, range(n))), range(6))) == [0, 0, 1, 3, 6, 10]
+
+
 def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypatch):
     # Several strips and several sums of everything.
     monkeypatch.setattr("turbrestore.warp._STRIP", 1000)
     monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 700)
     monkeypatch.setattr("turbrestore.flow_subspace._STRIP_BYTES", 1 << 16)
-    for name in ("deconvolution._THREADED_PASS", "strip_grid._ONE_STRIP"):
-        monkeypatch.setattr(f"turbrestore.{name}", 1)
+    monkeypatch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
     monkeypatch.setattr("turbrestore.strip_grid._STRIP", 700)
     frames = make_sequence(seed=3, count=28).frames[:, :64, :80]
 

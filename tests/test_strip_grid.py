@@ -1,7 +1,5 @@
 """Strips of images and blocks of spectra against transforms of the whole."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +8,7 @@ from scipy import fft
 
 from turbrestore import strip_grid
 from turbrestore.convolution_problem import Problem, seen_mean
+from turbrestore.parallel import Crew
 from turbrestore.psf import psf_to_otf
 from turbrestore.strip_grid import StripGrid, inner
 
@@ -43,8 +42,8 @@ def spectrum_of(grid: StripGrid, image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("in_file", [False, True])
 def test_transforms_are_those_of_the_whole(strips, shape, in_file, tmp_path):
     image = rng.normal(size=shape).astype(np.float32)
-    with ThreadPoolExecutor(3) as pool:
-        grid = StripGrid(shape, pool, tmp_path if in_file else None)
+    with Crew(3) as crew:
+        grid = StripGrid(shape, crew, tmp_path if in_file else None)
         spectrum = spectrum_of(grid, image)
         together = np.concatenate(spectrum, axis=1)
         assert together[:, : shape[1] // 2 + 1] == pytest.approx(fft.rfft2(image), abs=1e-4)

@@ -26,7 +26,6 @@ from __future__ import annotations
 import dataclasses
 import tempfile
 from collections.abc import Callable
-from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -47,7 +46,7 @@ from .local_tv import LocalPenalty
 from .memory_size import DeconvolutionMemory
 from .nonlocal_penalty import NonlocalPenalty
 from .nonlocal_tv import NonlocalParams, nonlocal_weights
-from .parallel import available_cores, one_thread_each
+from .parallel import Crew, available_cores, one_thread_each
 from .planes import join_planes, margin_widths, padded_guide, split_planes
 from .plots import plot_objective
 from .preview import preview
@@ -74,8 +73,6 @@ METHODS = ("nltv", "tv", "wiener", "tikhonov")
 BOUNDARIES = ("unknown", "periodic")
 CHANNELS = ("luminance", "each")
 
-# Passes over the pairs of fewer pixels take no less time on several threads than on one.
-_THREADED_PASS = 1 << 17
 # Least margin, in widths of the blur.
 MARGIN_SIGMAS = 4.0
 # Steps to the Wiener solution that is started from: from the first on only what lies near the border changes.
@@ -296,15 +293,14 @@ def deconvolve(
     memory = params.memory if find_device(params.device or PROCESSOR) == PROCESSOR else None
     room = DeconvolutionWork(shape, len(planes), params.method, params.weights).room(memory, available_cores())
     folder = scratch or Path(tempfile.gettempdir())
-    with one_thread_each(), ThreadPoolExecutor(room.threads) as pool:
-        threaded = shape[0] * shape[1] >= _THREADED_PASS
-        grid = StripGrid(shape, pool if threaded else None, folder if room.images_in_file else None)
+    with one_thread_each(), Crew(room.threads) as crew:
+        grid = StripGrid(shape, crew, folder if room.images_in_file else None)
         problems = _pose(planes, widths, inside, grid, otf, fidelity)
         around = padded_guide(guide, size, widths)
         around = None if around is None else kept_in(around, grid.folder)
         for array in (pixels, guide):
             release(array)
-        result = _solve(problems, params, around, progress, _Workshop(pool, room, folder))
+        result = _solve(problems, params, around, progress, _Workshop(crew, room, folder))
     restored = new_stack(pixels.shape, grid.folder)
 
     def join(rows: slice) -> None:
@@ -385,7 +381,7 @@ def _pose(
 class _Workshop(NamedTuple):
     """Threads, what there is room for, and the folder for the rest."""
 
-    pool: Executor
+    crew: Crew
     room: Room
     folder: Path
 
@@ -501,7 +497,7 @@ def _sharpened(
     if grid.one_strip or (grid.folder is None and len(blurred) >= workshop.room.threads):
         # Side by side, each with what it works with.
         apart = [dataclasses.replace(problem, grid=StripGrid(grid.shape)) for problem in blurred]
-        sharp = list(workshop.pool.map(_wiener_image, apart))
+        sharp = list(workshop.crew.map(_wiener_image, apart))
     else:
         sharp = [_wiener_image(problem) for problem in blurred]
     starts, further = sharp[: len(problems)], sharp[len(problems) :]

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from .arrays import FloatArray
+from .parallel import Crew
 from .scratch import release
 
 
@@ -120,7 +120,7 @@ def sum_strips(
     strips: Sequence[EdgeStrip],
     part: Callable[[int, EdgeStrip], FloatArray],
     total: FloatArray,
-    pool: Executor | None = None,
+    crew: Crew | None = None,
 ) -> None:
     """Add up what every strip gives its window.
 
@@ -131,7 +131,7 @@ def sum_strips(
         From the number of a strip and the strip to values over its window.
     total : ndarray, float32, shape (H · W,)
         Becomes the sum.
-    pool : Executor, optional
+    crew : Crew, optional
         Threads that work on strips side by side.
 
     Examples
@@ -149,7 +149,7 @@ def sum_strips(
         return values
 
     numbers, clear = range(len(strips)), 0
-    for strip, values in zip(strips, map(work, numbers) if pool is None else pool.map(work, numbers), strict=True):
+    for strip, values in zip(strips, map(work, numbers) if crew is None else crew.map(work, numbers), strict=True):
         stop = strip.first + strip.window
         # What no strip before has reached.
         total[clear:stop] = 0

@@ -120,7 +120,7 @@ class NonlocalPenalty:
             np.multiply(image[rows], np.float32(relaxation - 1), out=dual.lagged[rows])
 
         self.grid.over_rows(rise, image, dual.lagged)
-        sum_strips(self.graph.strips, add, pull.ravel(), self.grid.pool)
+        sum_strips(self.graph.strips, add, pull.ravel(), self.grid.crew)
         self.grid.over_rows(project, image, pull, dual.factor, dual.lagged)
         self._pull(dual, pull.ravel())
 
@@ -143,7 +143,7 @@ class NonlocalPenalty:
                 release(array)
             return found
 
-        sum_strips(self.graph.strips, draw, pull, self.grid.pool)
+        sum_strips(self.graph.strips, draw, pull, self.grid.crew)
 
     def value(self, image: FloatArray) -> float:
         """J[u]."""
@@ -161,7 +161,7 @@ class NonlocalPenalty:
             release(flat)
             return found
 
-        sum_strips(self.graph.strips, squares, total.ravel(), self.grid.pool)
+        sum_strips(self.graph.strips, squares, total.ravel(), self.grid.crew)
         return sum(self.grid.over_rows(lambda rows: float(np.sqrt(total[rows]).sum(dtype=np.float64)), total))
 
     def _images(self, count: int) -> list[FloatArray]:

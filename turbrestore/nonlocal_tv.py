@@ -18,7 +18,6 @@ are tested against them.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -33,7 +32,7 @@ from .arrays import FloatArray, check_image, luminance
 from .compiled import compiled
 from .edge_strips import EdgeStrip, sum_strips
 from .errors import DataError, require
-from .parallel import available_cores, one_thread_each
+from .parallel import Crew, available_cores, one_thread_each
 from .patch_pairs import pairs_of_band
 from .patch_search import BAND_ROWS, PatchSearch, search_bands
 from .psf import estimate_noise
@@ -425,13 +424,13 @@ def _norm_squared_bound(strips: tuple[EdgeStrip, ...], pixels: int, threads: int
         sums = (strip.at_tails(values) + strip.at_heads(values)) * strip.roots
         return strip.gather((strip.roots, sums), (strip.roots, sums))
 
-    with one_thread_each(), ThreadPoolExecutor(threads) as pool:
+    with one_thread_each(), Crew(threads) as crew:
         for _ in range(iterations):
             # Pixels without edges do not take part.
             x /= x.max()
             np.maximum(x, np.float32(1e-6), out=x)
             image = np.empty_like(x)
-            sum_strips(strips, apply, image, pool)
+            sum_strips(strips, apply, image, crew)
             bound = min(bound, float(np.divide(image, x, out=x).max()))
             x = image
     return 2 * bound

@@ -8,10 +8,11 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ContextDecorator, ExitStack
 from itertools import islice
-from typing import TypeVar
+from types import TracebackType
+from typing import Self, TypeVar
 
 import cv2
 import numpy as np
@@ -172,6 +173,88 @@ def sum_side_by_side(
     for _, sums in map_ahead(add, in_batches(items, _SUMMED), threads):
         totals = tuple(np.add(*pair, out=pair[0]) for pair in zip(totals, sums, strict=True)) if totals else sums
     return totals
+
+
+class Crew:
+    """Threads that share out some work, the calling thread among them.
+
+    Handing an item to a sleeping thread takes as long as a pass over a small image, so the caller does not sleep
+    meanwhile.  Of one thread there are none but the caller.
+
+    Parameters
+    ----------
+    threads : int
+        At least 1, with the caller.
+
+    Examples
+    --------
+    >>> with Crew(2) as crew:
+    ...     list(crew.map(pow, [2, 3], [5, 2]))
+    [32, 9]
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._others = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._count = threads - 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._others is not None:
+            self._others.shutdown()
+
+    def map(self, function: Callable[..., Result], *iterables: Iterable[object]) -> Iterator[Result]:
+        """Yield what the function makes of each set of arguments, in their order.
+
+        All have ended when this has, also after an error or where it is left early; it may be called within itself.
+
+        Parameters
+        ----------
+        function : callable
+            Should release the interpreter lock.
+        iterables : iterable
+            Of one length.
+
+        Yields
+        ------
+        result
+        """
+        left, found, due = deque(enumerate(zip(*iterables, strict=True))), dict[int, Result](), 0
+
+        def take_one() -> bool:
+            try:
+                number, arguments = left.popleft()
+            except IndexError:
+                return False
+            found[number] = function(*arguments)
+            return True
+
+        def help_out() -> None:
+            try:
+                while take_one():
+                    pass
+            finally:
+                # After an error nobody asks for the rest.
+                left.clear()
+
+        count = min(self._count, len(left) - 1)
+        others = [] if self._others is None else [self._others.submit(help_out) for _ in range(count)]
+        try:
+            while take_one():
+                while due in found:
+                    yield found.pop(due)
+                    due += 1
+            # Who has not begun by now may be waiting for a thread that waits for this one.
+            for other in others:
+                if not other.cancel():
+                    other.result()
+            while due in found:
+                yield found.pop(due)
+                due += 1
+        finally:
+            left.clear()
+            wait(other for other in others if not other.cancel())
 
 
 def in_batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:

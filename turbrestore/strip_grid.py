@@ -16,7 +16,6 @@ B, C : blocks of a spectrum, and columns of each; of the last one some may be em
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from .arrays import FloatArray
+from .parallel import Crew
 from .psf import Spectrum
 from .scratch import new_stack, release
 
@@ -46,14 +46,14 @@ class StripGrid:
     ----------
     shape : (int, int)
         P and Q.
-    pool : Executor, optional
+    crew : Crew, optional
         Threads that work on strips side by side.
     folder : Path, optional
         Where images lie in files; without it they are in memory.
     """
 
     shape: tuple[int, int]
-    pool: Executor | None = None
+    crew: Crew | None = None
     folder: Path | None = None
 
     @property
@@ -173,7 +173,7 @@ class StripGrid:
                 release(array)
             return found
 
-        return list(map(do, items) if self.pool is None or self.one_strip else self.pool.map(do, items))
+        return list(map(do, items) if self.crew is None or self.one_strip else self.crew.map(do, items))
 
 
 def inner(a: FloatArray, b: FloatArray) -> float:
