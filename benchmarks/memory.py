@@ -5,8 +5,9 @@
 ``--quick`` takes 40 frames of that size, with the same training frames, and no larger ones: a quarter of the time.
 ``--largest`` adds frames of 7680×4320.
 ``--stages`` prints the peak of every stage without a limit, in bytes a pixel, and of what is made of the whole image
-where frames are worked on in tiles: what the plan of ``turbrestore/memory.py`` rests on.  Memory is the largest
-resident set, mapped files included.
+where frames are worked on in tiles: what the plan of ``turbrestore/memory.py`` rests on.  For deconvolutions it prints
+what they take of that which ``turbrestore/deconvolution_memory.py`` plans.  Memory is the largest resident set, mapped
+files included.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -337,6 +338,35 @@ def read_corners(path: Path) -> None:
         pass
 
 
+def measure_deconvolution(clip: Clip, method: str) -> None:
+    """Print the peak of a deconvolution in memory, with pairs in files and with images in files too, bytes a pixel."""
+    from turbrestore.deconvolution import DeconvolutionParams, deconvolve
+    from turbrestore.deconvolution_memory import DeconvolutionWork, Room
+    from turbrestore.memory_size import DeconvolutionMemory
+    from turbrestore.parallel import available_cores
+    from turbrestore.scratch import release, returning_freed
+
+    pixels, threads = clip.height * clip.width, available_cores()
+    # Of a periodic image the margin is none.
+    params = DeconvolutionParams(method=method, iterations=20, tolerance=0, channels="each", boundary="periodic")
+    work = DeconvolutionWork((clip.height, clip.width), clip.channels, method, params.weights)
+    words = []
+    with returning_freed(), tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_apart(clip, folder / "clip.npy")
+        image = np.load(folder / "clip.npy")[0] / np.float32(255)
+        # What is loaded and compiled once.
+        deconvolve(image[:64, :64], 2.0, params)
+        filings = [(False, False), (True, False), (True, True)]
+        for files in filings if method == "nltv" else filings[::2]:
+            planned = work.peak(Room(threads, *files))
+            memory = DeconvolutionMemory(planned) if any(files) else None
+            watch = Watch()
+            release(deconvolve(image, 2.0, replace(params, memory=memory), scratch=folder).image)
+            words.append(f"{watch.lap() / pixels:.0f} of {planned / pixels:.0f}")
+    print(f"{clip} {method:6} {threads} threads, less and less in memory: {', '.join(words)} bytes a pixel", flush=True)
+
+
 def print_stages() -> None:
     """Run every combination in a process of its own."""
     for channels, threads, method in (
@@ -354,6 +384,9 @@ def print_stages() -> None:
     for channels in (1, 3):
         run_apart(f"measure_whole(Clip(3, 2160, 3840, {channels}))")
         run_apart(f"measure_whole(Clip(3, 1080, 1920, {channels}))")
+        for method in ("nltv", "tv", "wiener"):
+            run_apart(f"measure_deconvolution(Clip(1, 1080, 1920, {channels}), {method!r})")
+            run_apart(f"measure_deconvolution(Clip(1, 2160, 3840, {channels}), {method!r})")
 
 
 def main() -> int:

@@ -178,8 +178,10 @@ def test_a_compiler_that_cannot_be_loaded_is_none(monkeypatch):
     def refuse(name):
         raise ImportError("Numba needs NumPy 2.4 or less")
 
-    monkeypatch.setattr(compiling, "can_compile", lambda: True)
+    monkeypatch.setattr(compiling, "find_spec", lambda name: object())
     monkeypatch.setattr(compiling.importlib, "import_module", refuse)
+    assert not compiling.can_compile.__wrapped__()
+    monkeypatch.setattr(compiling, "can_compile", lambda: False)
     assert compiling.compiled.__wrapped__(mark_folds) is None
 
 

@@ -22,8 +22,9 @@ _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {
 COMPILER_BYTES = 1.4e8
 
 
+@functools.cache
 def can_compile() -> bool:
-    """Whether Numba is installed.
+    """Whether Numba is installed, and works with this NumPy: it is loaded to find out.
 
     Returns
     -------
@@ -34,7 +35,14 @@ def can_compile() -> bool:
     >>> isinstance(can_compile(), bool)
     True
     """
-    return find_spec("numba") is not None
+    if find_spec("numba") is None:
+        return False
+    try:
+        importlib.import_module("numba")
+    except ImportError:
+        # It refuses a NumPy that is newer than it knows.
+        return False
+    return True
 
 
 @functools.cache
@@ -66,11 +74,7 @@ def compiled(loops: Loops) -> Loops | None:
     """
     if not can_compile():
         return None
-    try:
-        numba: Any = importlib.import_module("numba")
-    except ImportError:
-        # It refuses a NumPy that is newer than it knows.
-        return None
+    numba: Any = importlib.import_module("numba")
     try:
         fast: Loops = numba.njit(cache=True, **_OPTIONS)(loops)
     except RuntimeError:
