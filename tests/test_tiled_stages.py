@@ -93,8 +93,8 @@ QUICK = RestoreParams(
 def in_tiles(monkeypatch):
     """Restore in tiles from now on, whatever the limit."""
 
-    def begin(source):
-        plan = replace(pipeline.memory_plan(source, QUICK), in_file=True, tile=112)
+    def begin(source, threads=2):
+        plan = replace(pipeline.memory_plan(source, QUICK), in_file=True, tile=112, threads=threads)
         for module in (pipeline, resumption):
             monkeypatch.setattr(module, "memory_plan", lambda *_: plan)
         monkeypatch.setattr(pipeline, "halo_tiles", lambda shape, side, halo=HALO: halo_tiles(shape, side, halo))
@@ -139,6 +139,32 @@ def test_a_restoration_in_tiles_is_deblurred_as_a_whole(sequence, in_tiles, tmp_
     whole = deconvolve(tiled.filtered.image, 1.0, QUICK.deconvolution, tiled.centroid.image)
     assert isinstance(tiled.deconvolution.image, np.memmap)
     assert np.array_equal(tiled.deconvolution.image, whole.image)
+
+
+def test_a_restoration_in_tiles_is_the_same_bytes_whatever_the_number_of_threads(sequence, in_tiles, monkeypatch):
+    source = FrameSource.from_array(sequence.frames)
+    # Several strips of everything.
+    monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 2000)
+    monkeypatch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
+    monkeypatch.setattr("turbrestore.strip_grid._STRIP", 2000)
+
+    def run(threads):
+        in_tiles(source, threads)
+        for module in ("parallel", "deconvolution", "nonlocal_tv"):
+            monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: threads)
+        restored = pipeline.restore(source, QUICK)
+        return [
+            getattr(stage, name).tobytes()
+            for stage, names in (
+                (restored, ("mean", "image")),
+                (restored.centroid, ("image", "flows")),
+                (restored.filtered, ("image", "variance", "flow_states", "shares")),
+            )
+            for name in names
+        ]
+
+    one, *others = map(run, (1, 2, 5))
+    assert all(other == one for other in others)
 
 
 def test_frames_that_do_not_count_do_not_in_any_tile(sequence, in_tiles):
