@@ -13,6 +13,7 @@ from turbrestore.checkpoint import load_tiles, save_tiles
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.dynamics import DynamicsParams
 from turbrestore.errors import DataError
+from turbrestore.flow import FlowParams
 from turbrestore.frame_source import FrameSource
 from turbrestore.halo_tiles import halo_tiles
 from turbrestore.metrics import psnr
@@ -93,8 +94,8 @@ QUICK = RestoreParams(
 def in_tiles(monkeypatch):
     """Restore in tiles from now on, whatever the limit."""
 
-    def begin(source, threads=2):
-        plan = replace(pipeline.memory_plan(source, QUICK), in_file=True, tile=112, threads=threads)
+    def begin(source):
+        plan = replace(pipeline.memory_plan(source, QUICK), in_file=True, tile=112)
         for module in (pipeline, resumption):
             monkeypatch.setattr(module, "memory_plan", lambda *_: plan)
         monkeypatch.setattr(pipeline, "halo_tiles", lambda shape, side, halo=HALO: halo_tiles(shape, side, halo))
@@ -143,16 +144,16 @@ def test_a_restoration_in_tiles_is_deblurred_as_a_whole(sequence, in_tiles, tmp_
 
 def test_a_restoration_in_tiles_is_the_same_bytes_whatever_the_number_of_threads(sequence, in_tiles, monkeypatch):
     source = FrameSource.from_array(sequence.frames)
+    in_tiles(source)
     # Several strips of everything.
     monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 2000)
     monkeypatch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
     monkeypatch.setattr("turbrestore.strip_grid._STRIP", 2000)
 
     def run(threads):
-        in_tiles(source, threads)
         for module in ("parallel", "deconvolution", "nonlocal_tv"):
             monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: threads)
-        restored = pipeline.restore(source, QUICK)
+        restored = pipeline.restore(source, replace(QUICK, flow=FlowParams(threads=threads)))
         return [
             getattr(stage, name).tobytes()
             for stage, names in (
