@@ -145,7 +145,7 @@ def test_a_restoration_in_tiles_is_deblurred_as_a_whole(sequence, in_tiles, tmp_
 def test_a_restoration_in_tiles_is_the_same_bytes_whatever_the_number_of_threads(sequence, in_tiles, monkeypatch):
     source = FrameSource.from_array(sequence.frames)
     in_tiles(source)
-    # Several strips of everything.
+    # Several strips in the deconvolution.
     monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 2000)
     monkeypatch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
     monkeypatch.setattr("turbrestore.strip_grid._STRIP", 2000)

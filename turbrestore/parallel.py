@@ -238,14 +238,15 @@ class Crew:
                 # After an error nobody asks for the rest.
                 left.clear()
 
-        count = min(self._count, len(left) - 1)
-        others = [] if self._others is None else [self._others.submit(help_out) for _ in range(count)]
+        others: list[Future[None]] = []
         try:
+            if self._others is not None:
+                others.extend(self._others.submit(help_out) for _ in range(min(self._count, len(left) - 1)))
             while take_one():
                 while due in found:
                     yield found.pop(due)
                     due += 1
-            # Who has not begun by now may be waiting for a thread that waits for this one.
+            # One that has not begun may be queued behind a thread that waits for this one.
             for other in others:
                 if not other.cancel():
                     other.result()
