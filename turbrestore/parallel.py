@@ -189,23 +189,23 @@ class Crew:
     Examples
     --------
     >>> with Crew(2) as crew:
-    ...     list(crew.map(pow, [2, 3], [5, 2]))
-    [32, 9]
+    ...     list(crew.map(abs, [-2, 3]))
+    [2, 3]
     """
 
     def __init__(self, threads: int) -> None:
-        self._others = ThreadPoolExecutor(threads - 1) if threads > 1 else None
         self._count = threads - 1
+        # It starts no thread before there is something for it to do.
+        self._others = ThreadPoolExecutor(max(self._count, 1))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._others is not None:
-            self._others.shutdown()
+        self._others.shutdown()
 
-    def map(self, function: Callable[..., Result], *iterables: Iterable[object]) -> Iterator[Result]:
-        """Yield what the function makes of each set of arguments, in their order.
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Yield ``function(item)`` in order; nothing begins before the first is asked for.
 
         All have ended when this has, also after an error or where it is left early; it may be called within itself.
 
@@ -213,21 +213,20 @@ class Crew:
         ----------
         function : callable
             Should release the interpreter lock.
-        iterables : iterable
-            Of one length.
+        items : iterable
 
         Yields
         ------
         result
         """
-        left, found, due = deque(enumerate(zip(*iterables, strict=True))), dict[int, Result](), 0
+        left, found, due = deque(enumerate(items)), dict[int, Result](), 0
 
         def take_one() -> bool:
             try:
-                number, arguments = left.popleft()
+                number, item = left.popleft()
             except IndexError:
                 return False
-            found[number] = function(*arguments)
+            found[number] = function(item)
             return True
 
         def help_out() -> None:
@@ -240,8 +239,7 @@ class Crew:
 
         others: list[Future[None]] = []
         try:
-            if self._others is not None:
-                others.extend(self._others.submit(help_out) for _ in range(min(self._count, len(left) - 1)))
+            others.extend(self._others.submit(help_out) for _ in range(min(self._count, len(left) - 1)))
             while take_one():
                 while due in found:
                     yield found.pop(due)
