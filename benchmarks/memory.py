@@ -4,10 +4,10 @@
 300 grey frames of 1920×1080 within 2 GB, every other limit kept, and 2,000 frames no more than 20 MB above 200.
 ``--quick`` takes 40 frames of that size, with the same training frames, and no larger ones: a quarter of the time.
 ``--largest`` adds frames of 7680×4320.
-``--stages`` prints the peak of every stage without a limit, in bytes a pixel, and of what is made of the whole image
-where frames are worked on in tiles: what the plan of ``turbrestore/memory.py`` rests on.  For deconvolutions it prints
-what they take of that which ``turbrestore/deconvolution_memory.py`` plans.  Memory is the largest resident set, mapped
-files included.
+``--stages`` prints the peak of every stage, in bytes a pixel, with training frames in memory and in a file, and of what
+is made of the whole image where frames are worked on in tiles: what the plan of ``turbrestore/memory.py`` rests on.
+For deconvolutions it prints what they take of that which ``turbrestore/deconvolution_memory.py`` plans.  Memory is the
+largest resident set, mapped files included.
 """
 
 from __future__ import annotations
@@ -166,63 +166,90 @@ class Watch:
     """Largest resident set between laps, above what was there when they began; bytes."""
 
     def __init__(self) -> None:
-        self._floor = self._peak = self._resident()
+        self._floor = self._peak = resident()
+        self._reading = threading.Lock()
         threading.Thread(target=self._look, daemon=True).start()
 
     def lap(self) -> float:
         """Begin anew, and return what was taken."""
-        taken = max(self._peak, self._resident()) - self._floor
-        self._floor = self._peak = self._resident()
+        with self._reading:
+            taken = max(self._peak, resident()) - self._floor
+            self._floor = self._peak = resident()
         return taken
 
     def _look(self) -> None:
         while True:
-            self._peak = max(self._peak, self._resident())
+            with self._reading:
+                self._peak = max(self._peak, resident())
             time.sleep(0.003)
 
-    def _resident(self) -> float:
-        return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+def resident() -> float:
+    """Bytes of the process in memory."""
+    return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 class StageWatch(Watch):
-    """What every stage takes."""
+    """What the process takes in every stage, above what is there to begin with."""
 
     def __init__(self) -> None:
         super().__init__()
+        self._begun = self._floor
         self.taken: dict[str, float] = {}
 
     def result(self, done: object) -> None:
         """Take the call of a restoration that a stage, or a block of frames, is done."""
         name = next(name for name in ("filtered", "checkpoint", "dynamics", "centroid") if getattr(done, name))
         if name != "checkpoint" and name not in self.taken:
-            self.taken[name] = self.lap()
+            earlier = self._floor - self._begun
+            self.taken[name] = earlier + self.lap()
 
 
 def measure_stages(clip: Clip, threads: int, method: str) -> None:
-    """Print the peak of each stage above what earlier ones left, bytes a pixel; in a process of its own."""
+    """Print the peak of each stage above what libraries take, bytes a pixel; in a process of its own.
+
+    First with the training frames in memory, then in a file, and beside both what is planned of the largest.
+    """
     from turbrestore import pipeline
+    from turbrestore.alternating import FilterParams
     from turbrestore.centroid import CentroidParams
+    from turbrestore.deconvolution import DeconvolutionParams
+    from turbrestore.dynamics import DynamicsParams
     from turbrestore.flow import FlowParams
     from turbrestore.frame_source import FrameSource
+    from turbrestore.memory import _Work
     from turbrestore.restoration import RestoreParams
     from turbrestore.scratch import returning_freed
 
-    train, pixels = 4, clip.height * clip.width
+    # Fewer than there are, for the filter holds a block of those that follow.
+    train, pixels = 8, clip.height * clip.width
     settings = RestoreParams(
         train=train,
         until="filter",
         flow=FlowParams(threads=threads, method=method),
         centroid=CentroidParams(iterations=2),
     )
-    with returning_freed(), tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clip.npy"
-        clip.write(path)
-        watch = StageWatch()
-        pipeline.restore(FrameSource.from_array(np.load(path, mmap_mode="r")), settings, on_result=watch.result)
-    # Frames and flows, which the plan counts apart.
-    watch.taken["centroid"] -= train * pixels * (4 * clip.channels + 8)
-    words = "  ".join(f"{name} {size / pixels:4.0f}" for name, size in watch.taken.items())
-    print(f"{clip} {method:9} {threads} threads: {words} bytes a pixel", flush=True)
+        write_apart(replace(clip, height=96, width=96), path)
+        with returning_freed():
+            # What is loaded and compiled once.
+            pipeline.restore(FrameSource.from_array(np.load(path)), settings)
+        write_apart(clip, path)
+        for in_file in (False, True):
+            source = FrameSource.from_array(np.load(path, mmap_mode="r"))
+            work = _Work(
+                source.shape, FilterParams(), DynamicsParams(), DeconvolutionParams(), settings.until, False, False
+            )
+            planned = work.peak(train, threads, in_file)
+            with returning_freed():
+                watch = StageWatch()
+                limited = replace(settings, memory_limit=planned if in_file else None)
+                pipeline.restore(source, limited, on_result=watch.result, scratch=Path(folder))
+            words = ", ".join(f"{name} {size / pixels:.0f}" for name, size in watch.taken.items())
+            where = "in a file" if in_file else "in memory"
+            words += f", of {(planned - work.base) / pixels:.0f} planned"
+            print(f"{clip} {method:9} {threads} threads, {where}: {words}; bytes a pixel", flush=True)
 
 
 def measure_whole(clip: Clip) -> None:
@@ -380,7 +407,7 @@ def print_stages() -> None:
         (1, 1, "tvl1"),
         (1, 2, "tvl1"),
     ):
-        run_apart(f"measure_stages(Clip(16, 720, 1280, {channels}), {threads}, {method!r})")
+        run_apart(f"measure_stages(Clip(40, 720, 1280, {channels}), {threads}, {method!r})")
     for channels in (1, 3):
         run_apart(f"measure_whole(Clip(3, 2160, 3840, {channels}))")
         run_apart(f"measure_whole(Clip(3, 1080, 1920, {channels}))")

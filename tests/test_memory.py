@@ -222,6 +222,17 @@ def test_two_gigabytes_are_enough_for_bounds_on_the_blur_of_the_largest_video(sh
     assert plan_memory(shape, 2e9, blur_bounds=True).tile is not None
 
 
+def test_a_block_counts_only_where_frames_follow_those_trained_on():
+    def peak(count):
+        shape = (count, 1080, 1920)
+        work = _Work(shape, FilterParams(block=24), DynamicsParams(), DeconvolutionParams(), "filter", False, False)
+        return work.peak(40, 2, True)
+
+    # Of each frame its levels, and what flow prepares of it.
+    assert peak(64) - peak(40) == pytest.approx(24 * 1080 * 1920 * 6)
+    assert peak(300) == peak(64)
+
+
 def test_bounds_on_the_blur_count_for_whole_frames():
     # So many that they outweigh the filter.
     shape = (8000, 1080, 1920)
@@ -474,7 +485,7 @@ def test_a_limit_changes_nothing_that_a_stage_depends_on(frames, in_file):
 
 
 def test_a_stage_depends_on_the_size_of_the_tiles():
-    source = FrameSource.from_array(np.zeros((12, 600, 800)))
+    source = FrameSource.from_array(np.zeros((12, 800, 1000)))
     loose, strict = (stage_facts(source, replace(QUICK, train=None, memory_limit=limit)) for limit in (1e9, 5e8))
     assert "tile" not in loose["centroid"] and strict["centroid"].pop("tile") >= 384
     assert strict == loose

@@ -21,9 +21,9 @@ whole images are worked on, which lie in files::
 
 and while a tile is worked on, what is decoded of the frame that it is cut from is in memory beside it.
 
-The constants of stages are those of ``python benchmarks/memory.py --stages``, and a tenth added: of tiles, as of whole
-frames, at 1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at 3840×2160; of
-what codes the images of a report at 1920×1080.
+The constants of stages are those of ``python benchmarks/memory.py --stages``, and a twentieth or more added: of tiles, as
+of whole frames, at 1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at
+3840×2160; of what codes the images of a report at 1920×1080.
 torch counts where a device is asked for, but not what a stage holds there, on the processor or not.  The deconvolution
 is told what is left, of whole frames as of tiles, and works in strips of files and fewer threads where that is little;
 the other stages need what they need.
@@ -105,7 +105,7 @@ class StageMemory:
 # While flow is measured: that of dis, which takes most.
 _FLOW = StageMemory(120, 5, 185, 10)
 # While frames are registered and weighed beside that.
-_FILTER = StageMemory(10, 5, 10, 5)
+_FILTER = StageMemory(0, 15, 10, 5)
 # Of the whole beside tiles: while frames are looked through and read, and the result is put into words and written;
 # while the flow model is found, the blur, and bounds on it.
 _WHOLE_RESULT, _WHOLE_MODEL = StageMemory(3, 15, 0, 0), StageMemory(27, 0, 0, 0)
@@ -223,12 +223,12 @@ class _Work:
         stack, modes = self.stack(train), self.modes(train)
         if in_file:
             # What threads have in hand comes into memory while it is used.
-            stack, modes = min(stack, self.stack(2 * threads + 3)), min(modes, 4.0 * _IN_HAND * threads)
+            stack, modes = min(stack, self.stack(2 * threads + 1)), min(modes, 4.0 * _IN_HAND * threads)
         flow = _FLOW.bytes(*size)
         # From the third iteration on that of the first block is kept even there.
         prepared = 0.0 if in_file and self.filter.inner_iterations < 3 else 1.0 * self.pixels * train
-        # A frame, what flow prepares of it, and its flow at half the resolution.
-        block = self.pixels * (4.0 * self.channels + 2.0) * min(self.filter.block, self.shape[0])
+        # A frame, what flow prepares of it, and its flow at half the resolution; the first block is that of the stack.
+        block = self.pixels * (4.0 * self.channels + 2.0) * min(self.filter.block, self.shape[0] - train)
         judged = 8.0 * self.pixels * train if self.filter.frame_noise == "blur" else 0.0
         deblurred = _BLUR.bytes(*size) + self.deblurring.peak(Room(1, True, True))
         later = {
@@ -358,7 +358,8 @@ def plan_memory(
         if work.peak_in_tiles(train, threads, side) <= limit:
             return _plan_in_tiles(work, limit, (train, most), side)
     smallest = list(_tilings(work))[-1:]
-    least = min([work.peak(fewest, 1, True), *(work.peak_in_tiles(train, *tiling) for tiling in smallest)])
+    whole = min(work.peak(count, 1, True) for count in (fewest, train))
+    least = min([whole, *(work.peak_in_tiles(train, *tiling) for tiling in smallest)])
     asked = f" and {train} training frames" if wanted is not None else ""
     raise ConfigurationError(
         f"--memory-limit: expected at least {size_text(1.01 * least)} for frames of "
