@@ -21,8 +21,8 @@ whole images are worked on, which lie in files::
 
 and while a tile is worked on, what is decoded of the frame that it is cut from is in memory beside it.
 
-The constants of stages are those of ``python benchmarks/memory.py --stages``, and a twentieth or more added: of tiles, as
-of whole frames, at 1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at
+The constants of stages are those of ``python benchmarks/memory.py --stages``, and at least a twentieth added: of tiles,
+as of whole frames, at 1280×720, grey and in colour, with one, two and four threads, and of the whole beside tiles at
 3840×2160; of what codes the images of a report at 1920×1080.
 torch counts where a device is asked for, but not what a stage holds there, on the processor or not.  The deconvolution
 is told what is left, of whole frames as of tiles, and works in strips of files and fewer threads where that is little;
