@@ -222,7 +222,7 @@ def measure_stages(clip: Clip, threads: int, method: str) -> None:
     from turbrestore.scratch import returning_freed
 
     # Fewer than there are, for the filter holds a block of those that follow.
-    train, pixels = 8, clip.height * clip.width
+    train, pixels = 16, clip.height * clip.width
     settings = RestoreParams(
         train=train,
         until="filter",
@@ -245,6 +245,7 @@ def measure_stages(clip: Clip, threads: int, method: str) -> None:
             with returning_freed():
                 watch = StageWatch()
                 limited = replace(settings, memory_limit=planned if in_file else None)
+                assert pipeline.memory_plan(source, limited).in_file == in_file
                 pipeline.restore(source, limited, on_result=watch.result, scratch=Path(folder))
             words = ", ".join(f"{name} {size / pixels:.0f}" for name, size in watch.taken.items())
             where = "in a file" if in_file else "in memory"

@@ -233,6 +233,14 @@ def test_a_block_counts_only_where_frames_follow_those_trained_on():
     assert peak(300) == peak(64)
 
 
+def test_the_least_limit_is_that_of_the_best_number_of_training_frames():
+    # Too small for tiles; fewer training frames would leave more for a block of the filter.
+    shape = (40, 384, 384, 3)
+    work = _Work(shape, FilterParams(), DynamicsParams(), DeconvolutionParams(), "filter", False, False)
+    assert work.peak(10, 1, True) > 1.05 * work.peak(40, 1, True)
+    assert least_limit(shape, until="filter") < 1.03 * work.peak(40, 1, True)
+
+
 def test_bounds_on_the_blur_count_for_whole_frames():
     # So many that they outweigh the filter.
     shape = (8000, 1080, 1920)
@@ -355,6 +363,9 @@ def test_a_plan_keeps_the_limit_or_names_one_that_can_be_kept(
         least = MemorySize(words)
         assert least > limit
         assert plan_memory(shape, least, **rest).train >= 2
+        # It is rounded, with a hundredth added.
+        with pytest.raises(ConfigurationError):
+            plan_memory(shape, 0.97 * least, **rest)
         return
     share = training_share(count, shape[1:], wanted)
     # In a file there is room for a few even of the largest.
@@ -484,9 +495,10 @@ def test_a_limit_changes_nothing_that_a_stage_depends_on(frames, in_file):
     assert stage_facts(source, loose) != stage_facts(source, strict)
 
 
+@pytest.mark.usefixtures("no_compiler")
 def test_a_stage_depends_on_the_size_of_the_tiles():
     source = FrameSource.from_array(np.zeros((12, 800, 1000)))
-    loose, strict = (stage_facts(source, replace(QUICK, train=None, memory_limit=limit)) for limit in (1e9, 5e8))
+    loose, strict = (stage_facts(source, replace(QUICK, train=None, memory_limit=limit)) for limit in (1e9, 4e8))
     assert "tile" not in loose["centroid"] and strict["centroid"].pop("tile") >= 384
     assert strict == loose
 

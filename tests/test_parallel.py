@@ -142,18 +142,23 @@ def test_sums_do_not_depend_on_the_number_of_threads(count):
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 def test_a_crew_hands_results_over_in_order(threads, count):
-    second = threading.Event()
+    last = threading.Event()
 
     def work(number):
-        if number == 0 and min(threads, count) > 1:
-            # It ends after the next one.
-            assert second.wait(10)
-        if number == 1:
-            second.set()
+        if number == count - 1:
+            last.set()
+        if number == 0 and threads > 1:
+            # It ends after those between.
+            assert last.wait(10)
         return 10 * number
 
     with Crew(threads) as crew:
         assert list(crew.map(work, range(count))) == [10 * number for number in range(count)]
+
+
+def test_a_crew_of_one_is_the_caller():
+    with Crew(1) as crew:
+        assert set(crew.map(lambda _: threading.current_thread(), range(3))) == {threading.current_thread()}
 
 
 def test_a_crew_is_so_many_threads_and_the_caller_one_of_them():

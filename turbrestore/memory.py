@@ -1,12 +1,13 @@
 """How a restoration keeps within a memory limit: what each stage takes, and what is done where that is too much.
 
-Peak memory of the process is taken to be, in bytes, with HW pixels of c channels, τ training frames, n states and t
-threads::
+Peak memory of the process is taken to be, in bytes, with HW pixels of c channels, T frames, τ of them for training, b
+in a block of the filter, n states and t threads::
 
-    base + stack + modes + HW · (shared + c · colour + t · (each + c · each_colour))
+    base + stack + modes + block + HW · (shared + c · colour + t · (each + c · each_colour))
 
-    stack = τ HW · (4 c + 8)    training frames and their flows
-    modes = 8 n HW              modes of the flow model, once it is identified
+    stack = τ HW · (4 c + 8)                training frames and their flows
+    modes = 8 n HW                          modes of the flow model, once it is identified
+    block = min(b, T − τ) HW · (4 c + 2)    frames that follow those, and what flow prepares of them, in the filter
 
 and for the deconvolution what :mod:`turbrestore.deconvolution_memory` says.
 
@@ -223,7 +224,7 @@ class _Work:
         stack, modes = self.stack(train), self.modes(train)
         if in_file:
             # What threads have in hand comes into memory while it is used.
-            stack, modes = min(stack, self.stack(2 * threads + 1)), min(modes, 4.0 * _IN_HAND * threads)
+            stack, modes = min(stack, self.stack(2 * threads + 2)), min(modes, 4.0 * _IN_HAND * threads)
         flow = _FLOW.bytes(*size)
         # From the third iteration on that of the first block is kept even there.
         prepared = 0.0 if in_file and self.filter.inner_iterations < 3 else 1.0 * self.pixels * train
@@ -347,7 +348,8 @@ def plan_memory(
         return MemoryPlan(train, flow.threads, file_bytes=int(work.deblurring.files(room)))
     most = flow.threads or available_cores()
     fewest = train if wanted is not None else min(train, _FEWEST_IN_NEED)
-    for count in range(train, fewest - 1, -1):
+    counts = range(train, fewest - 1, -1)
+    for count in counts:
         if work.peak(count, 1, True) <= limit:
             choices = ((threads, in_file) for threads in range(most, 0, -1) for in_file in (False, True))
             chosen = next(choice for choice in choices if work.peak(count, *choice) <= limit)
@@ -358,8 +360,8 @@ def plan_memory(
         if work.peak_in_tiles(train, threads, side) <= limit:
             return _plan_in_tiles(work, limit, (train, most), side)
     smallest = list(_tilings(work))[-1:]
-    whole = min(work.peak(count, 1, True) for count in (fewest, train))
-    least = min([whole, *(work.peak_in_tiles(train, *tiling) for tiling in smallest)])
+    wholes = [work.peak(count, 1, True) for count in counts]
+    least = min(wholes + [work.peak_in_tiles(train, *tiling) for tiling in smallest])
     asked = f" and {train} training frames" if wanted is not None else ""
     raise ConfigurationError(
         f"--memory-limit: expected at least {size_text(1.01 * least)} for frames of "
