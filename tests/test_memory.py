@@ -233,14 +233,6 @@ def test_a_block_counts_only_where_frames_follow_those_trained_on():
     assert peak(300) == peak(64)
 
 
-def test_the_least_limit_is_that_of_the_best_number_of_training_frames():
-    # Too small for tiles; fewer training frames would leave more for a block of the filter.
-    shape, few = (40, 384, 384, 3), DynamicsParams(rank=1)
-    work = _Work(shape, FilterParams(), few, DeconvolutionParams(), "filter", False, False)
-    assert work.peak(10, 1, True) > 1.05 * work.peak(40, 1, True)
-    assert least_limit(shape, until="filter", dynamics=few) < 1.03 * work.peak(40, 1, True)
-
-
 def test_bounds_on_the_blur_count_for_whole_frames():
     # So many that they outweigh the filter.
     shape = (8000, 1080, 1920)

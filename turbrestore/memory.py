@@ -348,8 +348,7 @@ def plan_memory(
         return MemoryPlan(train, flow.threads, file_bytes=int(work.deblurring.files(room)))
     most = flow.threads or available_cores()
     fewest = train if wanted is not None else min(train, _FEWEST_IN_NEED)
-    counts = range(train, fewest - 1, -1)
-    for count in counts:
+    for count in range(train, fewest - 1, -1):
         if work.peak(count, 1, True) <= limit:
             choices = ((threads, in_file) for threads in range(most, 0, -1) for in_file in (False, True))
             chosen = next(choice for choice in choices if work.peak(count, *choice) <= limit)
@@ -360,8 +359,7 @@ def plan_memory(
         if work.peak_in_tiles(train, threads, side) <= limit:
             return _plan_in_tiles(work, limit, (train, most), side)
     smallest = list(_tilings(work))[-1:]
-    wholes = [work.peak(count, 1, True) for count in counts]
-    least = min(wholes + [work.peak_in_tiles(train, *tiling) for tiling in smallest])
+    least = min([work.peak(fewest, 1, True), *(work.peak_in_tiles(train, *tiling) for tiling in smallest)])
     asked = f" and {train} training frames" if wanted is not None else ""
     raise ConfigurationError(
         f"--memory-limit: expected at least {size_text(1.01 * least)} for frames of "
