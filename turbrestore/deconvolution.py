@@ -77,6 +77,8 @@ CHANNELS = ("luminance", "each")
 MARGIN_SIGMAS = 4.0
 # Steps to the Wiener solution that is started from: from the first on only what lies near the border changes.
 _START_STEPS = 40
+# Smaller images go there one after the other: their transforms are shorter than a wait for the interpreter lock.
+_SIDE_BY_SIDE = 1 << 15
 # A multiple of the iterations that solvers have judged together.
 _RECORD_EVERY = 10
 
@@ -494,7 +496,8 @@ def _sharpened(
     blurred, grid = list(problems), problems[0].grid
     if params.method == "nltv" and params.sharpen_guide and guide is not None:
         blurred.append(dataclasses.replace(problems[0], observed=guide))
-    if grid.one_strip or (grid.folder is None and len(blurred) >= workshop.room.threads):
+    pays = grid.shape[0] * grid.shape[1] >= _SIDE_BY_SIDE
+    if pays and (grid.one_strip or (grid.folder is None and len(blurred) >= workshop.room.threads)):
         # Side by side, each with what it works with.
         apart = [dataclasses.replace(problem, grid=StripGrid(grid.shape)) for problem in blurred]
         sharp = list(workshop.crew.map(_wiener_image, apart))
