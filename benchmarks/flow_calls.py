@@ -67,12 +67,12 @@ def main() -> int:
     except TurbrestoreError as error:
         print(f"flow_calls: {error}", file=sys.stderr)
         return error.exit_code
-    text = document(measured)
+    text, at_knee = document(measured)
     print(text, end="")
     if options.write is not None:
         atomic_write(options.write, text.encode(), overwrite=True)
         draw(measured, options.write.parent / "images" / "flow_calls.png")
-    return 0
+    return int(not at_knee)
 
 
 def settings() -> dict[str, RestoreParams]:
@@ -104,8 +104,8 @@ def measure(frames: FloatArray, truth: FloatArray) -> Curves:
     return curves
 
 
-def document(measured: dict[str, Curves]) -> str:
-    """Markdown of the tables."""
+def document(measured: dict[str, Curves]) -> tuple[str, bool]:
+    """Markdown of the tables, and whether the default is at the knee."""
     lines = [
         "# What flow calls buy\n",
         "Optical flow takes most of the time of a restoration. This page says what its repetitions are worth, as "
@@ -113,8 +113,9 @@ def document(measured: dict[str, Curves]) -> str:
         f"{len(measured)} simulated clips: the first {FRAMES} frames, the middle {SIDE}×{SIDE} pixels, two threads.\n",
         "![PSNR against seconds of flow calls](images/flow_calls.png)\n",
         "## Mean over the clips\n",
-        "PSNR, dB, of the fused image (after the filter) and of the restored one; seconds of the flow calls; and what "
-        "one more repetition adds. The number of passes of the centroid is the largest allowed, without tolerance: it "
+        "PSNR, dB, of the fused image (after the filter) and of the restored one; seconds of the flow calls, each as "
+        "one by itself from a frame takes (those from an earlier flow, which most repetitions are, take two thirds, so that "
+        "what they buy in a second is more); and what one more repetition adds. The number of passes of the centroid is the largest allowed, without tolerance: it "
         "stops by itself where its mean flow no longer shrinks. The default stops as soon as that is below the "
         "tolerance, after two passes at least. What has not converged recentres its flows once more at the end, so two "
         "passes without tolerance are not the two of the default.\n",
@@ -139,7 +140,8 @@ def document(measured: dict[str, Curves]) -> str:
         base = curves["default"].restored
         changes = [f"{curves[other].restored - base:+.2f}" for other in list(settings())[1:]]
         lines.append(f"| {name} | {base:.2f} | {' | '.join(changes)} |")
-    return "\n".join([*lines, *_verdict(measured, mean)]) + "\n"
+    verdict, at_knee = _verdict(measured, mean)
+    return "\n".join([*lines, *verdict]) + "\n", at_knee
 
 
 def draw(measured: dict[str, Curves], path: Path) -> None:
@@ -165,8 +167,11 @@ def draw(measured: dict[str, Curves], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _verdict(measured: dict[str, Curves], mean: Curves) -> list[str]:
-    """Say what a second buys on either side of the default, and which settings cost no clip more than is tolerated."""
+def _verdict(measured: dict[str, Curves], mean: Curves) -> tuple[list[str], bool]:
+    """Say what a second buys on either side of the default, and which settings cost no clip more than is tolerated.
+
+    The default is at the knee where a second buys more up to it than beyond it, and cheaper settings cost too much.
+    """
     lines = [
         "\n## The knee\n",
         "What a second of flow calls buys from a cheaper setting to the default, and from the default to a dearer one. "
@@ -187,10 +192,11 @@ def _verdict(measured: dict[str, Curves], mean: Curves) -> list[str]:
     cheaper = min(rate for name, rate in rates.items() if mean[name].calls < default.calls)
     dearer = max(rate for name, rate in rates.items() if mean[name].calls > default.calls)
     text = f"A second more buys {cheaper:+.2f} dB or more up to the default, and {dearer:+.2f} or less beyond it"
-    text += ": the default is at the knee." if cheaper > max(dearer, 0) else ": the default is not at the knee."
+    at_knee = cheaper > max(dearer, 0) and not harmless
+    text += f": the default is {'' if at_knee else 'not '}at the knee."
     few = f"With fewer flow calls, no clip loses more than {TOLERATED} dB by {', '.join(harmless)}."
     none = f"Every setting with fewer flow calls costs some clip more than {TOLERATED} dB."
-    return [*lines, f"\n{text} {few if harmless else none}"]
+    return [*lines, f"\n{text} {few if harmless else none}"], at_knee
 
 
 def _row(name: str, point: Point, before: Point | None) -> str:

@@ -2,6 +2,7 @@
 
 ``python benchmarks/memory.py`` prints a table of frames × size × limit and exits with 1 when a bound is broken:
 300 grey frames of 1920×1080 within 2 GB, every other limit kept, and 2,000 frames no more than 20 MB above 200.
+``--write`` makes a document of it.
 ``--quick`` takes 40 frames of that size, with the same training frames, and no larger ones: a quarter of the time.
 ``--largest`` adds frames of 7680×4320.
 ``--stages`` prints the peak of every stage, in bytes a pixel, with training frames in memory and in a file, and of what
@@ -29,8 +30,16 @@ import numpy as np
 
 GROWTH_BOUND_MB = 20.0
 SEED = 0
-EVERYTHING = ["--report={folder}/report.html", "--keep={folder}/stages", "--bit-depth=32"]
-COMPARED = ["--truth={folder}/scene.png", "--json"]
+EVERYTHING = ("--report={folder}/report.html", "--keep={folder}/stages", "--bit-depth=32")
+COMPARED = ("--truth={folder}/scene.png", "--json")
+INTRO = """What `{command}` measures: the largest resident set of `turbrestore restore`, mapped files included, on
+{cores} cores.  Clips are a random scene under smooth random motion.  It ends with 1 where a limit is not kept.
+"""
+HEAD = """| frames | read from | options | limit, MB | peak, MB | s |
+|---|---|---|---:|---:|---:|"""
+# What a clip is read from.
+ARRAY, VIDEO, IMAGES = "clip.npy", "clip.mkv", "images"
+FORMS = {ARRAY: "8-bit array", VIDEO: "H.264 video", IMAGES: "16-bit images"}
 # A process takes over the peak of the one that starts it, so this one stays small and leaves clips to others to write.
 STATM = Path("/proc/self/statm")
 
@@ -66,10 +75,10 @@ class Clip:
             frames.flush()
 
     def encode(self, folder: Path) -> tuple[Path, Path]:
-        """Write the frames of ``clip.npy`` as H.264 and as a folder of images of 16 bits."""
+        """Write the frames of an array as H.264 and as a folder of images of 16 bits."""
         import av
 
-        frames, video, images = np.load(folder / "clip.npy", mmap_mode="r"), folder / "clip.mkv", folder / "images"
+        frames, video, images = np.load(folder / ARRAY, mmap_mode="r"), folder / VIDEO, folder / IMAGES
         images.mkdir()
         with av.open(str(video), "w") as output:
             stream = output.add_stream("libx264", rate=25)
@@ -112,54 +121,72 @@ def restore_peak(clip: Path, options: list[str]) -> tuple[float, float]:
     return usage.ru_maxrss * 1024 / 1e6, time.perf_counter() - begun
 
 
-def limited_rows(quick: bool, largest: bool) -> Iterator[tuple[Clip, float, list[str]]]:
-    """Clips, limits in MB, and further options."""
-    train = ["--train=60"] if not quick else ["--train=40"]
-    yield Clip(40 if quick else 300, 1080, 1920), 2000, train
-    yield Clip(24, 540, 960), 700, []
-    yield Clip(24, 540, 960, 3), 900, []
+@dataclass(frozen=True)
+class Case:
+    """A clip, what it is read from, the limit in MB, and further options."""
+
+    clip: Clip
+    limit: float | None
+    options: tuple[str, ...] = ()
+    form: str = ARRAY
+
+    def measure(self, extra: list[str]) -> tuple[float, str]:
+        """Peak, MB, and a row of the table."""
+        with tempfile.TemporaryDirectory() as name:
+            write_apart(self.clip, Path(name, ARRAY))
+            if self.form != ARRAY:
+                run_apart(f"{self.clip!r}.encode(Path({name!r}))")
+            limits = [] if self.limit is None else [f"--memory-limit={self.limit}MB"]
+            peak, seconds = restore_peak(Path(name, self.form), [*limits, *self.options, *extra])
+        options = " ".join(option.replace("{folder}/", "") for option in self.options)
+        limit = "none" if self.limit is None else f"{self.limit:,.0f}"
+        cells = str(self.clip), FORMS[self.form], f"`{options}`" if options else "", limit, f"{peak:,.0f}"
+        return peak, f"| {' | '.join(cells)} | {seconds:.0f} |"
+
+
+def limited_cases(quick: bool, largest: bool) -> Iterator[Case]:
+    """Restorations that have to keep a limit."""
+    yield Case(Clip(40 if quick else 300, 1080, 1920), 2000, ("--train=40" if quick else "--train=60",))
+    yield Case(Clip(24, 540, 960), 700)
+    yield Case(Clip(24, 540, 960, 3), 900)
     # Here and from 3840×2160 on whole frames do not fit.
-    yield Clip(24, 1080, 1920, 3), 1000, []
-    yield Clip(8, 1080, 1920), 900, ["--sigma=30", "--deconvolution.iterations=30"]
+    yield Case(Clip(24, 1080, 1920, 3), 1000)
+    yield Case(Clip(24, 1080, 1920, 3), 1000, form=VIDEO)
+    yield Case(Clip(24, 540, 960, 3), 900, form=IMAGES)
+    yield Case(Clip(8, 1080, 1920), 900, ("--sigma=30", "--deconvolution.iterations=30"))
     # With all that a run can write, near the least limits.
-    yield Clip(8, 1080, 1920, 3), 560, [*EVERYTHING, *COMPARED]
+    yield Case(Clip(8, 1080, 1920, 3), 560, (*EVERYTHING, *COMPARED))
     if not quick:
-        yield Clip(24, 1080, 1920, 3), 3000, []
-        yield Clip(16, 2160, 3840), 2000, []
-        yield Clip(16, 2160, 3840, 3), 2000, []
-        yield Clip(3, 2160, 3840, 3), 720, EVERYTHING
-        yield Clip(3, 2160, 3840, 3), 1320, [*EVERYTHING, *COMPARED]
+        yield Case(Clip(24, 1080, 1920, 3), 3000)
+        yield Case(Clip(24, 1080, 1920, 3), 3000, form=VIDEO)
+        yield Case(Clip(16, 2160, 3840), 2000)
+        yield Case(Clip(16, 2160, 3840, 3), 2000)
+        yield Case(Clip(3, 2160, 3840, 3), 720, EVERYTHING)
+        yield Case(Clip(3, 2160, 3840, 3), 1320, (*EVERYTHING, *COMPARED))
     if largest:
-        yield Clip(12, 4320, 7680), 2000, []
-        yield Clip(12, 4320, 7680, 3), 2000, []
-        yield Clip(12, 4320, 7680), 1600, ["--blur-bounds"]
+        yield Case(Clip(12, 4320, 7680), 2000)
+        yield Case(Clip(12, 4320, 7680, 3), 2000)
+        yield Case(Clip(12, 4320, 7680), 1600, ("--blur-bounds",))
 
 
-def check_limits(folder: Path, quick: bool, largest: bool, extra: list[str]) -> bool:
-    """Print what limited runs take; whether all keep their limit."""
-    kept = True
-    for clip, limit, options in limited_rows(quick, largest):
-        path = folder / "clip.npy"
-        write_apart(clip, path)
-        peak, seconds = restore_peak(path, [f"--memory-limit={limit}MB", *options, *extra])
-        kept &= peak <= limit
-        print(f"{clip!s:28} limit {limit:6.0f} MB  peak {peak:6.0f} MB  {seconds:6.0f} s", flush=True)
-    return kept
+def check_limits(quick: bool, largest: bool, extra: list[str]) -> Iterator[tuple[str, bool]]:
+    """Rows of limited runs, and whether each keeps its limit."""
+    for case in limited_cases(quick, largest):
+        peak, row = case.measure(extra)
+        yield row, case.limit is None or peak <= case.limit
 
 
-def check_growth(folder: Path, extra: list[str]) -> bool:
-    """Print what more frames take; whether it is within the bound."""
+def check_growth(extra: list[str]) -> Iterator[tuple[str, bool]]:
+    """Rows of few and of many frames, and what more frames take; whether it is within the bound."""
     peaks = []
     for count in (200, 2000):
-        path = folder / "clip.npy"
-        clip = Clip(count, 128, 128)
-        write_apart(clip, path)
-        peak, seconds = restore_peak(path, ["--train=60", "--sigma=1", "--deconvolution.method=wiener", *extra])
+        options = "--train=60", "--sigma=1", "--deconvolution.method=wiener"
+        peak, row = Case(Clip(count, 128, 128), None, options).measure(extra)
         peaks.append(peak)
-        print(f"{clip!s:28} no limit        peak {peak:6.0f} MB  {seconds:6.0f} s", flush=True)
+        yield row, True
     growth = peaks[1] - peaks[0]
-    print(f"2,000 frames take {growth:.1f} MB more than 200; bound {GROWTH_BOUND_MB:g} MB")
-    return growth <= GROWTH_BOUND_MB
+    text = f"\n2,000 frames of 128×128 take {growth:.1f} MB more than 200; bound {GROWTH_BOUND_MB:g} MB."
+    yield text, growth <= GROWTH_BOUND_MB
 
 
 class Watch:
@@ -417,6 +444,22 @@ def print_stages() -> None:
             run_apart(f"measure_deconvolution(Clip(1, 2160, 3840, {channels}), {method!r})")
 
 
+def document(arguments: argparse.Namespace) -> tuple[str, bool]:
+    """Print the table as it is made; its document, and whether all bounds hold."""
+    quick, largest, options = arguments.quick, arguments.largest, arguments.options
+    command = f"python benchmarks/memory.py{' --quick' if quick else ''}{' --largest' if largest else ''}"
+    lines, held = [], True
+    checks = {"limits": lambda: check_limits(quick, largest, options), "growth": lambda: check_growth(options)}
+    print(HEAD, flush=True)
+    for name, check in checks.items():
+        for line, good in check() if arguments.only in (None, name) else ():
+            print(line if good else f"{line} broken", flush=True)
+            lines.append(line)
+            held &= good
+    intro = INTRO.format(command=f"{command} --write docs/memory.md", cores=len(os.sched_getaffinity(0)))
+    return "\n".join(["# Memory\n", intro, HEAD, *lines]) + "\n", held
+
+
 def main() -> int:
     """Print the tables; 1 where a bound is broken."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -424,16 +467,16 @@ def main() -> int:
     parser.add_argument("--largest", action="store_true", help="frames of 7680×4320 as well")
     parser.add_argument("--stages", action="store_true", help="bytes a pixel of every stage, and nothing else")
     parser.add_argument("--only", choices=("limits", "growth"), help="one of the two tables")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
     parser.add_argument("options", nargs="*", help="further options of turbrestore restore, after --")
     arguments = parser.parse_args()
     if arguments.stages:
         print_stages()
         return 0
-    with tempfile.TemporaryDirectory() as name:
-        folder, options = Path(name), arguments.options
-        kept = arguments.only == "growth" or check_limits(folder, arguments.quick, arguments.largest, options)
-        steady = arguments.only == "limits" or check_growth(folder, options)
-    return 0 if kept and steady else 1
+    text, held = document(arguments)
+    if arguments.write is not None:
+        arguments.write.write_text(text, encoding="utf-8")
+    return int(not held)
 
 
 if __name__ == "__main__":

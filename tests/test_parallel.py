@@ -217,7 +217,8 @@ def test_a_crew_may_be_called_within_itself():
         assert list(crew.map(lambda n: sum(crew.map(abs, range(n))), range(6))) == [0, 0, 1, 3, 6, 10]
 
 
-def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypatch):
+@pytest.mark.parametrize("method", ["dis", "tvl1"])
+def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypatch, method):
     # Several strips and several sums of everything.
     monkeypatch.setattr("turbrestore.warp._STRIP", 1000)
     monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 700)
@@ -229,7 +230,7 @@ def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypa
     def run(threads):
         for module in ("parallel", "deconvolution", "nonlocal_tv", "memory"):
             monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: threads)
-        return restore(frames, RestoreParams(train=12, flow=FlowParams(threads=threads)))
+        return restore(frames, RestoreParams(train=12, flow=FlowParams(method, threads=threads)))
 
     one, *others = map(run, (1, 2, 4))
     for other in others:
