@@ -399,6 +399,15 @@ def test_interruption_ends_with_130(run, clip, tmp_path, monkeypatch):
 
     monkeypatch.setattr("turbrestore.pipeline.find_centroid", interrupt)
     fails(run("restore", clip, tmp_path / "o.png"), 130, "interrupted")
+
+
+def test_a_lack_of_memory_is_one_line(run, clip, tmp_path, monkeypatch):
+    def fill(*_):
+        raise MemoryError("Unable to allocate 9 GiB")
+
+    monkeypatch.setattr("turbrestore.pipeline.find_centroid", fill)
+    fails(run("restore", clip, tmp_path / "o.png"), 1, "out of memory", "--roi")
+    assert not (tmp_path / "o.png").exists()
     assert list(tmp_path.iterdir()) == []
 
 
