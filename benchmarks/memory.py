@@ -35,8 +35,8 @@ COMPARED = ("--truth={folder}/scene.png", "--json")
 INTRO = """What `{command}` measures: the largest resident set of `turbrestore restore`, mapped files included, on
 {cores} cores.  Clips are a random scene under smooth random motion.  It ends with 1 where a limit is not kept.
 """
-HEAD = """| frames | read from | options | limit, MB | peak, MB | s |
-|---|---|---|---:|---:|---:|"""
+HEAD = """| frames | read from | options | limit, MB | peak, MB |
+|---|---|---|---:|---:|"""
 # What a clip is read from.
 ARRAY, VIDEO, IMAGES = "clip.npy", "clip.mkv", "images"
 FORMS = {ARRAY: "8-bit array", VIDEO: "H.264 video", IMAGES: "16-bit images"}
@@ -106,19 +106,18 @@ def run_apart(call: str) -> None:
     subprocess.run([sys.executable, "-c", f"from memory import *; {call}"], check=True, cwd=Path(__file__).parent)
 
 
-def restore_peak(clip: Path, options: list[str]) -> tuple[float, float]:
-    """Largest resident set, MB, and seconds of ``turbrestore restore``."""
+def restore_peak(clip: Path, options: list[str]) -> float:
+    """Largest resident set of ``turbrestore restore``, MB."""
     output = clip.with_suffix(".tif")
     options = [option.format(folder=clip.parent) for option in options]
     words = ["restore", str(clip), str(output), "--quiet", "--overwrite", *options]
     code = f"import sys; from turbrestore_cli.__main__ import main; sys.exit(main({words!r}))"
-    begun = time.perf_counter()
     child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:
         raise RuntimeError(f"turbrestore {' '.join(words)} ended with {child.returncode}")
-    return usage.ru_maxrss * 1024 / 1e6, time.perf_counter() - begun
+    return usage.ru_maxrss * 1024 / 1e6
 
 
 @dataclass(frozen=True)
@@ -137,11 +136,11 @@ class Case:
             if self.form != ARRAY:
                 run_apart(f"{self.clip!r}.encode(Path({name!r}))")
             limits = [] if self.limit is None else [f"--memory-limit={self.limit}MB"]
-            peak, seconds = restore_peak(Path(name, self.form), [*limits, *self.options, *extra])
+            peak = restore_peak(Path(name, self.form), [*limits, *self.options, *extra])
         options = " ".join(option.replace("{folder}/", "") for option in self.options)
         limit = "none" if self.limit is None else f"{self.limit:,.0f}"
         cells = str(self.clip), FORMS[self.form], f"`{options}`" if options else "", limit, f"{peak:,.0f}"
-        return peak, f"| {' | '.join(cells)} | {seconds:.0f} |"
+        return peak, f"| {' | '.join(cells)} |"
 
 
 def limited_cases(quick: bool, largest: bool) -> Iterator[Case]:
