@@ -60,8 +60,8 @@ class ConjugateGradients:
 
     symbol: FloatArray
 
-    # Iterations that are judged together.
-    window: ClassVar[int] = 1
+    # Iterations that are judged together: single steps may be short by chance.
+    window: ClassVar[int] = 2
 
     def start(self, problem: Problem) -> GradientState:
         """Start from the solution for the continued image."""

@@ -4,6 +4,11 @@ A photograph is deblurred after some fifty iterations, the finest bars of a char
 change of the whole tells them apart badly: what changes slowly may have far to go, and a few letters on a large page
 change little of it.  So changes are looked at where they are largest, and what follows them is foreseen.
 
+Not so, by primal-dual splitting, in the outermost pixels, as many as the blur is wide.  Up to half of the light in
+them is that of pixels beyond the border, which nobody saw, and both swing about for hundreds of iterations, by less
+than can be seen.  The larger the image, the more tiles there are for one to swing most.  Conjugate gradients do not
+swing, and end there.
+
 Symbols
 -------
 d : change of the image in a window of iterations, relative.

@@ -32,6 +32,8 @@ class Problem:
         λ.
     grid : StripGrid
         Of these.
+    judged : tuple of two ndarrays, float32, shapes (P,) and (Q,), optional
+        1 for the rows and columns that changes are judged in; by default all are.
     """
 
     observed: FloatArray
@@ -39,6 +41,14 @@ class Problem:
     transfer: Spectrum
     fidelity: float
     grid: StripGrid
+    judged: tuple[FloatArray, FloatArray] | None = None
+
+    def weight(self, rows: slice) -> FloatArray:
+        """Weigh squares of changes in some rows: M, but 0 where changes are not judged."""
+        if self.judged is None:
+            return self.seen[rows]
+        down, across = self.judged
+        return self.seen[rows] * np.outer(down[rows], across)
 
     def blurred(self, u: FloatArray) -> FloatArray:
         """Bu, a new image."""

@@ -103,7 +103,7 @@ class DeconvolutionParams:
     tolerance : float
         Stop when no tile of 64×64 pixels is foreseen to change by this any more, relative to the brightest tile; see
         ``turbrestore.convergence``.  Of nltv and tv, whose images swing about the one that they approach, ten
-        iterations are judged together.
+        iterations are judged together, else two.
     boundary : {"unknown", "periodic"}
         What lies beyond the border: pixels to be found, or the image itself.
     channels : {"luminance", "each"}
@@ -297,7 +297,9 @@ def deconvolve(
     folder = scratch or Path(tempfile.gettempdir())
     with one_thread_each(), Crew(room.threads) as crew:
         grid = StripGrid(shape, crew, folder if room.images_in_file else None)
-        problems = _pose(planes, widths, inside, grid, otf, fidelity)
+        swings = params.boundary == "unknown" and params.method in ("nltv", "tv")
+        rim = min(int(np.ceil(sigma)), (min(size) - 1) // 2) if swings else 0
+        problems = _pose(planes, widths, inside, rim, grid, otf, fidelity)
         around = padded_guide(guide, size, widths)
         around = None if around is None else kept_in(around, grid.folder)
         for array in (pixels, guide):
@@ -366,6 +368,7 @@ def _pose(
     planes: list[FloatArray],
     widths: list[tuple[int, int]],
     inside: tuple[slice, ...],
+    rim: int,
     grid: StripGrid,
     otf: Spectrum,
     fidelity: float,
@@ -374,9 +377,12 @@ def _pose(
     transfer, seen, problems = grid.in_blocks(otf), grid.image(), list[Problem]()
     seen[:], seen[inside] = 0, 1
     release(seen)
+    judged = tuple(np.zeros(length, np.float32) for length in grid.shape)
+    for axis, part in zip(judged, inside, strict=True):
+        axis[part.start + rim : part.stop - rim] = 1
     while planes:
         observed = kept_in(np.pad(planes.pop(0), widths, mode="symmetric"), grid.folder)
-        problems.append(Problem(observed, seen, transfer, fidelity, grid))
+        problems.append(Problem(observed, seen, transfer, fidelity, grid, (judged[0], judged[1])))
     return problems
 
 
@@ -457,11 +463,11 @@ def _iterate(
     for iteration in range(1, params.iterations + 1):
         if (iteration - 1) % solver.window == 0:
             # Those of a window are changed in place.
-            before, begun = images if solver.window == 1 else [grid.copied(u) for u in images], iteration - 1
+            before, begun = [grid.copied(u) for u in images], iteration - 1
         states = [solver.step(problem, state) for problem, state in zip(problems, states, strict=True)]
-        images = [state.image for state in states]
         last = iteration == params.iterations
         if last or iteration % solver.window == 0:
+            images = [state.image for state in states]
             moved.append(_change(before, images, problems[0]) * solver.window / (iteration - begun))
             last |= (converged := still_to_come(moved) <= params.tolerance)
         if last or iteration % _RECORD_EVERY == 0:
@@ -543,15 +549,16 @@ def _read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | N
 
 def _change(before: list[FloatArray], after: list[FloatArray], problem: Problem) -> float:
     """Of what is shown: the margin, which is cut off, drifts for long, and so may what is clipped."""
-    seen, grid = problem.seen, problem.grid
+    grid = problem.grid
     sums = np.zeros((2, *(-(-length // TILE) for length in grid.shape)))
 
     def squares(rows: slice, old: FloatArray, new: FloatArray) -> tuple[int, NDArray[np.float64]]:
         then, now = (np.clip(image[rows], 0, 1) for image in (old, new))
-        both = (tile_sums(seen[rows] * np.square(part), rows.start) for part in (now - then, now))
+        weight = problem.weight(rows)
+        both = (tile_sums(weight * np.square(part), rows.start) for part in (now - then, now))
         return rows.start // TILE, np.array(list(both))
 
     for old, new in zip(before, after, strict=True):
-        for first, found in grid.over_rows(partial(squares, old=old, new=new), old, new, seen):
+        for first, found in grid.over_rows(partial(squares, old=old, new=new), old, new, problem.seen):
             sums[:, first : first + found.shape[1]] += found
     return relative_change(*sums)

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 # Raised where the same frames and settings begin to give another image.
-_RESULTS = 6
+_RESULTS = 7
 STAGES_RECORD, CHECKPOINT, MEAN = "stages.json", "checkpoint.npz", "mean.npy"
 FILES = {
     "centroid": ("centroid.npz",),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 
 from .arrays import FloatArray
-from .conjugate_gradients import ROUNDING
+from .conjugate_gradients import ROUNDING, ConjugateGradients
 from .convergence import TILE, relative_change, still_to_come
 from .convolution_problem import Problem
 from .device import memory_of
@@ -80,6 +80,7 @@ class _Problem:
     seen: Tensor
     otf: Tensor
     fidelity: float
+    judged: Tensor
 
     def gradient_spectrum(self, spectrum: Tensor) -> Tensor:
         return self.fidelity * self.otf.conj() * _forward(self.residual(spectrum))
@@ -200,10 +201,10 @@ def _iterate(
         if (iteration - 1) % solver.window == 0:
             before, begun = images, iteration - 1
         states = [solver.step(problem, state) for problem, state in zip(problems, states, strict=True)]
-        images = [state.image for state in states]
         last = iteration == settings.iterations
         if last or iteration % solver.window == 0:
-            moved.append(_change(before, images, problems[0].seen) * solver.window / (iteration - begun))
+            images = [state.image for state in states]
+            moved.append(_change(before, images, problems[0].judged) * solver.window / (iteration - begun))
             last |= (converged := still_to_come(moved) <= settings.tolerance)
         if last or iteration % settings.record_every == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
@@ -258,7 +259,7 @@ class _Quadratic:
     """See :class:`turbrestore.conjugate_gradients.ConjugateGradients`."""
 
     symbol: Tensor
-    window: ClassVar[int] = 1
+    window: ClassVar[int] = ConjugateGradients.window
 
     def start(self, problem: _Problem) -> _GradientState:
         m = problem.mean()
@@ -346,8 +347,9 @@ def _laplacian(problem: Problem) -> FloatArray:
 
 def _load(problem: Problem, device: str) -> _Problem:
     whole = np.concatenate(problem.transfer, axis=1)[:, : problem.seen.shape[1] // 2 + 1]
-    observed, seen, otf = (_tensor(array, device) for array in (problem.observed, problem.seen, whole))
-    return _Problem(observed, seen, otf, problem.fidelity)
+    arrays = problem.observed, problem.seen, whole, problem.weight(slice(None))
+    observed, seen, otf, judged = (_tensor(array, device) for array in arrays)
+    return _Problem(observed, seen, otf, problem.fidelity, judged)
 
 
 def _tensor(array: np.ndarray, device: str) -> Tensor:
@@ -378,13 +380,13 @@ def _total(values: Tensor) -> float:
     return float(values.sum(dtype=torch.float64))
 
 
-def _change(before: list[Tensor], after: list[Tensor], seen: Tensor) -> float:
+def _change(before: list[Tensor], after: list[Tensor], judged: Tensor) -> float:
     import torch
 
     sums = []
     for old, new in zip(before, after, strict=True):
         then, now = old.clamp(0, 1), new.clamp(0, 1)
-        sums.append(torch.stack([_tile_sums(seen * part.square()) for part in (now - then, now)]))
+        sums.append(torch.stack([_tile_sums(judged * part.square()) for part in (now - then, now)]))
     moved, size = torch.stack(sums).sum(0).cpu().numpy()
     return relative_change(moved, size)
 
