@@ -105,14 +105,15 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
         f"cores, {_machine()}, {_compiled()}.  It ends with 1 where a bound is broken.\n",
         "## Against the flow calls\n",
         "Seconds of a whole restoration with the default settings, and of the optical flow alone that it asks for, "
-        f"each call by itself from a frame. The bound of both ratios is {TIME_BOUND}. Clips whose flow takes little "
-        "time break it, by what is done once, above all the deconvolution. As made, most calls start from an earlier "
-        "flow of the frame, which has been prepared already, and are cheaper: no bound holds for the ratio to these. "
+        f"each call by itself from a frame. The bound of both ratios is {TIME_BOUND}. It is broken where what is done "
+        "once, above all the deconvolution, takes long beside the flow: by small clips, and by few frames of a large "
+        "photograph. As made, most calls start from an earlier flow of the frame, which has been prepared already, and "
+        "are cheaper: no bound holds for the ratio to these. "
         "Frames are in memory, so nothing is decoded.\n",
         *_time_table((*ROWS, *FULL_ROWS) if full else ROWS, tree, broken),
         *_plain_lines(),
         "\n## Growth\n",
-        "Exponent of the time of a restoration, fitted to four clips each, with two passes of the centroid and "
+        "Exponent of the time of a restoration, fitted to some clips each, with two passes of the centroid and "
         f"{TRAINED} frames to train.\n",
         *_growth_table(tree, broken),
         "\n## Parts\n",

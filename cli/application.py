@@ -119,7 +119,10 @@ def _explain(error: BaseException) -> tuple[str, int]:
     if isinstance(error, OSError):
         return f"{error.filename or _full_output() or 'system'}: {error.strerror or error}", StorageError.exit_code
     if isinstance(error, MemoryError):
-        return "out of memory; a part of the input by --roi or --frames takes less, and restore has --memory-limit", BUG
+        return (
+            "out of memory; a part of the input takes less (--roi, --frames), and restore has --memory-limit",
+            BUG,
+        )
     return str(error) or "interrupted", getattr(error, "exit_code", INTERRUPTED)
 
 

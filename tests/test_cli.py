@@ -399,6 +399,7 @@ def test_interruption_ends_with_130(run, clip, tmp_path, monkeypatch):
 
     monkeypatch.setattr("turbrestore.pipeline.find_centroid", interrupt)
     fails(run("restore", clip, tmp_path / "o.png"), 130, "interrupted")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_lack_of_memory_is_one_line(run, clip, tmp_path, monkeypatch):
@@ -407,7 +408,6 @@ def test_a_lack_of_memory_is_one_line(run, clip, tmp_path, monkeypatch):
 
     monkeypatch.setattr("turbrestore.pipeline.find_centroid", fill)
     fails(run("restore", clip, tmp_path / "o.png"), 1, "out of memory", "--roi")
-    assert not (tmp_path / "o.png").exists()
     assert list(tmp_path.iterdir()) == []
 
 

@@ -16,6 +16,7 @@ from turbrestore import device as device_module
 from turbrestore import restoration as restoration_module
 from turbrestore.alternating import FilterParams, filter_frames
 from turbrestore.centroid import CentroidParams
+from turbrestore.conjugate_gradients import ConjugateGradients
 from turbrestore.decision import Decision
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.device import TORCH_BYTES, check_device, explain_device, find_device, memory_of, needs_torch
@@ -383,8 +384,9 @@ class TestDeconvolution:
         there = deconvolve(image, 1.5, replace(params, device=device), progress=steps.append)
         assert abs(psnr(here.image, scene) - psnr(there.image, scene)) < 0.002
         assert np.abs(here.image - there.image).max() < 5e-3
-        # Of nltv and tv ten are judged together.
-        assert abs(here.iterations - there.iterations) <= (WINDOW if params.method in ("nltv", "tv") else 1)
+        # So many are judged together.
+        window = WINDOW if params.method in ("nltv", "tv") else ConjugateGradients.window
+        assert abs(here.iterations - there.iterations) <= window
         assert sum(steps) == there.iterations
         assert there.converged == here.converged
         assert there.objective[-1] == pytest.approx(here.objective[-1], rel=1e-4)

@@ -225,6 +225,7 @@ def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypa
     monkeypatch.setattr("turbrestore.flow_subspace._STRIP_BYTES", 1 << 16)
     monkeypatch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
     monkeypatch.setattr("turbrestore.strip_grid._STRIP", 700)
+    monkeypatch.setattr("turbrestore.deconvolution._SIDE_BY_SIDE", 0)
     frames = make_sequence(seed=3, count=28).frames[:, :64, :80]
 
     def run(threads):

@@ -4,10 +4,10 @@ A photograph is deblurred after some fifty iterations, the finest bars of a char
 change of the whole tells them apart badly: what changes slowly may have far to go, and a few letters on a large page
 change little of it.  So changes are looked at where they are largest, and what follows them is foreseen.
 
-Not so, by primal-dual splitting, in the outermost pixels, as many as the blur is wide.  Up to half of the light in
-them is that of pixels beyond the border, which nobody saw, and both swing about for hundreds of iterations, by less
-than can be seen.  The larger the image, the more tiles there are for one to swing most.  Conjugate gradients do not
-swing, and end there.
+Where the image goes on beyond its border, primal-dual splitting is not judged in the outermost pixels, as many as the
+blur is wide.  Up to half of their light comes from pixels that nobody saw.  These and those swing for hundreds of
+iterations, by less than can be seen, and the more tiles there are, the more likely one still swings.  Conjugate
+gradients do not swing; what they change last lies there, so they are judged everywhere.
 
 Symbols
 -------

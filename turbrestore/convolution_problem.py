@@ -44,11 +44,11 @@ class Problem:
     judged: tuple[FloatArray, FloatArray] | None = None
 
     def weight(self, rows: slice) -> FloatArray:
-        """Weigh squares of changes in some rows: M, but 0 where changes are not judged."""
+        """Weigh squares of changes in some rows: 1 where they are judged."""
         if self.judged is None:
-            return self.seen[rows]
+            return np.ones_like(self.observed[rows])
         down, across = self.judged
-        return self.seen[rows] * np.outer(down[rows], across)
+        return np.outer(down[rows], across)
 
     def blurred(self, u: FloatArray) -> FloatArray:
         """Bu, a new image."""

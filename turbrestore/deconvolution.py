@@ -182,7 +182,8 @@ class Deconvolution:
         Value of the minimised energy, summed over channels.
     changes : ndarray, float64, shape (n,)
         Change of the tile that changes most over the iterations that are judged together, divided by their number, and
-        relative to the brightest tile.
+        relative to the brightest tile.  Of nltv and tv with an unknown boundary the outermost pixels do not count, as
+        many as the blur is wide.
     """
 
     image: FloatArray
@@ -298,7 +299,7 @@ def deconvolve(
     with one_thread_each(), Crew(room.threads) as crew:
         grid = StripGrid(shape, crew, folder if room.images_in_file else None)
         swings = params.boundary == "unknown" and params.method in ("nltv", "tv")
-        rim = min(int(np.ceil(sigma)), (min(size) - 1) // 2) if swings else 0
+        rim = min(int(np.ceil(sigma)), min(size) // 4) if swings else 0
         problems = _pose(planes, widths, inside, rim, grid, otf, fidelity)
         around = padded_guide(guide, size, widths)
         around = None if around is None else kept_in(around, grid.folder)
@@ -559,6 +560,6 @@ def _change(before: list[FloatArray], after: list[FloatArray], problem: Problem)
         return rows.start // TILE, np.array(list(both))
 
     for old, new in zip(before, after, strict=True):
-        for first, found in grid.over_rows(partial(squares, old=old, new=new), old, new, problem.seen):
+        for first, found in grid.over_rows(partial(squares, old=old, new=new), old, new):
             sums[:, first : first + found.shape[1]] += found
     return relative_change(*sums)

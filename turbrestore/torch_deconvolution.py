@@ -80,7 +80,7 @@ class _Problem:
     seen: Tensor
     otf: Tensor
     fidelity: float
-    judged: Tensor
+    weight: Tensor
 
     def gradient_spectrum(self, spectrum: Tensor) -> Tensor:
         return self.fidelity * self.otf.conj() * _forward(self.residual(spectrum))
@@ -204,7 +204,7 @@ def _iterate(
         last = iteration == settings.iterations
         if last or iteration % solver.window == 0:
             images = [state.image for state in states]
-            moved.append(_change(before, images, problems[0].judged) * solver.window / (iteration - begun))
+            moved.append(_change(before, images, problems[0].weight) * solver.window / (iteration - begun))
             last |= (converged := still_to_come(moved) <= settings.tolerance)
         if last or iteration % settings.record_every == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
@@ -348,8 +348,8 @@ def _laplacian(problem: Problem) -> FloatArray:
 def _load(problem: Problem, device: str) -> _Problem:
     whole = np.concatenate(problem.transfer, axis=1)[:, : problem.seen.shape[1] // 2 + 1]
     arrays = problem.observed, problem.seen, whole, problem.weight(slice(None))
-    observed, seen, otf, judged = (_tensor(array, device) for array in arrays)
-    return _Problem(observed, seen, otf, problem.fidelity, judged)
+    observed, seen, otf, weight = (_tensor(array, device) for array in arrays)
+    return _Problem(observed, seen, otf, problem.fidelity, weight)
 
 
 def _tensor(array: np.ndarray, device: str) -> Tensor:
@@ -380,13 +380,13 @@ def _total(values: Tensor) -> float:
     return float(values.sum(dtype=torch.float64))
 
 
-def _change(before: list[Tensor], after: list[Tensor], judged: Tensor) -> float:
+def _change(before: list[Tensor], after: list[Tensor], weight: Tensor) -> float:
     import torch
 
     sums = []
     for old, new in zip(before, after, strict=True):
         then, now = old.clamp(0, 1), new.clamp(0, 1)
-        sums.append(torch.stack([_tile_sums(judged * part.square()) for part in (now - then, now)]))
+        sums.append(torch.stack([_tile_sums(weight * part.square()) for part in (now - then, now)]))
     moved, size = torch.stack(sums).sum(0).cpu().numpy()
     return relative_change(moved, size)
 
