@@ -21,7 +21,7 @@ from turbrestore.nonlocal_tv import NonlocalParams, add_sums, nonlocal_weights, 
 from turbrestore.patch_pairs import join_choices, pairs_of_band
 from turbrestore.patch_search import BAND_ROWS, OUTSIDE, PatchSearch, choose_offsets, search_bands
 from turbrestore.pixel_fusion import PixelFusion, take_in_pixels
-from turbrestore.primal_dual import _follow, follow_loops
+from turbrestore.primal_dual import _divide, _follow, divide_loops, follow_loops
 from turbrestore.strip_grid import StripGrid
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.tvl1_sweeps import FlowProblem, SweepParams, sweep, sweep_frame
@@ -29,7 +29,7 @@ from turbrestore.warp import sample_spline, warp
 
 USERS = (
     *("blur_estimation", "frame_noise", "nonlocal_penalty", "nonlocal_tv", "patch_search", "pixel_fusion", "warp"),
-    *("patch_pairs", "primal_dual", "confidence", "flow_model", "tvl1_sweeps"),
+    *("paired_transform", "patch_pairs", "primal_dual", "confidence", "flow_model", "tvl1_sweeps"),
 )
 rng = np.random.default_rng(0)
 needs_compiler = pytest.mark.skipif(not compiling.can_compile(), reason="Numba is not installed: nothing to compare")
@@ -194,13 +194,27 @@ def test_folds_run_without_a_compiler_too():
 
 def test_what_follows_an_iteration_is_alike():
     """Both without a compiler: the loop itself, and NumPy."""
-    arrays = [*rng.normal(size=(6, 50)).astype(np.float32), rng.integers(0, 2, 50).astype(np.float32)]
+    arrays = list(rng.normal(size=(8, 50)).astype(np.float32))
+    arrays[4] = rng.integers(0, 2, 50).astype(np.float32)
     steps = np.float32([30.0, 0.7, 1.8])
     fast, slow = [array.copy() for array in arrays], [array.copy() for array in arrays]
     follow_loops(*fast, steps)
     _follow(*slow, steps)
-    for one, other in zip(fast, slow, strict=True):
+    for one, other in zip(fast[:6], slow[:6], strict=True):
         assert one == pytest.approx(other, abs=1e-4)
+
+
+@pytest.mark.parametrize("real", [False, True])
+def test_what_a_step_divides_by_is_alike(real):
+    """Both without a compiler, as above."""
+    parts = rng.normal(size=(2, 3, 7, 5)).astype(np.float32)
+    numbers = parts[0] + 1j * parts[1]
+    transfer = parts[0, 2] if real else numbers[2]
+    fast, slow = numbers[:2].copy(), numbers[:2].copy()
+    divide_loops(*fast, transfer, np.float32([2, 30]))
+    _divide(*slow, transfer, np.float32([2, 30]))
+    assert fast == pytest.approx(slow, abs=1e-5)
+    assert np.abs(fast - numbers[:2]).max() > 0.1
 
 
 @needs_compiler

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from regulariser import Regulariser
 from scipy import fft, optimize
 from skimage import data
 
-from turbrestore import primal_dual
+from turbrestore import deconvolution, primal_dual, torch_deconvolution
 from turbrestore.blur_estimation import BlurEstimate
 from turbrestore.conjugate_gradients import ConjugateGradients
 from turbrestore.convergence import still_to_come
@@ -30,10 +31,11 @@ from turbrestore.local_tv import LocalPenalty, local_divergence, local_gradient
 from turbrestore.nonlocal_penalty import NonlocalPenalty
 from turbrestore.nonlocal_tv import NonlocalParams, nonlocal_gradient, nonlocal_magnitude, nonlocal_weights
 from turbrestore.planes import margin_widths
-from turbrestore.primal_dual import PrimalDual, PrimalDualState
+from turbrestore.primal_dual import REST, PrimalDual, PrimalDualState
 from turbrestore.psf import KOLMOGOROV, blur_otf, gaussian_otf, gaussian_psf, laplacian_symbol, psf_to_otf
 from turbrestore.strip_grid import StripGrid
 from turbrestore.synthesis.scenes import SCENES
+from turbrestore.torch_deconvolution import SolverSettings
 
 TV = Regulariser(
     local_gradient,
@@ -344,6 +346,46 @@ def test_changes_beside_the_border_are_judged_where_they_do_not_swing(device, me
     moved, inside, everywhere = (largest(after - before, left_out) for left_out in (rim, 3, 0))
     assert runs[1].changes[-1] == pytest.approx(moved / largest(after, rim) / (numbers[1] - numbers[0]), rel=0.02)
     assert everywhere > 1.3 * inside
+
+
+class Swinging:
+    """A solver that moves every pixel up and down, back where it was after some iterations."""
+
+    window, rest = 10, REST
+
+    def __init__(self, period, drift=0.0):
+        self.period, self.drift = period, drift
+
+    def start(self, image):
+        return SimpleNamespace(image=image, number=0)
+
+    def step(self, problem, state):
+        number = state.number + 1
+        level = 0.5 + 0.1 * math.sin(2 * math.pi * number / self.period) + self.drift * number
+        return SimpleNamespace(image=0 * state.image + level, number=number)
+
+    def penalty(self, problem, u):
+        return 0.0
+
+
+@pytest.mark.parametrize("device", [None, "cpu"])
+@pytest.mark.parametrize(
+    ("period", "drift", "rest", "stopped"),
+    [(50, 0.0, REST, 50), (25, 0.0, REST, 50), (50, 1e-4, REST, 200), (40, 0.0, REST, 200), (50, 0.0, 0, 200)],
+)
+def test_an_image_that_is_where_it_was_rests(device, period, drift, rest, stopped):
+    solver, image = Swinging(period, drift), np.full((8, 8), 0.5, np.float32)
+    solver.rest = rest
+    problem = Problem(image, np.ones_like(image), np.ones((1, 8, 5), np.float32), 1.0, StripGrid((8, 8)))
+    params = DeconvolutionParams(tolerance=3e-3, iterations=200)
+    if device:
+        torch = pytest.importorskip("torch")
+        settings = SolverSettings("tv", 200, 3e-3, 10, 40, True, NonlocalParams())
+        loaded, start = torch_deconvolution._load(problem, device), solver.start(torch.from_numpy(image))
+        found = torch_deconvolution._iterate(solver, [loaded], [start], settings, None)
+    else:
+        found = deconvolution._iterate(solver, [problem], [solver.start(image)], params, None)
+    assert (found.iterations, found.converged) == (stopped, stopped < 200)
 
 
 def test_of_a_small_image_half_is_judged_however_wide_the_blur(monkeypatch):

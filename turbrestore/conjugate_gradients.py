@@ -62,6 +62,8 @@ class ConjugateGradients:
 
     # Iterations that are judged together: single steps may be short by chance.
     window: ClassVar[int] = 2
+    # They do not swing: what has not moved for some iterations may move yet.
+    rest: ClassVar[int] = 0
 
     def start(self, problem: Problem) -> GradientState:
         """Start from the solution for the continued image."""

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -101,9 +102,9 @@ class DeconvolutionParams:
     iterations : int
         Largest number of iterations.
     tolerance : float
-        Stop when no tile of 64×64 pixels is foreseen to change by this any more, relative to the brightest tile; see
-        ``turbrestore.convergence``.  Of nltv and tv, whose images swing about the one that they approach, ten
-        iterations are judged together, else two.
+        Stop when no tile of 64×64 pixels is foreseen to change by this any more, relative to the brightest tile, or,
+        of nltv and tv, whose images swing about the one that they approach, when none has changed by more since fifty
+        iterations ago; see ``turbrestore.convergence``.  Of these, ten iterations are judged together, else two.
     boundary : {"unknown", "periodic"}
         What lies beyond the border: pixels to be found, or the image itself.
     channels : {"luminance", "each"}
@@ -444,6 +445,7 @@ def _solve_on_device(
 
 class _Solver(Protocol[State]):
     window: ClassVar[int]
+    rest: ClassVar[int]
 
     def step(self, problem: Problem, state: State) -> State: ...
     def penalty(self, problem: Problem, u: FloatArray) -> float: ...
@@ -458,19 +460,23 @@ def _iterate(
 ) -> _Solution:
     """Step all channels side by side until none changes any more."""
     records: list[tuple[int, float, float]] = []
-    grid = problems[0].grid
-    before, images, begun = list[FloatArray](), [state.image for state in states], 0
-    moved, converged = list[float](), False
+    grid, images = problems[0].grid, [state.image for state in states]
+    # Of the last windows: a step changes images in place.
+    earlier = deque([[grid.copied(u) for u in images]], max(solver.rest, 1))
+    moved, begun, converged = list[float](), 0, False
     for iteration in range(1, params.iterations + 1):
-        if (iteration - 1) % solver.window == 0:
-            # Those of a window are changed in place.
-            before, begun = [grid.copied(u) for u in images], iteration - 1
         states = [solver.step(problem, state) for problem, state in zip(problems, states, strict=True)]
         last = iteration == params.iterations
         if last or iteration % solver.window == 0:
             images = [state.image for state in states]
-            moved.append(_change(before, images, problems[0]) * solver.window / (iteration - begun))
-            last |= (converged := still_to_come(moved) <= params.tolerance)
+            moved.append(_change(earlier[-1], images, problems[0]) * solver.window / (iteration - begun))
+            converged = still_to_come(moved) <= params.tolerance
+            if not converged and len(earlier) == solver.rest:
+                converged = _change(earlier[0], images, problems[0]) <= params.tolerance
+            last |= converged
+            begun = iteration
+            if not last:
+                earlier.append([grid.copied(u) for u in images])
         if last or iteration % _RECORD_EVERY == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
             records.append((iteration, sum(energies), moved[-1] / solver.window))

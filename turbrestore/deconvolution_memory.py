@@ -5,14 +5,14 @@ largest of these counts, of the time when its start is found, its weights, and w
 
     work + H W · (20 + 10 c + 32 min(t, c + 1)) + 8 MB · t
     work + H W · (35 + 10 c + 8 pairs) + 60 · 64 W · b + t · 4 · tile · n
-    work + H W · (50 + 36 c + (8 + 8 c) pairs) + t · max(26 · strip · b, 8 MB)
+    work + H W · (50 + 52 c + (8 + 8 c) pairs) + t · max(26 · strip · b, 8 MB)
 
 64 W pixels are the band whose choices become pairs at a time, which takes 30 instead of 60 with Numba; of a tile a
 thread has the distances to all neighbours, and of a strip the edges; with Numba it needs less.  A pixel has 0.65 b
-pairs.  They may be kept in a file: their terms are 0 then.  Where images are kept in files too, H W · (50 + 40 c)
+pairs.  They may be kept in a file: their terms are 0 then.  Where images are kept in files too, H W · (50 + 56 c)
 bytes of them, H W · (14 + 4 c) remains of the first line and H W · 20 of each of the others.
 
-tv takes H W · (40 + 36 c) and the linear methods H W · (35 + 32 c), in files H W · (14 + 4 c), and 8 MB · t.
+tv takes H W · (40 + 52 c) and the linear methods H W · (35 + 32 c), in files H W · (14 + 4 c), and 8 MB · t.
 The blur is one that is known by its width: a sampled point spread function takes more.
 """
 
@@ -27,11 +27,11 @@ from .patch_search import BAND_ROWS, tile_columns
 # Of the process.
 _WORK = 2e7
 # Of every pixel, and for a channel: of tv and of the linear methods, in memory and where images are in files.
-_TV, _LINEAR, _IN_FILE = (40.0, 36.0), (35.0, 32.0), (14.0, 4.0)
+_TV, _LINEAR, _IN_FILE = (40.0, 52.0), (35.0, 32.0), (14.0, 4.0)
 # Of nltv: while the start is found, and for a thread; while weights are found; in an iteration.
 _STARTED, _STARTED_THREAD = (20.0, 10.0), 32.0
 _FOUND, _FOUND_IN_FILE = (35.0, 10.0), (20.0, 0.0)
-_ITERATED, _ITERATED_IN_FILE = (50.0, 36.0), (20.0, 0.0)
+_ITERATED, _ITERATED_IN_FILE = (50.0, 52.0), (20.0, 0.0)
 # Of a pair: its head and weight, and its dual in every channel.
 _PAIR, _DUAL = 8.0, 8.0
 # Of a thread: strips and blocks of images.
@@ -43,7 +43,7 @@ _SHARE_OF_PAIRS = 0.65
 # Pairs in files, and images: what is tried, one after the other.
 _FILINGS = (False, False), (True, False), (True, True)
 # In files: of every pixel, and for a channel.
-_FILES = 50.0, 40.0
+_FILES = 50.0, 56.0
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class DeconvolutionWork:
         --------
         >>> work = DeconvolutionWork((100, 100), 1, "nltv", NonlocalParams())
         >>> [work.files(Room(1, *files)) for files in ((False, False), (True, False), (True, True))]
-        [0.0, 1456000.0, 2356000.0]
+        [0.0, 1456000.0, 2516000.0]
         """
         images = self._all(_FILES) if room.images_in_file else 0.0
         return images + (self.pairs() if room.in_file else 0.0)
@@ -140,7 +140,7 @@ class DeconvolutionWork:
         --------
         >>> work = DeconvolutionWork((1080, 1920), 1, "tv", NonlocalParams())
         >>> [round(work.peak(Room(2, False, in_file)) / 1e6) for in_file in (False, True)]
-        [194, 73]
+        [227, 73]
         """
         if self.method != "nltv":
             in_memory = _TV if self.method == "tv" else _LINEAR

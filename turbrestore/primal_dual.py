@@ -35,11 +35,14 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from .arrays import FloatArray
 from .compiled import compiled
 from .convolution_problem import Problem
+from .paired_transform import paired_descent
+from .psf import Spectrum
 
 # ρ.
 RELAXATION = 1.8
@@ -49,6 +52,8 @@ PRIMAL_STEP = 0.08
 LEAST_DATA_STEP = 0.02
 # Iterations that are judged together: over as many, most of what swings cancels, and what drifts does not.
 WINDOW = 10
+# As many windows back, an image that rests was where it is: longer than it swings for.
+REST = 5
 
 
 class Penalty(Protocol):
@@ -93,6 +98,7 @@ class PrimalDual:
     regulariser: Penalty
 
     window: ClassVar[int] = WINDOW
+    rest: ClassVar[int] = REST
 
     def start(self, problem: Problem, u: FloatArray) -> PrimalDualState:
         """Start from the image ``u``, with the q that it asks for and p one step from 0."""
@@ -110,34 +116,10 @@ class PrimalDual:
 
     def step(self, problem: Problem, state: PrimalDualState) -> PrimalDualState:
         """One iteration, over-relaxed."""
-        grid, (falls, moves) = problem.grid, problem.grid.spectra
         (tau, s), share = self._steps, max(1 / state.number, LEAST_DATA_STEP)
-        (u, blurred, q, p, pull, _), transfer = state, problem.transfer
-        follow = compiled(follow_loops) or _follow
-        steps = np.array([share * problem.fidelity, 1 / (1 + share), RELAXATION], np.float32)
-
-        def transform(rows: slice) -> None:
-            grid.transform_strip(q[rows], falls, rows)
-            grid.transform_strip(pull[rows], moves, rows)
-
-        def solve(block: int) -> None:
-            down, otf = fft.fft(falls[block], axis=0), transfer[block]
-            down *= otf.conj()
-            down += fft.fft(moves[block], axis=0)
-            down *= np.reciprocal(np.float32(1 / tau) + np.float32(share * problem.fidelity) * problem.power(block))
-            falls[block] = fft.ifft(down * otf, axis=0, overwrite_x=True)
-            moves[block] = fft.ifft(down, axis=0, overwrite_x=True)
-
-        def move(rows: slice) -> None:
-            moved, drop = grid.strip_of(moves, rows), grid.strip_of(falls, rows)
-            changed = moved.ravel(), blurred[rows].reshape(-1), drop.ravel(), q[rows].reshape(-1)
-            follow(u[rows].ravel(), *changed, problem.observed[rows].ravel(), problem.seen[rows].ravel(), steps)
-            u[rows], grid.spare[rows] = moved, drop
-
-        grid.over_rows(transform, falls, moves, q, pull)
-        grid.over_blocks(solve, falls, moves, transfer)
-        grid.over_rows(move, falls, moves, u, blurred, q, grid.spare, problem.observed, problem.seen)
-        self.regulariser.ascend(p, grid.spare, s, RELAXATION, pull)
+        descend = _descend_at_once if problem.grid.one_strip else _descend_in_strips
+        descend(problem, state, 1 / tau, share)
+        self.regulariser.ascend(state.dual, problem.grid.spare, s, RELAXATION, state.pull)
         return state._replace(number=state.number + 1)
 
     def penalty(self, problem: Problem, u: FloatArray) -> float:
@@ -151,19 +133,112 @@ class PrimalDual:
         return PRIMAL_STEP / norm, 1 / (PRIMAL_STEP * norm)
 
 
+def _descend_at_once(problem: Problem, state: PrimalDualState, floor: float, share: float) -> None:
+    """Move u, Bu and q of an image that is one strip; 2u' − u is left in the spare image."""
+    arrays = state.image, state.blurred, state.pressure, state.pull, problem.observed, problem.seen, problem.transfer
+
+    def descend(rows: slice) -> None:
+        weight = share * problem.fidelity
+        both = paired_descent(state.pressure, state.pull, problem.transfer[0], floor, weight)
+        _move(problem, state, share, rows, both[..., 0], both[..., 1])
+
+    problem.grid.over_rows(descend, problem.grid.spare, *arrays)
+
+
+def _descend_in_strips(problem: Problem, state: PrimalDualState, floor: float, share: float) -> None:
+    """Likewise of an image of several strips."""
+    grid, (falls, moves), transfer = problem.grid, problem.grid.spectra, problem.transfer
+    u, blurred, q, *_ = state
+    scales = np.array([floor, share * problem.fidelity], np.float32)
+    divide = compiled(divide_loops) or _divide
+
+    def transform(rows: slice) -> None:
+        grid.transform_strip(q[rows], falls, rows)
+        grid.transform_strip(state.pull[rows], moves, rows)
+
+    def solve(block: int) -> None:
+        pressed, pulled = (fft.fft(spectrum[block], axis=0) for spectrum in (falls, moves))
+        divide(pressed, pulled, transfer[block], scales)
+        falls[block] = fft.ifft(pressed, axis=0, overwrite_x=True)
+        moves[block] = fft.ifft(pulled, axis=0, overwrite_x=True)
+
+    def move(rows: slice) -> None:
+        _move(problem, state, share, rows, grid.strip_of(moves, rows), grid.strip_of(falls, rows))
+
+    grid.over_rows(transform, falls, moves, q, state.pull)
+    grid.over_blocks(solve, falls, moves, transfer)
+    grid.over_rows(move, falls, moves, u, blurred, q, grid.spare, problem.observed, problem.seen)
+
+
+def _move(
+    problem: Problem, state: PrimalDualState, share: float, rows: slice, moved: FloatArray, drop: FloatArray
+) -> None:
+    """Follow what some rows move by, u − u' and B of it."""
+    steps = np.array([share * problem.fidelity, 1 / (1 + share), RELAXATION], np.float32)
+    images = state.image, state.blurred, state.pressure, problem.observed, problem.seen, problem.grid.spare
+    u, blurred, q, observed, seen, ahead = (image[rows].reshape(-1) for image in images)
+    follow = compiled(follow_loops) or _follow
+    follow(u, blurred, q, observed, seen, ahead, moved.reshape(-1), drop.reshape(-1), steps)
+
+
+def _divide(
+    pressed: NDArray[np.complex64], pulled: NDArray[np.complex64], transfer: Spectrum, scales: FloatArray
+) -> None:
+    """:func:`divide_loops` by NumPy."""
+    floor, weight = scales
+    pressed *= transfer.conj()
+    pulled += pressed
+    pulled *= np.reciprocal(floor + weight * np.square(np.abs(transfer)))
+    np.multiply(pulled, transfer, out=pressed)
+
+
+def divide_loops(
+    pressed: NDArray[np.complex64], pulled: NDArray[np.complex64], transfer: Spectrum, scales: FloatArray
+) -> None:
+    """Find the transforms of what u descends by and of B of it; to be compiled.
+
+    Parameters
+    ----------
+    pressed : ndarray, complex64, shape (P, C)
+        Transform of q; becomes that of ``BP⁻¹(Kᵀp + Bᵀq)``.
+    pulled : ndarray, complex64, shape (P, C)
+        Transform of Kᵀp; becomes that of ``P⁻¹(Kᵀp + Bᵀq)``.
+    transfer : ndarray, float32 or complex64, shape (P, C)
+        Transfer function of B.
+    scales : ndarray, float32, shape (2,)
+        1/τ and t.
+
+    Examples
+    --------
+    >>> pressed, pulled = np.complex64([[8]]), np.complex64([[2j]])
+    >>> divide_loops(pressed, pulled, np.float32([[0.5]]), np.float32([1, 4]))
+    >>> pressed, pulled
+    (array([[1.+0.5j]], dtype=complex64), array([[2.+1.j]], dtype=complex64))
+    """
+    floor, weight = scales
+    for row in range(pressed.shape[0]):
+        for column in range(pressed.shape[1]):
+            blur = transfer[row, column]
+            inverse = np.float32(1) / (floor + weight * (blur.real * blur.real + blur.imag * blur.imag))
+            down = (blur.conjugate() * pressed[row, column] + pulled[row, column]) * inverse
+            pulled[row, column], pressed[row, column] = down, blur * down
+
+
 def _follow(
     u: FloatArray,
-    moved: FloatArray,
     blurred: FloatArray,
-    drop: FloatArray,
     q: FloatArray,
     observed: FloatArray,
     seen: FloatArray,
+    ahead: FloatArray,
+    moved: FloatArray,
+    drop: FloatArray,
     steps: FloatArray,
 ) -> None:
     """:func:`follow_loops` by NumPy."""
     step, shrink, relaxation = steps
-    ahead = blurred - 2 * drop
+    np.multiply(drop, -2, out=ahead)
+    ahead += blurred
     ahead -= observed
     ahead *= step
     ahead += q
@@ -172,54 +247,53 @@ def _follow(
     ahead -= q
     ahead *= relaxation
     q += ahead
-    drop *= relaxation
-    blurred -= drop
-    np.multiply(moved, -2, out=drop)
-    drop += u
-    moved *= -relaxation
-    moved += u
+    np.multiply(drop, -relaxation, out=ahead)
+    blurred += ahead
+    np.multiply(moved, -2, out=ahead)
+    ahead += u
+    np.multiply(moved, relaxation, out=moved)
+    u -= moved
 
 
 def follow_loops(
     u: FloatArray,
-    moved: FloatArray,
     blurred: FloatArray,
-    drop: FloatArray,
     q: FloatArray,
     observed: FloatArray,
     seen: FloatArray,
+    ahead: FloatArray,
+    moved: FloatArray,
+    drop: FloatArray,
     steps: FloatArray,
 ) -> None:
     """Follow u' with q, Bu, u, and 2u' − u; to be compiled.
 
     Parameters
     ----------
-    u : ndarray, float32, shape (n,)
-    moved : ndarray, float32, shape (n,)
-        u − u'; becomes the next u.
-    blurred, q : ndarray, float32, shape (n,)
-        Bu, and q; become the next ones.
-    drop : ndarray, float32, shape (n,)
-        B(u − u'); becomes 2u' − u.
+    u, blurred, q : ndarray, float32, shape (n,)
+        u, Bu and q; become the next ones.
     observed, seen : ndarray, float32, shape (n,)
         f and M.
+    ahead : ndarray, float32, shape (n,)
+        Becomes 2u' − u.
+    moved, drop : ndarray, float32, shape (n,)
+        u − u', and B of it; what is in them may be lost.
     steps : ndarray, float32, shape (3,)
         t, λ/(λ + t) and ρ.
 
     Examples
     --------
     >>> one = np.ones(1, np.float32)
-    >>> moved, blurred, drop, q = 0.5 * one, 4 * one, 1 * one, 2 * one
-    >>> follow_loops(3 * one, moved, blurred, drop, q, one, one, np.float32([4, 0.5, 1.5]))
-    >>> [float(array[0]) for array in (moved, blurred, drop, q)]
-    [2.25, 2.5, 2.0, 3.5]
+    >>> u, blurred, q, ahead = 3 * one, 4 * one, 2 * one, 0 * one
+    >>> follow_loops(u, blurred, q, one, one, ahead, 0.5 * one, one, np.float32([4, 0.5, 1.5]))
+    >>> [float(array[0]) for array in (u, blurred, q, ahead)]
+    [2.25, 2.5, 3.5, 2.0]
     """
     step, shrink, relaxation = steps[0], steps[1], steps[2]
     for pixel in range(u.size):
         blur, fall, force, down = blurred[pixel], drop[pixel], q[pixel], moved[pixel]
-        ahead = blur - fall - fall - observed[pixel]
-        raised = (force + step * ahead) * seen[pixel] * shrink
+        raised = (force + step * (blur - fall - fall - observed[pixel])) * seen[pixel] * shrink
         q[pixel] = force + relaxation * (raised - force)
         blurred[pixel] = blur - relaxation * fall
-        drop[pixel] = u[pixel] - down - down
-        moved[pixel] = u[pixel] - relaxation * down
+        ahead[pixel] = u[pixel] - down - down
+        u[pixel] -= relaxation * down

@@ -7,6 +7,7 @@ Sums that decide are taken in double precision, as they are there.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -19,7 +20,7 @@ from .convergence import TILE, relative_change, still_to_come
 from .convolution_problem import Problem
 from .device import memory_of
 from .nonlocal_tv import NonlocalParams
-from .primal_dual import LEAST_DATA_STEP, PRIMAL_STEP, RELAXATION, WINDOW
+from .primal_dual import LEAST_DATA_STEP, PRIMAL_STEP, RELAXATION, REST, WINDOW
 from .psf import estimate_noise, laplacian_symbol, wiener_fidelity
 from .torch_weights import (
     device_divergence,
@@ -44,7 +45,7 @@ class SolverSettings:
     iterations : int
         Most iterations.
     tolerance : float
-        They stop when less than this is still to come (:mod:`turbrestore.convergence`).
+        They stop when less than this is still to come, or the image rests (:mod:`turbrestore.convergence`).
     record_every : int
         Iterations from one record of the energy to the next, a multiple of those that are judged together.
     start_steps : int
@@ -195,17 +196,20 @@ def _iterate(
     progress: Callable[[int], None] | None,
 ) -> DeviceSolution:
     records: list[tuple[int, float, float]] = []
-    before, images, begun = [], [state.image for state in states], 0
-    moved, converged = list[float](), False
+    images = [state.image for state in states]
+    earlier, moved, begun, converged = deque([images], max(solver.rest, 1)), list[float](), 0, False
     for iteration in range(1, settings.iterations + 1):
-        if (iteration - 1) % solver.window == 0:
-            before, begun = images, iteration - 1
         states = [solver.step(problem, state) for problem, state in zip(problems, states, strict=True)]
         last = iteration == settings.iterations
         if last or iteration % solver.window == 0:
             images = [state.image for state in states]
-            moved.append(_change(before, images, problems[0].weight) * solver.window / (iteration - begun))
-            last |= (converged := still_to_come(moved) <= settings.tolerance)
+            moved.append(_change(earlier[-1], images, problems[0].weight) * solver.window / (iteration - begun))
+            converged = still_to_come(moved) <= settings.tolerance
+            if not converged and len(earlier) == solver.rest:
+                converged = _change(earlier[0], images, problems[0].weight) <= settings.tolerance
+            last |= converged
+            begun = iteration
+            earlier.append(images)
         if last or iteration % settings.record_every == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
             records.append((iteration, sum(energies), moved[-1] / solver.window))
@@ -222,6 +226,7 @@ class _PrimalDual:
 
     regulariser: _Penalty
     window: ClassVar[int] = WINDOW
+    rest: ClassVar[int] = REST
 
     def start(self, problem: _Problem, u: Tensor) -> _DualState:
         blurred = problem.blurred(_forward(u))
@@ -260,6 +265,7 @@ class _Quadratic:
 
     symbol: Tensor
     window: ClassVar[int] = ConjugateGradients.window
+    rest: ClassVar[int] = ConjugateGradients.rest
 
     def start(self, problem: _Problem) -> _GradientState:
         m = problem.mean()
