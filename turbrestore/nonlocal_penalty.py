@@ -15,6 +15,7 @@ that is to be Kᵀp has |a|².
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,9 +93,8 @@ class NonlocalPenalty:
         """
         loops, factor, change = compiled(add_differences), dual.factor.ravel(), dual.lagged.ravel()
 
-        def rise(rows: slice) -> None:
-            image[rows] *= np.float32(step)
-            dual.lagged[rows] += image[rows]
+        shares = np.array([step, relaxation], np.float32)
+        rise, project = compiled(rise_loops) or _rise, compiled(project_loops) or _project
 
         def add(number: int, strip: EdgeStrip) -> FloatArray:
             own, (there, back) = strip.view(factor), dual.values[:, dual.parts[number]]
@@ -112,16 +112,12 @@ class NonlocalPenalty:
                 release(array)
             return squares
 
-        def project(rows: slice) -> None:
-            found = np.sqrt(pull[rows])
-            np.maximum(found, 1, out=found)
-            np.divide(np.float32(relaxation), found, out=found)
-            np.subtract(found, np.float32(relaxation - 1), out=dual.factor[rows])
-            np.multiply(image[rows], np.float32(relaxation - 1), out=dual.lagged[rows])
+        def over_rows(loops: Callable[..., None], *images: FloatArray) -> None:
+            self.grid.over_rows(lambda rows: loops(*(each[rows].reshape(-1) for each in images), shares), *images)
 
-        self.grid.over_rows(rise, image, dual.lagged)
+        over_rows(rise, image, dual.lagged)
         sum_strips(self.graph.strips, add, pull.ravel(), self.grid.crew)
-        self.grid.over_rows(project, image, pull, dual.factor, dual.lagged)
+        over_rows(project, image, pull, dual.factor, dual.lagged)
         self._pull(dual, pull.ravel())
 
     def _pull(self, dual: EdgeDual, pull: FloatArray) -> None:
@@ -166,6 +162,74 @@ class NonlocalPenalty:
 
     def _images(self, count: int) -> list[FloatArray]:
         return [self.grid.image() for _ in range(count)]
+
+
+def _rise(image: FloatArray, lagged: FloatArray, shares: FloatArray) -> None:
+    """:func:`rise_loops` by NumPy."""
+    image *= shares[0]
+    lagged += image
+
+
+def rise_loops(image: FloatArray, lagged: FloatArray, shares: FloatArray) -> None:
+    """From ū to sū, and from l to l + sū; to be compiled.
+
+    Parameters
+    ----------
+    image, lagged : ndarray, float32, shape (n,)
+        ū and l; changed.
+    shares : ndarray, float32, shape (2,)
+        s and ρ.
+
+    Examples
+    --------
+    >>> image, lagged = np.float32([4]), np.float32([3])
+    >>> rise_loops(image, lagged, np.float32([0.5, 1.8]))
+    >>> image, lagged
+    (array([2.], dtype=float32), array([5.], dtype=float32))
+    """
+    for pixel in range(image.size):
+        more = image[pixel] * shares[0]
+        image[pixel] = more
+        lagged[pixel] += more
+
+
+def _project(
+    image: FloatArray, squares: FloatArray, factor: FloatArray, lagged: FloatArray, shares: FloatArray
+) -> None:
+    """:func:`project_loops` by NumPy."""
+    relaxation = shares[1]
+    np.sqrt(squares, out=factor)
+    np.maximum(factor, 1, out=factor)
+    np.divide(relaxation, factor, out=factor)
+    factor -= relaxation - 1
+    np.multiply(image, relaxation - 1, out=lagged)
+
+
+def project_loops(
+    image: FloatArray, squares: FloatArray, factor: FloatArray, lagged: FloatArray, shares: FloatArray
+) -> None:
+    """From |a|² to g, and from sū to l; to be compiled.
+
+    Parameters
+    ----------
+    image, squares : ndarray, float32, shape (n,)
+        sū and |a|².
+    factor, lagged : ndarray, float32, shape (n,)
+        Become g and l.
+    shares : ndarray, float32, shape (2,)
+        s and ρ.
+
+    Examples
+    --------
+    >>> factor, lagged = np.zeros((2, 1), np.float32)
+    >>> project_loops(np.float32([2]), np.float32([4]), factor, lagged, np.float32([0.5, 1.5]))
+    >>> factor, lagged
+    (array([0.25], dtype=float32), array([1.], dtype=float32))
+    """
+    for pixel in range(image.size):
+        length = max(np.sqrt(squares[pixel]), np.float32(1))
+        factor[pixel] = shares[1] / length - (shares[1] - np.float32(1))
+        lagged[pixel] = image[pixel] * (shares[1] - np.float32(1))
 
 
 def add_differences(
