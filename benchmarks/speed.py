@@ -4,7 +4,7 @@
     python benchmarks/speed.py --full --before 890600a --write docs/speed.md
 
 prints a Markdown document, writes it, and exits with 1 when a bound is broken.  Times of a row are taken in one child
-process, flow calls before and after the restoration, because machines differ and drift; of the shorter clips three
+process, flow calls before and after the restoration, because machines differ and drift; of the shorter clips five
 times, and the run whose ratio is in the middle counts.  Peak memory is that of a child process.  ``--before`` names a
 revision of this repository that is measured beside the present tree, row by row; ``--full`` adds 1,000 frames,
 1920×1080, and what ``benchmarks/tvl1.py`` and ``benchmarks/deconvolution.py`` print.  Where Numba is installed, some
@@ -53,15 +53,16 @@ ROWS: tuple[Row, ...] = (
 FULL_ROWS: tuple[Row, ...] = ((1000, 256, 256, "chart"), (25, 1080, 1920, "chart"), (25, 1080, 1920, "camera"))
 # Restored without Numba too.
 PLAIN_ROW = (120, 256, 256)
-# Clips of so many pixels in all are restored three times.
-REPEATED, RUNS = 25_000_000, 3
+# Clips of so many pixels in all are restored five times.
+REPEATED, RUNS = 25_000_000, 5
 # What the exponents are fitted to: two passes of the centroid, and so many frames to train, whatever the clip.
 COUNTS, COUNTS_SIDE = (500, 1000, 1500, 2000), 128
 SIDES, SIDES_COUNT = (128, 192, 256, 384, 768), 60
 FEW, MANY, TRAINED = 260, 2060, 60
 # Distinct frames of a clip; longer ones repeat them.
 DISTINCT = 60
-# One in so many frames is taken to measure flow alone before, and again after; at least and at most so many.
+# One in so many frames is taken to measure flow alone before, and again after; at least and at most so many.  Of the
+# shorter clips all are: a tenth of a second of flow says little.
 SAMPLE, LEAST_SAMPLE, LARGEST_SAMPLE = 2, 8, 200
 # Benchmarks of parts whose tables are part of the document.
 PARTS = ("tvl1", "deconvolution")
@@ -277,7 +278,8 @@ def run_child(task: Figures) -> Figures:
     train = None if task["kind"] == "time" else TRAINED
     centroid = CentroidParams() if task["kind"] == "time" else CentroidParams(iterations=2)
     params = RestoreParams(train=train, flow=FlowParams(threads=THREADS), centroid=centroid)
-    part = min(max(task["frames"] // SAMPLE, LEAST_SAMPLE), LARGEST_SAMPLE)
+    few = task["frames"] * task["height"] * task["width"] <= REPEATED
+    part = task["frames"] if few else min(max(task["frames"] // SAMPLE, LEAST_SAMPLE), LARGEST_SAMPLE)
 
     def alone() -> None:
         frames = (sample[index % len(sample)] for index in range(part))

@@ -1,5 +1,8 @@
 """Widths of known blurs, found blind, and the cost against its definition."""
 
+import threading
+import time
+
 import cv2
 import numpy as np
 import pytest
@@ -131,6 +134,24 @@ def test_the_uncertainty_is_half_of_what_half_and_twice_the_noise_differ_by(sigm
     with one_thread_each():
         less, more = (_lowest(_costs(gradients, KOLMOGOROV, share * found.noise, 1)) for share in (0.5, 2.0))
     assert found.uncertainty == abs(_widen(more, found.reduction) - _widen(less, found.reduction)) / 2
+
+
+def test_two_threads_find_the_same(monkeypatch):
+    image, threads = blurred("camera", 1.5, 0.005), set()
+
+    def costs(*settings, **more):
+        threads.add(threading.get_ident())
+        # Long enough for the other thread to take the other sweep.
+        time.sleep(0.05)
+        return _costs(*settings, **more)
+
+    alone = estimate_blur(image)
+    monkeypatch.setattr("turbrestore.blur_estimation._costs", costs)
+    together = estimate_blur(image, threads=2)
+    assert len(threads) == 2
+    for name in ("sigma", "uncertainty", "noise", "reduction", "evidence"):
+        assert getattr(together, name) == getattr(alone, name)
+    assert np.array_equal(together.costs, alone.costs)
 
 
 @pytest.mark.parametrize("scene", ["chart", "camera", "brick"])

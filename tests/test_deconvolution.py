@@ -438,6 +438,7 @@ def test_strips_give_the_image_of_the_whole(monkeypatch, method, boundary):
     assert np.abs(strips.image - whole.image).max() < 1e-5
     assert strips.iterations == whole.iterations
     assert strips.objective == pytest.approx(whole.objective, rel=1e-4)
+    assert strips.changes == pytest.approx(whole.changes, rel=1e-3, abs=1e-5)
 
 
 @pytest.mark.parametrize("channels", ["luminance", "each"])

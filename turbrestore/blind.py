@@ -16,6 +16,7 @@ from .blur_map import BlurMap, deconvolve_varying, estimate_blur_map, sigma_map
 from .decision import Decision
 from .deconvolution import Deconvolution, DeconvolutionParams, deconvolve
 from .guards import GuardParams, GuardReading, deconvolve_guarded, judge
+from .parallel import available_cores
 from .psf import KOLMOGOROV
 from .scratch import kept_in
 
@@ -103,7 +104,8 @@ def remove_blur(
     folder = (scratch or Path(tempfile.gettempdir())) if in_file else None
     deconvolution, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
     blind = deconvolution.sigma is None
-    blur = estimate_blur(image, exponent=deconvolution.exponent or KOLMOGOROV) if blind else None
+    exponent = deconvolution.exponent or KOLMOGOROV
+    blur = estimate_blur(image, exponent=exponent, threads=available_cores()) if blind else None
     sigma, settings = blur_to_remove(blur, deconvolution, bounds)
 
     def remove(width: float, progress: Callable[[int], None] | None = None) -> Deconvolution:

@@ -47,7 +47,7 @@ from scipy import fft
 from .arrays import FloatArray, check_image, luminance
 from .compiled import compiled
 from .errors import require
-from .parallel import one_thread_each
+from .parallel import Crew, one_thread_each
 from .plots import plot_blur
 from .preview import preview
 from .psf import KOLMOGOROV, check_exponent, estimate_noise, half_frequency
@@ -159,7 +159,9 @@ class BlurEstimate:
         return max(self.sigma - _CAUTION * self.uncertainty, 0.0) if self.sigma > 0 else 0.0
 
 
-def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV) -> BlurEstimate:
+def estimate_blur(
+    image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV, threads: int = 1
+) -> BlurEstimate:
     """Estimate the width of the blur of an image.
 
     Parameters
@@ -170,6 +172,8 @@ def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float 
         Standard deviation of the noise, intensity; estimated by default.
     exponent : float
         Shape of the blur, 1 to 2: 5/3 for images fused from turbulent frames, 2 for a Gaussian.
+    threads : int
+        With two, widths at half and at twice the noise are found side by side, to the same result.
 
     Returns
     -------
@@ -199,9 +203,10 @@ def estimate_blur(image: ArrayLike, noise: float | None = None, exponent: float 
     if min(grey.shape) < _SMALLEST_IMAGE or np.ptp(grey) <= _LEAST_NOISE:
         return BlurEstimate(0.0, float("inf"), exponent, noise or 0.0, 1, 0.0, np.zeros(0), np.zeros(0))
     factors = [factor for factor in _REDUCTIONS if factor == 1 or min(grey.shape) >= factor * _SMALLEST_SIDE]
-    # Transforms of so few pixels take no longer than handing the interpreter lock from thread to thread.
-    with one_thread_each():
-        estimates = [_estimate_reduced(grey, factor, exponent, noise) for factor in factors]
+    with one_thread_each(), Crew(threads) as crew:
+        # Reductions one after the other: where few pixels are transformed at a time, threads mostly wait for each
+        # other's interpreter lock.
+        estimates = [_estimate_reduced(grey, factor, exponent, noise, crew) for factor in factors]
     convincing = [one for one in estimates if np.isfinite(one.uncertainty)]
     if convincing:
         return min(convincing, key=_doubt)
@@ -219,7 +224,7 @@ def _doubt(estimate: BlurEstimate) -> float:
     return preference * estimate.uncertainty / estimate.sigma
 
 
-def _estimate_reduced(grey: FloatArray, factor: int, exponent: float, noise: float | None) -> BlurEstimate:
+def _estimate_reduced(grey: FloatArray, factor: int, exponent: float, noise: float | None, crew: Crew) -> BlurEstimate:
     """Estimate from one reduced image; the uncertainty is infinite where it does not convince."""
     reduced = _reduce(grey, factor)
     gradients, level = _gradients(_most_detailed(reduced)), _effective_noise(reduced, factor, noise)
@@ -228,7 +233,7 @@ def _estimate_reduced(grey: FloatArray, factor: int, exponent: float, noise: flo
     width, uncertainty = _widen(lowest, factor), float("inf")
     resolved = lowest < _WIDTHS[-1] and (factor == 1 or lowest >= _RESOLVED)
     if resolved and evidence >= (_EVIDENCE if width >= _SOFT else _STRONG_EVIDENCE):
-        sweeps = (_costs(gradients, exponent, other, rises=1) for other in (level / 2, 2 * level))
+        sweeps = crew.map(lambda other: _costs(gradients, exponent, other, rises=1), (level / 2, 2 * level))
         less, more = (_widen(_lowest(sweep), factor) for sweep in sweeps)
         uncertainty = abs(more - less) / 2
     tried = factor * _WIDTHS[: len(costs)]
