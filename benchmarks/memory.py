@@ -404,7 +404,7 @@ def measure_deconvolution(clip: Clip, method: str) -> None:
 
     pixels, threads = clip.height * clip.width, available_cores()
     # Of a periodic image the margin is none.
-    params = DeconvolutionParams(method=method, iterations=20, tolerance=0, channels="each", boundary="periodic")
+    params = DeconvolutionParams(method=method, iterations=60, tolerance=0, channels="each", boundary="periodic")
     work = DeconvolutionWork((clip.height, clip.width), clip.channels, method, params.weights)
     words = []
     with returning_freed(), tempfile.TemporaryDirectory() as name:

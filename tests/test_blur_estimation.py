@@ -1,7 +1,6 @@
 """Widths of known blurs, found blind, and the cost against its definition."""
 
 import threading
-import time
 
 import cv2
 import numpy as np
@@ -137,18 +136,17 @@ def test_the_uncertainty_is_half_of_what_half_and_twice_the_noise_differ_by(sigm
 
 
 def test_two_threads_find_the_same(monkeypatch):
-    image, threads = blurred("camera", 1.5, 0.005), set()
+    image, both = blurred("camera", 1.5, 0.005), threading.Barrier(2, timeout=60)
 
-    def costs(*settings, **more):
-        threads.add(threading.get_ident())
-        # Long enough for the other thread to take the other sweep.
-        time.sleep(0.05)
-        return _costs(*settings, **more)
+    def costs(*settings, rises):
+        if rises == 1:
+            # One thread by itself waits in vain.
+            both.wait()
+        return _costs(*settings, rises)
 
     alone = estimate_blur(image)
     monkeypatch.setattr("turbrestore.blur_estimation._costs", costs)
     together = estimate_blur(image, threads=2)
-    assert len(threads) == 2
     for name in ("sigma", "uncertainty", "noise", "reduction", "evidence"):
         assert getattr(together, name) == getattr(alone, name)
     assert np.array_equal(together.costs, alone.costs)

@@ -16,7 +16,15 @@ from turbrestore.errors import DataError
 from turbrestore.flow_model import SUMMED, add_products, project_deviation
 from turbrestore.frame_noise import _folded, judge_frame, mark_folds, measure_frame_noise, weigh_pixels
 from turbrestore.kalman import PixelGaussian
-from turbrestore.nonlocal_penalty import NonlocalPenalty, add_differences, draw_back
+from turbrestore.nonlocal_penalty import (
+    NonlocalPenalty,
+    _project,
+    _rise,
+    add_differences,
+    draw_back,
+    project_loops,
+    rise_loops,
+)
 from turbrestore.nonlocal_tv import NonlocalParams, add_sums, nonlocal_weights, search_offsets
 from turbrestore.patch_pairs import join_choices, pairs_of_band
 from turbrestore.patch_search import BAND_ROWS, OUTSIDE, PatchSearch, choose_offsets, search_bands
@@ -215,6 +223,17 @@ def test_what_a_step_divides_by_is_alike(real):
     _divide(*slow, transfer, np.float32([2, 30]))
     assert fast == pytest.approx(slow, abs=1e-5)
     assert np.abs(fast - numbers[:2]).max() > 0.1
+
+
+@pytest.mark.parametrize(("loops", "plain", "images"), [(rise_loops, _rise, 2), (project_loops, _project, 4)])
+def test_passes_over_images_of_a_dual_step_are_alike(loops, plain, images):
+    """Both without a compiler, as above."""
+    fast = rng.random((images, 50), np.float32) * 3
+    slow, before = fast.copy(), fast.copy()
+    loops(*fast, np.float32([0.7, 1.8]))
+    plain(*slow, np.float32([0.7, 1.8]))
+    assert fast == pytest.approx(slow, abs=1e-6)
+    assert np.abs(fast - before).max() > 0.1
 
 
 @needs_compiler

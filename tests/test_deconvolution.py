@@ -351,17 +351,17 @@ def test_changes_beside_the_border_are_judged_where_they_do_not_swing(device, me
 class Swinging:
     """A solver that moves every pixel up and down, back where it was after some iterations."""
 
-    window, rest = 10, REST
+    window = 10
 
-    def __init__(self, period, drift=0.0):
-        self.period, self.drift = period, drift
+    def __init__(self, period, swing, drift, rest):
+        self.period, self.swing, self.drift, self.rest = period, swing, drift, rest
 
     def start(self, image):
         return SimpleNamespace(image=image, number=0)
 
     def step(self, problem, state):
         number = state.number + 1
-        level = 0.5 + 0.1 * math.sin(2 * math.pi * number / self.period) + self.drift * number
+        level = 0.5 + self.swing * math.sin(2 * math.pi * number / self.period) + self.drift * number
         return SimpleNamespace(image=0 * state.image + level, number=number)
 
     def penalty(self, problem, u):
@@ -370,22 +370,28 @@ class Swinging:
 
 @pytest.mark.parametrize("device", [None, "cpu"])
 @pytest.mark.parametrize(
-    ("period", "drift", "rest", "stopped"),
-    [(50, 0.0, REST, 50), (25, 0.0, REST, 50), (50, 1e-4, REST, 200), (40, 0.0, REST, 200), (50, 0.0, 0, 200)],
+    ("solver", "iterations", "stopped"),
+    [
+        # Of 0.5, the tolerance is 0.0015, and of what has moved last six times as much is foreseen.
+        (Swinging(40, 0.0007, 0.0, REST), 200, 50),
+        (Swinging(40, 0.0007, 0.0, 0), 200, 200),
+        (Swinging(50, 0.1, 0.0, REST), 200, 200),
+        (Swinging(40, 0.0007, 1e-4, REST), 200, 200),
+        (Swinging(40, 0.0007, 0.0, REST), 45, 45),
+    ],
 )
-def test_an_image_that_is_where_it_was_rests(device, period, drift, rest, stopped):
-    solver, image = Swinging(period, drift), np.full((8, 8), 0.5, np.float32)
-    solver.rest = rest
+def test_an_image_that_stays_where_it_is_rests(device, solver, iterations, stopped):
+    image = np.full((8, 8), 0.5, np.float32)
     problem = Problem(image, np.ones_like(image), np.ones((1, 8, 5), np.float32), 1.0, StripGrid((8, 8)))
-    params = DeconvolutionParams(tolerance=3e-3, iterations=200)
     if device:
         torch = pytest.importorskip("torch")
-        settings = SolverSettings("tv", 200, 3e-3, 10, 40, True, NonlocalParams())
+        settings = SolverSettings("tv", iterations, 3e-3, 10, 40, True, NonlocalParams())
         loaded, start = torch_deconvolution._load(problem, device), solver.start(torch.from_numpy(image))
         found = torch_deconvolution._iterate(solver, [loaded], [start], settings, None)
     else:
+        params = DeconvolutionParams(tolerance=3e-3, iterations=iterations)
         found = deconvolution._iterate(solver, [problem], [solver.start(image)], params, None)
-    assert (found.iterations, found.converged) == (stopped, stopped < 200)
+    assert (found.iterations, found.converged) == (stopped, stopped == 50)
 
 
 def test_of_a_small_image_half_is_judged_however_wide_the_blur(monkeypatch):

@@ -11,6 +11,7 @@ import pytest
 from turbrestore.deconvolution import METHODS, DeconvolutionParams, deconvolve
 from turbrestore.deconvolution_memory import DeconvolutionWork, Room
 from turbrestore.nonlocal_tv import NonlocalParams, nonlocal_weights
+from turbrestore.primal_dual import REST, PrimalDual
 
 SHAPE = (256, 400)
 
@@ -81,7 +82,9 @@ def test_a_deconvolution_keeps_its_limit_on_many_cores(image, tmp_path, monkeypa
 def test_every_method_keeps_what_is_planned(monkeypatch, tmp_path, room, method, channels):
     """Of an image of many strips; mapped pages are not seen here, but by benchmarks/memory.py."""
     image = np.random.default_rng(0).random((600, 800, 3)[: 2 + (channels == 3)], np.float32)
-    params = DeconvolutionParams(method=method, iterations=2, channels="each")
+    # As many earlier images are kept as are looked back to.
+    monkeypatch.setattr(PrimalDual, "window", 1)
+    params = DeconvolutionParams(method=method, iterations=REST + 2, tolerance=0, channels="each")
     work = DeconvolutionWork((640, 840), channels, method, NonlocalParams())
     monkeypatch.setattr("turbrestore.deconvolution.DeconvolutionWork.room", lambda *_: room)
     deconvolve(image[:48, :48], 1.5, params)

@@ -5,7 +5,7 @@ import pytest
 from scipy import fft
 
 from turbrestore import paired_transform
-from turbrestore.paired_transform import descend_loops, paired_descent
+from turbrestore.paired_transform import pair_loops, paired_descent
 from turbrestore.psf import blur_otf, psf_to_otf
 
 
@@ -37,6 +37,6 @@ def test_loops_run_without_a_compiler_too():
     numbers = np.random.default_rng(2).normal(size=(2, 5, 6)).astype(np.float32)
     spectrum, transfer = numbers[0] + 1j * numbers[1], transfer_of((5, 6), True)
     found = np.empty((5, 6), np.complex64), np.empty((5, 6), np.complex64)
-    for loops, descent in zip((descend_loops, paired_transform._descend), found, strict=True):
+    for loops, descent in zip((pair_loops, paired_transform._pair), found, strict=True):
         loops(spectrum.astype(np.complex64), transfer, np.float32([2, 60]), descent)
     assert found[0] == pytest.approx(found[1], abs=1e-5)

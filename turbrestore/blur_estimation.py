@@ -173,7 +173,7 @@ def estimate_blur(
     exponent : float
         Shape of the blur, 1 to 2: 5/3 for images fused from turbulent frames, 2 for a Gaussian.
     threads : int
-        With two, widths at half and at twice the noise are found side by side, to the same result.
+        At least 1; with two, widths at half and at twice the noise are found side by side, to the same result.
 
     Returns
     -------
@@ -204,8 +204,7 @@ def estimate_blur(
         return BlurEstimate(0.0, float("inf"), exponent, noise or 0.0, 1, 0.0, np.zeros(0), np.zeros(0))
     factors = [factor for factor in _REDUCTIONS if factor == 1 or min(grey.shape) >= factor * _SMALLEST_SIDE]
     with one_thread_each(), Crew(threads) as crew:
-        # Reductions one after the other: where few pixels are transformed at a time, threads mostly wait for each
-        # other's interpreter lock.
+        # Reductions one after the other: most of the time goes into one of them, and a second thread would disturb it.
         estimates = [_estimate_reduced(grey, factor, exponent, noise, crew) for factor in factors]
     convincing = [one for one in estimates if np.isfinite(one.uncertainty)]
     if convincing:

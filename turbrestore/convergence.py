@@ -17,8 +17,10 @@ q : ratio of the changes of two windows in succession, the mean of the last ones
 The changes to come are continued as a geometric series, ``d (q + q² + …) = d q / (1 − q)``.  A q near 1 is known too
 badly for that: no more is foreseen than ``MOST`` times the last change, and that much as long as q is not known.
 
-That is too much where an image swings: it goes as far back as it went.  So it also rests when it is where it was some
-windows ago (``turbrestore.primal_dual.REST``), by the same tolerance.
+That is too much where an image swings: it goes as far back as it went.  So primal-dual splitting also ends where the
+image rests, that is, where all images of the last windows (``turbrestore.primal_dual.REST``) differ from it by no more
+than the tolerance.  Neither rule is a bound: that what is left can hardly be seen is measured
+(``benchmarks/stopping.py``), and what drifts very slowly may rest.
 """
 
 from __future__ import annotations

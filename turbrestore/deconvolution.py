@@ -102,9 +102,10 @@ class DeconvolutionParams:
     iterations : int
         Largest number of iterations.
     tolerance : float
-        Stop when no tile of 64×64 pixels is foreseen to change by this any more, relative to the brightest tile, or,
-        of nltv and tv, whose images swing about the one that they approach, when none has changed by more since fifty
-        iterations ago; see ``turbrestore.convergence``.  Of these, ten iterations are judged together, else two.
+        Stop when no tile of 64×64 pixels is foreseen to change by this any more, relative to the brightest tile; see
+        ``turbrestore.convergence``.  Of nltv and tv, whose images swing about the one that they approach, ten
+        iterations are judged together, else two, and they stop too when for fifty iterations no tile has been further
+        than this from what it is.
     boundary : {"unknown", "periodic"}
         What lies beyond the border: pixels to be found, or the image itself.
     channels : {"luminance", "each"}
@@ -176,7 +177,7 @@ class Deconvolution:
     iterations : int
         Iterations that were run.
     converged : bool
-        Whether less than the tolerance was still to come.
+        Whether less than the tolerance was still to come, or the image rested.
     recorded : ndarray, int64, shape (n,)
         Iterations at which the next two were recorded.
     objective : ndarray, float64, shape (n,)
@@ -471,11 +472,14 @@ def _iterate(
             images = [state.image for state in states]
             moved.append(_change(earlier[-1], images, problems[0]) * solver.window / (iteration - begun))
             converged = still_to_come(moved) <= params.tolerance
-            if not converged and len(earlier) == solver.rest:
-                converged = _change(earlier[0], images, problems[0]) <= params.tolerance
+            if not converged and len(earlier) == solver.rest and iteration % solver.window == 0:
+                converged = all(_change(old, images, problems[0]) <= params.tolerance for old in earlier)
             last |= converged
             begun = iteration
             if not last:
+                if len(earlier) == earlier.maxlen:
+                    # Its memory is free for the next.
+                    earlier.popleft()
                 earlier.append([grid.copied(u) for u in images])
         if last or iteration % _RECORD_EVERY == 0:
             energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))

@@ -92,7 +92,6 @@ class NonlocalPenalty:
         What is in the image is lost.
         """
         loops, factor, change = compiled(add_differences), dual.factor.ravel(), dual.lagged.ravel()
-
         shares = np.array([step, relaxation], np.float32)
         rise, project = compiled(rise_loops) or _rise, compiled(project_loops) or _project
 

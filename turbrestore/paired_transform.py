@@ -13,7 +13,8 @@ Bu are joined likewise::
     F[q](k) = (Z(k) + Z*(−k)) / 2,  F[Kᵀp](k) = (Z(k) − Z*(−k)) / 2i
     W(k) = D(k) + i H(k) D(k),  W(−k) = D*(k) + i (H D)*(k)
 
-OpenCV transforms small complex images in a third of the time that SciPy takes for two real ones.
+OpenCV transforms a complex image of 144² in a third of the time that SciPy takes for two real ones, of 480² in six
+tenths.
 """
 
 from __future__ import annotations
@@ -44,22 +45,23 @@ def paired_descent(
     Returns
     -------
     ndarray, float32, shape (P, Q, 2)
+        The last axis holds the descent, and B of it.
 
     Examples
     --------
-    >>> down = paired_descent(np.zeros((2, 2), np.float32), np.eye(2, dtype=np.float32), np.ones((2, 2)), 1.0, 3.0)
-    >>> down[..., 0]
+    >>> pressure, transfer = np.zeros((2, 2), np.float32), np.ones((2, 2), np.float32)
+    >>> paired_descent(pressure, np.eye(2, dtype=np.float32), transfer, 1.0, 3.0)[..., 0]
     array([[0.25, 0.  ],
            [0.  , 0.25]], dtype=float32)
     """
     found: NDArray[np.complex64] = _joined(cv2.dft(np.dstack([pressure, pull])))
     descent = np.empty_like(found)
     scales = np.array([2 * floor, 2 * weight], np.float32)
-    (compiled(descend_loops) or _descend)(found, transfer, scales, descent)
+    (compiled(pair_loops) or _pair)(found, transfer, scales, descent)
     return np.asarray(cv2.dft(_parted(descent), flags=cv2.DFT_INVERSE | cv2.DFT_SCALE), np.float32)
 
 
-def descend_loops(
+def pair_loops(
     spectrum: NDArray[np.complex64], transfer: Spectrum, scales: FloatArray, descent: NDArray[np.complex64]
 ) -> None:
     """From Z to W; to be compiled.
@@ -78,7 +80,7 @@ def descend_loops(
     Examples
     --------
     >>> descent = np.zeros((1, 1), np.complex64)
-    >>> descend_loops(np.complex64([[6 + 4j]]), np.float32([[0.5]]), np.float32([2, 8]), descent)
+    >>> pair_loops(np.complex64([[6 + 4j]]), np.float32([[0.5]]), np.float32([2, 8]), descent)
     >>> descent
     array([[3.5+1.75j]], dtype=complex64)
     """
@@ -97,10 +99,10 @@ def descend_loops(
             descent[opposite, mirror] = complex(down.real + drop.imag, drop.real - down.imag)
 
 
-def _descend(
+def _pair(
     spectrum: NDArray[np.complex64], transfer: Spectrum, scales: FloatArray, descent: NDArray[np.complex64]
 ) -> None:
-    """:func:`descend_loops` by NumPy."""
+    """:func:`pair_loops` by NumPy."""
     (height, width), half = spectrum.shape, transfer.shape[1]
     mirror = np.ix_(-np.arange(height) % height, -np.arange(half) % width)
     other, one = spectrum[mirror].conj(), spectrum[:, :half]

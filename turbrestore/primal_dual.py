@@ -26,7 +26,7 @@ The start is the Wiener solution by conjugate gradients, which has a good margin
 that one step from 0 gives.
 
 An iteration transforms four times: Bu follows u without transforms of its own, since what u moves by is found in
-Fourier.
+Fourier.  Of an image that is one strip, it transforms two images at a time (:mod:`turbrestore.paired_transform`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ PRIMAL_STEP = 0.08
 LEAST_DATA_STEP = 0.02
 # Iterations that are judged together: over as many, most of what swings cancels, and what drifts does not.
 WINDOW = 10
-# As many windows back, an image that rests was where it is: longer than it swings for.
+# An image rests where it has stayed for so many windows.
 REST = 5
 
 

@@ -205,8 +205,8 @@ def _iterate(
             images = [state.image for state in states]
             moved.append(_change(earlier[-1], images, problems[0].weight) * solver.window / (iteration - begun))
             converged = still_to_come(moved) <= settings.tolerance
-            if not converged and len(earlier) == solver.rest:
-                converged = _change(earlier[0], images, problems[0].weight) <= settings.tolerance
+            if not converged and len(earlier) == solver.rest and iteration % solver.window == 0:
+                converged = all(_change(old, images, problems[0].weight) <= settings.tolerance for old in earlier)
             last |= converged
             begun = iteration
             earlier.append(images)
