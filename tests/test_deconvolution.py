@@ -376,7 +376,7 @@ class Swinging:
         (Swinging(40, 0.0007, 0.0, REST), 200, 50),
         (Swinging(40, 0.0007, 0.0, 0), 200, 200),
         (Swinging(50, 0.1, 0.0, REST), 200, 200),
-        (Swinging(40, 0.0007, 1e-4, REST), 200, 200),
+        (Swinging(40, 0.0, 1e-4, REST), 200, 200),
         (Swinging(40, 0.0007, 0.0, REST), 45, 45),
     ],
 )
