@@ -3,9 +3,9 @@
 Run ``python benchmarks/deconvolution.py``; it prints tables and exits with 1 when a bound is broken.  Ratios are to
 work that any implementation has to do, taken in the same process and in turn: comparing every pixel with those of its
 search window, shift by shift, and four Fourier transforms of a real image, as many as an iteration needs.  Iterations
-and transforms use more threads where the image is large, and no more than two cores.  Of repeated runs the fastest counts, for others may use
-the machine, and of iterations the median.  Peak memory is that of child processes, which begin with that of the process
-that starts them, so it is measured first.
+and transforms use more threads where the image is large, and no more than two cores.  Of repeated runs the fastest
+counts, for others may use the machine, and of iterations the median.  Peak memory is that of child processes, which
+begin with that of the process that starts them, so it is measured first.
 """
 
 from __future__ import annotations
