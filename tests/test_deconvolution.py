@@ -1,25 +1,21 @@
-"""Solvers against dense algebra, brute force and the Euler–Lagrange equations; the border; stopping; settings."""
+"""Solvers against dense algebra, brute force and the Euler–Lagrange equations; the border; settings."""
 
 import dataclasses
 import itertools
-import math
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from blurred_images import camera, in_strips, psnr
 from regulariser import Regulariser
 from scipy import fft, optimize
-from skimage import data
 
-from turbrestore import deconvolution, primal_dual, torch_deconvolution
+from turbrestore import primal_dual
 from turbrestore.blur_estimation import BlurEstimate
 from turbrestore.conjugate_gradients import ConjugateGradients
-from turbrestore.convergence import still_to_come
 from turbrestore.convolution_problem import Problem
 from turbrestore.deconvolution import (
     BOUNDARIES,
-    MARGIN_SIGMAS,
     METHODS,
     DeconvolutionParams,
     automatic_fidelity,
@@ -30,12 +26,10 @@ from turbrestore.errors import ConfigurationError, DataError
 from turbrestore.local_tv import LocalPenalty, local_divergence, local_gradient
 from turbrestore.nonlocal_penalty import NonlocalPenalty
 from turbrestore.nonlocal_tv import NonlocalParams, nonlocal_gradient, nonlocal_magnitude, nonlocal_weights
-from turbrestore.planes import margin_widths
-from turbrestore.primal_dual import REST, PrimalDual, PrimalDualState
-from turbrestore.psf import KOLMOGOROV, blur_otf, gaussian_otf, gaussian_psf, laplacian_symbol, psf_to_otf
+from turbrestore.primal_dual import PrimalDual, PrimalDualState
+from turbrestore.psf import gaussian_otf, gaussian_psf, laplacian_symbol, psf_to_otf
 from turbrestore.strip_grid import StripGrid
 from turbrestore.synthesis.scenes import SCENES
-from turbrestore.torch_deconvolution import SolverSettings
 
 TV = Regulariser(
     local_gradient,
@@ -74,19 +68,6 @@ def solve(solver: PrimalDual, problem: Problem, iterations: int) -> np.ndarray:
     for _ in range(iterations):
         state = solver.step(problem, state)
     return state.image
-
-
-def camera(size: int, sigma: float, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Photograph, and a crop of it after blur and noise of a larger scene."""
-    scene = data.camera()[40 : 40 + size + 48, 100 : 100 + size + 48].astype(np.float32) / 255
-    blurred = cv2.GaussianBlur(scene, (0, 0), sigma)
-    blurred += np.random.default_rng(seed).normal(0, noise, scene.shape).astype(np.float32)
-    inside = slice(24, 24 + size)
-    return scene[inside, inside], blurred[inside, inside]
-
-
-def psnr(image: np.ndarray, truth: np.ndarray) -> float:
-    return float(-10 * np.log10(np.mean((image - truth) ** 2)))
 
 
 # --- operators -------------------------------------------------------------------------------------------------------
@@ -269,144 +250,6 @@ def test_optimum_solves_the_euler_lagrange_equation_of_the_paper():
     assert np.abs(data_slope + curvature)[regular].max() < 0.02
 
 
-@pytest.mark.parametrize(
-    ("method", "scene", "noise", "size", "most"),
-    [
-        ("nltv", "camera", 0.01, 64, 60),
-        ("nltv", "chart", 0.03, 64, 60),
-        ("nltv", "words", 0.002, 64, 100),
-        # The border cuts letters in two.
-        ("nltv", "words", 0.002, 128, 160),
-        ("nltv", "brick", 0.002, 128, 230),
-        # Bars that the blur has all but extinguished.
-        ("nltv", "chart", 0.002, 256, 360),
-        ("tv", "camera", 0.002, 64, 60),
-        ("tv", "words", 0.03, 64, 60),
-        ("tv", "words", 0.002, 128, 60),
-        ("wiener", "words", 0.002, 64, 40),
-        ("tikhonov", "chart", 0.01, 64, 60),
-    ],
-)
-def test_stopping_rule_is_as_good_as_two_thousand_iterations(method, scene, noise, size, most):
-    sigma, params = 1.5, DeconvolutionParams(method=method, exponent=KOLMOGOROV)
-    larger = SCENES[scene](size + 32, size + 32)
-    blurred = fft.irfft2(blur_otf(larger.shape, sigma, KOLMOGOROV) * fft.rfft2(larger), s=larger.shape)
-    blurred += np.random.default_rng(0).normal(0, noise, larger.shape)
-    inside = (slice(16, 16 + size), slice(16, 16 + size))
-    truth, seen = larger[inside], blurred[inside].astype(np.float32)
-    stopped = deconvolve(seen, sigma, params)
-    exhaustive = deconvolve(seen, sigma, dataclasses.replace(params, iterations=2000, tolerance=0))
-    assert stopped.converged
-    assert stopped.iterations <= most
-    assert exhaustive.iterations > stopped.iterations
-    assert abs(psnr(stopped.image, truth) - psnr(exhaustive.image, truth)) < 0.05
-    assert exhaustive.objective[-1] < exhaustive.objective[0]
-
-
-@pytest.mark.parametrize("strips", [False, True])
-def test_ten_iterations_are_judged_together_where_they_change_most(monkeypatch, strips):
-    if strips:
-        in_strips(monkeypatch)
-    # Without a margin, so that tiles are those of the image; what overshoots black is clipped, and does not count.
-    blurred = np.random.default_rng(1).normal(0.5, 0.01, (128, 128)).astype(np.float32)
-    blurred[8:56, 72:120] += 0.3 * (camera(48, 1.5, 0.002)[1] - 0.5)
-    params, numbers = DeconvolutionParams(boundary="periodic", tolerance=0), (40, 50, 55)
-    images = {n: deconvolve(blurred, 1.5, dataclasses.replace(params, iterations=n)).image for n in numbers}
-    result = deconvolve(blurred, 1.5, dataclasses.replace(params, iterations=55))
-    assert result.recorded.tolist() == [10, 20, 30, 40, 50, 55]
-    tiles = [(slice(y, y + 64), slice(x, x + 64)) for y in (0, 64) for x in (0, 64)]
-    for number, (before, after) in zip((4, 5), itertools.pairwise(numbers), strict=True):
-        moved = max(np.linalg.norm((images[after] - images[before])[tile]) for tile in tiles)
-        size = max(np.linalg.norm(images[after][tile]) for tile in tiles)
-        assert result.changes[number] == pytest.approx(moved / size / (after - before), rel=0.02)
-    foreseen = np.array([still_to_come(10 * result.changes[:count]) for count in range(1, 6)])
-    for tolerance in (1.001 * foreseen.min(), 0.999 * foreseen.min(), 1.001 * np.median(foreseen)):
-        stopped = deconvolve(blurred, 1.5, dataclasses.replace(params, iterations=50, tolerance=tolerance))
-        enough = foreseen <= tolerance
-        assert stopped.converged == enough.any()
-        assert stopped.iterations == (10 * (1 + int(enough.argmax())) if enough.any() else 50)
-
-
-@pytest.mark.parametrize("device", [None, "cpu:0"])
-@pytest.mark.parametrize(("method", "numbers", "rim"), [("nltv", (130, 140), 3), ("wiener", (4, 6), 0)])
-def test_changes_beside_the_border_are_judged_where_they_do_not_swing(device, method, numbers, rim):
-    if device:
-        pytest.importorskip("torch")
-    _, blurred = camera(96, 2.5, 0.002)
-    params = DeconvolutionParams(method=method, tolerance=0, device=device)
-    runs = [deconvolve(blurred, 2.5, dataclasses.replace(params, iterations=number)) for number in numbers]
-    before, after = (run.image for run in runs)
-
-    def largest(image, left_out):
-        """Root of the largest sum of squares of a tile of the image with its margin."""
-        inner = np.pad(image[left_out : 96 - left_out, left_out : 96 - left_out], left_out)
-        padded = np.pad(inner, margin_widths((96, 96), math.ceil(MARGIN_SIGMAS * 2.5)))
-        return max(np.linalg.norm(padded[y : y + 64, x : x + 64]) for y in (0, 64) for x in (0, 64))
-
-    moved, inside, everywhere = (largest(after - before, left_out) for left_out in (rim, 3, 0))
-    assert runs[1].changes[-1] == pytest.approx(moved / largest(after, rim) / (numbers[1] - numbers[0]), rel=0.02)
-    assert everywhere > 1.3 * inside
-
-
-class Swinging:
-    """A solver that moves every pixel up and down, back where it was after some iterations."""
-
-    window = 10
-
-    def __init__(self, period, swing, drift, rest):
-        self.period, self.swing, self.drift, self.rest = period, swing, drift, rest
-
-    def start(self, image):
-        return SimpleNamespace(image=image, number=0)
-
-    def step(self, problem, state):
-        number = state.number + 1
-        level = 0.5 + self.swing * math.sin(2 * math.pi * number / self.period) + self.drift * number
-        return SimpleNamespace(image=0 * state.image + level, number=number)
-
-    def penalty(self, problem, u):
-        return 0.0
-
-
-@pytest.mark.parametrize("device", [None, "cpu"])
-@pytest.mark.parametrize(
-    ("solver", "iterations", "stopped"),
-    [
-        # Of 0.5, the tolerance is 0.0015, and of what has moved last six times as much is foreseen.
-        (Swinging(40, 0.0007, 0.0, REST), 200, 50),
-        (Swinging(40, 0.0007, 0.0, 0), 200, 200),
-        (Swinging(50, 0.1, 0.0, REST), 200, 200),
-        (Swinging(40, 0.0, 1e-4, REST), 200, 200),
-        (Swinging(40, 0.0007, 0.0, REST), 45, 45),
-    ],
-)
-def test_an_image_that_stays_where_it_is_rests(device, solver, iterations, stopped):
-    image = np.full((8, 8), 0.5, np.float32)
-    problem = Problem(image, np.ones_like(image), np.ones((1, 8, 5), np.float32), 1.0, StripGrid((8, 8)))
-    if device:
-        torch = pytest.importorskip("torch")
-        settings = SolverSettings("tv", iterations, 3e-3, 10, 40, True, NonlocalParams())
-        loaded, start = torch_deconvolution._load(problem, device), solver.start(torch.from_numpy(image))
-        found = torch_deconvolution._iterate(solver, [loaded], [start], settings, None)
-    else:
-        params = DeconvolutionParams(tolerance=3e-3, iterations=iterations)
-        found = deconvolution._iterate(solver, [problem], [solver.start(image)], params, None)
-    assert (found.iterations, found.converged) == (stopped, stopped == 50)
-
-
-def test_of_a_small_image_half_is_judged_however_wide_the_blur(monkeypatch):
-    judged = []
-
-    def change(before, after, problem):
-        judged.append(problem.judged)
-        return 1.0
-
-    monkeypatch.setattr("turbrestore.deconvolution._change", change)
-    image = np.random.default_rng(0).random((16, 24), np.float32)
-    deconvolve(image, 40.0, DeconvolutionParams(method="tv", iterations=10))
-    assert [axis.sum() for axis in judged[0]] == [8, 16]
-
-
 # --- memory and threads ----------------------------------------------------------------------------------------------
 
 
@@ -424,12 +267,6 @@ def test_pairs_in_a_file_give_the_same_image(monkeypatch, tmp_path):
     assert any(isinstance(values.base, np.memmap) and values.shape[0] == 2 for values in held)
     assert np.abs(parts.image - whole.image).max() < 1e-5
     assert list(tmp_path.iterdir()) == []
-
-
-def in_strips(monkeypatch):
-    monkeypatch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
-    monkeypatch.setattr("turbrestore.strip_grid._STRIP", 700)
-    monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 700)
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
