@@ -9,7 +9,7 @@ import pytest
 
 from turbrestore.arrays import luminance
 from turbrestore.blind import remove_blur
-from turbrestore.blur_estimation import estimate_blur
+from turbrestore.blur_estimation import choose_blur, estimate_blur, find_candidates
 from turbrestore.blur_map import deconvolve_varying, estimate_blur_map, sigma_map
 from turbrestore.deconvolution import DeconvolutionParams, deconvolve
 from turbrestore.metrics import psnr
@@ -55,6 +55,26 @@ def test_a_blur_that_grows_to_the_right_is_found_and_removed(brick):
 def test_a_blur_that_is_the_same_everywhere_is_taken_as_one(name):
     _, image, _ = blurred(name, 1.4, 1.4)
     assert not estimate_blur_map(image, estimate_blur(image, exponent=2.0)).varies
+
+
+@pytest.mark.parametrize(("name", "right", "agree"), [("camera", 1.4, True), ("brick", 2.6, False)])
+def test_how_sure_widths_are_is_asked_only_where_they_may_differ(monkeypatch, name, right, agree):
+    _, image, _ = blurred(name, 1.4 if agree else 0.8, right)
+    asked = []
+
+    def counted(*arguments):
+        asked.append(arguments)
+        return choose_blur(*arguments)
+
+    monkeypatch.setattr("turbrestore.blur_map.choose_blur", counted)
+    whole = estimate_blur(image, exponent=2.0)
+    found = estimate_blur_map(image, whole)
+    assert (asked == []) == agree
+    assert np.isinf(found.uncertainties).all() == agree
+    monkeypatch.setattr("turbrestore.blur_map._agree", lambda tiles: False)
+    surely = estimate_blur_map(image, whole)
+    assert found.varies == surely.varies == (not agree)
+    assert found.sigmas == pytest.approx(surely.sigmas, rel=0.3 if agree else 0)
 
 
 def test_true_widths_beat_every_single_width(brick):
@@ -150,14 +170,13 @@ def test_widths_and_deconvolution_do_not_wait_for_each_other(monkeypatch):
 
 def test_after_an_interrupt_nobody_waits_for_all_tiles(monkeypatch):
     _, image, _ = blurred("brick", 1.4, 1.4)
-    tiles, whole = [], estimate_blur(image, exponent=2.0)
-    begun = threading.Event()
+    tiles, begun = [], threading.Event()
 
     def estimated(tile, **settings):
         tiles.append(tile)
         begun.set()
         interrupted.wait(20)
-        return whole
+        return find_candidates(tile, **settings)
 
     def interrupt(*_):
         begun.wait(20)
@@ -165,7 +184,7 @@ def test_after_an_interrupt_nobody_waits_for_all_tiles(monkeypatch):
         raise KeyboardInterrupt
 
     interrupted = threading.Event()
-    monkeypatch.setattr("turbrestore.blur_map.estimate_blur", estimated)
+    monkeypatch.setattr("turbrestore.blur_map.find_candidates", estimated)
     monkeypatch.setattr("turbrestore.blind.deconvolve", interrupt)
     with pytest.raises(KeyboardInterrupt):
         remove_blur(image, image, WIENER)

@@ -21,6 +21,7 @@ from turbrestore.nonlocal_penalty import (
     _project,
     _rise,
     add_differences,
+    add_squares,
     draw_back,
     project_loops,
     rise_loops,
@@ -162,6 +163,7 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
     "loops",
     [
         add_differences,
+        add_squares,
         add_products,
         add_sums,
         choose_offsets,

@@ -159,6 +159,30 @@ class BlurEstimate:
         return max(self.sigma - _CAUTION * self.uncertainty, 0.0) if self.sigma > 0 else 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class BlurCandidate:
+    """Blur found in a reduced image, if it is one that convinces.
+
+    Attributes
+    ----------
+    estimate : BlurEstimate
+        Its uncertainty is infinite as long as it is not known.
+    part : ndarray, float32, shape (h, w)
+        What was looked at of the reduced image.
+    """
+
+    estimate: BlurEstimate
+    part: FloatArray
+
+    @property
+    def convinces(self) -> bool:
+        """Whether the width is resolved, and a scene blurred by it clearly likelier than a sharp one."""
+        found = self.estimate
+        lowest = _lowest(found.costs)
+        resolved = lowest < _WIDTHS[-1] and (found.reduction == 1 or lowest >= _RESOLVED)
+        return resolved and found.evidence >= (_EVIDENCE if found.sigma >= _SOFT else _STRONG_EVIDENCE)
+
+
 def estimate_blur(
     image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV, threads: int = 1
 ) -> BlurEstimate:
@@ -194,6 +218,39 @@ def estimate_blur(
     >>> bool(1.7 < estimate_blur(blurred, exponent=2.0).sigma < 2.3)
     True
     """
+    with one_thread_each(), Crew(threads) as crew:
+        return choose_blur(find_candidates(image, noise, exponent), noise, exponent, crew)
+
+
+def find_candidates(
+    image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV
+) -> tuple[BlurCandidate, ...]:
+    """Find the likeliest blur of the image and of each of its reductions, but not yet how sure it is.
+
+    Parameters
+    ----------
+    image, noise, exponent
+        See :func:`estimate_blur`.
+
+    Returns
+    -------
+    tuple of BlurCandidate
+        Empty where the image says nothing.
+
+    Raises
+    ------
+    DataError
+        Wrong shape or values that are not finite.
+    ConfigurationError
+        ``noise`` is negative or not finite, or ``exponent`` outside 1 to 2.
+
+    Examples
+    --------
+    >>> from turbrestore.synthesis.scenes import SCENES
+    >>> blurred = cv2.GaussianBlur(SCENES["camera"](128, 128), (0, 0), 2.0)
+    >>> [(one.estimate.reduction, one.convinces) for one in find_candidates(blurred, exponent=2.0)]
+    [(1, True), (2, True)]
+    """
     grey = luminance(check_image(image))
     require(
         noise is None or (np.isfinite(noise) and noise >= 0),
@@ -201,15 +258,44 @@ def estimate_blur(
     )
     check_exponent(exponent)
     if min(grey.shape) < _SMALLEST_IMAGE or np.ptp(grey) <= _LEAST_NOISE:
-        return BlurEstimate(0.0, float("inf"), exponent, noise or 0.0, 1, 0.0, np.zeros(0), np.zeros(0))
+        return ()
     factors = [factor for factor in _REDUCTIONS if factor == 1 or min(grey.shape) >= factor * _SMALLEST_SIDE]
-    with one_thread_each(), Crew(threads) as crew:
-        # Reductions one after the other: most of the time goes into one of them, and a second thread would disturb it.
-        estimates = [_estimate_reduced(grey, factor, exponent, noise, crew) for factor in factors]
-    convincing = [one for one in estimates if np.isfinite(one.uncertainty)]
+    return tuple(_find_candidate(grey, factor, exponent, noise) for factor in factors)
+
+
+def choose_blur(
+    candidates: tuple[BlurCandidate, ...], noise: float | None, exponent: float, crew: Crew
+) -> BlurEstimate:
+    """Choose the candidate whose width depends least on the noise assumed.
+
+    Parameters
+    ----------
+    candidates : tuple of BlurCandidate
+        Of :func:`find_candidates`.
+    noise : float or None
+        As it was given there.
+    exponent : float
+        Likewise.
+    crew : Crew
+        Finds widths at half and at twice the noise side by side.
+
+    Returns
+    -------
+    BlurEstimate
+
+    Examples
+    --------
+    >>> with Crew(1) as crew:
+    ...     choose_blur((), None, KOLMOGOROV, crew).sigma
+    0.0
+    """
+    if not candidates:
+        return BlurEstimate(0.0, float("inf"), exponent, noise or 0.0, 1, 0.0, np.zeros(0), np.zeros(0))
+    # Reductions one after the other: most of the time goes into one of them, and a second thread would disturb it.
+    convincing = [_with_uncertainty(one, crew) for one in candidates if one.convinces]
     if convincing:
         return min(convincing, key=_doubt)
-    return replace(estimates[0], sigma=float(_WIDTHS[0]), uncertainty=_PIXEL_UNCERTAINTY)
+    return replace(candidates[0].estimate, sigma=float(_WIDTHS[0]), uncertainty=_PIXEL_UNCERTAINTY)
 
 
 def _doubt(estimate: BlurEstimate) -> float:
@@ -223,20 +309,22 @@ def _doubt(estimate: BlurEstimate) -> float:
     return preference * estimate.uncertainty / estimate.sigma
 
 
-def _estimate_reduced(grey: FloatArray, factor: int, exponent: float, noise: float | None, crew: Crew) -> BlurEstimate:
-    """Estimate from one reduced image; the uncertainty is infinite where it does not convince."""
+def _find_candidate(grey: FloatArray, factor: int, exponent: float, noise: float | None) -> BlurCandidate:
     reduced = _reduce(grey, factor)
-    gradients, level = _gradients(_most_detailed(reduced)), _effective_noise(reduced, factor, noise)
-    costs = _costs(gradients, exponent, level, rises=2)
-    evidence, lowest = float(costs[0] - costs.min()), _lowest(costs)
-    width, uncertainty = _widen(lowest, factor), float("inf")
-    resolved = lowest < _WIDTHS[-1] and (factor == 1 or lowest >= _RESOLVED)
-    if resolved and evidence >= (_EVIDENCE if width >= _SOFT else _STRONG_EVIDENCE):
-        sweeps = crew.map(lambda other: _costs(gradients, exponent, other, rises=1), (level / 2, 2 * level))
-        less, more = (_widen(_lowest(sweep), factor) for sweep in sweeps)
-        uncertainty = abs(more - less) / 2
+    # A copy, so that the reduced image is not kept.
+    part, level = _most_detailed(reduced).copy(), _effective_noise(reduced, factor, noise)
+    costs = _costs(_gradients(part), exponent, level, rises=2)
+    evidence, width = float(costs[0] - costs.min()), _widen(_lowest(costs), factor)
     tried = factor * _WIDTHS[: len(costs)]
-    return BlurEstimate(width, uncertainty, exponent, level, factor, evidence, tried, costs)
+    return BlurCandidate(BlurEstimate(width, float("inf"), exponent, level, factor, evidence, tried, costs), part)
+
+
+def _with_uncertainty(candidate: BlurCandidate, crew: Crew) -> BlurEstimate:
+    found, gradients = candidate.estimate, _gradients(candidate.part)
+    levels = found.noise / 2, 2 * found.noise
+    sweeps = crew.map(lambda level: _costs(gradients, found.exponent, level, rises=1), levels)
+    less, more = (_widen(_lowest(sweep), found.reduction) for sweep in sweeps)
+    return replace(found, uncertainty=abs(more - less) / 2)
 
 
 def _effective_noise(reduced: FloatArray, factor: int, noise: float | None) -> float:

@@ -3,12 +3,15 @@
 A scene in depth, or air that is rougher near the ground, blurs parts of an image differently.  Widths of single tiles
 are less sure than that of the whole, so they are used only where they differ by more than their uncertainties allow.
 A tile without texture says nothing, and has the width of the whole.
+
+How sure a width is takes twice the time of the width, and is asked only where it matters: the width of a tile is one of
+those of its reductions, and where all of them agree those that would be chosen do too.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import FloatArray, check_image, luminance
-from .blur_estimation import BlurEstimate, estimate_blur
+from .blur_estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidates
 from .deconvolution import Deconvolution
 from .halo_tiles import new_mosaic
-from .parallel import one_thread_each
+from .parallel import Crew, one_thread_each
 from .psf import estimate_noise
 from .scratch import release
 
@@ -47,7 +50,7 @@ class BlurMap:
     sigmas : ndarray, float64, shape (rows, columns)
         Width found in each tile, pixels; that of the whole image where the tile says nothing.
     uncertainties : ndarray, float64, shape (rows, columns)
-        Their standard deviations, pixels.
+        Their standard deviations, pixels; infinite where they were not needed to see that widths do not differ.
     varies : bool
         Whether the widths differ clearly.
     """
@@ -99,18 +102,24 @@ def estimate_blur_map(
     if len(rows) == 1 or len(columns) == 1:
         return None
     noise, shape = estimate_noise(grey), (len(rows), len(columns))
-    sigmas, uncertainties = np.full(shape, whole.sigma), np.full(shape, whole.uncertainty)
-    spoken = np.zeros(shape, bool)
-    with one_thread_each():
+    found = dict[tuple[int, ...], tuple[BlurCandidate, ...]]()
+    with one_thread_each(), Crew(1) as crew:
         for place in np.ndindex(shape):
             if given_up is not None and given_up():
                 return None
             tile = np.ascontiguousarray(grey[rows[place[0]], columns[place[1]]])
-            estimate = estimate_blur(tile, exponent=whole.exponent)
-            known = np.isfinite(estimate.uncertainty)
-            if known and (estimate.blurred or _fine_detail(tile) > _DETAIL * noise):
-                sigmas[place], uncertainties[place], spoken[place] = estimate.sigma, estimate.uncertainty, True
-    return BlurMap(sigmas, uncertainties, _clearly_differ(sigmas[spoken], uncertainties[spoken]))
+            candidates = find_candidates(tile, exponent=whole.exponent)
+            if any(one.convinces for one in candidates) or (candidates and _fine_detail(tile) > _DETAIL * noise):
+                found[place] = candidates
+        sigmas, uncertainties = np.full(shape, whole.sigma), np.full(shape, whole.uncertainty)
+        agree = _agree(found.values())
+        for place, candidates in found.items():
+            if given_up is not None and given_up():
+                return None
+            chosen = _like(whole, candidates) if agree else choose_blur(candidates, None, whole.exponent, crew)
+            sigmas[place], uncertainties[place] = chosen.sigma, chosen.uncertainty
+    spoken = tuple(np.array(list(found), int).reshape(-1, 2).T)
+    return BlurMap(sigmas, uncertainties, not agree and _clearly_differ(sigmas[spoken], uncertainties[spoken]))
 
 
 def sigma_map(tiles: ArrayLike, shape: tuple[int, int]) -> FloatArray:
@@ -202,6 +211,22 @@ def _fine_detail(tile: FloatArray) -> float:
     """Deviation of what the mask of the noise estimate lets through; that of the noise where there is nothing else."""
     second = np.array([1, -2, 1], np.float32)
     return float(cv2.sepFilter2D(tile, cv2.CV_32F, second, second).std()) / 6
+
+
+def _agree(tiles: Iterable[tuple[BlurCandidate, ...]]) -> bool:
+    """Whether all widths that may be chosen are too near to each other to differ clearly."""
+    convincing = [[one.estimate.sigma for one in tile if one.convinces] for tile in tiles]
+    if not all(convincing):
+        # One looks sharp.
+        return False
+    widths = [width for tile in convincing for width in tile]
+    return not widths or max(widths) <= _CLEAR_FACTOR * min(widths)
+
+
+def _like(whole: BlurEstimate, candidates: tuple[BlurCandidate, ...]) -> BlurEstimate:
+    """Estimate from the reduction nearest to that which decided of the whole."""
+    convincing = (one.estimate for one in candidates if one.convinces)
+    return min(convincing, key=lambda estimate: abs(estimate.reduction - whole.reduction))
 
 
 def _clearly_differ(sigmas: np.ndarray, uncertainties: np.ndarray) -> bool:

@@ -142,14 +142,12 @@ class NonlocalPenalty:
 
     def value(self, image: FloatArray) -> float:
         """J[u]."""
-        flat, loops, (total,) = image.ravel(), compiled(add_differences), self._images(1)
+        flat, loops, (total,) = image.ravel(), compiled(add_squares), self._images(1)
 
         def squares(_: int, strip: EdgeStrip) -> FloatArray:
-            values = strip.view(flat)
             if loops is not None:
-                found, along = np.zeros(strip.window, np.float32), np.zeros((2, len(strip.heads)), np.float32)
-                # From a = 0 the first pass of an iteration finds the squares of K, whatever the factor.
-                loops(values, values, strip.starts, strip.heads, strip.roots, along[0], along[1], found)
+                found = np.zeros(strip.window, np.float32)
+                loops(strip.view(flat), strip.starts, strip.heads, strip.roots, found)
             else:
                 differences = strip.differences(flat)
                 found = strip.gather((differences, differences), (differences, differences))
@@ -273,6 +271,36 @@ def add_differences(
             there[edge], back[edge] = forward, backward
             total += forward * forward
             squares[head] += backward * backward
+        squares[tail] += total
+
+
+def add_squares(
+    image: FloatArray, starts: NDArray[np.int32], heads: NDArray[np.int32], roots: FloatArray, squares: FloatArray
+) -> None:
+    """Add the square of K of an image along the edges of a strip to its pixels; to be compiled.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (window,)
+    starts, heads, roots : ndarray
+        Of the strip, see :class:`turbrestore.edge_strips.EdgeStrip`.
+    squares : ndarray, float32, shape (window,)
+        Added to.
+
+    Examples
+    --------
+    >>> edge, squares = (np.array([0, 1, 1]), np.array([1]), np.array([0.5])), np.zeros(2)
+    >>> add_squares(np.array([3.0, 5.0]), *edge, squares)
+    >>> squares
+    array([1., 1.])
+    """
+    for tail in range(starts.size - 1):
+        own, total = image[tail], np.float32(0)
+        for edge in range(np.uintp(starts[tail]), np.uintp(starts[tail + 1])):
+            head = np.uintp(heads[edge])
+            more = (image[head] - own) * roots[edge]
+            total += more * more
+            squares[head] += more * more
         squares[tail] += total
 
 
