@@ -11,6 +11,16 @@ import pytest
 from turbrestore import compiled as compiling
 from turbrestore.blur_estimation import descend_loops, estimate_blur
 from turbrestore.confidence import draw_pixels, flow_confidence, regularise_flow
+from turbrestore.conjugate_gradients import (
+    ConjugateGradients,
+    _apply,
+    _move,
+    _turn,
+    apply_loops,
+    move_loops,
+    turn_loops,
+)
+from turbrestore.convolution_problem import Problem
 from turbrestore.dynamics import identify
 from turbrestore.errors import DataError
 from turbrestore.flow_model import SUMMED, add_products, project_deviation
@@ -31,6 +41,7 @@ from turbrestore.patch_pairs import join_choices, pairs_of_band
 from turbrestore.patch_search import BAND_ROWS, OUTSIDE, PatchSearch, choose_offsets, search_bands
 from turbrestore.pixel_fusion import PixelFusion, take_in_pixels
 from turbrestore.primal_dual import _divide, _follow, divide_loops, follow_loops
+from turbrestore.psf import KOLMOGOROV, blur_otf, laplacian_symbol
 from turbrestore.strip_grid import StripGrid
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.tvl1_sweeps import FlowProblem, SweepParams, sweep, sweep_frame
@@ -39,6 +50,7 @@ from turbrestore.warp import sample_spline, warp
 USERS = (
     *("blur_estimation", "frame_noise", "nonlocal_penalty", "nonlocal_tv", "patch_search", "pixel_fusion", "warp"),
     *("paired_transform", "patch_pairs", "primal_dual", "confidence", "flow_model", "tvl1_sweeps"),
+    "conjugate_gradients",
 )
 rng = np.random.default_rng(0)
 needs_compiler = pytest.mark.skipif(not compiling.can_compile(), reason="Numba is not installed: nothing to compare")
@@ -166,6 +178,7 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
         add_squares,
         add_products,
         add_sums,
+        apply_loops,
         choose_offsets,
         descend_loops,
         draw_back,
@@ -173,9 +186,11 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
         follow_loops,
         join_choices,
         mark_folds,
+        move_loops,
         sample_spline,
         sweep_frame,
         take_in_pixels,
+        turn_loops,
         weigh_pixels,
     ],
     ids=lambda one: one.__name__,
@@ -225,6 +240,61 @@ def test_what_a_step_divides_by_is_alike(real):
     _divide(*slow, transfer, np.float32([2, 30]))
     assert fast == pytest.approx(slow, abs=1e-5)
     assert np.abs(fast - numbers[:2]).max() > 0.1
+
+
+@pytest.mark.parametrize("real", [False, True])
+@pytest.mark.parametrize(
+    ("part", "loops", "plain"), [(0, turn_loops, _turn), (1, apply_loops, _apply), (2, move_loops, _move)]
+)
+def test_parts_of_a_step_of_conjugate_gradients_are_alike(part, loops, plain, real):
+    """Both without a compiler, as above."""
+    parts = rng.normal(size=(2, 7, 6, 5)).astype(np.float32)
+    spectra, shares, share = parts[0] + 1j * parts[1], rng.random(5), np.float32([0.7])
+    positive, transfer = rng.random((6, 5), np.float32), parts[0, 6] if real else spectra[6]
+
+    def arguments():
+        one, two, three, four = (spectrum.copy() for spectrum in spectra[:4])
+        total = np.array([2.0])
+        return (
+            (one, two, positive, transfer, share, three),
+            (one, two, positive, transfer, share, shares, total),
+            (one, two, three, four, positive, share, shares, total),
+        )[part]
+
+    fast, slow, before = arguments(), arguments(), arguments()
+    loops(*fast)
+    plain(*slow)
+    changed = [not np.array_equal(one, other) for one, other in zip(fast, before, strict=True)]
+    assert sum(changed) == 2 + (part == 2)
+    for one, other in zip(fast, slow, strict=True):
+        assert one == pytest.approx(other, abs=1e-4)
+
+
+@needs_compiler
+@pytest.mark.parametrize("real", [False, True])
+def test_conjugate_gradients_step_alike(plain, real):
+    """An image of several strips and blocks, of which not all is seen."""
+    image = rng.random((30, 41), np.float32)
+    seen, transfer = (rng.random(image.shape) > 0.2).astype(np.float32), blur_otf(image.shape, 1.3, KOLMOGOROV)
+    if not real:
+        transfer = (transfer * np.exp(0.3j)).astype(np.complex64)
+        transfer[[0, 0, 15, 15], [0, -1, 0, -1]] = 0.5
+
+    def solve():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
+            patch.setattr("turbrestore.strip_grid._STRIP", 200)
+            grid = StripGrid(image.shape)
+            problem = Problem(image, seen, grid.in_blocks(transfer), 30.0, grid)
+            solver = ConjugateGradients(grid.in_blocks(laplacian_symbol(*image.shape)))
+            state = solver.start(problem)
+            for _ in range(6):
+                state = solver.step(problem, state)
+            return state.image, state.decrease
+
+    (fast, left), (slow, rest) = both(plain, solve)
+    assert fast == pytest.approx(slow, abs=1e-5)
+    assert left == pytest.approx(rest, rel=1e-2)
 
 
 @pytest.mark.parametrize(("loops", "plain", "images"), [(rise_loops, _rise, 2), (project_loops, _project, 4)])

@@ -114,7 +114,7 @@ def test_the_residual_of_conjugate_gradients_is_the_slope_of_the_energy(method, 
     # An asymmetric kernel, for which a convolution and its adjoint differ.
     psf = np.random.default_rng(1).random((3, 3))
     problem = dataclasses.replace(small_problem(1, 7.0), transfer=psf_to_otf(psf, (8, 8))[None])
-    solver = ConjugateGradients(laplacian_symbol(8, 8)[None] if method == "wiener" else np.ones((1, 1, 1), np.float32))
+    solver = ConjugateGradients(laplacian_symbol(8, 8)[None] if method == "wiener" else np.ones((1, 8, 5), np.float32))
     state = solver.start(problem)
     for _ in range(steps):
         state = solver.step(problem, state)

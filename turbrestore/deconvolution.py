@@ -407,8 +407,7 @@ def _solve(
     if find_device(params.device or PROCESSOR) != PROCESSOR:
         return _solve_on_device(problems, params, guide, progress)
     if params.method in ("wiener", "tikhonov"):
-        one = np.ones((len(problems[0].grid.blocks), 1, 1), np.float32)
-        quadratic = _wiener_solver(problems[0].grid) if params.method == "wiener" else ConjugateGradients(one)
+        quadratic = _quadratic_solver(problems[0].grid, params.method)
         return _iterate(quadratic, problems, [quadratic.start(p) for p in problems], params, progress)
     starts, guide = _sharpened(problems, guide, params, workshop)
     penalty: Penalty = LocalPenalty(problems[0].grid)
@@ -492,14 +491,15 @@ def _iterate(
     return _Solution(images, iteration, converged, np.array(recorded), np.array(objective), np.array(changes))
 
 
-def _wiener_solver(grid: StripGrid) -> ConjugateGradients:
-    return ConjugateGradients(grid.in_blocks(laplacian_symbol(*grid.shape)))
+def _quadratic_solver(grid: StripGrid, method: str) -> ConjugateGradients:
+    symbol = laplacian_symbol(*grid.shape)
+    return ConjugateGradients(grid.in_blocks(symbol if method == "wiener" else np.ones_like(symbol)))
 
 
 def _wiener_image(problem: Problem) -> FloatArray:
     """Wiener solution with its own fidelity."""
     problem = dataclasses.replace(problem, fidelity=wiener_fidelity(problem.observed, estimate_noise(problem.observed)))
-    solver = _wiener_solver(problem.grid)
+    solver = _quadratic_solver(problem.grid, "wiener")
     state = solver.start(problem)
     for _ in range(_START_STEPS):
         state = solver.step(problem, state)

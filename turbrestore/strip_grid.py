@@ -140,12 +140,10 @@ class StripGrid:
 
     def spectral_inner(self, a: Spectrum, b: Spectrum, number: int) -> float:
         """Share of a block of two spectra in the inner product of their images (Parseval)."""
-        products = a.real * b.real
-        products += a.imag * b.imag
-        return float(products.sum(axis=0, dtype=np.float64) @ self._shares[number])
+        return spectral_inner(a, b, self.shares[number])
 
     @cached_property
-    def _shares(self) -> NDArray[np.float64]:
+    def shares(self) -> NDArray[np.float64]:
         """What columns of half a spectrum count, (B, C): the other half repeats all but the first and a middle one."""
         height, width = self.shape
         shares = np.zeros(self._in_blocks_shape(1)[::2])
@@ -193,3 +191,26 @@ def inner(a: FloatArray, b: FloatArray) -> float:
     11.0
     """
     return float(np.sum(a * b, dtype=np.float64))
+
+
+def spectral_inner(a: Spectrum, b: Spectrum, shares: NDArray[np.float64]) -> float:
+    """Inner product of columns of two spectra, summed in double precision.
+
+    Parameters
+    ----------
+    a, b : ndarray, complex64, shape (P, C)
+    shares : ndarray, float64, shape (C,)
+        What each column counts.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> spectral_inner(np.complex64([[1 + 2j, 1]]), np.complex64([[3 + 4j, 5]]), np.array([1.0, 2.0]))
+    21.0
+    """
+    products = a.real * b.real
+    products += a.imag * b.imag
+    return float(products.sum(axis=0, dtype=np.float64) @ shares)
