@@ -11,8 +11,9 @@ sort like the integers of the same bits, so one partial sort finds both the dist
 times faster than a partial sort of indices.  Distances lose the last bits of their mantissa to the rank (relative error
 6e-5 for 21×21), and ties go to the nearer offset.
 
-Compiled, a distance is put into its place among the best as soon as it is known, so that none is kept; where many are
-to be chosen, a partial sort of all is faster.
+Compiled, distances are put into their places among the best as soon as they are known, so that none is kept: two at a
+time change places with each of the best that they are less than.  There is nothing to decide about in that, so that the
+compiler makes it of many pixels at once.  Where many are to be chosen, a partial sort of all is faster.
 """
 
 from __future__ import annotations
@@ -39,8 +40,9 @@ _SORTED_PIXELS = 512
 # Bits of a distance that is infinite, because the pixel lies outside the image; and a number larger than all bits.
 OUTSIDE = int(np.float32(np.inf).view(np.int32))
 _NO_CHOICE = int(np.iinfo(np.int32).max)
-# Most choices by distance that the compiled loop makes.
-_MOST_INSERTED = 32
+# Most choices by distance that the compiled loop makes, and places among them that it goes through at a time: it knows
+# how many, so that what changes places stays in registers.
+_MOST_INSERTED, _PLACES = 32, 5
 
 Keys = NDArray[np.int32]
 
@@ -190,38 +192,38 @@ def choose_offsets(
     rows, columns, chosen = found.shape
     patch, nothing, far = window.size, np.float32(0), np.float32(np.inf)
     margin = (block.shape[1] - columns) // 2 - patch // 2
-    down, along = np.empty(columns + patch - 1, np.float32), np.empty(columns, np.float32)
-    bits, worst = along.view(np.int32), np.empty(columns, np.int32)
+    down, along = np.empty(columns + patch - 1, np.float32), np.empty((2, columns), np.float32)
+    keys, best = along.view(np.int32), np.empty((-(-(chosen - nearest) // _PLACES) * _PLACES, columns), np.int32)
     for row in range(rows):
-        # Where none is chosen by its distance, none is small enough.
-        found[row], worst[:] = _NO_CHOICE, _NO_CHOICE if chosen > nearest else -1
-        for rank in range(len(offsets)):
-            dy, dx = offsets[rank]
-            down[:], along[:] = nothing, nothing
-            for k in range(patch):
-                here = block[margin + row + k, margin : margin + down.size]
-                there, share = block[margin + row + k + dy, margin + dx : margin + dx + down.size], window[k]
-                for x in range(down.size):
-                    down[x] += (here[x] - there[x]) * (here[x] - there[x]) * share
-            for k in range(patch):
-                part, share = down[k : k + columns], window[k]
+        best[:] = _NO_CHOICE
+        for first in range(0, len(offsets), 2):
+            for rank in range(first, first + 2):
+                (dy, dx), part, key = offsets[rank], along[rank - first], keys[rank - first]
+                down[:], part[:] = nothing, nothing
+                for k in range(patch):
+                    here = block[margin + row + k, margin : margin + down.size]
+                    there, share = block[margin + row + k + dy, margin + dx : margin + dx + down.size], window[k]
+                    for x in range(down.size):
+                        down[x] += (here[x] - there[x]) * (here[x] - there[x]) * share
+                for k in range(patch):
+                    ahead, share = down[k : k + columns], window[k]
+                    for x in range(columns):
+                        part[x] += ahead[x] * share
+                inside = edges[3] - dx if edges[0] <= row + dy < edges[1] else 0
+                part[: max(edges[2] - dx, 0)], part[max(inside, 0) :] = far, far
                 for x in range(columns):
-                    along[x] += part[x] * share
-            if not edges[0] <= row + dy < edges[1]:
-                along[:] = far
-            along[: max(edges[2] - dx, 0)] = far
-            along[max(edges[3] - dx, 0) :] = far
-            for x in range(columns):
-                key = bits[x] & ~rank_mask | rank
+                    key[x] = key[x] & ~rank_mask | rank
                 if rank < nearest:
-                    found[row, x, rank] = key
-                if key < worst[x]:
-                    place = chosen - 1
-                    while place > nearest and found[row, x, place - 1] > key:
-                        found[row, x, place] = found[row, x, place - 1]
-                        place -= 1
-                    found[row, x, place] = key
-                    worst[x] = found[row, x, chosen - 1]
+                    found[row, :, rank] = key
+            for start in range(0, len(best), _PLACES):
+                for x in range(columns):
+                    one, other = keys[0, x], keys[1, x]
+                    for place in range(start, start + _PLACES):
+                        held = best[place, x]
+                        held, one = min(held, one), max(held, one)
+                        best[place, x], other = min(held, other), max(held, other)
+                    keys[0, x], keys[1, x] = one, other
+        found[row, :, nearest:] = best[: chosen - nearest].T
 
 
 def _keys(block: FloatArray, search: PatchSearch) -> Keys:
