@@ -75,16 +75,16 @@ class NonlocalPenalty:
     def dual(self, image: FloatArray) -> EdgeDual:
         """Start from p = 0 for an image of this size."""
         ends = np.cumsum([0] + [len(strip.heads) for strip in self.graph.strips])
-        values, factor, lagged = np.asarray(new_stack((2, int(ends[-1])), self.folder)), *self._images(2)
-        for part in (parts := tuple(map(slice, ends[:-1], ends[1:]))):
-            values[:, part] = 0
-            release(values)
+        # A new file is full of zeros; in memory no page is touched before the threads do.
+        size = 2, int(ends[-1])
+        values = np.zeros(size, np.float32) if self.folder is None else np.asarray(new_stack(size, self.folder))
+        factor, lagged = self._images(2)
 
         def begin(rows: slice) -> None:
             factor[rows], lagged[rows] = 1, 0
 
         self.grid.over_rows(begin, factor, lagged)
-        return EdgeDual(values, factor, lagged, parts)
+        return EdgeDual(values, factor, lagged, tuple(map(slice, ends[:-1], ends[1:])))
 
     def ascend(self, dual: EdgeDual, image: FloatArray, step: float, relaxation: float, pull: FloatArray) -> None:
         """Add ``step`` times K of the image to p, project and over-relax, in place; ``pull`` becomes Kᵀp.
