@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -17,7 +18,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.errors import StorageError
-from turbrestore.scratch import kept_in, mean_of, new_stack, parts, release, returning_freed, variance_of, walk
+from turbrestore.scratch import (
+    keeping_freed,
+    kept_in,
+    mean_of,
+    new_stack,
+    parts,
+    release,
+    returning_freed,
+    variance_of,
+    walk,
+)
 
 STATM = Path("/proc/self/statm")
 SHAPES = st.lists(st.integers(1, 7), min_size=1, max_size=4).map(tuple)
@@ -140,10 +151,51 @@ def test_the_allocator_gets_back_what_it_had(monkeypatch):
     with pytest.raises(KeyError), returning_freed():
         assert calls == [(-3, 1 << 20), (-1, 2 << 20)]
         raise KeyError
-    assert calls[2:] == [(-3, 32 << 20), (-1, 64 << 20), 0]
+    as_it_was = [(-3, 32 << 20), (-1, 64 << 20), (-2, 128 << 10), 0]
+    assert calls[2:] == as_it_was
+    calls.clear()
+    with keeping_freed(False):
+        pass
+    assert calls == []
+    with pytest.raises(KeyError), keeping_freed():
+        assert calls == [(-3, 32 << 20), (-1, -1), (-2, 128 << 20)]
+        raise KeyError
+    assert calls[3:] == as_it_was
+    calls.clear()
     monkeypatch.setattr("platform.libc_ver", lambda: ("", ""))
-    with returning_freed():
-        assert len(calls) == 5
+    with returning_freed(), keeping_freed():
+        pass
+    assert calls == []
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the allocator is another")
+def test_a_thread_that_frees_all_keeps_its_pages():
+    """In a process of its own, whose thread takes 18,000 pages in arrays of 3 MB, and frees them, again and again."""
+    code = textwrap.dedent(
+        """
+        import resource, sys, threading
+        import numpy as np
+        from turbrestore.parallel import map_ahead
+        from turbrestore.scratch import keeping_freed
+
+        def work(_):
+            for _ in range(2):
+                arrays = [np.ones(3 << 17) for _ in range(24)]
+                del arrays
+                faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+
+        faults = []
+        with keeping_freed(sys.argv[1] == "kept"):
+            list(map_ahead(work, range(5), threads=1))
+        print(faults[-1] - faults[0])
+        """
+    )
+    faults = [
+        int(subprocess.run([sys.executable, "-c", code, how], capture_output=True, text=True, check=True).stdout)
+        for how in ("kept", "given back")
+    ]
+    assert faults[0] < 2000
+    assert faults[1] > 10_000
 
 
 def test_an_array_is_moved_to_a_file_once(tmp_path):

@@ -42,7 +42,7 @@ from .memory import MemoryPlan, plan_memory
 from .memory_size import DeconvolutionMemory
 from .psf import KOLMOGOROV
 from .restoration import STAGES, Restoration, RestoreParams, StageResults, explain_devices, place_stages
-from .scratch import kept_in, mean_of, new_stack, release, returning_freed, walk
+from .scratch import keeping_freed, kept_in, mean_of, new_stack, release, returning_freed, walk
 from .tiled_stages import FilteredTiles, filter_tiles, find_tiled_centroid
 
 # Share of the training frames that show every pixel of a cropped image.
@@ -271,16 +271,18 @@ def _restored(run: _Run, plan: MemoryPlan) -> Restoration:
         # Tiles read for themselves; nothing but this holds the decoder.
         stream = iter(())
     run.clock.lap("read")
-    centroid = _find_centroid(run, training)
-    image = centroid.image
     dynamics = filtered = deblurred = None
-    if "identify" in stages:
-        dynamics = _identify(run, centroid, training)
-    if "filter" in stages and dynamics is not None:
-        filtered, mean = _filter(run, centroid, dynamics, training, stream)
-        image = filtered.image
-    else:
-        mean = kept_in(mean_of(training), run.scratch)
+    # Of all frames anew; an image that is deblurred takes its memory once.
+    with keeping_freed(params.memory_limit is None):
+        centroid = _find_centroid(run, training)
+        image = centroid.image
+        if "identify" in stages:
+            dynamics = _identify(run, centroid, training)
+        if "filter" in stages and dynamics is not None:
+            filtered, mean = _filter(run, centroid, dynamics, training, stream)
+            image = filtered.image
+        else:
+            mean = kept_in(mean_of(training), run.scratch)
     if "deconvolve" in stages:
         deblurred = _deblur(run, image, mean, centroid, training)
         image = deblurred.deconvolution.image
