@@ -272,7 +272,8 @@ def measure_stages(clip: Clip, threads: int, method: str) -> None:
             planned = work.peak(train, threads, in_file)
             with returning_freed():
                 watch = StageWatch()
-                limited = replace(settings, memory_limit=planned if in_file else None)
+                # Without a limit the process would keep what is freed.
+                limited = replace(settings, memory_limit=planned if in_file else 1e12)
                 assert pipeline.memory_plan(source, limited).in_file == in_file
                 pipeline.restore(source, limited, on_result=watch.result, scratch=Path(folder))
             words = ", ".join(f"{name} {size / pixels:.0f}" for name, size in watch.taken.items())

@@ -20,6 +20,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeVar
@@ -109,8 +110,8 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
         f"each call by itself from a frame. The bound of both ratios is {TIME_BOUND}. It is broken where what is done "
         "once, above all the deconvolution, takes long beside the flow: by small clips, and by few frames of a large "
         "photograph. As made, most calls start from an earlier flow of the frame, which has been prepared already, and "
-        "are cheaper: no bound holds for the ratio to these. A restoration has the C library keep freed memory, flow "
-        "alone finds it as it is: kept too, 75 calls at 1920×1080 are 7 % faster, see [decisions](decisions/speed.md). "
+        "are cheaper: no bound holds for the ratio to these. The process keeps freed memory meanwhile, as a "
+        "restoration has it. "
         "Frames are in memory, so nothing is decoded.\n",
         *_time_table((*ROWS, *FULL_ROWS) if full else ROWS, tree, broken),
         *_plain_lines(),
@@ -148,7 +149,7 @@ def _time_table(rows: tuple[Row, ...], tree: Path | None, broken: list[str]) -> 
     stages = ("centroid", "identify", "filter", "deconvolve")
     earlier = ["before: whole, s", "flow calls", "ratio"] if tree else []
     names = ["whole, s", "flow calls", "alone, s", "ratio", "of processor time", "as made, s", "ratio"]
-    names += [f"{stage}, s" for stage in stages]
+    names += [*(f"{stage}, s" for stage in stages), "peak, MB"]
     names = ["frames", "size", "scene", *earlier, *names]
     lines = [f"| {' | '.join(names)} |", f"|{'---:|' * len(names)}"]
     for count, height, width, scene in rows:
@@ -165,7 +166,7 @@ def _time_table(rows: tuple[Row, ...], tree: Path | None, broken: list[str]) -> 
             cells += [f"{old['whole']:.1f}", f"{old['calls']}", f"{old['whole'] / old['bare']:.2f}"]
         cells += [f"{new['whole']:.1f}", f"{new['calls']}", f"{new['bare']:.1f}", f"{ratio:.2f}"]
         cells += [f"{work:.2f}", f"{new['made']:.1f}", f"{new['whole'] / new['made']:.2f}"]
-        cells += [f"{new['stages'].get(stage, 0.0):.1f}" for stage in stages]
+        cells += [*(f"{new['stages'].get(stage, 0.0):.1f}" for stage in stages), f"{new['peak']:,.0f}"]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
@@ -282,25 +283,30 @@ def run_child(task: Figures) -> Figures:
     few = task["frames"] * task["height"] * task["width"] <= REPEATED
     part = task["frames"] if few else min(max(task["frames"] // SAMPLE, LEAST_SAMPLE), LARGEST_SAMPLE)
 
-    def alone() -> None:
-        frames = (sample[index % len(sample)] for index in range(part))
+    def flows(count: int) -> None:
+        frames = (sample[index % len(sample)] for index in range(count))
         for _ in iterate_flows(sample.mean(axis=0), frames, params.flow):
             pass
 
+    def alone() -> np.ndarray:
+        with as_restored():
+            # Memory that is kept is taken before.
+            flows(2 * THREADS)
+            return np.array(clocked(lambda: flows(part))[0])
+
     # What is loaded and started once.
     restore(sample[:4, :32, :32])
-    first, _ = clocked(alone) if task["kind"] == "time" else ((0.0, 0.0), None)
+    first = alone() if task["kind"] == "time" else 0
     whole, restoration = clocked(lambda: restore(source, params))
     # Linux counts kilobytes, macOS bytes.
     unit = 1024 if sys.platform != "darwin" else 1024 * 1024
     figures = {"whole": whole[0], "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
     if task["kind"] != "time":
         return figures
-    second, _ = clocked(alone)
     passes = len(restoration.centroid.mean_flow_sizes)
     # The last pass of the centroid serves the first of the filter.
     calls = (passes - 1) * restoration.train + params.filter.inner_iterations * task["frames"]
-    bare = np.mean([first, second], axis=0) * calls / part
+    bare = (first + alone()) / 2 * calls / part
     figures |= {"whole_work": whole[1], "bare": bare[0], "bare_work": bare[1], "calls": calls}
     figures |= {"stages": restoration.seconds}
     if not task.get("made"):
@@ -308,9 +314,19 @@ def run_child(task: Figures) -> Figures:
     # New calls are those of the first pass of the centroid, and of the first of the filter for the other frames.
     cold = figures["bare"] / calls * task["frames"]
     stack = np.stack([sample[index % len(sample)] for index in range(part)])
-    later = started(stack, params.flow, 1) * (passes - 1) * restoration.train
-    again = started(stack, params.flow, 0) * (params.filter.inner_iterations - 1) * task["frames"]
+    with as_restored():
+        later = started(stack, params.flow, 1) * (passes - 1) * restoration.train
+        again = started(stack, params.flow, 0) * (params.filter.inner_iterations - 1) * task["frames"]
     return figures | {"made": cold + later + again}
+
+
+def as_restored() -> AbstractContextManager[None]:
+    """Have freed memory kept, as a restoration has it; other trees, which are measured by this script too, do not."""
+    try:
+        from turbrestore.scratch import keeping_freed
+    except ImportError:
+        return nullcontext()
+    return keeping_freed()
 
 
 def started(stack: np.ndarray, params: FlowParams, start_level: int) -> float:

@@ -1,8 +1,10 @@
 """Restorations within a memory limit: the plan, and that the result is the same."""
 
+import contextlib
 import json
 import weakref
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -412,18 +414,26 @@ def test_pairs_lie_in_the_folder_that_is_named(frames, tmp_path, monkeypatch):
                 pipeline.restore(frames, settings, scratch=tmp_path)
 
 
-@pytest.mark.parametrize(("limit", "tight"), [(None, False), ("20GB", False), ("400MB", True)])
-def test_the_allocator_is_left_alone_where_there_is_room(frames, monkeypatch, limit, tight):
-    wanted = []
+@pytest.mark.parametrize(("limit", "kept", "tight"), [(None, 1, 0), ("20GB", 0, 0), ("400MB", 0, 1)])
+def test_freed_memory_is_kept_without_a_limit_and_given_back_where_it_is_tight(frames, monkeypatch, limit, kept, tight):
+    seen = []
 
-    def returning(wish):
-        wanted.append(wish)
+    @contextlib.contextmanager
+    def setting(name, wanted):
+        seen.append((name, wanted))
+        yield
+        seen.append(name)
+
+    def deblur(*_):
+        seen.append("deblur")
         raise StorageError("seen")
 
-    monkeypatch.setattr(pipeline, "returning_freed", returning)
+    for name in ("returning_freed", "keeping_freed"):
+        monkeypatch.setattr(pipeline, name, partial(setting, name))
+    monkeypatch.setattr(pipeline, "_deblur", deblur)
     with pytest.raises(StorageError, match="seen"):
         pipeline.restore(frames, replace(QUICK, memory_limit=limit))
-    assert wanted == [tight]
+    assert seen == [("returning_freed", tight), ("keeping_freed", kept), "keeping_freed", "deblur"]
 
 
 def test_more_memory_is_never_worse():

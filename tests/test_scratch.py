@@ -3,6 +3,7 @@
 import itertools
 import os
 import platform
+import resource
 import shutil
 import signal
 import subprocess
@@ -31,6 +32,7 @@ from turbrestore.scratch import (
 )
 
 STATM = Path("/proc/self/statm")
+HUGE_PAGES = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 SHAPES = st.lists(st.integers(1, 7), min_size=1, max_size=4).map(tuple)
 
 
@@ -168,12 +170,17 @@ def test_the_allocator_gets_back_what_it_had(monkeypatch):
     assert calls == []
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the allocator is another")
+@pytest.mark.skipif(
+    platform.libc_ver()[0] != "glibc"
+    or resource.getpagesize() != 4096
+    or (HUGE_PAGES.is_file() and "[always]" in HUGE_PAGES.read_text()),
+    reason="the allocator is another, or its pages are",
+)
 def test_a_thread_that_frees_all_keeps_its_pages():
     """In a process of its own, whose thread takes 18,000 pages in arrays of 3 MB, and frees them, again and again."""
     code = textwrap.dedent(
         """
-        import resource, sys, threading
+        import resource, sys
         import numpy as np
         from turbrestore.parallel import map_ahead
         from turbrestore.scratch import keeping_freed
@@ -194,8 +201,7 @@ def test_a_thread_that_frees_all_keeps_its_pages():
         int(subprocess.run([sys.executable, "-c", code, how], capture_output=True, text=True, check=True).stdout)
         for how in ("kept", "given back")
     ]
-    assert faults[0] < 2000
-    assert faults[1] > 10_000
+    assert faults[1] > max(10 * faults[0], 10_000)
 
 
 def test_an_array_is_moved_to_a_file_once(tmp_path):

@@ -61,7 +61,7 @@ class BlurMap:
 
     @property
     def removable(self) -> np.ndarray:
-        """Widths that are safe to remove: half of the uncertainty is left in."""
+        """Widths that are safe to remove: half of the uncertainty is left in; 0 where that was not needed."""
         return np.maximum(self.sigmas - 0.5 * self.uncertainties, 0.0)
 
 

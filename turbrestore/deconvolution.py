@@ -492,8 +492,12 @@ def _iterate(
 
 
 def _quadratic_solver(grid: StripGrid, method: str) -> ConjugateGradients:
-    symbol = laplacian_symbol(*grid.shape)
-    return ConjugateGradients(grid.in_blocks(symbol if method == "wiener" else np.ones_like(symbol)))
+    if method == "wiener":
+        return ConjugateGradients(grid.in_blocks(laplacian_symbol(*grid.shape)))
+    one = grid.multiplier()
+    one[:] = 1
+    release(one)
+    return ConjugateGradients(one)
 
 
 def _wiener_image(problem: Problem) -> FloatArray:

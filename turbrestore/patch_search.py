@@ -42,7 +42,7 @@ OUTSIDE = int(np.float32(np.inf).view(np.int32))
 _NO_CHOICE = int(np.iinfo(np.int32).max)
 # Most choices by distance that the compiled loop makes, and places among them that it goes through at a time: it knows
 # how many, so that what changes places stays in registers.
-_MOST_INSERTED, _PLACES = 32, 5
+_MOST_INSERTED, _PLACES = 100, 5
 
 Keys = NDArray[np.int32]
 
@@ -173,7 +173,7 @@ def choose_offsets(
     window : ndarray, float32, shape (patch,)
         G_a along one axis.
     offsets : ndarray, int32, shape (n, 2)
-        (dy, dx), nearest first.
+        (dy, dx), nearest first; with each its opposite, so that n is even.
     edges : ndarray, int64, shape (4,)
         First row of the image and the one after its last, and the same of columns, counted from those of the tile.
     nearest, rank_mask : int

@@ -272,7 +272,7 @@ def _restored(run: _Run, plan: MemoryPlan) -> Restoration:
         stream = iter(())
     run.clock.lap("read")
     dynamics = filtered = deblurred = None
-    # Of all frames anew; an image that is deblurred takes its memory once.
+    # Every frame takes the same memory again; the deconvolution takes its own once, and would only find less room.
     with keeping_freed(params.memory_limit is None):
         centroid = _find_centroid(run, training)
         image = centroid.image

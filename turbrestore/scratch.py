@@ -37,7 +37,7 @@ _LITTLE_PAD, _LARGE_PAD = 128 << 10, 128 << 20
 
 
 def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.float32]:
-    """Return an array to be filled, in memory or in a file.
+    """Return an array to be filled, in memory or in a file; one in a file is full of zeros.
 
     Parameters
     ----------
@@ -275,8 +275,9 @@ def keeping_freed(wanted: bool = True) -> Iterator[None]:
 
     The allocator of glibc gives the heap of a thread back to the system as soon as nothing is in it any more, which at
     1920×1080 is several times a frame: to fill new pages with zeros takes a ninth of the time of flow and filter there.
-    It does not where a new heap would have to be larger.  Afterwards all has been given back.  The setting is that of
-    the process, as above.
+    It keeps a heap that has less room than M_TOP_PAD, so more than all heaps have keeps them all.  Afterwards all but
+    the last heap of each thread, 64 MB at most, has been given back.  The setting is that of the process, and ends that
+    of :func:`returning_freed` around it.
 
     Parameters
     ----------
@@ -299,9 +300,9 @@ def _adjusted(wanted: bool, *settings: tuple[int, int]) -> Iterator[None]:
         yield
         return
     library = ctypes.CDLL(None)
-    for setting in settings:
-        library.mallopt(*setting)
     try:
+        for setting in settings:
+            library.mallopt(*setting)
         yield
     finally:
         # Any of these ends the adjustment by itself for good, so they are set to where it ends.
