@@ -137,10 +137,11 @@ def search_bands(guide: FloatArray, search: PatchSearch, threads: int = 0) -> It
         if loops is not None:
             # The compiler makes faster loops of rows whose pixels it knows to be side by side.
             block = np.ascontiguousarray(block)
-            found = np.empty((rows, wide, search.nearest + search.best), np.int32)
+            places = search.nearest + -(-search.best // _PLACES) * _PLACES
+            found = np.full((rows, places, wide), _NO_CHOICE, np.int32)
             edges = np.array([-top, height - top, -left, width - left])
             loops(block, search.window.ravel(), search.offsets, edges, search.nearest, search.rank_mask, found)
-            return found
+            return found[:, : search.nearest + search.best].transpose(0, 2, 1)
         keys = _keys(block, search)
         _exclude_outside(keys, search.offsets, corner, (height, width))
         return _best(keys.reshape(len(keys), -1), search).reshape(rows, wide, -1)
@@ -178,24 +179,25 @@ def choose_offsets(
         First row of the image and the one after its last, and the same of columns, counted from those of the tile.
     nearest, rank_mask : int
         See :class:`PatchSearch`.
-    found : ndarray, int32, shape (rows, columns, nearest + best)
-        Filled, the best in order.
+    found : ndarray, int32, shape (rows, nearest + best or more, columns)
+        Full of what is more than all choices.  Becomes the nearest and the best, in order; the best are looked for in
+        fives.
 
     Examples
     --------
-    >>> offsets, found = np.array([[0, -1], [0, 1]], np.int32), np.empty((1, 3, 1), np.int32)
+    >>> offsets, found = np.array([[0, -1], [0, 1]], np.int32), np.full((1, 5, 3), _NO_CHOICE, np.int32)
     >>> block = np.repeat(np.float32([[0, 0, 0, 1, 1]]), 3, axis=0)
     >>> choose_offsets(block, np.ones(1, np.float32), offsets, np.array([0, 1, 0, 3]), 0, 3, found)
-    >>> offsets[found[0, :, 0] & 3, 1]
+    >>> offsets[found[0, 0] & 3, 1]
     array([ 1, -1, -1], dtype=int32)
     """
-    rows, columns, chosen = found.shape
+    rows, places, columns = found.shape
     patch, nothing, far = window.size, np.float32(0), np.float32(np.inf)
     margin = (block.shape[1] - columns) // 2 - patch // 2
     down, along = np.empty(columns + patch - 1, np.float32), np.empty((2, columns), np.float32)
-    keys, best = along.view(np.int32), np.empty((-(-(chosen - nearest) // _PLACES) * _PLACES, columns), np.int32)
+    keys = along.view(np.int32)
     for row in range(rows):
-        best[:] = _NO_CHOICE
+        best = found[row]
         for first in range(0, len(offsets), 2):
             for rank in range(first, first + 2):
                 (dy, dx), part, key = offsets[rank], along[rank - first], keys[rank - first]
@@ -213,9 +215,9 @@ def choose_offsets(
                 part[: max(edges[2] - dx, 0)], part[max(inside, 0) :] = far, far
                 for x in range(columns):
                     key[x] = key[x] & ~rank_mask | rank
-                if rank < nearest:
-                    found[row, :, rank] = key
-            for start in range(0, len(best), _PLACES):
+                    if rank < nearest:
+                        best[rank, x] = key[x]
+            for start in range(nearest, places, _PLACES):
                 for x in range(columns):
                     one, other = keys[0, x], keys[1, x]
                     for place in range(start, start + _PLACES):
@@ -223,7 +225,6 @@ def choose_offsets(
                         held, one = min(held, one), max(held, one)
                         best[place, x], other = min(held, other), max(held, other)
                     keys[0, x], keys[1, x] = one, other
-        found[row, :, nearest:] = best[: chosen - nearest].T
 
 
 def _keys(block: FloatArray, search: PatchSearch) -> Keys:
