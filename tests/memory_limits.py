@@ -1,0 +1,14 @@
+"""What the plan within a memory limit is asked in several tests."""
+
+import pytest
+
+from turbrestore.errors import ConfigurationError
+from turbrestore.memory import plan_memory
+from turbrestore.memory_size import MemorySize
+
+
+def least_limit(shape, **settings):
+    """Return the limit that a refusal names."""
+    with pytest.raises(ConfigurationError) as refusal:
+        plan_memory(shape, 1e8, **settings)
+    return MemorySize(str(refusal.value).split("at least ")[1].split(" for frames")[0])

@@ -1,0 +1,26 @@
+"""Problems of deconvolution that are small enough for dense algebra."""
+
+import numpy as np
+from scipy import fft
+
+from turbrestore.convolution_problem import Problem
+from turbrestore.psf import gaussian_otf
+from turbrestore.strip_grid import StripGrid
+
+
+def small_problem(seed: int, fidelity: float, shape: tuple[int, int] = (8, 8), margin: int = 2) -> Problem:
+    rng = np.random.default_rng(seed)
+    seen = np.zeros(shape, np.float32)
+    seen[margin : shape[0] - margin, margin : shape[1] - margin] = 1
+    grid = StripGrid(shape)
+    return Problem(rng.random(shape).astype(np.float32), seen, grid.in_blocks(gaussian_otf(shape, 0.7)), fidelity, grid)
+
+
+def dense(operator, shape: tuple[int, int]) -> np.ndarray:
+    unit = np.eye(shape[0] * shape[1], dtype=np.float32).reshape(-1, *shape)
+    return np.stack([operator(u).ravel() for u in unit], axis=1).astype(np.float64)
+
+
+def dense_blur(problem: Problem) -> np.ndarray:
+    shape = problem.seen.shape
+    return dense(lambda u: fft.irfft2(problem.transfer[0] * fft.rfft2(u), s=shape), shape)
