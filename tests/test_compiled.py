@@ -10,7 +10,7 @@ import pytest
 
 from turbrestore import compiled as compiling
 from turbrestore.blur_estimation import descend_loops, estimate_blur
-from turbrestore.confidence import draw_pixels, flow_confidence, regularise_flow
+from turbrestore.confidence import draw_pixels, flow_confidence, lower_pixels, regularise_flow
 from turbrestore.conjugate_gradients import (
     ConjugateGradients,
     _apply,
@@ -124,6 +124,22 @@ def test_a_flow_is_drawn_alike(plain, shape, contrast):
 
 
 @needs_compiler
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("shape", [(16, 16), (33, 50)])
+def test_tensors_are_lowered_alike(plain, shape, noise):
+    """Of flat ground, whose tensors vanish, of an edge, which has one eigenvalue, and of noise, which has two."""
+    random = np.random.default_rng(24)
+    image = np.full(shape, 0.5, np.float32)
+    image[:, shape[1] // 2 :] += random.normal(0, noise, (shape[0], shape[1] - shape[1] // 2)).astype(np.float32)
+    image[:, -5:] += 0.3
+    fast, slow = both(plain, lambda: flow_confidence(image).tensors)
+    for one, other in zip(fast, slow, strict=True):
+        assert one.dtype == other.dtype == np.float32
+        assert one == pytest.approx(other, rel=1e-4, abs=1e-6 * float(np.abs(slow[0]).max()))
+    assert np.ptp(slow[0][0]) > 1e-3
+
+
+@needs_compiler
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("shape", [(2, 3), (16, SUMMED // 32), (31, 45)])
 @pytest.mark.parametrize("rank", [0, 1, 7])
@@ -185,6 +201,7 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
         draw_pixels,
         follow_loops,
         join_choices,
+        lower_pixels,
         mark_folds,
         move_loops,
         sample_spline,

@@ -72,6 +72,20 @@ def test_a_fold_is_found_wherever_a_strip_ends(model_and_frames, monkeypatch):
         assert torn[row, 40] == pytest.approx(calm[row, 40], rel=1e-4)
 
 
+def test_what_holds_for_all_frames_does_not_depend_on_strips(model_and_frames, monkeypatch):
+    model, scene, frames = model_and_frames
+    monkeypatch.setattr("turbrestore.warp._STRIP", 3_000)
+    assert len(list(strips(SHAPE))) > 10
+    still = np.zeros((8, *SHAPE, 2), np.float32)
+    parts = measure_frame_noise(frames, still, scene, np.ones(SHAPE, np.float32), threads=2)
+    assert parts.image_noise == model.image_noise
+    for name in ("usual", "score_scale", "score_variance", "motion_share", "usual_frame", "deviation"):
+        one, other = getattr(parts, name), getattr(model, name)
+        assert one.dtype == np.float32
+        assert np.array_equal(one, other)
+        assert np.ptp(one) > 0
+
+
 def test_colour_is_judged_by_its_luminance(model_and_frames):
     model, _, frames = model_and_frames
     flow = np.zeros((*SHAPE, 2), np.float32)

@@ -99,6 +99,21 @@ def test_inverse_composed_with_the_flow_is_the_identity(seed):
     assert np.abs(compose_flows(inverse, flow)[interior]).max() < 0.05
 
 
+def test_strips_are_inverted_until_each_is_done(monkeypatch):
+    """Those that lie still after one step, others as far as they need; each is followed into the rows of others."""
+    flow = smooth_flow(np.random.default_rng(5), 60)
+    flow *= np.linspace(-1, 1, 60, dtype=np.float32).clip(0)[:, None, None]
+    whole = invert_flow(flow, iterations=50, tolerance=1e-5)
+    monkeypatch.setattr("turbrestore.warp._STRIP", 600)
+    assert len(list(strips(flow.shape))) == 6
+    parts = invert_flow(flow, iterations=50, tolerance=1e-5)
+    assert np.abs(parts - whole).max() < 1e-5
+    assert np.abs(compose_flows(flow, parts)).max() < 1e-4
+    assert np.abs(whole).max() > 1
+    short = invert_flow(flow, iterations=2)
+    assert np.abs(compose_flows(flow, short))[30:].max() > 1e-3
+
+
 def test_composition_warps_as_two_warps_do():
     rng = np.random.default_rng(2)
     y, x = np.mgrid[:48, :48]

@@ -159,12 +159,48 @@ def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -
 
 def _without_noise(xx: FloatArray, xy: FloatArray, yy: FloatArray, noise: np.float32) -> FloatArray:
     """Lower both eigenvalues by ``noise``, to zero at most."""
+    lower = compiled(lower_pixels)
+    if lower is not None:
+        lowered = np.empty((3, *xx.shape), np.float32)
+        lower(noise, xx.reshape(-1), xy.reshape(-1), yy.reshape(-1), lowered.reshape(3, -1))
+        return lowered
     half, tilt = (xx + yy) / 2, (xx - yy) / 2
     spread = np.sqrt(tilt * tilt + xy * xy)
     larger, smaller = np.maximum(half + spread - noise, 0), np.maximum(half - spread - noise, 0)
     kept = (larger - smaller) / np.maximum(2 * spread, np.finfo(np.float32).tiny)
     mean, tilt = (larger + smaller) / 2, kept * tilt
     return np.stack([mean + tilt, kept * xy, mean - tilt])
+
+
+def lower_pixels(noise: np.float32, xx: FloatArray, xy: FloatArray, yy: FloatArray, lowered: FloatArray) -> None:
+    """Lower both eigenvalues of each pixel by ``noise``, to zero at most; to be compiled.
+
+    Parameters
+    ----------
+    noise : float32
+        Squared intensity per squared pixel.
+    xx, xy, yy : ndarray, float32, shape (P,)
+        Structure tensors.
+    lowered : ndarray, float32, shape (3, P)
+        Filled, with xx, xy and yy.
+
+    Examples
+    --------
+    >>> lowered = np.empty((3, 1), np.float32)
+    >>> lower_pixels(np.float32(1), np.float32([5]), np.float32([0]), np.float32([0.5]), lowered)
+    >>> lowered[:, 0]
+    array([4., 0., 0.], dtype=float32)
+    """
+    zero, two, tiny = np.float32(0), np.float32(2), np.finfo(np.float32).tiny
+    for pixel in range(xx.size):
+        half, tilt = (xx[pixel] + yy[pixel]) / two, (xx[pixel] - yy[pixel]) / two
+        spread = np.sqrt(tilt * tilt + xy[pixel] * xy[pixel])
+        larger, smaller = max(half + spread - noise, zero), max(half - spread - noise, zero)
+        kept = (larger - smaller) / max(two * spread, tiny)
+        mean = (larger + smaller) / two
+        lowered[0, pixel] = mean + kept * tilt
+        lowered[1, pixel] = kept * xy[pixel]
+        lowered[2, pixel] = mean - kept * tilt
 
 
 def _apply(tensor: FloatArray, dx: FloatArray, dy: FloatArray) -> Planes:

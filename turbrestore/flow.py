@@ -433,7 +433,8 @@ def refer_flow(reference: ArrayLike, params: FlowParams | None = None, start_lev
         starts = [None if params.method == "farneback" else _start(frame) for frame in batch]
         shifts = [_whole_shift(frame, start, position) for frame, start in zip(batch, starts, strict=True)]
         levels = [_shifted(frame.levels, s, prepared) for frame, s in zip(batch, shifts, strict=True)]
-        starts = [None if start is None else start - s for start, s in zip(starts, shifts, strict=True)]
+        pairs = zip(starts, shifts, strict=True)
+        starts = [start - shift if start is not None and shift.any() else start for start, shift in pairs]
         flows = list(solver(np.stack(levels), starts))
         if confidence is not None:
             flows = [regularise_flow(f, confidence, frame.noise) for f, frame in zip(flows, batch, strict=True)]
@@ -513,7 +514,7 @@ def _start(frame: FlowFrame) -> FloatArray | None:
     if frame.start is None:
         return None
     height, width = frame.levels.shape
-    return cv2.resize(frame.start.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(frame.start.astype(np.float32, copy=False), (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _shifted(frame: GreyBytes, shift: FloatArray, outside: GreyBytes) -> GreyBytes:

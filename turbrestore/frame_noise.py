@@ -17,6 +17,7 @@ against the spectra of the first ones, so that none of them has to be kept.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -27,7 +28,7 @@ from .arrays import FloatArray, luminance
 from .blur_moments.frame_blur import BlurReference, blur_against, refer_blur
 from .blur_moments.fusion import FusionRule, fusion_rule, laplacian_energy, noise_factor
 from .compiled import compiled
-from .parallel import sum_side_by_side
+from .parallel import map_ahead, sum_side_by_side
 from .scratch import walk
 from .warp import inside, mirror, strips, warp
 
@@ -156,18 +157,30 @@ def measure_frame_noise(
                 kept[number] = registered
         return sums
 
-    pairs = zip(walk(frames), walk(flows), strict=True)
-    total, squares, sharp, sharp_squares = sum_side_by_side(measure, enumerate(pairs), threads)
-    count = len(frames)
-    variance = np.maximum(squares / count - (total / count) ** 2, 0.0) * count / max(count - 1, 1)
-    usual = sharp / count
-    spread = np.maximum(sharp_squares / count - usual**2, 0.0)
+    pairs, count = zip(walk(frames), walk(flows), strict=True), len(frames)
+    mean, variance, usual, spread = sum_side_by_side(measure, enumerate(pairs), threads)
+
+    def average(rows: slice) -> None:
+        for total, squares in ((mean, variance), (usual, spread)):
+            total[rows] /= count
+            squares[rows] = np.maximum(squares[rows] / count - total[rows] ** 2, 0.0)
+        variance[rows] *= count / max(count - 1, 1)
+
+    _in_strips(average, variance.shape, threads)
     # The flattest fifth of the image varies by sensor noise alone; elsewhere blur and misregistration add to it.
     square = template[0] ** 2 + template[1] ** 2
     energy = _smooth(square, window)
-    usual_frame, deviation = _without_outliers(frames, flows, total / count, variance, threads)
+    usual_frame, deviation = _without_outliers(frames, flows, mean, variance, threads)
     sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
-    scale = _score_scale(usual, spread, energy * _SOBEL_NOISE * sensor_noise, window)
+    scale, score_variance, motion_share = np.empty((3, *energy.shape), np.float32)
+
+    def scores(rows: slice) -> None:
+        explained = energy[rows] * _SOBEL_NOISE * sensor_noise
+        scale[rows] = _score_scale(usual[rows], spread[rows], explained, window)
+        score_variance[rows] = scale[rows] ** 2 * spread[rows]
+        motion_share[rows] = _motion_share(energy[rows], sensor_noise, residual_variance[rows], window)
+
+    _in_strips(scores, energy.shape, threads)
     registered = [kept[number] for number in range(len(kept))]
     return FrameNoise(
         image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
@@ -175,8 +188,8 @@ def measure_frame_noise(
         template_energy=float(square.sum(dtype=np.float64)),
         usual=usual.astype(np.float32),
         score_scale=scale,
-        score_variance=(scale**2 * spread).astype(np.float32),
-        motion_share=_motion_share(energy, sensor_noise, residual_variance, window),
+        score_variance=score_variance,
+        motion_share=motion_share,
         window=window,
         usual_frame=usual_frame,
         deviation=deviation,
@@ -351,9 +364,23 @@ def _without_outliers(
 
     centre, spread = mean.astype(np.float32), _deviation(variance)
     counted, total, squares = sum_side_by_side(trim, zip(walk(frames), walk(flows), strict=True), threads)
-    trimmed = np.where(counted > 0, total / np.maximum(counted, 1), mean)
-    counted = np.maximum(counted, 1)
-    return trimmed.astype(np.float32), _deviation(np.maximum(squares / counted - (trimmed - centre) ** 2, 0.0))
+    usual = np.empty_like(centre)
+
+    def average(rows: slice) -> None:
+        some = np.maximum(counted[rows], 1)
+        trimmed = np.where(counted[rows] > 0, total[rows] / some, mean[rows])
+        squares[rows] = np.maximum(squares[rows] / some - (trimmed - centre[rows]) ** 2, 0.0)
+        usual[rows] = trimmed
+
+    _in_strips(average, usual.shape, threads)
+    return usual, _deviation(squares)
+
+
+def _in_strips(work: Callable[[slice], None], shape: tuple[int, ...], threads: int) -> None:
+    """Work on images of this shape in strips of rows, side by side where there is more than one."""
+    parts = list(strips(shape))
+    for _ in map_ahead(work, parts, threads) if len(parts) > 1 else map(work, parts):
+        pass
 
 
 def _deviation(variance: np.ndarray) -> FloatArray:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -130,7 +130,7 @@ def invert_flow(flow: ArrayLike, iterations: int = 20, tolerance: float = 1e-3) 
     iterations : int
         Largest number of fixed-point steps.
     tolerance : float
-        Stop when no displacement changes by more than this many pixels.
+        A strip of rows is done when no displacement in it changes by more than this many pixels.
 
     Returns
     -------
@@ -152,13 +152,15 @@ def invert_flow(flow: ArrayLike, iterations: int = 20, tolerance: float = 1e-3) 
     flow = check_flow(flow)
     if flow.ndim != 3:
         raise DataError(f"flow: expected shape (H, W, 2), found {flow.shape}")
-    inverse = -flow
-    for _ in range(iterations):
-        update = -_linear(flow, inverse)
-        change = float(np.abs(update - inverse).max())
-        inverse = update
-        if change <= tolerance:
-            break
+    inverse, planes = -flow, cv2.split(flow)
+    for rows in strips(flow.shape):
+        for _ in range(iterations):
+            update = _sample_planes(planes, inverse[rows], rows)
+            np.negative(update, out=update)
+            change = cv2.norm(update, inverse[rows], cv2.NORM_INF)
+            inverse[rows] = update
+            if change <= tolerance:
+                break
     return inverse
 
 
@@ -269,14 +271,16 @@ def _pixel_grid(height: int, width: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _linear(image: FloatArray, flow: FloatArray) -> FloatArray:
-    x, y = _pixel_grid(*flow.shape[:2])
-    map_x, map_y = x + flow[..., 0], y + flow[..., 1]
-
-    def sample(plane: FloatArray) -> FloatArray:
-        return cv2.remap(plane, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
     # For one and three channels OpenCV 5 is exact; for the two of a flow it still rounds positions to 1/32 px.
-    return cv2.merge([sample(plane) for plane in cv2.split(image)]) if image.shape[2:] == (2,) else sample(image)
+    return _sample_planes(cv2.split(image) if image.shape[2:] == (2,) else (image,), flow)
+
+
+def _sample_planes(planes: Sequence[FloatArray], flow: FloatArray, rows: slice = slice(None)) -> FloatArray:
+    """Planes at where the flow of some rows leads, put together."""
+    x, y = (axis[rows] for axis in _pixel_grid(*planes[0].shape[:2]))
+    to = x + flow[..., 0], y + flow[..., 1]
+    sampled = [cv2.remap(plane, *to, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in planes]
+    return cv2.merge(sampled) if len(planes) > 1 else sampled[0]
 
 
 def _cubic(image: FloatArray, flow: FloatArray) -> FloatArray:
