@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
+from turbrestore.errors import DataError
 from turbrestore.frame_noise import judge_frame, measure_frame_noise
 from turbrestore.warp import strips
 
@@ -70,6 +71,26 @@ def test_a_fold_is_found_wherever_a_strip_ends(model_and_frames, monkeypatch):
         torn, _ = judge_frame(frames[4], flow, model, sharpness=1.0)
         assert torn[row, 110] > 500 * calm[row, 110]
         assert torn[row, 40] == pytest.approx(calm[row, 40], rel=1e-4)
+
+
+def test_what_holds_for_all_frames_is_their_mean_and_variance(model_and_frames):
+    model, scene, frames = model_and_frames
+    stack, slopes = np.array(frames, np.float64), gradient(scene)
+    products = [sum(a * b for a, b in zip(gradient(frame), slopes, strict=True)) for frame in frames]
+    seen = np.array([smooth(product, model.window) for product in products])
+    assert model.image_noise == pytest.approx(stack.var(axis=0, ddof=1).mean(), rel=1e-4)
+    # Nothing deviates from the rest.
+    assert model.usual_frame == pytest.approx(stack.mean(axis=0), abs=1e-5)
+    assert model.usual == pytest.approx(seen.mean(axis=0), abs=1e-3 * seen.mean())
+    assert model.score_variance == pytest.approx(model.score_scale**2 * seen.var(axis=0), rel=1e-2, abs=1e-3)
+    spread = smooth(stack.var(axis=0).astype(np.float32), 3.0) + 0.1 * stack.var(axis=0, ddof=1).mean()
+    assert np.median(np.abs(model.deviation / spread - 1)) < 0.02
+
+
+def test_residuals_of_another_shape_are_refused(model_and_frames):
+    _, scene, frames = model_and_frames
+    with pytest.raises(DataError, match=r"residual_variance: expected shape \(200, 210\), found \(200,\)"):
+        measure_frame_noise(frames, np.zeros((8, *SHAPE, 2), np.float32), scene, np.ones(200, np.float32))
 
 
 def test_what_holds_for_all_frames_does_not_depend_on_strips(model_and_frames, monkeypatch):

@@ -28,6 +28,7 @@ from .arrays import FloatArray, luminance
 from .blur_moments.frame_blur import BlurReference, blur_against, refer_blur
 from .blur_moments.fusion import FusionRule, fusion_rule, laplacian_energy, noise_factor
 from .compiled import compiled
+from .errors import DataError
 from .parallel import map_ahead, sum_side_by_side
 from .scratch import walk
 from .warp import inside, mirror, strips, warp
@@ -145,6 +146,8 @@ def measure_frame_noise(
     >>> round(model.image_noise, 3)
     0.01
     """
+    if residual_variance.shape != image.shape[:2]:
+        raise DataError(f"residual_variance: expected shape {image.shape[:2]}, found {residual_variance.shape}")
     template, kept = _gradient(luminance(image)), dict[int, FloatArray]()
 
     def measure(batch: list[tuple[int, tuple[FloatArray, FloatArray]]]) -> tuple[np.ndarray, ...]:
@@ -172,7 +175,7 @@ def measure_frame_noise(
     energy = _smooth(square, window)
     usual_frame, deviation = _without_outliers(frames, flows, mean, variance, threads)
     sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
-    scale, score_variance, motion_share = np.empty((3, *energy.shape), np.float32)
+    scale, score_variance, motion_share = (np.empty(energy.shape, np.float32) for _ in range(3))
 
     def scores(rows: slice) -> None:
         explained = energy[rows] * _SOBEL_NOISE * sensor_noise

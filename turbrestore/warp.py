@@ -130,7 +130,7 @@ def invert_flow(flow: ArrayLike, iterations: int = 20, tolerance: float = 1e-3) 
     iterations : int
         Largest number of fixed-point steps.
     tolerance : float
-        A strip of rows is done when no displacement in it changes by more than this many pixels.
+        Steps end when no displacement changes by more than this many pixels; in a large flow, for some rows at a time.
 
     Returns
     -------
