@@ -113,8 +113,9 @@ def test_strips_are_inverted_until_each_is_done(monkeypatch):
         steps[rows.start] += 1
         return _sample_planes(planes, inverse, rows)
 
-    monkeypatch.setattr("turbrestore.warp._sample_planes", count)
-    parts = invert_flow(flow, iterations=50, tolerance=1e-5)
+    with monkeypatch.context() as patch:
+        patch.setattr("turbrestore.warp._sample_planes", count)
+        parts = invert_flow(flow, iterations=50, tolerance=1e-5)
     assert list(steps) == [rows.start for rows in strips(flow.shape)] == [0, 10, 20, 30, 40, 50]
     assert steps[0] == steps[10] == 1
     assert 3 < steps[50] < 50
