@@ -108,8 +108,8 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
         "## Against the flow calls\n",
         "Seconds of a whole restoration with the default settings, and of the optical flow alone that it asks for, "
         f"each call by itself from a frame. The bound of both ratios is {TIME_BOUND}. It is broken where what is done "
-        "once, above all the deconvolution, takes long beside the flow: by small clips, and by few frames of a large "
-        "photograph. As made, most calls start from an earlier flow of the frame, which has been prepared already, and "
+        "once, above all the deconvolution, takes long beside the flow: by clips of less than a second. "
+        "As made, most calls start from an earlier flow of the frame, which has been prepared already, and "
         "are cheaper: no bound holds for the ratio to these. The process keeps freed memory meanwhile, as a "
         "restoration has it. "
         "Frames are in memory, so nothing is decoded.\n",
