@@ -16,17 +16,17 @@ from typing import Literal
 import numpy as np
 from clips import Clip, find_clips
 
-from turbrestore.alternating import FilterParams
-from turbrestore.arrays import FloatArray
-from turbrestore.blur_estimation import BlurEstimate, estimate_blur
-from turbrestore.centroid import CentroidParams
-from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.errors import TurbrestoreError
-from turbrestore.flow import FlowParams
-from turbrestore.images import atomic_write
+from turbrestore.blur.estimation import BlurEstimate, estimate_blur
+from turbrestore.blur.psf import GAUSSIAN
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import TurbrestoreError
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.filtering.alternating import FilterParams
+from turbrestore.io.images import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import Restoration, RestoreParams, restore
-from turbrestore.psf import GAUSSIAN
+from turbrestore.registration.centroid import CentroidParams
+from turbrestore.registration.flow import FlowParams
 
 DEFAULT = RestoreParams()
 # Run anew from the frames.

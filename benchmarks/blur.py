@@ -3,7 +3,7 @@
 Run ``python benchmarks/blur.py``.  It prints a table of three estimators on scenes of ten kinds, and exits with 1 when
 the one in use misses its bounds.
 
-* likelihood: :func:`turbrestore.blur_estimation.estimate_blur`, the one in use;
+* likelihood: :func:`turbrestore.blur.estimation.estimate_blur`, the one in use;
 * spectrum: fit of ``c − 2 log ν − 4π²σ²ν²`` to the logarithm of the radial power spectrum, where it stands clear of
   the noise;
 * re-blur: the ratio of gradients before and after another blur, at edges (Zhuo and Sim 2011), their median.
@@ -20,9 +20,10 @@ import cv2
 import numpy as np
 from scipy import fft
 
-from turbrestore.arrays import FloatArray
-from turbrestore.blur_estimation import estimate_blur
-from turbrestore.psf import GAUSSIAN, estimate_noise
+from turbrestore.blur.estimation import estimate_blur
+from turbrestore.blur.psf import GAUSSIAN
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.noise import estimate_noise
 from turbrestore.synthesis.scenes import SCENES
 
 SIDE = 256

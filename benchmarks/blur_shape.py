@@ -13,9 +13,9 @@ import numpy as np
 from clips import find_clips
 from scipy import fft
 
-from turbrestore.arrays import FloatArray, luminance
-from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.errors import TurbrestoreError
+from turbrestore.core.arrays import FloatArray, luminance
+from turbrestore.core.errors import TurbrestoreError
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.metrics import align, compare
 from turbrestore.pipeline import RestoreParams, restore
 

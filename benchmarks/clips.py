@@ -15,14 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from turbrestore.arrays import FloatArray
-from turbrestore.errors import InputNotFoundError
-from turbrestore.images import read_image
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import InputNotFoundError
+from turbrestore.io.images import read_image
+from turbrestore.io.video import open_frames
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.scenes import SCENES, printed_words
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
-from turbrestore.video import open_frames
 
 # Synthetic clips: frames and pixels a side.
 COUNT, SMOOTH_SIDE, SCREEN_SIDE = 60, 192, 256

@@ -13,20 +13,20 @@ from pathlib import Path
 import numpy as np
 from clips import Clip, data_folder, find_clips
 
-from turbrestore.alternating import FilterParams, filter_frames
-from turbrestore.arrays import FloatArray
-from turbrestore.blind import blur_to_remove
-from turbrestore.blur_cues import BlurBounds, bound_blur, displacement_maps, typical_noise
-from turbrestore.blur_estimation import BlurEstimate, estimate_blur
+from turbrestore.blind.remove_blur import blur_to_remove
+from turbrestore.blur.blur_cues import BlurBounds, bound_blur, displacement_maps, typical_noise
+from turbrestore.blur.estimation import BlurEstimate, estimate_blur
+from turbrestore.blur.psf import KOLMOGOROV
 from turbrestore.blur_moments.cues import RelativeBlur, displacement_variance
-from turbrestore.centroid import find_centroid
-from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.displacement import with_displacement
-from turbrestore.dynamics import identify
-from turbrestore.flow_model import FlowDynamics
-from turbrestore.memory import training_share
+from turbrestore.core.arrays import FloatArray
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.dynamics.displacement import with_displacement
+from turbrestore.dynamics.dynamic_texture import identify
+from turbrestore.dynamics.flow_model import FlowDynamics
+from turbrestore.filtering.alternating import FilterParams, filter_frames
+from turbrestore.memory_plan import training_share
 from turbrestore.metrics import compare
-from turbrestore.psf import KOLMOGOROV
+from turbrestore.registration.centroid import find_centroid
 
 SETTINGS = DeconvolutionParams()
 VARIANTS = ("default", "frame noise by blur", "displacement cue", "blur bounds")

@@ -14,17 +14,17 @@ import numpy as np
 import skimage.data
 from scipy.special import ndtr
 
-from turbrestore.arrays import FloatArray
 from turbrestore.blur_moments.cues import displacement_variance, relative_blur
 from turbrestore.blur_moments.frame_blur import FrameBlur, frame_blur
 from turbrestore.blur_moments.fusion import fuse_frames, fusion_rule, fusion_weights, laplacian_energy
 from turbrestore.blur_moments.tiles import tile_map
-from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.flow import estimate_flow
+from turbrestore.core.arrays import FloatArray
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.metrics import psnr
+from turbrestore.registration.flow import estimate_flow
+from turbrestore.registration.warp import invert_flow, warp
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
-from turbrestore.warp import invert_flow, warp
 
 NOISE = 0.01
 SHARPEST, SOFTEST = 0.6, 2.4

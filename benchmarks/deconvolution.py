@@ -25,12 +25,12 @@ import numpy as np
 from revisions import take_two_cores
 from scipy import fft
 
-from turbrestore import nonlocal_tv
-from turbrestore.blind import remove_blur
-from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.nonlocal_tv import nonlocal_weights
-from turbrestore.parallel import available_cores
-from turbrestore.psf import KOLMOGOROV, blur_otf
+from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.blur.psf import KOLMOGOROV, blur_otf
+from turbrestore.deconvolution import nonlocal_tv
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.deconvolution.nonlocal_tv import nonlocal_weights
+from turbrestore.runtime.threads import available_cores
 from turbrestore.synthesis.scenes import SCENES
 
 # Height and width of an image that is deblurred with all in files, pixels; and what strips may differ by.
@@ -123,7 +123,7 @@ def run_child(limit: float) -> None:
 def strips_difference() -> float:
     """Largest difference between an image deblurred as one strip and in strips, in memory or in files."""
     # Trees before this one have it not.
-    from turbrestore import strip_grid
+    from turbrestore.deconvolution import strip_grid
 
     # One band of the search holds all rows, with those that deconvolution adds.
     image, params = make_image(40, 512), DeconvolutionParams(iterations=40)

@@ -19,21 +19,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from turbrestore.alternating import FilterParams, filter_frames
-from turbrestore.arrays import FloatArray
-from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.device import PROCESSOR, find_device
-from turbrestore.dynamics import identify
-from turbrestore.flow import FlowParams, estimate_flow
+from turbrestore.core.arrays import FloatArray
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.deconvolution.nonlocal_tv import NonlocalParams, nonlocal_weights
+from turbrestore.deconvolution.torch_weights import weights_on_device
+from turbrestore.dynamics.dynamic_texture import identify
+from turbrestore.filtering.alternating import FilterParams, filter_frames
 from turbrestore.metrics import psnr
-from turbrestore.nonlocal_tv import NonlocalParams, nonlocal_weights
 from turbrestore.pipeline import restore
-from turbrestore.restoration import RestoreParams
+from turbrestore.registration.flow import FlowParams, estimate_flow
+from turbrestore.registration.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
+from turbrestore.registration.warp import warp
+from turbrestore.runtime.device import PROCESSOR, find_device
+from turbrestore.settings import RestoreParams
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
-from turbrestore.torch_weights import weights_on_device
-from turbrestore.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
-from turbrestore.warp import warp
 
 DECIBELS, PIXELS = 0.02, 0.02
 FRAMES, SIGMA = 8, 1.5

@@ -13,16 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from turbrestore.alternating import FilterParams, filter_frames
-from turbrestore.arrays import FloatArray
-from turbrestore.centroid import find_centroid
-from turbrestore.dynamics import identify
-from turbrestore.images import read_image
-from turbrestore.memory import training_share
+from turbrestore.core.arrays import FloatArray
+from turbrestore.dynamics.dynamic_texture import identify
+from turbrestore.filtering.alternating import FilterParams, filter_frames
+from turbrestore.io.images import read_image
+from turbrestore.io.video import open_frames
+from turbrestore.memory_plan import training_share
 from turbrestore.metrics import compare
+from turbrestore.registration.centroid import find_centroid
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
-from turbrestore.video import open_frames
 
 DEFAULT = FilterParams()
 VARIANTS = {

@@ -20,14 +20,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 from clips import find_clips
 
-from turbrestore.alternating import FilterParams
-from turbrestore.arrays import FloatArray
-from turbrestore.centroid import CentroidParams
-from turbrestore.errors import TurbrestoreError
-from turbrestore.flow import FlowParams, iterate_flows
-from turbrestore.images import atomic_write
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import TurbrestoreError
+from turbrestore.filtering.alternating import FilterParams
+from turbrestore.io.images import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import RestoreParams, restore
+from turbrestore.registration.centroid import CentroidParams
+from turbrestore.registration.flow import FlowParams, iterate_flows
 
 CLIPS = ("quick_*", "ao_*", "purdue1_*")
 FRAMES, SIDE, THREADS = 48, 160, 2

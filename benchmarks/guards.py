@@ -13,10 +13,10 @@ import sys
 
 import numpy as np
 
-from turbrestore.arrays import FloatArray, luminance
-from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.guards import GuardReading, judge
-from turbrestore.psf import GAUSSIAN, blur_otf
+from turbrestore.blind.guards import GuardReading, judge
+from turbrestore.blur.psf import GAUSSIAN, blur_otf
+from turbrestore.core.arrays import FloatArray, luminance
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.synthesis.scenes import SCENES
 
 NAMES = ("chart", "words", "camera", "cat", "page", "grass", "brick")

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from turbrestore.arrays import FloatArray
+from turbrestore.core.arrays import FloatArray
+from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
-from turbrestore.video import write_video
 
 FORMATS = (".mkv", ".mp4", ".avi", ".mov", ".gif", ".ser", ".tif", ".npy")
 FLIPPED = {"FFV1 with checksums": ".mkv", "H.264": ".mp4", "SER": ".ser", "TIFF": ".tif", "npy": ".npy"}

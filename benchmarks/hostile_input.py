@@ -39,8 +39,8 @@ from hostile_files import (
     write_still,
 )
 
-from turbrestore.errors import DataError
-from turbrestore.images import read_image
+from turbrestore.core.errors import DataError
+from turbrestore.io.images import read_image
 from turbrestore_cli.__main__ import main as command_line
 
 BAD_DATA, DONE = 65, 0

@@ -29,9 +29,9 @@ from pathlib import Path
 
 import numpy as np
 
+from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
-from turbrestore.video import write_video
 
 COMMAND = [sys.executable, "-m", "turbrestore_cli"]
 SETTINGS = ["--train=8", "--centroid.iterations=1", "--filter.block=8", "--deconvolution.iterations=5", "--quiet"]
@@ -260,7 +260,7 @@ def output_cases(mounts: bool) -> list[Case]:
 def flow_on_full(folder: Path, stack: ExitStack) -> None:
     """Mount a full disk, and let a reference be there."""
     full(65536)(folder, stack)
-    from turbrestore.images import write_image
+    from turbrestore.io.images import write_image
 
     write_image(folder / "clip.png", resolution_chart(64, 64), 8)
 

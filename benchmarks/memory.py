@@ -6,9 +6,10 @@
 ``--quick`` takes 40 frames of that size, with the same training frames.
 ``--largest`` adds frames of 3840×2160 and 7680×4320.
 ``--stages`` prints the peak of every stage, in bytes a pixel, with training frames in memory and in a file, and of what
-is made of the whole image where frames are worked on in tiles: what the plan of ``turbrestore/memory.py`` rests on.
-For deconvolutions it prints what they take of that which ``turbrestore/deconvolution_memory.py`` plans.  Memory is the
-largest resident set, mapped files included.
+is made of the whole image where frames are worked on in tiles: what the plan of ``turbrestore/memory_plan.py`` rests
+on.
+For deconvolutions it prints what they take of that which ``turbrestore/deconvolution/deconvolution_memory.py`` plans.
+Memory is the largest resident set, mapped files included.
 """
 
 from __future__ import annotations
@@ -239,15 +240,15 @@ def measure_stages(clip: Clip, threads: int, method: str) -> None:
     First with the training frames in memory, then in a file, and beside both what is planned of the largest.
     """
     from turbrestore import pipeline
-    from turbrestore.alternating import FilterParams
-    from turbrestore.centroid import CentroidParams
-    from turbrestore.deconvolution import DeconvolutionParams
-    from turbrestore.dynamics import DynamicsParams
-    from turbrestore.flow import FlowParams
-    from turbrestore.frame_source import FrameSource
-    from turbrestore.memory import _Work
-    from turbrestore.restoration import RestoreParams
-    from turbrestore.scratch import returning_freed
+    from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+    from turbrestore.dynamics.dynamic_texture import DynamicsParams
+    from turbrestore.filtering.alternating import FilterParams
+    from turbrestore.io.source import FrameSource
+    from turbrestore.memory_plan import _Work
+    from turbrestore.registration.centroid import CentroidParams
+    from turbrestore.registration.flow import FlowParams
+    from turbrestore.runtime.scratch import returning_freed
+    from turbrestore.settings import RestoreParams
 
     # Fewer than there are, for the filter holds a block of those that follow.
     train, pixels = 16, clip.height * clip.width
@@ -284,7 +285,7 @@ def measure_stages(clip: Clip, threads: int, method: str) -> None:
 
 def measure_whole(clip: Clip) -> None:
     """Print what is made of the whole image beside tiles, bytes a pixel; in a process of its own."""
-    from turbrestore.scratch import release, returning_freed
+    from turbrestore.runtime.scratch import release, returning_freed
 
     pixels = clip.height * clip.width
     with returning_freed(), tempfile.TemporaryDirectory() as name:
@@ -305,23 +306,23 @@ def measure_whole(clip: Clip) -> None:
 def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[], object]]]]:
     """Constants of the plan, and calls that they are for."""
     from turbrestore import pipeline
-    from turbrestore.blur_cues import bound_blur
-    from turbrestore.blur_estimation import estimate_blur
-    from turbrestore.blur_map import estimate_blur_map, sigma_map
-    from turbrestore.content import check_content
-    from turbrestore.dynamics import identify
+    from turbrestore.blind.blur_map import estimate_blur_map, sigma_map
+    from turbrestore.blind.guards import judge
+    from turbrestore.blur.blur_cues import bound_blur
+    from turbrestore.blur.estimation import estimate_blur
+    from turbrestore.blur.psf import estimate_noise
+    from turbrestore.deconvolution.planes import split_planes
+    from turbrestore.dynamics.dynamic_texture import identify
     from turbrestore.explanation import explain_input, explain_motion
-    from turbrestore.frame_source import FrameSource
-    from turbrestore.guards import judge
-    from turbrestore.images import write_image
+    from turbrestore.footage.content import check_content
+    from turbrestore.io.images import write_image
+    from turbrestore.io.source import FrameSource
+    from turbrestore.io.video import open_frames
     from turbrestore.metrics import compare
-    from turbrestore.planes import split_planes
-    from turbrestore.psf import estimate_noise
     from turbrestore.report import render_report
     from turbrestore.report.pictures import encode_gallery, stages
-    from turbrestore.run_record import describe_run
-    from turbrestore.scratch import new_stack, release, walk
-    from turbrestore.video import open_frames
+    from turbrestore.runs.run_record import describe_run
+    from turbrestore.runtime.scratch import new_stack, release, walk
 
     # Video is always read in colour.
     encoded = [folder / "images", *([folder / "clip.mkv"] if clip.channels == 3 else [])]
@@ -370,8 +371,8 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
 
 def until_centroid(image: np.ndarray, mean: np.ndarray, flows: np.ndarray) -> object:
     """Return a restoration that ended with the centroid."""
-    from turbrestore.centroid import Centroid
-    from turbrestore.restoration import Restoration
+    from turbrestore.registration.centroid import Centroid
+    from turbrestore.settings import Restoration
 
     return Restoration(
         image=image,
@@ -389,7 +390,7 @@ def until_centroid(image: np.ndarray, mean: np.ndarray, flows: np.ndarray) -> ob
 
 def read_corners(path: Path) -> None:
     """Read a corner of each frame, as a tile does."""
-    from turbrestore.video import open_frames
+    from turbrestore.io.video import open_frames
 
     for _ in open_frames(path, roi=(0, 0, 64, 64)):
         pass
@@ -397,11 +398,11 @@ def read_corners(path: Path) -> None:
 
 def measure_deconvolution(clip: Clip, method: str) -> None:
     """Print the peak of a deconvolution in memory, with pairs in files and with images in files too, bytes a pixel."""
-    from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-    from turbrestore.deconvolution_memory import DeconvolutionWork, Room
-    from turbrestore.memory_size import DeconvolutionMemory
-    from turbrestore.parallel import available_cores
-    from turbrestore.scratch import release, returning_freed
+    from turbrestore.deconvolution.deconvolution_memory import DeconvolutionWork, Room
+    from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+    from turbrestore.runtime.memory_size import DeconvolutionMemory
+    from turbrestore.runtime.scratch import release, returning_freed
+    from turbrestore.runtime.threads import available_cores
 
     pixels, threads = clip.height * clip.width, available_cores()
     # Of a periodic image the margin is none.

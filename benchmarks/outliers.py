@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from clips import Clip, find_clips
 
-from turbrestore.arrays import FloatArray
+from turbrestore.core.arrays import FloatArray
 from turbrestore.metrics import compare
 from turbrestore.pipeline import Restoration, RestoreParams, restore
 

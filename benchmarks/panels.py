@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from clips import data_folder, find_clips
 
-from turbrestore.arrays import FloatArray, luminance
-from turbrestore.images import read_image, write_image
+from turbrestore.core.arrays import FloatArray, luminance
+from turbrestore.io.images import read_image, write_image
+from turbrestore.io.video import open_frames
 from turbrestore.pipeline import Restoration, restore
-from turbrestore.video import open_frames
 
 HEIGHT, GAP = 256, 6
 # Large clips are read through a window, so that detail stays visible.

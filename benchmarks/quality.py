@@ -28,16 +28,16 @@ from clips import COUNT, LARGEST_SIDE, MOST_FRAMES, SCREEN_SIDE, SMOOTH_SIDE, Cl
 from quality_change import compare_with
 from words import can_read, share_read
 
-from turbrestore.alternating import FilterParams
-from turbrestore.arrays import FloatArray
-from turbrestore.centroid import CentroidParams, mean_registered
-from turbrestore.deconvolution import DeconvolutionParams
-from turbrestore.errors import TurbrestoreError
-from turbrestore.flow import estimate_flow
-from turbrestore.images import atomic_write, read_image, write_image
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import TurbrestoreError
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.filtering.alternating import FilterParams
+from turbrestore.io.images import atomic_write, read_image, write_image
+from turbrestore.io.video import open_frames
 from turbrestore.metrics import appearance, compare
 from turbrestore.pipeline import Restoration, RestoreParams, restore
-from turbrestore.video import open_frames
+from turbrestore.registration.centroid import CentroidParams, mean_registered
+from turbrestore.registration.flow import estimate_flow
 
 # The paper's choices, with this project's optical flow and automatic fidelity.
 PAPER = RestoreParams(

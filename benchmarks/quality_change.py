@@ -20,8 +20,8 @@ from clips import Clip, find_clips
 from revisions import child, revision
 from words import can_read, share_read
 
-from turbrestore.arrays import FloatArray
-from turbrestore.errors import InputNotFoundError
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import InputNotFoundError
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
 

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from turbrestore.errors import ConfigurationError, TurbrestoreError
+from turbrestore.core.errors import ConfigurationError, TurbrestoreError
 
 Figures = dict[str, Any]
 

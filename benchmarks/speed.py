@@ -30,13 +30,13 @@ import numpy as np
 import tvl1
 from revisions import Figures, child, revision, take_two_cores
 
-from turbrestore.centroid import CentroidParams
-from turbrestore.errors import TurbrestoreError
-from turbrestore.flow import FlowParams, iterate_flows
-from turbrestore.frame_source import FrameSource
-from turbrestore.images import atomic_write
-from turbrestore.nonlocal_tv import nonlocal_weights
+from turbrestore.core.errors import TurbrestoreError
+from turbrestore.deconvolution.nonlocal_tv import nonlocal_weights
+from turbrestore.io.images import atomic_write
+from turbrestore.io.source import FrameSource
 from turbrestore.pipeline import RestoreParams, restore
+from turbrestore.registration.centroid import CentroidParams
+from turbrestore.registration.flow import FlowParams, iterate_flows
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
@@ -323,7 +323,7 @@ def run_child(task: Figures) -> Figures:
 def as_restored() -> AbstractContextManager[None]:
     """Have freed memory kept, as a restoration has it; other trees, which are measured by this script too, do not."""
     try:
-        from turbrestore.scratch import keeping_freed
+        from turbrestore.runtime.scratch import keeping_freed
     except ImportError:
         return nullcontext()
     return keeping_freed()
@@ -332,7 +332,7 @@ def as_restored() -> AbstractContextManager[None]:
 def started(stack: np.ndarray, params: FlowParams, start_level: int) -> float:
     """Seconds of a flow of a frame that has been prepared, from an earlier flow."""
     # Other trees, which are measured by this script too, have none of these.
-    from turbrestore.flow import FlowFrame, fill_flows, refer_flow
+    from turbrestore.registration.flow import FlowFrame, fill_flows, refer_flow
 
     reference, prepared = refer_flow(stack.mean(axis=0), params, start_level), dict[int, FlowFrame]()
     flows = np.zeros((*stack.shape[:3], 2), np.float32)

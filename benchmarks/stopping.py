@@ -21,11 +21,11 @@ import numpy as np
 from clips import Clip, find_clips
 from scipy import fft
 
-from turbrestore.blur_estimation import BlurEstimate, estimate_blur
-from turbrestore.deconvolution import METHODS, DeconvolutionParams, deconvolve
+from turbrestore.blur.estimation import BlurEstimate, estimate_blur
+from turbrestore.blur.psf import KOLMOGOROV, blur_otf
+from turbrestore.deconvolution.deconvolve import METHODS, DeconvolutionParams, deconvolve
 from turbrestore.metrics import psnr
 from turbrestore.pipeline import RestoreParams, restore
-from turbrestore.psf import KOLMOGOROV, blur_otf
 from turbrestore.synthesis.scenes import SCENES
 
 NAMES, NOISES = ("camera", "chart", "words", "brick"), (0.002, 0.01, 0.03)

@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 
 from turbrestore import pipeline
-from turbrestore.frame_source import FrameSource
+from turbrestore.io.source import FrameSource
 from turbrestore.metrics import psnr
-from turbrestore.restoration import Restoration, RestoreParams
+from turbrestore.settings import Restoration, RestoreParams
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
 

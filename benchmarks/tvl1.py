@@ -32,16 +32,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from turbrestore.arrays import FloatArray, luminance
-from turbrestore.flow import FlowParams, Solver, iterate_flows, normalise_contrast
+from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.metrics import endpoint_error
-from turbrestore.parallel import map_ahead
+from turbrestore.registration.flow import FlowParams, Solver, iterate_flows, normalise_contrast
+from turbrestore.registration.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
+from turbrestore.runtime.threads import map_ahead
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import synthesize_like
 from turbrestore.synthesis.scenes import SCENES, resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
-from turbrestore.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
 
 SIDE, THREADS, LEAST_RATIO = 192, 2, 5.0
 # Frames that a dynamic texture is identified on, later frames that flows are started for, and levels of the pyramid.
@@ -170,8 +170,8 @@ def main() -> int:
 def compare_starts() -> None:
     """Print time, warps at full resolution and error of flows by what they start from, and how far off that is."""
     # Earlier trees, for which benchmarks/speed.py imports this module too, have these elsewhere.
-    from turbrestore.dynamics import identify
-    from turbrestore.flow_model import predict_flow, project
+    from turbrestore.dynamics.dynamic_texture import identify
+    from turbrestore.dynamics.flow_model import predict_flow, project
 
     for name, make in SETS.items():
         motion = make(IDENTIFIED + STARTED)
@@ -200,9 +200,9 @@ def compare_clips() -> None:
     """Print the processor time of whole restorations, and PSNR of the filtered and the deblurred image."""
     from clips import find_clips
 
-    from turbrestore.flow import FLOW_METHODS
     from turbrestore.metrics import compare
     from turbrestore.pipeline import RestoreParams, restore
+    from turbrestore.registration.flow import FLOW_METHODS
 
     started = FLOW_METHODS["tvl1"]
 

@@ -18,8 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from turbrestore.arrays import FloatArray, from_unit, luminance
-from turbrestore.images import write_image
+from turbrestore.core.arrays import FloatArray, from_unit, luminance
+from turbrestore.io.images import write_image
 
 ENLARGEMENT = 3
 # Page segmentation of tesseract: one uniform block, sparse text.

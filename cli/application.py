@@ -10,7 +10,7 @@ import sys
 from cyclopts import App, CycloptsError, UnusedCliTokensError
 
 from turbrestore import __version__
-from turbrestore.errors import ConfigurationError, StorageError, TurbrestoreError
+from turbrestore.core.errors import ConfigurationError, StorageError, TurbrestoreError
 
 from .examples import EXAMPLES, FIRST_STEPS, epilogue
 from .settings import settings_file

@@ -7,7 +7,7 @@ from typing import Literal
 
 from cyclopts.completion.detect import ShellDetectionError
 
-from turbrestore.errors import ConfigurationError
+from turbrestore.core.errors import ConfigurationError
 
 from .streams import tell
 

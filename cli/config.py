@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, get_args
 import tomli_w
 
 from turbrestore import __version__
-from turbrestore.errors import require
-from turbrestore.images import atomic_write, check_output
-from turbrestore.pixels import check_depth
-from turbrestore.restoration import RestoreParams
+from turbrestore.core.errors import require
+from turbrestore.io.images import atomic_write, check_output
+from turbrestore.io.pixels import check_depth
+from turbrestore.settings import RestoreParams
 
 from .options import Flag, known_sigma
 from .settings import read_toml, settings

@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from turbrestore import __version__
-from turbrestore.errors import TurbrestoreError
+from turbrestore.core.errors import TurbrestoreError
 
 from .streams import put
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from turbrestore.arrays import FloatArray
-from turbrestore.artifacts import load_stage_image
-from turbrestore.content import ContentParams, ContentReport, check_content, clean_source
-from turbrestore.errors import DataError, require
-from turbrestore.frame_source import FrameSource
-from turbrestore.images import read_image
-from turbrestore.limits import Limits
-from turbrestore.video import open_frames
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import DataError, require
+from turbrestore.footage.content import ContentParams, ContentReport, check_content, clean_source
+from turbrestore.io.images import read_image
+from turbrestore.io.limits import Limits
+from turbrestore.io.source import FrameSource
+from turbrestore.io.video import open_frames
+from turbrestore.runs.artifacts import load_stage_image
 
 from .options import Selection
 from .progress import say

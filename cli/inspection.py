@@ -10,15 +10,15 @@ from typing import Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from turbrestore.arrays import FloatArray, check_flow
-from turbrestore.artifacts import load_flows
-from turbrestore.content import clean_source
-from turbrestore.errors import DataError, require
-from turbrestore.images import read_image
-from turbrestore.input_files import check_input, input_errors
-from turbrestore.limits import DEFAULT_LIMITS
-from turbrestore.memory import training_share
+from turbrestore.core.arrays import FloatArray, check_flow
+from turbrestore.core.errors import DataError, require
+from turbrestore.footage.content import clean_source
+from turbrestore.io.files import check_input, input_errors
+from turbrestore.io.images import read_image
+from turbrestore.io.limits import DEFAULT_LIMITS
+from turbrestore.memory_plan import training_share
 from turbrestore.metrics import appearance, compare, compare_flows
+from turbrestore.runs.artifacts import load_flows
 
 from .inputs import open_checked, read_input_image
 from .options import Flag, Selection, limits_of

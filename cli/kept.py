@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from turbrestore.folder_lock import lock_folder
-from turbrestore.frame_source import FrameSource
-from turbrestore.images import check_space
+from turbrestore.io.images import check_space
+from turbrestore.io.source import FrameSource
 from turbrestore.pipeline import memory_plan
-from turbrestore.restoration import RestoreParams
-from turbrestore.resumption import KeptStages, read_stages
+from turbrestore.runs.folder_lock import lock_folder
+from turbrestore.runs.resumption import KeptStages, read_stages
+from turbrestore.settings import RestoreParams
 
 from .progress import say
 

@@ -12,8 +12,8 @@ from turbrestore.blur_moments.experiments import mirror as run_mirror
 from turbrestore.blur_moments.experiments import wavefront as run_wavefront
 from turbrestore.blur_moments.figures import draw_mirror, draw_wavefront, new_figure
 from turbrestore.blur_moments.scenarios import MirrorParams, WavefrontParams
-from turbrestore.errors import require_between
-from turbrestore.images import atomic_write, check_output
+from turbrestore.core.errors import require_between
+from turbrestore.io.images import atomic_write, check_output
 
 from .options import Flag
 from .output import print_json

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from turbrestore.errors import ConfigurationError
+from turbrestore.core.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from turbrestore.deconvolution import DeconvolutionParams
-    from turbrestore.frame_source import FrameRange, Roi
-    from turbrestore.limits import Limits
+    from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+    from turbrestore.io.limits import Limits
+    from turbrestore.io.source import FrameRange, Roi
 
 # A switch without a "--no-" twin.
 Flag = Annotated[bool, Parameter(negative="")]
@@ -69,7 +69,7 @@ class Selection:
 
 def limits_of(max_pixels: int | None) -> Limits:
     """Turn ``--max-pixels`` into limits."""
-    from turbrestore.limits import DEFAULT_LIMITS
+    from turbrestore.io.limits import DEFAULT_LIMITS
 
     return DEFAULT_LIMITS if max_pixels is None else replace(DEFAULT_LIMITS, max_pixels=max_pixels)
 

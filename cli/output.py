@@ -13,15 +13,15 @@ import numpy as np
 import tomli_w
 
 from turbrestore import __version__
-from turbrestore.arrays import FloatArray
-from turbrestore.errors import OutputError
-from turbrestore.folder_lock import LOCK
-from turbrestore.images import atomic_write, check_output, write_image
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import OutputError
+from turbrestore.io.images import atomic_write, check_output, write_image
 from turbrestore.metrics import compare
-from turbrestore.restoration import Restoration, RestoreParams
-from turbrestore.resumption import STAGE_FILES, KeptStages, is_part, read_stages
-from turbrestore.run_record import RUN_FILES, RunRecord, save_run
-from turbrestore.scratch import walk
+from turbrestore.runs.folder_lock import LOCK
+from turbrestore.runs.resumption import STAGE_FILES, KeptStages, is_part, read_stages
+from turbrestore.runs.run_record import RUN_FILES, RunRecord, save_run
+from turbrestore.runtime.scratch import iter_frames
+from turbrestore.settings import Restoration, RestoreParams
 
 from .options import Selection
 from .streams import put
@@ -78,7 +78,7 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
     record["decisions"] = [dataclasses.asdict(decision) for decision in restoration.decisions]
     if truth is not None:
         images = stage_images(restoration)
-        figures = (dataclasses.asdict(compare(image, truth)) for image in walk(images.values()))
+        figures = (dataclasses.asdict(compare(image, truth)) for image in iter_frames(images.values()))
         record["stages"] = dict(zip(images, figures, strict=True))
     return record
 

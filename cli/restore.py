@@ -8,17 +8,17 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from turbrestore.errors import require
-from turbrestore.images import check_output, write_image
-from turbrestore.memory import check_comparison
+from turbrestore.core.errors import require
+from turbrestore.io.images import check_output, write_image
+from turbrestore.io.pixels import check_depth
+from turbrestore.memory_plan import check_comparison
 from turbrestore.metrics import comparable
 from turbrestore.pipeline import memory_plan
 from turbrestore.pipeline import restore as run_pipeline
-from turbrestore.pixels import check_depth
 from turbrestore.report import check_report, write_report
-from turbrestore.restoration import RestoreParams
-from turbrestore.run_record import describe_run
-from turbrestore.scratch import returning_freed
+from turbrestore.runs.run_record import describe_run
+from turbrestore.runtime.scratch import returning_freed
+from turbrestore.settings import RestoreParams
 
 from .inputs import open_input, read_input_image
 from .kept import check_room, kept_stages, own_outputs

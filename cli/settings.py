@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from cyclopts.config import Dict
 
-from turbrestore.errors import ConfigurationError, InputNotFoundError
+from turbrestore.core.errors import ConfigurationError, InputNotFoundError
 
 if TYPE_CHECKING:
     from cyclopts import App

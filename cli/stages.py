@@ -8,21 +8,21 @@ from typing import Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from turbrestore.alternating import Filtered, FilterParams, filter_frames
-from turbrestore.artifacts import load_artifact, load_flows, save_artifact, save_flows
-from turbrestore.blind import remove_blur
-from turbrestore.centroid import Centroid, CentroidParams, find_centroid
-from turbrestore.deconvolution import Deconvolution, DeconvolutionParams
-from turbrestore.dynamics import DynamicsParams
-from turbrestore.dynamics import identify as identify_flows
-from turbrestore.errors import require
-from turbrestore.flow import FlowParams, estimate_flow
-from turbrestore.flow_model import FlowDynamics
-from turbrestore.guards import GuardParams
-from turbrestore.images import IMAGE_OUTPUT_SUFFIXES, check_output, check_space, read_image, write_image
-from turbrestore.memory import training_share
+from turbrestore.blind.guards import GuardParams
+from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.core.errors import require
+from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
+from turbrestore.dynamics.dynamic_texture import DynamicsParams
+from turbrestore.dynamics.dynamic_texture import identify as identify_flows
+from turbrestore.dynamics.flow_model import FlowDynamics
+from turbrestore.filtering.alternating import Filtered, FilterParams, filter_frames
+from turbrestore.io.images import IMAGE_OUTPUT_SUFFIXES, check_output, check_space, read_image, write_image
+from turbrestore.io.pixels import check_depth
+from turbrestore.memory_plan import training_share
 from turbrestore.pipeline import stage_counter
-from turbrestore.pixels import check_depth
+from turbrestore.registration.centroid import Centroid, CentroidParams, find_centroid
+from turbrestore.registration.flow import FlowParams, estimate_flow
+from turbrestore.runs.artifacts import load_artifact, load_flows, save_artifact, save_flows
 
 from .inputs import open_input, read_input_image
 from .options import Flag, Selection, known_sigma, limits_of

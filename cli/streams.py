@@ -7,7 +7,7 @@ import sys
 from contextlib import suppress
 from typing import TextIO
 
-from turbrestore.errors import StorageError
+from turbrestore.core.errors import StorageError
 
 
 def open_closed() -> None:

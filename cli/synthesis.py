@@ -16,11 +16,12 @@ import numpy as np
 from cyclopts import Parameter
 
 from turbrestore import __version__
-from turbrestore.arrays import FloatArray
-from turbrestore.errors import ConfigurationError, OutputError, require, require_between
-from turbrestore.images import check_output, check_space, read_image, write_image
-from turbrestore.limits import Limits
-from turbrestore.memory import training_share
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import ConfigurationError, OutputError, require, require_between
+from turbrestore.io.images import check_output, check_space, read_image, write_image
+from turbrestore.io.limits import Limits
+from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video
+from turbrestore.memory_plan import training_share
 from turbrestore.pipeline import Progress, stage_counter
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
@@ -28,7 +29,6 @@ from turbrestore.synthesis.dynamic_texture import DynamicTextureParams, synthesi
 from turbrestore.synthesis.exposure import exposed_frame, flows_between
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.sequence import CameraParams, SyntheticFrame, check_scene, record
-from turbrestore.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video
 
 from .options import Flag, limits_of
 from .output import print_json

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from turbrestore.images import write_image
+from turbrestore.io.images import write_image
+from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
-from turbrestore.video import write_video
 
 FOLDER = Path(__file__).parent
 HEIGHT, WIDTH, FRAMES, RATE = 192, 256, 48, 25

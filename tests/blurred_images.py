@@ -19,6 +19,6 @@ def psnr(image: np.ndarray, truth: np.ndarray) -> float:
 
 
 def in_strips(monkeypatch):
-    monkeypatch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
-    monkeypatch.setattr("turbrestore.strip_grid._STRIP", 700)
-    monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 700)
+    monkeypatch.setattr("turbrestore.deconvolution.strip_grid._ONE_STRIP", 1)
+    monkeypatch.setattr("turbrestore.deconvolution.strip_grid._STRIP", 700)
+    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_tv.STRIP_PIXELS", 700)

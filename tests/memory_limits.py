@@ -2,9 +2,9 @@
 
 import pytest
 
-from turbrestore.errors import ConfigurationError
-from turbrestore.memory import plan_memory
-from turbrestore.memory_size import MemorySize
+from turbrestore.core.errors import ConfigurationError
+from turbrestore.memory_plan import plan_memory
+from turbrestore.runtime.memory_size import MemorySize
 
 
 def least_limit(shape, **settings):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from turbrestore.arrays import FloatArray
+from turbrestore.core.arrays import FloatArray
 
 
 class Regulariser(NamedTuple):

@@ -3,9 +3,9 @@
 import numpy as np
 from scipy import fft
 
-from turbrestore.convolution_problem import Problem
-from turbrestore.psf import gaussian_otf
-from turbrestore.strip_grid import StripGrid
+from turbrestore.blur.psf import gaussian_otf
+from turbrestore.deconvolution.problem import Problem
+from turbrestore.deconvolution.strip_grid import StripGrid
 
 
 def small_problem(seed: int, fidelity: float, shape: tuple[int, int] = (8, 8), margin: int = 2) -> Problem:

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.errors import DataError
+from turbrestore.core.errors import DataError
 from turbrestore.metrics import (
     align,
     appearance,

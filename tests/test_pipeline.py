@@ -5,20 +5,20 @@ import numpy as np
 import pytest
 
 from conftest import SCENES, make_sequence
-from turbrestore import flow
-from turbrestore.alternating import FilterParams
-from turbrestore.blind import blur_to_remove
-from turbrestore.blur_cues import BlurBounds, bound_blur
-from turbrestore.blur_estimation import BlurEstimate
-from turbrestore.centroid import CentroidParams
-from turbrestore.deconvolution import DeconvolutionParams
-from turbrestore.errors import ConfigurationError, DataError
-from turbrestore.flow import FlowParams
-from turbrestore.frame_source import FrameSource
-from turbrestore.memory import training_share
+from turbrestore.blind.remove_blur import blur_to_remove
+from turbrestore.blur.blur_cues import BlurBounds, bound_blur
+from turbrestore.blur.estimation import BlurEstimate
+from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.filtering.alternating import FilterParams
+from turbrestore.io.source import FrameSource
+from turbrestore.memory_plan import training_share
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
-from turbrestore.restoration import RestoreParams
+from turbrestore.registration import flow
+from turbrestore.registration.centroid import CentroidParams
+from turbrestore.registration.flow import FlowParams
+from turbrestore.settings import RestoreParams
 
 QUICK = RestoreParams(centroid=CentroidParams(iterations=2))
 
@@ -266,7 +266,9 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
 
 def test_a_frame_is_prepared_for_flow_once(monkeypatch):
     prepared = []
-    monkeypatch.setattr("turbrestore.flow._levels", lambda *a, find=flow._levels: prepared.append(1) or find(*a))
+    monkeypatch.setattr(
+        "turbrestore.registration.flow._levels", lambda *a, find=flow._levels: prepared.append(1) or find(*a)
+    )
     frames = make_sequence(seed=1, count=20).frames[:, :48, :48]
     found = restore(frames, RestoreParams(train=12, until="filter"))
     # One for each pass of the centroid, one for the training frames with the rest and one for the rest in the filter.

@@ -6,19 +6,20 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore import pipeline, resumption
-from turbrestore.alternating import Filtered
-from turbrestore.centroid import CentroidParams, find_centroid
-from turbrestore.checkpoint import load_tiles, save_tiles
-from turbrestore.deconvolution import DeconvolutionParams, deconvolve
-from turbrestore.dynamics import DynamicsParams
-from turbrestore.errors import DataError
-from turbrestore.flow import FlowParams
-from turbrestore.frame_source import FrameSource
-from turbrestore.halo_tiles import halo_tiles
+from turbrestore import pipeline
+from turbrestore.core.errors import DataError
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.dynamics.dynamic_texture import DynamicsParams
+from turbrestore.filtering.alternating import Filtered
+from turbrestore.io.source import FrameSource
 from turbrestore.metrics import psnr
-from turbrestore.restoration import RestoreParams
-from turbrestore.resumption import KeptStages
+from turbrestore.registration.centroid import CentroidParams, find_centroid
+from turbrestore.registration.flow import FlowParams
+from turbrestore.runs import resumption
+from turbrestore.runs.checkpoint import load_tiles, save_tiles
+from turbrestore.runs.resumption import KeptStages
+from turbrestore.runtime.tiling import halo_tiles
+from turbrestore.settings import RestoreParams
 from turbrestore.tiled_stages import filter_tiles, find_tiled_centroid
 
 HALO = 24
@@ -146,12 +147,12 @@ def test_a_restoration_in_tiles_is_the_same_bytes_whatever_the_number_of_threads
     source = FrameSource.from_array(sequence.frames)
     in_tiles(source)
     # Several strips in the deconvolution.
-    monkeypatch.setattr("turbrestore.nonlocal_tv.STRIP_PIXELS", 2000)
-    monkeypatch.setattr("turbrestore.strip_grid._ONE_STRIP", 1)
-    monkeypatch.setattr("turbrestore.strip_grid._STRIP", 2000)
+    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_tv.STRIP_PIXELS", 2000)
+    monkeypatch.setattr("turbrestore.deconvolution.strip_grid._ONE_STRIP", 1)
+    monkeypatch.setattr("turbrestore.deconvolution.strip_grid._STRIP", 2000)
 
     def run(threads):
-        for module in ("parallel", "deconvolution", "nonlocal_tv"):
+        for module in ("runtime.threads", "deconvolution.deconvolve", "deconvolution.nonlocal_tv"):
             monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: threads)
         restored = pipeline.restore(source, replace(QUICK, flow=FlowParams(threads=threads)))
         return [

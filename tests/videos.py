@@ -7,7 +7,7 @@ import av
 import numpy as np
 import pytest
 
-from turbrestore.video import open_frames
+from turbrestore.io.video import open_frames
 
 RATE = Fraction(30)
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from .alternating import Filtered
-from .arrays import FloatArray, luminance
-from .border import Rectangle
-from .centroid import Centroid
-from .decision import Decision
-from .flow_model import FlowDynamics
-from .scratch import walk
-from .stabilisation import DEAD_ZONE
+from .core.arrays import FloatArray, luminance
+from .core.decision import Decision
+from .dynamics.flow_model import FlowDynamics
+from .filtering.alternating import Filtered
+from .registration.centroid import Centroid
+from .registration.coverage import Rectangle
+from .registration.global_shift import DEAD_ZONE
+from .runtime.scratch import iter_frames
 
 # A frame that counts for less than this share of the average hardly counts.
 _HARDLY = 0.2
@@ -76,7 +76,7 @@ def explain_input(training: FloatArray) -> tuple[Decision, ...]:
     """
     said = []
     saturated, contrast = 0.0, np.zeros(len(training))
-    for index, frame in enumerate(walk(training)):
+    for index, frame in enumerate(iter_frames(training)):
         saturated += float(np.mean(frame >= _FULL)) / len(training)
         grey = luminance(frame)
         # A saturated part is no texture.
@@ -111,7 +111,7 @@ def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
     >>> explain_motion(np.full((2, 24, 24, 2), 3.0, np.float32))[0].choice
     'taken as measured'
     """
-    squares = sum(float(np.mean(np.square(flow), dtype=np.float64)) for flow in walk(flows))
+    squares = sum(float(np.mean(np.square(flow), dtype=np.float64)) for flow in iter_frames(flows))
     size = float(np.sqrt(2 * squares / len(flows)))
     side = min(flows.shape[1:3])
     if size < _FAR * side:
@@ -141,7 +141,7 @@ def explain_camera(flows: FloatArray) -> tuple[Decision, ...]:
     >>> explain_camera(still + np.float32([6, -8]))[0].choice
     'followed over 10.0 pixels'
     """
-    shifts = np.array([np.median(flow[::4, ::4].reshape(-1, 2), axis=0) for flow in walk(flows)])
+    shifts = np.array([np.median(flow[::4, ::4].reshape(-1, 2), axis=0) for flow in iter_frames(flows)])
     largest = float(np.hypot(shifts[:, 0], shifts[:, 1]).max())
     if largest <= DEAD_ZONE:
         return ()
@@ -187,7 +187,7 @@ def explain_dynamics(dynamics: FlowDynamics) -> tuple[Decision, ...]:
     Examples
     --------
     >>> import numpy as np
-    >>> from turbrestore.dynamics import identify
+    >>> from turbrestore.dynamics.dynamic_texture import identify
     >>> flows = np.random.default_rng(0).normal(size=(8, 4, 4, 2)).astype(np.float32)
     >>> explain_dynamics(identify(flows))[0].subject
     'flow model'

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import FloatArray, check_flow, check_image
-from .errors import DataError
-from .scratch import walk
+from .core.arrays import FloatArray, check_flow, check_image
+from .core.errors import DataError
+from .runtime.scratch import iter_frames
 
 BORDER = 30
 # A margin that the sub-pixel shift may pull in from outside, cut off after it.
@@ -318,7 +318,7 @@ def sharpness(image: ArrayLike, reference: ArrayLike) -> float:
     >>> round(sharpness(ramp, 0.5 * ramp), 3)
     2.0
     """
-    gradients = [_gradient(grey) for grey in map(_grey, walk((image, reference)), ("image", "reference"))]
+    gradients = [_gradient(grey) for grey in map(_grey, iter_frames((image, reference)), ("image", "reference"))]
     if gradients[1] == 0:
         raise DataError("reference: expected an image with some contrast, found one colour")
     return gradients[0] / gradients[1]

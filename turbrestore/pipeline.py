@@ -11,17 +11,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .alternating import Filtered, filter_frames
-from .arrays import FloatArray
-from .blind import Deblurred, remove_blur
-from .blur_cues import bound_blur, displacement_maps
-from .border import Rectangle, coverage, well_seen
-from .centroid import Centroid, find_centroid
-from .decision import Decision
-from .device import needs_torch
-from .displacement import with_displacement
-from .dynamics import identify
-from .errors import DataError, require
+from .blind.remove_blur import Deblurred, remove_blur
+from .blur.blur_cues import bound_blur, displacement_maps
+from .blur.psf import KOLMOGOROV
+from .core.arrays import FloatArray
+from .core.decision import Decision
+from .core.errors import DataError, require
+from .dynamics.displacement import with_displacement
+from .dynamics.dynamic_texture import identify
+from .dynamics.flow_model import FlowDynamics
 from .explanation import (
     explain_border,
     explain_camera,
@@ -32,17 +30,19 @@ from .explanation import (
     explain_motion,
     explain_training,
 )
-from .flow import MIN_SIDE, FlowFrame
-from .flow_model import FlowDynamics
-from .frame_selection import best_frames, frame_quality
-from .frame_source import FrameSource
-from .halo_tiles import HaloTile, cut_tile, halo_tiles
-from .images import check_space
-from .memory import MemoryPlan, plan_memory
-from .memory_size import DeconvolutionMemory
-from .psf import KOLMOGOROV
-from .restoration import STAGES, Restoration, RestoreParams, StageResults, explain_devices, place_stages
-from .scratch import keeping_freed, kept_in, mean_of, new_stack, release, returning_freed, walk
+from .filtering.alternating import Filtered, filter_frames
+from .footage.frame_selection import best_frames, frame_quality
+from .io.images import check_space
+from .io.source import FrameSource
+from .memory_plan import MemoryPlan, plan_memory
+from .registration.centroid import Centroid, find_centroid
+from .registration.coverage import Rectangle, coverage, well_seen
+from .registration.flow import MIN_SIDE, FlowFrame
+from .runtime.device import needs_torch
+from .runtime.memory_size import DeconvolutionMemory
+from .runtime.scratch import drop_pages, iter_frames, keeping_freed, mean_of, new_stack, returning_freed, to_scratch
+from .runtime.tiling import HaloTile, cut_tile, halo_tiles
+from .settings import STAGES, Restoration, RestoreParams, StageResults, explain_devices, place_stages
 from .tiled_stages import FilteredTiles, filter_tiles, find_tiled_centroid
 
 # Share of the training frames that show every pixel of a cropped image.
@@ -79,7 +79,7 @@ def restore(
         Called as ``progress(stage, done, total)``.
     done : StageResults, optional
         What an earlier run of the same frames and settings has done already; the result is the same, bit for bit.
-        Nothing is checked: :mod:`turbrestore.resumption` keeps results on disk and tells which still hold.
+        Nothing is checked: :mod:`turbrestore.runs.resumption` keeps results on disk and tells which still hold.
     on_result : callable, optional
         Called with all that is done after each stage, and in the filter after each block of frames, or each tile.
     scratch : Path, optional
@@ -218,7 +218,7 @@ class _Sum:
         self._count = 0
 
     def __iter__(self) -> Iterator[FloatArray]:
-        for frames in (walk(self._training), self._rest):
+        for frames in (iter_frames(self._training), self._rest):
             for frame in frames:
                 self._total += frame
                 self._count += 1
@@ -282,7 +282,7 @@ def _restored(run: _Run, plan: MemoryPlan) -> Restoration:
             filtered, mean = _filter(run, centroid, dynamics, training, stream)
             image = filtered.image
         else:
-            mean = kept_in(mean_of(training), run.scratch)
+            mean = to_scratch(mean_of(training), run.scratch)
     if "deconvolve" in stages:
         deblurred = _deblur(run, image, mean, centroid, training)
         image = deblurred.deconvolution.image
@@ -389,7 +389,7 @@ def _filter_in_tiles(
         frames, flows = (cut_tile(stack, tile, run.scratch) for stack in (training, centroid.flows))
         summed = _Sum(frames, _rest_of(source, len(training), tile))
         image = centroid.image[tile.rows, tile.columns].copy()
-        release(centroid.image)
+        drop_pages(centroid.image)
         model = _flow_model(run, flows, frames)
         filtered = filter_frames(summed, image, model, params.filter, params.flow, flows, counter, counted)
         return filtered, summed.mean()
@@ -484,7 +484,7 @@ def _read_training(stream: Iterator[FloatArray], train: int, shape: tuple[int, .
     for index in range(train):
         # In a loop over frames, one would stay while the next is read.
         training[index] = next(stream)
-        release(training)
+        drop_pages(training)
     contrast = float(np.ptp(mean_of(training)))
     if contrast < _LEAST_CONTRAST:
         raise DataError(

@@ -1,4 +1,4 @@
-"""Stages of a restoration whose frames are too large for memory, in tiles that overlap (:mod:`turbrestore.halo_tiles`).
+"""Stages of a restoration whose frames are too large for memory, in tiles (:mod:`turbrestore.runtime.tiling`).
 
 A tile is a clip of its own: it has its own centroid iterations, flow model and filter, and what they leave fades into
 what the neighbours leave.  That is not the result of the whole frame, though close to it: what is taken from all pixels
@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .alternating import Filtered
-from .arrays import FloatArray
-from .centroid import Centroid, CentroidParams, find_centroid
-from .flow import FlowParams
-from .halo_tiles import HaloTile, add_tile, cut_tile, new_mosaic
-from .scratch import kept_in, release, walk
+from .core.arrays import FloatArray
+from .filtering.alternating import Filtered
+from .registration.centroid import Centroid, CentroidParams, find_centroid
+from .registration.flow import FlowParams
+from .runtime.scratch import drop_pages, iter_frames, to_scratch
+from .runtime.tiling import HaloTile, add_tile, cut_tile, new_mosaic
 
 Float64Array = NDArray[np.float64]
 
@@ -76,11 +76,11 @@ def find_tiled_centroid(
     Raises
     ------
     DataError, ConfigurationError
-        As :func:`turbrestore.centroid.find_centroid`.
+        As :func:`turbrestore.registration.centroid.find_centroid`.
 
     Examples
     --------
-    >>> from turbrestore.halo_tiles import halo_tiles
+    >>> from turbrestore.runtime.tiling import halo_tiles
     >>> tiles = halo_tiles((40, 64), side=44, halo=8)
     >>> centroid = find_tiled_centroid(np.ones((2, 40, 64), np.float32), tiles)
     >>> len(tiles), centroid.flows.shape
@@ -92,7 +92,7 @@ def find_tiled_centroid(
     for tile in tiles:
         part = find_centroid(cut_tile(frames, tile, scratch), params, flow_params, progress, scratch)
         add_tile(image, tile, part.image)
-        for whole, flow in zip(flows, walk(part.flows), strict=True):
+        for whole, flow in zip(flows, iter_frames(part.flows), strict=True):
             add_tile(whole, tile, flow)
         sizes.append(part.mean_flow_sizes)
         converged &= part.converged
@@ -137,7 +137,7 @@ def filter_tiles(
 
     Examples
     --------
-    >>> from turbrestore.halo_tiles import halo_tiles
+    >>> from turbrestore.runtime.tiling import halo_tiles
     >>> def stand_still(tile):
     ...     one, image = np.ones(2), np.ones(tile.shape, np.float32)
     ...     return Filtered(image, image, one[:, None], one, one, one, one / 2, 1e-4, 1.0), image
@@ -148,15 +148,16 @@ def filter_tiles(
     done = start or FilteredTiles()
     for tile in tiles[len(done.parts) :]:
         part, usual = filter_tile(tile)
-        part = dataclasses.replace(part, image=kept_in(part.image, scratch), variance=kept_in(part.variance, scratch))
-        done = FilteredTiles((*done.parts, part), (*done.means, kept_in(usual, scratch)))
+        image, variance = to_scratch(part.image, scratch), to_scratch(part.variance, scratch)
+        part = dataclasses.replace(part, image=image, variance=variance)
+        done = FilteredTiles((*done.parts, part), (*done.means, to_scratch(usual, scratch)))
         if on_tile is not None:
             on_tile(done)
     image, mean, variance = (new_mosaic(size, scratch) for size in (shape, shape, shape[:2]))
     for tile, part, usual in zip(tiles, done.parts, done.means, strict=True):
         for whole, found in ((image, part.image), (mean, usual), (variance, part.variance)):
             add_tile(whole, tile, found)
-            release(found)
+            drop_pages(found)
     return _joined(image, variance, done.parts, _areas(tiles)), mean
 
 

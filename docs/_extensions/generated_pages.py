@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 DOCS = Path(__file__).parents[1]
 EXAMPLES_FOLDER = DOCS / "examples"
-API_MARK = re.compile(r"<!-- api: ([\w ]+) -->")
+API_MARK = re.compile(r"<!-- api: ([\w. ]+) -->")
 KINDS = {bool: "", int: "INT", float: "NUMBER", str: "TEXT", Path: "PATH"}
 
 
@@ -117,14 +117,14 @@ def _plain(text: str) -> str:
 def public_names(modules: list[str]) -> list[str]:
     """Public names that modules or folders of the package define, functions first, in the order of the package."""
     named = [(name, getattr(turbrestore, name)) for name in turbrestore.__all__]
-    here = [(name, item) for name, item in named if item.__module__.split(".")[1] in modules]
-    return [
-        name for name, _ in sorted(here, key=lambda pair: (inspect.isclass(pair[1]), modules.index(_module(pair[1]))))
-    ]
+    here = [(inspect.isclass(item), _position(item, modules), name) for name, item in named]
+    return [name for _, place, name in sorted(here, key=lambda entry: entry[:2]) if place >= 0]
 
 
-def _module(item: Any) -> str:
-    return item.__module__.split(".")[1]
+def _position(item: Any, modules: list[str]) -> int:
+    """Where a name stands among some modules or folders; -1 if none of them defines it."""
+    module = item.__module__.removeprefix("turbrestore.")
+    return next((index for index, name in enumerate(modules) if f"{module}.".startswith(f"{name}.")), -1)
 
 
 def reference(modules: list[str]) -> str:

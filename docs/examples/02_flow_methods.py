@@ -23,9 +23,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import turbrestore as tr
+from turbrestore.registration.warp import warp
 from turbrestore.synthesis.scenes import picture
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
-from turbrestore.warp import warp
 
 METHODS = ("dis", "tvl1", "farneback")
 MARKERS = dict(zip(METHODS, "osD", strict=True))

@@ -22,9 +22,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import turbrestore as tr
+from turbrestore.registration.warp import warp
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
-from turbrestore.warp import warp
 
 plt.style.use("tableau-colorblind10")
 plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "font.size": 9})

@@ -21,11 +21,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import turbrestore as tr
+from turbrestore.registration.warp import warp
 from turbrestore.synthesis.atmosphere import structure_function
 from turbrestore.synthesis.phase_screen import draw_screen, sample_path
 from turbrestore.synthesis.scenes import picture, resolution_chart
 from turbrestore.synthesis.smooth_flow import distort
-from turbrestore.warp import warp
 
 plt.style.use("tableau-colorblind10")
 plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "font.size": 9})

@@ -24,7 +24,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import turbrestore as tr
-from turbrestore.errors import TurbrestoreError
+from turbrestore.core.errors import TurbrestoreError
 from turbrestore.synthesis.scenes import picture
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 

@@ -7,7 +7,7 @@ import tomli_w
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from turbrestore.errors import ConfigurationError
+from turbrestore.core.errors import ConfigurationError
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.application import build
 from turbrestore_cli.options import Selection

@@ -12,20 +12,20 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from turbrestore.alternating import Filtered, FilterParams, filter_frames
-from turbrestore.artifacts import KINDS, load_artifact, save_artifact
-from turbrestore.blur_cues import BlurBounds
-from turbrestore.blur_estimation import BlurEstimate
-from turbrestore.centroid import Centroid
-from turbrestore.content import check_content, clean_source
-from turbrestore.deconvolution import Deconvolution, DeconvolutionParams, deconvolve
-from turbrestore.dynamics import DynamicsParams, identify
-from turbrestore.errors import TurbrestoreError
-from turbrestore.flow_model import FlowDynamics
-from turbrestore.images import read_image
-from turbrestore.limits import Limits
-from turbrestore.npy import map_npy, read_npz
-from turbrestore.video import open_frames, write_video
+from turbrestore.blur.blur_cues import BlurBounds
+from turbrestore.blur.estimation import BlurEstimate
+from turbrestore.core.errors import TurbrestoreError
+from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams, deconvolve
+from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
+from turbrestore.dynamics.flow_model import FlowDynamics
+from turbrestore.filtering.alternating import Filtered, FilterParams, filter_frames
+from turbrestore.footage.content import check_content, clean_source
+from turbrestore.io.images import read_image
+from turbrestore.io.limits import Limits
+from turbrestore.io.npy import map_npy, read_npz
+from turbrestore.io.video import open_frames, write_video
+from turbrestore.registration.centroid import Centroid
+from turbrestore.runs.artifacts import KINDS, load_artifact, save_artifact
 
 SMALL = Limits(max_pixels=10_000, max_frames=200, max_bytes=10**6)
 FRAMES = np.random.default_rng(0).random((3, 8, 10), dtype=np.float32)

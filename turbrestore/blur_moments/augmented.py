@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import irfft, next_fast_len, rfft
 
-from ..errors import require
-from ..kalman import Gaussian
+from ..core.errors import require
+from ..filtering.kalman import Gaussian
 from .kernels import Float64Array
 from .sensor import ExposureTiming
 

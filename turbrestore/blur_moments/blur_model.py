@@ -15,8 +15,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ..errors import require
-from ..kalman import Gaussian
+from ..core.errors import require
+from ..filtering.kalman import Gaussian
 from .exposure_table import ExposureTable, tabulate
 from .kernels import Float64Array
 from .moment_algebra import compose_moments, kernel_moments, path_moments, powers

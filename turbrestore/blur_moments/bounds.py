@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import DataError
+from ..core.errors import DataError
 from .blur_model import BlurModel, predicted_moments
 from .kernels import Float64Array
 from .sensor import noise_variance

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import FloatArray, check_frames, check_image, luminance
-from ..errors import DataError
-from ..scratch import walk
+from ..core.arrays import FloatArray, check_frames, check_image, luminance
+from ..core.errors import DataError
+from ..runtime.scratch import iter_frames
 from .exponent_fit import fit_difference
 from .tiles import CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
 
@@ -157,7 +157,7 @@ def displacement_variance(frames: ArrayLike, noise: float, params: CueParams | N
     count = len(stack)
     spectra = TileSpectra.of(stack.shape[1:3], params)
     mean, power = np.zeros(stack.shape[1:3]), np.zeros(1)
-    for frame in walk(stack):
+    for frame in iter_frames(stack):
         grey = luminance(frame)
         mean += grey / np.float64(count)
         power = power + spectra.power(grey) / np.float64(count)

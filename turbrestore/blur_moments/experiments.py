@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import require
-from ..kalman import Gaussian
-from ..parallel import map_ahead
+from ..core.errors import require
+from ..filtering.kalman import Gaussian
+from ..runtime.threads import map_ahead
 from .blur_model import BlurModel
 from .bounds import image_information, moment_information, posterior_bound
 from .image_prediction import ImageFilter

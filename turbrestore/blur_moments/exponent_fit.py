@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray
+from ..core.arrays import FloatArray
 from .tiles import CORRELATED, CueParams, Float64Array
 
 # Newton steps, and squared pixels that each may go.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import require
+from ..core.errors import require
 from .kernels import Float64Array, line_response, line_slope
 from .sensor import LineSensor
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ConfigurationError
+from ..core.errors import ConfigurationError
 from .experiments import Experiment
 
 # Colour and dash of every observer, the same in all panels.

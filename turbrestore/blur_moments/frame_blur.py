@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import FloatArray, check_frames, luminance
-from ..errors import DataError
-from ..scratch import walk
+from ..core.arrays import FloatArray, check_frames, luminance
+from ..core.errors import DataError
+from ..runtime.scratch import iter_frames
 from .exponent_fit import LARGEST_EXPONENT, PRIOR, fit_relative
 from .tiles import CORRELATED, CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
 
@@ -241,7 +241,7 @@ def _ring_power(frames: FloatArray, spectra: TileSpectra, averaging: FloatArray)
     """Power of frames in rings, shape (T, tiles, rings)."""
     tiles = len(spectra.grid.rows) * len(spectra.grid.columns)
     power = np.empty((len(frames), tiles, averaging.shape[1]), np.float32)
-    for frame, found in zip(walk(frames), power, strict=True):
+    for frame, found in zip(iter_frames(frames), power, strict=True):
         np.matmul(spectra.power(luminance(frame)), averaging, out=found)
     return power
 

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import FloatArray, check_frames, check_image, luminance
-from ..errors import DataError, require, require_between
+from ..core.arrays import FloatArray, check_frames, check_image, luminance
+from ..core.errors import DataError, require, require_between
 from .frame_blur import FrameBlur
 from .tiles import check_noise, tile_map
 

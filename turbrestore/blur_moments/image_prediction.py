@@ -26,8 +26,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import ConfigurationError, DataError, require
-from ..kalman import Gaussian, Innovation, update_information
+from ..core.errors import ConfigurationError, DataError, require
+from ..filtering.kalman import Gaussian, Innovation, update_information
 from .blur_model import BlurModel
 from .exposure_table import ExposureTable
 from .kernels import Float64Array

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
-from ..errors import ConfigurationError, DataError, require
+from ..core.errors import ConfigurationError, DataError, require
 
 Float64Array = NDArray[np.float64]
 

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from ..errors import ConfigurationError, DataError, require
-from ..kalman import Gaussian, predict
+from ..core.errors import ConfigurationError, DataError, require
+from ..filtering.kalman import Gaussian, predict
 from .kernels import Float64Array
 from .sensor import ExposureTiming
 

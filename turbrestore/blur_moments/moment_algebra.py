@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import comb
 
-from ..errors import DataError, require
+from ..core.errors import DataError, require
 from .kernels import Float64Array, Kernel, PixelGrid, marginal_kernel
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import ConfigurationError, DataError, require
+from ..core.errors import ConfigurationError, DataError, require
 from .kernels import Float64Array, PixelGrid
 from .moment_algebra import check_light, check_order
 

@@ -7,7 +7,7 @@ exposure, so one loop, :func:`run_observer`, runs any of them; those on the whol
 
 Symbols (paper 1, section V; paper 2, section IV)
 -------------------------------------------------
-x̂, P : mean and covariance of the state, :class:`~turbrestore.kalman.Gaussian`.
+x̂, P : mean and covariance of the state, :class:`~turbrestore.filtering.kalman.Gaussian`.
 y^(p), h : moments of the frame and what the state makes them, :func:`.blur_model.predicted_moments`.
 C_s, H : derivative of the moments with respect to the state.
 L : gain of the Luenberger observer; K of the Kalman filter.
@@ -32,8 +32,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solve_discrete_are
 from scipy.signal import place_poles
 
-from ..errors import ConfigurationError, DataError, require
-from ..kalman import Gaussian, Innovation, predict, update
+from ..core.errors import ConfigurationError, DataError, require
+from ..filtering.kalman import Gaussian, Innovation, predict, update
 from .blur_model import BlurModel, predicted_moments
 from .exposure_table import ExposureTable
 from .kernels import Float64Array

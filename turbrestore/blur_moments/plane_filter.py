@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from ..errors import DataError, require
-from ..kalman import Gaussian, Innovation, update
+from ..core.errors import DataError, require
+from ..filtering.kalman import Gaussian, Innovation, update
 from .kernels import Float64Array, Kernel, PixelGrid, check_kernel
 from .lifted import LiftedSystem
 from .moment_algebra import compose_moments, plane_kernel_moments

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import require, require_between
+from ..core.errors import require, require_between
 from .augmented import Oscillator, OscillatorMotion, largest_deviation
 from .blur_model import BlurModel
 from .kernels import Float64Array, PixelGrid, gaussian_kernel

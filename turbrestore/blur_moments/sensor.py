@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
-from ..errors import DataError, require
+from ..core.errors import DataError, require
 from .kernels import Float64Array, Kernel, PixelGrid, check_kernel, line_response, marginal_kernel
 
 # Nodes per pixel along x for a tilted Gaussian: the error stays under 1e-5 of the total down to σ = Δ / 2.

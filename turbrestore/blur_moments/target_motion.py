@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from ..errors import require
+from ..core.errors import require
 from .kernels import Float64Array
 from .lifted import FastSystem, LiftedSystem, lift
 from .sensor import ExposureTiming

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from ..arrays import FloatArray
-from ..errors import DataError, require, require_between
+from ..core.arrays import FloatArray
+from ..core.errors import DataError, require, require_between
 
 Float64Array = NDArray[np.float64]
 
@@ -292,7 +292,7 @@ def check_noise(noise: float) -> None:
     --------
     >>> check_noise(-1.0)
     Traceback (most recent call last):
-    turbrestore.errors.ConfigurationError: noise: expected a finite number of 0 or more, found -1.0
+    turbrestore.core.errors.ConfigurationError: noise: expected a finite number of 0 or more, found -1.0
     """
     require(np.isfinite(noise) and noise >= 0, f"noise: expected a finite number of 0 or more, found {noise}")
 

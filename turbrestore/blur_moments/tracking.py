@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag, expm
 from scipy.optimize import minimize_scalar
 
-from ..arrays import check_frames, luminance
-from ..errors import ConfigurationError, DataError, require, require_between
-from ..kalman import Gaussian, Innovation
+from ..core.arrays import check_frames, luminance
+from ..core.errors import ConfigurationError, DataError, require, require_between
+from ..filtering.kalman import Gaussian, Innovation
 from .kernels import Float64Array, PixelGrid, gaussian_kernel
 from .moments import plane_moments, total_intensity
 from .plane_filter import PlaneModel, PlaneMomentFilter, PlaneSensor

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from ..kalman import Gaussian
+from ..filtering.kalman import Gaussian
 from .blur_model import BlurModel, Motion
 from .kernels import Float64Array
 from .observers import Observer, run_observer

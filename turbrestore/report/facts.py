@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..metrics import sharpness
-from ..restoration import Restoration, RestoreParams
-from ..run_record import RunRecord
-from ..scratch import release, variance_of
+from ..runs.run_record import RunRecord
+from ..runtime.scratch import drop_pages, variance_of
+from ..settings import Restoration, RestoreParams
 
 _STAGE_NAMES = {
     "read": "Reading",
@@ -95,7 +95,7 @@ def headline(restoration: Restoration) -> list[Fact]:
     x, y, width, height = restoration.crop
     mean = restoration.mean[y : y + height, x : x + width]
     contrast = np.ptp(mean)
-    release(mean)
+    drop_pages(mean)
     if contrast > 0:
         facts.append(Fact("Sharpness", f"×{sharpness(restoration.image, mean):.2f}", "that of the mean"))
     if restoration.deconvolution is not None:

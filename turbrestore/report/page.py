@@ -15,11 +15,11 @@ from importlib.resources import files
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from ..errors import ConfigurationError
-from ..images import atomic_write, check_output
-from ..restoration import Restoration
-from ..run_record import RunRecord
-from ..scratch import returning_freed
+from ..core.errors import ConfigurationError
+from ..io.images import atomic_write, check_output
+from ..runs.run_record import RunRecord
+from ..runtime.scratch import returning_freed
+from ..settings import Restoration
 from .facts import findings, headline, laps, remarks, settings
 from .panels import draw_panels
 from .pictures import encode_gallery, stages
@@ -57,7 +57,7 @@ def check_report(
     >>> check_report("report.txt")
     Traceback (most recent call last):
     ...
-    turbrestore.errors.ConfigurationError: report.txt: expected a name that ends in .html or .htm, found .txt
+    turbrestore.core.errors.ConfigurationError: report.txt: expected a name that ends in .html or .htm, found .txt
     """
     check_output(path, inputs, overwrite, _SUFFIXES)
     # They are loaded when they are used: a restoration has no room for them.
@@ -78,7 +78,7 @@ def write_report(
     restoration : Restoration
         Whole or in part.
     run : RunRecord
-        Where it comes from, see :func:`turbrestore.run_record.describe_run`.
+        Where it comes from, see :func:`turbrestore.runs.run_record.describe_run`.
     overwrite : bool
         Replace an existing file.
 

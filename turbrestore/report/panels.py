@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from ..alternating import Filtered
-from ..deconvolution import Deconvolution
-from ..flow_model import FlowDynamics
-from ..plots import (
+from ..deconvolution.deconvolve import Deconvolution
+from ..display.plots import (
     plot_blur,
     plot_convergence,
     plot_displacements,
@@ -19,9 +17,11 @@ from ..plots import (
     plot_objective,
     plot_singular_values,
 )
-from ..restoration import Restoration
-from ..run_record import RunRecord
-from ..scratch import release
+from ..dynamics.flow_model import FlowDynamics
+from ..filtering.alternating import Filtered
+from ..runs.run_record import RunRecord
+from ..runtime.scratch import drop_pages
+from ..settings import Restoration
 from .vector import inline_svg
 
 
@@ -77,7 +77,7 @@ def _motion(restoration: Restoration, run: RunRecord) -> Iterator[Panel]:
     figure = plot_displacements(centroid.flows, centroid.image)
     caption = "Over the training frames. Strokes lie along the axis that moves most."
     yield Panel(inline_svg(figure, "spread", "Map of the standard deviation of the displacement"), caption)
-    release(centroid.image)
+    drop_pages(centroid.image)
     tolerance = run.settings.get("centroid", {}).get("tolerance")
     figure = plot_convergence(centroid.mean_flow_sizes, tolerance)
     caption = "At the centre of the motion the mean flow vanishes; what is left is the bias of the flow method."

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, from_unit
-from ..preview import data_uri, encode_image
-from ..restoration import Restoration
-from ..scratch import parts, walk
+from ..core.arrays import FloatArray, from_unit
+from ..display.preview import data_uri, encode_image
+from ..runtime.scratch import iter_frames, iter_parts
+from ..settings import Restoration
 
 # All images together, bytes before base64, which with half a megabyte of plots and text stays below 2 MB; quality
 # beyond it; longest side that is shown, pixels.
@@ -88,7 +88,9 @@ def stages(restoration: Restoration, frame: FloatArray) -> dict[str, FloatArray]
         images["filtered"] = restoration.filtered.image
     images = {key: image[y : y + height, x : x + width] for key, image in images.items()}
     last = next(reversed(images))
-    if all((one == other).all() for one, other in zip(parts(restoration.image), parts(images[last]), strict=True)):
+    if all(
+        (one == other).all() for one, other in zip(iter_parts(restoration.image), iter_parts(images[last]), strict=True)
+    ):
         del images[last]
     return {**images, "result": restoration.image}
 
@@ -107,7 +109,7 @@ def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
     -------
     Gallery
     """
-    shown = dict(zip(images, map(_levels, walk(images.values())), strict=True))
+    shown = dict(zip(images, map(_levels, iter_frames(images.values())), strict=True))
     coding = "8 bits, lossless"
     files = {key: encode_image(levels, "webp") for key, levels in shown.items()}
     if sum(map(len, files.values())) > _LOSSLESS_BYTES:

@@ -1,8 +1,8 @@
 """Figures as SVG elements for the body of a page.
 
 The page's content security policy allows no style attributes, so styles become attributes of the elements; colours
-stay what they are, and the page's style sheet replaces those of :mod:`turbrestore.plots` by its own, which differ
-between light and dark.  Text stays text, in the page's font.
+stay what they are, and the page's style sheet replaces those of :mod:`turbrestore.display.plots` by its own, which
+differ between light and dark.  Text stays text, in the page's font.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 
-from ..preview import data_uri
+from ..display.preview import data_uri
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,7 +45,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
 
     Examples
     --------
-    >>> from turbrestore.plots import plot_convergence
+    >>> from turbrestore.display.plots import plot_convergence
     >>> inline_svg(plot_convergence([1.0, 0.2]), "c", "mean flow")[:35]
     '<svg role="img" aria-label="mean fl'
     """

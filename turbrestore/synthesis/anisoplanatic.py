@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from ..arrays import FloatArray
-from ..errors import require
-from ..parallel import map_ahead, one_thread_each
+from ..core.arrays import FloatArray
+from ..core.errors import require
+from ..runtime.threads import map_ahead, one_thread_each
 from .atmosphere import PhaseScreenParams
 from .exposure import exposed_frame
 from .phase_screen import Turbulence, draw_turbulence, tilt_flow

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from ..errors import ConfigurationError, require, require_between
+from ..core.errors import ConfigurationError, require, require_between
 
 Float64Array = NDArray[np.float64]
 Wave = Literal["spherical", "plane"]

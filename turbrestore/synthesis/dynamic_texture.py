@@ -6,7 +6,7 @@ with fresh noise.  The new flows distort the centroid, or any other scene.
 Symbols
 -------
 W : flow; C, ξ, A, Q, Ξ, R : modes, state, transition, process noise, training states and residual variance of
-:mod:`turbrestore.dynamics`, for n states and τ training flows.
+:mod:`turbrestore.dynamics.dynamic_texture`, for n states and τ training flows.
 r : what the n modes leave out of a flow; D, η : its own modes and their states, ``r = D η``.
 φ : correlation of a residual state with itself one frame later.
 
@@ -18,7 +18,7 @@ Departures from the paper
   by an autoregression of order one with the variance and φ that it has in training.  The expected variance of the
   displacement at every pixel is then that of the training flows, and the modes of r are orthogonal to C, so the
   system identified from a synthetic sequence is the one it was made with.
-- A and Q are those of :func:`turbrestore.dynamics.stable_system`: the sequence neither grows nor fades.
+- A and Q are those of :func:`turbrestore.dynamics.dynamic_texture.stable_system`: the sequence neither grows nor fades.
 - The mean flow W̄, which vanishes at the centroid but for the bias of the flow method, is left out, so the scene lies
   at the mean geometry of the synthetic sequence.
 """
@@ -33,13 +33,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import FloatArray, check_flow
-from ..centroid import CentroidParams, find_centroid
-from ..dynamics import DynamicsParams, identify
-from ..errors import DataError, require
-from ..flow import FlowParams
-from ..flow_model import FlowDynamics
-from ..simulation import simulate, stable_system
+from ..core.arrays import FloatArray, check_flow
+from ..core.errors import DataError, require
+from ..dynamics.dynamic_texture import DynamicsParams, identify
+from ..dynamics.flow_model import FlowDynamics
+from ..dynamics.simulate import simulate, stable_system
+from ..registration.centroid import CentroidParams, find_centroid
+from ..registration.flow import FlowParams
 from .sequence import check_scene
 
 Float64Array = NDArray[np.float64]

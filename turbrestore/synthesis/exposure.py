@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import FloatArray, check_image
-from ..errors import DataError, require
-from ..warp import invert_flow, warp
+from ..core.arrays import FloatArray, check_image
+from ..core.errors import DataError, require
+from ..registration.warp import invert_flow, warp
 
 
 def exposed_frame(

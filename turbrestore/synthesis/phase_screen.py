@@ -32,8 +32,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, special
 from scipy.interpolate import make_interp_spline
 
-from ..arrays import FloatArray
-from ..errors import require
+from ..core.arrays import FloatArray
+from ..core.errors import require
 from .atmosphere import Layer, PhaseScreenParams, phase_spectrum
 
 Float64Array = NDArray[np.float64]

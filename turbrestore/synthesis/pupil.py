@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray
+from ..core.arrays import FloatArray
 from .atmosphere import PhaseScreenParams
 from .phase_screen import Turbulence, sample_lattice
 

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray
-from ..errors import require
-from ..images import read_image
+from ..core.arrays import FloatArray
+from ..core.errors import require
+from ..io.images import read_image
 
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont, ImageFont

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import FloatArray, check_image, from_unit
-from ..errors import DataError, require, require_between
+from ..core.arrays import FloatArray, check_image, from_unit
+from ..core.errors import DataError, require, require_between
 
 # Below this no stage can tell motion.
 SMALLEST_SCENE = 16
@@ -114,7 +114,7 @@ def check_scene(scene: ArrayLike) -> FloatArray:
     >>> check_scene(np.full((32, 32), 0.5))
     Traceback (most recent call last):
     ...
-    turbrestore.errors.DataError: scene: expected contrast, found one colour only; choose a picture with detail
+    turbrestore.core.errors.DataError: scene: expected contrast, found one colour only; choose a picture with detail
     """
     image = check_image(scene, "scene")
     height, width = image.shape[:2]

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import FloatArray, check_flow, check_image
-from ..errors import require
-from ..warp import invert_flow, warp
+from ..core.arrays import FloatArray, check_flow, check_image
+from ..core.errors import require
+from ..registration.warp import invert_flow, warp
 
 
 @dataclass(frozen=True)

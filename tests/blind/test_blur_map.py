@@ -1,0 +1,191 @@
+"""Blur that differs over the image: found by tiles where it does, not where it does not."""
+
+import threading
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from turbrestore.blind.blur_map import deconvolve_varying, estimate_blur_map, sigma_map
+from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.blur.estimation import choose_blur, estimate_blur, find_candidates
+from turbrestore.core.arrays import luminance
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.metrics import psnr
+from turbrestore.synthesis.scenes import SCENES
+
+SIDE = 384
+WIENER = DeconvolutionParams(method="wiener", exponent=2.0)
+
+
+def blurred(name, left, right):
+    """Scene, image and true widths: ``left`` up to a quarter, then linearly to ``right`` at three quarters."""
+    scene = luminance(SCENES[name](SIDE, SIDE))
+    widths = np.interp(np.arange(SIDE), [SIDE / 4, 3 * SIDE / 4], [left, right]) * np.ones((SIDE, 1))
+    steps = np.linspace(min(left, right), max(left, right), 15) if left != right else np.array([left])
+    image = np.zeros_like(scene)
+    for index, step in enumerate(steps):
+        share = np.interp(widths, steps, np.eye(len(steps))[index]) if left != right else 1.0
+        image += (cv2.GaussianBlur(scene, (0, 0), step) * share).astype(np.float32)
+    noise = np.random.default_rng(0).normal(0, 0.003, scene.shape)
+    return scene, (image + noise).astype(np.float32), widths.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def brick():
+    return blurred("brick", 0.8, 2.2)
+
+
+def test_a_blur_that_grows_to_the_right_is_found_and_removed(brick):
+    scene, image, widths = brick
+    found = estimate_blur_map(image, estimate_blur(image, exponent=2.0))
+    assert found.varies
+    assert (found.sigmas[:, 1] > 1.4 * found.sigmas[:, 0]).all()
+    assert (found.sigmas[:, 1] < 1.3 * 2.2).all()
+    result = remove_blur(image, image, WIENER)
+    assert result.tiles.varies
+    assert "a width for every pixel" in [decision.choice for decision in result.decisions]
+    single = deconvolve(image, result.blur.removable, WIENER).image
+    assert psnr(result.deconvolution.image, scene) > psnr(single, scene) + 0.5
+    assert result.deconvolution.sigma == pytest.approx(float(widths.mean()), rel=0.35)
+
+
+@pytest.mark.parametrize("name", ["chart", "camera"])
+def test_a_blur_that_is_the_same_everywhere_is_taken_as_one(name):
+    _, image, _ = blurred(name, 1.4, 1.4)
+    assert not estimate_blur_map(image, estimate_blur(image, exponent=2.0)).varies
+
+
+@pytest.mark.parametrize(("name", "right", "agree"), [("camera", 1.4, True), ("brick", 2.6, False)])
+def test_how_sure_widths_are_is_asked_only_where_they_may_differ(monkeypatch, name, right, agree):
+    _, image, _ = blurred(name, 1.4 if agree else 0.8, right)
+    asked = []
+
+    def counted(*arguments):
+        asked.append(arguments)
+        return choose_blur(*arguments)
+
+    monkeypatch.setattr("turbrestore.blind.blur_map.choose_blur", counted)
+    whole = estimate_blur(image, exponent=2.0)
+    found = estimate_blur_map(image, whole)
+    assert (asked == []) == agree
+    assert np.isinf(found.uncertainties).all() == agree
+    monkeypatch.setattr("turbrestore.blind.blur_map._agree", lambda tiles: False)
+    surely = estimate_blur_map(image, whole)
+    assert found.varies == surely.varies == (not agree)
+    assert found.sigmas == pytest.approx(surely.sigmas, rel=0.3 if agree else 0)
+
+
+def test_true_widths_beat_every_single_width(brick):
+    scene, image, widths = brick
+    by_pixel = deconvolve_varying(lambda width: deconvolve(image, width, WIENER), widths)
+    singles = [deconvolve(image, width, WIENER).image for width in (0.8, 1.2, 1.5, 1.8, 2.2)]
+    assert psnr(by_pixel.image, scene) > max(psnr(single, scene) for single in singles) + 1
+    assert by_pixel.sigma == pytest.approx(1.5, abs=0.02)
+
+
+def test_images_in_strips_and_in_a_file_are_the_same(brick, tmp_path, monkeypatch):
+    _, image, widths = brick
+    colour = np.stack([image, image[::-1], image.T], axis=-1)
+    results = []
+    for rows, folder in ((1000, None), (100, tmp_path)):
+        monkeypatch.setattr("turbrestore.blind.blur_map._STRIP_ROWS", rows)
+        results.append(deconvolve_varying(lambda width: deconvolve(colour, width, WIENER), widths, folder).image)
+    assert np.array_equal(*results)
+    assert isinstance(results[1], np.memmap)
+
+
+def test_interpolation_keeps_plateaus_and_is_monotone():
+    widths = sigma_map([[1.0, 2.0, 4.0]] * 2, (500, 760))
+    assert widths.shape == (500, 760)
+    assert widths[0, 0] == 1.0
+    assert widths[0, -1] == 4.0
+    assert (np.diff(widths, axis=1) >= 0).all()
+    assert np.ptp(widths, axis=0).max() == 0
+
+
+@pytest.mark.parametrize("above", ["flat", "ramp"])
+def test_a_tile_without_texture_is_not_taken_for_sharp(above):
+    scene = SCENES["chart"](480, 480)
+    scene[:310] = 0.88 if above == "flat" else np.linspace(0.3, 0.8, 480)
+    noise = np.random.default_rng(0).normal(0, 0.003, scene.shape)
+    image = (cv2.GaussianBlur(scene, (0, 0), 1.5) + noise).astype(np.float32)
+    whole = estimate_blur(image, exponent=2.0)
+    found = estimate_blur_map(image, whole)
+    assert not found.varies
+    assert (found.sigmas[0] == whole.sigma).all()
+
+
+def test_a_sharp_part_beside_a_blurred_one_stays_sharp():
+    scene = SCENES["brick"](480, 480)
+    blurred = cv2.GaussianBlur(scene, (0, 0), 2.0)
+    image = np.where(np.arange(480) < 240, scene, blurred) + np.random.default_rng(0).normal(0, 0.003, scene.shape)
+    found = estimate_blur_map(image, estimate_blur(image, exponent=2.0))
+    assert found.varies
+    assert found.sigmas[:, 0].max() < 0.9
+    assert found.sigmas[:, 1].min() > 1.2
+
+
+def test_small_images_have_no_tiles():
+    small = np.random.default_rng(0).random((600, 300)).astype(np.float32)
+    assert estimate_blur_map(small, estimate_blur(small)) is None
+
+
+@pytest.mark.parametrize(("right", "calls"), [(1.4, 1), (2.6, None)])
+def test_widths_are_found_beside_a_deconvolution_that_is_used_where_they_agree(monkeypatch, right, calls):
+    _, image, _ = blurred("brick", 1.4 if calls else 0.8, right)
+    widths = []
+
+    def counted(image, width, *rest):
+        widths.append(width)
+        return deconvolve(image, width, *rest)
+
+    monkeypatch.setattr("turbrestore.blind.remove_blur.deconvolve", counted)
+    result = remove_blur(image, image, WIENER)
+    tried = widths.copy()
+    in_turn = remove_blur(image, image, replace(WIENER, memory=1e9))
+    assert np.array_equal(result.deconvolution.image, in_turn.deconvolution.image)
+    assert result.decisions == in_turn.decisions
+    assert result.tiles.varies == (calls is None)
+    # Where they differ the one beside them is in vain.
+    assert len(tried) == (calls or 1 + len(widths) - len(tried))
+
+
+def test_widths_and_deconvolution_do_not_wait_for_each_other(monkeypatch):
+    _, image, _ = blurred("brick", 1.4, 1.4)
+    both = threading.Barrier(2, timeout=20)
+
+    def waiting(function):
+        def wait(*arguments):
+            both.wait()
+            return function(*arguments)
+
+        return wait
+
+    monkeypatch.setattr("turbrestore.blind.remove_blur.deconvolve", waiting(deconvolve))
+    monkeypatch.setattr("turbrestore.blind.remove_blur.estimate_blur_map", waiting(estimate_blur_map))
+    assert remove_blur(image, image, WIENER).tiles is not None
+
+
+def test_after_an_interrupt_nobody_waits_for_all_tiles(monkeypatch):
+    _, image, _ = blurred("brick", 1.4, 1.4)
+    tiles, begun = [], threading.Event()
+
+    def estimated(tile, **settings):
+        tiles.append(tile)
+        begun.set()
+        interrupted.wait(20)
+        return find_candidates(tile, **settings)
+
+    def interrupt(*_):
+        begun.wait(20)
+        threading.Timer(0.2, interrupted.set).start()
+        raise KeyboardInterrupt
+
+    interrupted = threading.Event()
+    monkeypatch.setattr("turbrestore.blind.blur_map.find_candidates", estimated)
+    monkeypatch.setattr("turbrestore.blind.remove_blur.deconvolve", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        remove_blur(image, image, WIENER)
+    assert len(tiles) == 1

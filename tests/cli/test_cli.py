@@ -1,0 +1,440 @@
+"""The command line on real files: what it writes, what it says, how it ends."""
+
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from conftest import make_sequence
+from turbrestore.io.images import read_image, write_image
+from turbrestore.io.video import write_video
+from turbrestore_cli.__main__ import main
+
+SAMPLE = Path(__file__).parents[2] / "sample_data"
+QUICK = ["--centroid.iterations", "1", "--filter.inner-iterations", "1", "--quiet"]
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    path = tmp_path_factory.mktemp("clip") / "clip.mkv"
+    write_video(path, make_sequence(seed=31, count=8, size=80, rms=0.8).frames, 25)
+    return path
+
+
+@pytest.fixture
+def run(capsys):
+    def call(*words):
+        code = main([str(word) for word in words])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+def fails(result, code, *parts):
+    """One line on standard error that names the parts, nothing on standard output."""
+    found, out, err = result
+    assert found == code, err
+    assert out == ""
+    assert err.startswith("turbrestore: ")
+    assert err.count("\n") == 1
+    for part in parts:
+        assert part in err
+
+
+def frames_clip(path, frames):
+    write_video(path, frames, 25)
+    return path
+
+
+class TestRestore:
+    def test_sample_clip_is_restored_and_described(self, run, tmp_path):
+        output = tmp_path / "sharp.png"
+        words = ["restore", SAMPLE / "chart.mkv", output, "--json", "--truth", SAMPLE / "chart_truth.png"]
+        code, out, err = run(*words)
+        assert code == 0, err
+        report = json.loads(out)
+        stages = {name: figures["psnr"] for name, figures in report["stages"].items()}
+        assert list(stages) == ["mean", "centroid", "filtered", "deconvolved"]
+        assert stages["mean"] + 1 < stages["centroid"] <= stages["filtered"] < stages["deconvolved"]
+        assert read_image(output).image.shape == (192, 256)
+        assert report["frames"] == 48
+
+    def test_settings_beside_the_result_repeat_it(self, run, clip, tmp_path):
+        first, second = tmp_path / "a.png", tmp_path / "b.png"
+        part = ["--frames", "1:8", "--roi", "4,0,72,80", "--bit-depth", "16"]
+        settings = [*part, "--sigma", "0.9", "--train", "5", "--flow.method", "farneback"]
+        assert run("restore", clip, first, *settings, *QUICK)[0] == 0
+        settings = tmp_path / "a.png.toml"
+        assert tomllib.loads(settings.read_text())["flow"]["method"] == "farneback"
+        assert run("restore", clip, second, "--config", settings, "--quiet")[0] == 0
+        assert first.read_bytes() == second.read_bytes()
+        assert settings.read_text() == (tmp_path / "b.png.toml").read_text()
+
+    def test_flags_win_over_the_file(self, run, clip, tmp_path):
+        config = tmp_path / "run.toml"
+        config.write_text('train = 4\n[filter]\nresidual = "drop"\n')
+        assert run("restore", clip, tmp_path / "o.png", "--config", config, "--train", "6", *QUICK)[0] == 0
+        settings = tomllib.loads((tmp_path / "o.png.toml").read_text())
+        assert settings["train"] == 6
+        assert settings["filter"]["residual"] == "drop"
+
+    def test_kept_stages_feed_the_stage_commands(self, run, clip, tmp_path):
+        keep, whole = tmp_path / "keep", tmp_path / "whole.tif"
+        assert run("restore", clip, whole, "--keep", keep, "--sigma", "1", "--bit-depth", "32", *QUICK)[0] == 0
+        assert {path.name for path in keep.iterdir()} >= {"centroid.npz", "dynamics.npz", "filtered.npz", "mean.png"}
+        flow = ["--flow.method", "dis"]
+        steps = [
+            ["centroid", clip, tmp_path / "c.npz", "--centroid.iterations", "1", *flow],
+            ["flow", tmp_path / "c.npz", clip, tmp_path / "f.npy", "--frames", "0:3"],
+            ["identify", tmp_path / "c.npz", tmp_path / "d.npz"],
+            [
+                "filter",
+                clip,
+                tmp_path / "c.npz",
+                tmp_path / "d.npz",
+                tmp_path / "e.npz",
+                "--filter.inner-iterations",
+                "1",
+            ],
+            ["deconvolve", tmp_path / "e.npz", tmp_path / "o.tif", "--guide", tmp_path / "c.npz", "--sigma", "1"],
+        ]
+        for words in steps:
+            code, _, err = run(*words)
+            assert code == 0, err
+        run("deconvolve", tmp_path / "e.npz", tmp_path / "o32.tif", "--guide", keep / "centroid.npz", "--sigma", "1",
+            "--bit-depth", "32")  # fmt: skip
+        assert np.abs(read_image(tmp_path / "o32.tif").image - read_image(whole).image).max() < 1e-6
+        assert np.load(tmp_path / "f.npy").shape == (3, 80, 80, 2)
+
+    @pytest.mark.parametrize("until", ["centroid", "identify", "filter"])
+    def test_until(self, run, clip, tmp_path, until):
+        assert run("restore", clip, tmp_path / "o.png", "--until", until, *QUICK)[0] == 0
+        assert read_image(tmp_path / "o.png").image.shape == (80, 80)
+
+    def test_range_and_region(self, run, clip, tmp_path):
+        code, out, _ = run(
+            "restore", clip, tmp_path / "o.png", "--frames", "1:7:2", "--roi", "8,4,64,40", "--json", *QUICK
+        )
+        assert code == 0
+        assert json.loads(out)["frames"] == 3
+        assert read_image(tmp_path / "o.png").image.shape == (40, 64)
+
+    def test_sixteen_bits_stay_sixteen_bits(self, run, tmp_path):
+        frames = make_sequence(seed=32, count=4, size=64, rms=0.5).frames
+        write_video(tmp_path / "deep.mkv", frames, 25, bit_depth=16)
+        assert run("restore", tmp_path / "deep.mkv", tmp_path / "o.png", *QUICK)[0] == 0
+        image = cv2.imread(str(tmp_path / "o.png"), cv2.IMREAD_UNCHANGED)
+        assert image.dtype == np.uint16
+        assert (image % 257 != 0).any()
+
+    def test_alpha_is_left_out_with_a_remark(self, run, tmp_path):
+        folder = tmp_path / "frames"
+        folder.mkdir()
+        for index, frame in enumerate(make_sequence(seed=33, count=4, size=64, rms=0.5).frames):
+            rgba = np.dstack([frame] * 3 + [np.ones_like(frame)])
+            cv2.imwrite(str(folder / f"{index}.png"), np.rint(rgba * 255).astype(np.uint8))
+        code, _, err = run("restore", folder, tmp_path / "o.png", *QUICK[:-1])
+        assert code == 0
+        assert "alpha" in err
+        assert read_image(tmp_path / "o.png").image.shape == (64, 64, 3)
+
+    def test_overwrite_is_explicit(self, run, clip, tmp_path):
+        output = tmp_path / "o.png"
+        assert run("restore", clip, output, *QUICK)[0] == 0
+        before = output.read_bytes()
+        fails(run("restore", clip, output, *QUICK), 73, "exists already")
+        assert output.read_bytes() == before
+        assert run("restore", clip, output, "--overwrite", *QUICK)[0] == 0
+
+
+def renamed_text(folder):
+    (folder / "text.mp4").write_text("no video")
+    return folder / "text.mp4"
+
+
+def truncated(folder):
+    path = frames_clip(folder / "whole.mkv", make_sequence(seed=34, count=8, size=64).frames)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 6 // 10])
+    return path
+
+
+def one_frame(folder):
+    return frames_clip(folder / "one.mkv", make_sequence(seed=35, count=2, size=64).frames[:1])
+
+
+def two_sizes(folder):
+    path = folder / "sizes"
+    path.mkdir()
+    for name, size in (("a", 64), ("b", 64), ("c", 48)):
+        cv2.imwrite(str(path / f"{name}.png"), np.full((size, size), 90, np.uint8))
+    return path
+
+
+def empty_folder(folder):
+    (folder / "empty").mkdir()
+    (folder / "empty" / "notes.txt").write_text("no images here")
+    return folder / "empty"
+
+
+def not_a_number(value):
+    def make(folder):
+        frames = make_sequence(seed=36, count=5, size=64).frames
+        frames[2] = value
+        np.save(folder / "bad.npy", frames)
+        return folder / "bad.npy"
+
+    return make
+
+
+def constant(folder):
+    np.save(folder / "grey.npy", np.full((5, 64, 64), 0.5, np.float32))
+    return folder / "grey.npy"
+
+
+def tiny(folder):
+    return frames_clip(folder / "tiny.mkv", np.random.default_rng(0).random((5, 8, 8)).astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("make", "code", "part"),
+    [
+        (lambda folder: folder / "missing.mp4", 66, "missing.mp4"),
+        (empty_folder, 65, "image"),
+        (renamed_text, 65, "text.mp4"),
+        (truncated, 65, "whole.mkv"),
+        (one_frame, 65, "at least 2"),
+        (two_sizes, 65, "c.png"),
+        (not_a_number(np.nan), 65, "frame 2"),
+        (not_a_number(np.inf), 65, "frame 2"),
+        (constant, 65, "contrast"),
+        (tiny, 65, "16×16"),
+    ],
+    ids=["missing", "empty folder", "text", "truncated", "one frame", "two sizes", "nan", "inf", "constant", "8x8"],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, make, code, part):
+    source = make(tmp_path)
+    outputs = tmp_path / "outputs"
+    outputs.mkdir()
+    fails(run("restore", source, outputs / "o.png", "--keep", outputs / "keep"), code, part)
+    assert list(outputs.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "part"),
+    [
+        (["--smoothnes", "3"], 2, "--smoothnes"),
+        (["--flow.dis.smoothnes", "3"], 2, "Did you mean --flow.dis.smoothness"),
+        (["--flow.method", "sift"], 2, "sift"),
+        (["--train", "many"], 2, "train"),
+        (["--train", "1"], 2, "train"),
+        (["--train", "3.5"], 2, "--train: expected a whole number"),
+        (["--filter.block", "2.9"], 2, "block"),
+        (["--train", "900"], 2, "8 frames"),
+        (["--sigma", "-1"], 2, "sigma"),
+        (["--sigma", "inf"], 2, "sigma"),
+        (["--sigma", "nan"], 2, "sigma"),
+        (["--sigma", "60"], 2, "sigma"),
+        (["--until", "filter", "--deconvolution.sigma", "1"], 2, "until"),
+        (["--flow.dis.smoothness", "inf"], 2, "smoothness"),
+        (["--flow.contrast-window", "inf"], 2, "contrast_window"),
+        (["--filter.image-noise", "1e300"], 2, "image_noise"),
+        (["--filter.sharpness-window", "nan"], 2, "sharpness_window"),
+        (["--dynamics.frames-per-state", "inf"], 2, "frames_per_state"),
+        (["--bit-depth", "20"], 2, "bit"),
+        (["--sigma", "1", "--until", "filter"], 2, "until = filter"),
+        (["--sigma", "1", "--deconvolution.sigma", "2"], 2, "contradicts"),
+        (["--frames", "5"], 2, "--frames"),
+        (["--frames", "a:b"], 2, "--frames"),
+        (["--frames", "90:99"], 2, "8"),
+        (["--roi", "0,0,64"], 2, "--roi"),
+        (["--roi", "40,40,64,64"], 2, "roi"),
+        (["--bit-depth", "7000"], 2, "bit"),
+        (["--config", "none.toml"], 66, "none.toml"),
+        (["--truth", "none.png"], 66, "none.png"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_settings_name_themselves_and_leave_nothing(run, clip, tmp_path, words, code, part):
+    fails(run("restore", clip, tmp_path / "o.png", *words), code, part)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ('[flow]\nmethodd = "dis"\n', "methodd"),
+        ("[flwo]\n", "flwo"),
+        ('[flow]\nmethod = "sift"\n', "sift"),
+        ("train = \n", "settings.toml"),
+        ("[flow.dis]\npatch_stride = 40\n", "patch_stride"),
+        ("train = 3.5\n", "whole number"),
+        ("overwrite = true\n", "overwrite belongs on the command line"),
+    ],
+)
+def test_bad_settings_files_are_refused(run, clip, tmp_path, text, part):
+    config = tmp_path / "settings.toml"
+    config.write_text(text)
+    fails(run("restore", clip, tmp_path / "o.png", "--config", config), 2, part)
+    assert list(tmp_path.iterdir()) == [config]
+
+
+def test_outputs_that_cannot_be(run, clip, tmp_path):
+    copy = tmp_path / "copy.png"
+    copy.write_bytes(clip.read_bytes())
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "a.png"), np.zeros((32, 32), np.uint8))
+    fails(run("restore", copy, copy, "--overwrite"), 73, "copy.png")
+    (tmp_path / "link.png").symlink_to(copy)
+    fails(run("restore", copy, tmp_path / "link.png", "--overwrite"), 73, "link.png")
+    fails(run("restore", folder, folder / "b.png"), 73, "frames")
+    fails(run("restore", clip, tmp_path / "none" / "o.png"), 73, "does not exist")
+    (tmp_path / "folder.png").mkdir()
+    fails(run("restore", clip, tmp_path / "folder.png"), 73, "is a folder")
+    fails(run("restore", clip, ""), 2)
+    fails(run("restore", clip, "/proc/o.png"), 73, "/proc")
+    fails(run("restore", clip, tmp_path / "o.jpg"), 2, ".png")
+    fails(run("restore", clip, tmp_path / "o.png", "--keep", copy), 73, "copy.png")
+    fails(run("restore", clip, tmp_path / "o.png", "--keep", tmp_path / "o.png"), 73, "already")
+    fails(run("restore", folder, tmp_path / "o.png", "--keep", folder, "--overwrite"), 73, "already")
+    fails(run("restore", clip, tmp_path / "o.png", "--keep", folder), 73, "not empty")
+    assert [path.name for path in folder.iterdir()] == ["a.png"]
+    assert copy.read_bytes() == clip.read_bytes()
+
+
+def test_missing_words_and_unknown_commands(run):
+    fails(run("restore"), 2, "INPUT")
+    fails(run("resstore"), 2, 'Did you mean "restore"')
+
+
+def test_info_says_what_a_video_is(run, clip):
+    code, out, _ = run("info", clip, "--json")
+    assert code == 0
+    record = json.loads(out)
+    assert (record["frames"], record["width"], record["height"], record["bit_depth"]) == (8, 80, 80, 8)
+    code, out, _ = run("info", clip)
+    assert code == 0
+    assert "80" in out
+    fails(run("info", "missing.mkv"), 66)
+
+
+class TestEvaluate:
+    TRUTH = SAMPLE / "chart_truth.png"
+
+    def test_against_the_truth(self, run):
+        code, out, _ = run("evaluate", self.TRUTH, self.TRUTH, "--json")
+        assert code == 0
+        assert json.loads(out) == {"psnr": None, "psnr_fit": None, "ssim": 1.0, "sharpness": 1.0, "overshoot": 0.0}
+
+    def test_a_brighter_crop_is_located_first(self, run, tmp_path):
+        truth = read_image(self.TRUTH).image
+        write_image(tmp_path / "crop.png", truth[3:, 5:] * 0.8 + 0.1, 16)
+        code, out, _ = run("evaluate", tmp_path / "crop.png", self.TRUTH, "--json")
+        assert code == 0
+        figures = json.loads(out)
+        # The drawing uses 0.12 and 0.88: at most 0.08 off.
+        assert 22 < figures["psnr"] < 30
+        assert figures["psnr_fit"] > 60
+        assert figures["sharpness"] == pytest.approx(0.8, abs=0.01)
+
+    def test_against_a_reference_without_truth(self, run, tmp_path):
+        truth = read_image(self.TRUTH).image
+        write_image(tmp_path / "soft.png", cv2.GaussianBlur(truth, (0, 0), 1.5), 16)
+        code, out, _ = run("evaluate", self.TRUTH, "--reference", tmp_path / "soft.png", "--json")
+        assert code == 0
+        figures = json.loads(out)
+        assert set(figures) == {"sharpness", "overshoot"}
+        assert figures["sharpness"] > 1.1
+        code, out, _ = run("evaluate", self.TRUTH, self.TRUTH, "--reference", tmp_path / "soft.png")
+        assert code == 0
+        assert [line.split()[0] for line in out.splitlines()] == ["psnr", "psnr", "ssim", "sharpness", "overshoot"]
+        assert f"{figures['sharpness']}" in out
+
+    @pytest.mark.parametrize("suffix", [".npy", ".flo"])
+    def test_flows_give_an_end_point_error(self, run, tmp_path, suffix):
+        flows = np.random.default_rng(0).normal(0, 1, (1, 5, 7, 2)).astype(np.float32)
+        paths = [tmp_path / f"{name}{suffix}" for name in ("measured", "true")]
+        for path, flow in zip(paths, (flows + np.float32(3), flows), strict=True):
+            if suffix == ".flo":
+                cv2.writeOpticalFlow(str(path), flow[0])
+            else:
+                np.save(path, flow)
+        code, out, err = run("evaluate", *paths, "--json")
+        assert code == 0, err
+        figures = json.loads(out)
+        assert figures["endpoint_error"] == pytest.approx(np.sqrt(18), abs=1e-3)
+        assert figures["endpoint_error_centred"] is None
+
+    def test_bad_input_is_one_line(self, run, tmp_path):
+        write_image(tmp_path / "small.png", np.full((20, 20), 0.5), 8)
+        write_image(tmp_path / "flat.png", np.full((100, 100), 0.5), 8)
+        np.save(tmp_path / "flows.npy", np.zeros((2, 8, 8, 2), np.float32))
+        np.save(tmp_path / "fewer.npy", np.zeros((1, 8, 8, 2), np.float32))
+        (tmp_path / "cut.flo").write_bytes(b"PIEH\x08\0\0\0\x08\0\0\0123")
+        fails(run("evaluate", self.TRUTH), 2, "expected a truth or --reference")
+        fails(run("evaluate", "none.png", self.TRUTH), 66, "none.png")
+        fails(run("evaluate", self.TRUTH, "none.png"), 66, "none.png")
+        fails(run("evaluate", tmp_path / "small.png", self.TRUTH), 65, "result: expected at least 68 pixels")
+        fails(run("evaluate", self.TRUTH, tmp_path / "flat.png"), 65, "truth: expected an image with some contrast")
+        fails(run("evaluate", self.TRUTH, "--reference", tmp_path / "small.png"), 65, "expected the size")
+        fails(run("evaluate", tmp_path / "flows.npy", self.TRUTH), 65, "flows.npy: expected an image")
+        fails(run("evaluate", self.TRUTH, tmp_path / "flows.npy"), 65, "expected flows")
+        fails(run("evaluate", tmp_path / "fewer.npy", tmp_path / "flows.npy"), 65, "flows: expected shape")
+        fails(run("evaluate", tmp_path / "cut.flo", tmp_path / "flows.npy"), 65, "cut.flo: expected a flow")
+        fails(run("evaluate", "none.flo", tmp_path / "flows.npy"), 66, "none.flo")
+        flows = ("evaluate", tmp_path / "flows.npy", tmp_path / "flows.npy", "--reference", self.TRUTH)
+        fails(run(*flows), 2, "--reference: has no effect on flows")
+
+
+def test_interruption_ends_with_130(run, clip, tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("turbrestore.pipeline.find_centroid", interrupt)
+    fails(run("restore", clip, tmp_path / "o.png"), 130, "interrupted")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lack_of_memory_is_one_line(run, clip, tmp_path, monkeypatch):
+    def fill(*_):
+        raise MemoryError("Unable to allocate 9 GiB")
+
+    monkeypatch.setattr("turbrestore.pipeline.find_centroid", fill)
+    fails(run("restore", clip, tmp_path / "o.png"), 1, "out of memory", "--roi")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_installed_command_answers(tmp_path):
+    command = Path(sys.executable).with_name("turbrestore")
+    version = subprocess.run([command, "--version"], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert version.stdout.strip().count(".") == 2
+    failed = subprocess.run([command, "info", "none.mkv"], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert failed.returncode == 66
+    assert "Traceback" not in failed.stderr
+
+
+def test_a_smaller_set_of_stages_leaves_none_of_a_larger_one(run, clip, tmp_path):
+    keep = tmp_path / "keep"
+    assert run("restore", clip, tmp_path / "a.png", "--keep", keep, *QUICK)[0] == 0
+    assert (
+        run("restore", clip, tmp_path / "b.png", "--keep", keep, "--until", "centroid", "--overwrite", *QUICK)[0] == 0
+    )
+    images = {"frame.png", "mean.png", "centroid.png"}
+    assert {path.name for path in keep.iterdir()} == {"centroid.npz", "images.npz", "run.json", "stages.json", *images}
+
+
+def test_stage_commands_check_their_settings(run, clip, tmp_path):
+    fails(run("centroid", clip, tmp_path / "c.npz", "--train", "-3"), 2, "train")
+    image = SAMPLE / "chart_truth.png"
+    fails(run("deconvolve", image, tmp_path / "d.npz", "--bit-depth", "8"), 2, "bit-depth")
+    fails(run("deconvolve", image, tmp_path / "d.png", "--sigma", "1", "--deconvolution.sigma", "2"), 2, "contradicts")
+    assert run("centroid", clip, tmp_path / "C.NPZ", *QUICK[:2], "--quiet")[0] == 0
+    assert run("identify", tmp_path / "C.NPZ", tmp_path / "d.npz", "--quiet")[0] == 0
+    fails(run("filter", SAMPLE / "chart.mkv", tmp_path / "C.NPZ", tmp_path / "d.npz", tmp_path / "f.npz"), 65, "shape")

@@ -1,0 +1,297 @@
+"""Arguments and settings files that are wrong: each is refused in one line that says what to change."""
+
+import contextlib
+import io
+import shutil
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from turbrestore.io.images import write_image
+from turbrestore_cli.__main__ import main
+
+USAGE, MISSING = 2, 66
+RESTORE = ["restore", "clip.npy", "o.png"]
+CENTROID = ["centroid", "clip.npy", "c.npz"]
+FLOW = ["flow", "image.png", "clip.npy", "f.npy"]
+IDENTIFY = ["identify", "flows.npy", "d.npz"]
+FILTER = ["filter", "clip.npy", "c.npz", "d.npz", "o.png"]
+DECONVOLVE = ["deconvolve", "image.png", "o.png"]
+SYNTHESIZE = ["synthesize", "chart", "s.mkv"]
+EVALUATE = ["evaluate", "image.png", "image.png"]
+INFO = ["info", "clip.npy"]
+WAVEFRONT, MIRROR = ["moments", "wavefront"], ["moments", "mirror"]
+CHECK = ["config", "--check", "run.toml"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Words, what the line must hold, the settings file if there is one, the exit code."""
+
+    words: list[str]
+    holds: tuple[str, ...]
+    toml: str | bytes | None = None
+    code: int = USAGE
+
+    def __str__(self):
+        return " ".join(self.words) + ("" if self.toml is None else f" {self.toml!r:.50}")
+
+
+def misspelt():
+    """Commands, options and values that are nearly right."""
+    for words, near in (
+        (["restor"], "restore"),
+        (["centriod"], "centroid"),
+        (["deconvole", "a.png", "b.png"], "deconvolve"),
+        (["sythesize"], "synthesize"),
+        (["moments", "miror"], "mirror"),
+        ([*RESTORE, "--sigm", "1"], "--sigma"),
+        ([*RESTORE, "--kep-best", "0.3"], "--keep-best"),
+        ([*RESTORE, "--memory-limt", "2GB"], "--memory-limit"),
+        ([*RESTORE, "--flow.metod", "dis"], "--flow.method"),
+        ([*RESTORE, "--deconvolution.fidelty", "3"], "--deconvolution.fidelity"),
+        ([*RESTORE, "--overwrit"], "--overwrite"),
+        ([*CENTROID, "--centroid.iteration", "3"], "--centroid.iterations"),
+        ([*CENTROID, "--trian", "3"], "--train"),
+        ([*FLOW, "--flow.dis.smothness", "3"], "--flow.dis.smoothness"),
+        ([*IDENTIFY, "--dynamics.rnk", "3"], "--dynamics.rank"),
+        ([*FILTER, "--filter.blok", "3"], "--filter.block"),
+        ([*DECONVOLVE, "--deconvolution.iteratons", "3"], "--deconvolution.iterations"),
+        ([*SYNTHESIZE, "--strenght", "weak"], "--strength"),
+        ([*EVALUATE, "--referense", "image.png"], "--reference"),
+        ([*INFO, "--jsn"], "--json"),
+        ([*WAVEFRONT, "--seed", "3"], "--seeds"),
+        (["config", "--chek", "run.toml"], "--check"),
+        (["report", "kept", "--overwite"], "--overwrite"),
+    ):
+        wrong = next((word for word in reversed(words) if word.startswith("--")), None)
+        yield Case(words, (wrong or words[1 if words[0] == "moments" else 0], near))
+    for words, option, near in (
+        (RESTORE, "--flow.method=tvl2", "tvl1"),
+        (RESTORE, "--until=filtr", "filter"),
+        (RESTORE, "--centroid.mode=fussed", "fused"),
+        (RESTORE, "--border=crp", "crop"),
+        (RESTORE, "--memory-limit=2GBB", "2GB?"),
+        (FILTER, "--filter.residual=kep", "keep"),
+        (DECONVOLVE, "--deconvolution.method=nltvv", "nltv"),
+        (SYNTHESIZE, "--strength=meduim", "medium"),
+        (SYNTHESIZE, "--model=phase-scren", "phase-screen"),
+    ):
+        yield Case([*words, option], (*option.split("="), near))
+
+
+def of_another_type():
+    """Values that are no numbers where numbers belong, and the like."""
+    for words, option in (
+        (RESTORE, "--sigma=wide"),
+        (RESTORE, "--keep-best=thirty"),
+        (RESTORE, "--memory-limit=plenty"),
+        (RESTORE, "--memory-limit=2QB"),
+        (RESTORE, "--frames=a:b"),
+        (RESTORE, "--frames=1:2:3:4"),
+        (RESTORE, "--frames=5"),
+        (RESTORE, "--roi=1,2,3"),
+        (RESTORE, "--roi=1,2,x,4"),
+        (RESTORE, "--train=3.5"),
+        (RESTORE, "--bit-depth=eight"),
+        (RESTORE, "--checkpoint-every=1.5"),
+        (CENTROID, "--centroid.tolerance=small"),
+        (CENTROID, "--centroid.iterations=2.5"),
+        (FLOW, "--flow.threads=many"),
+        (FLOW, "--flow.global-shift=perhaps"),
+        (IDENTIFY, "--dynamics.rank=high"),
+        (FILTER, "--filter.block=1e1"),
+        (DECONVOLVE, "--deconvolution.fidelity=1,5"),
+        (SYNTHESIZE, "--frames=all"),
+        (SYNTHESIZE, "--size=256"),
+        (SYNTHESIZE, "--size=axb"),
+        (EVALUATE, "--max-pixels=big"),
+        (INFO, "--roi=left"),
+        (WAVEFRONT, "--seeds=some"),
+        (MIRROR, "--deviation=7dB"),
+    ):
+        yield Case([*words, option], (option.split("=")[0],))
+
+
+def out_of_range():
+    """Numbers that no stage can work with."""
+    for words, option in (
+        (RESTORE, "--train=1"),
+        (RESTORE, "--keep-best=0"),
+        (RESTORE, "--keep-best=150%"),
+        (RESTORE, "--memory-limit=-2GB"),
+        (RESTORE, "--memory-limit=1MB"),
+        (RESTORE, "--bit-depth=20"),
+        (RESTORE, "--sigma=-1"),
+        (RESTORE, "--sigma=nan"),
+        (RESTORE, "--max-pixels=0"),
+        (RESTORE, "--roi=-1,0,8,8"),
+        ([*RESTORE, "--keep=kept"], "--checkpoint-every=0"),
+        (CENTROID, "--centroid.iterations=0"),
+        (CENTROID, "--centroid.tolerance=-1"),
+        (FLOW, "--flow.contrast-window=-1"),
+        (FLOW, "--flow.threads=-1"),
+        (FLOW, "--flow.dis.patch-size=0"),
+        (FLOW, "--flow.tvl1.attachment=0"),
+        (FLOW, "--flow.tvl1.median=4"),
+        (FLOW, "--flow.farneback.neighbourhood=6"),
+        (IDENTIFY, "--dynamics.rank=-1"),
+        (IDENTIFY, "--dynamics.energy=1.5"),
+        (IDENTIFY, "--dynamics.ridge=-1"),
+        (FILTER, "--filter.block=0"),
+        (FILTER, "--filter.inner-iterations=0"),
+        (FILTER, "--filter.image-noise=0"),
+        (FILTER, "--filter.sharpness=-1"),
+        (DECONVOLVE, "--deconvolution.iterations=0"),
+        (DECONVOLVE, "--deconvolution.fidelity=-1"),
+        (DECONVOLVE, "--bit-depth=33"),
+        (SYNTHESIZE, "--frames=0"),
+        (SYNTHESIZE, "--seed=-1"),
+        (SYNTHESIZE, "--size=0x0"),
+        (WAVEFRONT, "--seeds=0"),
+        (WAVEFRONT, "--params.noise=-1"),
+        (MIRROR, "--deviation=9"),
+    ):
+        yield Case([*words, option], (option.split("=")[0].removeprefix("--").rpartition(".")[2],))
+
+
+def contradicting():
+    """Options that do not go together, words that are missing or too many."""
+    yield Case([*RESTORE, "--sigma=1", "--deconvolution.sigma=2"], ("--sigma", "deconvolution.sigma"))
+    yield Case([*RESTORE, "--strict", "--skip-damaged"], ("--strict", "--skip-damaged"))
+    yield Case([*RESTORE, "--resume"], ("--resume", "--keep"))
+    yield Case([*RESTORE, "--report=r.txt"], ("r.txt", ".html"))
+    yield Case([*RESTORE, "--frames"], ("--frames",))
+    yield Case([*RESTORE, "more.png"], ("more.png",))
+    yield Case(["restore", "clip.npy"], ("OUTPUT",))
+    yield Case(["restore", "clip.npy", "o.gif"], ("o.gif", ".png"))
+    yield Case(["centroid", "clip.npy", "c.zip"], ("c.zip", ".npz"))
+    yield Case(["flow", "image.png", "clip.npy", "f.npz"], ("f.npz", ".npy"))
+    yield Case(["identify", "flows.npy", "d.npy"], ("d.npy", ".npz"))
+    yield Case(["synthesize", "chart", "s.avi"], ("s.avi", ".mkv"))
+    yield Case(["deconvolve", "image.png", "o.npz", "--bit-depth=8"], ("--bit-depth",))
+    yield Case([*SYNTHESIZE, "--like=clip.npy"], ("--like",))
+    yield Case([*SYNTHESIZE, "--model=dynamic-texture", "--strength=weak"], ("--strength",))
+    yield Case(["evaluate", "image.png"], ("--reference",))
+    yield Case(["evaluate", "flows.npy", "flows.npy", "--reference=image.png"], ("--reference",))
+    yield Case(["config"], ("--init", "--check"))
+    yield Case(["config", "--init=a.toml", "--check=a.toml"], ("--init", "--check"))
+    yield Case(["config", "--check=a.toml", "--overwrite"], ("--overwrite",))
+
+
+def missing():
+    """Files that are not there."""
+    for words in (
+        ["restore", "none.mkv", "o.png"],
+        [*RESTORE, "--config=none.toml"],
+        [*RESTORE, "--truth=none.png"],
+        ["centroid", "none.mkv", "c.npz"],
+        ["flow", "none.png", "clip.npy", "f.npy"],
+        ["identify", "none.npy", "d.npz"],
+        ["filter", "clip.npy", "none.npz", "d.npz", "o.png"],
+        ["deconvolve", "none.png", "o.png"],
+        ["deconvolve", "image.png", "o.png", "--guide=none.png"],
+        ["synthesize", "none.png", "s.mkv"],
+        ["evaluate", "none.png", "image.png"],
+        ["info", "none.mkv"],
+        ["config", "--check=none.toml"],
+        ["report", "none"],
+    ):
+        name = next(word for word in words if "none" in word).split("=")[-1]
+        yield Case(words, (name,), code=MISSING)
+
+
+def settings_files():
+    """Settings files: keys that mean nothing or are in the wrong place, wrong types and ranges, no TOML."""
+    for text, holds in (
+        ("trian = 3\n", ("trian", "did you mean train?")),
+        ("keep_bst = 0.3\n", ("keep_bst", "keep_best")),
+        ("[flow]\nmetod = 'dis'\n", ("flow.metod", "flow.method")),
+        ("[flow.dis]\nsmothness = 3\n", ("flow.dis.smothness", "flow.dis.smoothness")),
+        ("[flwo]\nmethod = 'dis'\n", ("flwo", "did you mean flow?")),
+        ("fidelity = 3\n", ("fidelity", "deconvolution.fidelity")),
+        ("[flow]\nfidelity = 3\n", ("flow.fidelity", "deconvolution.fidelity")),
+        ("[filter]\nmethod = 'dis'\n", ("filter.method", "flow.method")),
+        ("flow = 'dis'\n", ("flow", "section")),
+        ("[train]\n", ("train", "section")),
+        ("quiet = true\n", ("quiet", "command line")),
+        ("overwrite = true\n", ("overwrite", "command line")),
+        ("[flow]\nmethod = 'tvl2'\n", ("method", "tvl1")),
+        ("train = 'x'\n", ("train", "whole number")),
+        ("train = 3.5\n", ("train", "whole number")),
+        ("train = true\n", ("train",)),
+        ("train = [1, 2]\n", ("train",)),
+        ("train = 1979-05-27\n", ("train",)),
+        ("sigma = 'wide'\n", ("sigma",)),
+        ("strict = 'perhaps'\n", ("strict",)),
+        ("keep_best = 'thirty'\n", ("keep",)),
+        ("keep_best = 2.0\n", ("keep_best",)),
+        ("memory_limit = '2 big'\n", ("--memory-limit", "2GB")),
+        ("memory_limit = true\n", ("--memory-limit",)),
+        ("train = 1\n", ("train",)),
+        ("roi = '1,2,3'\n", ("--roi",)),
+        ("frames = 'a:b'\n", ("--frames",)),
+        ("bit_depth = 20\n", ("bit_depth",)),
+        ("[dynamics]\nenergy = 1.5\n", ("energy",)),
+        ("[deconvolution]\niterations = -1\n", ("iterations",)),
+        ("sigma = 1\n[deconvolution]\nsigma = 2\n", ("--sigma", "contradicts")),
+        ("train = \n", ("run.toml", "TOML")),
+        ("train = 3\ntrain = 4\n", ("run.toml", "TOML")),
+        ("[flow\n", ("run.toml", "TOML")),
+        ('{"train": 3}\n', ("run.toml", "TOML")),
+        (b"\xff\xfe\x00", ("run.toml", "TOML")),
+        (bytes(64), ("run.toml", "TOML")),
+    ):
+        yield Case(CHECK, holds, text)
+        yield Case([*RESTORE, "--config=run.toml"], holds, text)
+
+
+CASES = [*misspelt(), *of_another_type(), *out_of_range(), *contradicting(), *missing(), *settings_files()]
+
+
+def write_inputs(folder):
+    """A clip, an image and flows that the commands could work with, were the arguments right."""
+    rng = np.random.default_rng(0)
+    np.save(folder / "clip.npy", rng.uniform(size=(6, 32, 32)).astype(np.float32))
+    np.save(folder / "flows.npy", rng.normal(size=(6, 8, 8, 2)).astype(np.float32))
+    write_image(folder / "image.png", rng.uniform(size=(32, 32)).astype(np.float32), 8)
+
+
+def complaint(case, folder):
+    """What is wrong with how a case is refused; empty if nothing is."""
+    settings = folder / "run.toml"
+    settings.unlink(missing_ok=True)
+    if case.toml is not None:
+        settings.write_bytes(case.toml if isinstance(case.toml, bytes) else case.toml.encode())
+    before = set(folder.iterdir())
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main(list(case.words))
+    line = err.getvalue()
+    left = [path for path in folder.iterdir() if path not in before]
+    for path in left:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    if left:
+        return f"left {', '.join(path.name for path in left)}: {line!r}"
+    if code != case.code:
+        return f"exit code {code} in place of {case.code}: {line!r}"
+    if line.count("\n") != 1 or not line.startswith("turbrestore: ") or out.getvalue():
+        return f"not one line: {line!r}, {out.getvalue()!r}"
+    # Keys have underscores where options have hyphens, and either names the setting.
+    lacking = [word for word in case.holds if word.replace("_", "-") not in line.replace("_", "-")]
+    return f"{', '.join(lacking)} not in {line!r}" if lacking else ""
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_is_refused_in_one_line_that_names_it(case, tmp_path):
+    write_inputs(tmp_path)
+    assert complaint(case, tmp_path) == ""
+
+
+def test_a_refusal_that_is_not_as_it_should_be_is_seen(tmp_path):
+    write_inputs(tmp_path)
+    assert "exit code 2" in complaint(Case(["restor"], (), code=MISSING), tmp_path)
+    assert "nonsense not in" in complaint(Case(["restor"], ("nonsense",)), tmp_path)
+    assert "left a.toml" in complaint(Case(["config", "--init=a.toml"], ()), tmp_path)
+    assert "exit code 0" in complaint(Case(INFO, ()), tmp_path)

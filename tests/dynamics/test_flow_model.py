@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flow_systems import (
+    rotating_flows,
+    uneven_flows,
+)
+
+from turbrestore.core.errors import DataError
+from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
+from turbrestore.dynamics.flow_model import flow_of, predict_flow, project, project_deviation
+from turbrestore.dynamics.simulate import simulate, stable_system
+from turbrestore.runtime.scratch import drop_pages, new_stack
+
+STATM = Path("/proc/self/statm")
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+@pytest.fixture
+def noise_flows() -> np.ndarray:
+    return uneven_flows()
+
+
+def test_full_rank_reconstructs_the_flows(noise_flows):
+    dynamics = identify(noise_flows, DynamicsParams(rank=19))
+    assert dynamics.rank == 19
+    for k, flow in enumerate(noise_flows):
+        np.testing.assert_allclose(flow_of(dynamics, dynamics.states[:, k]), flow, atol=2e-6)
+        np.testing.assert_allclose(project(dynamics, flow), dynamics.states[:, k], atol=1e-5)
+    assert pytest.approx(0.0, abs=1e-10) == dynamics.R
+    assert dynamics.energy_share == pytest.approx(1.0)
+
+
+def test_projection_undoes_the_flow_of_a_state(rng, noise_flows):
+    dynamics = identify(noise_flows, DynamicsParams(rank=7))
+    state = rng.standard_normal(7)
+    np.testing.assert_allclose(project(dynamics, flow_of(dynamics, state)), state, atol=1e-5)
+    flow = noise_flows[4]
+    rest = flow - flow_of(dynamics, project(dynamics, flow))
+    np.testing.assert_allclose(dynamics.C.T @ rest.reshape(-1), 0, atol=1e-5)
+
+
+def test_inputs_are_left_alone(noise_flows):
+    before = noise_flows.copy()
+    dynamics = identify(noise_flows, DynamicsParams(rank=3))
+    project(dynamics, noise_flows[0])
+    np.testing.assert_array_equal(noise_flows, before)
+    state = np.ones(3)
+    A = dynamics.A.copy()
+    predict_flow(dynamics, state)
+    stable_system(dynamics, 0.5)
+    simulate(dynamics, 3, np.random.default_rng(0), initial=state)
+    np.testing.assert_array_equal(state, 1.0)
+    np.testing.assert_array_equal(dynamics.A, A)
+
+
+def test_unusable_states_and_flows_are_a_clear_error(rng):
+    dynamics = identify(rotating_flows())
+    for call, words in (
+        (lambda: flow_of(dynamics, np.zeros(3)), "state: expected shape"),
+        (lambda: predict_flow(dynamics, [np.nan, 0.0]), "state: expected finite"),
+        (lambda: simulate(dynamics, 3, rng, initial=np.zeros((2, 1))), "state: expected shape"),
+        (lambda: project(dynamics, np.zeros((5, 7, 2))), "flow: expected shape"),
+        (lambda: project(dynamics, np.full((6, 7, 2), np.nan)), "flow: expected finite"),
+    ):
+        with pytest.raises(DataError, match=words):
+            call()
+
+
+@pytest.mark.parametrize("rank", [0, 5, 19])
+def test_flow_variance_is_that_of_the_flows_whatever_the_rank(noise_flows, rank):
+    found = identify(noise_flows, DynamicsParams(rank=rank)).flow_variance
+    np.testing.assert_allclose(found, noise_flows.var(axis=0, ddof=1).mean(axis=-1), rtol=1e-4)
+
+
+def test_a_state_is_the_same_from_a_file_and_piece_by_piece(rng, tmp_path, monkeypatch):
+    flows = rng.normal(size=(20, 60, 70, 2)).astype(np.float32)
+    whole = identify(flows, DynamicsParams(rank=7))
+    mapped = new_stack(whole.C.shape[::-1], tmp_path).T
+    mapped[:] = whole.C
+    at_once = project(whole, flows[3])
+    monkeypatch.setattr("turbrestore.dynamics.flow_model.PIECE", 70)
+    kept, filed = project(whole, flows[3]), project(replace(whole, C=mapped), flows[3])
+    np.testing.assert_array_equal(kept, filed)
+    np.testing.assert_allclose(kept, at_once, atol=1e-5)
+
+
+# Pages of a mapped file that are resident are counted by the system alone, and only Linux tells them.
+@pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
+@pytest.mark.parametrize(("count", "shape"), [(80, (256, 512)), (2, (2048, 2560))])
+def test_a_state_takes_a_piece_of_the_modes_at_a_time(tmp_path, count, shape):
+    modes = new_stack((count, 2 * shape[0] * shape[1]), tmp_path).T
+    modes[:] = 1e-3
+    drop_pages(modes)
+    dynamics = replace(identify(np.zeros((3, 2, 2, 2))), C=modes)
+    deviation = np.ones((*shape, 2), np.float32)
+    before = resident()
+    state = project_deviation(dynamics, deviation)
+    # All of them are 84 MB.
+    assert resident() - before < 40e6
+    assert state == pytest.approx(np.full(count, 1e-3 * deviation.size), rel=1e-4)
+
+
+def resident() -> int:
+    """Bytes of this process that are in memory."""
+    return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")

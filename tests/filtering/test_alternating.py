@@ -1,0 +1,448 @@
+import itertools
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from conftest import make_sequence
+from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
+from turbrestore.filtering.alternating import FilterParams, filter_frames
+from turbrestore.filtering.flow_tracking import state_covariances
+from turbrestore.filtering.kalman import Gaussian, PixelGaussian, predict, update, update_pixels
+from turbrestore.metrics import psnr
+from turbrestore.registration import flow
+from turbrestore.registration.centroid import find_centroid
+from turbrestore.registration.flow import FlowParams
+from turbrestore.registration.warp import warp
+
+INSIDE = (slice(12, -12), slice(12, -12))
+
+
+def quality(image, sequence, blur=1.0):
+    return psnr(image[INSIDE], cv2.GaussianBlur(sequence.scene, (0, 0), blur)[INSIDE])
+
+
+def start(sequence, train=None, **dynamics):
+    centroid = find_centroid(sequence.frames[:train])
+    return centroid, identify(centroid.flows, DynamicsParams(**dynamics))
+
+
+# Weak and strong, smooth and rough, correlated in time and not, few frames, much noise.
+STATISTICS = [
+    {"seed": 1},
+    {"seed": 2, "rms": 0.5},
+    {"seed": 3, "rms": 2.5, "correlation_length": 20.0},
+    {"seed": 4, "correlation_length": 8.0, "rms": 1.0},
+    {"seed": 5, "persistence": 0.0},
+    {"seed": 6, "count": 8},
+    {"seed": 7, "noise": 0.04},
+]
+
+
+@pytest.mark.parametrize("scene", ["chart", "camera"])
+@pytest.mark.parametrize("statistics", STATISTICS, ids=str)
+def test_the_filter_never_ends_worse_than_the_centroid(scene, statistics):
+    sequence = make_sequence(scene=scene, blur_change=1.0, **statistics)
+    centroid, dynamics = start(sequence, len(sequence.frames) // 2)
+    filtered = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows)
+    assert quality(filtered.image, sequence) >= quality(centroid.image, sequence)
+
+
+@pytest.mark.parametrize("scene", ["chart", "camera"])
+@pytest.mark.parametrize("statistics", STATISTICS, ids=str)
+def test_where_nothing_can_be_gained_less_than_two_grey_levels_are_lost(scene, statistics):
+    """Equally sharp frames, registered almost perfectly: the centroid is within a grey level or two of the truth."""
+    sequence = make_sequence(scene=scene, **statistics)
+    centroid, dynamics = start(sequence, len(sequence.frames) // 2)
+    filtered = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows)
+    before, after = (10 ** (-quality(image, sequence) / 20) for image in (centroid.image, filtered.image))
+    assert after < before + 2 / 255
+
+
+def test_keeping_the_residual_beats_dropping_it():
+    sequence = make_sequence(seed=4, correlation_length=8.0)
+    centroid, dynamics = start(sequence)
+    keep, drop = (
+        filter_frames(
+            sequence.frames,
+            centroid.image,
+            dynamics,
+            FilterParams(residual=residual, sharpness=0, inner_iterations=1),
+            known_flows=centroid.flows,
+        )
+        for residual in ("keep", "drop")
+    )
+    assert quality(keep.image, sequence) > quality(drop.image, sequence) + 3
+    assert keep.motion_share > 0.5
+    assert drop.motion_share == 0
+
+
+def test_in_the_subspace_it_is_the_linear_kalman_filter(sequence):
+    """Flows that the model explains exactly: each part must follow the textbook filter."""
+    count, rank = 12, 3
+    _, model = start(sequence, rank=rank)
+    rng = np.random.default_rng(0)
+    states = rng.normal(0, 20, (count, rank))
+    flows = np.stack([model.mean_flow + (model.C @ xi.astype(np.float32)).reshape(96, 96, 2) for xi in states])
+    model = replace(model, R=0.04, residual_variance=np.zeros((96, 96), np.float32))
+    reference, frames = sequence.frames.mean(axis=0), sequence.frames[:count]
+    noise, prior_frames = 1e-3, 2.0
+    params = FilterParams(sharpness=0, image_noise=noise, prior_frames=prior_frames, inner_iterations=1)
+    filtered = filter_frames(frames, reference, model, params, known_flows=flows)
+
+    flow = Gaussian(np.zeros(rank), model.state_covariance)
+    image = PixelGaussian(reference, np.full((96, 96), noise / prior_frames, np.float32))
+    for frame, xi, found, unforeseen in zip(frames, states, filtered.flow_states, filtered.innovations, strict=True):
+        missed = (model.C @ (xi - predict(flow, model.A, model.Q).mean).astype(np.float32)).astype(np.float64)
+        assert unforeseen == pytest.approx(np.sqrt(np.mean(missed**2)), rel=1e-3)
+        # With CᵀC = I the measurement Cᵀ(W − W̄) = ξ + Cᵀr says all that W does.
+        flow, _ = update(predict(flow, model.A, model.Q), xi, np.eye(rank), model.R * np.eye(rank))
+        assert np.allclose(found, flow.mean, rtol=1e-4, atol=1e-4)
+        estimate = model.mean_flow + (model.C @ flow.mean.astype(np.float32)).reshape(96, 96, 2)
+        image, _ = update_pixels(image, warp(frame, estimate), noise)
+    assert np.abs(filtered.image - image.mean).max() < 1e-3
+    assert np.allclose(filtered.variance, image.variance)
+
+
+def test_without_drift_and_sharpness_it_is_the_average_of_registered_frames(sequence):
+    centroid, dynamics = start(sequence, rank=2)
+    # Everything outside the subspace counts as motion, so each frame is warped by its measured flow.
+    dynamics = replace(dynamics, residual_variance=np.full((96, 96), 1e12, np.float32))
+    params = FilterParams(sharpness=0, inner_iterations=1)
+    filtered = filter_frames(sequence.frames, centroid.image, dynamics, params, known_flows=centroid.flows)
+    average = np.mean([warp(f, w) for f, w in zip(sequence.frames, centroid.flows, strict=True)], axis=0)
+    # The diffuse prior of variance 1 still weighs as much as Z of a frame.
+    assert np.abs(filtered.image - average).max() < 2e-3
+    assert np.allclose(filtered.gains, 1 / np.arange(1, 17), atol=2e-3)
+
+
+def test_the_diffuse_prior_forgets_the_reference(sequence):
+    centroid, dynamics = start(sequence)
+    tinted = filter_frames(sequence.frames, centroid.image + 0.1, dynamics, known_flows=centroid.flows)
+    plain = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows)
+    assert np.abs(tinted.image - plain.image)[INSIDE].mean() < 1e-3
+
+
+@pytest.mark.parametrize("sharpness", [0.0, 2.0])
+def test_frames_alike_carry_the_same_information_whatever_the_weighting(sequence, sharpness):
+    still = np.repeat(sequence.scene[None], 20, axis=0)
+    still = still + np.random.default_rng(0).normal(0, 0.01, still.shape).astype(np.float32)
+    dynamics = identify(np.zeros((20, 96, 96, 2), np.float32))
+    known = np.zeros((20, 96, 96, 2), np.float32)
+    params = FilterParams(sharpness=sharpness, inner_iterations=1)
+    filtered = filter_frames(still, still.mean(axis=0), dynamics, params, known_flows=known)
+    assert np.median(filtered.variance) * 20 / filtered.image_noise == pytest.approx(1, abs=0.15)
+
+
+def test_sharper_frames_weigh_more():
+    sequence = make_sequence(seed=7, blur=0.0)
+    blurry = np.stack([cv2.GaussianBlur(f, (0, 0), 2.5) if k % 2 else f for k, f in enumerate(sequence.frames)])
+    centroid = find_centroid(blurry)
+    dynamics = identify(centroid.flows)
+    plain, sharp = (
+        filter_frames(blurry, centroid.image, dynamics, FilterParams(sharpness=b), known_flows=centroid.flows)
+        for b in (0.0, 2.0)
+    )
+    assert quality(sharp.image, sequence, blur=0.5) > quality(plain.image, sequence, blur=0.5) + 1
+
+
+def test_a_second_inner_iteration_does_not_count_frames_twice(sequence):
+    centroid, dynamics = start(sequence)
+    once, twice = (
+        filter_frames(
+            sequence.frames,
+            centroid.image,
+            dynamics,
+            FilterParams(inner_iterations=n, sharpness=0),
+            known_flows=centroid.flows,
+        )
+        for n in (1, 2)
+    )
+    assert np.allclose(once.variance, twice.variance)
+
+
+def test_drift_keeps_the_gain_up(sequence):
+    centroid, dynamics = start(sequence)
+    params = FilterParams(sharpness=0, image_noise=1e-3, image_drift=1e-4, inner_iterations=1)
+    filtered = filter_frames(sequence.frames, centroid.image, dynamics, params, known_flows=centroid.flows)
+    # Steady state of Σ⁺ = (Σ + S) Z / (Σ + S + Z).
+    drift, noise = 1e-4, 1e-3
+    prior = (drift + np.sqrt(drift**2 + 4 * drift * noise)) / 2
+    assert filtered.gains[-1] == pytest.approx(prior / (prior + noise), rel=0.02)
+
+
+def test_frames_are_streamed_a_block_at_a_time(sequence):
+    centroid, dynamics = start(sequence, 4)
+    taken, furthest = 0, 0
+
+    def stream():
+        nonlocal taken
+        for frame in itertools.islice(itertools.cycle(sequence.frames), 40):
+            taken += 1
+            yield frame
+
+    def progress(_):
+        nonlocal furthest
+        furthest = max(furthest, taken - progress.done)
+        progress.done += 1
+
+    progress.done = 0
+    params = FilterParams(block=5, inner_iterations=1)
+    filtered = filter_frames(stream(), centroid.image, dynamics, params, known_flows=centroid.flows, progress=progress)
+    assert len(filtered.gains) == 40
+    # Four training frames need no new flow; beyond them at most a block is in hand.
+    assert furthest <= 4 + 5
+
+
+def test_covariances_of_a_block_are_those_of_the_filter_step_by_step(sequence):
+    _, dynamics = start(sequence)[:2]
+    noise, state = dynamics.R * np.eye(dynamics.rank), Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance)
+    frames = [sequence.frames[0], None, sequence.frames[1], None, None, sequence.frames[2]]
+    found = state_covariances(state, [frame is not None for frame in frames], dynamics)
+    for frame, covariance in zip(frames, found, strict=True):
+        state = predict(state, dynamics.A, dynamics.Q)
+        if frame is not None:
+            state, _ = update(state, np.zeros(dynamics.rank), np.eye(dynamics.rank), noise)
+        assert covariance == pytest.approx(state.cov, rel=1e-9, abs=1e-12 * state.cov.max())
+
+
+@pytest.mark.parametrize(
+    ("iterations", "train", "colour", "left_out"),
+    [(1, 9, False, ()), (2, 9, False, ()), (2, 3, True, ()), (3, 9, False, ()), (2, 9, False, (2, 8, 9, 10, 13))],
+)
+def test_from_every_checkpoint_a_run_goes_on_bit_for_bit(sequence, iterations, train, colour, left_out):
+    frames = sequence.frames[:15, :48, :48]
+    frames = np.stack([frames, 0.5 * frames, frames**2], axis=-1) if colour else frames
+    centroid = find_centroid(frames[:train])
+    params = FilterParams(inner_iterations=iterations, block=4)
+    counted, kept = np.isin(np.arange(15), left_out, invert=True), []
+
+    def run(**options):
+        options = {"known_flows": centroid.flows, "counted": counted, **options}
+        dynamics = identify(centroid.flows, DynamicsParams(rank=2))
+        found = filter_frames(frames, centroid.image, dynamics, params, **options)
+        arrays = found.image, found.variance, found.flow_states, found.shares, found.innovations
+        return [array.tobytes() for array in arrays]
+
+    whole = run(on_checkpoint=kept.append)
+    assert [len(one.records) for one in kept] == list(dict.fromkeys([*range(train, 15, 4), 15]))
+    steps = []
+    for checkpoint in kept:
+        steps.clear()
+        assert run(start=checkpoint, progress=steps.append) == whole
+        assert sum(steps) == 15 * iterations - train
+    assert run(flow_params=FlowParams(threads=3)) == whole
+    assert run(prepared={}) == whole
+
+
+def test_what_was_prepared_before_changes_nothing_and_is_not_kept(sequence, monkeypatch):
+    prepared = {}
+    centroid = find_centroid(sequence.frames, prepared=prepared)
+    dynamics = identify(centroid.flows)
+    assert sorted(prepared) == list(range(len(sequence.frames)))
+    again = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows)
+    levels = []
+    monkeypatch.setattr(
+        "turbrestore.registration.flow._levels", lambda *a, find=flow._levels: levels.append(1) or find(*a)
+    )
+    filtered = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows, prepared=prepared)
+    # That of the one reference, and of no frame.
+    assert len(levels) == 1
+    assert prepared == {}
+    assert filtered.image.tobytes() == again.image.tobytes()
+
+
+def test_threads_do_not_change_the_result(sequence):
+    centroid, dynamics = start(sequence)
+    one, three = (
+        filter_frames(sequence.frames, centroid.image, dynamics, flow_params=FlowParams(threads=n)).image
+        for n in (1, 3)
+    )
+    assert (one == three).all()
+
+
+def test_colour_moves_with_luminance(sequence):
+    tint = np.array([1.0, 0.8, 0.6], np.float32)
+    frames = sequence.frames[:4, ..., None] * tint
+    centroid = find_centroid(frames)
+    filtered = filter_frames(frames, centroid.image, identify(centroid.flows), known_flows=centroid.flows)
+    assert filtered.image.shape == (96, 96, 3)
+    assert np.abs(filtered.image / tint - filtered.image[..., :1])[INSIDE].max() < 0.01
+
+
+def test_a_model_without_motion_works(sequence):
+    still = np.repeat(sequence.frames[:1], 5, axis=0)
+    dynamics = identify(np.zeros((5, 96, 96, 2), np.float32))
+    filtered = filter_frames(still, still[0], dynamics)
+    assert np.abs(filtered.image - still[0])[INSIDE].max() < 0.02
+
+
+def test_bad_input_is_refused(sequence):
+    centroid, dynamics = start(sequence, 4)
+    with pytest.raises(DataError, match="at least 1, found 0"):
+        filter_frames([], centroid.image, dynamics)
+    with pytest.raises(DataError, match="at least 4, found 2"):
+        filter_frames(sequence.frames[:2], centroid.image, dynamics, known_flows=centroid.flows)
+    with pytest.raises(DataError, match="dynamics: expected flows of"):
+        filter_frames(sequence.frames[:, :64], centroid.image[:64], dynamics)
+    for bad in (
+        {"residual": "half"},
+        {"frame_noise": "contrast"},
+        {"inner_iterations": 0},
+        {"block": 0},
+        {"sharpness": -1.0},
+        {"sharpness_window": 0.0},
+        {"image_noise": 0.0},
+        {"image_drift": -1.0},
+        {"prior_frames": -1.0},
+    ):
+        with pytest.raises(ConfigurationError, match=f"^{next(iter(bad))}: expected"):
+            FilterParams(**bad)
+
+
+def test_frames_whose_flow_folds_count_for_little(sequence):
+    dynamics = identify(np.zeros((6, 96, 96, 2), np.float32))
+    frames = np.repeat(sequence.frames[:1], 6, axis=0)
+    known = np.zeros((6, 96, 96, 2), np.float32)
+    # In three frames a region is turned over: x + dx falls as x grows.
+    x = np.arange(96, dtype=np.float32)
+    known[::2, 30:60, 30:60, 0] = -2 * (x[30:60] - 45)
+    dynamics = replace(dynamics, residual_variance=np.full((96, 96), 1e9, np.float32))
+    # Hardly any weight on sharpness, so that nothing but the fold can tell the frames apart.
+    params = FilterParams(inner_iterations=1, sharpness=1e-3)
+    filtered = filter_frames(frames, frames[0], dynamics, params, known_flows=known)
+    region = (slice(36, 54), slice(36, 54))
+    plain = np.mean([warp(f, w) for f, w in zip(frames, known, strict=True)], axis=0)
+    assert np.abs(filtered.image - frames[0])[region].max() < 0.05
+    assert np.abs(plain - frames[0])[region].max() > 0.1
+    # Three of six frames are all the information there is.
+    assert np.median(filtered.variance[region]) > 1.7 * np.median(filtered.variance[70:, 70:])
+
+
+def still_frames(sequence, sigmas):
+    """Frames without motion, each with its own blur and noise."""
+    rng = np.random.default_rng(0)
+    frames = [cv2.GaussianBlur(sequence.scene, (0, 0), sigma) for sigma in sigmas]
+    return np.stack(frames) + rng.normal(0, 0.01, (len(sigmas), 96, 96)).astype(np.float32)
+
+
+def test_by_blur_sharp_frames_weigh_more_also_among_those_that_come_later(sequence):
+    sigmas = np.tile([0.8, 1.8], 12)
+    frames = still_frames(sequence, sigmas)
+    dynamics = identify(np.zeros((8, 96, 96, 2), np.float32))
+    params = FilterParams(frame_noise="blur", inner_iterations=1, image_drift=1e-5, prior_frames=1.0)
+    known = np.zeros((8, 96, 96, 2), np.float32)
+    filtered = filter_frames(frames, frames[:8].mean(axis=0), dynamics, params, known_flows=known)
+    sharp, blurry = filtered.gains[0::2], filtered.gains[1::2]
+    assert blurry[1:].max() < 0.6 * sharp[1:].min()
+    assert quality(filtered.image, sequence, 0.8) > quality(frames.mean(axis=0), sequence, 0.8) + 2
+
+
+def test_by_blur_frames_alike_carry_the_same_information(sequence):
+    frames = still_frames(sequence, np.full(20, 1.0))
+    dynamics = identify(np.zeros((20, 96, 96, 2), np.float32))
+    params = FilterParams(frame_noise="blur", inner_iterations=1)
+    known = np.zeros((20, 96, 96, 2), np.float32)
+    filtered = filter_frames(frames, frames.mean(axis=0), dynamics, params, known_flows=known)
+    assert np.median(filtered.variance) * 20 / filtered.image_noise == pytest.approx(1, abs=0.15)
+
+
+def test_by_blur_one_frame_a_block_is_enough(sequence):
+    dynamics = identify(np.zeros((4, 96, 96, 2), np.float32))
+    params = FilterParams(frame_noise="blur", block=1, inner_iterations=1)
+    assert np.isfinite(filter_frames(sequence.frames[:3], sequence.frames[0], dynamics, params).image).all()
+
+
+def test_no_more_of_the_residual_is_kept_than_the_model_says_is_motion(sequence):
+    centroid, dynamics = start(sequence)
+    plain, capped = (
+        filter_frames(sequence.frames, centroid.image, replace(dynamics, motion_factor=f), known_flows=centroid.flows)
+        for f in (dynamics.motion_factor, np.full((96, 96), 0.25, np.float32))
+    )
+    assert plain.motion_share > 0.5
+    assert capped.motion_share == pytest.approx(0.25, abs=0.01)
+
+
+def spoil(frames):
+    """A bird that crosses, two flashes, a glint and a frame that slipped."""
+    spoilt = frames.copy()
+    for step, index in enumerate(range(4, 12)):
+        cv2.circle(spoilt[index], (10 + 14 * step, 60), 7, 0.05, -1)
+    spoilt[13] = np.clip(spoilt[13] + 0.35, 0, 1)
+    spoilt[14] = np.clip(1.5 * spoilt[14], 0, 1)
+    cv2.circle(spoilt[16], (80, 40), 12, 1.0, -1)
+    return spoilt
+
+
+@pytest.mark.parametrize("scene", ["chart", "camera"])
+def test_what_only_a_few_frames_show_leaves_no_trace(scene):
+    sequence = make_sequence(scene=scene, seed=21, count=40)
+    filtered = {}
+    for name, frames in (("clean", sequence.frames), ("spoilt", spoil(sequence.frames))):
+        centroid = find_centroid(frames)
+        filtered[name] = filter_frames(frames, centroid.image, identify(centroid.flows), known_flows=centroid.flows)
+    clean, spoilt = (10 ** (-quality(filtered[name].image, sequence) / 20) for name in ("clean", "spoilt"))
+    assert spoilt < clean + 1 / 255
+    # A flash covers all of its frame, the bird a part of the frames it crosses.
+    assert filtered["spoilt"].shares[13:15].max() < 0.1 / 40
+    assert filtered["spoilt"].shares[20:].min() > 0.2 / 40
+
+
+def test_sharper_frames_count_more():
+    sequence = make_sequence(scene="camera", seed=22, count=20)
+    frames = sequence.frames.copy()
+    frames[::2] = [cv2.GaussianBlur(frame, (0, 0), 1.5) for frame in frames[::2]]
+    centroid = find_centroid(frames)
+    dynamics = identify(centroid.flows)
+    filtered = filter_frames(frames, centroid.image, dynamics, known_flows=centroid.flows)
+    assert filtered.sharpness[1::2].min() > filtered.sharpness[::2].max()
+    assert filtered.shares[1::2].min() > filtered.shares[::2].max()
+    assert filtered.shares.sum() == pytest.approx(1)
+
+
+def test_frames_that_do_not_count_change_the_flow_state_only():
+    sequence = make_sequence(seed=23, count=16)
+    centroid, dynamics = start(sequence, 8)
+    counted = np.ones(16, bool)
+    counted[[3, 9, 10, 15]] = False
+    garbage = sequence.frames.copy()
+    garbage[~counted] = np.random.default_rng(0).uniform(size=garbage[~counted].shape)
+    options = {"params": FilterParams(image_noise=1e-3), "counted": counted}
+    first, second = (
+        filter_frames(frames, centroid.image, dynamics, known_flows=centroid.flows, **options)
+        for frames in (sequence.frames, garbage)
+    )
+    assert np.isnan(first.innovations[~counted]).all()
+    assert np.isfinite(first.innovations[counted]).all()
+    assert (first.gains[~counted] == 0).all()
+    assert (first.shares[~counted] == 0).all()
+    assert np.allclose(first.flow_states[9], dynamics.A @ first.flow_states[8])
+    # The noise model is read off all training frames, so frame 3 is not quite without effect.
+    assert np.abs(first.image - second.image).mean() < 0.01
+
+
+def test_marks_that_do_not_fit_are_refused():
+    sequence = make_sequence(seed=24, count=12, size=64)
+    centroid, dynamics = start(sequence, 4)
+    for marks, message in (([False] * 12, "at least one"), ([True] * 10, "found 10 marks"), ([True] * 13, "13 marks")):
+        with pytest.raises(DataError, match=message):
+            filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows, counted=marks)
+
+
+def test_a_border_that_was_not_seen_is_not_made_of_its_repetition():
+    sequence = make_sequence(scene="camera", seed=25, count=16, blur=0.0, noise=0.005)
+    shifts = np.linspace(-4, 4, 16)
+    frames = np.stack(
+        [
+            warp(f, np.broadcast_to(np.float32([s, 0]), (*f.shape, 2)))
+            for f, s in zip(sequence.frames, shifts, strict=True)
+        ]
+    )
+    frames = frames[:, 8:-8, 8:-8]
+    truth = sequence.scene[8:-8, 8:-8]
+    centroid = find_centroid(frames)
+    filtered = filter_frames(frames, centroid.image, identify(centroid.flows), known_flows=centroid.flows)
+    error = np.abs(filtered.image - truth)
+    assert np.median(error[:, :2]) < 3 * np.median(error[:, 20:-20])

@@ -1,0 +1,290 @@
+"""What frames show: defects that are put in are found and repaired, and clean clips come back bit for bit."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from conftest import make_sequence
+from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.footage.content import ContentParams, check_content, clean_source
+from turbrestore.io.source import FrameSource
+from turbrestore.io.video import open_frames, write_video
+
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return np.clip(0.1 + 0.8 * make_sequence(3, count=14, size=64).frames, 0, 1).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    return np.clip(make_sequence(4, count=14, size=64, scene="camera").frames, 0, 1).astype(np.float32)
+
+
+def cleaned(stack, **settings):
+    source = FrameSource.from_array(stack, "clip")
+    report = check_content(source, ContentParams(**settings))
+    return report, clean_source(source, report)
+
+
+class TestCleanClips:
+    def test_the_sample_clip_is_left_as_it_is(self):
+        source = open_frames(SAMPLE)
+        report = check_content(source)
+        assert report.warnings == () and not report.left_out and len(report.scenes) == 1
+        np.testing.assert_array_equal(clean_source(source, report).read(), source.read())
+
+    @pytest.mark.parametrize("scene", ["chart", "camera"])
+    @pytest.mark.parametrize("statistics", [{"rms": 0.3}, {"rms": 4.0}, {"blur": 3.0}, {"noise": 0.1}, {"noise": 0.0}])
+    def test_synthesized_clips_are_left_as_they_are(self, scene, statistics):
+        stack = np.clip(make_sequence(5, count=12, size=64, scene=scene, **statistics).frames, 0, 1)
+        report, source = cleaned(stack)
+        assert report.warnings == ()
+        np.testing.assert_array_equal(source.read(), stack)
+        assert source.repair is None and source.numbers == range(12)
+
+    def test_quantised_colour_is_left_as_it_is(self, frames):
+        stack = np.stack([np.uint8(255 * frames), np.uint8(200 * frames), np.uint8(90 * frames)], -1)
+        report, source = cleaned(stack)
+        assert report.warnings == ()
+        np.testing.assert_array_equal(source.read(), stack / np.float32(255))
+
+    def test_a_drifting_shaking_camera_makes_no_cut(self, elsewhere):
+        rng = np.random.default_rng(0)
+        shifts = np.linspace(0, 20, 14)[:, None] + rng.normal(0, 2, (14, 2))
+        stack = [
+            np.roll(frame, np.rint(shift).astype(int), (0, 1)) for frame, shift in zip(elsewhere, shifts, strict=True)
+        ]
+        assert len(cleaned(np.stack(stack))[0].scenes) == 1
+
+    def test_a_slow_change_of_the_scene_makes_no_cut(self, frames, elsewhere):
+        share = np.linspace(0, 1, 80, dtype=np.float32)[:, None, None]
+        stack = (1 - share) * np.resize(frames, (80, 64, 64)) + share * np.resize(elsewhere, (80, 64, 64))
+        assert len(cleaned(stack)[0].scenes) == 1
+
+    def test_changing_brightness_makes_no_cut(self, elsewhere):
+        gain = np.linspace(0.3, 1, 14, dtype=np.float32)[:, None, None]
+        assert cleaned(elsewhere * gain)[0].warnings == ()
+
+    def test_pure_noise_makes_no_cut(self):
+        stack = np.random.default_rng(0).random((30, 40, 40), dtype=np.float32)
+        report, _ = cleaned(stack)
+        assert len(report.scenes) == 1 and not report.left_out and not len(report.stuck)
+
+
+class TestValuesThatAreNotFinite:
+    @given(data=st.data())
+    @settings(max_examples=20, deadline=None)
+    def test_isolated_ones_are_filled_within_the_range_of_the_rest(self, frames, data):
+        stack = frames.copy()
+        places = data.draw(
+            st.lists(st.tuples(st.integers(0, 13), st.integers(0, 63), st.integers(0, 63)), min_size=1, max_size=20)
+        )
+        for place in places:
+            stack[place] = data.draw(st.sampled_from([np.nan, np.inf, -np.inf]))
+        report, source = cleaned(stack)
+        assert report.filled_values == len(set(places))
+        assert report.filled == tuple(sorted({place[0] for place in places}))
+        found, bad = source.read(), ~np.isfinite(stack)
+        np.testing.assert_array_equal(found[~bad], stack[~bad])
+        assert found.min() >= frames.min() and found.max() <= frames.max()
+
+    def test_a_hole_in_a_ramp_is_filled_smoothly(self):
+        ramp = np.tile(np.linspace(0, 1, 40, dtype=np.float32), (3, 40, 1)) + 0 * np.arange(3)[:, None, None]
+        stack = ramp.copy()
+        stack[1, 10:13, 20:23] = np.nan
+        _, source = cleaned(stack)
+        np.testing.assert_allclose(source.read(), ramp, atol=0.03)
+
+    def test_colour_is_filled_channel_by_channel(self, frames):
+        stack = np.stack([frames, 0.5 * frames, 0.2 * frames], -1)
+        stack[2, 30, 30, 1] = np.nan
+        _, source = cleaned(stack)
+        assert np.isfinite(source.read()).all()
+        np.testing.assert_array_equal(source.read()[..., ::2], stack[..., ::2])
+
+    def test_too_many_are_refused_with_count_and_frame(self, frames):
+        stack = frames.copy()
+        stack[4, :10] = np.nan
+        with pytest.raises(DataError, match=r"clip: frame 4: .* 640 of 4096 NaN"):
+            cleaned(stack)
+
+    def test_strict_refuses_one(self, frames):
+        stack = frames.copy()
+        stack[4, 3, 3] = np.nan
+        with pytest.raises(DataError, match="1 NaN or infinite value in frame 4"):
+            cleaned(stack, strict=True)
+
+    def test_outside_of_the_region_they_do_not_count(self, frames):
+        stack = frames.copy()
+        stack[:, :20] = np.nan
+        source = FrameSource.from_array(stack).select(roi=(0, 20, 64, 44))
+        assert check_content(source).warnings == ()
+
+    @pytest.mark.parametrize("name", ["a.npy", "a.tif"])
+    def test_a_hole_in_the_first_frame_of_a_file(self, tmp_path, frames, name):
+        import tifffile
+
+        stack = frames.copy()
+        stack[0, 5, 5] = np.nan
+        np.save(tmp_path / "a.npy", stack)
+        tifffile.imwrite(tmp_path / "a.tif", stack, photometric="minisblack")
+        source = open_frames(tmp_path / name)
+        with pytest.raises(DataError, match="frame 0: expected finite values"):
+            source.read()
+        assert np.isfinite(clean_source(source, check_content(source)).read()).all()
+
+
+class TestStuckPixels:
+    @pytest.mark.parametrize("dtype", [np.float32, np.uint8, ">u2"])
+    @pytest.mark.parametrize(("level", "place"), [(1.0, (20, 30)), (0.0, (40, 11)), (1.0, (1, 62))])
+    def test_hot_and_dead_pixels_are_replaced(self, frames, level, place, dtype):
+        white = 1 if dtype == np.float32 else np.iinfo(dtype).max
+        whole = (frames * white).astype(dtype)
+        # A dead pixel is seen where it is surrounded by light.
+        stack = whole.copy()
+        around = (slice(None), slice(place[0] - 1, place[0] + 2), slice(place[1] - 1, place[1] + 2))
+        stack[around] = np.clip(stack[around], 0.3 * white, 0.7 * white)
+        expected = stack / np.float32(white)
+        stack[:, place[0], place[1]] = level * white
+        report, source = cleaned(stack)
+        assert report.stuck.tolist() == [list(place)]
+        found = source.read()
+        assert np.abs(found - expected).max() < 0.5
+        found[:, place[0], place[1]] = expected[:, place[0], place[1]]
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+    def test_places_are_those_of_the_file_under_any_crop(self, frames):
+        stack = frames.copy()
+        stack[:, 40, 50] = 1
+        stack[:, 39:42, 49:52] = np.clip(stack[:, 39:42, 49:52], 0, 0.5)
+        stack[:, 40, 50] = 1
+        source = FrameSource.from_array(stack).select(roi=(45, 35, 16, 16))
+        report = check_content(source)
+        assert report.stuck.tolist() == [[40, 50]]
+        repaired = clean_source(source, report)
+        assert repaired.read()[:, 5, 5].max() <= 0.5
+        assert repaired.select(roi=(4, 4, 3, 3)).read()[:, 1, 1].max() <= 0.5
+
+    def test_a_small_light_of_the_scene_is_kept(self):
+        rng = np.random.default_rng(0)
+        scene = np.full((64, 64), 0.2, np.float32)
+        scene[30, 30] = 8.0
+        stack = [
+            cv2.GaussianBlur(np.roll(scene, rng.integers(-1, 2, 2), (0, 1)), (0, 0), 0.8)
+            + rng.normal(0, 0.01, (64, 64))
+            for _ in range(20)
+        ]
+        report, _ = cleaned(np.clip(np.float32(stack), 0, 1))
+        assert report.warnings == ()
+
+    def test_few_frames_tell_nothing(self, frames):
+        stack = frames[:6].copy()
+        stack[:, 20, 30] = 1
+        assert not len(cleaned(stack)[0].stuck)
+
+
+class TestFramesLeftOut:
+    def test_duplicates_blanks_and_numbers_of_the_file(self, frames):
+        stack = frames.copy()
+        stack[5] = stack[4]
+        stack[9] = 0
+        stack[0] = 1
+        report, source = cleaned(stack)
+        assert (report.duplicated, report.blank) == ((5,), (0, 9))
+        assert source.numbers == tuple(n for n in range(14) if n not in (0, 5, 9))
+        np.testing.assert_array_equal(source.read(), stack[list(source.numbers)])
+        np.testing.assert_array_equal(list(source), list(source))
+        assert len(source) == len(list(source)) == source.shape[0] == 11
+        np.testing.assert_array_equal(source.select((2, 8, 2)).read(), stack[list(source.numbers)[2:8:2]])
+
+    @pytest.mark.parametrize("name", ["a.mkv", "a.ser", "a.tif", "a.npy"])
+    def test_every_reader_passes_over_them(self, tmp_path, frames, name):
+        stack = frames.copy()
+        stack[[3, 4, 8]] = 0
+        write_video(tmp_path / name, stack, 25)
+        source = open_frames(tmp_path / name, frames=(1, 13, 2))
+        whole = source.read()
+        report = check_content(source)
+        assert report.blank == (3,)
+        np.testing.assert_array_equal(clean_source(source, report).read(), np.delete(whole, 1, 0))
+
+    def test_times_follow(self, tmp_path, frames):
+        stack = frames.copy()
+        stack[3] = 0
+        write_video(tmp_path / "a.mkv", stack, 25)
+        source = open_frames(tmp_path / "a.mkv")
+        found = clean_source(source, check_content(source))
+        np.testing.assert_allclose(found.timestamps, np.delete(np.arange(14), 3) / 25, atol=1e-3)
+
+    def test_the_longest_scene_is_used(self, frames, elsewhere):
+        report, source = cleaned(np.concatenate([elsewhere[:8], frames]))
+        assert [(scene.first, scene.last, scene.count) for scene in report.scenes] == [(0, 7, 8), (8, 21, 14)]
+        np.testing.assert_array_equal(source.read(), frames)
+        assert "--frames selects another (0:8)" in report.warnings[0]
+
+    def test_a_scene_that_comes_back_is_one(self, frames, elsewhere):
+        report, source = cleaned(np.concatenate([frames[:6], elsewhere[:3], frames[6:]]))
+        assert len(report.scenes) == 2
+        np.testing.assert_array_equal(source.read(), frames)
+
+    def test_a_lens_cap_with_noise_is_blank(self, elsewhere):
+        stack = elsewhere.copy()
+        stack[:3] = np.abs(np.random.default_rng(0).normal(0, 0.01, (3, 64, 64)))
+        assert cleaned(stack)[0].blank == (0, 1, 2)
+
+    def test_a_still_image_is_kept_with_a_remark(self, frames):
+        report, source = cleaned(np.repeat(frames[:1], 12, 0))
+        assert len(source) == 12 and report.warnings == ("all frames are the same: there is no turbulence to take out",)
+
+    def test_frames_without_any_contrast_are_kept_with_a_remark(self):
+        report, source = cleaned(np.full((12, 20, 20), 0.3, np.float32))
+        assert len(source) == 12 and report.blank == () and report.contrast == 0
+        assert report.warnings == ("every frame is of one intensity: there is no scene",)
+
+    @pytest.mark.parametrize("defect", ["duplicate", "blank", "cut", "stuck"])
+    def test_strict_refuses(self, frames, elsewhere, defect):
+        stack = frames.copy()
+        if defect == "duplicate":
+            stack[5] = stack[4]
+        elif defect == "blank":
+            stack[5] = 0
+        elif defect == "cut":
+            stack[9:] = elsewhere[9:]
+        else:
+            stack[:, 19:22, 29:32] = 0.4
+            stack[:, 20, 30] = 1
+        with pytest.raises(DataError) as info:
+            cleaned(stack, strict=True)
+        assert "\n" not in str(info.value) and info.value.exit_code == 65
+
+
+def test_saturation_is_told_and_nothing_is_changed(frames):
+    stack = np.clip(frames * 1.6, 0, 1)
+    report, source = cleaned(stack)
+    assert report.saturated > 0.5 and "at white" in report.warnings[0]
+    np.testing.assert_array_equal(source.read(), stack)
+
+
+def test_a_report_belongs_to_its_frames(frames):
+    source = FrameSource.from_array(frames)
+    with pytest.raises(ConfigurationError, match="other frames"):
+        clean_source(source, check_content(source.select((0, 5))))
+
+
+@pytest.mark.parametrize("shape", [(3, 1, 1), (3, 1, 40), (3, 2, 2), (1, 5, 5), (12, 3, 3, 3), (2, 33, 31)])
+def test_any_size_is_looked_at(shape):
+    stack = np.random.default_rng(0).random(shape, dtype=np.float32)
+    assert len(cleaned(stack)[1]) == shape[0]
+
+
+def test_damaged_frames_are_refused_and_strictness_changes_nothing():
+    source = FrameSource("a", "test", (5, 2, 2), 255, 8, lambda chosen: iter([np.zeros((2, 2), np.uint8)] * 3))
+    with pytest.raises(DataError, match="expected 5 frames, found 3"):
+        check_content(source)

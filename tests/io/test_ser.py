@@ -1,0 +1,226 @@
+"""SER files: against bytes laid out by hand, and round trips."""
+
+import struct
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, OutputError, TurbrestoreError
+from turbrestore.io.ser import open_ser, read_ser_header, write_ser
+from turbrestore.io.video import open_frames
+
+MONO = np.arange(2 * 3 * 4).reshape(2, 3, 4)
+
+
+def ser_bytes(frames, colour=0, depth=16, flag=0, order="<", ticks=None, count=None):
+    """A SER file as its description lays it out, independent of the writer under test."""
+    frames = np.asarray(frames)
+    head = struct.pack(
+        "<14s7i40s40s40s2q",
+        b"LUCAM-RECORDER",
+        *(0, colour, flag, frames.shape[2], frames.shape[1], depth, len(frames) if count is None else count),
+        b"observer",
+        b"instrument",
+        b"telescope",
+        *(0, 0),
+    )
+    assert len(head) == 178
+    body = frames.astype(np.uint8 if depth <= 8 else f"{order}u2").tobytes()
+    return head + body + (b"" if ticks is None else np.asarray(ticks, "<i8").tobytes())
+
+
+@pytest.fixture
+def ser(tmp_path):
+    def write(*arguments, **options):
+        path = tmp_path / "a.ser"
+        path.write_bytes(ser_bytes(*arguments, **options))
+        return path
+
+    return write
+
+
+def refused(path, error, word, **options):
+    with pytest.raises(error) as info:
+        open_frames(path, **options)
+    message = str(info.value)
+    assert "\n" not in message and word in message, message
+
+
+@pytest.mark.parametrize("depth", [8, 10, 12, 16])
+def test_mono_is_scaled_by_its_depth(ser, depth):
+    source = open_frames(ser(MONO, depth=depth))
+    assert source.shape == (2, 3, 4) and source.bit_depth == depth and source.format == f"ser/mono{depth}"
+    np.testing.assert_array_equal(source.read(), (MONO / np.float32(2**depth - 1)).astype(np.float32))
+    assert source.fps is None and source.timestamps is None
+
+
+def test_flag_0_is_little_endian_and_1_big_endian(ser):
+    for flag, order in ((0, "<"), (1, ">")):
+        found = open_frames(ser(MONO * 1000, flag=flag, order=order)).read()
+        np.testing.assert_allclose(found, MONO * 1000 / 65535, rtol=1e-6)
+
+
+@pytest.mark.parametrize("depth", [8, 16])
+def test_rgb_and_bgr_come_as_rgb(ser, depth):
+    colour = np.random.default_rng(0).integers(0, 2**depth, (2, 3, 4, 3))
+    for code in (100, 101):
+        stored = colour if code == 100 else colour[..., ::-1]
+        found = open_frames(ser(stored, colour=code, depth=depth)).read()
+        np.testing.assert_allclose(found, colour / (2**depth - 1), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("code", "pattern"), [(8, "RGGB"), (9, "GRBG"), (10, "GBRG"), (11, "BGGR")])
+@pytest.mark.parametrize("depth", [8, 16])
+def test_bayer_pattern_of_one_colour_becomes_that_colour(ser, code, pattern, depth):
+    level = {"R": 200, "G": 120, "B": 30}
+    mosaic = np.empty((1, 8, 10), int)
+    for place, letter in enumerate(pattern):
+        mosaic[:, place // 2 :: 2, place % 2 :: 2] = level[letter]
+    found = open_frames(ser(mosaic, colour=code, depth=depth), roi=(2, 2, 4, 4)).read() * (2**depth - 1)
+    np.testing.assert_allclose(found, np.broadcast_to([200, 120, 30], (1, 4, 4, 3)), atol=0.01)
+
+
+def test_times_come_from_the_trailer(ser):
+    source = open_frames(ser(MONO, ticks=[5_000_000, 10_000_000]))
+    assert source.timestamps.tolist() == [0.0, 0.5]
+    assert source.fps == 2.0
+
+
+@pytest.mark.parametrize("ticks", [[0, 0, 0], [7, 5, 3], [0, 9, 3]])
+def test_useless_times_are_left_out(ser, ticks):
+    source = open_frames(ser(np.zeros((3, 3, 4)), ticks=ticks))
+    assert source.timestamps is None and source.fps is None
+
+
+@given(
+    pixels=hnp.arrays(
+        np.uint16, hnp.array_shapes(min_dims=3, max_dims=3, max_side=4), elements=st.integers(0, 2**16 - 1)
+    ),
+    depth=st.integers(1, 16),
+    colour=st.booleans(),
+)
+@settings(max_examples=30, deadline=None)
+def test_round_trip_is_exact(tmp_path_factory, pixels, depth, colour):
+    pixels = pixels >> (16 - depth)
+    if colour:
+        pixels = np.repeat(pixels[..., None], 3, axis=3) ^ np.array([0, 1, 0], np.uint16)
+    path = tmp_path_factory.mktemp("ser") / "a.ser"
+    write_ser(path, (pixels / (2**depth - 1)).astype(np.float32), bit_depth=depth, fps=20)
+    source = open_ser(path)
+    np.testing.assert_array_equal(np.rint(source.read() * np.float64(2**depth - 1)), pixels)
+    assert source.bit_depth == depth
+    assert source.fps == (pytest.approx(20) if len(pixels) > 1 else None)
+
+
+def test_writer_lays_bytes_out_as_described(tmp_path):
+    write_ser(tmp_path / "a.ser", (MONO / 4095).astype(np.float32), bit_depth=12)
+    expected = ser_bytes(MONO, depth=12)
+    found = (tmp_path / "a.ser").read_bytes()
+    assert found[:42] == expected[:42] and found[178:] == expected[178:]
+
+
+def test_written_dates_are_of_the_year_2000(tmp_path):
+    write_ser(tmp_path / "a.ser", np.zeros((2, 1, 1), np.float32), bit_depth=8, fps=10)
+    ticks = np.frombuffer((tmp_path / "a.ser").read_bytes()[-16:], "<i8")
+    start = np.datetime64("0001-01-01", "us") + (ticks // 10).astype("timedelta64[us]")
+    assert start.astype(str).tolist() == ["2000-01-01T00:00:00.000000", "2000-01-01T00:00:00.100000"]
+
+
+def test_missing_file(tmp_path):
+    refused(tmp_path / "no.ser", InputNotFoundError, "no.ser")
+
+
+@pytest.mark.parametrize("content", [b"", b"LUCAM-RECORDER", b"some text " * 100])
+def test_other_content_is_refused(tmp_path, content):
+    (tmp_path / "a.ser").write_bytes(content)
+    refused(tmp_path / "a.ser", DataError, "not a SER file")
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"colour": 17}, "colour code 17"),
+        ({"depth": 0}, "bits"),
+        ({"depth": 24}, "24"),
+        ({"count": 0}, "frame"),
+        ({"count": -3}, "frame"),
+    ],
+)
+def test_unsupported_headers_are_refused(ser, options, word):
+    refused(ser(MONO, **options), DataError, word)
+
+
+@pytest.mark.parametrize(("place", "value"), [(26, 0), (26, -5), (26, 2**30), (30, 2**31 - 1)])
+def test_absurd_sizes_are_refused(ser, place, value):
+    path = ser(MONO)
+    data = bytearray(path.read_bytes())
+    data[place : place + 4] = struct.pack("<i", value)
+    path.write_bytes(data)
+    refused(path, DataError, "pixels")
+
+
+def test_values_above_the_stated_depth_are_refused(ser):
+    refused(ser(np.full((1, 2, 2), 1024), depth=10), DataError, "1023")
+
+
+def test_truncated_file_is_refused_unless_the_lost_frames_are_left_out(ser):
+    frames = np.arange(5 * 3 * 4).reshape(5, 3, 4)
+    path = ser(frames, ticks=range(1, 6))
+    path.write_bytes(path.read_bytes()[: 178 + 2 * 12 * 3 + 7])
+    refused(path, DataError, "after 3 whole frames")
+    refused(path, DataError, "select frames up to 3", frames=(0, 4))
+    found = open_frames(path, frames=(1, 3))
+    np.testing.assert_allclose(found.read() * 65535, frames[1:3], rtol=1e-6)
+    refused(path, ConfigurationError, "frames", frames=(3, 3))
+
+
+def test_file_cut_within_the_first_frame(ser):
+    path = ser(MONO)
+    path.write_bytes(path.read_bytes()[:185])
+    refused(path, DataError, "before the end of the first frame")
+    refused(path, DataError, "none", frames=(0, 0))
+
+
+def test_reading_again_gives_the_same_and_changes_nothing(ser):
+    path = ser(MONO)
+    before = path.read_bytes()
+    source = open_frames(path)
+    first = [frame.copy() for frame in source]
+    for frame in source:
+        frame[:] = 1
+    np.testing.assert_array_equal(source.read(), first)
+    assert path.read_bytes() == before
+
+
+def test_header_is_read_without_the_frames(ser):
+    header = read_ser_header(ser(MONO, count=10**6))
+    assert (header.width, header.height, header.frames, header.little_endian) == (4, 3, 10**6, True)
+
+
+def test_writer_refusals_leave_nothing_behind(tmp_path):
+    path = tmp_path / "a.ser"
+    sizes = [np.zeros((2, 2), np.float32), np.zeros((3, 2), np.float32)]
+    cases: list[tuple[object, int, type[TurbrestoreError]]] = [
+        ([], 8, DataError),
+        (sizes, 8, DataError),
+        (sizes[:1], 20, ConfigurationError),
+    ]
+    for frames, depth, error in cases:
+        with pytest.raises(error):
+            write_ser(path, frames, bit_depth=depth)
+    assert not any(tmp_path.iterdir())
+    write_ser(path, sizes[:1])
+    with pytest.raises(OutputError):
+        write_ser(path, sizes[:1])
+
+
+def test_debayering_of_a_scene_agrees_with_opencv(ser):
+    mosaic = np.random.default_rng(0).integers(0, 65536, (1, 6, 8))
+    expected = cv2.cvtColor(mosaic[0].astype(np.uint16), cv2.COLOR_BayerRGGB2RGB)
+    for flag, order in ((0, "<"), (1, ">")):
+        found = open_frames(ser(mosaic, colour=8, flag=flag, order=order)).read()[0]
+        np.testing.assert_allclose(found * 65535, expected, atol=0.01)

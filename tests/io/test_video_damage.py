@@ -1,0 +1,365 @@
+"""Videos in: what is refused, and every kind of damage."""
+
+import io
+import os
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from turbrestore.core.errors import (
+    DataError,
+    InputNotFoundError,
+    StorageError,
+)
+from turbrestore.io.images import write_image
+from turbrestore.io.integrity import ffv1_slices_intact, is_cut_short
+from turbrestore.io.limits import Limits
+from turbrestore.io.source import FrameSource
+from turbrestore.io.video import open_frames, write_video
+from videos import RATE, encode, gif, grey_ffv1, refused, scene
+
+
+class TestRefusals:
+    def test_missing(self, tmp_path):
+        assert refused(tmp_path / "no.mkv", InputNotFoundError, "no.mkv") == 66
+
+    @pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".avi", ".gif", ".webm", ".mov", ".tif", ".npy", ".ser"])
+    @pytest.mark.parametrize(
+        "content",
+        [
+            b"",
+            b"only text\n" * 40,
+            b"1\n00:00:01,000 --> 00:00:02,000\nsubtitle\n\n" * 9,
+            b"ffconcat version 1.0\nfile other.mkv\n",
+            bytes(5000),
+        ],
+    )
+    def test_other_content(self, tmp_path, suffix, content):
+        grey_ffv1(tmp_path / "other.mkv")
+        (tmp_path / f"a{suffix}").write_bytes(content)
+        assert refused(tmp_path / f"a{suffix}", DataError, f"a{suffix}") == 65
+
+    @pytest.mark.parametrize(("name", "word"), [("a.xyz", ".mkv"), ("a", "no suffix"), ("a.png", "folder")])
+    def test_unknown_suffix(self, tmp_path, name, word):
+        (tmp_path / name).write_bytes(b"x")
+        refused(tmp_path / name, DataError, word)
+
+    def test_folder_without_images(self, tmp_path):
+        (tmp_path / "a.txt").write_text("x")
+        refused(tmp_path, DataError, "none in the folder")
+
+    def test_sound_only(self, tmp_path):
+        with av.open(str(tmp_path / "a.mkv"), "w") as output:
+            stream = output.add_stream("pcm_s16le", rate=8000, layout="mono")
+            frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+            frame.rate = 8000
+            output.mux(stream.encode(frame))
+            output.mux(stream.encode(None))
+        refused(tmp_path / "a.mkv", DataError, "no video stream")
+
+    @pytest.mark.parametrize("name", ["a.mkv", "a.avi"])
+    def test_frame_size_that_changes_in_the_middle(self, tmp_path, name):
+        with av.open(str(tmp_path / name), "w") as output:
+            stream = output.add_stream("mjpeg", rate=30)
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+            for stamp, frame in enumerate([*scene(3), *scene(3, 24, 32)]):
+                encoder = av.CodecContext.create("mjpeg", "w")
+                encoder.height, encoder.width = frame.shape[:2]
+                encoder.pix_fmt, encoder.time_base = "yuvj420p", 1 / RATE
+                picture = av.VideoFrame.from_ndarray(frame, format="rgb24").reformat(format="yuvj420p")
+                picture.pts = stamp
+                for packet in [*encoder.encode(picture), *encoder.encode(None)]:
+                    packet.stream, packet.time_base = stream, 1 / RATE
+                    output.mux(packet)
+        refused(tmp_path / name, DataError, "frame 3", "64×48", "32×24")
+
+    def test_a_frame_in_the_middle_that_claims_to_be_huge_is_not_decoded(self, tmp_path):
+        path = encode(tmp_path / "a.avi", scene(), "mjpeg", "yuvj420p", "rgb24")
+        data, place = bytearray(path.read_bytes()), 0
+        for _ in range(5):
+            place = data.index(b"\xff\xc0\x00\x11\x08", place + 1)
+        data[place + 5 : place + 9] = np.array([96, 128], ">u2").tobytes()
+        path.write_bytes(data)
+        refused(path, DataError, "frame 4", "cannot be decoded", limits=Limits(max_pixels=64 * 48))
+        refused(path, DataError, "frame 4", limits=Limits(max_pixels=128 * 96))
+
+    @pytest.mark.parametrize("other", ["size", "depth", "colour"])
+    def test_folder_of_two_kinds(self, tmp_path, other):
+        cv2.imwrite(str(tmp_path / "1.png"), np.zeros((4, 5), np.uint8))
+        second = {
+            "size": np.zeros((5, 4), np.uint8),
+            "depth": np.zeros((4, 5), np.uint16),
+            "colour": np.zeros((4, 5, 3), np.uint8),
+        }[other]
+        cv2.imwrite(str(tmp_path / "2.png"), second)
+        refused(tmp_path, DataError, "2.png", "5×4 grey uint8")
+
+    def test_tiff_pages_of_two_sizes(self, tmp_path):
+        with tifffile.TiffWriter(tmp_path / "a.tif") as tiff:
+            tiff.write(np.zeros((4, 5), np.uint8), metadata=None)
+            tiff.write(np.zeros((5, 4), np.uint8), metadata=None)
+        refused(tmp_path / "a.tif", DataError, "frame 1", "5×4", "4×5")
+
+    @pytest.mark.parametrize("form", ["npy", "tif"])
+    @pytest.mark.parametrize(
+        ("value", "word"), [(4095.0, "0 to 4095"), (-0.5, "-0.5 to 0"), (np.nan, "NaN"), (np.inf, "NaN")]
+    )
+    def test_floats_that_are_no_intensities(self, tmp_path, form, value, word):
+        stack = np.zeros((4, 5, 6), np.float32)
+        stack[2, 1, 1] = value
+        if form == "npy":
+            np.save(tmp_path / "a.npy", stack)
+        else:
+            tifffile.imwrite(tmp_path / "a.tif", stack, photometric="minisblack")
+        refused(tmp_path / f"a.{form}", DataError, "frame 2", word)
+
+    def test_arrays_that_are_no_video(self, tmp_path):
+        for array in (
+            np.zeros((4, 5)),
+            np.zeros((4, 5, 6), np.int16),
+            np.zeros((4, 5, 6), "c8"),
+            np.zeros((4, 5, 6, 4)),
+        ):
+            np.save(tmp_path / "a.npy", array)
+            refused(tmp_path / "a.npy", DataError)
+        np.save(tmp_path / "a.npy", np.array([None, {}], object), allow_pickle=True)
+        refused(tmp_path / "a.npy", DataError)
+        with (tmp_path / "a.npy").open("wb") as file:
+            np.savez(file, a=np.zeros((4, 5, 6)))
+        refused(tmp_path / "a.npy", DataError, "not a whole .npy array")
+
+    @pytest.mark.parametrize("photometric", ["palette", "cmyk"])
+    def test_tiff_of_other_colours(self, tmp_path, photometric):
+        if photometric == "palette":
+            tifffile.imwrite(
+                tmp_path / "a.tif", np.zeros((4, 5), np.uint8), photometric="palette", colormap=np.zeros((3, 256), "u2")
+            )
+        else:
+            tifffile.imwrite(tmp_path / "a.tif", np.zeros((4, 5, 4), np.uint8), photometric="separated")
+        refused(tmp_path / "a.tif", DataError, "grey or RGB")
+
+    def test_tiff_whose_pages_form_a_circle(self, tmp_path):
+        tifffile.imwrite(tmp_path / "a.tif", np.zeros((4, 5), np.uint8), metadata=None)
+        data = bytearray((tmp_path / "a.tif").read_bytes())
+        first = int.from_bytes(data[4:8], "little")
+        link = first + 2 + 12 * int.from_bytes(data[first : first + 2], "little")
+        data[link : link + 4] = first.to_bytes(4, "little")
+        (tmp_path / "a.tif").write_bytes(data)
+        refused(tmp_path / "a.tif", DataError, "circle")
+
+    def test_no_permission_is_a_storage_error(self, tmp_path, monkeypatch):
+        path = grey_ffv1(tmp_path / "a.mkv")
+        monkeypatch.setattr(Path, "open", denied)
+        assert refused(path, StorageError, "Permission denied") == 74
+
+    def test_absurd_size_in_the_header(self, tmp_path):
+        path = encode(tmp_path / "a.avi", scene(), "rawvideo", "bgr24", "rgb24")
+        data = bytearray(path.read_bytes())
+        sizes = data.index(b"strf") + 12
+        data[sizes : sizes + 8] = np.array([16500, 16500], "<i4").tobytes()
+        path.write_bytes(data)
+        refused(path, DataError, "pixels")
+
+    @pytest.mark.parametrize("name", ["a.mkv", "a.ser", "a.npy", "a.tif", "folder"])
+    def test_sizes_and_counts_beyond_the_limits(self, tmp_path, name):
+        path = tmp_path / name
+        frames = np.stack([frame[..., 0] for frame in scene(3)]) / np.float32(255)
+        if name == "folder":
+            path.mkdir()
+            for number, frame in enumerate(frames):
+                write_image(path / f"{number}.png", frame, 8)
+        else:
+            write_video(path, frames, 25)
+        assert len(open_frames(path, limits=Limits(64 * 48, 3))) == 3
+        assert refused(path, DataError, "64×48", limits=Limits(max_pixels=64 * 48 - 1)) == 65
+        assert refused(path, DataError, "up to 2 frames", limits=Limits(max_frames=2)) == 65
+
+    def test_stream_that_states_another_size_than_its_container(self, tmp_path):
+        path = encode(tmp_path / "a.avi", scene(), "mpeg4", "yuv420p", "rgb24")
+        data = bytearray(path.read_bytes())
+        sizes = data.index(b"strf") + 12
+        data[sizes : sizes + 8] = np.array([16, 16], "<i4").tobytes()
+        path.write_bytes(data)
+        assert open_frames(path).shape[1:3] == (48, 64)
+        refused(path, DataError, limits=Limits(max_pixels=64 * 48 - 1))
+
+
+def denied(self, *arguments):
+    raise PermissionError(13, "Permission denied", os.fspath(self))
+
+
+class TestDamage:
+    CASES = (
+        ("a.mkv", "ffv1", "gray", {"level": "3", "slicecrc": "1"}),
+        ("a.mkv", "libx264", "yuv420p", {}),
+        ("a.webm", "libvpx-vp9", "yuv420p", {}),
+        ("a.avi", "ffv1", "gray", {"level": "3"}),
+        ("a.avi", "mpeg4", "yuv420p", {}),
+        ("a.avi", "mjpeg", "yuvj420p", {}),
+        ("a.mp4", "libx264", "yuv420p", {}),
+        ("a.mp4", "mpeg4", "yuv420p", {"container_options": {"movflags": "faststart"}}),
+        ("a.mp4", "libx264", "yuv420p", {"container_options": {"movflags": "frag_keyframe+empty_moov"}}),
+        ("a.mov", "mpeg4", "yuv420p", {}),
+    )
+
+    @pytest.mark.parametrize(("name", "codec", "pixel_format", "options"), CASES)
+    @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.9, 0.99])
+    def test_truncation_is_found_and_the_whole_file_is_not_blamed(
+        self, tmp_path, name, codec, pixel_format, options, share
+    ):
+        frames = scene() if pixel_format != "gray" else [frame[..., 0] for frame in scene()]
+        kind = "rgb24" if pixel_format != "gray" else None
+        path = encode(tmp_path / name, frames, codec, pixel_format, kind, **options)
+        assert not is_cut_short(path) and len(list(open_frames(path))) == 12
+        data = path.read_bytes()
+        path.write_bytes(data[: int(share * len(data))])
+        assert refused(path, DataError) == 65
+
+    def test_gif_truncation(self, tmp_path):
+        path = gif(tmp_path, scene(5))
+        data = path.read_bytes()
+        path.write_bytes(data + bytes(100))
+        assert len(list(open_frames(path))) == 5
+        path.write_bytes(data[: int(0.7 * len(data))])
+        refused(path, DataError, "cut short")
+
+    @pytest.mark.parametrize("form", ["npy", "tif", "zlib"])
+    @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.9, 0.99])
+    def test_truncated_arrays(self, tmp_path, form, share):
+        stack = np.random.default_rng(0).integers(0, 65536, (6, 20, 30), dtype=np.uint16)
+        path = tmp_path / ("a.npy" if form == "npy" else "a.tif")
+        if form == "npy":
+            np.save(path, stack)
+        else:
+            compression = "zlib" if form == "zlib" else None
+            with tifffile.TiffWriter(path) as tiff:
+                for frame in stack:
+                    tiff.write(frame, compression=compression, contiguous=False, metadata=None)
+        data = path.read_bytes()
+        path.write_bytes(data[: int(share * len(data))])
+        assert refused(path, DataError) == 65
+
+    @pytest.mark.parametrize("name", ["a.mkv", "a.avi", "a.gif", "a.mp4"])
+    def test_the_intact_part_of_a_truncated_video_can_be_read(self, tmp_path, name):
+        if name == "a.gif":
+            path = gif(tmp_path, scene())
+        elif name == "a.mp4":
+            movflags = {"movflags": "frag_keyframe+empty_moov"}
+            path = encode(tmp_path / name, scene(), "mjpeg", "yuvj420p", "rgb24", container_options=movflags)
+        else:
+            path = grey_ffv1(tmp_path / name)
+        whole = open_frames(path).read()
+        data = path.read_bytes()
+        path.write_bytes(data[: len(data) // 2])
+        with pytest.raises(DataError) as info:
+            open_frames(path)
+        intact = int(str(info.value).split()[-1])
+        assert 2 < intact < 10
+        np.testing.assert_array_equal(open_frames(path, frames=(1, intact)).read(), whole[1:intact])
+        refused(path, DataError, "cut short", frames=(1, intact + 1))
+
+    @pytest.mark.parametrize("name", ["a.mkv", "a.avi"])
+    @pytest.mark.parametrize("first", [6, 11])
+    def test_zeros_instead_of_the_last_frames_are_found(self, tmp_path, name, first):
+        path = grey_ffv1(tmp_path / name)
+        with av.open(str(path)) as container:
+            position = [packet.pos for packet in container.demux() if packet.size][first]
+        data = path.read_bytes()
+        path.write_bytes(data[:position] + bytes(len(data) - position))
+        refused(path, DataError, f"cut short after {first} whole frames" if name == "a.mkv" else "frame")
+
+    def test_loss_that_the_decoder_conceals_but_marks_is_found(self, tmp_path):
+        path = encode(tmp_path / "a.avi", scene(), "mpeg4", "yuv420p", "rgb24")
+        with av.open(str(path)) as container:
+            packet = [bytes(packet) for packet in container.demux() if packet.size][5]
+        half = len(packet) // 2
+        path.write_bytes(path.read_bytes().replace(packet, packet[:half] + bytes(len(packet) - half)))
+        refused(path, DataError, "frame 5")
+
+    @pytest.mark.parametrize("part", range(1, 9))
+    def test_any_damaged_byte_of_a_slice_footer_is_found(self, tmp_path, part):
+        path = grey_ffv1(tmp_path / "a.mkv", slices="4")
+        with av.open(str(path)) as container:
+            packet = [bytes(packet) for packet in container.demux() if packet.size][5]
+        damaged = bytearray(packet)
+        damaged[-part] ^= 0x11
+        path.write_bytes(path.read_bytes().replace(packet, damaged))
+        refused(path, DataError, "frame 5:")
+
+    @pytest.mark.parametrize("name", ["a.mkv", "a.avi"])
+    @given(data=st.data())
+    @settings(max_examples=25, deadline=None)
+    def test_any_flipped_byte_in_ffv1_is_found(self, tmp_path_factory, name, data):
+        path = grey_ffv1(tmp_path_factory.mktemp("flip") / name)
+        with av.open(str(path)) as container:
+            packets = [(packet.pos, packet.size) for packet in container.demux() if packet.size]
+        content = bytearray(path.read_bytes())
+        number = data.draw(st.integers(0, len(packets) - 1))
+        position, size = packets[number]
+        # The position is that of the container's header of the packet, some bytes before the packet itself.
+        offset = data.draw(st.integers(20, size - 1))
+        content[position + offset] ^= data.draw(st.integers(1, 255))
+        path.write_bytes(content)
+        refused(path, DataError, f"frame {number}:")
+
+    def test_damage_outside_the_selection_is_no_error(self, tmp_path):
+        path = grey_ffv1(tmp_path / "a.mkv", g="1")
+        whole = open_frames(path).read()
+        with av.open(str(path)) as container:
+            positions = [packet.pos for packet in container.demux() if packet.size]
+        content = bytearray(path.read_bytes())
+        for number in (4, 7):
+            content[positions[number] + 100] ^= 0x10
+        path.write_bytes(content)
+        refused(path, DataError, "frame 4 and 1 more")
+        refused(path, DataError, "frame 7:", frames=(5, None))
+        np.testing.assert_array_equal(open_frames(path, frames=(0, 4)).read(), whole[:4])
+        np.testing.assert_array_equal(open_frames(path, frames=(5, None, 3)).read(), whole[5::3])
+
+    def test_damage_before_the_selection_counts_where_frames_build_on_each_other(self, tmp_path):
+        path = grey_ffv1(tmp_path / "a.mkv", g="12")
+        with av.open(str(path)) as container:
+            positions = [packet.pos for packet in container.demux() if packet.size]
+        content = bytearray(path.read_bytes())
+        content[positions[4] + 100] ^= 0x10
+        path.write_bytes(content)
+        refused(path, DataError, "frame 4:", frames=(6, None))
+        assert len(list(open_frames(path, frames=(0, 4)))) == 4
+
+    def test_ffv1_without_checksums_is_not_blamed(self, tmp_path):
+        frames = [frame[..., 0] for frame in scene()]
+        for name, options in (("a.mkv", {"level": "3", "slicecrc": "0"}), ("b.mkv", {"level": "1"})):
+            path = encode(tmp_path / name, frames, **options)
+            np.testing.assert_array_equal(open_frames(path).read(), np.stack(frames) / np.float32(255))
+
+    def test_checksum_agrees_with_the_decoder(self, tmp_path):
+        """What is refused is what FFmpeg itself logs as a mismatch."""
+        path = grey_ffv1(tmp_path / "a.mkv", g="1")
+        with av.open(str(path)) as container:
+            packets = [bytes(packet) for packet in container.demux() if packet.size]
+        assert all(ffv1_slices_intact(packet) for packet in packets)
+        content = bytearray(path.read_bytes())
+        content[content.index(packets[5]) + 30] ^= 1
+        path.write_bytes(content)
+        before = av.logging.get_level()
+        av.logging.set_level(av.logging.ERROR)
+        try:
+            with av.logging.Capture() as logs, av.open(io.BytesIO(content)) as container:
+                container.streams.video[0].codec_context.thread_count = 1
+                for _ in container.decode(video=0):
+                    pass
+        finally:
+            av.logging.set_level(before)
+        assert any("CRC" in message for _, _, message in logs)
+        refused(path, DataError, "frame 5:")
+
+    def test_fewer_frames_than_promised(self):
+        source = FrameSource("a", "test", (5, 2, 2), 255, 8, lambda chosen: iter([np.zeros((2, 2), np.uint8)] * 3))
+        with pytest.raises(DataError, match="expected 5 frames, found 3"):
+            source.read()

@@ -1,0 +1,251 @@
+"""Videos in: every format, exact at its depth."""
+
+from fractions import Fraction
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from turbrestore.core.errors import (
+    DataError,
+)
+from turbrestore.io.source import FrameSource
+from turbrestore.io.video import open_frames, write_video
+from videos import encode, encode_yuv, gif, grey_ffv1, scene
+
+
+class TestFormats:
+    @pytest.mark.parametrize("depth", [8, 9, 10, 12, 14, 16])
+    def test_grey_stays_grey_at_its_depth(self, tmp_path, depth):
+        dtype = np.uint8 if depth == 8 else np.uint16
+        pixels = np.random.default_rng(0).integers(0, 2**depth, (3, 7, 9)).astype(dtype)
+        name = "gray" if depth == 8 else f"gray{depth}le"
+        source = open_frames(encode(tmp_path / "a.mkv", pixels, pixel_format=name))
+        assert (source.shape, source.bit_depth, source.format) == ((3, 7, 9), depth, f"ffv1/{name}")
+        np.testing.assert_array_equal(source.read(), pixels / np.float32(2**depth - 1))
+
+    @pytest.mark.parametrize(
+        ("name", "kind", "depth"),
+        [
+            ("bgr0", "rgb24", 8),
+            ("gbrp9le", None, 9),
+            ("gbrp10le", None, 10),
+            ("gbrp12le", None, 12),
+            ("gbrp14le", None, 14),
+            ("gbrp16le", None, 16),
+            ("rgb48le", None, 16),
+        ],
+    )
+    def test_rgb_is_exact(self, tmp_path, name, kind, depth):
+        dtype = np.uint8 if depth == 8 else np.uint16
+        pixels = np.random.default_rng(0).integers(0, 2**depth, (3, 7, 9, 3)).astype(dtype)
+        source = open_frames(encode(tmp_path / "a.mkv", pixels, pixel_format=name, kind=kind))
+        assert (source.shape, source.bit_depth, source.warnings) == ((3, 7, 9, 3), depth, ())
+        np.testing.assert_array_equal(source.read(), pixels / np.float32(2**depth - 1))
+
+    @pytest.mark.parametrize(
+        ("name", "codec", "pixel_format"),
+        [
+            ("a.mp4", "libx264", "yuv420p"),
+            ("a.mp4", "mpeg4", "yuv420p"),
+            ("a.m4v", "libx264", "yuv444p"),
+            ("a.mov", "mpeg4", "yuv420p"),
+            ("a.avi", "mpeg4", "yuv420p"),
+            ("a.avi", "mjpeg", "yuvj420p"),
+            ("a.avi", "rawvideo", "bgr24"),
+            ("a.mkv", "libx264", "yuv420p"),
+            ("a.webm", "libvpx", "yuv420p"),
+            ("a.webm", "libvpx-vp9", "yuv420p"),
+            ("A.MKV", "ffv1", "yuv420p"),
+        ],
+    )
+    def test_colour_video_is_read_within_the_loss_of_its_codec(self, tmp_path, name, codec, pixel_format):
+        frames = scene()
+        path = encode(tmp_path / name, frames, codec, pixel_format, "rgb24", b="4000000")
+        source = open_frames(path)
+        assert source.shape == (12, 48, 64, 3) and source.bit_depth == 8 and source.fps == 30
+        assert source.warnings == ()
+        np.testing.assert_allclose(source.timestamps, np.arange(12) / 30, atol=2e-3)
+        assert np.mean(np.abs(source.read() - np.stack(frames) / 255)) < 0.02
+
+    @pytest.mark.parametrize("pixel_format", ["yuv420p10le", "yuv444p12le"])
+    def test_deep_yuv_keeps_more_than_8_bits(self, tmp_path, pixel_format):
+        ramp = np.tile(np.linspace(0, 65535, 1024).astype(np.uint16)[None, :, None], (16, 1, 3))
+        source = open_frames(encode(tmp_path / "a.mkv", [ramp], pixel_format=pixel_format, kind="rgb48le"))
+        found = source.read()[0]
+        assert source.bit_depth == int(pixel_format[-4:-2])
+        assert len(np.unique(found[..., 1])) > 800
+        np.testing.assert_allclose(found, ramp / 65535, atol=0.005)
+
+    def test_yuv_is_rounded_to_the_nearest_level(self, tmp_path):
+        luma = np.tile(np.arange(16, 236, dtype=np.uint8), (16, 1))
+        planes = np.concatenate([luma.ravel(), np.full(luma.size // 2, 128, np.uint8)]).reshape(24, 220)
+        source = open_frames(encode_yuv(tmp_path / "a.mkv", planes))
+        exact = (luma - 16.0)[..., None] / 219
+        assert np.abs(source.read()[0] - exact).max() <= 0.5 / 255 + 1e-6
+
+    @pytest.mark.parametrize(("name", "channels"), [("ya8", ()), ("bgra", (3,)), ("yuva420p", (3,))])
+    def test_alpha_is_dropped_with_a_warning(self, tmp_path, name, channels):
+        kind = {"ya8": "gray", "bgra": "rgba", "yuva420p": "rgba"}[name]
+        frames = [frame[..., 0] if kind == "gray" else np.dstack([frame, frame[..., 0]]) for frame in scene(3)]
+        source = open_frames(encode(tmp_path / "a.mkv", frames, pixel_format=name, kind=kind))
+        assert source.warnings == ("alpha channel ignored",)
+        assert source.shape == (3, 48, 64, *channels)
+        expected = np.stack(scene(3))[..., :3] if channels else np.stack(frames)
+        assert np.mean(np.abs(source.read() - expected / 255)) < 0.02
+
+    def test_gif_is_rgb_without_alpha(self, tmp_path):
+        frames = [np.repeat(frame[..., :1] // 64 * 85, 3, 2) for frame in scene(5)]
+        source = open_frames(gif(tmp_path, frames))
+        assert source.shape == (5, 48, 64, 3) and source.warnings == () and source.format == "gif/bgra"
+        np.testing.assert_array_equal(source.read(), np.stack(frames) / np.float32(255))
+
+    def test_grey_avi_of_an_intra_codec(self, tmp_path):
+        frames = np.stack([frame[..., 0] for frame in scene()])
+        source = open_frames(grey_ffv1(tmp_path / "a.avi", frames))
+        np.testing.assert_array_equal(source.read(), frames / np.float32(255))
+
+    def test_variable_frame_rate_is_told(self, tmp_path):
+        stamps = [0, 1, 2, 5, 6, 20]
+        frames = [frame[..., 0] for frame in scene(6)]
+        source = open_frames(grey_ffv1(tmp_path / "a.mkv", frames, stamps=stamps))
+        assert source.warnings == ("variable frame rate",)
+        np.testing.assert_allclose(source.timestamps, np.array(stamps) / 30, atol=2e-3)
+        assert source.fps == pytest.approx(5 / (20 / 30), rel=1e-2)
+
+    @pytest.mark.parametrize("codec", ["libx264", "mjpeg"])
+    def test_frames_cut_off_by_an_edit_list_do_not_count(self, tmp_path, codec):
+        pixel_format = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        frames = scene(40)
+        path = encode(tmp_path / "a.mov", frames, codec, pixel_format, "rgb24", stamps=range(-12, 28))
+        source = open_frames(path)
+        assert len(source) == len(list(source)) == 28
+        closest = np.abs(source.read(0, 1)[0] - np.stack(frames) / 255).mean(axis=(1, 2, 3)).argmin()
+        assert closest == 12
+
+    def test_rotation_and_interlacing_are_told(self, tmp_path):
+        path = encode(tmp_path / "a.mp4", scene(), "libx264", "yuv420p", "rgb24", flags="+ilme+ildct")
+        data = bytearray(path.read_bytes())
+        matrix = data.index(b"tkhd") + 44
+        quarter_turn = [0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30]
+        data[matrix : matrix + 36] = np.array(quarter_turn, ">i4").tobytes()
+        path.write_bytes(data)
+        assert open_frames(path).warnings == (
+            "interlaced video: its fields are not separated",
+            "rotation of -90 degrees ignored",
+        )
+
+    @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.gif"])
+    def test_data_that_other_programs_append_are_no_damage(self, tmp_path, name):
+        frames = scene(5)
+        codec = {"a.mp4": "libx264", "a.mkv": "libx264", "a.avi": "mpeg4"}.get(name)
+        path = encode(tmp_path / name, frames, codec, "yuv420p", "rgb24") if codec else gif(tmp_path, frames)
+        with path.open("ab") as file:
+            file.write(bytes(64) if name == "a.gif" else b"SEFH appended by the camera" * 9)
+        assert len(list(open_frames(path))) == 5
+
+    def test_live_recording_without_duration_is_whole(self, tmp_path):
+        path = grey_ffv1(tmp_path / "a.mkv", container_options={"live": "1"})
+        assert len(list(open_frames(path))) == 12
+
+    @pytest.mark.parametrize("name", ["http:a.mkv", "a%03d.mkv", "-a.mkv"])
+    def test_names_that_look_like_something_else(self, tmp_path, monkeypatch, name):
+        monkeypatch.chdir(tmp_path)
+        grey_ffv1(tmp_path / "plain.mkv").rename(name)
+        assert len(open_frames(name)) == 12
+
+    @pytest.mark.parametrize("rate", [Fraction(30000, 1001), Fraction(240)])
+    def test_rounding_to_milliseconds_is_no_variable_rate(self, tmp_path, rate):
+        write_video(tmp_path / "a.mkv", np.zeros((20, 4, 5), np.float32), float(rate))
+        assert open_frames(tmp_path / "a.mkv").warnings == ()
+
+
+class TestArraysStacksAndFolders:
+    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64, ">u2"])
+    @pytest.mark.parametrize("colour", [False, True])
+    @pytest.mark.parametrize("form", ["npy", "tif"])
+    def test_values_are_exact(self, tmp_path, dtype, colour, form):
+        rng = np.random.default_rng(0)
+        shape = (4, 5, 6, 3) if colour else (4, 5, 6)
+        dtype = np.dtype(dtype)
+        white = np.iinfo(dtype).max if dtype.kind == "u" else 1
+        stack = (rng.random(shape) * white).astype(dtype)
+        path = tmp_path / f"a.{form}"
+        if form == "npy":
+            np.save(path, stack)
+        else:
+            byteorder = ">" if dtype.byteorder == ">" else "<"
+            kind = "rgb" if colour else "minisblack"
+            tifffile.imwrite(path, stack, photometric=kind, compression="zlib", byteorder=byteorder)
+        source = open_frames(path)
+        assert source.shape == shape
+        assert source.bit_depth == (8 * dtype.itemsize if dtype.kind == "u" else 32)
+        expected = (stack / np.float32(white)).astype(np.float32)
+        np.testing.assert_array_equal(source.read(), expected)
+        assert source.fps is None and source.timestamps is None
+
+    @pytest.mark.parametrize(
+        "options",
+        [
+            {},
+            {"imagej": True},
+            {"imagej": True, "truncate": True},
+            {"bigtiff": True},
+            {"metadata": None},
+            {"ome": True},
+            {"compression": "zlib", "predictor": False},
+        ],
+    )
+    def test_tiff_of_many_writers(self, tmp_path, options):
+        stack = np.random.default_rng(0).integers(0, 65536, (5, 6, 7), dtype=np.uint16)
+        tifffile.imwrite(tmp_path / "a.tiff", stack, **options)
+        np.testing.assert_array_equal(open_frames(tmp_path / "a.tiff").read(), stack / np.float32(65535))
+
+    def test_tiff_planes_alpha_and_inverted_grey(self, tmp_path):
+        colour = np.random.default_rng(0).integers(0, 256, (4, 3, 5, 6), dtype=np.uint8)
+        tifffile.imwrite(tmp_path / "p.tif", colour, photometric="rgb", planarconfig="separate")
+        found = open_frames(tmp_path / "p.tif").read()
+        np.testing.assert_array_equal(found, np.moveaxis(colour, 1, -1) / np.float32(255))
+        four = np.random.default_rng(0).integers(0, 256, (4, 5, 6, 4), dtype=np.uint8)
+        tifffile.imwrite(tmp_path / "a.tif", four, photometric="rgb", extrasamples=["unassalpha"])
+        source = open_frames(tmp_path / "a.tif")
+        assert source.warnings == ("alpha channel ignored",)
+        np.testing.assert_array_equal(source.read(), four[..., :3] / np.float32(255))
+        tifffile.imwrite(tmp_path / "w.tif", colour[:, 0], photometric="miniswhite")
+        np.testing.assert_array_equal(open_frames(tmp_path / "w.tif").read(), (255 - colour[:, 0]) / np.float32(255))
+
+    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+    @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp"])
+    def test_folder_is_read_in_natural_order(self, tmp_path, dtype, suffix):
+        if suffix == ".bmp" and dtype == np.uint16:
+            dtype = np.uint8
+        stack = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (12, 5, 6), dtype=dtype)
+        for index, frame in enumerate(stack):
+            assert cv2.imwrite(str(tmp_path / f"Frame{index}{suffix}"), frame)
+        (tmp_path / "notes.txt").write_text("not an image")
+        (tmp_path / ".hidden.png").write_text("not an image")
+        (tmp_path / "sub.png").mkdir()
+        source = open_frames(tmp_path)
+        assert source.shape == (12, 5, 6) and source.bit_depth == np.iinfo(dtype).bits
+        np.testing.assert_array_equal(source.read(), stack / np.float32(np.iinfo(dtype).max))
+
+    def test_colour_folder_with_alpha(self, tmp_path):
+        pixels = np.dstack([scene(1)[0], scene(1)[0][..., 0]])
+        for name in ("a1.png", "a2.png"):
+            cv2.imwrite(str(tmp_path / name), pixels)
+        source = open_frames(tmp_path)
+        assert source.shape == (2, 48, 64, 3) and source.warnings == ("alpha channel ignored",)
+
+    def test_from_array_refuses_what_is_no_video(self):
+        for array, word in (
+            (np.zeros((4, 5)), "(4, 5)"),
+            (np.zeros((4, 5, 6, 2)), "(4, 5, 6, 2)"),
+            (np.zeros((0, 5, 6)), "none"),
+            (np.zeros((2, 5, 6), int), "int64"),
+            (np.zeros((2, 5, 6), bool), "bool"),
+            (np.zeros((2, 0, 6)), "6×0"),
+        ):
+            with pytest.raises(DataError) as info:
+                FrameSource.from_array(array, "name")
+            assert word in str(info.value) and "name" in str(info.value)

@@ -1,0 +1,123 @@
+import cv2
+import numpy as np
+import pytest
+
+from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.registration.confidence import FlowConfidence, flow_confidence, regularise_flow
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
+
+
+def texture(side=96, seed=0):
+    noise = np.random.default_rng(seed).standard_normal((side, side)).astype(np.float32)
+    return 0.5 + 0.4 * cv2.GaussianBlur(noise, (0, 0), 1.5)
+
+
+def size(flow):
+    return float(np.sqrt(np.mean(np.sum(np.square(flow, dtype=np.float64), axis=-1))))
+
+
+def test_one_window_is_the_posterior_mean():
+    # Without wider windows what is expected is zero.
+    image, rng = texture(12), np.random.default_rng(1)
+    flow, noise = rng.normal(0, 2, (12, 12, 2)).astype(np.float32), 0.05
+    confidence = FlowConfidence(flow_confidence(image).tensors[:1])
+    xx, xy, yy = confidence.tensors[0].astype(np.float64)
+    tensor = np.moveaxis(np.array([[xx, xy], [xy, yy]]), (0, 1), (2, 3))
+    # The covariance of a displacement is ten times σ² / (A J) within A = 16 π pixels, and that of the prior 0.5²; the
+    # tensor is known to a hundredth of its mean eigenvalue.
+    information = 16 * np.pi * tensor / (10 * noise**2)
+    tilt = 0.01 * 16 * np.pi * ((xx + yy) / 2)[..., None, None] / (10 * noise**2) * np.eye(2)
+    expected = np.linalg.solve(information + np.eye(2) / 0.25 + tilt, information @ flow[..., None].astype(np.float64))
+    assert regularise_flow(flow, confidence, noise) == pytest.approx(expected[..., 0], abs=1e-4)
+
+
+def test_each_window_draws_towards_the_next_wider_one():
+    # Equal tensors and flow everywhere: each window moves what the next wider one expects towards the flow.
+    tensors = tuple(np.full((side, side, 3), (1e-5, 0, 2e-5), np.float32).transpose(2, 0, 1) for side in (16, 8, 4))
+    noise = 0.05
+    found = regularise_flow(np.ones((16, 16, 2), np.float32), FlowConfidence(tensors), noise)
+    prior, expected = 10 * noise**2 / (16 * np.pi * 0.25) + 0.01 * 1.5e-5, np.zeros(2)
+    for _ in range(3):
+        share = np.array([1e-5, 2e-5]) / (np.array([1e-5, 2e-5]) + prior)
+        expected = expected + share * (1 - expected)
+    assert found == pytest.approx(np.broadcast_to(expected, (16, 16, 2)), rel=1e-4)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+@pytest.mark.parametrize("degrees", [0, 30, 45, 77])
+@pytest.mark.parametrize("profile", ["edge", "stripes", "ramp"])
+def test_single_edges_of_any_direction_invent_no_motion(profile, degrees, noise):
+    y, x = np.mgrid[:64, :64] - 32.0
+    across = x * np.cos(np.radians(degrees)) + y * np.sin(np.radians(degrees))
+    image = {
+        "edge": np.where(across > 0, 0.9, 0.1),
+        "stripes": 0.5 + 0.3 * np.sin(across / 3),
+        "ramp": 0.5 + across / 99,
+    }
+    rng = np.random.default_rng(7)
+    reference = (image[profile] + rng.normal(0, noise, (64, 64))).astype(np.float32)
+    flow = smooth_flows(1, 64, 64, rng, SmoothFlowParams(rms=1.5))[0]
+    found = regularise_flow(flow, flow_confidence(reference), noise)
+    assert np.isfinite(found).all()
+    assert size(found) < 1.2 * size(flow)
+    assert (found >= np.minimum(flow.min(axis=(0, 1)), 0)).all()
+    assert (found <= np.maximum(flow.max(axis=(0, 1)), 0)).all()
+
+
+def test_texture_keeps_its_flow():
+    flow = smooth_flows(1, 96, 96, np.random.default_rng(2), SmoothFlowParams(rms=2.0))[0]
+    assert size(regularise_flow(flow, flow_confidence(texture()), 0.005) - flow) < 0.05
+
+
+def test_stripes_keep_only_the_motion_across_them():
+    stripes = np.tile(0.5 + 0.3 * np.sin(np.arange(64) / 2), (64, 1)).astype(np.float32)
+    flow = np.broadcast_to(np.float32([1.5, 4.0]), (64, 64, 2))
+    found = regularise_flow(flow, flow_confidence(stripes), 0.01)[8:-8, 8:-8]
+    assert np.abs(found[..., 0] - 1.5).max() < 0.05
+    assert np.abs(found[..., 1]).max() < 0.05
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.03])
+def test_noise_is_no_texture(noise):
+    rng = np.random.default_rng(3)
+    reference = (0.5 + rng.normal(0, noise, (96, 96))).astype(np.float32)
+    flow = rng.normal(0, 5, (96, 96, 2)).astype(np.float32)
+    assert size(regularise_flow(flow, flow_confidence(reference), noise)) < 0.01 * size(flow)
+
+
+def test_a_flat_half_moves_as_its_neighbourhood():
+    image = texture()
+    image[:, 48:] = 0.5
+    flow = np.full((96, 96, 2), 2.0, np.float32)
+    flow[:, 56:] = np.random.default_rng(4).normal(0, 6, (96, 40, 2))
+    found = regularise_flow(flow, flow_confidence(image), 0.01)
+    assert size(found[:, 56:] - 2) < 0.1
+    assert size(found[8:-8, 8:40] - 2) < 0.02
+
+
+def test_more_noise_draws_more():
+    flow = np.random.default_rng(5).normal(0, 2, (64, 64, 2)).astype(np.float32)
+    confidence = flow_confidence(texture(64))
+    changes = [size(regularise_flow(flow, confidence, noise) - flow) for noise in (0.001, 0.01, 0.1)]
+    assert changes == sorted(changes)
+    assert changes[2] > 2 * changes[0]
+
+
+@pytest.mark.parametrize("shape", [(8, 9), (17, 40), (33, 64, 3)])
+def test_odd_sizes_and_no_noise_are_fine(shape):
+    rng = np.random.default_rng(6)
+    flow = rng.normal(0, 1, (*shape[:2], 2)).astype(np.float32)
+    before = flow.copy()
+    found = regularise_flow(flow, flow_confidence(rng.random(shape).astype(np.float32)), 0.0)
+    assert np.isfinite(found).all()
+    assert found.dtype == np.float32
+    assert (flow == before).all()
+
+
+def test_bad_input_is_refused():
+    confidence = flow_confidence(np.zeros((16, 20)))
+    with pytest.raises(DataError, match=r"flow: expected shape \(16, 20, 2\)"):
+        regularise_flow(np.zeros((16, 16, 2)), confidence, 0.01)
+    for noise in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ConfigurationError, match="^noise: expected"):
+            regularise_flow(np.zeros((16, 20, 2)), confidence, noise)

@@ -1,0 +1,217 @@
+"""Arrays in a file without a name: what they hold, what they take, and what is left of them."""
+
+import itertools
+import mmap
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+from collections import namedtuple
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from turbrestore.core.errors import StorageError
+from turbrestore.runtime.scratch import (
+    drop_pages,
+    iter_frames,
+    iter_parts,
+    keeping_freed,
+    mean_of,
+    new_stack,
+    returning_freed,
+    to_scratch,
+    variance_of,
+)
+
+STATM = Path("/proc/self/statm")
+HUGE_PAGES = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+SHAPES = st.lists(st.integers(1, 7), min_size=1, max_size=4).map(tuple)
+
+
+def resident() -> int:
+    """Bytes of this process that are in memory."""
+    return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+needs_proc = pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
+
+
+@given(SHAPES, st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_a_stack_in_a_file_is_one_in_memory(tmp_path_factory, shape, seed):
+    with pytest.MonkeyPatch.context() as patch:
+        compare_with_memory(tmp_path_factory.getbasetemp(), shape, seed, patch)
+
+
+def compare_with_memory(folder, shape, seed, patch):
+    """Assert that it makes no difference where a stack is, nor in how many iter_parts it is gone through."""
+    values = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    mapped = new_stack(shape, folder)
+    mapped[...] = values
+    drop_pages(mapped)
+    assert isinstance(mapped, np.memmap)
+    assert np.array_equal(mapped, values)
+    for stack, part in itertools.product((values, mapped), (3, 1 << 22)):
+        patch.setattr("turbrestore.runtime.scratch._PART", part)
+        assert np.array_equal(mean_of(stack), values.mean(axis=0, dtype=np.float32))
+        assert np.allclose(variance_of(stack), values.var(axis=0), atol=1e-5)
+        assert np.array_equal(np.concatenate(list(iter_parts(stack))), values)
+        assert all(np.array_equal(a, b) for a, b in zip(iter_frames(stack), values, strict=True))
+
+
+def test_without_a_folder_or_numbers_it_is_in_memory(tmp_path):
+    assert not isinstance(new_stack((2, 3)), np.memmap)
+    assert new_stack((5, 0), tmp_path).shape == (5, 0)
+
+
+def test_no_file_is_left(tmp_path):
+    stack = new_stack((4, 10), tmp_path)
+    stack[:] = 1
+    assert not list(tmp_path.iterdir())
+    assert stack.sum() == 40
+
+
+@pytest.mark.parametrize("number", ["SIGKILL", "SIGINT", "SIGTERM"])
+def test_no_file_is_left_by_a_process_that_dies(tmp_path, number):
+    code = f"""
+        import os, signal
+        from pathlib import Path
+        from turbrestore.runtime.scratch import new_stack
+        stack = new_stack((4, 1000), Path({str(tmp_path)!r}))
+        stack[:] = 1
+        os.kill(os.getpid(), signal.{number})
+        signal.pause()
+    """
+    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, check=False)
+    assert ended.returncode == -getattr(signal, number)
+    assert not list(tmp_path.iterdir())
+
+
+@needs_proc
+def test_walking_a_stack_takes_one_frame_at_a_time(tmp_path):
+    stack = new_stack((40, 512, 1024), tmp_path)
+    before = resident()
+    for frame in stack:
+        frame[:] = 1
+        drop_pages(frame)
+    peak = max(resident() for frame in iter_frames(stack) if frame.sum())
+    assert peak - before < 12e6
+    assert stack.sum(dtype=np.float64) == stack.size
+    # What was written is there, and the counter above would have seen it.
+    assert resident() - before > 70e6
+
+
+def test_who_leaves_a_walk_early_hands_back_what_was_seen_last(tmp_path, monkeypatch):
+    released = []
+    monkeypatch.setattr("turbrestore.runtime.scratch.drop_pages", lambda array: released.append(float(array[0])))
+    assert any(frame[0] == 1 for frame in iter_frames(np.arange(3.0)[:, None]))
+    assert released == [0, 1]
+
+
+def test_changes_of_a_private_map_are_kept(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros(10_000, np.float32))
+    private = np.load(tmp_path / "a.npy", mmap_mode="c")
+    private[:] = 3
+    drop_pages(private[5:])
+    assert (private == 3).all()
+
+
+def test_what_is_no_map_is_left_alone():
+    for thing in (np.ones(3), None, [np.ones(2)], 4):
+        drop_pages(thing)
+
+
+def test_a_full_disk_is_a_clear_error(tmp_path, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage(10**9, 10**9 - 10**8, 10**8))
+    with pytest.raises(StorageError, match=r"expected 0\.4 GB free .*, found 0\.1 GB; name another --keep folder"):
+        new_stack((100, 1000, 1000), tmp_path)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(StorageError, match="name another folder by TMPDIR"):
+        new_stack((100, 1000, 1000), tmp_path)
+    with pytest.raises(StorageError, match="nowhere: cannot hold"):
+        monkeypatch.undo()
+        new_stack((2, 2), tmp_path / "nowhere")
+
+
+def test_the_allocator_gets_back_what_it_had(monkeypatch):
+    calls = []
+    library = SimpleNamespace(mallopt=lambda *setting: calls.append(setting), malloc_trim=calls.append)
+    monkeypatch.setattr("ctypes.CDLL", lambda name: library)
+    monkeypatch.setattr("platform.libc_ver", lambda: ("glibc", "2.36"))
+    with returning_freed(False):
+        pass
+    assert calls == []
+    with pytest.raises(KeyError), returning_freed():
+        assert calls == [(-3, 1 << 20), (-1, 2 << 20)]
+        raise KeyError
+    as_it_was = [(-3, 32 << 20), (-1, 64 << 20), (-2, 128 << 10), 0]
+    assert calls[2:] == as_it_was
+    calls.clear()
+    with keeping_freed(False):
+        pass
+    assert calls == []
+    with pytest.raises(KeyError), keeping_freed():
+        assert calls == [(-3, 32 << 20), (-1, -1), (-2, 128 << 20)]
+        raise KeyError
+    assert calls[3:] == as_it_was
+    calls.clear()
+    monkeypatch.setattr("platform.libc_ver", lambda: ("", ""))
+    with returning_freed(), keeping_freed():
+        pass
+    assert calls == []
+
+
+# Heaps that threads have of their own are those of glibc, and faults count pages only where these are small.
+@pytest.mark.skipif(
+    platform.libc_ver()[0] != "glibc"
+    or mmap.PAGESIZE != 4096
+    or (HUGE_PAGES.is_file() and "[always]" in HUGE_PAGES.read_text()),
+    reason="the allocator is another, or its pages are",
+)
+def test_a_thread_that_frees_all_keeps_its_pages():
+    """In a process of its own, whose thread takes 18,000 pages in arrays of 3 MB, and frees them, again and again."""
+    code = textwrap.dedent(
+        """
+        import resource, sys
+        import numpy as np
+        from turbrestore.runtime.threads import map_ahead
+        from turbrestore.runtime.scratch import keeping_freed
+
+        def work(_):
+            for _ in range(2):
+                arrays = [np.ones(3 << 17) for _ in range(24)]
+                del arrays
+                faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+
+        faults = []
+        with keeping_freed(sys.argv[1] == "kept"):
+            list(map_ahead(work, range(5), threads=1))
+        print(faults[-1] - faults[0])
+        """
+    )
+    faults = [
+        int(subprocess.run([sys.executable, "-c", code, how], capture_output=True, text=True, check=True).stdout)
+        for how in ("kept", "given back")
+    ]
+    assert faults[1] > max(10 * faults[0], 10_000)
+
+
+def test_an_array_is_moved_to_a_file_once(tmp_path):
+    array = np.arange(6, dtype=np.float32).reshape(2, 3)
+    kept = to_scratch(array, tmp_path)
+    assert isinstance(kept, np.memmap) and np.array_equal(kept, array)
+    for there in (kept, kept[1:], np.asarray(kept).reshape(-1)):
+        assert to_scratch(there, tmp_path) is there
+    # Of the class of mapped arrays, but in memory.
+    copy = kept.copy()
+    assert to_scratch(copy, tmp_path) is not copy
+    assert to_scratch(array) is array

@@ -1,0 +1,1 @@
+"""Blur of an image: point spread functions, and estimates of its width."""

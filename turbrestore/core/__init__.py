@@ -1,0 +1,1 @@
+"""What every other folder shares: arrays, errors, decisions and the noise of an image."""

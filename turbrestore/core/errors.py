@@ -1,0 +1,93 @@
+"""Errors that turbrestore raises on purpose.
+
+Each message is one line: what was expected, what was found, what to do. ``exit_code`` is what the command line
+ends with; the numbers follow the BSD ``sysexits`` convention.
+"""
+
+
+class TurbrestoreError(Exception):
+    """Base of every expected failure."""
+
+    exit_code = 1
+
+
+class ConfigurationError(TurbrestoreError):
+    """A setting is unknown, out of range or contradicts another one."""
+
+    exit_code = 2
+
+
+class DataError(TurbrestoreError):
+    """The input exists but is not usable: damaged, wrong shape, NaN, too few frames."""
+
+    exit_code = 65
+
+
+class InputNotFoundError(TurbrestoreError):
+    """The named input does not exist."""
+
+    exit_code = 66
+
+
+class OutputError(TurbrestoreError):
+    """The output cannot be created: exists already, folder missing, not writable, equal to the input."""
+
+    exit_code = 73
+
+
+class StorageError(TurbrestoreError):
+    """Reading or writing failed half-way, for example because the disk is full."""
+
+    exit_code = 74
+
+
+def require_between(name: str, value: float, low: float, high: float, unit: str = "") -> None:
+    """Raise :class:`ConfigurationError` unless ``low <= value <= high``; NaN never does.
+
+    Parameters
+    ----------
+    name : str
+        Name of the setting.
+    value : float
+        What was set.
+    low, high : float
+        Smallest and largest value that make sense.
+    unit : str
+        Unit of the value, for the message.
+
+    Raises
+    ------
+    ConfigurationError
+        The value lies outside.
+
+    Examples
+    --------
+    >>> require_between("width", float("inf"), 0, 100, "pixels")
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.ConfigurationError: width: expected 0 to 100 pixels, found inf
+    """
+    require(low <= value <= high, f"{name}: expected {low:g} to {high:g}{' ' * bool(unit)}{unit}, found {value:g}")
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise :class:`ConfigurationError` with ``message`` unless ``condition`` holds.
+
+    Parameters
+    ----------
+    condition : bool
+        What a setting must fulfil.
+    message : str
+        Expected, found, and what to do, in one line.
+
+    Raises
+    ------
+    ConfigurationError
+        If ``condition`` is false.
+
+    Examples
+    --------
+    >>> require(0 < 1, "never shown")
+    """
+    if not condition:
+        raise ConfigurationError(message)

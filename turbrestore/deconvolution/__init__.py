@@ -1,0 +1,1 @@
+"""Deconvolution by nonlocal TV, TV, Wiener and Tikhonov regularisation (paper 3, section 5)."""

@@ -1,0 +1,1 @@
+"""Figures and previews of results: arrays in, pictures out."""

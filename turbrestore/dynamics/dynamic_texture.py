@@ -1,0 +1,209 @@
+"""Dynamic texture of the flow: identify a small linear system from flows.
+
+The model is ``ξ_{k+1} = A ξ_k + q_k``, ``W_k = W̄ + C ξ_k + r_k`` (paper 3, eqs. 7 to 10, written for flows).
+
+Symbols (paper 3, sections 3.1 and 3.2)
+---------------------------------------
+τ, n : number of flows, number of states.
+W, W̄ : flow and its mean over time. X : matrix of W − W̄, one column of 2HW numbers a flow.
+U Σ Vᵀ : singular value decomposition of X, from :mod:`turbrestore.dynamics.flow_subspace`.
+C : first n columns of U, rows in the order of ``flow.reshape(-1)``. Ξ : states, first n rows of Σ Vᵀ.
+A : transition. Q, R : covariances of q and r. e : residuals of the one-step prediction, ξ_{k+1} − A ξ_k.
+
+Departures from the paper
+-------------------------
+- Ξ is Σ Vᵀ, where the paper prints Σ V.
+- Q is divided by τ − 2 − n, the paper by τ − 2. Each of the n regressors takes one degree of freedom, as the mean
+  takes one; without the n, Q is a third too small at τ = 3n.
+- R is one number (the paper says m×m and advises a multiple of the identity), with a map per pixel beside it,
+  divided by τ − 1 − n for the same reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..core.arrays import FloatArray
+from ..core.errors import require_between
+from ..runtime.scratch import to_scratch
+from ..runtime.threads import one_thread_each
+from .flow_model import Float64Array, FlowDynamics
+from .flow_subspace import FlowStrips, gram_matrix, singular_vectors, spatial_modes
+
+# Flows are float32, so singular values below this share of the norm of all flows are rounding.
+_ROUNDING = 1e-6
+
+
+@dataclass(frozen=True)
+class DynamicsParams:
+    """How the system is identified.
+
+    Parameters
+    ----------
+    rank : int or None
+        Number of states n. None chooses the smallest n that holds ``energy``, but never singular values below
+        the optimal hard threshold for white noise of unknown level (Gavish and Donoho, 2014), never more than
+        ``max_rank``, and never more than one state for every ``frames_per_state`` flows.
+    energy : float
+        Share of the variance that the automatic choice keeps, in (0, 1].
+    max_rank : int
+        Largest automatic n.
+    frames_per_state : float
+        At least 1. With fewer flows a state the system is flagged as overfitted (paper 3, Figure 7a).
+    ridge : float
+        Damping of A: this share of the mean state variance is added to each state's own in the least squares. 0
+        is the pseudo-inverse of the paper.
+
+    Raises
+    ------
+    ConfigurationError
+        A value is out of range.
+
+    Examples
+    --------
+    >>> DynamicsParams(rank=40).energy
+    0.95
+    """
+
+    rank: int | None = None
+    energy: float = 0.95
+    max_rank: int = 100
+    frames_per_state: float = 3.0
+    ridge: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.rank is not None:
+            require_between("rank", self.rank, 0, 10_000, "states")
+        require_between("energy", self.energy, 1e-6, 1)
+        require_between("max_rank", self.max_rank, 0, 10_000, "states")
+        require_between("frames_per_state", self.frames_per_state, 1, 1000)
+        require_between("ridge", self.ridge, 0, 1e12)
+
+
+@one_thread_each()
+def identify(
+    flows: FloatArray | Iterable[FloatArray],
+    params: DynamicsParams | None = None,
+    scratch: Path | None = None,
+    threads: int = 0,
+) -> FlowDynamics:
+    """Fit the dynamic texture to a training sequence of flows (paper 3, sections 3.1 and 3.2).
+
+    Parameters
+    ----------
+    flows : ndarray of shape (τ, H, W, 2), or iterable of arrays of shape (H, W, 2)
+        Flows from the reference to successive frames, in pixels. A memory map is read strip by strip and never
+        held as a whole. An iterable is run through once for the shapes and twice for every 32 MB that its flows
+        take as float64, which is free for a list of arrays and dear for flows made on the fly.
+    params : DynamicsParams, optional
+    scratch : Path, optional
+        Folder of files that hold C and the maps; by default they are in memory.
+    threads : int
+        Parts of the image worked on side by side; 0 means one per available core.
+
+    Returns
+    -------
+    FlowDynamics
+        Of rank 0 when nothing moves.
+
+    Raises
+    ------
+    DataError
+        Fewer than two flows, shapes that differ, values that are not finite, or an iterator that can be run
+        through only once.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> angle = 2 * np.pi * np.arange(24) / 12
+    >>> flows = np.zeros((24, 4, 4, 2), np.float32)
+    >>> flows[..., 0], flows[..., 1] = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
+    >>> dynamics = identify(flows)
+    >>> dynamics.rank, np.abs(dynamics.eigenvalues).round(3)
+    (2, array([1., 1.]))
+    """
+    params = params or DynamicsParams()
+    strips = FlowStrips.of(flows, threads)
+    mean, gram, norm = gram_matrix(strips)
+    singular_values, V = singular_vectors(gram)
+    pixels = 2 * strips.height * strips.width
+    present = int(np.count_nonzero(singular_values > _ROUNDING * norm))
+    n = _rank(singular_values, present, pixels, params)
+    states = singular_values[:n, None] * V[:, :n].T
+    C, residual_energy = spatial_modes(strips, mean, singular_values[:n], V[:, :n], scratch)
+    residual_variance = np.divide(residual_energy, max(strips.count - 1 - n, 1), out=residual_energy)
+    A, Q = _transition(states, params.ridge)
+    energy = float(np.sum(singular_values[:present] ** 2))
+    overfitted = strips.count < params.frames_per_state * n
+    return FlowDynamics(
+        A=A,
+        C=C,
+        Q=Q,
+        R=float(residual_variance.mean()),
+        residual_variance=to_scratch(residual_variance.astype(np.float32), scratch),
+        mean_flow=to_scratch(mean, scratch),
+        states=states,
+        singular_values=singular_values,
+        energy_share=float(np.sum(singular_values[:n] ** 2)) / energy if energy else 1.0,
+        overfitted=overfitted,
+        notes=_notes(A, strips.count, n, present, overfitted, params),
+        motion_factor=to_scratch(np.ones(mean.shape[:2], np.float32), scratch),
+    )
+
+
+def _rank(singular_values: Float64Array, present: int, pixels: int, params: DynamicsParams) -> int:
+    if params.rank is not None:
+        return min(params.rank, present)
+    if present == 0:
+        return 0
+    energy = np.cumsum(singular_values[:present] ** 2)
+    enough = int(np.searchsorted(energy, params.energy * energy[-1])) + 1
+    above_noise = int(np.count_nonzero(singular_values[:present] > _noise_threshold(singular_values, pixels)))
+    return min(enough, above_noise, params.max_rank, int(len(singular_values) / params.frames_per_state))
+
+
+def _noise_threshold(singular_values: Float64Array, pixels: int) -> float:
+    """Optimal hard threshold for white noise of unknown level (Gavish and Donoho, 2014, eq. 5)."""
+    # Taking off the mean makes one singular value zero: the matrix is as good as one column narrower.
+    columns = len(singular_values) - 1
+    beta = min(pixels, columns) / max(pixels, columns)
+    omega = 0.56 * beta**3 - 0.95 * beta**2 + 1.82 * beta + 1.43
+    return omega * float(np.median(singular_values[: min(pixels, columns)]))
+
+
+def _transition(states: Float64Array, ridge: float) -> tuple[Float64Array, Float64Array]:
+    """Fit A = Ξ_{2:τ} Ξ_{1:τ−1}⁺, damped by ``ridge``, and Q without bias."""
+    n, count = states.shape
+    if n == 0:
+        return np.zeros((0, 0)), np.zeros((0, 0))
+    before, after = states[:, :-1], states[:, 1:]
+    u, s, vt = np.linalg.svd(before, full_matrices=False)
+    # The states sum to zero over time, so those before the last have full rank too: no s is zero.
+    inverse = s / (s**2 + ridge * np.sum(s**2) / n)
+    A = after @ (vt.T * inverse) @ u.T
+    residual = after - A @ before
+    # Damped regressors count for less than one degree of freedom each.
+    used = float(np.sum(s * inverse))
+    return A, residual @ residual.T / max(count - 2 - used, 1.0)
+
+
+def _notes(
+    A: Float64Array, count: int, n: int, present: int, overfitted: bool, params: DynamicsParams
+) -> tuple[str, ...]:
+    notes = []
+    if present == 0:
+        notes.append("the flows do not change over time: no states")
+    if params.rank is not None and n < params.rank:
+        notes.append(f"{params.rank} states asked for, {n} independent flows found")
+    if overfitted:
+        notes.append(f"{count} flows are few for {n} states: the system repeats them rather than describes them")
+    if n == 0 and present > 0 and params.rank is None:
+        notes.append(f"{count} flows are too few, or too noisy, for a state")
+    largest = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
+    if largest >= 1:
+        notes.append(f"largest eigenvalue of A has modulus {largest:.4f}: predictions far ahead do not fade")
+    return tuple(notes)

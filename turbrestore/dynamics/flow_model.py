@@ -1,0 +1,353 @@
+"""Linear system that flows follow: what identification finds, and the flow that belongs to a state.
+
+The model is ``ξ_{k+1} = A ξ_k + q_k``, ``W_k = W̄ + C ξ_k + r_k`` (paper 3, eqs. 7 to 10, written for flows).
+
+Symbols (paper 3, sections 3.1 and 3.2)
+---------------------------------------
+τ, n : number of flows, number of states.
+W, W̄ : flow and its mean over time.
+A : transition. C : n flows, one a column, rows in the order of ``flow.reshape(-1)``. Ξ : states, one column a flow.
+Q, R : covariances of q and r.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..core.arrays import FloatArray, check_flow
+from ..core.errors import DataError
+from ..display.plots import plot_dynamics
+from ..display.preview import preview
+from ..runtime.jit import compiled
+from ..runtime.scratch import drop_pages, iter_parts
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Float64Array = NDArray[np.float64]
+
+# Products that are summed in single precision, before their sum is added in double; they stay in the first cache.
+SUMMED = 2048
+# Numbers of the modes that are in hand at a time.
+PIECE = 1 << 22
+
+
+@dataclass(frozen=True, eq=False)
+class FlowDynamics:
+    """Linear system that the flows follow.
+
+    Parameters
+    ----------
+    A : ndarray, float64, shape (n, n)
+        Transition of the state, as fitted: its eigenvalues may reach or leave the unit circle.
+    C : ndarray, float32, shape (2 H W, n)
+        Orthonormal columns; ``C[:, i].reshape(H, W, 2)`` is the flow of state i.
+    Q : ndarray, float64, shape (n, n)
+        Covariance of the process noise, in squared units of the states.
+    R : float
+        Variance of what C leaves out, per component, in squared pixels; mean of ``residual_variance``. Zero when
+        C holds everything, so a filter needs a floor for it.
+    residual_variance : ndarray, float32, shape (H, W)
+        The same at every pixel, mean of the two components.
+    mean_flow : ndarray, float32, shape (H, W, 2)
+        W̄, pixels.
+    states : ndarray, float64, shape (n, τ)
+        Ξ, one column a flow; the squared length of a column is that of its flow, summed over the grid.
+    singular_values : ndarray, float64, shape (τ,)
+        All of them, falling.
+    energy_share : float
+        Share of the flows' variance that C holds; 1 when nothing moves.
+    overfitted : bool
+        Fewer flows a state than asked for. At n = τ − 1, the largest n there is, A only repeats the flows: its
+        eigenvalues are the τ-th roots of unity other than 1 (paper 3, Figure 7a), and Q is meaningless.
+    notes : tuple of str
+        What a person should know about this fit, one line each.
+    motion_factor : ndarray, float32, shape (H, W)
+        Variance of the motion over that of the measured flows; 1 unless
+        :func:`turbrestore.dynamics.displacement.with_displacement` found another. Q and ``state_covariance`` hold its
+        mean; states, singular values and R are those of the flows as measured.
+    """
+
+    A: Float64Array
+    C: FloatArray
+    Q: Float64Array
+    R: float
+    residual_variance: FloatArray
+    mean_flow: FloatArray
+    states: Float64Array
+    singular_values: Float64Array
+    energy_share: float
+    overfitted: bool
+    notes: tuple[str, ...]
+    motion_factor: FloatArray
+
+    def plot(self) -> Figure:
+        """Draw the singular values of the flows and the eigenvalues of A.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ConfigurationError
+            Matplotlib is not installed.
+        """
+        return plot_dynamics(self.singular_values, self.eigenvalues)
+
+    def _repr_html_(self) -> str:
+        spread = np.sqrt(self.flow_variance).astype(np.float32)
+        facts = [
+            ("states", f"{self.rank}, from {self.frame_count} flows"),
+            ("share of the motion", f"{100 * self.energy_share:.1f} %"),
+            ("largest eigenvalue", f"{np.abs(self.eigenvalues).max(initial=0.0):.3f}"),
+            ("motion", f"{spread.mean():.2f} pixels a component, brightest {spread.max():.2f}"),
+        ]
+        return preview("Flow dynamics", facts, spread / max(float(spread.max()), 1e-6))
+
+    @property
+    def rank(self) -> int:
+        """Number of states n; 0 when the flows do not move."""
+        return self.A.shape[0]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the flows."""
+        return self.mean_flow.shape[0], self.mean_flow.shape[1]
+
+    @property
+    def frame_count(self) -> int:
+        """Number of flows τ that the system was fitted to."""
+        return self.states.shape[1]
+
+    @property
+    def eigenvalues(self) -> NDArray[np.complex128]:
+        """Eigenvalues of A, largest modulus first (paper 3, Figure 7)."""
+        values = np.linalg.eigvals(self.A).astype(np.complex128)
+        return values[np.argsort(-np.abs(values), kind="stable")]
+
+    @property
+    def initial_state(self) -> Float64Array:
+        """State of the first flow, shape (n,)."""
+        return self.states[:, 0]
+
+    @property
+    def last_state(self) -> Float64Array:
+        """State of the last flow, shape (n,)."""
+        return self.states[:, -1]
+
+    @property
+    def flow_variance(self) -> FloatArray:
+        """Variance of the measured flows, mean of the two components, shape (H, W), squared pixels."""
+        free = self.frame_count - 1
+        states = self.singular_values[: self.rank] ** 2 / free
+        weights = states.astype(np.float32)
+        modelled = np.concatenate([np.einsum("pi,pi,i->p", part, part, weights) for part in iter_parts(self.C)])
+        # The residual has been divided by its own degrees of freedom.
+        residual = np.float32(max(free - self.rank, 1) / free) * self.residual_variance
+        return modelled.reshape(self.mean_flow.shape).mean(axis=-1) + residual
+
+    @property
+    def state_covariance(self) -> Float64Array:
+        """Covariance of the states over the training flows, times the mean motion factor; shape (n, n), diagonal."""
+        measured = self.singular_values[: self.rank] ** 2 / (self.frame_count - 1)
+        return np.diag(float(self.motion_factor.mean()) * measured)
+
+
+def project(dynamics: FlowDynamics, flow: ArrayLike) -> Float64Array:
+    """State of a flow: Cᵀ (W − W̄), the least-squares solution since Cᵀ C = I (paper 3, eq. 9).
+
+    Parameters
+    ----------
+    dynamics : FlowDynamics
+    flow : array_like, shape (H, W, 2)
+        Pixels.
+
+    Returns
+    -------
+    ndarray, float64, shape (n,)
+
+    Raises
+    ------
+    DataError
+        The flow has another shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> flows = np.zeros((4, 2, 2, 2), np.float32); flows[..., 0] = np.array([1, -1, 1, -1])[:, None, None]
+    >>> dynamics = identify(flows)
+    >>> np.abs(project(dynamics, flows[0])).round(3)
+    array([2.])
+    """
+    flow = check_flow(flow)
+    if flow.shape != dynamics.mean_flow.shape:
+        raise DataError(f"flow: expected shape {dynamics.mean_flow.shape}, found {flow.shape}")
+    return project_deviation(dynamics, flow - dynamics.mean_flow)
+
+
+def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64Array:
+    """State of a flow that is given as its deviation from the mean, unchecked: Cᵀ (W − W̄).
+
+    Parameters
+    ----------
+    dynamics : FlowDynamics
+    deviation : ndarray, float32, shape (H, W, 2)
+        Pixels.
+
+    Returns
+    -------
+    ndarray, float64, shape (n,)
+
+    Examples
+    --------
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> dynamics = identify(np.zeros((3, 2, 2, 2), np.float32))
+    >>> project_deviation(dynamics, dynamics.mean_flow)
+    array([], dtype=float64)
+    """
+    # Columns of C lie one after the other.
+    modes, rest, state = dynamics.C.T, deviation.reshape(-1), np.zeros(dynamics.C.shape[1])
+    # NumPy's product of a vector and a matrix keeps the interpreter lock.
+    project_part = compiled(add_products)
+    # C may be mapped: all of it at once would come into memory.
+    step = SUMMED * max(1, PIECE // (SUMMED * max(1, len(modes))))
+    for start in range(0, rest.size, step):
+        stop = min(start + step, rest.size)
+        if project_part is not None:
+            project_part(modes, rest, start, stop, state)
+        else:
+            state += modes[:, start:stop] @ rest[start:stop]
+        drop_pages(modes)
+    return state
+
+
+def add_products(modes: FloatArray, deviation: FloatArray, first: int, end: int, state: Float64Array) -> None:
+    """Add the inner products of some flows and one, over a range of pixels; to be compiled.
+
+    Parameters
+    ----------
+    modes : ndarray, float32, shape (n, P)
+    deviation : ndarray, float32, shape (P,)
+    first, end : int
+        Range in P, the end left out.
+    state : ndarray, float64, shape (n,)
+        Added to.
+
+    Examples
+    --------
+    >>> state = np.zeros(2)
+    >>> add_products(np.eye(2, dtype=np.float32), np.float32([3, 5]), 0, 2, state)
+    >>> state
+    array([3., 5.])
+    """
+    for start in range(first, end, SUMMED):
+        stop = min(start + SUMMED, end)
+        for mode in range(modes.shape[0]):
+            total = np.float32(0)
+            for place in range(np.uintp(start), np.uintp(stop)):
+                total += modes[mode, place] * deviation[place]
+            state[mode] += total
+
+
+def flow_of(dynamics: FlowDynamics, state: ArrayLike) -> FloatArray:
+    """Flow of a state: W̄ + C ξ (paper 3, eq. 10, without the residual r).
+
+    Parameters
+    ----------
+    dynamics : FlowDynamics
+    state : array_like, shape (n,)
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W, 2)
+        Pixels.
+
+    Raises
+    ------
+    DataError
+        The state has another shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> dynamics = identify(np.full((3, 2, 2, 2), 0.5, np.float32))
+    >>> flow_of(dynamics, np.zeros(dynamics.rank))[0, 0]
+    array([0.5, 0.5], dtype=float32)
+    """
+    state = check_state(dynamics, state).astype(np.float32)
+    moved, done = np.empty(len(dynamics.C), np.float32), 0
+    for part in iter_parts(dynamics.C):
+        np.matmul(part, state, out=moved[done : done + len(part)])
+        done += len(part)
+    flow = moved.reshape(dynamics.mean_flow.shape)
+    flow += dynamics.mean_flow
+    return flow
+
+
+def predict_flow(dynamics: FlowDynamics, state: ArrayLike) -> FloatArray:
+    """Flow of the next frame: W̄ + C A ξ (paper 3, Figure 8).
+
+    Parameters
+    ----------
+    dynamics : FlowDynamics
+    state : array_like, shape (n,)
+        State of the present frame, for example ``dynamics.last_state``.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W, 2)
+        Pixels.
+
+    Raises
+    ------
+    DataError
+        The state has another shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> flows = np.zeros((6, 2, 2, 2), np.float32); flows[::2, ..., 0], flows[1::2, ..., 0] = 1, -1
+    >>> dynamics = identify(flows)
+    >>> predict_flow(dynamics, dynamics.last_state)[0, 0]
+    array([1., 0.], dtype=float32)
+    """
+    return flow_of(dynamics, dynamics.A @ check_state(dynamics, state))
+
+
+def check_state(dynamics: FlowDynamics, state: ArrayLike) -> Float64Array:
+    """Return ``state`` as a finite float64 array of shape (n,).
+
+    Parameters
+    ----------
+    dynamics : FlowDynamics
+    state : array_like, shape (n,)
+
+    Returns
+    -------
+    ndarray, float64, shape (n,)
+
+    Raises
+    ------
+    DataError
+        The state has another shape, or values are not finite.
+
+    Examples
+    --------
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> check_state(identify(np.zeros((3, 2, 2, 2), np.float32)), [])
+    array([], dtype=float64)
+    """
+    array = np.asarray(state, np.float64)
+    if array.shape != (dynamics.rank,):
+        raise DataError(f"state: expected shape ({dynamics.rank},), found {array.shape}")
+    if not np.isfinite(array).all():
+        raise DataError("state: expected finite values, found NaN or infinite ones")
+    return array

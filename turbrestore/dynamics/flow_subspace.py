@@ -1,0 +1,252 @@
+"""Subspace of flows by the method of snapshots: singular values and modes through the τ×τ Gram matrix.
+
+Symbols (paper 3, sections 3.1 and 3.2)
+---------------------------------------
+τ, n : number of flows, number of states.
+W̄ : mean flow. X : matrix of the flows less W̄, one column of 2HW numbers a flow.
+U Σ Vᵀ : singular value decomposition of X. G : Gram matrix Xᵀ X = V Σ² Vᵀ.
+C : first n columns of U. Ξ : first n rows of Σ Vᵀ.
+
+U is never formed: G is summed over strips of rows, C = X V Σ⁻¹ follows strip by strip. The sums are float64: in float32
+the small singular values drown in rounding, to save less than a tenth of a second at τ = 100, 256².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..core.arrays import FloatArray, check_flow
+from ..core.errors import DataError
+from ..runtime.scratch import drop_pages, new_stack
+from ..runtime.threads import map_ahead, sum_in_threads
+from .flow_model import Float64Array
+
+# Size of a float64 strip of all flows; each thread has one in memory.  Flows that are made on the fly are made anew for
+# every strip.
+_STRIP_BYTES, _STRIP_BYTES_MADE = 2**22, 2**25
+
+
+@dataclass(frozen=True)
+class FlowStrips:
+    """All flows of a few image rows at a time, whatever the flows are kept in.
+
+    Parameters
+    ----------
+    flows : ndarray of shape (τ, H, W, 2), or iterable of arrays of shape (H, W, 2)
+    count, height, width : int
+        τ, H and W.
+    threads : int
+        Strips of an array worked on side by side, 0 for one per available core; other flows may be made on the fly, and
+        are asked for in turn.
+
+    Examples
+    --------
+    >>> strips = FlowStrips.of(np.zeros((3, 4, 5, 2), np.float32))
+    >>> [strips.read(rows).shape for rows in strips.rows()]
+    [(3, 40)]
+    """
+
+    flows: FloatArray | Iterable[FloatArray]
+    count: int
+    height: int
+    width: int
+    threads: int = 0
+
+    @classmethod
+    def of(cls, flows: FloatArray | Iterable[FloatArray], threads: int = 0) -> FlowStrips:
+        """Look at the shapes of flows.
+
+        Parameters
+        ----------
+        flows : ndarray of shape (τ, H, W, 2), or iterable of arrays of shape (H, W, 2)
+        threads : int
+            0 means one per available core.
+
+        Returns
+        -------
+        FlowStrips
+
+        Raises
+        ------
+        DataError
+            Fewer than two flows, shapes that differ, or an iterator that can be run through only once.
+        """
+        if isinstance(flows, np.ndarray):
+            shapes = [flows.shape[1:]] * len(flows) if flows.ndim else []
+        elif not isinstance(flows, Iterable) or iter(flows) is flows:
+            raise DataError(
+                f"flows: expected an array or an iterable that can be run through again, "
+                f"found {type(flows).__name__}; make a list of it"
+            )
+        else:
+            shapes = [np.shape(flow) for flow in flows]
+        if len(shapes) < 2:
+            raise DataError(f"flows: expected at least 2 flows, found {len(shapes)}")
+        for shape in shapes:
+            if len(shape) != 3 or shape[2] != 2 or 0 in shape or shape != shapes[0]:
+                raise DataError(f"flows: expected all of one shape (H, W, 2), found {shape} beside {shapes[0]}")
+        height, width = shapes[0][:2]
+        return cls(flows, len(shapes), height, width, threads if isinstance(flows, np.ndarray) else 1)
+
+    def rows(self) -> list[slice]:
+        """Rows of each strip.
+
+        Returns
+        -------
+        list of slice
+        """
+        size = _STRIP_BYTES if isinstance(self.flows, np.ndarray) else _STRIP_BYTES_MADE
+        step = max(size // (16 * self.count * max(self.width, 1)), 1)
+        return [slice(start, start + step) for start in range(0, self.height, step)]
+
+    def read(self, rows: slice) -> Float64Array:
+        """Flows of these rows.
+
+        Parameters
+        ----------
+        rows : slice
+
+        Returns
+        -------
+        ndarray, float64, shape (τ, numbers)
+            A copy.
+
+        Raises
+        ------
+        DataError
+            Values that are not finite.
+        """
+        flows = self.flows
+        strip = flows[:, rows] if isinstance(flows, np.ndarray) else np.stack([np.asarray(f)[rows] for f in flows])
+        copy = check_flow(strip, "flows").astype(np.float64).reshape(self.count, -1)
+        drop_pages(flows)
+        return copy
+
+
+def gram_matrix(strips: FlowStrips) -> tuple[FloatArray, Float64Array, float]:
+    """Gram matrix of the flows without their mean, strip by strip.
+
+    Parameters
+    ----------
+    strips : FlowStrips
+
+    Returns
+    -------
+    mean : ndarray, float32, shape (H, W, 2)
+        W̄, pixels.
+    gram : ndarray, float64, shape (τ, τ)
+        G, squared pixels.
+    norm : float
+        Root of the sum of squares of all flows, the mean included; pixels.
+
+    Examples
+    --------
+    >>> flows = np.zeros((2, 1, 1, 2), np.float32); flows[0, ..., 0], flows[1, ..., 0] = 3, 1
+    >>> mean, gram, norm = gram_matrix(FlowStrips.of(flows))
+    >>> mean.ravel(), gram.tolist(), round(norm**2)
+    (array([2., 0.], dtype=float32), [[1.0, -1.0], [-1.0, 1.0]], 10)
+    """
+    mean = np.empty((strips.height, strips.width, 2), np.float32)
+
+    def add(batch: list[slice]) -> tuple[Float64Array, ...]:
+        gram, energy = np.zeros((strips.count, strips.count)), np.zeros(())
+        for rows in batch:
+            strip = strips.read(rows)
+            energy += np.vdot(strip, strip)
+            flat = strip.mean(0).astype(np.float32)
+            mean[rows] = flat.reshape(mean[rows].shape)
+            strip -= flat
+            gram += strip @ strip.T
+        return gram, energy
+
+    gram, energy = sum_in_threads(add, strips.rows(), strips.threads)
+    return mean, gram, float(np.sqrt(energy))
+
+
+def singular_vectors(gram: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Singular values of X, and V.
+
+    Parameters
+    ----------
+    gram : ndarray, float64, shape (τ, τ)
+        G.
+
+    Returns
+    -------
+    values : ndarray, float64, shape (τ,)
+        Falling.
+    V : ndarray, float64, shape (τ, τ)
+        Orthonormal columns, the largest entry of each positive.
+
+    Examples
+    --------
+    >>> values, V = singular_vectors(np.diag([1.0, 4.0]))
+    >>> values, V
+    (array([2., 1.]), array([[0., 1.],
+           [1., 0.]]))
+    """
+    values, V = np.linalg.eigh(gram)
+    values, V = np.sqrt(np.maximum(values[::-1], 0.0)), V[:, ::-1]
+    largest = V[np.abs(V).argmax(0), np.arange(len(V))]
+    return values, V * np.where(largest < 0, -1.0, 1.0)
+
+
+def spatial_modes(
+    strips: FlowStrips,
+    mean: FloatArray,
+    singular_values: Float64Array,
+    V: Float64Array,
+    scratch: Path | None = None,
+) -> tuple[FloatArray, Float64Array]:
+    """C = X V Σ⁻¹ and what it leaves out, strip by strip.
+
+    Parameters
+    ----------
+    strips : FlowStrips
+    mean : ndarray, float32, shape (H, W, 2)
+        W̄, pixels.
+    singular_values : ndarray, float64, shape (n,)
+        The first n, none of them zero.
+    V : ndarray, float64, shape (τ, n)
+        The first n columns.
+    scratch : Path, optional
+        Folder of a file that holds C; by default it is in memory.
+
+    Returns
+    -------
+    C : ndarray, float32, shape (2 H W, n)
+        In Fortran order.
+    energy : ndarray, float64, shape (H, W)
+        Sum over time of the squares of X − C Ξ, mean of the two components, squared pixels.
+
+    Examples
+    --------
+    >>> flows = np.zeros((2, 1, 1, 2), np.float32); flows[0, ..., 0], flows[1, ..., 0] = 3, 1
+    >>> strips = FlowStrips.of(flows)
+    >>> mean, gram, _ = gram_matrix(strips)
+    >>> values, V = singular_vectors(gram)
+    >>> C, energy = spatial_modes(strips, mean, values[:1], V[:, :1])
+    >>> np.abs(C).round(3).tolist(), float(energy.round(3)[0, 0])
+    ([[1.0], [0.0]], 0.0)
+    """
+    # One mode after the other in memory: products with C, and with Cᵀ, are then twice as fast.
+    C = new_stack((len(singular_values), *mean.shape), scratch)
+    energy = np.empty(mean.shape[:2])
+
+    def fill(rows: slice) -> None:
+        strip = strips.read(rows)
+        strip -= mean[rows].reshape(-1)
+        modes = strip.T @ V
+        # V has orthonormal columns: what the modes hold over time is what the residual does not.
+        left = np.einsum("tx,tx->x", strip, strip) - np.einsum("xi,xi->x", modes, modes)
+        energy[rows] = np.maximum(left, 0.0).reshape(mean[rows].shape).mean(-1)
+        C[:, rows] = (modes / singular_values).T.reshape(C[:, rows].shape)
+        drop_pages(C)
+
+    for _ in map_ahead(fill, strips.rows(), strips.threads):
+        pass
+    return C.reshape(len(singular_values), mean.size).T, energy

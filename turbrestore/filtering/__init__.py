@@ -1,0 +1,1 @@
+"""Alternating-estimation Kalman filter over image and flow state (paper 3, section 4)."""

@@ -1,0 +1,550 @@
+"""Kalman filter in pieces: prediction, update in covariance and in information form, update of every pixel.
+
+Symbols (paper 3, section 4)
+----------------------------
+ξ̂, P : mean and covariance of the state, :class:`Gaussian`.
+A, Q : state transition and covariance of the process noise (eqs. 13b, 14b, 14d).
+H, R : measurement matrix and covariance of its noise; C and R for the flow (eq. 17).
+M : gain (eq. 18; information form, eq. 19).
+ρ̂, Σ : mean and variance of every pixel of the image, :class:`PixelGaussian`.
+S, Z : variances of the image's drift and of the registered frame (eqs. 13a, 15).
+L : gain of every pixel (eq. 16).
+
+Matrix operations act on the last two axes, so leading axes are batches and broadcast. NaN in a measurement
+means that this component is missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..core.errors import DataError
+from ..runtime.scratch import drop_pages
+
+Float64Array = NDArray[np.float64]
+
+# Rows of a tall measurement matrix handled at once: 16384 × 40 float64 are 5 MB.
+_BLOCK_ROWS = 16384
+_LOG_2PI = float(np.log(2 * np.pi))
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussian:
+    """Mean and covariance of a state.
+
+    Parameters
+    ----------
+    mean : ndarray, float64, shape (..., n)
+        ξ̂.
+    cov : ndarray, float64, shape (..., n, n)
+        P, symmetric positive semi-definite. Its leading axes may be fewer than those of the mean: one covariance
+        then holds for all of them.
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, values are not finite, or the covariance is no covariance.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> Gaussian(np.zeros(2), np.eye(2)).mean
+    array([0., 0.])
+    """
+
+    mean: Float64Array
+    cov: Float64Array
+
+    def __post_init__(self) -> None:
+        mean, cov = np.asarray(self.mean, np.float64), np.asarray(self.cov, np.float64)
+        if mean.ndim < 1:
+            raise DataError("mean: expected shape (..., n), found a single number")
+        if not np.isfinite(mean).all():
+            raise DataError("mean: expected finite values, found NaN or infinite ones; the filter may be unstable")
+        _check_covariance(cov, mean.shape[-1], "cov")
+        _check_batches(mean.shape[:-1], cov=cov.shape[:-2])
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "cov", cov)
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """What a measurement said beyond the prediction; the material of consistency checks.
+
+    Over a filter that fits its model, ``normalised_squared`` averages ``observed``, and the sum of
+    ``log_likelihood`` is the log-density of all measurements.
+
+    Parameters
+    ----------
+    values : ndarray, float64, shape (..., m) or (..., n)
+        Covariance form: z − H ξ̂, NaN where the component is missing. Information form: its projection
+        Hᵀ R⁻¹ (z − H ξ̂), all of it that the update uses.
+    cov : ndarray, float64, shape (..., m, m) or (..., n, n)
+        Covariance of ``values``, NaN where a component is missing.
+    normalised_squared : ndarray, float64, shape (...)
+        Squared innovation in units of its covariance; chi-squared with ``observed`` degrees of freedom.
+    log_likelihood : ndarray, float64, shape (...)
+        Log-density of the measurement given all before it.
+    observed : ndarray, int, shape (...)
+        Number of components that are not missing.
+    """
+
+    values: Float64Array
+    cov: Float64Array
+    normalised_squared: Float64Array
+    log_likelihood: Float64Array
+    observed: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class PixelGaussian:
+    """Mean and variance of every pixel, pixels independent of each other; channels share the variance.
+
+    Parameters
+    ----------
+    mean : ndarray, float32 or float64, shape (H, W) or (H, W, 3)
+        ρ̂, intensities.
+    variance : ndarray, dtype of ``mean``, shape (H, W)
+        Σ, squared intensities, not negative.
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, values are not finite, or a variance is negative.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> PixelGaussian(np.zeros((2, 3), np.float32), np.ones((2, 3))).variance.dtype
+    dtype('float32')
+    """
+
+    mean: NDArray[np.floating]
+    variance: NDArray[np.floating]
+
+    def __post_init__(self) -> None:
+        mean = _floating(self.mean)
+        variance = np.asarray(self.variance, mean.dtype)
+        _check_pixels(mean, variance.shape, "mean")
+        if not np.isfinite(np.sum(mean, dtype=np.float64)):
+            raise DataError("mean: expected finite values, found NaN or infinite ones")
+        if not np.isfinite(np.sum(variance, dtype=np.float64)) or (variance < 0).any():
+            raise DataError("variance: expected finite values of at least 0, found others")
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "variance", variance)
+
+
+def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
+    """Time update: A ξ̂ and A P Aᵀ + Q (paper 3, eqs. 14b and 14d).
+
+    Parameters
+    ----------
+    state : Gaussian
+        After the last measurement.
+    A : array_like, shape (..., n, n)
+        State transition.
+    Q : array_like, shape (..., n, n)
+        Covariance of the process noise.
+
+    Returns
+    -------
+    Gaussian
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, Q is no covariance, or the result overflows.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> predict(Gaussian(np.ones(1), np.eye(1)), 0.5 * np.eye(1), np.eye(1)).cov
+    array([[1.25]])
+    """
+    n = state.mean.shape[-1]
+    A, Q = np.asarray(A, np.float64), np.asarray(Q, np.float64)
+    _check_matrix(A, n, n, "A")
+    _check_covariance(Q, n, "Q")
+    _check_batches(state.mean.shape[:-1], A=A.shape[:-2], Q=Q.shape[:-2])
+    # An overflow is reported by Gaussian in words; NumPy's warning would add nothing.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ _transposed(A) + Q))
+
+
+def update(
+    state: Gaussian, measurement: ArrayLike, H: ArrayLike, R: ArrayLike, predicted: ArrayLike | None = None
+) -> tuple[Gaussian, Innovation]:
+    """Measurement update in covariance form, for few components (paper 3, eqs. 17 and 18).
+
+    The covariance follows Joseph, ``(I − M H) P (I − M H)ᵀ + M R Mᵀ``, where the paper has ``(I − M H) P``: the
+    same in exact arithmetic, and symmetric and positive semi-definite in any other.
+
+    Parameters
+    ----------
+    state : Gaussian
+        Prediction.
+    measurement : array_like, shape (..., m)
+        z; NaN where missing. With everything missing the state comes back unchanged.
+    H : array_like, shape (..., m, n)
+        Measurement matrix, or the Jacobian of a nonlinear measurement at the prediction.
+    R : array_like, shape (..., m, m)
+        Covariance of the measurement noise.
+    predicted : array_like, shape (..., m), optional
+        h(ξ̂) of a nonlinear measurement (extended Kalman filter). H ξ̂ by default.
+
+    Returns
+    -------
+    state : Gaussian
+    innovation : Innovation
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, R is no covariance, the innovation has a singular covariance, or infinite values.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> after, innovation = update(Gaussian(np.zeros(1), np.eye(1)), [2.0], np.eye(1), np.eye(1))
+    >>> after.mean, after.cov, innovation.normalised_squared
+    (array([1.]), array([[0.5]]), array(2.))
+    """
+    n = state.mean.shape[-1]
+    z, H, R = np.asarray(measurement, np.float64), np.asarray(H, np.float64), np.asarray(R, np.float64)
+    m = _check_measurement(z, H, n)
+    _check_covariance(R, m, "R")
+    _check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2], R=R.shape[:-2])
+    residual = z - (_apply(H, state.mean) if predicted is None else np.asarray(predicted, np.float64))
+    missing = np.isnan(z)
+    if missing.any():
+        # An identity block in the place of missing components decouples them: no gain, no likelihood.
+        residual = np.where(missing, 0.0, residual)
+        H = np.where(missing[..., None], 0.0, H)
+        R = np.where(missing[..., None] | missing[..., None, :], np.eye(m), R)
+    HP = H @ state.cov
+    S = _symmetric(HP @ _transposed(H) + R)
+    lower = _cholesky(S, "innovation covariance H P Hᵀ + R", "positive definite")
+    M = _transposed(_solve(S, HP))
+    F = np.eye(n) - M @ H
+    after = Gaussian(
+        state.mean + _apply(M, residual),
+        _symmetric(F @ state.cov @ _transposed(F) + M @ R @ _transposed(M)),
+    )
+    squared = (residual * _solve(S, residual[..., None])[..., 0]).sum(-1)
+    log_det = 2 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
+    observed = m - missing.sum(-1)
+    if missing.any():
+        residual = np.where(missing, np.nan, residual)
+        S = np.where(missing[..., None] | missing[..., None, :], np.nan, S)
+    return after, _innovation(residual, S, squared, log_det, observed)
+
+
+def update_information(
+    state: Gaussian, measurement: ArrayLike, H: ArrayLike, noise_variance: ArrayLike, orthonormal: bool = False
+) -> tuple[Gaussian, Innovation]:
+    """Measurement update in information form, for many components and few states (paper 3, eq. 19).
+
+    ``M = (G + P⁻¹)⁻¹ Hᵀ R⁻¹`` with ``G = Hᵀ R⁻¹ H``: only n×n matrices are decomposed. With ``P = L Lᵀ`` and
+    ``Lᵀ G L = V D Vᵀ`` the new covariance is ``T Tᵀ``, ``T = L V (I + D)^(-1/2)``: P may be singular, and the
+    result is symmetric and positive semi-definite. Its relative error is about 1e-16 times the largest of D.
+    H is read in blocks of rows; nothing of size m×n is formed.
+
+    Parameters
+    ----------
+    state : Gaussian
+        Prediction.
+    measurement : array_like, shape (..., m)
+        z, float32 or float64; NaN where missing.
+    H : array_like, shape (..., m, n)
+        Measurement matrix, float32 or float64, for example C of the flow.
+    noise_variance : float or array_like, shape (m,)
+        Diagonal of R, positive, one number for all components or one each.
+    orthonormal : bool
+        State that Hᵀ H = I, which is not checked. With one noise variance for all components and nothing
+        missing, G = I / R and the product Hᵀ z is all that is left to compute; it is then summed in the type of
+        H within a block and in float64 across blocks. Otherwise this has no effect.
+
+    Returns
+    -------
+    state : Gaussian
+    innovation : Innovation
+        ``values`` and ``cov`` are those of Hᵀ R⁻¹ (z − H ξ̂).
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, a noise variance is not positive, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> C = np.array([[0.6], [0.8]], np.float32)
+    >>> after, _ = update_information(Gaussian(np.zeros(1), np.eye(1)), [0.6, 0.8], C, 1.0, orthonormal=True)
+    >>> after.mean.round(6), after.cov
+    (array([0.5]), array([[0.5]]))
+    """
+    n = state.mean.shape[-1]
+    z, H = _floating(measurement), _floating(H)
+    m = _check_measurement(z, H, n)
+    _check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2])
+    variance = np.asarray(noise_variance, np.float64)
+    if variance.shape not in ((), (m,)):
+        raise DataError(f"noise_variance: expected one number or shape ({m},), found shape {variance.shape}")
+    if not (np.isfinite(variance) & (variance > 0)).all():
+        raise DataError("noise_variance: expected finite values above 0, found others; give the noise a floor")
+    missing = np.isnan(z)
+    if orthonormal and variance.ndim == 0 and not missing.any():
+        G = np.eye(n) / variance
+        Hz, zz = _projection(H, z)
+        Hz, zz = Hz / variance, zz / variance
+    else:
+        weight = np.where(missing, 0.0, 1.0 / variance)
+        G, Hz, zz = _normal_equations(H, np.where(missing, z.dtype.type(0), z), weight)
+    log_det_noise = np.where(missing, 0.0, np.log(variance)).sum(-1)
+    return _information_step(state, G, Hz, zz, log_det_noise, m - missing.sum(-1))
+
+
+def predict_pixels(state: PixelGaussian, drift_variance: ArrayLike) -> PixelGaussian:
+    """Time update of an image that drifts: the mean stays, Σ + S (paper 3, eqs. 14a and 14c).
+
+    Parameters
+    ----------
+    state : PixelGaussian
+    drift_variance : float or array_like, shape (H, W)
+        S, not negative.
+
+    Returns
+    -------
+    PixelGaussian
+
+    Raises
+    ------
+    DataError
+        A drift variance is negative or not finite, or its shape does not fit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> predict_pixels(PixelGaussian(np.zeros((1, 2)), np.ones((1, 2))), 0.25).variance
+    array([[1.25, 1.25]])
+    """
+    drift = _pixel_variance(drift_variance, state, "drift_variance")
+    if not (np.isfinite(drift) & (drift >= 0)).all():
+        raise DataError("drift_variance: expected finite values of at least 0, found others")
+    return PixelGaussian(state.mean, state.variance + drift)
+
+
+def update_pixels(
+    state: PixelGaussian, measurement: ArrayLike, noise_variance: ArrayLike
+) -> tuple[PixelGaussian, NDArray[np.floating]]:
+    """Measurement update of every pixel by a registered frame: L = Σ / (Σ + Z) (paper 3, eqs. 15 and 16).
+
+    The paper takes Σ and Z to be one number each; here both may vary from pixel to pixel.
+
+    Parameters
+    ----------
+    state : PixelGaussian
+        Prediction.
+    measurement : array_like, shape of ``state.mean``
+        I ∘ w; a pixel with NaN in any channel is missing.
+    noise_variance : float or array_like, shape (H, W)
+        Z, positive; infinite where the frame is not to be trusted at all.
+
+    Returns
+    -------
+    state : PixelGaussian
+        In the dtype of the prediction.
+    gain : ndarray, shape (H, W)
+        L, 0 where nothing was measured.
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, a noise variance is not positive, or the measurement is infinite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> prior = PixelGaussian(np.zeros((1, 3)), np.ones((1, 3)))
+    >>> after, gain = update_pixels(prior, [[1.0, 1.0, np.nan]], [[1.0, 3.0, 1.0]])
+    >>> after.mean, gain
+    (array([[0.5 , 0.25, 0.  ]]), array([[0.5 , 0.25, 0.  ]]))
+    """
+    mean, prior = state.mean, state.variance
+    z = np.asarray(measurement, mean.dtype)
+    noise = _pixel_variance(noise_variance, state, "noise_variance")
+    if z.shape != mean.shape:
+        raise DataError(f"measurement: expected shape {mean.shape}, found {z.shape}")
+    if not noise.min() > 0:
+        raise DataError("noise_variance: expected values above 0, found others; give the noise a floor")
+    difference = z - mean
+    # Where nothing is missing, as in most frames, two sums say so.
+    with np.errstate(invalid="ignore"):
+        some = not np.isfinite(difference.sum(dtype=np.float64) + noise.sum(dtype=np.float64))
+    if some:
+        if np.isinf(z).any():
+            raise DataError("measurement: expected finite values, or NaN where missing, found infinite ones")
+        absent = np.isnan(difference)
+        missing = (absent.any(-1) if mean.ndim > prior.ndim else absent) | np.isinf(noise)
+        noise = np.where(missing, noise.dtype.type(1), noise)
+        difference = np.where(absent, mean.dtype.type(0), difference)
+    gain = prior / (prior + noise)
+    # L Z equals (1 − L) Σ of eq. 16 without the cancellation when Z is small.
+    variance = gain * noise
+    if some:
+        gain, variance = np.where(missing, noise.dtype.type(0), gain), np.where(missing, prior, variance)
+    difference *= gain[..., None] if mean.ndim > prior.ndim else gain
+    difference += mean
+    return PixelGaussian(difference, variance), gain
+
+
+def _information_step(
+    state: Gaussian,
+    G: Float64Array,
+    Hz: Float64Array,
+    zz: Float64Array,
+    log_det_noise: Float64Array,
+    observed: NDArray[np.intp],
+) -> tuple[Gaussian, Innovation]:
+    """Update from the normal equations G = Hᵀ R⁻¹ H, Hz = Hᵀ R⁻¹ z, zz = zᵀ R⁻¹ z."""
+    T, gained = _posterior_root(state.cov, G)
+    cov = _symmetric(T @ _transposed(T))
+    G_mean = _apply(G, state.mean)
+    score = Hz - G_mean
+    step = _apply(cov, score)
+    # zᵀR⁻¹z − 2 ξ̂ᵀHᵀR⁻¹z + ξ̂ᵀGξ̂ spares a pass over H; rounding may leave it a little below zero.
+    weighted = zz - (state.mean * (Hz + score)).sum(-1)
+    squared = np.maximum(weighted - (score * step).sum(-1), 0.0)
+    log_det = log_det_noise + np.log1p(gained).sum(-1)
+    score_cov = _symmetric(G + G @ state.cov @ G)
+    return Gaussian(state.mean + step, cov), _innovation(score, score_cov, squared, log_det, observed)
+
+
+def _posterior_root(P: Float64Array, G: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """T with T Tᵀ = (G + P⁻¹)⁻¹, and the eigenvalues of P G: how much more is known in each direction."""
+    values, vectors = np.linalg.eigh(P)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    gained, directions = np.linalg.eigh(_symmetric(_transposed(root) @ G @ root))
+    gained = np.maximum(gained, 0.0)
+    return root @ directions / np.sqrt(1.0 + gained)[..., None, :], gained
+
+
+def _innovation(
+    values: Float64Array,
+    cov: Float64Array,
+    squared: Float64Array,
+    log_det: Float64Array,
+    observed: NDArray[np.intp],
+) -> Innovation:
+    log_likelihood = -0.5 * (squared + log_det + observed * _LOG_2PI)
+    return Innovation(values, cov, np.asarray(squared), np.asarray(log_likelihood), np.asarray(observed))
+
+
+def _blocks(rows: int) -> list[slice]:
+    return [slice(start, start + _BLOCK_ROWS) for start in range(0, rows, _BLOCK_ROWS)]
+
+
+def _projection(H: NDArray[np.floating], z: NDArray[np.floating]) -> tuple[Float64Array, Float64Array]:
+    """Hᵀ z and zᵀ z."""
+    Hz, zz = np.zeros(H.shape[-1]), np.zeros(())
+    for rows in _blocks(H.shape[-2]):
+        part = z[..., rows]
+        Hz = Hz + np.matmul(part.astype(H.dtype, copy=False)[..., None, :], H[..., rows, :])[..., 0, :]
+        zz = zz + np.square(part, dtype=np.float64).sum(-1)
+        drop_pages(H)
+    return Hz, zz
+
+
+def _normal_equations(
+    H: NDArray[np.floating], z: NDArray[np.floating], weight: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Hᵀ w H, Hᵀ w z and zᵀ w z."""
+    n = H.shape[-1]
+    G, Hz, zz = np.zeros((n, n)), np.zeros(n), np.zeros(())
+    for rows in _blocks(H.shape[-2]):
+        part, values, w = H[..., rows, :].astype(np.float64), z[..., rows], weight[..., rows]
+        weighted = _transposed(part * w[..., None])
+        G = G + weighted @ part
+        Hz = Hz + _apply(weighted, values.astype(np.float64))
+        zz = zz + (w * np.square(values, dtype=np.float64)).sum(-1)
+    return _symmetric(G), Hz, zz
+
+
+def _apply(matrix: Float64Array, vector: Float64Array) -> Float64Array:
+    return np.matmul(matrix, vector[..., None])[..., 0]
+
+
+def _transposed(matrix: Float64Array) -> Float64Array:
+    return np.swapaxes(matrix, -1, -2)
+
+
+def _solve(matrix: Float64Array, right: Float64Array) -> Float64Array:
+    return np.asarray(np.linalg.solve(matrix, right), np.float64)
+
+
+def _symmetric(matrix: Float64Array) -> Float64Array:
+    return 0.5 * (matrix + _transposed(matrix))
+
+
+def _floating(values: ArrayLike) -> NDArray[np.floating]:
+    array = np.asarray(values)
+    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+
+
+def _pixel_variance(variance: ArrayLike, state: PixelGaussian, name: str) -> NDArray[np.floating]:
+    array = np.asarray(variance, state.variance.dtype)
+    if array.shape not in ((), state.variance.shape):
+        raise DataError(f"{name}: expected one number or shape {state.variance.shape}, found {array.shape}")
+    return array
+
+
+def _check_pixels(mean: NDArray[np.floating], pixels: tuple[int, ...], name: str) -> None:
+    if mean.shape not in (pixels, (*pixels, 3)):
+        raise DataError(f"{name}: expected the shape of variance {pixels} or {(*pixels, 3)}, found {mean.shape}")
+
+
+def _check_matrix(matrix: NDArray[np.floating], rows: int, columns: int, name: str) -> None:
+    if matrix.ndim < 2 or matrix.shape[-2:] != (rows, columns):
+        raise DataError(f"{name}: expected shape (..., {rows}, {columns}), found {matrix.shape}")
+
+
+def _check_measurement(z: NDArray[np.floating], H: NDArray[np.floating], n: int) -> int:
+    if z.ndim < 1:
+        raise DataError("measurement: expected shape (..., m), found a single number")
+    _check_matrix(H, z.shape[-1], n, "H")
+    if np.isinf(z).any():
+        raise DataError("measurement: expected finite values, or NaN where missing, found infinite ones")
+    return int(z.shape[-1])
+
+
+def _check_covariance(cov: Float64Array, n: int, name: str) -> None:
+    _check_matrix(cov, n, n, name)
+    if not np.isfinite(cov).all():
+        raise DataError(f"{name}: expected finite values, found NaN or infinite ones; the filter may be unstable")
+    diagonal = np.abs(np.diagonal(cov, axis1=-2, axis2=-1))
+    scale = diagonal.max(-1, initial=0.0)[..., None]
+    if (np.abs(cov - _transposed(cov)) > 1e-8 * scale[..., None]).any():
+        raise DataError(f"{name}: expected a symmetric matrix, found one that is not")
+    # Rounding may leave the eigenvalue of a known direction slightly negative; only more than that is an error.
+    slack = 1e-10 * diagonal + 1e-14 * scale + 1e-300
+    _cholesky(cov + slack[..., None] * np.eye(n), name, "positive semi-definite")
+
+
+def _check_batches(state: tuple[int, ...], **batches: tuple[int, ...]) -> None:
+    for name, batch in batches.items():
+        try:
+            np.broadcast_shapes(state, batch)
+        except ValueError:
+            raise DataError(
+                f"{name}: expected leading axes that fit those of the mean {state}, found {batch}"
+            ) from None
+
+
+def _cholesky(matrix: Float64Array, name: str, kind: str) -> Float64Array:
+    try:
+        return np.asarray(np.linalg.cholesky(matrix), np.float64)
+    except np.linalg.LinAlgError:
+        raise DataError(f"{name}: expected a {kind} matrix, found one that is not; check the covariances") from None

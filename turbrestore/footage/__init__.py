@@ -1,0 +1,1 @@
+"""What a clip shows: cuts, stuck pixels, repeated or damaged frames, and which frames are sharpest."""

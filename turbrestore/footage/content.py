@@ -1,0 +1,331 @@
+"""What frames show that no image should be made of: found in one pass, then repaired or left out.
+
+====================  =================================================================  =============================
+found                 how                                                                what :func:`clean_source` does
+====================  =================================================================  =============================
+NaN, infinite values  in up to 1 % of a frame; more is refused                           fills them from around
+stuck pixels          apart from all eight neighbours, the same way in every frame       median of the neighbours
+duplicated frames     every value as in the frame before                                 leaves them out
+blank frames          a tenth of the usual contrast or less: lens cap, flash, dropout    leaves them out
+cuts                  two frames look alike under no shift                               keeps the longest scene
+saturation            half of the values or more at white                                only says so
+====================  =================================================================  =============================
+
+How cuts and stuck pixels are told from the scene: :mod:`turbrestore.footage.scene_cuts`,
+:mod:`turbrestore.footage.stuck_pixels`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from array import array
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import ConfigurationError, DataError, require_between
+from ..io.pixels import PixelArray, to_unit
+from ..io.source import FrameSource, numbers_text
+from .scene_cuts import Scene, SceneWatch, divide, thumbnail
+from .stuck_pixels import StuckPixels, without_stuck
+
+# More values than this share are no isolated defects.
+_MOST_MISSING = 0.01
+# Rings of values that are filled around what is known.
+_WIDEST_HOLE = 32
+_LEAST_CONTRAST = 1 / 510
+_SATURATED = 0.5
+
+
+@dataclass(frozen=True)
+class ContentParams:
+    """What counts as a defect of the content, and what is done about it.
+
+    Parameters
+    ----------
+    strict : bool
+        Refuse what would otherwise be repaired or left out.
+    blank_contrast : float
+        Frames of at most this share of the median contrast are blank.
+    cut_similarity : float
+        Similarity, 0 to 1, below which two frames show different scenes.
+    stuck_excess : float
+        Distance, as a share of full scale, by which a stuck pixel lies outside of the range of its neighbours.
+
+    Examples
+    --------
+    >>> ContentParams(cut_similarity=2)
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.ConfigurationError: cut_similarity: expected 0 to 1, found 2
+    """
+
+    strict: bool = False
+    blank_contrast: float = 0.1
+    cut_similarity: float = 0.5
+    stuck_excess: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("blank_contrast", "cut_similarity", "stuck_excess"):
+            require_between(name, getattr(self, name), 0, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class ContentReport:
+    """What was found in the frames of a video.
+
+    Attributes
+    ----------
+    numbers : range or tuple of int
+        Numbers, in the file, of the frames that were looked at.
+    filled : tuple of int
+        Frames with NaN or infinite values.
+    filled_values : int
+        How many such values there are.
+    stuck : ndarray, int, shape (N, 2) or (N, 3)
+        Row, column, and channel of colour frames, in the file, of every stuck pixel.
+    duplicated : tuple of int
+        Frames that equal the one before.
+    blank : tuple of int
+        Frames without contrast.
+    scenes : tuple of Scene
+        In the order of their first frames; one where there is no cut.
+    saturated : float
+        Mean share of values at white.
+    contrast : float
+        Largest standard deviation within a frame, seen as a thumbnail; 0 where no frame shows anything.
+    left_out : frozenset of int
+        Frames that :func:`clean_source` leaves out.
+    warnings : tuple of str
+        All of this in words, and what is done about it; empty for a clean video.
+    """
+
+    numbers: range | tuple[int, ...]
+    filled: tuple[int, ...]
+    filled_values: int
+    stuck: NDArray[np.int64]
+    duplicated: tuple[int, ...]
+    blank: tuple[int, ...]
+    scenes: tuple[Scene, ...]
+    saturated: float
+    contrast: float
+    left_out: frozenset[int]
+    warnings: tuple[str, ...]
+
+
+def check_content(source: FrameSource, params: ContentParams | None = None) -> ContentReport:
+    """Look at every frame once; memory does not grow with the video, but for 20 bytes a frame.
+
+    Parameters
+    ----------
+    source : FrameSource
+        The video.
+    params : ContentParams, optional
+        What counts as a defect.
+
+    Returns
+    -------
+    ContentReport
+
+    Raises
+    ------
+    DataError
+        Damaged frames, too many values that are not finite, or, where ``params.strict``, any defect.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> frames = np.linspace(0.2, 0.7, 32) + rng.normal(0, 0.01, (12, 32, 32))
+    >>> frames[5] = frames[4]
+    >>> frames[:, 8, 9] = 1.0
+    >>> report = check_content(FrameSource.from_array(frames))
+    >>> report.duplicated, report.stuck.tolist()
+    ((5,), [[8, 9]])
+    """
+    params = params or ContentParams()
+    watch = _Watch(source, params)
+    for number, pixels in zip(source.numbers, source.native(), strict=True):
+        watch.look(number, pixels)
+    report = watch.report()
+    if params.strict and (report.left_out or report.filled or len(report.stuck)):
+        raise DataError(f"{source.name}: {report.warnings[0]}; refused by strict, leave it out to go on")
+    return report
+
+
+def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
+    """Repair or leave out what :func:`check_content` has found; a clean video comes back as it is.
+
+    Parameters
+    ----------
+    source : FrameSource
+        The video.
+    report : ContentReport
+        What was found in these very frames.
+
+    Returns
+    -------
+    FrameSource
+        Reads the frames anew and repairs them on the way; ``warnings`` says what was done.
+
+    Raises
+    ------
+    ConfigurationError
+        The report is about other frames.
+
+    Examples
+    --------
+    >>> frames = np.random.default_rng(0).random((4, 20, 20))
+    >>> frames[1, 3, 3] = np.nan
+    >>> source = FrameSource.from_array(frames)
+    >>> cleaned = clean_source(source, check_content(source))
+    >>> bool(np.isfinite(cleaned.read()).all()), cleaned.warnings
+    (True, ('1 NaN or infinite value in frame 1: filled from around',))
+    """
+    if report.numbers != source.numbers:
+        raise ConfigurationError(f"{source.name}: the report is about other frames; check this selection")
+    cleaned = source.without(report.left_out, "")
+    fill, stuck = bool(report.filled), report.stuck
+
+    def repaired(pixels: PixelArray) -> PixelArray:
+        pixels = _filled(pixels) if fill else pixels
+        return without_stuck(pixels, stuck) if len(stuck) else pixels
+
+    return dataclasses.replace(
+        cleaned,
+        warnings=(*source.warnings, *report.warnings),
+        repair=repaired if fill or len(stuck) else source.repair,
+    )
+
+
+class _Watch:
+    """What has been seen so far."""
+
+    def __init__(self, source: FrameSource, params: ContentParams) -> None:
+        self._source, self._params = source, params
+        self._previous: PixelArray | None = None
+        self._contrasts = array("d")
+        self._usual = 0.0
+        self._saturated = 0.0
+        self._filled: list[int] = []
+        self._filled_values = 0
+        self._duplicated: list[int] = []
+        self._stuck = StuckPixels(params.stuck_excess)
+        self._scenes = SceneWatch(params.cut_similarity)
+
+    def look(self, number: int, pixels: PixelArray) -> None:
+        pixels = self._complete(number, pixels)
+        values = to_unit(pixels, self._source.full_scale, f"{self._source.name}: frame {number}")
+        self._saturated += np.count_nonzero(values >= 1) / values.size
+        if self._previous is not None and np.array_equal(pixels, self._previous):
+            self._duplicated.append(number)
+        self._previous = pixels
+        thumb = thumbnail(values)
+        contrast = float(thumb.std())
+        self._contrasts.append(contrast)
+        # A slowly updated median: blank frames must not count as scenes, nor end the watch on stuck pixels.
+        self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
+        if contrast > max(_LEAST_CONTRAST, self._params.blank_contrast * self._usual):
+            self._stuck.look(values)
+            self._scenes.look(thumb)
+        else:
+            self._scenes.skip()
+
+    def report(self) -> ContentReport:
+        numbers = np.asarray(self._source.numbers)
+        contrasts = np.frombuffer(self._contrasts)
+        blank = contrasts <= self._params.blank_contrast * np.median(contrasts)
+        blank &= ~blank.all()
+        duplicated = np.isin(numbers, self._duplicated)
+        labels = np.where(blank, -1, self._scenes.labels())
+        scenes, used = divide(numbers, labels)
+        left_out = blank | ~used
+        # A video of one repeated frame is a still image; there is nothing else to take.
+        repeated = (~(left_out | duplicated)).sum() < 2
+        left_out |= duplicated & ~repeated
+        stuck = self._stuck.found()
+        rows, columns = self._source.window
+        stuck[:, 0] += rows.start
+        stuck[:, 1] += columns.start
+        report = ContentReport(
+            numbers=self._source.numbers,
+            filled=tuple(self._filled),
+            filled_values=self._filled_values,
+            stuck=stuck,
+            duplicated=tuple(self._duplicated),
+            blank=tuple(numbers[blank].tolist()),
+            scenes=scenes,
+            saturated=float(self._saturated) / len(numbers),
+            contrast=float(contrasts.max()),
+            left_out=frozenset(numbers[left_out].tolist()),
+            warnings=(),
+        )
+        return dataclasses.replace(report, warnings=tuple(_in_words(report, bool(repeated))))
+
+    def _complete(self, number: int, pixels: PixelArray) -> PixelArray:
+        """Pixels whose values are finite; isolated holes are filled."""
+        if not np.issubdtype(pixels.dtype, np.floating):
+            return pixels
+        missing = int(pixels.size - np.count_nonzero(np.isfinite(pixels)))
+        if missing > _MOST_MISSING * pixels.size:
+            raise DataError(
+                f"{self._source.name}: frame {number}: expected finite values, found {missing} of {pixels.size} NaN or "
+                "infinite; select other frames or a region"
+            )
+        if missing:
+            self._filled.append(number)
+            self._filled_values += missing
+        return _filled(pixels) if missing else pixels
+
+
+def _in_words(report: ContentReport, repeated: bool) -> list[str]:
+    if report.contrast == 0:
+        return ["every frame is of one intensity: there is no scene"]
+    lines = []
+    if report.filled:
+        values = "value" if report.filled_values == 1 else "values"
+        where = numbers_text(report.filled)
+        lines.append(f"{report.filled_values} NaN or infinite {values} in {where}: filled from around")
+    if len(report.stuck):
+        places = "; ".join(f"x {place[1]}, y {place[0]}" for place in report.stuck[:3])
+        lines.append(
+            f"{len(report.stuck)} stuck pixels ({places}{'; …' * (len(report.stuck) > 3)}): replaced by the "
+            "median of their neighbours"
+        )
+    if report.blank:
+        lines.append(f"{len(report.blank)} blank: {numbers_text(report.blank)} left out")
+    if report.duplicated and repeated:
+        lines.append("all frames are the same: there is no turbulence to take out")
+    elif report.duplicated:
+        lines.append(f"{len(report.duplicated)} duplicated: {numbers_text(report.duplicated)} left out")
+    if len(report.scenes) > 1:
+        longest = max(report.scenes, key=lambda scene: scene.count)
+        others = ", ".join(f"{scene.first}:{scene.last + 1}" for scene in report.scenes if scene is not longest)
+        lines.append(
+            f"{len(report.scenes)} scenes: only the longest is used, {longest.count} frames from {longest.first} to "
+            f"{longest.last}; --frames selects another ({others})"
+        )
+    if report.saturated >= _SATURATED:
+        lines.append(f"{100 * report.saturated:.0f} % of the values are at white: detail there is lost")
+    return lines
+
+
+def _filled(pixels: PixelArray) -> PixelArray:
+    """Fill holes, ring by ring, with the mean of the known among the eight neighbours."""
+    missing = ~np.isfinite(pixels)
+    if not missing.any():
+        return pixels
+    with np.errstate(over="ignore"):
+        values = np.where(missing, 0, pixels).astype(np.float32)
+    for _ in range(_WIDEST_HOLE):
+        known = (~missing).astype(np.float32)
+        weight = cv2.boxFilter(known, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        ring = missing & (weight > 0.5)
+        values[ring] = total[ring] / weight[ring]
+        missing &= ~ring
+        if not missing.any():
+            break
+    values[missing] = np.nan
+    return values

@@ -1,0 +1,1 @@
+"""Images and videos in and out, one module a format."""

@@ -1,0 +1,358 @@
+"""Video files (MP4, MOV, Matroska, WebM, AVI, GIF) through PyAV, in their native pixel format.
+
+Grey formats stay grey at their depth, 8-bit colour becomes RGB, deeper colour 16-bit RGB. Opening reads all packets
+once without decoding them: that gives the number of frames, their times, and the damage that decoders keep quiet
+about (see :mod:`turbrestore.io.integrity`). Losses in the middle of a lossy codec's packet, which its decoder conceals,
+are not found.
+
+Colour of more than 8 bits in YUV comes out up to 0.4 % darker than exact arithmetic has it: that is how FFmpeg
+converts it. Grey video is taken as full range, as its decoder delivers it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import DataError
+from .files import input_errors
+from .integrity import ffv1_slices_intact, is_cut_short
+from .limits import DEFAULT_LIMITS, Limits
+from .pixels import PixelArray
+from .source import (
+    FrameRange,
+    FrameSource,
+    check_frame_range,
+    cut_short_text,
+    skipped_end_text,
+)
+
+if TYPE_CHECKING:
+    import av
+
+CONTAINER_SUFFIXES = (".mkv", ".mp4", ".m4v", ".mov", ".webm", ".avi", ".gif")
+# By content FFmpeg would also open playlists, which lead to other files.
+_OPEN_OPTIONS = {"format_whitelist": "matroska,webm,mov,mp4,avi,gif"}
+# Every packet of these codecs decodes without the others.
+_INTRA_CODECS = {"ffv1", "mjpeg", "rawvideo", "png", "huffyuv", "ffvhuff", "utvideo", "prores", "dnxhd"}
+
+
+@dataclass(frozen=True)
+class _PixelFormat:
+    """How frames of one pixel format become arrays."""
+
+    name: str
+    target: str
+    bit_depth: int
+    full_scale: int
+    channels: tuple[int, ...]
+    alpha: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Scan:
+    """What all packets together tell."""
+
+    count: int
+    intact: int
+    keyframes: int
+    damaged: tuple[int, ...]
+    times: NDArray[np.float64] | None
+    tick: float
+    last: float
+
+
+def open_container(
+    path: str | os.PathLike[str],
+    frames: FrameRange | None = None,
+    limits: Limits = DEFAULT_LIMITS,
+    skip_damaged: bool = False,
+) -> FrameSource:
+    """Open a video file.
+
+    Parameters
+    ----------
+    path : path-like
+        MP4, MOV, Matroska, WebM, AVI or GIF file.
+    frames : tuple, optional
+        The frames that will be selected; damage elsewhere is no error then. The source has all frames all the same.
+    limits : Limits
+        Largest video that is read.
+    skip_damaged : bool
+        Read what is whole of a file that is cut short, and only name frames that are damaged and that no others
+        depend on (``FrameSource.damaged``).
+
+    Returns
+    -------
+    FrameSource
+
+    Raises
+    ------
+    InputNotFoundError, StorageError
+        No such file, or it cannot be read.
+    DataError
+        Not a video, damaged or cut short, or too large.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from turbrestore.io.encoding import write_mkv
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_mkv(folder + "/a.mkv", [np.zeros((4, 6), np.float32)] * 3, fps=25, bit_depth=12)
+    ...     source = open_container(folder + "/a.mkv")
+    >>> source.shape, source.bit_depth, source.fps, source.format
+    ((3, 4, 6), 12, 25.0, 'ffv1/gray12le')
+    """
+    path = Path(path)
+    with input_errors(path):
+        cut = is_cut_short(path)
+    with input_errors(path), _decoding(path, "it is cut short" if cut else "not a video, or damaged"):
+        with _open(path) as container:
+            stream = _video_stream(path, container, limits)
+            codec, rate = stream.codec_context.name, stream.average_rate or stream.guessed_rate
+            duration = _declared_duration(stream)
+            frame = next(container.decode(stream), None)
+            if frame is None:
+                raise DataError(f"{path}: expected at least one frame, found none")
+            layout = _pixel_format(path, frame.format)
+            notes = _notes(frame, layout, codec)
+        scan = _scan(path, cut, limits)
+    cut = cut or scan.intact < scan.count or (duration is not None and _ends_early(scan, duration))
+    intra = codec in _INTRA_CODECS and scan.keyframes == scan.count
+    damaged = _check_damage(path, scan, cut, frames, intra, skip_damaged)
+    varies = scan.times is not None and _varies(scan.times, scan.tick)
+    fps = float(rate) if rate else None
+    if varies and scan.times is not None:
+        fps, notes = (len(scan.times) - 1) / float(scan.times[-1]), (*notes, "variable frame rate")
+    if cut and skip_damaged:
+        notes = (*notes, skipped_end_text(scan.intact))
+    return FrameSource(
+        name=path.name,
+        format=f"{codec}/{layout.name}",
+        file_shape=(scan.intact, frame.height, frame.width, *layout.channels),
+        full_scale=layout.full_scale,
+        bit_depth=layout.bit_depth,
+        pixels=lambda chosen: _frames(path, layout, chosen, intra, limits),
+        path=path,
+        fps=fps,
+        timestamps=scan.times,
+        warnings=notes,
+        damaged=damaged,
+    )
+
+
+def _open(path: Path) -> av.container.InputContainer:
+    import av
+
+    # The prefix keeps a colon in the name from being read as a protocol.
+    return av.open(f"file:{path}", options=dict(_OPEN_OPTIONS), metadata_errors="replace")
+
+
+def _video_stream(path: Path, container: av.container.InputContainer, limits: Limits) -> av.VideoStream:
+    import av
+
+    stream = container.streams.best("video")
+    if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
+        raise DataError(f"{path}: holds no video stream that can be decoded")
+    limits.check_size(stream.width, stream.height, str(path))
+    # The stream can state another size than the container.
+    stream.codec_context.options = {"max_pixels": str(min(limits.max_pixels, 2**31 - 1))}
+    return stream
+
+
+def _pixel_format(path: Path, native: av.VideoFormat) -> _PixelFormat:
+    name = native.name
+    alpha = any(component.is_alpha for component in native.components)
+    values = [component for component in native.components if not component.is_alpha]
+    depth = max(component.bits for component in values)
+    if depth > 16 or "f16" in name or "f32" in name:
+        raise DataError(f"{path}: expected up to 16 bits, found {name}; store such frames as TIFF or .npy")
+    if name.startswith("bayer"):
+        depth = 8 if name.endswith("8") else 16
+    if len(values) == 1 and not native.has_palette and not native.is_rgb:
+        depth = max(depth, 8)
+        target = "gray" if depth == 8 else f"gray{depth}le"
+        return _PixelFormat(name, target, depth, 2**depth - 1, (), alpha)
+    if name.startswith("gbrp") and depth > 8:
+        return _PixelFormat(name, f"gbrp{depth}le", depth, 2**depth - 1, (3,), False)
+    if depth > 8:
+        return _PixelFormat(name, "rgb48le", depth, 65535, (3,), alpha)
+    return _PixelFormat(name, "rgb24", 8, 255, (3,), alpha)
+
+
+def _notes(frame: av.VideoFrame, layout: _PixelFormat, codec: str) -> tuple[str, ...]:
+    notes = []
+    # GIF frames always come with alpha, though few images use it.
+    if layout.alpha and codec != "gif":
+        notes.append("alpha channel ignored")
+    if frame.interlaced_frame:
+        notes.append("interlaced video: its fields are not separated")
+    if frame.rotation:
+        notes.append(f"rotation of {frame.rotation} degrees ignored")
+    return tuple(notes)
+
+
+def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
+    """Read all packets once, decoding none."""
+    stamps: list[int | None] = []
+    damaged: list[int] = []
+    unchecked: list[int] = []
+    keyframes, last, intact = 0, 0.0, None
+    with _open(path) as container:
+        stream = _video_stream(path, container, limits)
+        codec = stream.codec_context.name
+        tick = float(stream.time_base or 0)
+        for packet in container.demux(stream):
+            # Empty packets end the stream or stand for frames that the camera dropped; discarded ones are cut off
+            # by the edit list of an MP4 file.
+            if packet.size == 0 or packet.is_discard:
+                continue
+            if packet.is_corrupt and intact is None:
+                intact = len(stamps)
+            if codec == "ffv1":
+                verdict = ffv1_slices_intact(bytes(packet))
+                (unchecked if verdict is None else damaged if not verdict else []).append(len(stamps))
+            keyframes += packet.is_keyframe
+            stamps.append(packet.dts if packet.pts is None else packet.pts)
+            limits.check_count(len(stamps), str(path))
+            if stamps[-1] is not None:
+                last = max(last, stamps[-1] * tick)
+    if not stamps:
+        raise DataError(f"{path}: expected at least one frame, found none")
+    times = None
+    if None not in stamps:
+        ticks = np.sort(np.array(stamps, np.int64))
+        times = (ticks - ticks[0]) * tick
+    # A damaged slice size makes one packet look as if it had no checksums; in a stream without them, all do.
+    if len(unchecked) < len(stamps):
+        damaged = sorted(damaged + unchecked)
+    count = len(stamps)
+    if intact is None:
+        # The last frame of a GIF file decodes as far as it goes, without complaint.
+        intact = count - 1 if cut and codec == "gif" else count
+    return _Scan(count, intact, keyframes, tuple(damaged), None if times is None else times[:intact], tick, last)
+
+
+def _check_damage(
+    path: Path, scan: _Scan, cut: bool, frames: FrameRange | None, intra: bool, skip: bool
+) -> tuple[int, ...]:
+    """Refuse damage in what was asked for; return the numbers of damaged frames that can be skipped."""
+    wanted = check_frame_range(frames)
+    if cut and not (skip and scan.intact) and (wanted.stop is None or wanted.stop > scan.intact):
+        raise DataError(f"{path}: {cut_short_text(scan.intact)}")
+    needed = range(scan.intact)[wanted]
+    if needed and not intra:
+        needed = range(needed[-1] + 1)
+    bad = [number for number in scan.damaged if number in needed]
+    if bad and not (skip and intra):
+        more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
+        raise DataError(f"{path}: frame {bad[0]}{more}: checksum fails; copy the file again or select other frames")
+    return tuple(bad)
+
+
+def _declared_duration(stream: av.VideoStream) -> float | None:
+    """End of the last frame in seconds, as the header of an AVI file or Matroska's statistics have it."""
+    if stream.container.format.name == "avi":
+        return float(stream.frames / stream.average_rate) if stream.frames and stream.average_rate else None
+    try:
+        hours, minutes, seconds = stream.metadata["DURATION"].split(":")
+        return 3600 * int(hours) + 60 * int(minutes) + float(seconds)
+    except (KeyError, ValueError):
+        return None
+
+
+def _ends_early(scan: _Scan, duration: float) -> bool:
+    """Whether a frame should follow the last one; where intervals vary, the longest counts."""
+    if scan.times is None or len(scan.times) < 2:
+        return False
+    return scan.last < duration - 1.5 * float(np.diff(scan.times).max())
+
+
+def _varies(times: NDArray[np.float64], tick: float) -> bool:
+    """Whether the frame intervals differ by more than the rounding to the file's clock."""
+    if len(times) < 3:
+        return False
+    intervals = np.diff(times)
+    return bool(np.ptp(intervals) > max(2.5 * tick, 0.05 * float(np.median(intervals))))
+
+
+def _frames(
+    path: Path, layout: _PixelFormat, chosen: Sequence[int], intra: bool, limits: Limits
+) -> Iterator[PixelArray]:
+    import av
+
+    number = chosen[0] - 1 if intra else -1
+    wanted = chosen if isinstance(chosen, range) else frozenset(chosen)
+    try:
+        with input_errors(path), _open(path) as container:
+            stream = _video_stream(path, container, limits)
+            packets = (packet for packet in container.demux(stream) if packet.size > 0 or packet.dts is None)
+            numbers: Iterator[int] = itertools.count()
+            if intra:
+                # Without this a range or a step would pay for the frames that it leaves out.
+                numbers = iter(chosen)
+                packets = (packet for index, packet in enumerate(packets) if packet.size == 0 or index in wanted)
+            for packet in packets:
+                for frame in packet.decode():
+                    number = next(numbers)
+                    if number in wanted:
+                        yield _pixels(path, frame, layout, number)
+                    if number >= chosen[-1]:
+                        return
+    except av.error.FFmpegError as error:
+        raise DataError(f"{path}: frame {number + 1} or after cannot be decoded ({error.strerror})") from error
+
+
+def _pixels(path: Path, frame: av.VideoFrame, layout: _PixelFormat, number: int) -> PixelArray:
+    if frame.is_corrupt:
+        raise DataError(f"{path}: frame {number} is damaged; copy the file again or select other frames")
+    if frame.format.name != layout.name:
+        raise DataError(f"{path}: frame {number}: expected pixel format {layout.name}, found {frame.format.name}")
+    return convert(frame, layout.target).to_ndarray()
+
+
+def convert(frame: av.VideoFrame, target: str) -> av.VideoFrame:
+    """Convert a frame to another pixel format, rounding to nearest.
+
+    Parameters
+    ----------
+    frame : av.VideoFrame
+    target : str
+        FFmpeg's name of the pixel format.
+
+    Returns
+    -------
+    av.VideoFrame
+        The frame itself where it has that format.
+
+    Examples
+    --------
+    >>> import av
+    >>> convert(av.VideoFrame(4, 4, "gray"), "rgb24").format.name
+    'rgb24'
+    """
+    from av.video.reformatter import Interpolation
+
+    # FFmpeg's default rounds YUV down, half a grey level on average.
+    exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+    return frame if frame.format.name == target else frame.reformat(format=target, interpolation=exact)
+
+
+@contextmanager
+def _decoding(path: Path, reason: str) -> Iterator[None]:
+    import av
+
+    try:
+        yield
+    except (av.error.FileNotFoundError, av.error.PermissionError):
+        raise
+    except av.error.FFmpegError as error:
+        raise DataError(f"{path}: cannot be opened as a video ({error.strerror}); {reason}") from error

@@ -1,0 +1,287 @@
+"""SER, the uncompressed video format of astronomy cameras (version 3 of its description).
+
+======  ====================================================================================
+bytes   content
+======  ====================================================================================
+0–13    ``LUCAM-RECORDER``
+14–41   seven int32: camera, colour, endianness flag, width, height, bits per plane, frames
+42–161  observer, instrument, telescope
+162     two int64: date, date in UTC
+178     frames, rows from the top
+then    optionally an int64 a frame: time in units of 100 ns
+======  ====================================================================================
+
+The description says that a flag of 1 means little endian. The programs that came first wrote 0 with little-endian
+pixels, all later ones followed them, and so does this module: 0 is little endian, everything else is big endian.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.arrays import FloatArray, from_unit
+from ..core.errors import DataError
+from .files import input_errors
+from .images import atomic_output
+from .limits import DEFAULT_LIMITS, Limits
+from .pixels import PixelArray, check_depth
+from .source import FrameSource, cut_short_text, skipped_end_text
+
+SIGNATURE = b"LUCAM-RECORDER"
+HEADER_SIZE = 178
+TICKS_PER_SECOND = 10_000_000
+_MONO, _RGB, _BGR = 0, 100, 101
+_BAYER = {
+    8: cv2.COLOR_BayerRGGB2RGB,
+    9: cv2.COLOR_BayerGRBG2RGB,
+    10: cv2.COLOR_BayerGBRG2RGB,
+    11: cv2.COLOR_BayerBGGR2RGB,
+}
+_NAMES = {_MONO: "mono", _RGB: "rgb", _BGR: "bgr", 8: "rggb", 9: "grbg", 10: "gbrg", 11: "bggr"}
+
+
+@dataclass(frozen=True)
+class SerHeader:
+    """What the header of a SER file says.
+
+    Attributes
+    ----------
+    colour : int
+        0 mono; 8 to 11 Bayer RGGB, GRBG, GBRG, BGGR; 100 RGB; 101 BGR.
+    little_endian : bool
+        Byte order of pixels of two bytes, as written in practice.
+    width, height, frames : int
+        Size in pixels, and how many frames.
+    bit_depth : int
+        Bits per plane, 1 to 16.
+    """
+
+    colour: int
+    little_endian: bool
+    width: int
+    height: int
+    bit_depth: int
+    frames: int
+
+    @property
+    def dtype(self) -> np.dtype[np.unsignedinteger]:
+        """Type of a pixel value in the file."""
+        if self.bit_depth <= 8:
+            return np.dtype(np.uint8)
+        return np.dtype("<u2" if self.little_endian else ">u2")
+
+    @property
+    def planes(self) -> int:
+        """Values a pixel."""
+        return 3 if self.colour in (_RGB, _BGR) else 1
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size of a frame in the file."""
+        return self.width * self.height * self.planes * self.dtype.itemsize
+
+
+def read_ser_header(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> SerHeader:
+    """Read and check the header of a SER file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    limits : Limits
+        Largest size of a frame that is read.
+
+    Returns
+    -------
+    SerHeader
+
+    Raises
+    ------
+    InputNotFoundError, StorageError
+        No such file, or it cannot be read.
+    DataError
+        Not a SER file, or of a kind that is not supported.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_ser(folder + "/a.ser", [np.zeros((2, 3), np.float32)], bit_depth=12)
+    ...     header = read_ser_header(folder + "/a.ser")
+    >>> header.width, header.height, header.bit_depth, header.frames
+    (3, 2, 12, 1)
+    """
+    path = Path(path)
+    with input_errors(path), path.open("rb") as file:
+        data = file.read(HEADER_SIZE)
+    if len(data) < HEADER_SIZE or not data.startswith(SIGNATURE):
+        raise DataError(f"{path}: not a SER file; it does not begin with {SIGNATURE.decode()} and a whole header")
+    _, colour, flag, width, height, depth, frames = (int(value) for value in np.frombuffer(data, "<i4", 7, 14))
+    if colour not in _NAMES:
+        raise DataError(f"{path}: expected mono, Bayer RGB or RGB frames, found colour code {colour}")
+    if not 1 <= depth <= 16:
+        raise DataError(f"{path}: expected 1 to 16 bits per plane, found {depth}")
+    limits.check_size(width, height, str(path))
+    if frames < 1:
+        raise DataError(f"{path}: expected at least one frame, found {frames}; the recording was not completed")
+    return SerHeader(colour, flag == 0, width, height, depth, frames)
+
+
+def open_ser(
+    path: str | os.PathLike[str], stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
+) -> FrameSource:
+    """Open a SER file; Bayer patterns become RGB by bilinear interpolation.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    stop : int, optional
+        Frames from this one on are not needed, so they may be missing.
+    limits : Limits
+        Largest video that is read.
+    skip_damaged : bool
+        Read what is whole of a file that is cut short.
+
+    Returns
+    -------
+    FrameSource
+
+    Raises
+    ------
+    InputNotFoundError, StorageError
+        No such file, or it cannot be read.
+    DataError
+        Not a SER file, of a kind that is not supported, or cut short.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_ser(folder + "/a.ser", [np.zeros((2, 3), np.float32)] * 4, bit_depth=12, fps=50)
+    ...     source = open_ser(folder + "/a.ser")
+    >>> source.shape, source.format, source.fps
+    ((4, 2, 3), 'ser/mono12', 50.0)
+    """
+    path = Path(path)
+    header = read_ser_header(path, limits)
+    with input_errors(path):
+        size = path.stat().st_size
+    present = (size - HEADER_SIZE) // header.frame_bytes
+    cut = present < header.frames
+    if cut and not (skip_damaged and present) and (stop is None or stop > present):
+        raise DataError(f"{path}: {cut_short_text(present)}")
+    limits.check_count(min(header.frames, present), str(path))
+    times = _timestamps(path, header, size)
+    notes = ("variable frame rate",) if times is not None and _has_gaps(times) else ()
+    channels = () if header.colour == _MONO else (3,)
+    return FrameSource(
+        name=path.name,
+        format=f"ser/{_NAMES[header.colour]}{header.bit_depth}",
+        file_shape=(min(header.frames, present), header.height, header.width, *channels),
+        full_scale=2**header.bit_depth - 1,
+        bit_depth=header.bit_depth,
+        pixels=lambda chosen: _frames(path, header, chosen),
+        path=path,
+        fps=None if times is None else (len(times) - 1) / float(times[-1]),
+        timestamps=times,
+        warnings=(*notes, skipped_end_text(present)) if cut and skip_damaged else notes,
+    )
+
+
+def write_ser(
+    path: str | os.PathLike[str],
+    frames: Iterable[FloatArray],
+    bit_depth: int = 16,
+    fps: float | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write frames as a SER file, mono or RGB, little endian.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to be written.
+    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
+        Intensities; values outside [0, 1] are clipped.
+    bit_depth : int
+        1 to 16 bits per plane; 32 is written as 16.
+    fps : float, optional
+        Frames per second; adds a time to each frame, from 1 January 2000 on.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    ConfigurationError
+        Unsupported bit depth.
+    DataError
+        No frames, or frames of two sizes.
+    OutputError, StorageError
+        The file cannot be created or completed.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_ser(folder + "/a.ser", [np.full((2, 2), 0.4, np.float32)], bit_depth=4)
+    ...     open_ser(folder + "/a.ser").read()[0, 0]
+    array([0.4, 0.4], dtype=float32)
+    """
+    depth = min(check_depth(bit_depth), 16)
+    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+        count, shape = 0, None
+        file.write(bytes(HEADER_SIZE))
+        for frame in frames:
+            if shape is not None and frame.shape != shape:
+                raise DataError(f"{path}: frame {count}: expected shape {shape}, found {frame.shape}")
+            shape = frame.shape
+            pixels = from_unit(frame, depth)
+            file.write(pixels.astype(pixels.dtype.newbyteorder("<")).tobytes())
+            count += 1
+        if shape is None:
+            raise DataError(f"{path}: expected at least one frame, found none")
+        if fps is not None:
+            start = (np.datetime64("2000-01-01") - np.datetime64("0001-01-01")) // np.timedelta64(1, "s")
+            ticks = start * TICKS_PER_SECOND + np.rint(np.arange(count) * (TICKS_PER_SECOND / fps)).astype("<i8")
+            file.write(ticks.astype("<i8").tobytes())
+        file.seek(0)
+        colour = _MONO if len(shape) == 2 else _RGB
+        fields = np.array([0, colour, 0, shape[1], shape[0], depth, count], "<i4")
+        file.write(SIGNATURE + fields.tobytes())
+
+
+def _frames(path: Path, header: SerHeader, chosen: Sequence[int]) -> Iterator[PixelArray]:
+    shape = (header.height, header.width) if header.planes == 1 else (header.height, header.width, 3)
+    for number in chosen:
+        with input_errors(path):
+            # Mapped one by one: pages of frames already seen do not count as this process's memory.
+            offset = HEADER_SIZE + number * header.frame_bytes
+            frame = np.memmap(path, header.dtype, "r", offset, shape)
+        if header.colour in _BAYER:
+            yield cv2.cvtColor(frame.astype(frame.dtype.newbyteorder("=")), _BAYER[header.colour])
+        else:
+            yield frame[..., ::-1] if header.colour == _BGR else frame
+
+
+def _timestamps(path: Path, header: SerHeader, size: int) -> NDArray[np.float64] | None:
+    start = HEADER_SIZE + header.frames * header.frame_bytes
+    if header.frames < 2 or size < start + 8 * header.frames:
+        return None
+    with input_errors(path):
+        ticks = np.fromfile(path, "<i8", header.frames, offset=start)
+    # Recorders without a clock leave zeros; a clock that was set back during the recording tells no frame rate.
+    return (ticks - ticks[0]) / TICKS_PER_SECOND if np.all(np.diff(ticks) >= 0) and ticks[-1] > ticks[0] else None
+
+
+def _has_gaps(times: NDArray[np.float64]) -> bool:
+    """Whether frames are missing in time; cameras that time their frames themselves scatter by much less."""
+    intervals = np.diff(times)
+    return len(times) > 2 and bool(intervals.max() > 1.5 * np.median(intervals))

@@ -1,0 +1,256 @@
+"""The centroid: the image at the mean geometry of the frames (paper 3, §3.2, eq. 12).
+
+Symbols
+-------
+q : current estimate of the centroid
+W_i : flow from q to frame I_i; W̄ their mean, which vanishes at the centroid
+V : inverse flow, ``(id + V) = (id + W̄)^{-1}``
+
+The image moves *with* the mean flow, so backward warping needs the inverse, ``q ← q ∘ (id + W̄)^{-1}``; the paper
+leaves this open.  Two departures from it: flows are composed and frames are interpolated once, where the paper warps
+the warped image again in every iteration; and ``fused`` (the default) averages all registered frames, where the
+paper (``single``) keeps one warped frame with all of its noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arrays import FloatArray, check_frames
+from ..core.errors import require, require_between
+from ..display.plots import plot_displacements
+from ..display.preview import preview
+from ..runtime.device import PROCESSOR
+from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
+from ..runtime.threads import map_ahead, sum_in_threads
+from .flow import FlowFrame, FlowParams, fill_flows, refer_flow
+from .global_shift import mean_stabilised
+from .warp import compose_flows, inside, invert_flow, warp
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MODES = ("fused", "single")
+# A mean flow that keeps this share of its length from one iteration to the next is the bias of the flow method.
+_STALLED = 0.8
+# One that grows by more than this has lost the frames.
+_DIVERGED = 1.25
+# Weight of the repeated border beside that of a pixel that was seen.
+_UNSEEN = 1e-3
+
+
+@dataclass(frozen=True)
+class CentroidParams:
+    """How the centroid is iterated.
+
+    Parameters
+    ----------
+    mode : {"fused", "single"}
+        Average of the registered frames, or one warped frame as in the paper.
+    iterations : int
+        Largest number of iterations; each costs one flow per frame.  The paper runs 10.
+    tolerance : float
+        Stop when the mean flow is shorter than this, pixels (mean over the image), or shrinks by less than a fifth;
+        stop without convergence when it grows by more than a quarter.  ``fused`` does two iterations at least, for the
+        temporal mean that it starts from is a blurred reference.
+        What is left is the bias of the flow method; it is not corrected, which would bend the image.
+    start : int
+        Frame that ``single`` warps; ``fused`` starts from the temporal mean, of stabilised frames if flow takes shifts
+        of whole frames out.
+    """
+
+    mode: Literal["fused", "single"] = "fused"
+    iterations: int = 5
+    tolerance: float = 0.15
+    start: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.mode in MODES, f"mode: expected one of {', '.join(MODES)}, found {self.mode!r}")
+        require_between("iterations", self.iterations, 1, 1000)
+        require_between("tolerance", self.tolerance, 0, 1000, "pixels")
+        require(self.start >= 0, f"start: expected a frame number from 0, found {self.start}")
+
+
+@dataclass(frozen=True)
+class Centroid:
+    """The centroid of a stack of frames.
+
+    Attributes
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        The centroid (ρ̃ in the paper).
+    flows : ndarray, float32, shape (T, H, W, 2)
+        Flows from the centroid to each frame, pixels.
+    mean_flow_sizes : ndarray, float64, shape (iterations,)
+        Mean length of W̄ found in each iteration, pixels.  All but the last have been corrected, and the last too if
+        the iteration has not converged.
+    converged : bool
+        Whether the last of them is below the tolerance, or no longer shrinks without growing either.
+    """
+
+    image: FloatArray
+    flows: FloatArray
+    mean_flow_sizes: np.ndarray
+    converged: bool
+
+    def plot(self) -> Figure:
+        """Draw how far every pixel moves over the frames.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ConfigurationError
+            Matplotlib is not installed.
+        """
+        return plot_displacements(self.flows, self.image)
+
+    def _repr_html_(self) -> str:
+        facts = [
+            ("frames", str(len(self.flows))),
+            ("mean flow left", f"{self.mean_flow_sizes[-1]:.2f} pixels"),
+            ("iterations", f"{self.mean_flow_sizes.size}, {'' if self.converged else 'not '}converged"),
+        ]
+        return preview("Centroid", facts, self.image)
+
+
+def find_centroid(
+    frames: ArrayLike,
+    params: CentroidParams | None = None,
+    flow_params: FlowParams | None = None,
+    progress: Callable[[int], None] | None = None,
+    scratch: Path | None = None,
+    prepared: dict[int, FlowFrame] | None = None,
+) -> Centroid:
+    """Iterate to the centroid of ``frames``.
+
+    Parameters
+    ----------
+    frames : array_like, shape (T, H, W) or (T, H, W, 3)
+        At least two frames.
+    params : CentroidParams, optional
+        Mode and stopping.
+    flow_params : FlowParams, optional
+        How flow is measured.
+    progress : callable, optional
+        Called with 1 after each flow.
+    scratch : Path, optional
+        Folder of a file that holds the flows; by default they are in memory.
+    prepared : dict, optional
+        From the number of a frame to what flow prepares of it: filled here, and of use to the filter.
+
+    Returns
+    -------
+    Centroid
+
+    Raises
+    ------
+    DataError
+        Fewer than two frames, wrong shapes or values that are not finite.
+    ConfigurationError
+        ``start`` is not a frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:48, :48]
+    >>> left, right = (0.5 + 0.2 * np.sin((x + s) / 3.0) * np.cos(y / 4.0) for s in (-0.5, 0.5))
+    >>> centroid = find_centroid(np.stack([left, right]).astype(np.float32))
+    >>> centroid.converged, centroid.image.shape
+    (True, (48, 48))
+    """
+    params, flow_params = params or CentroidParams(), flow_params or FlowParams()
+    stack = check_frames(frames, at_least=2)
+    require(params.start < len(stack), f"start: expected a frame below {len(stack)}, found {params.start}")
+    image = _start(stack, params, flow_params)
+    total = np.zeros((*stack.shape[1:3], 2), np.float32)
+    flows = new_stack((*stack.shape[:3], 2), scratch)
+    if prepared is None and scratch is None:
+        # Where even the frames are in a file, what is prepared of them is not kept.
+        prepared = {}
+    sizes: list[float] = []
+    while True:
+        # The first image is a blurred mean, so what was measured from it needs a coarser level to be mended.
+        reference = refer_flow(image, flow_params, start_level=1)
+        fill_flows(reference, stack, flows, prepared, progress, again=bool(sizes))
+        mean_flow = mean_of(flows)
+        sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
+        change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
+        # The temporal mean is a blurred reference: flow from the first registered mean is better, wherever it lies.
+        settled = len(sizes) > 1 or params.mode == "single" or params.iterations == 1
+        converged = (sizes[-1] <= params.tolerance and settled) or _STALLED < change <= _DIVERGED
+        if not converged:
+            recentre = invert_flow(mean_flow)
+            total = compose_flows(total, recentre) if params.mode == "single" else total
+            _recentre(flows, recentre, flow_params.threads)
+        image = (
+            mean_registered(stack, flows, flow_params.threads, flow_params.device or PROCESSOR)
+            if params.mode == "fused"
+            else warp(stack[params.start], total)
+        )
+        if converged or change > _DIVERGED or len(sizes) == params.iterations:
+            return Centroid(image, flows, np.array(sizes), converged)
+
+
+def _start(stack: FloatArray, params: CentroidParams, flow_params: FlowParams) -> FloatArray:
+    if params.mode == "single":
+        return stack[params.start]
+    return mean_stabilised(stack, flow_params.threads) if flow_params.global_shift else mean_of(stack)
+
+
+def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:
+    """Let flows start from where ``recentre`` leads, in place."""
+
+    def move(index: int) -> None:
+        flows[index] = compose_flows(flows[index], recentre)
+
+    for _ in map_ahead(move, range(len(flows)), threads):
+        drop_pages(flows)
+
+
+def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0, device: str = PROCESSOR) -> FloatArray:
+    """Average of frames warped onto the reference that their flows start from.
+
+    At each pixel those frames count that show it; where none does, all of them, with their borders repeated.
+
+    Parameters
+    ----------
+    frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
+    flows : ndarray, float32, shape (T, H, W, 2)
+        Pixels.
+    threads : int
+        Frames warped side by side; 0 means one per available core.
+    device : str
+        Where they are warped, see :mod:`turbrestore.runtime.device`.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W) or (H, W, 3)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> mean_registered(np.ones((2, 4, 4), np.float32), np.zeros((2, 4, 4, 2), np.float32))[0]
+    array([1., 1., 1., 1.], dtype=float32)
+    """
+
+    def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, np.ndarray]:
+        total, weight = np.zeros(frames.shape[1:]), np.zeros(frames.shape[1:3])
+        for frame, flow in pairs:
+            registered, seen = warp(frame, flow, device=device), np.maximum(inside(flow), _UNSEEN)
+            registered *= seen if registered.ndim == seen.ndim else seen[..., None]
+            cv2.accumulate(registered, total)
+            cv2.accumulate(seen, weight)
+        return total, weight
+
+    total, weight = sum_in_threads(add, zip(iter_frames(frames), iter_frames(flows), strict=True), threads)
+    return (total.T / weight.T).T.astype(np.float32)

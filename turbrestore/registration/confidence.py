@@ -1,0 +1,281 @@
+"""How far a measured flow can be believed, and what stands in where it cannot: flat regions and single edges.
+
+Symbols
+-------
+g : gradient of the reference, intensity per pixel
+J : structure tensor, ``g gᵀ`` averaged over a window of area A
+σ : noise of a frame, intensity
+W : measured flow; W̄ what is expected before it is measured; τ deviation of W from W̄
+
+From a window the displacement is known at best to the covariance ``σ² (A J)⁻¹`` (the Cramér–Rao bound; Robinson and
+Milanfar 2004): well across an edge, not at all along it, and not at all where nothing is seen.  Flow methods give a
+number all the same.  In flat regions dense inverse search matches noise with noise, over 5 px and more.
+
+With W̄ known to τ the posterior mean is ``Ŵ = (J + ε)⁻¹ (J W + ε W̄)``, ``ε = m σ² / (A τ²) + κ tr(J) / 2``, where J and
+J W are averages over the window.  W̄ is the same in a window twice as wide, and so on until the window is the image, for
+which it is zero: this is normalised convolution (Knutsson and Westin 1993) with tensors and growing windows.  Texture
+keeps its flow, an edge takes the component along it from its neighbourhood, and a flat region takes both.
+
+Three things keep it from believing too much.  A flow method errs by more than noise explains, by a factor m in
+variance.  Its errors at neighbouring pixels have one origin, so ε is the same for every window.  And the direction of
+an edge is known to a few degrees only: without κ the tilt of the tensor from one pixel to the next would pass for a
+measurement of what lies along the edge.  What comes out lies within the range of what went in.
+
+J holds the noise of the reference as well, which must not pass for texture: the eigenvalues are lowered by it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arrays import FloatArray, check_flow, check_image, luminance
+from ..core.errors import DataError, require
+from ..core.noise import estimate_noise
+from ..runtime.jit import compiled
+
+# Standard deviations of the windows of the gradient and of the tensor, pixels.
+_GRADIENT_WINDOW, _TENSOR_WINDOW = 1.0, 2.0
+_AREA = 4 * np.pi * _TENSOR_WINDOW**2
+# Variance of a derivative in that window of white noise of unit variance; three times it bounds what noise looks like.
+_GRADIENT_NOISE = 1 / (8 * np.pi * _GRADIENT_WINDOW**4)
+_NOISE_MARGIN = 3.0
+# τ, pixels; m and κ.
+_DEVIATION = 0.5
+_METHOD_ERROR = 10.0
+_TILT = 0.01
+# Smallest noise, so that every tensor has an inverse: 1/4096 of full scale.
+_LEAST_NOISE = 1 / 4096
+
+# Components of a field of vectors: planes are read several times as fast as every second number of an array.
+Planes = tuple[FloatArray, FloatArray]
+
+
+@dataclass(frozen=True)
+class FlowConfidence:
+    """What the texture of a reference tells of displacements.
+
+    Attributes
+    ----------
+    tensors : tuple of ndarray, float32, shape (3, h, w)
+        J as planes xx, xy and yy, squared intensity per squared pixel: of the image, then of windows and grids twice
+        as wide each.
+    """
+
+    tensors: tuple[FloatArray, ...]
+
+
+def flow_confidence(reference: ArrayLike) -> FlowConfidence:
+    """Structure tensors of the image that flows start from.
+
+    Parameters
+    ----------
+    reference : array_like, shape (H, W) or (H, W, 3)
+        Intensities; colour is reduced to luminance.
+
+    Returns
+    -------
+    FlowConfidence
+
+    Raises
+    ------
+    DataError
+        Wrong shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> edges = np.tile(np.arange(32) // 8 % 2, (32, 1)).astype(np.float32)
+    >>> along_x, _, along_y = flow_confidence(edges).tensors[0][:, 16, 16]
+    >>> bool(along_x > 0.01), bool(along_y < 1e-6)
+    (True, True)
+    """
+    image = luminance(check_image(reference, "reference"))
+    smooth = cv2.GaussianBlur(image, (0, 0), _GRADIENT_WINDOW)
+    dx, dy = cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32
+    xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW) for product in (dx * dx, dx * dy, dy * dy))
+    noise = np.float32(_NOISE_MARGIN * _GRADIENT_NOISE * estimate_noise(image) ** 2)
+    tensors = [_without_noise(xx, xy, yy, noise)]
+    while min(tensors[-1].shape[1:]) > 1:
+        tensors.append(np.stack([cv2.pyrDown(plane) for plane in tensors[-1]]))
+    return FlowConfidence(tuple(tensors))
+
+
+def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -> FloatArray:
+    """Draw a flow towards its neighbourhood where the texture tells little.
+
+    Parameters
+    ----------
+    flow : array_like, shape (H, W, 2)
+        Measured displacements (dx, dy), pixels.
+    confidence : FlowConfidence
+        Of the reference that the flow starts from.
+    noise : float
+        σ of the frame that it leads to, intensity.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W, 2)
+        Pixels, within the range of ``flow`` and zero; zero where the whole image is flat.
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, or values are not finite.
+    ConfigurationError
+        ``noise`` is negative or not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> flat = flow_confidence(np.full((32, 32), 0.5))
+    >>> float(np.abs(regularise_flow(np.full((32, 32, 2), 3.0), flat, 0.01)).max())
+    0.0
+    """
+    measured = check_flow(flow)
+    require(0 <= noise < np.inf, f"noise: expected a finite number of 0 or more, found {noise}")
+    tensors = confidence.tensors
+    if measured.ndim != 3 or measured.shape[:2] != tensors[0].shape[1:]:
+        raise DataError(f"flow: expected shape {(*tensors[0].shape[1:], 2)}, found {measured.shape}")
+    planes = cv2.split(measured)
+    weighted = [_apply(tensors[0], *planes)]
+    for _ in tensors[1:]:
+        weighted.append((cv2.pyrDown(weighted[-1][0]), cv2.pyrDown(weighted[-1][1])))
+    prior = _METHOD_ERROR * max(noise, _LEAST_NOISE) ** 2 / (_AREA * _DEVIATION**2)
+    u, v = (np.zeros_like(part) for part in weighted[-1])
+    for level in range(len(tensors) - 1, -1, -1):
+        height, width = tensors[level].shape[1:]
+        if u.shape != (height, width):
+            u, v = (cv2.pyrUp(part, dstsize=(width, height)) for part in (u, v))
+        u, v = _solve(tensors[level], weighted[level], (u, v), prior)
+    for expected, plane in zip((u, v), planes, strict=True):
+        low, high, _, _ = cv2.minMaxLoc(plane)
+        np.clip(expected, np.float32(min(low, 0)), np.float32(max(high, 0)), out=expected)
+    return cv2.merge([u, v])
+
+
+def _without_noise(xx: FloatArray, xy: FloatArray, yy: FloatArray, noise: np.float32) -> FloatArray:
+    """Lower both eigenvalues by ``noise``, to zero at most."""
+    lower = compiled(lower_pixels)
+    if lower is not None:
+        lowered = np.empty((3, *xx.shape), np.float32)
+        lower(noise, xx.reshape(-1), xy.reshape(-1), yy.reshape(-1), lowered.reshape(3, -1))
+        return lowered
+    half, tilt = (xx + yy) / 2, (xx - yy) / 2
+    spread = np.sqrt(tilt * tilt + xy * xy)
+    larger, smaller = np.maximum(half + spread - noise, 0), np.maximum(half - spread - noise, 0)
+    kept = (larger - smaller) / np.maximum(2 * spread, np.finfo(np.float32).tiny)
+    mean, tilt = (larger + smaller) / 2, kept * tilt
+    return np.stack([mean + tilt, kept * xy, mean - tilt])
+
+
+def lower_pixels(noise: np.float32, xx: FloatArray, xy: FloatArray, yy: FloatArray, lowered: FloatArray) -> None:
+    """Lower both eigenvalues of each pixel by ``noise``, to zero at most; to be compiled.
+
+    Parameters
+    ----------
+    noise : float32
+        Squared intensity per squared pixel.
+    xx, xy, yy : ndarray, float32, shape (P,)
+        Structure tensors.
+    lowered : ndarray, float32, shape (3, P)
+        Filled, with xx, xy and yy.
+
+    Examples
+    --------
+    >>> lowered = np.empty((3, 1), np.float32)
+    >>> lower_pixels(np.float32(1), np.float32([5]), np.float32([0]), np.float32([0.5]), lowered)
+    >>> lowered[:, 0]
+    array([4., 0., 0.], dtype=float32)
+    """
+    zero, two, tiny = np.float32(0), np.float32(2), np.finfo(np.float32).tiny
+    for pixel in range(xx.size):
+        half, tilt = (xx[pixel] + yy[pixel]) / two, (xx[pixel] - yy[pixel]) / two
+        spread = np.sqrt(tilt * tilt + xy[pixel] * xy[pixel])
+        larger, smaller = max(half + spread - noise, zero), max(half - spread - noise, zero)
+        kept = (larger - smaller) / max(two * spread, tiny)
+        mean = (larger + smaller) / two
+        lowered[0, pixel] = mean + kept * tilt
+        lowered[1, pixel] = kept * xy[pixel]
+        lowered[2, pixel] = mean - kept * tilt
+
+
+def _apply(tensor: FloatArray, dx: FloatArray, dy: FloatArray) -> Planes:
+    xx, xy, yy = tensor
+    return _sum_of_products(xx, dx, xy, dy), _sum_of_products(xy, dx, yy, dy)
+
+
+def _sum_of_products(a: FloatArray, x: FloatArray, b: FloatArray, y: FloatArray) -> FloatArray:
+    total = a * x
+    total += b * y
+    return total
+
+
+def _solve(tensor: FloatArray, weighted: Planes, expected: Planes, noise: float) -> Planes:
+    """``(J + ε)⁻¹ (J W + ε W̄)`` of each pixel.
+
+    Where J is singular, along an edge, its determinant is what cancellation leaves; as ε is at least κ tr(J) / 2,
+    single precision keeps four digits and a half of the flow there.
+    """
+    xx, xy, yy = tensor
+    draw = compiled(draw_pixels)
+    if draw is not None:
+        result = np.empty(xx.shape, np.float32), np.empty(xx.shape, np.float32)
+        planes = xx, xy, yy, *weighted, *expected, *result
+        draw(np.float32(noise), *(plane.reshape(-1) for plane in planes))
+        return result
+    prior = xx + yy
+    prior *= np.float32(_TILT / 2)
+    prior += np.float32(noise)
+    u, v = (prior * mean + part for mean, part in zip(expected, weighted, strict=True))
+    xx, yy = xx + prior, yy + prior
+    determinant = xx * yy
+    determinant -= xy * xy
+    return (yy * u - xy * v) / determinant, (xx * v - xy * u) / determinant
+
+
+def draw_pixels(
+    noise: np.float32,
+    xx: FloatArray,
+    xy: FloatArray,
+    yy: FloatArray,
+    weighted_x: FloatArray,
+    weighted_y: FloatArray,
+    expected_x: FloatArray,
+    expected_y: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+) -> None:
+    """``(J + ε)⁻¹ (J W + ε W̄)`` of each pixel; to be compiled.
+
+    Parameters
+    ----------
+    noise : float32
+        ``m σ² / (A τ²)``.
+    xx, xy, yy : ndarray, float32, shape (P,)
+        J.
+    weighted_x, weighted_y, expected_x, expected_y : ndarray, float32, shape (P,)
+        J W and W̄.
+    x, y : ndarray, float32, shape (P,)
+        Filled.
+
+    Examples
+    --------
+    >>> one, zero, x, y = np.float32([1]), np.float32([0]), np.empty(1, np.float32), np.empty(1, np.float32)
+    >>> draw_pixels(np.float32(1), one, zero, zero, 3 * one, zero, zero, 5 * one, x, y)
+    >>> x.round(2), y.round(2)
+    (array([1.5], dtype=float32), array([5.], dtype=float32))
+    """
+    half = np.float32(_TILT / 2)
+    for pixel in range(x.size):
+        a, b, c = xx[pixel], xy[pixel], yy[pixel]
+        prior = (a + c) * half + noise
+        u, v = prior * expected_x[pixel] + weighted_x[pixel], prior * expected_y[pixel] + weighted_y[pixel]
+        a += prior
+        c += prior
+        scale = np.float32(1) / (a * c - b * b)
+        x[pixel] = (c * u - b * v) * scale
+        y[pixel] = (a * v - b * u) * scale

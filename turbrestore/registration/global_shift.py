@@ -1,0 +1,326 @@
+"""Global shifts: what a shaking or drifting camera adds to the motion of turbulence, taken out before dense flow.
+
+Symbols
+-------
+s : shift (dx, dy) of a whole frame, pixels, ``reference(x, y) ≈ frame(x + dx, y + dy)``
+F, R : spectra of the windowed frame and reference; ``R* F / |R* F|`` peaks at s (phase correlation, Kuglin and Hines
+    1975)
+
+Dense flow follows a texture over a tenth of the image side and no further; phase correlation finds shifts of a
+quarter of it and more, and costs little, because reduced images are enough: dense flow measures the rest.  A peak is
+believed only if moving the frame by it makes the images clearly more alike where they overlap.  Turbulence alone does
+not pass that test, so that its frames are left as they are.
+
+Small rotations need no such help: 2° move the corners of an image by a fortieth of its side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
+
+from ..core.arrays import FloatArray, check_frames, check_image, luminance
+from ..core.errors import DataError
+from ..runtime.scratch import drop_pages, mean_of
+from ..runtime.threads import map_ahead
+
+# Images are reduced by a whole factor until no side is longer: beyond it only the time grows.
+_LONGEST_SIDE = 192
+# Local contrast is normalised in a window of this many pixels of the reduced image; deviations below the floor,
+# intensity, count as flat.
+_WINDOW, _FLOOR = 6.0, 0.01
+# Standard deviation of the peak that is looked for, pixels of the reduced image: turbulence smears it.
+_PEAK_WIDTH = 1.0
+# Correlation that a shift must reach, and what it must gain on no shift at all.
+_LEAST_CORRELATION, _LEAST_GAIN = 0.3, 0.1
+# Parts of the image below this share say nothing about the whole.
+_LEAST_OVERLAP = 0.1
+# Shifts up to this many pixels are left to dense flow.
+DEAD_ZONE = 2.0
+
+Shift = NDArray[np.float64]
+Slices = tuple[slice, slice]
+
+
+@dataclass(frozen=True)
+class ShiftReference:
+    """What shifts are measured against.
+
+    Attributes
+    ----------
+    reduced : ndarray, float32, shape (h, w)
+        The image, reduced, with normalised contrast.
+    spectrum : ndarray, complex64, shape (h, w // 2 + 1)
+        Conjugate spectrum of it under a Hann window.
+    shape : tuple of int
+        (H, W) of the image itself.
+    """
+
+    reduced: FloatArray
+    spectrum: NDArray[np.complex64]
+    shape: tuple[int, int]
+
+
+def refer_shift(image: ArrayLike) -> ShiftReference:
+    """Prepare an image that the shifts of many frames are measured against.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W) or (H, W, 3)
+        Intensities; colour is reduced to luminance.
+
+    Returns
+    -------
+    ShiftReference
+
+    Raises
+    ------
+    DataError
+        Wrong shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> refer_shift(np.zeros((480, 640))).reduced.shape
+    (120, 160)
+    """
+    checked = check_image(image)
+    reduced = _reduce(checked)
+    return ShiftReference(reduced, np.conj(_spectrum(reduced)), checked.shape[:2])
+
+
+def shift_against(image: ArrayLike, reference: ShiftReference) -> Shift | None:
+    """Shift of a frame against a reference.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W) or (H, W, 3)
+        The frame.
+    reference : ShiftReference
+        What :func:`refer_shift` made of the reference.
+
+    Returns
+    -------
+    ndarray, float64, shape (2,), or None
+        (dx, dy) in pixels, zero where no shift explains the frame clearly better; None where the images are not alike
+        with any shift.
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> scene = np.random.default_rng(0).random((64, 80)).astype(np.float32)
+    >>> shift_against(scene[3:51, 5:69], refer_shift(scene[8:56, 9:73])).round(1)
+    array([4., 5.])
+    """
+    checked = check_image(image)
+    if checked.shape[:2] != reference.shape:
+        raise DataError(f"image: expected {reference.shape} pixels as the reference has, found {checked.shape[:2]}")
+    reduced = _reduce(checked)
+    peak = _peak(reference.spectrum * _spectrum(reduced), reduced.shape)
+    still = _correlation(reference.reduced, reduced)
+    to, origin = overlap(reduced.shape, np.rint(peak))
+    seen = reduced[origin]
+    moved = _correlation(reference.reduced[to], seen) if seen.size > _LEAST_OVERLAP * reduced.size else 0.0
+    if max(still, moved) < _LEAST_CORRELATION:
+        return None
+    scale = np.divide(reference.shape, reduced.shape)[::-1]
+    return peak * scale if moved > still + _LEAST_GAIN else np.zeros(2)
+
+
+def global_shifts(frames: ArrayLike) -> Shift:
+    """Shift of each frame against the mean position of all.
+
+    Frames are held against the middle one, and where that is too far away, against the last one whose shift is known.
+    A frame that is like neither, black or of something else, is taken to lie between its neighbours.
+
+    Parameters
+    ----------
+    frames : array_like, shape (T, H, W) or (T, H, W, 3)
+        Frames of one scene.
+
+    Returns
+    -------
+    ndarray, float64, shape (T, 2)
+        (dx, dy) in pixels, zero on average.
+
+    Raises
+    ------
+    DataError
+        Wrong shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> scene = np.random.default_rng(0).random((64, 100)).astype(np.float32)
+    >>> global_shifts(np.stack([scene[:, k : k + 64] for k in (0, 10, 20)])).round()[:, 0]
+    array([ 10.,   0., -10.])
+    """
+    return _known_shifts(check_frames(frames))[0]
+
+
+def mean_stabilised(frames: ArrayLike, threads: int = 0) -> FloatArray:
+    """Temporal mean of the frames, each moved by whole pixels to the mean position.
+
+    Where all frames lie within two pixels of it they are averaged as they are; else frames that cannot be placed are
+    left out.
+
+    Parameters
+    ----------
+    frames : array_like, shape (T, H, W) or (T, H, W, 3)
+        Frames of one scene.
+    threads : int
+        Frames looked at side by side; 0 means one per available core.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W) or (H, W, 3)
+
+    Raises
+    ------
+    DataError
+        Wrong shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> scene = np.random.default_rng(0).random((64, 100)).astype(np.float32)
+    >>> mean = mean_stabilised(np.stack([scene[:, k : k + 64] for k in (0, 10, 20)]))
+    >>> bool(np.allclose(mean, scene[:, 10:74]))
+    True
+    """
+    stack = check_frames(frames)
+    mean = mean_of(stack)
+    shifts, known = _known_shifts(stack, threads)
+    if np.abs(shifts).max() <= DEAD_ZONE:
+        return mean
+    total = np.zeros(mean.shape)
+    count = np.zeros(mean.shape[:2])
+    for index in np.flatnonzero(known):
+        to, origin = overlap(count.shape, np.rint(shifts[index]))
+        total[to] += stack[index][origin]
+        count[to] += 1
+        drop_pages(stack)
+    seen = count > 0
+    mean[seen] = (total[seen].T / count[seen]).T
+    return mean
+
+
+def overlap(shape: tuple[int, ...], shift: ArrayLike) -> tuple[Slices, Slices]:
+    """Where a reference and a frame that is shifted by whole pixels show the same.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        (H, W) of both.
+    shift : array_like, shape (2,)
+        Whole pixels (dx, dy), ``reference(x, y) = frame(x + dx, y + dy)``.
+
+    Returns
+    -------
+    reference, frame : tuple of slice
+        Rows and columns in each; empty where they have nothing in common.
+
+    Examples
+    --------
+    >>> overlap((4, 8), (3, -1))
+    ((slice(1, 4, None), slice(0, 5, None)), (slice(0, 3, None), slice(3, 8, None)))
+    """
+    dx, dy = (int(step) for step in np.asarray(shift))
+    pairs = [_overlap_of_axis(length, step) for length, step in ((shape[0], dy), (shape[1], dx))]
+    return (pairs[0][0], pairs[1][0]), (pairs[0][1], pairs[1][1])
+
+
+def _overlap_of_axis(length: int, step: int) -> Slices:
+    step = min(max(step, -length), length)
+    return slice(max(-step, 0), length - max(step, 0)), slice(max(step, 0), length - max(-step, 0))
+
+
+def _known_shifts(stack: FloatArray, threads: int = 0) -> tuple[Shift, NDArray[np.bool_]]:
+    """Shifts of all frames, and which of them were found."""
+    numbers = np.arange(len(stack))
+    # The middle frame may itself be the odd one out.
+    for anchor in (len(stack) // 2, len(stack) // 4, 3 * len(stack) // 4):
+        shifts, known = np.zeros((len(stack), 2)), numbers == anchor
+        for order in (numbers[anchor + 1 :], numbers[:anchor][::-1]):
+            _walk(stack, anchor, order, shifts, known, threads)
+        if 2 * known.sum() > len(stack):
+            break
+    shifts = np.column_stack([np.interp(numbers, numbers[known], axis) for axis in shifts[known].T])
+    return shifts - shifts.mean(axis=0), known
+
+
+def _walk(
+    stack: FloatArray, anchor: int, order: Iterable[int], shifts: Shift, known: NDArray[np.bool_], threads: int
+) -> None:
+    """Fill in the shifts of frames on one side of the anchor, from near to far."""
+    key, key_shift, last = refer_shift(stack[anchor]), shifts[anchor], anchor
+    first = key
+
+    def held(index: int) -> Shift | None:
+        found = shift_against(stack[index], first)
+        drop_pages(stack)
+        return found
+
+    # Most frames are like the anchor: all are held against it side by side, and the others one after the other.
+    for index, against in list(map_ahead(held, order, threads)):
+        found = against if key is first else shift_against(stack[index], key)
+        if found is None:
+            nearer = refer_shift(stack[last])
+            found = shift_against(stack[index], nearer)
+            if found is not None:
+                key, key_shift = nearer, shifts[last]
+        if found is not None:
+            shifts[index], known[index], last = key_shift + found, True, index
+        drop_pages(stack)
+
+
+def _reduce(image: FloatArray) -> FloatArray:
+    """Smaller luminance with zero mean and unit deviation in a Gaussian window."""
+    height, width = image.shape[:2]
+    factor = -(-max(height, width) // _LONGEST_SIDE)
+    size = max(width // factor, 1), max(height // factor, 1)
+    grey = luminance(image if factor == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    centred = grey - cv2.GaussianBlur(grey, (0, 0), _WINDOW)
+    return centred / np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), _WINDOW) + np.float32(_FLOOR**2))
+
+
+def _spectrum(reduced: FloatArray) -> NDArray[np.complex64]:
+    window = cv2.createHanningWindow((max(reduced.shape[1], 2), max(reduced.shape[0], 2)), cv2.CV_32F)
+    return fft.rfft2(reduced * window)
+
+
+def _peak(product: NDArray[np.complex64], shape: tuple[int, ...]) -> Shift:
+    """Place (x, y) of the largest phase correlation, to a fraction of a pixel."""
+    height, width = shape
+    y, x = fft.fftfreq(height)[:, None], fft.rfftfreq(width)[None]
+    blur = np.exp(-2 * np.pi**2 * _PEAK_WIDTH**2 * (x * x + y * y)).astype(np.float32)
+    size = np.abs(product)
+    surface = fft.irfft2(product * (blur / (size + 1e-6 * size.max() + 1e-30)), s=(height, width))
+    row, column = np.unravel_index(int(np.argmax(surface)), surface.shape)
+    across = surface[row, [column - 1, column, (column + 1) % width]]
+    down = surface[[row - 1, row, (row + 1) % height], column]
+    place = np.array([column + _vertex(across), row + _vertex(down)])
+    period = np.array([width, height])
+    return (place + period / 2) % period - period / 2
+
+
+def _vertex(three: FloatArray) -> float:
+    """Vertex of the parabola through three values, from the middle one."""
+    bend = float(three[0] - 2 * three[1] + three[2])
+    return 0.5 * float(three[0] - three[2]) / bend if bend < 0 else 0.0
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    energy = float(np.vdot(a, a)) * float(np.vdot(b, b))
+    return float(np.vdot(a, b)) / energy**0.5 if energy > 0 else 0.0

@@ -1,0 +1,357 @@
+"""TV-L1 optical flow from one reference to many frames.
+
+Symbols
+-------
+r : reference; f : frame; both of any intensity unit
+u : flow, pixels, ``r(x) ≈ f(x + u(x))``; u₀ : flow about which the frame is linearised; ``f_w(x) = f(x + u₀(x))``
+ρ(u) = f_w − r + g·(u − u₀) : linearised difference; g : gradient
+λ : weight of the data term (``attachment``); α : Huber threshold (``huber``), pixels per pixel
+
+Energy
+------
+``E(u) = Σ λ|f(x + u) − r(x)| + h_α(∇u₁) + h_α(∇u₂)``.  The absolute value forgives outliers; h_α is quadratic for
+gradients below α and linear above.  α = 0 is the total variation of Zach, Pock and Bischof (2007), which makes flows
+of flat patches; the flow of turbulence is smooth, and α > 0 (Werlberger et al. 2009) takes the patches away.
+
+How it is minimised
+-------------------
+From the coarsest level of a pyramid (factor 2) to the image: warp the frame by the present flow, linearise, minimise
+the convex problem by a few primal-dual sweeps (:mod:`turbrestore.registration.tvl1_sweeps`), take the median of the
+flow in 5×5
+windows, which removes outliers (Wedel et al. 2009), and again, until half of the pixels move by less than a tolerance.
+
+Departures from Zach et al. and OpenCV's DualTVL1
+--------------------------------------------------
+- All frames share one reference: its pyramid and gradients are computed once.
+- g is the mean of the gradients of the reference and of the warped frame.  Both are the same where the flow is right;
+  their mean makes the linearisation exact to second order (Malis 2004) and halves the variance of the noise in g.
+  The gradient of the reference alone (inverse compositional: Baker and Matthews 2004) saves a twentieth of the time
+  and makes the end-point error 2 to 8 % larger.
+- No second flow that is coupled by θ: the proximal map of the data term is known, so the problem itself is solved.
+- The dual variable is kept from warp to warp and from level to level: p is a field of directions, which a finer grid
+  changes little.  Half of the sweeps then come as near to the minimum.
+- Frames are sampled by cubic B-splines.  Where a sample falls outside the frame there is no data term.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..core.arrays import FloatArray, check_flow, check_frames, check_image, luminance
+from ..core.errors import DataError, require, require_between
+from ..runtime.device import PROCESSOR, find_device
+from ..runtime.image_stacks import Shape, Stack, StackOps, numpy_ops, spline_coefficients, torch_ops
+from .tvl1_sweeps import FlowProblem, SweepParams, resize_dual, sweep
+
+MEDIANS = (1, 3, 5)
+# A level of the pyramid has at least half of this many pixels a side.
+_LEAST_SIDE = 32
+# Gradient, per pixel, below which nothing is seen.
+_FLAT = 1e-6
+_ONE = np.ones(1, np.float32)
+# Exact for polynomials of degree four.
+_DERIVATIVE = (np.array([1, -8, 0, 8, -1]) / 12).astype(np.float32)
+# Gaussian of 0.8 pixels before every second pixel is dropped.
+_BLUR = np.exp(-(np.arange(-2, 3) ** 2) / (2 * 0.8**2))
+_REDUCTION = (_BLUR / _BLUR.sum()).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class TvL1Params:
+    """Settings of TV-L1 flow.
+
+    Parameters
+    ----------
+    attachment : float
+        Weight of the data term (λ), per unit of intensity; smaller is smoother.  The default is for 8-bit grey levels
+        with 32 of them a local standard deviation, as :mod:`turbrestore.registration.flow` makes them.
+    huber : float
+        Gradient of the flow (α), pixels per pixel, up to which smoothness is quadratic; 0 is the total variation.
+    warps : int
+        Most warps per level.
+    sweeps : int
+        Primal-dual sweeps per warp.
+    step : float
+        Step of the flow in a sweep (τ), pixels.
+    median : int
+        Side of the median filter after each warp; 1 switches it off, else 3 or 5.
+    levels : int
+        Most levels of the pyramid; fewer where the image is small.
+    tolerance : float
+        A level ends when half of its pixels move by less than this in a warp, pixels.
+    batch : int
+        Frames that a device solves together; memory grows with it.  A processor solves one after the other.
+    """
+
+    attachment: float = 0.08
+    huber: float = 0.3
+    warps: int = 5
+    sweeps: int = 15
+    step: float = 0.7
+    median: int = 5
+    levels: int = 5
+    tolerance: float = 0.1
+    batch: int = 4
+
+    def __post_init__(self) -> None:
+        require_between("attachment", self.attachment, 1e-4, 1e3)
+        require_between("huber", self.huber, 0, 10, "pixels per pixel")
+        for name in ("warps", "sweeps", "levels", "batch"):
+            require_between(name, getattr(self, name), 1, 10_000)
+        require_between("step", self.step, 1e-3, 1e3, "pixels")
+        require(self.median in MEDIANS, f"median: expected 1 (off), 3 or 5, found {self.median}")
+        require_between("tolerance", self.tolerance, 0, 10, "pixels")
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceLevel:
+    """One level of the pyramid of a reference.
+
+    Attributes
+    ----------
+    image : stack, shape (1, H, W)
+    gradient : stack, shape (1, 2, H, W)
+    x, y : stack, shape (H, W)
+        Pixel coordinates.
+    """
+
+    image: Stack
+    gradient: Stack
+    x: Stack
+    y: Stack
+
+
+@dataclass(frozen=True, eq=False)
+class TvL1Reference:
+    """What is computed once for all frames; threads may share it.
+
+    Attributes
+    ----------
+    levels : tuple of ReferenceLevel
+        From the image to the coarsest.
+    params : TvL1Params
+    ops : StackOps
+        Operations of where it is computed.
+    together : bool
+        Whether frames are solved together, as on a device.
+    """
+
+    levels: tuple[ReferenceLevel, ...]
+    params: TvL1Params
+    ops: StackOps
+    together: bool
+
+
+@dataclass(frozen=True, eq=False)
+class TvL1Flows:
+    """Flows of frames.
+
+    Attributes
+    ----------
+    flows : ndarray, float32, shape (T, H, W, 2)
+        (dx, dy), pixels.
+    warps : ndarray, int, shape (T,)
+        Warps that each frame took at full resolution.
+    settled : ndarray, bool, shape (T,)
+        Whether the last of them moved half of the pixels by less than the tolerance.
+    """
+
+    flows: FloatArray
+    warps: NDArray[np.intp]
+    settled: NDArray[np.bool_]
+
+
+def refer_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device: str = PROCESSOR) -> TvL1Reference:
+    """Prepare the reference of many flows.
+
+    Parameters
+    ----------
+    reference : array_like, shape (H, W) or (H, W, 3)
+        At least 16×16 pixels; colour is reduced to luminance.
+    params : TvL1Params, optional
+        Settings of all flows from this reference.
+    device : str
+        Where they are computed, see :mod:`turbrestore.runtime.device`.
+
+    Returns
+    -------
+    TvL1Reference
+
+    Raises
+    ------
+    DataError
+        Wrong shape, too small, or values that are not finite.
+    ConfigurationError
+        The device is not there.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> [level.image.shape for level in refer_tvl1(np.zeros((80, 70))).levels]
+    [(1, 80, 70), (1, 40, 35), (1, 20, 18)]
+    """
+    params = params or TvL1Params()
+    image = luminance(check_image(reference, "reference"))
+    if min(image.shape) < _LEAST_SIDE // 2:
+        raise DataError(f"reference: expected at least 16×16 pixels, found {image.shape[1]}×{image.shape[0]}")
+    found = find_device(device)
+    ops = numpy_ops() if found == PROCESSOR else torch_ops(found)
+    levels = (_refer_level(stack, ops) for stack in _pyramid(ops.load(image[None]), params.levels, ops))
+    return TvL1Reference(tuple(levels), params, ops, found != PROCESSOR)
+
+
+def tvl1_flows(
+    frames: ArrayLike, reference: TvL1Reference, start: ArrayLike | None = None, levels: int | None = None
+) -> TvL1Flows:
+    """Flows from the reference to each of some frames, in the calling thread.
+
+    Parameters
+    ----------
+    frames : array_like, shape (T, H, W) or (T, H, W, 3)
+        In the intensity unit of the reference; a device solves them together, so memory grows with T.
+    reference : TvL1Reference
+        What :func:`refer_tvl1` made of it.
+    start : array_like, shape (T, H, W, 2), optional
+        Flows to begin with on the coarsest level, zero by default: earlier flows of these frames from much the same
+        reference, or, where a frame shows little, a prediction.  The flow of the frame before, or the one that a
+        dynamic texture predicts, is hardly nearer than zero where turbulence changes from frame to frame.
+    levels : int, optional
+        Finest levels that are gone through; all by default.  A good start replaces the others: two save a tenth of the
+        time.
+
+    Returns
+    -------
+    TvL1Flows
+        The flow of a frame does not depend on the other frames.
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, or values are not finite.
+    ConfigurationError
+        ``levels`` is less than 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:64, :64]
+    >>> reference, frame = (100 + 50 * np.sin((x - dx) / 3) * np.cos(y / 4) for dx in (0, 0.7))
+    >>> found = tvl1_flows(frame[None], refer_tvl1(reference))
+    >>> np.median(found.flows[0], axis=(0, 1)).round(1) + 0
+    array([0.7, 0. ], dtype=float32)
+    """
+    stack = luminance(check_frames(frames))
+    shape = tuple(reference.levels[0].image.shape[-2:])
+    if stack.shape[1:] != shape:
+        raise DataError(f"frames: expected {shape} pixels as the reference has, found {stack.shape[1:]}")
+    flows = None if start is None else check_flow(start, "start")
+    if flows is not None and flows.shape != (*stack.shape, 2):
+        raise DataError(f"start: expected shape {(*stack.shape, 2)}, found {flows.shape}")
+    if levels is not None:
+        require_between("levels", levels, 1, 10_000)
+        reference = replace(reference, levels=reference.levels[:levels])
+    # On a processor one frame after the other stays in the cache.
+    size = len(stack) if reference.together else 1
+    groups = [slice(first, first + size) for first in range(0, len(stack), size)]
+    parts = [_solve(stack[group], reference, None if flows is None else flows[group]) for group in groups]
+    return TvL1Flows(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("flows", "warps", "settled")))
+
+
+def _refer_level(image: Stack, ops: StackOps) -> ReferenceLevel:
+    y, x = np.mgrid[: image.shape[-2], : image.shape[-1]].astype(np.float32)
+    return ReferenceLevel(image, _gradient(image, ops), ops.load(x), ops.load(y))
+
+
+def _gradient(images: Stack, ops: StackOps) -> Stack:
+    return ops.arrays.stack([ops.filter(images, _DERIVATIVE, _ONE), ops.filter(images, _ONE, _DERIVATIVE)], 1)
+
+
+def _pyramid(images: Stack, levels: int, ops: StackOps) -> list[Stack]:
+    pyramid = [images]
+    while len(pyramid) < levels and min(pyramid[-1].shape[-2:]) >= _LEAST_SIDE:
+        height, width = pyramid[-1].shape[-2:]
+        smooth = ops.filter(pyramid[-1], _REDUCTION, _REDUCTION)
+        pyramid.append(ops.resize(smooth, ((height + 1) // 2, (width + 1) // 2)))
+    return pyramid
+
+
+def _solve(frames: FloatArray, reference: TvL1Reference, start: FloatArray | None) -> TvL1Flows:
+    """Flows of a batch, from the coarsest level to the finest."""
+    ops = reference.ops
+    pyramid = _pyramid(ops.load(frames), len(reference.levels), ops)
+    count, *size = pyramid[-1].shape
+    flow, dual = ops.zeros((count, 2, *size)), ops.zeros((count, 2, 2, *size))
+    if start is not None:
+        flow = _resized(ops.load(np.moveaxis(start, -1, 1)), tuple(size), ops)
+    for level, images in zip(reference.levels[::-1], pyramid[::-1], strict=True):
+        shape = tuple(images.shape[-2:])
+        if tuple(flow.shape[-2:]) != shape:
+            flow, dual = _resized(flow, shape, ops), resize_dual(dual, shape, ops)
+        warps, settled = _settle(level, spline_coefficients(images, ops), flow, dual, reference)
+    return TvL1Flows(np.moveaxis(ops.store(flow), 1, -1), warps, settled)
+
+
+def _resized(flow: Stack, shape: Shape, ops: StackOps) -> Stack:
+    """Flow on another grid; displacements grow with it."""
+    height, width = flow.shape[-2:]
+    result = ops.resize(flow, shape)
+    result[:, 0] *= shape[1] / width
+    result[:, 1] *= shape[0] / height
+    return result
+
+
+def _settle(
+    level: ReferenceLevel, frames: Stack, flow: Stack, dual: Stack, reference: TvL1Reference
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Warp and minimise until the flow of each frame, given as spline coefficients, stays.
+
+    ``flow`` and ``dual`` are overwritten.
+    """
+    params, ops = reference.params, reference.ops
+    warps, settled = np.zeros(len(frames), np.intp), np.zeros(len(frames), np.bool_)
+    for _ in range(params.warps):
+        running = np.flatnonzero(~settled)
+        if not len(running):
+            break
+        before, p = flow[running], dual[running]
+        problem = _linearise(level, frames[running], before, reference)
+        after = _minimise(problem, before, p, reference)
+        if params.median > 1:
+            after = ops.median(after, params.median)
+        little = ops.arrays.square(after - before).sum(1) < params.tolerance**2
+        # Counted where the flow is, so that a device gives back one number a frame.
+        still = ops.store(little.reshape(len(running), -1).sum(1))
+        flow[running], dual[running] = after, p
+        warps[running] += 1
+        settled[running] = 2 * still > little.shape[-2] * little.shape[-1]
+    return warps, settled
+
+
+def _linearise(level: ReferenceLevel, frames: Stack, flow: Stack, reference: TvL1Reference) -> FlowProblem:
+    """Take the data term about a flow."""
+    ops = reference.ops
+    x, y = level.x + flow[:, 0], level.y + flow[:, 1]
+    height, width = x.shape[-2:]
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    warped = ops.sample(frames, x, y)
+    g = _gradient(warped, ops)
+    g += level.gradient
+    # Where nothing is seen g vanishes, and with it the way that the data term can push.
+    g *= 0.5 * inside[:, None]
+    offset = warped - level.image
+    offset -= (g * flow).sum(1)
+    length = ops.arrays.sqrt(ops.arrays.square(g).sum(1) + _FLAT**2)
+    offset /= length
+    g /= length[:, None]
+    return FlowProblem(g, offset, length * reference.params.attachment)
+
+
+def _minimise(problem: FlowProblem, flow: Stack, dual: Stack, reference: TvL1Reference) -> Stack:
+    params, ops = reference.params, reference.ops
+    sweeps = SweepParams(params.sweeps, params.step, params.huber)
+    work = ops.arrays.empty_like(flow)
+    work[:] = flow
+    return sweep(problem, work, dual, sweeps, ops.arrays)

@@ -1,0 +1,1 @@
+"""What a run leaves on disk: stage files, checkpoints, the run folder and its record."""

@@ -1,0 +1,252 @@
+"""What the fields of every kind of artifact are: type, shape and range, checked when one is read.
+
+Shapes name their axes; one name stands for one length within an artifact:
+
+======  ===============================================
+H, W    height and width, pixels
+P       2 H W, components of a flow
+T       flows
+n       states
+τ       flows that the dynamics were fitted to, from n
+N       frames
+i       iterations of the centroid
+k       values of a record, such as one an iteration
+======  ===============================================
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import DataError
+from ..runtime.scratch import iter_parts
+
+# Far beyond what pixels and intensities are, and small enough to be squared.
+_MOST = 1e9
+_INFINITE = math.inf
+_SMALLEST = {"n": 0, "k": 0, "τ": 2}
+# Rounding that a covariance may show, relative to its largest eigenvalue.
+_ROUNDING = 1e-6
+
+
+@dataclass(frozen=True)
+class Array:
+    """An array of an artifact.
+
+    Attributes
+    ----------
+    dtype : str
+        As NumPy abbreviates it.
+    shape : str
+        Names and lengths of the axes; shapes that are possible too follow after ``|``.
+    low, high : float
+        Least and largest value; infinite ones are allowed where a bound is infinite.
+    gaps : bool
+        Whether NaN is allowed.
+    """
+
+    dtype: str
+    shape: str
+    low: float = -_MOST
+    high: float = _MOST
+    gaps: bool = False
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number of an artifact.
+
+    Attributes
+    ----------
+    whole : bool
+        Whether it is whole.
+    low, high : float
+        Least and largest value; infinite ones are allowed where a bound is infinite.
+    """
+
+    whole: bool = False
+    low: float = 0
+    high: float = _MOST
+
+
+@dataclass(frozen=True)
+class Flag:
+    """True or false."""
+
+
+@dataclass(frozen=True)
+class Lines:
+    """A list of text."""
+
+
+Field = Array | Number | Flag | Lines
+_IMAGE = Array("f4", "H W|H W 3")
+FIELDS: dict[str, dict[str, Field]] = {
+    "centroid": {
+        "image": _IMAGE,
+        "flows": Array("f4", "T H W 2"),
+        "mean_flow_sizes": Array("f8", "i", low=0),
+        "converged": Flag(),
+    },
+    "dynamics": {
+        "mean_flow": Array("f4", "H W 2"),
+        "A": Array("f8", "n n"),
+        "C": Array("f4", "P n"),
+        "Q": Array("f8", "n n"),
+        "R": Number(),
+        "residual_variance": Array("f4", "H W", low=0),
+        "states": Array("f8", "n τ"),
+        "singular_values": Array("f8", "τ", low=0),
+        "energy_share": Number(high=1 + _ROUNDING),
+        "overfitted": Flag(),
+        "notes": Lines(),
+        "motion_factor": Array("f4", "H W", low=0),
+    },
+    "filtered": {
+        "image": _IMAGE,
+        "variance": Array("f4", "H W", low=0),
+        "flow_states": Array("f8", "N n"),
+        "gains": Array("f8", "N", low=0),
+        "innovations": Array("f8", "N", low=0, gaps=True),
+        "sharpness": Array("f8", "N", gaps=True),
+        "shares": Array("f8", "N", low=0, high=1 + _ROUNDING),
+        "image_noise": Number(),
+        "motion_share": Number(),
+    },
+    "deconvolution": {
+        "image": _IMAGE,
+        "sigma": Number(),
+        "fidelity": Number(high=_INFINITE),
+        "noise": Number(),
+        "iterations": Number(whole=True),
+        "converged": Flag(),
+        "recorded": Array("i8", "k", low=0),
+        "objective": Array("f8", "k", low=-_INFINITE, high=_INFINITE, gaps=True),
+        "changes": Array("f8", "k", low=0, high=_INFINITE, gaps=True),
+    },
+    "blur": {
+        "sigma": Number(),
+        "uncertainty": Number(high=_INFINITE),
+        "exponent": Number(),
+        "noise": Number(),
+        "reduction": Number(whole=True, low=1),
+        "evidence": Number(low=-_INFINITE, high=_INFINITE),
+        "widths": Array("f8", "k", low=0),
+        "costs": Array("f8", "k", low=-_INFINITE, high=_INFINITE),
+    },
+    "blur_bounds": {"low": Number(), "high": Number(high=_INFINITE)},
+}
+
+
+def check_fields(kind: str, fields: Mapping[str, Any], name: str) -> None:
+    """Refuse fields that a stage cannot have made.
+
+    Parameters
+    ----------
+    kind : str
+        Kind of the artifact.
+    fields : mapping
+        Values by field.
+    name : str
+        How error messages call the file.
+
+    Raises
+    ------
+    DataError
+        A field is missing, too many, of another type or shape, not finite or out of range.
+
+    Examples
+    --------
+    >>> check_fields("blur_bounds", {"low": 0.5, "high": -1.0}, "a.npz")
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.DataError: a.npz: expected high from 0 to inf, found -1.0; the file is damaged
+    """
+    layout = FIELDS[kind]
+    if set(fields) != set(layout):
+        raise DataError(f"{name}: expected the fields {sorted(layout)}, found {sorted(fields)}")
+    sizes: dict[str, int] = {}
+    for field, wanted in layout.items():
+        complaint = _complaint(fields[field], wanted, sizes)
+        if complaint:
+            raise DataError(f"{name}: expected {field} {complaint}; the file is damaged")
+    if kind == "dynamics":
+        _check_dynamics(fields, name)
+
+
+def _complaint(value: object, wanted: Field, sizes: dict[str, int]) -> str:
+    """Say what is expected of a value and what it is instead; nothing where it is right."""
+    if isinstance(wanted, Array):
+        return _array_complaint(value, wanted, sizes)
+    if isinstance(wanted, Flag):
+        return "" if isinstance(value, bool) else f"to be true or false, found {value!r:.40}"
+    if isinstance(wanted, Lines):
+        right = isinstance(value, list) and all(isinstance(line, str) for line in value)
+        return "" if right else f"to be a list of text, found {value!r:.40}"
+    # A whole number of any length would be read, but not every one is a float.
+    too_long = isinstance(value, int) and value.bit_length() > 64
+    if not isinstance(value, int if wanted.whole else (int, float)) or isinstance(value, bool) or too_long:
+        return f"to be a {'whole ' if wanted.whole else ''}number, found {value!r:.40}"
+    return "" if wanted.low <= value <= wanted.high else _range(wanted, value)
+
+
+def _array_complaint(value: object, wanted: Array, sizes: dict[str, int]) -> str:
+    dtype = np.dtype(wanted.dtype)
+    if not isinstance(value, np.ndarray):
+        return f"to be an array, found {value!r:.40}"
+    if value.dtype != dtype:
+        return f"to be of {dtype}, found {value.dtype}"
+    if not any(_fits(value.shape, shape.split(), sizes) for shape in wanted.shape.split("|")):
+        known = ", ".join(f"{axis} = {size}" for axis, size in sizes.items())
+        shape = wanted.shape.replace(" ", ", ").replace("|", ") or (")
+        return f"of shape ({shape}){f' with {known}' if known else ''}, found {value.shape}"
+    if value.size == 0:
+        return ""
+    # A large array may lie in a mapped file.
+    for part in iter_parts(value):
+        low, high = (
+            (np.fmin.reduce(part, None), np.fmax.reduce(part, None)) if wanted.gaps else (part.min(), part.max())
+        )
+        if wanted.gaps and math.isnan(low):
+            continue
+        if not wanted.low <= low <= high <= wanted.high:
+            return _range(wanted, low if not wanted.low <= low else high)
+    return ""
+
+
+def _range(wanted: Array | Number, found: float) -> str:
+    return f"from {wanted.low:g} to {wanted.high:g}, found {found}"
+
+
+def _fits(shape: tuple[int, ...], axes: list[str], sizes: dict[str, int]) -> bool:
+    """Whether a shape has these axes; lengths that are new are taken down if so."""
+    if len(shape) != len(axes):
+        return False
+    found = dict(sizes)
+    for length, axis in zip(shape, axes, strict=True):
+        if axis == "P":
+            known = 2 * found["H"] * found["W"]
+        else:
+            known = int(axis) if axis.isdecimal() else found.setdefault(axis, max(length, _SMALLEST.get(axis, 1)))
+        if length != known:
+            return False
+    sizes.update(found)
+    return True
+
+
+def _check_dynamics(fields: Mapping[str, Any], name: str) -> None:
+    """Refuse a covariance with a negative eigenvalue, and more states than there are flows."""
+    Q, count = fields["Q"], fields["states"].shape[1]
+    if len(Q) > count:
+        raise DataError(f"{name}: expected up to {count} states, one a flow, found {len(Q)}; the file is damaged")
+    largest = np.abs(Q).max(initial=0.0)
+    if np.abs(Q - Q.T).max(initial=0.0) > _ROUNDING * largest:
+        raise DataError(f"{name}: expected Q to be symmetric, found {Q.shape} that is not; the file is damaged")
+    least = np.linalg.eigvalsh(Q).min(initial=0.0)
+    if least < -_ROUNDING * largest:
+        raise DataError(f"{name}: expected Q without negative eigenvalues, found {least:.3g}; the file is damaged")

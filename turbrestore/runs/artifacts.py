@@ -1,0 +1,265 @@
+"""Stage results on disk: one ``.npz`` file each, arrays plus a JSON header, never a pickle.
+
+The header names the kind of result and the version of this layout, and holds every field that is not an array.
+Flow stacks by themselves are plain ``.npy`` files, which anything reads and which can be memory-mapped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..blur.blur_cues import BlurBounds
+from ..blur.estimation import BlurEstimate
+from ..core.arrays import FloatArray, check_flow, check_image
+from ..core.errors import DataError, InputNotFoundError
+from ..deconvolution.deconvolve import Deconvolution
+from ..dynamics.flow_model import FlowDynamics
+from ..filtering.alternating import Filtered
+from ..io.files import check_input
+from ..io.images import atomic_output, check_output, read_image
+from ..io.npy import map_npy, read_npz, write_npz
+from ..registration.centroid import Centroid
+from .artifact_fields import check_fields
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+SCHEMA = 1
+KINDS: dict[str, type[DataclassInstance]] = {
+    "centroid": Centroid,
+    "dynamics": FlowDynamics,
+    "filtered": Filtered,
+    "deconvolution": Deconvolution,
+    "blur": BlurEstimate,
+    "blur_bounds": BlurBounds,
+}
+_HEADER = "header"
+
+Result = TypeVar("Result", bound="DataclassInstance")
+
+
+def save_artifact(path: str | os.PathLike[str], result: DataclassInstance, overwrite: bool = False) -> None:
+    """Write a stage result.
+
+    Parameters
+    ----------
+    path : path
+        Must end in ``.npz``.
+    result : Centroid, FlowDynamics, Filtered, Deconvolution, BlurEstimate or BlurBounds
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    ConfigurationError
+        Another suffix.
+    OutputError
+        The file exists, or its folder does not.
+    StorageError
+        Writing failed; nothing is left behind.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> from turbrestore.dynamics.flow_model import FlowDynamics
+    >>> dynamics = identify(np.random.default_rng(0).normal(size=(5, 4, 4, 2)).astype(np.float32))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_artifact(folder + "/dynamics.npz", dynamics)
+    ...     again = load_artifact(folder + "/dynamics.npz", FlowDynamics)
+    >>> bool((again.A == dynamics.A).all())
+    True
+    """
+    target = Path(path)
+    check_output(target, overwrite=overwrite, suffixes=(".npz",))
+    kind = _kind_of(type(result))
+    values = {item.name: getattr(result, item.name) for item in dataclasses.fields(result)}
+    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    others = {name: value for name, value in values.items() if name not in arrays}
+    header = json.dumps({"kind": kind, "schema": SCHEMA, "fields": others})
+    with atomic_output(target, overwrite) as temporary, temporary.open("wb") as stream:
+        write_npz(stream, {_HEADER: np.array(header), **arrays})
+
+
+def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Path | None = None) -> Result:
+    """Read a stage result back.
+
+    Parameters
+    ----------
+    path : path
+        File written by :func:`save_artifact`.
+    kind : type
+        Class that is expected.
+    scratch : Path, optional
+        Folder of a file that holds what is large; by default that is in memory.
+
+    Returns
+    -------
+    instance of ``kind``
+
+    Raises
+    ------
+    InputNotFoundError
+        There is no such file.
+    DataError
+        The file is damaged, of another kind, of another version of the layout, or holds what no stage makes.
+
+    Examples
+    --------
+    >>> from turbrestore.registration.centroid import Centroid
+    >>> load_artifact("missing.npz", Centroid)
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
+    """
+    name, (found, fields) = _kind_of(kind), _read(Path(path), scratch)
+    if found != name:
+        raise DataError(f"{path}: expected a {name} artifact, found a {found} artifact")
+    return _build(kind, fields)
+
+
+def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
+    """Read an image file, or the image of an artifact that has one.
+
+    Parameters
+    ----------
+    path : path
+        Image, or ``.npz`` of a centroid, a filtered or a deconvolved image.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W) or (H, W, 3)
+
+    Raises
+    ------
+    InputNotFoundError
+        There is no such file.
+    DataError
+        The file is damaged or holds no image.
+
+    Examples
+    --------
+    >>> load_stage_image("missing.npz")
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
+    """
+    source = Path(path)
+    if source.suffix.lower() != ".npz":
+        return read_image(source).image
+    kind, fields = _read(source)
+    if "image" not in fields:
+        raise DataError(f"{source}: expected an artifact with an image, found a {kind} artifact")
+    return check_image(fields["image"], str(source))
+
+
+def save_flows(path: str | os.PathLike[str], flows: ArrayLike, overwrite: bool = False) -> None:
+    """Write flows as a ``.npy`` file.
+
+    Parameters
+    ----------
+    path : path
+        Must end in ``.npy``.
+    flows : array_like, shape (T, H, W, 2)
+        Pixels.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    ConfigurationError
+        Another suffix.
+    OutputError
+        The file exists, or its folder does not.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_flows(folder + "/flows.npy", np.zeros((2, 4, 4, 2)))
+    ...     load_flows(folder + "/flows.npy").shape
+    (2, 4, 4, 2)
+    """
+    target = Path(path)
+    check_output(target, overwrite=overwrite, suffixes=(".npy",))
+    with atomic_output(target, overwrite) as temporary, temporary.open("wb") as stream:
+        np.save(stream, check_flow(flows, "flows"), allow_pickle=False)
+
+
+def load_flows(path: str | os.PathLike[str]) -> FloatArray:
+    """Read flows from a ``.npy`` file, or those of a centroid artifact.
+
+    Parameters
+    ----------
+    path : path
+        ``.npy``, or ``.npz`` of a centroid.
+
+    Returns
+    -------
+    ndarray, float32, shape (T, H, W, 2)
+        Memory-mapped if it comes from ``.npy``.
+
+    Raises
+    ------
+    InputNotFoundError
+        There is no such file.
+    DataError
+        The file is damaged or holds something else.
+
+    Examples
+    --------
+    >>> load_flows("missing.npy")
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.InputNotFoundError: missing.npy: no such file
+    """
+    source = Path(path)
+    if source.suffix.lower() == ".npz":
+        return load_artifact(source, Centroid).flows
+    if not source.is_file():
+        raise InputNotFoundError(f"{source}: no such file")
+    try:
+        flows = map_npy(source)
+    except DataError as error:
+        raise DataError(f"{source}: expected flows in a .npy file, found something else") from error
+    if flows.ndim != 4:
+        raise DataError(f"{source}: expected flows of shape (T, H, W, 2), found {flows.shape}")
+    return check_flow(flows, str(source))
+
+
+def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any]]:
+    """Kind and fields of an artifact."""
+    if source.is_dir() or not source.exists():
+        raise InputNotFoundError(f"{source}: no such file")
+    check_input(source)
+    try:
+        arrays = read_npz(source, scratch=scratch)
+        header: dict[str, Any] = json.loads(str(arrays.pop(_HEADER)))
+        kind, schema, fields = header["kind"], header["schema"], {**header["fields"], **arrays}
+        known = kind in KINDS
+    except (DataError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise DataError(f"{source}: expected an artifact of turbrestore, found something else or damage") from error
+    if type(schema) is not int or schema != SCHEMA or not known:
+        raise DataError(
+            f"{source}: expected an artifact of layout {SCHEMA}, found a {kind!r:.40} of layout {schema!r:.40}"
+        )
+    check_fields(kind, fields, str(source))
+    return kind, fields
+
+
+def _build(kind: type[Result], fields: dict[str, Any]) -> Result:
+    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})
+
+
+def _kind_of(cls: type) -> str:
+    for name, known in KINDS.items():
+        if known is cls:
+            return name
+    raise DataError(f"artifact: expected one of {', '.join(KINDS)}, found {cls.__name__}")

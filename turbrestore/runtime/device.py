@@ -1,0 +1,236 @@
+"""Where a stage computes: on the processor with NumPy and OpenCV, or on a device with torch.
+
+A device is a word: ``"cpu"`` is NumPy and OpenCV, ``"cuda"`` a GPU, and ``"auto"`` a GPU where torch sees one and else
+``"cpu"``.  Any other name that torch gives a device may be used from Python: ``"cuda:1"``, or ``"cpu:0"``, which is
+torch on the processor, for tests.  Every stage takes and gives NumPy arrays wherever it computes, and finds the same to
+rounding.
+
+torch is loaded when a device is asked for, and not before: that takes two seconds and 200 MB.  ``"auto"`` loads it only
+where there may be a GPU.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib.util
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..core.decision import Decision
+from ..core.errors import ConfigurationError, require
+
+PROCESSOR = "cpu"
+# Name of the stage whose methods do not all run on a device.
+FLOW = "optical flow"
+# Memory of the process that torch 2.13 takes once it is imported and has computed something on the processor, bytes:
+# 200 MB, and 270 MB the first time, when its modules are compiled as well.  Builds with CUDA take more.
+TORCH_BYTES = 2.8e8
+_NAME = re.compile(r"[a-z]+(:\d+)?")
+_INSTALL = "install turbrestore[torch] or use 'cpu'"
+# What a system with a GPU that torch can use has among its devices: NVIDIA's, those of its boards, AMD's, and that of
+# Windows beneath Linux.  torch has no GPU of this kind under macOS; of other systems nothing is known.
+_NODES = {"linux": ("nvidia*", "nvhost*", "nvmap", "kfd", "dxg"), "darwin": ()}
+_DEVICES = Path("/dev")
+_NO_GPU = "no GPU that torch sees"
+_NO_MEMORY = ("out of memory", "not enough memory")
+
+
+def check_device(name: str) -> None:
+    """Raise unless a setting looks like the name of a device; whether it is there is not asked.
+
+    Parameters
+    ----------
+    name : str
+        What was set.
+
+    Raises
+    ------
+    ConfigurationError
+        It cannot be a name.
+
+    Examples
+    --------
+    >>> check_device("cuda:1")
+    >>> check_device("GPU 1")
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.ConfigurationError: device: expected auto, cpu, cuda or a name that torch knows, found ...
+    """
+    known = isinstance(name, str) and _NAME.fullmatch(name) is not None
+    require(known, f"device: expected auto, cpu, cuda or a name that torch knows, found {name!r}")
+
+
+def find_device(wanted: str) -> str:
+    """Name of the device that a setting means on this machine.
+
+    Parameters
+    ----------
+    wanted : str
+        ``"auto"``, ``"cpu"``, ``"cuda"`` or another of torch's names.
+
+    Returns
+    -------
+    str
+        ``"cpu"``: NumPy and OpenCV; any other: torch on the device of that name.
+
+    Raises
+    ------
+    ConfigurationError
+        A device other than ``"auto"`` and ``"cpu"`` was asked for and is not there, or torch is not installed.
+
+    Examples
+    --------
+    >>> find_device("cpu")
+    'cpu'
+    """
+    check_device(wanted)
+    if wanted == PROCESSOR:
+        return PROCESSOR
+    if wanted == "auto":
+        return "cuda" if needs_torch(wanted) and _cuda_is_there() else PROCESSOR
+    try:
+        import torch
+    except ImportError as error:
+        raise ConfigurationError(f"device: torch is not installed, found {wanted!r}; {_INSTALL}") from error
+    if wanted.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigurationError(f"device: torch sees no CUDA device here, found {wanted!r}; use 'cpu' or 'auto'")
+    try:
+        _compute_on(wanted)
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
+        raise ConfigurationError(f"device: torch has no {wanted!r} here; use 'cpu' or 'auto'") from error
+    return wanted
+
+
+def needs_torch(wanted: str | None) -> bool:
+    """Tell whether torch is loaded to compute on a device, or only to ask for one.
+
+    Parameters
+    ----------
+    wanted : str or None
+        As in :func:`find_device`; None for what is not asked for.
+
+    Returns
+    -------
+    bool
+        False for ``"auto"`` where there is surely no GPU, or no torch.
+
+    Examples
+    --------
+    >>> needs_torch("cpu"), needs_torch("cuda")
+    (False, True)
+    """
+    if wanted == "auto":
+        return importlib.util.find_spec("torch") is not None and _may_have_gpu()
+    return wanted is not None and wanted != PROCESSOR
+
+
+def explain_device(wanted: str, found: str, stages: Mapping[str, str], flow_method: str) -> tuple[Decision, ...]:
+    """Say where the stages computed.
+
+    Parameters
+    ----------
+    wanted : str
+        What was asked for.
+    found : str
+        From :func:`find_device`.
+    stages : mapping of str to str
+        Device of every stage, by the name of the stage.
+    flow_method : str
+        Method of the optical flow; those of OpenCV stay on the processor.
+
+    Returns
+    -------
+    tuple of Decision
+        Empty where the processor was asked for, and nothing else by any stage.
+
+    Examples
+    --------
+    >>> explain_device("cpu", "cpu", {"filter": "cpu"}, "dis")
+    ()
+    >>> explain_device("cuda", "cuda", {"optical flow": "cuda", "filter": "cpu"}, "dis")[1].choice
+    'on the processor'
+    """
+    return tuple(_explanations(wanted, found, stages, flow_method))
+
+
+def _explanations(wanted: str, found: str, stages: Mapping[str, str], flow_method: str) -> Iterator[Decision]:
+    if wanted != PROCESSOR and found == PROCESSOR:
+        yield Decision("device", "processor", _NO_GPU)
+    elif wanted != PROCESSOR:
+        yield Decision("device", found, "asked for" if wanted == found else "a GPU that torch sees")
+    for stage, device in stages.items():
+        if stage == FLOW and device != PROCESSOR and flow_method != "tvl1":
+            reason = f"the method {flow_method} is OpenCV's and runs there only; tvl1 runs on a device"
+            yield Decision(stage, "on the processor", reason)
+        elif device != found:
+            where = "the processor" if device == PROCESSOR else device
+            yield Decision(stage, f"on {where}", "a setting of its own")
+
+
+@contextmanager
+def memory_of(device: str, advice: str) -> Iterator[None]:
+    """Say in one line that the memory of a device is not enough.
+
+    Parameters
+    ----------
+    device : str
+        Its name.
+    advice : str
+        What to do.
+
+    Raises
+    ------
+    ConfigurationError
+        torch finds no memory for what is computed meanwhile.
+
+    Examples
+    --------
+    >>> with memory_of("cuda", "lower the batch"):
+    ...     raise RuntimeError("CUDA out of memory. Tried to allocate 9 GiB")
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.ConfigurationError: device: the memory of 'cuda' is not enough; lower the batch or use 'cpu'
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        # torch names the processor's case in words only.
+        if not any(said in str(error) for said in _NO_MEMORY):
+            raise
+        raise ConfigurationError(f"device: the memory of {device!r} is not enough; {advice} or use 'cpu'") from error
+
+
+@functools.cache
+def _compute_on(device: str) -> float:
+    """Sum on a device: not every one that makes a tensor has numbers in it, or sums in double precision.
+
+    Once is enough; waiting for the answer at every frame would hold a GPU up.
+    """
+    import torch
+
+    return float(torch.ones(2, device=device).sum(dtype=torch.float64))
+
+
+def _cuda_is_there() -> bool:
+    import torch
+
+    return torch.cuda.is_available()
+
+
+def _may_have_gpu() -> bool:
+    """Tell without torch, which takes long to load; False only where it is sure."""
+    nodes = _NODES.get(sys.platform)
+    if nodes is None or any(any(_DEVICES.glob(pattern)) for pattern in nodes):
+        return True
+    if not nodes:
+        return False
+    try:
+        # NVIDIA's nodes may be missing until a program first uses a GPU, but none does without this library.
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,89 @@
+"""Sizes of memory as people write them."""
+
+from __future__ import annotations
+
+import difflib
+from typing import ClassVar, Self
+
+from ..core.errors import ConfigurationError, require
+
+_UNITS = {"": 1, "b": 1, "kb": 1e3, "mb": 1e6, "gb": 1e9, "tb": 1e12, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+_SPELT = {"kb": "kB", "mb": "MB", "gb": "GB", "tb": "TB", "kib": "KiB", "mib": "MiB", "gib": "GiB"}
+# As close as GBB is to GB and G to it, but not as QB is to four of them.
+_CLOSE = 0.65
+
+
+class MemorySize(float):
+    """Number of bytes; text such as ``"2GB"`` or ``"1.5 GiB"`` is understood.
+
+    Parameters
+    ----------
+    value : float or str
+        A number of bytes, or text of a number with a unit: B, kB, MB, GB, TB, KiB, MiB, GiB.
+
+    Raises
+    ------
+    ConfigurationError
+        Neither.
+
+    Examples
+    --------
+    >>> MemorySize("2GB"), MemorySize("1.5 MiB"), MemorySize(3e9)
+    (2000000000.0, 1572864.0, 3000000000.0)
+    """
+
+    _option: ClassVar[str] = "--memory-limit"
+
+    def __new__(cls, value: float | str) -> Self:
+        """Read number and unit."""
+        expected = f"{cls._option}: expected a size such as 2GB, 800MB or 1.5GiB"
+        text = str(value).strip()
+        digits = text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ ")
+        unit = text[len(digits) :].strip().lower()
+        try:
+            size = float(digits) * _UNITS[unit]
+        except (KeyError, ValueError):
+            # Who writes a unit wrong does not mean single bytes.
+            close = difflib.get_close_matches(unit, _SPELT, n=1, cutoff=_CLOSE)
+            meant = f"; did you mean {digits}{_SPELT[close[0]]}?" if digits and close else ""
+            raise ConfigurationError(f"{expected}, found {value!r}{meant}") from None
+        require(0 < size < float("inf"), f"{expected}, found {value!r}")
+        return super().__new__(cls, size)
+
+
+class DeconvolutionMemory(MemorySize):
+    """Number of bytes for the deconvolution alone.
+
+    Examples
+    --------
+    >>> DeconvolutionMemory("plenty")
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.ConfigurationError: --deconvolution.memory: expected a size such as 2GB, 800MB or 1.5GiB, \
+found 'plenty'
+    """
+
+    _option = "--deconvolution.memory"
+
+
+def size_text(size: float) -> str:
+    """Write a number of bytes with a unit in which it is no less than one.
+
+    Parameters
+    ----------
+    size : float
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> [size_text(size) for size in (2, 4100, 280e6, 1.3e9)]
+    ['2 bytes', '4.1 kB', '280 MB', '1.30 GB']
+    """
+    if size >= 1e9:
+        return f"{size / 1e9:.2f} GB"
+    if size >= 1e6:
+        return f"{-(-size // 1e6):.0f} MB"
+    return f"{size / 1e3:.1f} kB" if size >= 1e3 else f"{size:g} bytes"

@@ -1,0 +1,357 @@
+"""Work on a stream of items in threads, a few items ahead, results in order."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import ContextDecorator, ExitStack
+from itertools import islice
+from types import TracebackType
+from typing import Self, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
+
+# An array of this size is the largest from whose release the C library of Linux learns; bytes.
+_LEARNT = 31 << 20
+# Items that one thread sums before it hands the sum over.
+_SUMMED = 4
+
+Item = TypeVar("Item")
+Early = TypeVar("Early")
+Middle = TypeVar("Middle")
+Result = TypeVar("Result")
+
+
+def map_ahead(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    threads: int = 0,
+    on_end: Callable[[], None] | None = None,
+) -> Iterator[tuple[Item, Result]]:
+    """Yield ``(item, function(item))`` in order while threads work a few items ahead.
+
+    Memory is bounded by a handful of items and results, however many there are.  The threads of OpenCV and BLAS are
+    switched off meanwhile: items run side by side already.
+
+    Parameters
+    ----------
+    function : callable
+        Should release the interpreter lock, as OpenCV and NumPy do.
+    items : iterable
+        Consumed lazily, in the calling thread.
+    threads : int
+        0 means one per available core.
+    on_end : callable, optional
+        Called at the end, after an error and where the stream is left early too, before items that have not begun are
+        given up: calls of ``function`` that wait for each other can be woken.
+
+    Yields
+    ------
+    item, result
+
+    Examples
+    --------
+    >>> list(map_ahead(abs, [-1, 2]))
+    [(-1, 1), (2, 2)]
+    """
+    workers = threads or available_cores()
+    _keep_freed_memory()
+    with one_thread_each(), ThreadPoolExecutor(workers) as pool:
+        pending: deque[tuple[Item, Future[Result]]] = deque()
+        try:
+            for item in items:
+                pending.append((item, pool.submit(function, item)))
+                if len(pending) > 2 * workers:
+                    done, future = pending.popleft()
+                    yield done, future.result()
+            while pending:
+                done, future = pending.popleft()
+                yield done, future.result()
+        finally:
+            if on_end is not None:
+                on_end()
+            # After an error or an early end nobody asks for the rest.
+            for _, future in pending:
+                future.cancel()
+
+
+def map_in_turns(
+    early: Callable[[Item], Early],
+    in_turn: Callable[[Early], Middle],
+    late: Callable[[Middle], Result],
+    items: Iterable[Item],
+    threads: int = 0,
+) -> Iterator[Result]:
+    """Yield ``late(in_turn(early(item)))`` in order, one thread from an item's first step to its last.
+
+    ``early`` and ``late`` run side by side, ``in_turn`` for one item after the other in their order, so that it may
+    carry a state along.  An item's data stay in the cache of one core, and no more threads run than there are cores.
+
+    Parameters
+    ----------
+    early, in_turn, late : callable
+    items : iterable
+        Consumed lazily, in the calling thread.
+    threads : int
+        0 means one per available core.
+
+    Yields
+    ------
+    result
+
+    Examples
+    --------
+    >>> from itertools import accumulate
+    >>> sums = iter(accumulate([4, 1, 9]))
+    >>> list(map_in_turns(abs, lambda one: next(sums), float, [4, -1, 9]))
+    [4.0, 5.0, 14.0]
+    """
+    turns, due, broken = threading.Condition(), 0, math.inf
+
+    def break_at(number: float) -> None:
+        nonlocal broken
+        with turns:
+            broken = min(broken, number)
+            turns.notify_all()
+
+    def work(numbered: tuple[int, Item]) -> Result:
+        nonlocal due
+        number, item = numbered
+        try:
+            begun = early(item)
+            with turns:
+                turns.wait_for(lambda: due == number or broken < number)
+                if broken < number:
+                    raise RuntimeError("an earlier item failed, or nobody asks for this one any more")
+                middle = in_turn(begun)
+                due += 1
+                turns.notify_all()
+        except BaseException:
+            break_at(number)
+            raise
+        return late(middle)
+
+    # An item that is given up before it begins never has its turn, so those that have begun must not wait for it.
+    for _, result in map_ahead(work, enumerate(items), threads, on_end=lambda: break_at(-1)):
+        yield result
+
+
+def sum_in_threads(
+    add: Callable[[list[Item]], tuple[NDArray[np.float64], ...]], items: Iterable[Item], threads: int = 0
+) -> tuple[NDArray[np.float64], ...]:
+    """Sum arrays over items: those of a few items in one thread, then those sums in order.
+
+    Which items go together does not depend on the number of threads, so neither do the bytes of the result.
+
+    Parameters
+    ----------
+    add : callable
+        From a few consecutive items to the sums of what is made of them.
+    items : iterable
+        At least one; consumed lazily, in the calling thread.
+    threads : int
+        0 means one per available core.
+
+    Returns
+    -------
+    tuple of ndarray, float64
+
+    Examples
+    --------
+    >>> sum_in_threads(lambda some: (np.array(sum(some), np.float64),), range(100))
+    (array(4950.),)
+    """
+    totals: tuple[NDArray[np.float64], ...] = ()
+    for _, sums in map_ahead(add, in_batches(items, _SUMMED), threads):
+        totals = tuple(np.add(*pair, out=pair[0]) for pair in zip(totals, sums, strict=True)) if totals else sums
+    return totals
+
+
+class ThreadTeam:
+    """Threads that share out some work, the calling thread among them.
+
+    Handing an item to a sleeping thread takes as long as a pass over a small image, so the caller does not sleep
+    meanwhile.  Of one thread there are none but the caller.
+
+    Parameters
+    ----------
+    threads : int
+        At least 1, with the caller.
+
+    Examples
+    --------
+    >>> with ThreadTeam(2) as team:
+    ...     list(team.map(abs, [-2, 3]))
+    [2, 3]
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._count = threads - 1
+        # It starts no thread before there is something for it to do.
+        self._others = ThreadPoolExecutor(max(self._count, 1))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._others.shutdown()
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Yield ``function(item)`` in order; nothing begins before the first is asked for.
+
+        All have ended when this has, also after an error or where it is left early; it may be called within itself.
+
+        Parameters
+        ----------
+        function : callable
+            Should release the interpreter lock.
+        items : iterable
+
+        Yields
+        ------
+        result
+        """
+        left, found, due = deque(enumerate(items)), dict[int, Result](), 0
+
+        def take_one() -> bool:
+            try:
+                number, item = left.popleft()
+            except IndexError:
+                return False
+            found[number] = function(item)
+            return True
+
+        def help_out() -> None:
+            try:
+                while take_one():
+                    pass
+            finally:
+                # After an error nobody asks for the rest.
+                left.clear()
+
+        others: list[Future[None]] = []
+        try:
+            others.extend(self._others.submit(help_out) for _ in range(min(self._count, len(left) - 1)))
+            while take_one():
+                while due in found:
+                    yield found.pop(due)
+                    due += 1
+            # One that has not begun may be queued behind a thread that waits for this one.
+            for other in others:
+                if not other.cancel():
+                    other.result()
+            while due in found:
+                yield found.pop(due)
+                due += 1
+        finally:
+            left.clear()
+            wait(other for other in others if not other.cancel())
+
+
+def in_batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
+    """Yield lists of ``size`` consecutive items, the last perhaps shorter.
+
+    Parameters
+    ----------
+    items : iterable
+        Consumed lazily.
+    size : int
+
+    Yields
+    ------
+    list
+
+    Examples
+    --------
+    >>> list(in_batches("abc", 2))
+    [['a', 'b'], ['c']]
+    """
+    stream = iter(items)
+    return iter(lambda: list(islice(stream, size)), [])
+
+
+def available_cores() -> int:
+    """Count the cores that this process may use.
+
+    Returns
+    -------
+    int
+
+    Examples
+    --------
+    >>> available_cores() >= 1
+    True
+    """
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class _OneThreadEach(ContextDecorator):
+    """Threads of OpenCV and BLAS, switched off while anybody is inside: the first takes them, the last gives them back.
+
+    Two streams that are worked on in turns do not end in the order in which they began.
+    """
+
+    def __init__(self) -> None:
+        # Reentrant: memory that is collected meanwhile may end a stream in this very thread.
+        self._lock = threading.RLock()
+        self._inside = 0
+        self._restore = ExitStack()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._restore.callback(cv2.setNumThreads, cv2.getNumThreads())
+                self._restore.enter_context(_controller().limit(limits=1, user_api="blas"))
+                cv2.setNumThreads(1)
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._restore.close()
+
+
+@functools.cache
+def one_thread_each() -> _OneThreadEach:
+    """Keep OpenCV and BLAS from starting threads of their own, and give them back what they had afterwards.
+
+    Beside busy threads a BLAS call on two threads is not twice as fast but tens of times slower: each waits for the
+    other to be scheduled.  Uses may overlap, in one thread or in several: what they had comes back after the last.
+
+    Returns
+    -------
+    context manager
+        The same every time; a decorator too.
+
+    Examples
+    --------
+    >>> with one_thread_each():
+    ...     cv2.getNumThreads()
+    1
+    """
+    return _OneThreadEach()
+
+
+@functools.cache
+def _controller() -> ThreadpoolController:
+    """Libraries with threads of their own; finding them takes a millisecond, as long as a small frame."""
+    return ThreadpoolController()
+
+
+def _keep_freed_memory() -> None:
+    """Let the C library keep what arrays of a frame give back for the next ones.
+
+    By default glibc gives every array of a megabyte back to the system, and filling the pages of the next one with
+    zeros takes a seventh of the time of optical flow at 512×512.  It keeps what is smaller than the largest array that
+    it has seen given back (mallopt(3), M_MMAP_THRESHOLD), so one that is never filled is all it takes.
+    """
+    np.empty(_LEARNT, np.uint8)
