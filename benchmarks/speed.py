@@ -332,9 +332,9 @@ def as_restored() -> AbstractContextManager[None]:
 def started(stack: np.ndarray, params: FlowParams, start_level: int) -> float:
     """Seconds of a flow of a frame that has been prepared, from an earlier flow."""
     # Other trees, which are measured by this script too, have none of these.
-    from turbrestore.registration.flow import FlowFrame, fill_flows, refer_flow
+    from turbrestore.registration.flow import FlowFrame, fill_flows, prepare_reference
 
-    reference, prepared = refer_flow(stack.mean(axis=0), params, start_level), dict[int, FlowFrame]()
+    reference, prepared = prepare_reference(stack.mean(axis=0), params, start_level), dict[int, FlowFrame]()
     flows = np.zeros((*stack.shape[:3], 2), np.float32)
     fill_flows(reference, stack, flows, prepared)
     (seconds, _), _ = clocked(lambda: fill_flows(reference, stack, flows, prepared, again=True))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from .blind.guards import GuardParams, GuardReading
@@ -22,8 +22,6 @@ from .footage.frame_selection import Share, check_share
 from .registration.centroid import Centroid, CentroidParams
 from .registration.coverage import Rectangle
 from .registration.flow import FlowParams
-from .runtime.device import FLOW, PROCESSOR, check_device, explain_device, find_device
-from .runtime.memory_size import MemorySize
 from .tiled_stages import FilteredTiles
 
 if TYPE_CHECKING:
@@ -83,13 +81,6 @@ class RestoreParams:
     blur_bounds : bool
         Keep an estimated width of the blur within what the blur of frames, mean and fused image relative to each other
         allows.
-    memory_limit : float, optional
-        Most memory to take, such as 2GB: training frames then go to a file, and fewer threads work, where that is
-        needed.  The result is the same unless even so fewer frames have to be trained on, or frames are too large and
-        have to be worked on in tiles that overlap.
-    device : str
-        Where flow (tvl1), warps, fusion and deconvolution are computed: cpu, cuda, or auto for a GPU where torch sees
-        one.  It holds for the stages that have no ``device`` of their own.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -110,8 +101,6 @@ class RestoreParams:
     border: Literal["keep", "crop"] = "keep"
     displacement_cue: bool = False
     blur_bounds: bool = False
-    memory_limit: MemorySize | None = None
-    device: str = PROCESSOR
     flow: FlowParams = field(default_factory=FlowParams)
     centroid: CentroidParams = field(default_factory=CentroidParams)
     dynamics: DynamicsParams = field(default_factory=DynamicsParams)
@@ -120,10 +109,6 @@ class RestoreParams:
     guards: GuardParams = field(default_factory=GuardParams)
 
     def __post_init__(self) -> None:
-        check_device(self.device)
-        if self.memory_limit is not None:
-            # A number or text is as good where settings are written in Python.
-            object.__setattr__(self, "memory_limit", MemorySize(self.memory_limit))
         require(self.train is None or self.train >= 2, f"train: expected 2 frames or more, found {self.train}")
         require(
             self.until == STAGES[-1] or self.deconvolution.sigma is None,
@@ -140,58 +125,6 @@ class RestoreParams:
             not self.blur_bounds or (self.until == STAGES[-1] and self.deconvolution.sigma is None),
             "blur_bounds: has an effect only where the width of the blur is estimated; leave it out",
         )
-
-
-def place_stages(params: RestoreParams) -> RestoreParams:
-    """Find the device of every stage that has one: its own, or that of the whole chain.
-
-    Parameters
-    ----------
-    params : RestoreParams
-
-    Returns
-    -------
-    RestoreParams
-
-    Raises
-    ------
-    ConfigurationError
-        One of them is not there.
-
-    Examples
-    --------
-    >>> place_stages(RestoreParams()).flow.device
-    'cpu'
-    """
-    flow, fusion, deconvolution = params.flow, params.filter, params.deconvolution
-    return replace(
-        params,
-        flow=replace(flow, device=find_device(flow.device or params.device)),
-        filter=replace(fusion, device=find_device(fusion.device or params.device)),
-        deconvolution=replace(deconvolution, device=find_device(deconvolution.device or params.device)),
-    )
-
-
-def explain_devices(params: RestoreParams) -> tuple[Decision, ...]:
-    """Say where the stages compute.
-
-    Parameters
-    ----------
-    params : RestoreParams
-        From :func:`place_stages`.
-
-    Returns
-    -------
-    tuple of Decision
-
-    Examples
-    --------
-    >>> explain_devices(place_stages(RestoreParams()))
-    ()
-    """
-    placed = {FLOW: params.flow.device, "filter": params.filter.device, "deconvolution": params.deconvolution.device}
-    stages = {name: device or PROCESSOR for name, device in placed.items()}
-    return explain_device(params.device, find_device(params.device), stages, params.flow.method)
 
 
 @dataclass(frozen=True)

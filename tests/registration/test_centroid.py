@@ -141,13 +141,13 @@ def test_bad_input_is_refused(sequence):
 
 
 def test_starts_from_a_blurred_mean_are_mended_a_level_above_the_finest(monkeypatch):
-    levels, refer = [], centroid.refer_flow
+    levels, refer = [], centroid.prepare_reference
 
     def spied(image, params, start_level=0):
         levels.append(start_level)
         return refer(image, params, start_level)
 
-    monkeypatch.setattr(centroid, "refer_flow", spied)
+    monkeypatch.setattr(centroid, "prepare_reference", spied)
     frames = np.random.default_rng(0).random((3, 32, 32)).astype(np.float32)
     centroid.find_centroid(frames, centroid.CentroidParams(iterations=2))
     assert set(levels) == {1}

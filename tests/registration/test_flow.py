@@ -17,7 +17,7 @@ from turbrestore.registration.flow import (
     fill_flows,
     iterate_flows,
     normalise_contrast,
-    refer_flow,
+    prepare_reference,
 )
 from turbrestore.registration.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
@@ -162,11 +162,11 @@ def test_what_is_prepared_of_a_frame_serves_every_reference():
     stack = np.stack([pair(seed)[1] for seed in range(3)])
     one, other = pair(0)[0], pair(1)[0]
     kept, flows = {}, np.empty((3, *stack.shape[1:], 2), np.float32)
-    fill_flows(refer_flow(one), stack, flows, kept)
+    fill_flows(prepare_reference(one), stack, flows, kept)
     assert sorted(kept) == [0, 1, 2]
     assert np.array_equal(flows, estimate_flow(one, stack))
     # From what was kept, not from the stack.
-    fill_flows(refer_flow(other), np.zeros_like(stack), flows, kept)
+    fill_flows(prepare_reference(other), np.zeros_like(stack), flows, kept)
     assert np.array_equal(flows, estimate_flow(other, stack))
 
 
@@ -175,7 +175,7 @@ def test_a_flow_from_a_good_start_is_as_good_as_one_from_none(method):
     reference, frame, truth = pair(rms=2.0)
     params, found = FlowParams(method=method, confidence=False), (truth + np.float32(0.5))[None]
     anew = estimate_flow(reference, frame[None], params)[0]
-    fill_flows(refer_flow(reference, params), frame[None], found, again=True)
+    fill_flows(prepare_reference(reference, params), frame[None], found, again=True)
     errors = [endpoint_error(one[8:-8, 8:-8], truth[8:-8, 8:-8]) for one in (found[0], anew)]
     assert errors[0] <= 1.05 * errors[1] + 0.005
 
@@ -187,7 +187,7 @@ def test_a_flow_begins_at_its_start(finest):
     image, errors = texture(size=160), []
     for start in (10, 10 + 12 * 2**finest):
         flows = np.full((1, 160, 160, 2), (start, 0), np.float32)
-        fill_flows(refer_flow(image, params), np.roll(image, 10, axis=1)[None], flows, again=True)
+        fill_flows(prepare_reference(image, params), np.roll(image, 10, axis=1)[None], flows, again=True)
         errors.append(float(np.abs(flows[0, 40:-40, 40:-40, 0] - 10).mean()))
     assert errors[0] < 0.1
     assert errors[1] > 2
@@ -199,7 +199,7 @@ def test_a_start_includes_the_shift_of_the_frame(method):
     frame = np.roll(frame, 20, axis=1)
     flows = estimate_flow(reference, frame[None], params)
     again = flows.copy()
-    fill_flows(refer_flow(reference, params), frame[None], again, again=True)
+    fill_flows(prepare_reference(reference, params), frame[None], again, again=True)
     inside = np.s_[0, 30:-30, 30:-30, 0]
     assert np.median(flows[inside]) == pytest.approx(20, abs=0.1)
     assert again[inside] == pytest.approx(flows[inside], abs=0.2)
@@ -208,7 +208,7 @@ def test_a_start_includes_the_shift_of_the_frame(method):
 @pytest.mark.parametrize(("method", "most"), [("dis", 0.05), ("tvl1", 0.5)])
 def test_the_shift_of_a_start_is_not_measured_again(monkeypatch, method, most):
     reference, params = texture(size=128), FlowParams(method=method)
-    frame, target = np.roll(reference, 20, axis=1), refer_flow(reference, params)
+    frame, target = np.roll(reference, 20, axis=1), prepare_reference(reference, params)
     flows = estimate_flow(reference, frame[None], params)
 
     def refuse(*arguments):
@@ -229,7 +229,7 @@ def test_where_half_of_the_scene_moves_the_other_stays(motion):
     frame[:, 80:] = np.roll(reference, motion, axis=1)[:, 80:]
     flows = estimate_flow(reference, frame[None])
     for _ in range(2):
-        fill_flows(refer_flow(reference), frame[None], flows, again=True)
+        fill_flows(prepare_reference(reference), frame[None], flows, again=True)
         assert np.abs(flows[0, :, :12]).max() < 0.05
 
 
@@ -238,14 +238,14 @@ def test_a_flow_with_a_start_begins_at_its_level_and_is_refined_half_as_often(re
     image, params = texture(size=64), FlowParams(confidence=False, dis=DisParams(refinements=refinements))
     frame, start = np.roll(image, 2, axis=1), np.full((1, 64, 64, 2), (1, 0), np.float32)
     found = start.copy()
-    fill_flows(refer_flow(image, params, level), frame[None], found, again=True)
+    fill_flows(prepare_reference(image, params, level), frame[None], found, again=True)
     solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     solver.setCoarsestScale(level)
     solver.setFinestScale(0)
     solver.setPatchStride(params.dis.patch_stride)
     solver.setVariationalRefinementIterations(half)
     solver.setVariationalRefinementAlpha(params.dis.smoothness)
-    levels = [refer_flow(image, params).prepare(one).levels for one in (image, frame)]
+    levels = [prepare_reference(image, params).prepare(one).levels for one in (image, frame)]
     assert np.array_equal(found[0], solver.calc(*levels, start[0].copy()))
 
 
@@ -253,8 +253,10 @@ def test_a_flow_with_a_start_begins_at_its_level_and_is_refined_half_as_often(re
 def test_tvl1_with_a_start_goes_through_two_levels(level):
     reference, frame, truth = pair(rms=2.0)
     params, found = FlowParams(method="tvl1", confidence=False), truth[None].copy()
-    fill_flows(refer_flow(reference, params, level), frame[None], found, again=True)
-    grey = [refer_flow(reference, params).prepare(image).levels.astype(np.float32) for image in (reference, frame)]
+    fill_flows(prepare_reference(reference, params, level), frame[None], found, again=True)
+    grey = [
+        prepare_reference(reference, params).prepare(image).levels.astype(np.float32) for image in (reference, frame)
+    ]
     anew = refer_tvl1(grey[0], TvL1Params(levels=2))
     assert np.array_equal(found[0], tvl1_flows(grey[1][None], anew, truth[None]).flows[0])
 
@@ -263,7 +265,7 @@ def test_tvl1_with_a_start_goes_through_two_levels(level):
 def test_of_a_batch_some_have_a_start_and_some_have_none(method):
     params = FlowParams(method=method)
     reference, _, _ = pair(0)
-    target = refer_flow(reference, params)
+    target = prepare_reference(reference, params)
     frames = [target.prepare(pair(seed)[1]) for seed in range(4)]
     for number in (1, 2):
         frames[number] = replace(frames[number], start=pair(number)[2])
@@ -277,7 +279,7 @@ def test_of_a_batch_some_have_a_start_and_some_have_none(method):
 def test_a_start_in_the_smallest_images(shape, method):
     image = texture(size=64)[: shape[0], : shape[1]]
     flows, params = np.zeros((1, *shape, 2), np.float32), FlowParams(method=method)
-    fill_flows(refer_flow(image, params, start_level=1), image[None], flows, again=True)
+    fill_flows(prepare_reference(image, params, start_level=1), image[None], flows, again=True)
     assert np.abs(flows).max() < 0.1
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from ..blur.blur_cues import BlurBounds
 from ..blur.estimation import BlurEstimate, estimate_blur
@@ -15,8 +13,8 @@ from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray
 from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, deconvolve
+from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import to_scratch
-from ..runtime.threads import available_cores
 from .blur_map import BlurMap, deconvolve_varying, estimate_blur_map, sigma_map
 from .guards import GuardParams, GuardReading, deconvolve_guarded, judge
 
@@ -51,9 +49,8 @@ def remove_blur(
     deconvolution: DeconvolutionParams | None = None,
     guards: GuardParams | None = None,
     bounds: BlurBounds | None = None,
+    runtime: Runtime = DEFAULT,
     progress: Callable[[int], None] | None = None,
-    scratch: Path | None = None,
-    in_file: bool = False,
 ) -> Deblurred:
     """Deblur an image by the width asked for, else by the width estimated, as far as the guards allow.
 
@@ -74,12 +71,10 @@ def remove_blur(
         Bounds that the result must keep.
     bounds : BlurBounds, optional
         What an estimated width is kept within.
+    runtime : Runtime
+        Threads, device, most memory to take, and a folder for the images; without one they stay in memory.
     progress : callable, optional
         Called with the number of iterations done, in an attempt by one width.
-    scratch : Path, optional
-        Folder of files for what memory does not hold; by default that of temporary files.
-    in_file : bool
-        Whether deblurred images are kept in files.
 
     Returns
     -------
@@ -101,20 +96,20 @@ def remove_blur(
     >>> result.decisions
     (Decision(subject='blur', choice='none removed', reason='asked for'),)
     """
-    folder = (scratch or Path(tempfile.gettempdir())) if in_file else None
+    folder = runtime.scratch
     deconvolution, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
     blind = deconvolution.sigma is None
     exponent = deconvolution.exponent or KOLMOGOROV
-    blur = estimate_blur(image, exponent=exponent, threads=available_cores()) if blind else None
+    blur = estimate_blur(image, exponent=exponent, threads=runtime.workers) if blind else None
     sigma, settings = blur_to_remove(blur, deconvolution, bounds)
 
     def remove(width: float, progress: Callable[[int], None] | None = None) -> Deconvolution:
-        result = deconvolve(image, width, settings, guide, progress, scratch)
+        result = deconvolve(image, width, settings, guide, runtime, progress)
         return replace(result, image=to_scratch(result.image, folder))
 
     tiles, first = None, None
     if blur is not None and blur.blurred and bounds is None:
-        if settings.memory is not None:
+        if runtime.memory_limit is not None:
             # Both at once may take more than is allowed.
             tiles = estimate_blur_map(image, blur)
         else:

@@ -52,10 +52,10 @@ from ..core.errors import require, require_between
 from ..core.noise import estimate_noise
 from ..display.plots import plot_objective
 from ..display.preview import preview
-from ..runtime.device import PROCESSOR, check_device, find_device
-from ..runtime.memory_size import DeconvolutionMemory
+from ..runtime.device import PROCESSOR, find_device
+from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import drop_pages, new_stack, to_scratch
-from ..runtime.threads import ThreadTeam, available_cores, one_thread_each
+from ..runtime.threads import ThreadTeam, one_thread_each
 from .conjugate_gradient import ConjugateGradients
 from .deconvolution_memory import DeconvolutionWork, Room
 from .nonlocal_penalty import NonlocalPenalty
@@ -117,14 +117,6 @@ class DeconvolutionParams:
         patches tell more about which pixels belong together (0.2 to 4 dB on photographs, brick and text).
     weights : NonlocalParams
         Nonlocal weights.
-    device : str, optional
-        Where weights and image are computed: cpu, cuda or auto.  By default where the whole chain is computed, and cpu
-        for this stage alone.
-    memory : DeconvolutionMemory, optional
-        Most that may be taken, such as 500MB; it has no effect on a device.  Where that is too little, the nonlocal
-        pairs and what is known of them are kept in a file, then images too, also the one that is returned, and then
-        fewer threads work, to the same result.  What remains is taken whatever is asked for, see
-        :mod:`turbrestore.deconvolution.deconvolution_memory`.  By default there is no limit.
     """
 
     method: Literal["nltv", "tv", "wiener", "tikhonov"] = "nltv"
@@ -137,8 +129,6 @@ class DeconvolutionParams:
     channels: Literal["luminance", "each"] = "luminance"
     sharpen_guide: bool = True
     weights: NonlocalParams = field(default_factory=NonlocalParams)
-    device: str | None = None
-    memory: DeconvolutionMemory | None = None
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -155,11 +145,6 @@ class DeconvolutionParams:
             require_between("fidelity", self.fidelity, 1e-6, 1e9)
         require_between("iterations", self.iterations, 1, 100_000)
         require_between("tolerance", self.tolerance, 0, 1)
-        if self.device is not None:
-            check_device(self.device)
-        if self.memory is not None:
-            # A number or text is as good where settings are written in Python.
-            object.__setattr__(self, "memory", DeconvolutionMemory(self.memory))
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,8 +221,8 @@ def deconvolve(
     sigma_or_psf: float | BlurEstimate | ArrayLike,
     params: DeconvolutionParams | None = None,
     guide: ArrayLike | None = None,
+    runtime: Runtime = DEFAULT,
     progress: Callable[[int], None] | None = None,
-    scratch: Path | None = None,
 ) -> Deconvolution:
     """Deblur an image.
 
@@ -254,10 +239,10 @@ def deconvolve(
     guide : array_like, shape (H, W) or (H, W, 3), optional
         Image that nonlocal weights are taken from, as blurred as ``image``; by default ``image``. The paper takes
         the centroid.
+    runtime : Runtime
+        Threads, device and the most memory to take.
     progress : callable, optional
         Called with 1 after each iteration. Channels are solved side by side.
-    scratch : Path, optional
-        Folder of files for what ``params.memory`` does not allow in memory; by default that of temporary files.
 
     Returns
     -------
@@ -297,9 +282,9 @@ def deconvolve(
     shape = size[0] + sum(widths[0]), size[1] + sum(widths[1])
     inside = tuple(slice(before, before + length) for (before, _), length in zip(widths, size, strict=True))
     otf = blur_otf(shape, sigma, params.exponent or GAUSSIAN) if psf is None else psf_to_otf(psf, shape)
-    memory = params.memory if find_device(params.device or PROCESSOR) == PROCESSOR else None
-    room = DeconvolutionWork(shape, len(planes), params.method, params.weights).room(memory, available_cores())
-    folder = scratch or Path(tempfile.gettempdir())
+    memory = runtime.memory_limit if find_device(runtime.device) == PROCESSOR else None
+    room = DeconvolutionWork(shape, len(planes), params.method, params.weights).room(memory, runtime.workers)
+    folder = runtime.scratch or Path(tempfile.gettempdir())
     with one_thread_each(), ThreadTeam(room.threads) as team:
         grid = StripGrid(shape, team, folder if room.images_in_file else None)
         swings = params.boundary == "unknown" and params.method in ("nltv", "tv")
@@ -309,7 +294,7 @@ def deconvolve(
         around = None if around is None else to_scratch(around, grid.folder)
         for array in (pixels, guide):
             drop_pages(array)
-        result = _solve(problems, params, around, progress, _Workshop(team, room, folder))
+        result = _solve(problems, params, around, progress, _Workshop(team, room, folder, runtime.device))
     restored = new_stack(pixels.shape, grid.folder)
 
     def join(rows: slice) -> None:
@@ -397,6 +382,7 @@ class _Workshop(NamedTuple):
     team: ThreadTeam
     room: Room
     folder: Path
+    device: str
 
 
 def _solve(
@@ -406,8 +392,8 @@ def _solve(
     progress: Callable[[int], None] | None,
     workshop: _Workshop,
 ) -> _Solution:
-    if find_device(params.device or PROCESSOR) != PROCESSOR:
-        return _solve_on_device(problems, params, guide, progress)
+    if find_device(workshop.device) != PROCESSOR:
+        return _solve_on_device(problems, params, guide, progress, find_device(workshop.device))
     if params.method in ("wiener", "tikhonov"):
         quadratic = _quadratic_solver(problems[0].grid, params.method)
         return _iterate(quadratic, problems, [quadratic.start(p) for p in problems], params, progress)
@@ -429,6 +415,7 @@ def _solve_on_device(
     params: DeconvolutionParams,
     guide: FloatArray | None,
     progress: Callable[[int], None] | None,
+    device: str,
 ) -> _Solution:
     settings = SolverSettings(
         params.method,
@@ -439,7 +426,7 @@ def _solve_on_device(
         params.sharpen_guide,
         params.weights,
     )
-    found = solve_on_device(problems, guide, settings, find_device(params.device or PROCESSOR), progress)
+    found = solve_on_device(problems, guide, settings, device, progress)
     recorded, objective, changes = zip(*found.records, strict=True)
     figures = np.array(recorded), np.array(objective), np.array(changes)
     return _Solution(found.images, found.iterations, found.converged, *figures)

@@ -23,12 +23,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from ..core.arrays import FloatArray
 from ..core.errors import require_between
+from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import to_scratch
 from ..runtime.threads import one_thread_each
 from .flow_model import Float64Array, FlowDynamics
@@ -88,8 +88,7 @@ class DynamicsParams:
 def identify(
     flows: FloatArray | Iterable[FloatArray],
     params: DynamicsParams | None = None,
-    scratch: Path | None = None,
-    threads: int = 0,
+    runtime: Runtime = DEFAULT,
 ) -> FlowDynamics:
     """Fit the dynamic texture to a training sequence of flows (paper 3, sections 3.1 and 3.2).
 
@@ -100,10 +99,8 @@ def identify(
         held as a whole. An iterable is run through once for the shapes and twice for every 32 MB that its flows
         take as float64, which is free for a list of arrays and dear for flows made on the fly.
     params : DynamicsParams, optional
-    scratch : Path, optional
-        Folder of files that hold C and the maps; by default they are in memory.
-    threads : int
-        Parts of the image worked on side by side; 0 means one per available core.
+    runtime : Runtime
+        Threads, and a folder for C and the maps; without one they stay in memory.
 
     Returns
     -------
@@ -127,14 +124,14 @@ def identify(
     (2, array([1., 1.]))
     """
     params = params or DynamicsParams()
-    strips = FlowStrips.of(flows, threads)
+    strips = FlowStrips.of(flows, runtime.threads)
     mean, gram, norm = gram_matrix(strips)
     singular_values, V = singular_vectors(gram)
     pixels = 2 * strips.height * strips.width
     present = int(np.count_nonzero(singular_values > _ROUNDING * norm))
     n = _rank(singular_values, present, pixels, params)
     states = singular_values[:n, None] * V[:, :n].T
-    C, residual_energy = spatial_modes(strips, mean, singular_values[:n], V[:, :n], scratch)
+    C, residual_energy = spatial_modes(strips, mean, singular_values[:n], V[:, :n], runtime.scratch)
     residual_variance = np.divide(residual_energy, max(strips.count - 1 - n, 1), out=residual_energy)
     A, Q = _transition(states, params.ridge)
     energy = float(np.sum(singular_values[:present] ** 2))
@@ -144,14 +141,14 @@ def identify(
         C=C,
         Q=Q,
         R=float(residual_variance.mean()),
-        residual_variance=to_scratch(residual_variance.astype(np.float32), scratch),
-        mean_flow=to_scratch(mean, scratch),
+        residual_variance=to_scratch(residual_variance.astype(np.float32), runtime.scratch),
+        mean_flow=to_scratch(mean, runtime.scratch),
         states=states,
         singular_values=singular_values,
         energy_share=float(np.sum(singular_values[:n] ** 2)) / energy if energy else 1.0,
         overfitted=overfitted,
         notes=_notes(A, strips.count, n, present, overfitted, params),
-        motion_factor=to_scratch(np.ones(mean.shape[:2], np.float32), scratch),
+        motion_factor=to_scratch(np.ones(mean.shape[:2], np.float32), runtime.scratch),
     )
 
 

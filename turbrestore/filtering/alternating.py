@@ -55,7 +55,8 @@ from ..display.plots import plot_frames
 from ..display.preview import preview
 from ..dynamics.flow_model import FlowDynamics, flow_of
 from ..registration.flow import FlowFrame, FlowParams, iterate_flows
-from ..runtime.device import PROCESSOR, check_device, find_device
+from ..runtime.device import PROCESSOR, find_device
+from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import one_thread_each
 from .flow_tracking import Frames, TrackedFrame, Tracking, state_covariances, track_known, track_measured
 from .frame_noise import FrameNoise, measure_frame_noise
@@ -98,9 +99,6 @@ class FilterParams:
         S: variance by which the image may drift from one frame to the next, squared intensity.
     prior_frames : float
         How many frames' worth of information the starting image carries; 0 lets the first frames replace it.
-    device : str, optional
-        Where frames are warped and fused: cpu, cuda or auto; on the processor where blur is what counts.  By
-        default where the whole chain is computed, and cpu for this stage alone.
     """
 
     residual: Literal["keep", "drop"] = "keep"
@@ -112,7 +110,6 @@ class FilterParams:
     image_noise: float | None = None
     image_drift: float = 0.0
     prior_frames: float = 0.0
-    device: str | None = None
 
     def __post_init__(self) -> None:
         require(
@@ -131,8 +128,6 @@ class FilterParams:
             require_between("image_noise", self.image_noise, 1e-12, 1)
         require_between("image_drift", self.image_drift, 0, 1)
         require_between("prior_frames", self.prior_frames, 0, 1e6)
-        if self.device is not None:
-            check_device(self.device)
 
 
 @dataclass(frozen=True)
@@ -277,6 +272,7 @@ def filter_frames(
     params: FilterParams | None = None,
     flow_params: FlowParams | None = None,
     known_flows: ArrayLike | None = None,
+    runtime: Runtime = DEFAULT,
     progress: Callable[[int], None] | None = None,
     counted: ArrayLike | None = None,
     start: FilterCheckpoint | None = None,
@@ -302,6 +298,8 @@ def filter_frames(
         How flow is measured.
     known_flows : array_like, shape (K, H, W, 2), optional
         Flows already measured from ``reference`` to the first K frames, pixels; they form the first block.
+    runtime : Runtime
+        Threads and device.
     progress : callable, optional
         Called with 1 after each measured flow.
     counted : array_like, bool, shape (N,), optional
@@ -346,10 +344,10 @@ def filter_frames(
     stream = _checked(frames, image.shape)
     first = _first_block(stream, params.block, flows)
     if flows is None:
-        flows = np.stack([flow for _, flow in iterate_flows(image, first, flow_params)])
-    model = _noise_model(first, flows, image, dynamics, params, flow_params.threads)
-    fusion, share = _fusion(model, params), cv2.merge([model.motion_share] * 2)
-    tracking = Tracking(dynamics, model, share, params.sharpness, flow_params, fusion is None, progress)
+        flows = np.stack([flow for _, flow in iterate_flows(image, first, flow_params, runtime)])
+    model = _noise_model(first, flows, image, dynamics, params, runtime.threads)
+    fusion, share = _fusion(model, params, runtime), cv2.merge([model.motion_share] * 2)
+    tracking = Tracking(dynamics, model, share, params.sharpness, flow_params, runtime, fusion is None, progress)
     setting = _Setting(tracking, params, fusion, marks, flows)
     begun = deque(first if params.inner_iterations > 1 else [])
     prepared = {} if prepared is None else prepared
@@ -535,9 +533,9 @@ def _filter_window(
     return _Standing(state, records, newest)
 
 
-def _fusion(model: FrameNoise, params: FilterParams) -> DeviceFusion | None:
+def _fusion(model: FrameNoise, params: FilterParams, runtime: Runtime) -> DeviceFusion | None:
     """Bring to a device what fusion needs; None for the processor, where alone blur is measured."""
-    device = find_device(params.device or PROCESSOR)
+    device = find_device(runtime.device)
     if device == PROCESSOR or model.blur is not None:
         return None
     return load_fusion(model, params.sharpness, params.image_drift, device)

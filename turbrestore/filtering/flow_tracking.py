@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..dynamics.flow_model import FlowDynamics, flow_of, project_deviation
-from ..registration.flow import FlowFrame, FlowParams, refer_flow
+from ..registration.flow import FlowFrame, FlowParams, prepare_reference
 from ..registration.warp import warp
+from ..runtime.runtime import Runtime
 from ..runtime.scratch import drop_pages, iter_frames
 from ..runtime.threads import in_batches, map_in_turns
 from .frame_noise import FrameNoise, judge_frame
@@ -95,6 +96,7 @@ class Tracking:
     sharpness : float
         β, see :func:`turbrestore.filtering.frame_noise.judge_frame`.
     flow : FlowParams
+    runtime : Runtime
     registers : bool
         Whether frames are registered too.
     progress : callable or None
@@ -106,6 +108,7 @@ class Tracking:
     motion_share: FloatArray
     sharpness: float
     flow: FlowParams
+    runtime: Runtime
     registers: bool
     progress: Callable[[int], None] | None
 
@@ -182,7 +185,7 @@ def track_known(
     TrackedFrame
     """
     pairs = ([pair] for pair in zip(iter_frames(frames), iter_frames(flows), strict=True))
-    return _track(state, covariances, pairs, list, tracking.flow.threads, tracking)
+    return _track(state, covariances, pairs, list, tracking.runtime.threads, tracking)
 
 
 def track_measured(
@@ -221,7 +224,7 @@ def track_measured(
     ------
     TrackedFrame
     """
-    reference = refer_flow(image, tracking.flow)
+    reference = prepare_reference(image, tracking.flow, tracking.runtime)
 
     def prepare(index: int, frame: FloatArray) -> FlowFrame:
         found = reference.frame(index, frame, prepared, index < number + done)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import cv2
@@ -27,10 +26,10 @@ from ..core.arrays import FloatArray, check_frames
 from ..core.errors import require, require_between
 from ..display.plots import plot_displacements
 from ..display.preview import preview
-from ..runtime.device import PROCESSOR
+from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
 from ..runtime.threads import map_ahead, sum_in_threads
-from .flow import FlowFrame, FlowParams, fill_flows, refer_flow
+from .flow import FlowFrame, FlowParams, fill_flows, prepare_reference
 from .global_shift import mean_stabilised
 from .warp import compose_flows, inside, invert_flow, warp
 
@@ -127,9 +126,9 @@ def find_centroid(
     frames: ArrayLike,
     params: CentroidParams | None = None,
     flow_params: FlowParams | None = None,
-    progress: Callable[[int], None] | None = None,
-    scratch: Path | None = None,
+    runtime: Runtime = DEFAULT,
     prepared: dict[int, FlowFrame] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Centroid:
     """Iterate to the centroid of ``frames``.
 
@@ -141,12 +140,12 @@ def find_centroid(
         Mode and stopping.
     flow_params : FlowParams, optional
         How flow is measured.
-    progress : callable, optional
-        Called with 1 after each flow.
-    scratch : Path, optional
-        Folder of a file that holds the flows; by default they are in memory.
+    runtime : Runtime
+        Threads, device, and a folder for the flows; without one they stay in memory.
     prepared : dict, optional
         From the number of a frame to what flow prepares of it: filled here, and of use to the filter.
+    progress : callable, optional
+        Called with 1 after each flow.
 
     Returns
     -------
@@ -171,16 +170,16 @@ def find_centroid(
     params, flow_params = params or CentroidParams(), flow_params or FlowParams()
     stack = check_frames(frames, at_least=2)
     require(params.start < len(stack), f"start: expected a frame below {len(stack)}, found {params.start}")
-    image = _start(stack, params, flow_params)
+    image = _start(stack, params, flow_params, runtime)
     total = np.zeros((*stack.shape[1:3], 2), np.float32)
-    flows = new_stack((*stack.shape[:3], 2), scratch)
-    if prepared is None and scratch is None:
+    flows = new_stack((*stack.shape[:3], 2), runtime.scratch)
+    if prepared is None and runtime.scratch is None:
         # Where even the frames are in a file, what is prepared of them is not kept.
         prepared = {}
     sizes: list[float] = []
     while True:
         # The first image is a blurred mean, so what was measured from it needs a coarser level to be mended.
-        reference = refer_flow(image, flow_params, start_level=1)
+        reference = prepare_reference(image, flow_params, runtime, start_level=1)
         fill_flows(reference, stack, flows, prepared, progress, again=bool(sizes))
         mean_flow = mean_of(flows)
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
@@ -191,20 +190,16 @@ def find_centroid(
         if not converged:
             recentre = invert_flow(mean_flow)
             total = compose_flows(total, recentre) if params.mode == "single" else total
-            _recentre(flows, recentre, flow_params.threads)
-        image = (
-            mean_registered(stack, flows, flow_params.threads, flow_params.device or PROCESSOR)
-            if params.mode == "fused"
-            else warp(stack[params.start], total)
-        )
+            _recentre(flows, recentre, runtime.threads)
+        image = mean_registered(stack, flows, runtime) if params.mode == "fused" else warp(stack[params.start], total)
         if converged or change > _DIVERGED or len(sizes) == params.iterations:
             return Centroid(image, flows, np.array(sizes), converged)
 
 
-def _start(stack: FloatArray, params: CentroidParams, flow_params: FlowParams) -> FloatArray:
+def _start(stack: FloatArray, params: CentroidParams, flow_params: FlowParams, runtime: Runtime) -> FloatArray:
     if params.mode == "single":
         return stack[params.start]
-    return mean_stabilised(stack, flow_params.threads) if flow_params.global_shift else mean_of(stack)
+    return mean_stabilised(stack, runtime.threads) if flow_params.global_shift else mean_of(stack)
 
 
 def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:
@@ -217,7 +212,7 @@ def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:
         drop_pages(flows)
 
 
-def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0, device: str = PROCESSOR) -> FloatArray:
+def mean_registered(frames: FloatArray, flows: FloatArray, runtime: Runtime = DEFAULT) -> FloatArray:
     """Average of frames warped onto the reference that their flows start from.
 
     At each pixel those frames count that show it; where none does, all of them, with their borders repeated.
@@ -227,10 +222,8 @@ def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0, dev
     frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
     flows : ndarray, float32, shape (T, H, W, 2)
         Pixels.
-    threads : int
-        Frames warped side by side; 0 means one per available core.
-    device : str
-        Where they are warped, see :mod:`turbrestore.runtime.device`.
+    runtime : Runtime
+        Threads, and the device that warps the frames.
 
     Returns
     -------
@@ -246,11 +239,11 @@ def mean_registered(frames: FloatArray, flows: FloatArray, threads: int = 0, dev
     def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, np.ndarray]:
         total, weight = np.zeros(frames.shape[1:]), np.zeros(frames.shape[1:3])
         for frame, flow in pairs:
-            registered, seen = warp(frame, flow, device=device), np.maximum(inside(flow), _UNSEEN)
+            registered, seen = warp(frame, flow, device=runtime.device), np.maximum(inside(flow), _UNSEEN)
             registered *= seen if registered.ndim == seen.ndim else seen[..., None]
             cv2.accumulate(registered, total)
             cv2.accumulate(seen, weight)
         return total, weight
 
-    total, weight = sum_in_threads(add, zip(iter_frames(frames), iter_frames(flows), strict=True), threads)
+    total, weight = sum_in_threads(add, zip(iter_frames(frames), iter_frames(flows), strict=True), runtime.threads)
     return (total.T / weight.T).T.astype(np.float32)

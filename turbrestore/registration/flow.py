@@ -38,8 +38,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.arrays import FloatArray, check_frames, check_image, luminance
 from ..core.errors import DataError, require, require_between
 from ..core.noise import estimate_noise
-from ..runtime.device import PROCESSOR, check_device, find_device, memory_of
-from ..runtime.scratch import drop_pages
+from ..runtime.device import PROCESSOR, find_device, memory_of
+from ..runtime.runtime import DEFAULT, Runtime
+from ..runtime.scratch import drop_pages, new_stack
 from ..runtime.threads import in_batches, map_ahead
 from .confidence import flow_confidence, regularise_flow
 from .global_shift import DEAD_ZONE, ShiftReference, overlap, refer_shift, shift_against
@@ -141,11 +142,6 @@ class FlowParams:
         Take large shifts of whole frames out first.
     confidence : bool
         Draw the flow of flat regions, and along edges, towards its neighbourhood.
-    threads : int
-        Frames solved side by side; 0 means one per available core.
-    device : str, optional
-        Where ``tvl1`` runs, and frames are warped for the centroid: cpu, cuda or auto; the other methods are OpenCV's
-        and run on the processor.  By default where the whole chain is computed, and cpu for this stage alone.
     dis : DisParams
         Settings of dense inverse search.
     tvl1 : TvL1Params
@@ -159,8 +155,6 @@ class FlowParams:
     contrast_floor: float = 0.01
     global_shift: bool = True
     confidence: bool = True
-    threads: int = 0
-    device: str | None = None
     dis: DisParams = field(default_factory=DisParams)
     tvl1: TvL1Params = field(default_factory=TvL1Params)
     farneback: FarnebackParams = field(default_factory=FarnebackParams)
@@ -172,9 +166,6 @@ class FlowParams:
         )
         require_between("contrast_window", self.contrast_window, 0, 1000, "pixels")
         require_between("contrast_floor", self.contrast_floor, 1e-6, 1)
-        require_between("threads", self.threads, 0, 256)
-        if self.device is not None:
-            check_device(self.device)
 
 
 @dataclass(frozen=True)
@@ -236,8 +227,7 @@ def estimate_flow(
     reference: ArrayLike,
     frames: ArrayLike,
     params: FlowParams | None = None,
-    progress: Callable[[int], None] | None = None,
-    out: FloatArray | None = None,
+    runtime: Runtime = DEFAULT,
 ) -> FloatArray:
     """Flows from ``reference`` to each of ``frames``.
 
@@ -249,10 +239,8 @@ def estimate_flow(
         Frames; colour is reduced to luminance.
     params : FlowParams, optional
         Method and settings.
-    progress : callable, optional
-        Called with 1 after each frame, in the calling thread.
-    out : ndarray, float32, shape (T, H, W, 2), optional
-        Where the flows are put, in memory or in a mapped file; by default a new array.
+    runtime : Runtime
+        Threads, device of ``tvl1`` (the other methods are OpenCV's and run on the CPU), and a folder for the flows.
 
     Returns
     -------
@@ -276,8 +264,8 @@ def estimate_flow(
     True
     """
     stack = check_frames(frames)
-    flows = np.empty((*stack.shape[:3], 2), np.float32) if out is None else out
-    fill_flows(refer_flow(reference, params), stack, flows, progress=progress)
+    flows = new_stack((*stack.shape[:3], 2), runtime.scratch)
+    fill_flows(prepare_reference(reference, params, runtime), stack, flows)
     return flows
 
 
@@ -313,7 +301,7 @@ def fill_flows(
     --------
     >>> import numpy as np
     >>> stack, flows, prepared = np.ones((2, 16, 16), np.float32), np.ones((2, 16, 16, 2), np.float32), {}
-    >>> fill_flows(refer_flow(stack[0]), stack, flows, prepared)
+    >>> fill_flows(prepare_reference(stack[0]), stack, flows, prepared)
     >>> float(flows.max()), sorted(prepared)
     (0.0, [0, 1])
     """
@@ -336,7 +324,10 @@ def fill_flows(
 
 
 def iterate_flows(
-    reference: ArrayLike, frames: Iterable[ArrayLike], params: FlowParams | None = None
+    reference: ArrayLike,
+    frames: Iterable[ArrayLike],
+    params: FlowParams | None = None,
+    runtime: Runtime = DEFAULT,
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield ``(frame, flow)`` in order while a pool of threads solves a few frames ahead.
 
@@ -350,6 +341,8 @@ def iterate_flows(
         Consumed lazily.
     params : FlowParams, optional
         Method and settings.
+    runtime : Runtime
+        Threads, and the device of ``tvl1``.
 
     Yields
     ------
@@ -370,7 +363,7 @@ def iterate_flows(
     >>> [float(abs(flow).max()) for _, flow in iterate_flows(image, [image, image])]
     [0.0, 0.0]
     """
-    target = refer_flow(reference, params)
+    target = prepare_reference(reference, params, runtime)
 
     def checked() -> Iterator[FloatArray]:
         for index, frame in enumerate(frames):
@@ -386,7 +379,12 @@ def iterate_flows(
         yield from zip(batch, flows, strict=True)
 
 
-def refer_flow(reference: ArrayLike, params: FlowParams | None = None, start_level: int = 0) -> FlowReference:
+def prepare_reference(
+    reference: ArrayLike,
+    params: FlowParams | None = None,
+    runtime: Runtime = DEFAULT,
+    start_level: int = 0,
+) -> FlowReference:
     """Prepare the image that flows start from.
 
     Parameters
@@ -394,6 +392,8 @@ def refer_flow(reference: ArrayLike, params: FlowParams | None = None, start_lev
     reference : array_like, shape (H, W) or (H, W, 3)
     params : FlowParams, optional
         Method and settings.
+    runtime : Runtime
+        Threads, and the device of ``tvl1``.
     start_level : int
         Level of the pyramid of dense inverse search, counted from the finest that is used, at which flows that have a
         start begin.
@@ -411,7 +411,7 @@ def refer_flow(reference: ArrayLike, params: FlowParams | None = None, start_lev
     --------
     >>> import numpy as np
     >>> y, x = np.mgrid[:32, :32].astype(np.float32)
-    >>> reference = refer_flow(y * x / 1024)
+    >>> reference = prepare_reference(y * x / 1024)
     >>> float(abs(reference.solve([reference.prepare(y * x / 1024)])[0]).max())
     0.0
     """
@@ -425,7 +425,8 @@ def refer_flow(reference: ArrayLike, params: FlowParams | None = None, start_lev
     prepared = _levels(target, params)
     position = refer_shift(target) if params.global_shift else None
     confidence = flow_confidence(target) if params.confidence else None
-    solver = FLOW_METHODS[params.method](params, prepared, start_level)
+    device = find_device(runtime.device) if params.method == "tvl1" else PROCESSOR
+    solver = FLOW_METHODS[params.method](params, prepared, start_level, device)
 
     def prepare(image: FloatArray) -> FlowFrame:
         return FlowFrame(image, _levels(image, params), estimate_noise(image) if confidence is not None else 0.0)
@@ -442,10 +443,8 @@ def refer_flow(reference: ArrayLike, params: FlowParams | None = None, start_lev
         return [flow + shift if shift.any() else flow for shift, flow in zip(shifts, flows, strict=True)]
 
     # A device solves a batch at once, while the next is prepared; on the processor every frame has a thread.
-    on_device = params.method == "tvl1" and find_device(params.device or PROCESSOR) != PROCESSOR
-    return FlowReference(
-        prepare, solve, target.shape[:2], *((params.tvl1.batch, 2) if on_device else (1, params.threads))
-    )
+    batch, threads = (1, runtime.threads) if device == PROCESSOR else (params.tvl1.batch, 2)
+    return FlowReference(prepare, solve, target.shape[:2], batch, threads)
 
 
 def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> FloatArray:
@@ -528,7 +527,7 @@ def _shifted(frame: GreyBytes, shift: FloatArray, outside: GreyBytes) -> GreyByt
     return result
 
 
-def _dis(params: FlowParams, reference: GreyBytes, start_level: int) -> Solver:
+def _dis(params: FlowParams, reference: GreyBytes, start_level: int, _device: str) -> Solver:
     def solve(frame: GreyBytes, start: FloatArray | None) -> FloatArray:
         # A solver object keeps buffers that must not be shared between threads, and is cheap beside a flow.
         solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -547,9 +546,7 @@ def _dis(params: FlowParams, reference: GreyBytes, start_level: int) -> Solver:
     return _one_by_one(solve)
 
 
-def _tvl1(params: FlowParams, reference: GreyBytes, _start_level: int) -> Solver:
-    device = find_device(params.device or PROCESSOR)
-
+def _tvl1(params: FlowParams, reference: GreyBytes, _start_level: int, device: str) -> Solver:
     def solve(frames: GreyBytes, starts: list[FloatArray | None]) -> FloatArray:
         flows = np.empty((*frames.shape, 2), np.float32)
         started = {number: start for number, start in enumerate(starts) if start is not None}
@@ -567,7 +564,7 @@ def _tvl1(params: FlowParams, reference: GreyBytes, _start_level: int) -> Solver
     return solve
 
 
-def _farneback(params: FlowParams, reference: GreyBytes, _start_level: int) -> Solver:
+def _farneback(params: FlowParams, reference: GreyBytes, _start_level: int, _device: str) -> Solver:
     settings = params.farneback
     spread = {5: 1.1, 7: 1.5}[settings.neighbourhood]
 
@@ -592,7 +589,7 @@ def _one_by_one(solve: FrameSolver) -> Solver:
     return lambda frames, starts: np.stack([solve(*pair) for pair in zip(frames, starts, strict=True)])
 
 
-FLOW_METHODS: dict[str, Callable[[FlowParams, GreyBytes, int], Solver]] = {
+FLOW_METHODS: dict[str, Callable[[FlowParams, GreyBytes, int, str], Solver]] = {
     "dis": _dis,
     "tvl1": _tvl1,
     "farneback": _farneback,
