@@ -134,7 +134,7 @@ def check_cores() -> Iterator[Finding]:
     """How many frames are worked on side by side."""
     there = os.cpu_count() or 1
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else there
-    yield Finding("cores", "ok", f"{usable} usable of {there}; as many threads, unless --flow.threads says otherwise")
+    yield Finding("cores", "ok", f"{usable} usable of {there}; as many threads, unless --threads says otherwise")
     limits = [
         f"{name}={os.environ[name]}" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS") if name in os.environ
     ]

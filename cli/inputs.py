@@ -11,7 +11,7 @@ from turbrestore.io.images import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames
-from turbrestore.runs.artifacts import load_stage_image
+from turbrestore.runs.stage_files import load_stage_image
 
 from .options import Selection
 from .progress import say

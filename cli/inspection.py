@@ -18,7 +18,7 @@ from turbrestore.io.images import read_image
 from turbrestore.io.limits import DEFAULT_LIMITS
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import appearance, compare, compare_flows
-from turbrestore.runs.artifacts import load_flows
+from turbrestore.runs.stage_files import load_flows
 
 from .inputs import open_checked, read_input_image
 from .options import Flag, Selection, limits_of

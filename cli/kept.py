@@ -8,9 +8,10 @@ from pathlib import Path
 
 from turbrestore.io.images import check_space
 from turbrestore.io.source import FrameSource
-from turbrestore.pipeline import memory_plan
+from turbrestore.memory_plan import plan_memory
 from turbrestore.runs.folder_lock import lock_folder
-from turbrestore.runs.resumption import KeptStages, read_stages
+from turbrestore.runs.run_folder import RunFolder, read_stages
+from turbrestore.runtime.runtime import Runtime
 from turbrestore.settings import RestoreParams
 
 from .progress import say
@@ -23,8 +24,14 @@ _FRAMES_A_MODE = 2
 
 @contextmanager
 def kept_stages(
-    folder: Path | None, source: FrameSource, params: RestoreParams, resume: bool, every: int, quiet: bool
-) -> Iterator[KeptStages | None]:
+    folder: Path | None,
+    source: FrameSource,
+    params: RestoreParams,
+    runtime: Runtime,
+    resume: bool,
+    every: int,
+    quiet: bool,
+) -> Iterator[RunFolder | None]:
     """Hold the folder, take over what an earlier run has left, and keep the newest state if this one is interrupted."""
     if folder is None:
         yield None
@@ -32,7 +39,7 @@ def kept_stages(
     with lock_folder(folder) as locks:
         if not locks:
             say(f"{folder}: this file system knows no locks; see to it that no other run uses the folder", quiet)
-        stages = KeptStages(folder, source, params, resume, every)
+        stages = RunFolder(folder, source, params, runtime, resume, every)
         for note in stages.notes:
             say(f"{folder}: {note}", quiet)
         try:
@@ -40,7 +47,7 @@ def kept_stages(
         except KeyboardInterrupt as stop:
             stages.flush()
             stages.withdraw()
-            stop.args = (f"{str(stop) or 'interrupted'}; --keep {folder} --resume goes on {stages.progress()}",)
+            stop.args = (f"{str(stop) or 'interrupted'}; --keep {folder} --resume continues {stages.progress()}",)
             raise
         except Exception:
             stages.withdraw()
@@ -53,13 +60,13 @@ def own_outputs(folder: Path) -> set[Path]:
     return set() if record is None else {Path(name) for name in record["outputs"]}
 
 
-def check_room(source: FrameSource, params: RestoreParams, output: Path, folder: Path | None) -> None:
+def check_room(source: FrameSource, params: RestoreParams, runtime: Runtime, output: Path, folder: Path | None) -> None:
     """Refuse to begin what would end on a full disk."""
     height, width = source.shape[1:3]
     image = 4 * height * width * (3 if len(source.shape) == 4 else 1)
     check_space(output, image)
     if folder is not None:
         flow = 8 * height * width
-        plan = memory_plan(source, params)
+        plan = plan_memory(source.shape, params, runtime)
         size = flow * (plan.train + plan.train // _FRAMES_A_MODE) + _IMAGES * image
-        check_space(folder, size + plan.file_bytes)
+        check_space(folder, size + plan.scratch_bytes)

@@ -10,9 +10,13 @@ from cyclopts import Parameter
 from turbrestore.core.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from turbrestore.deconvolution.deconvolve import DeconvolutionParams
     from turbrestore.io.limits import Limits
     from turbrestore.io.source import FrameRange, Roi
+    from turbrestore.runtime.memory_size import MemorySize
+    from turbrestore.runtime.runtime import Runtime
 
 # A switch without a "--no-" twin.
 Flag = Annotated[bool, Parameter(negative="")]
@@ -65,6 +69,32 @@ class Selection:
     def limits(self) -> Limits:
         """Return how large an input may be."""
         return limits_of(self.max_pixels)
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What a command may use of the machine.
+
+    Parameters
+    ----------
+    threads : int
+        Frames that are worked on side by side; 0 means one for each core.
+    device : str
+        Where flow by tvl1, warps, fusion and deconvolution are computed: cpu, cuda, or auto for a GPU where torch sees
+        one.
+    """
+
+    threads: int = 0
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        self.runtime()
+
+    def runtime(self, memory_limit: MemorySize | None = None, scratch: Path | None = None) -> Runtime:
+        """Return the record that the stages take."""
+        from turbrestore.runtime.runtime import Runtime
+
+        return Runtime(self.threads, memory_limit, self.device, scratch)
 
 
 def limits_of(max_pixels: int | None) -> Limits:

@@ -17,13 +17,16 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import OutputError
 from turbrestore.io.images import atomic_write, check_output, write_image
 from turbrestore.metrics import compare
+from turbrestore.results import Restoration
 from turbrestore.runs.folder_lock import LOCK
-from turbrestore.runs.resumption import STAGE_FILES, KeptStages, is_part, read_stages
-from turbrestore.runs.run_record import RUN_FILES, RunRecord, save_run
+from turbrestore.runs.run_files import RUN_FILES
+from turbrestore.runs.run_folder import CHECKPOINT, RunFolder, is_part, read_stages
+from turbrestore.runs.run_record import RunRecord
+from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.scratch import iter_frames
-from turbrestore.settings import Restoration, RestoreParams
+from turbrestore.settings import RestoreParams
 
-from .options import Selection
+from .options import Machine, Selection
 from .streams import put
 
 _IMAGES = ("frame", "mean", "centroid", "filtered", "deconvolved")
@@ -51,7 +54,6 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
             "rank": restoration.dynamics.rank,
             "energy_share": restoration.dynamics.energy_share,
             "residual_variance": restoration.dynamics.R,
-            "motion_factor": float(restoration.dynamics.motion_factor.mean()),
             "largest_eigenvalue": float(abs(restoration.dynamics.eigenvalues).max(initial=0.0)),
             "notes": list(restoration.dynamics.notes),
         }
@@ -71,8 +73,6 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
     if restoration.blur is not None:
         names = ("sigma", "uncertainty", "exponent", "noise", "reduction", "evidence")
         record["blur"] = {name: getattr(restoration.blur, name) for name in names}
-    if restoration.blur_bounds is not None:
-        record["blur_bounds"] = dataclasses.asdict(restoration.blur_bounds)
     record["guards"] = [dataclasses.asdict(reading) for reading in restoration.guard_readings]
     record["crop"] = list(restoration.crop)
     record["decisions"] = [dataclasses.asdict(decision) for decision in restoration.decisions]
@@ -125,7 +125,7 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: 
         if resume:
             raise OutputError(f"{folder}: holds no run to go on with; choose another folder or allow overwriting")
         raise OutputError(f"{folder}: is not empty; choose another folder, allow overwriting, or resume the run in it")
-    for name in (LOCK, *RUN_FILES, *STAGE_FILES, *(f"{image}.png" for image in _IMAGES)):
+    for name in (LOCK, *RUN_FILES, CHECKPOINT, *(f"{image}.png" for image in _IMAGES)):
         if (folder / name).is_symlink():
             raise OutputError(f"{folder / name}: is a link to a file elsewhere; remove it or name another folder")
         if (folder / name).resolve() in {path.resolve() for path in taken}:
@@ -133,10 +133,10 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: 
         check_output(folder / name, taken, overwrite=True, suffixes=None)
 
 
-def save_stages(stages: KeptStages, restoration: Restoration, run: RunRecord, bit_depth: int) -> None:
+def save_stages(stages: RunFolder, restoration: Restoration, run: RunRecord, bit_depth: int) -> None:
     """Complete a kept run: what a report needs, and images to look at."""
     folder = stages.folder
-    save_run(folder, restoration, run, stages.stored)
+    stages.complete(restoration, run)
     images = {"frame": run.frame, **stage_images(restoration)}
     for name in _IMAGES:
         if name in images:
@@ -146,9 +146,16 @@ def save_stages(stages: KeptStages, restoration: Restoration, run: RunRecord, bi
             (folder / f"{name}.png").unlink(missing_ok=True)
 
 
-def settings_record(params: RestoreParams, selection: Selection, bit_depth: int | None) -> dict[str, Any]:
+def settings_record(
+    params: RestoreParams,
+    selection: Selection,
+    bit_depth: int | None,
+    machine: Machine,
+    memory_limit: MemorySize | None,
+) -> dict[str, Any]:
     """All settings of a run, nested as in a settings file; None where they are left to be measured."""
-    return {"bit_depth": bit_depth, **dataclasses.asdict(selection), **dataclasses.asdict(params)}
+    head = {"bit_depth": bit_depth, "memory_limit": memory_limit}
+    return {**head, **dataclasses.asdict(machine), **dataclasses.asdict(selection), **dataclasses.asdict(params)}
 
 
 def write_settings(path: Path, record: dict[str, Any]) -> None:
@@ -160,7 +167,7 @@ def write_settings(path: Path, record: dict[str, Any]) -> None:
 def repeating_command(input: Path, output: Path, record: dict[str, Any]) -> tuple[str, ...]:
     """Words of a command that repeats a run without its settings file: what differs from the defaults as flags."""
     paths = (str(path) if not str(path).startswith("-") else f"./{path}" for path in (input, output))
-    usual = settings_record(RestoreParams(), Selection(), None)
+    usual = settings_record(RestoreParams(), Selection(), None, Machine(), None)
     return ("turbrestore", "restore", *paths, *_flags(record, usual, ""))
 
 

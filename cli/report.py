@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from turbrestore.report import check_report, write_report
-from turbrestore.runs.run_record import load_run
+from turbrestore.runs.run_files import load_run
 
 from .options import Flag
 from .progress import say

@@ -11,18 +11,16 @@ from cyclopts import Parameter
 from turbrestore.core.errors import require
 from turbrestore.io.images import check_output, write_image
 from turbrestore.io.pixels import check_depth
-from turbrestore.memory_plan import check_comparison
 from turbrestore.metrics import comparable
-from turbrestore.pipeline import memory_plan
 from turbrestore.pipeline import restore as run_pipeline
 from turbrestore.report import check_report, write_report
 from turbrestore.runs.run_record import describe_run
-from turbrestore.runtime.scratch import returning_freed
+from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.settings import RestoreParams
 
 from .inputs import open_input, read_input_image
 from .kept import check_room, kept_stages, own_outputs
-from .options import Flag, Selection, known_sigma
+from .options import Flag, Machine, Selection, known_sigma
 from .output import (
     check_keep,
     describe,
@@ -50,6 +48,8 @@ def restore(
     report: Path | None = None,
     truth: Path | None = None,
     bit_depth: int | None = None,
+    memory_limit: MemorySize | None = None,
+    machine: Annotated[Machine, Parameter(name="*")] = Machine(),
     overwrite: Flag = False,
     json: Flag = False,
     quiet: Flag = False,
@@ -81,6 +81,9 @@ def restore(
         Image of the true scene: every stage is compared with it.
     bit_depth : int
         Bits per channel of the output, 8, 16 or 32 (float, TIFF only).  Those of the input by default.
+    memory_limit : MemorySize
+        Most memory to take, such as 2GB: training frames then go to a scratch file, fewer threads work, fewer frames
+        are trained on, or frames are processed in tiles that overlap, whichever comes first.
     overwrite : bool
         Replace existing outputs.
     json : bool
@@ -102,40 +105,32 @@ def restore(
         check_report(report, inputs, overwrite or report.absolute() in left)
     outputs = [path for path in (output, settings_path, report) if path is not None]
     check_keep(keep, [*inputs, *outputs], overwrite, resume)
-    limited = settings.memory_limit is not None
-    with returning_freed(limited):
-        scene_shape = None if truth is None else comparable(read_input_image(truth, selection.limits()), "truth").shape
+    runtime = machine.runtime(memory_limit, keep)
+    if truth is not None:
+        comparable(read_input_image(truth, selection.limits()), "truth")
     source = open_input(input, selection, quiet)
-    if scene_shape is not None:
+    if truth is not None:
         comparable(source.read(0, 1)[0], source.name)
-        if json:
-            plan = memory_plan(source, settings)
-            check_comparison(plan, settings.memory_limit, source.shape[1:], scene_shape)
-    check_room(source, settings, output, keep)
-    with kept_stages(keep, source, settings, resume, checkpoint_every, quiet) as stages:
+    check_room(source, settings, runtime, output, keep)
+    with kept_stages(keep, source, settings, runtime, resume, checkpoint_every, quiet) as stages:
         with progress_bars(quiet) as progress:
-            done, on_result = (None, None) if stages is None else (stages.done, stages.keep)
-            restoration = run_pipeline(source, settings, progress, done, on_result, keep)
-        with returning_freed(limited):
-            record = settings_record(settings, selection, bit_depth)
-            run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
-            depth = source.bit_depth if bit_depth is None else bit_depth
-            if stages is not None and run is not None:
-                save_stages(stages, restoration, run, depth)
-                stages.expect(*outputs)
-            # Whatever else is there has been refused above.
-            write_image(output, restoration.image, depth, overwrite=overwrite or output.absolute() in left)
-            write_settings(settings_path, record)
-            if report is not None and run is not None:
-                write_report(report, restoration, run, overwrite=overwrite or report.absolute() in left)
-            # A frame is in it.
-            del run
+            restoration = run_pipeline(source, settings, runtime, stages, progress)
+        record = settings_record(settings, selection, bit_depth, machine, memory_limit)
+        run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
+        depth = source.bit_depth if bit_depth is None else bit_depth
+        if stages is not None and run is not None:
+            save_stages(stages, restoration, run, depth)
+            stages.expect(*outputs)
+        # Whatever else is there has been refused above.
+        write_image(output, restoration.image, depth, overwrite=overwrite or output.absolute() in left)
+        write_settings(settings_path, record)
+        if report is not None and run is not None:
+            write_report(report, restoration, run, overwrite=overwrite or report.absolute() in left)
         if stages is not None:
             stages.expect()
     if json:
-        with returning_freed(limited):
-            # Read again, for all that works in between has no room for it.
-            facts = describe(restoration, None if truth is None else read_input_image(truth, selection.limits()))
+        # The truth is read again, so that it takes no memory while the stages run.
+        facts = describe(restoration, None if truth is None else read_input_image(truth, selection.limits()))
         print_json({"input": str(input), "output": str(output), "settings": str(settings_path), **facts})
     else:
         say(summary(output, restoration), quiet)

@@ -9,23 +9,24 @@ import numpy as np
 from cyclopts import Parameter
 
 from turbrestore.blind.guards import GuardParams
-from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.core.errors import require
 from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.dynamics.dynamic_texture import identify as identify_flows
 from turbrestore.dynamics.flow_model import FlowDynamics
-from turbrestore.filtering.alternating import Filtered, FilterParams, filter_frames
+from turbrestore.filtering.alternating import Filtered, FilterParams, FilterStep, filter_steps
 from turbrestore.io.images import IMAGE_OUTPUT_SUFFIXES, check_output, check_space, read_image, write_image
 from turbrestore.io.pixels import check_depth
 from turbrestore.memory_plan import training_share
-from turbrestore.pipeline import stage_counter
-from turbrestore.registration.centroid import Centroid, CentroidParams, find_centroid
-from turbrestore.registration.flow import FlowParams, estimate_flow
-from turbrestore.runs.artifacts import load_artifact, load_flows, save_artifact, save_flows
+from turbrestore.pipeline import step_counter
+from turbrestore.registration.centroid import Centroid, CentroidParams, centroid_steps
+from turbrestore.registration.flow import FlowParams, iterate_flows
+from turbrestore.runs.stage_files import load_artifact, load_flows, save_artifact, save_flows
+from turbrestore.runtime.steps import finish
 
 from .inputs import open_input, read_input_image
-from .options import Flag, Selection, known_sigma, limits_of
+from .options import Flag, Machine, Selection, known_sigma, limits_of
 from .progress import progress_bars, say
 
 ARTIFACT = (".npz",)
@@ -40,6 +41,7 @@ def centroid(
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
     centroid: CentroidParams = CentroidParams(),
     flow: FlowParams = FlowParams(),
+    machine: Annotated[Machine, Parameter(name="*")] = Machine(),
     overwrite: Flag = False,
     quiet: Flag = False,
 ) -> None:
@@ -67,9 +69,8 @@ def centroid(
     count = training_share(len(source), source.shape[1:], train)
     check_space(output, _flow_bytes(count, source.shape) + _image_bytes(source.shape))
     with progress_bars(quiet) as progress:
-        found = find_centroid(
-            source.read(0, count), centroid, flow, stage_counter(progress, "centroid", count * centroid.iterations)
-        )
+        steps = centroid_steps(source.read(0, count), centroid, flow, machine.runtime())
+        found = finish(steps, step_counter(progress, "centroid", count * centroid.iterations))
     save_artifact(output, found, overwrite)
     sizes = ", ".join(f"{size:.2f}" for size in found.mean_flow_sizes)
     say(f"{output}: centroid of {count} frames, mean flow {sizes} pixels", quiet)
@@ -83,6 +84,7 @@ def flow(
     *,
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
     flow: FlowParams = FlowParams(),
+    machine: Annotated[Machine, Parameter(name="*")] = Machine(),
     overwrite: Flag = False,
     quiet: Flag = False,
 ) -> None:
@@ -108,7 +110,11 @@ def flow(
     source = open_input(input, selection, quiet)
     check_space(output, _flow_bytes(len(source), source.shape))
     with progress_bars(quiet) as progress:
-        flows = estimate_flow(image, source.read(), flow, stage_counter(progress, "flow", len(source)))
+        measured, count = [], step_counter(progress, "flow", len(source))
+        for _, found in iterate_flows(image, source, flow, machine.runtime()):
+            measured.append(found)
+            count(found)
+        flows = np.stack(measured)
     save_flows(output, flows, overwrite)
     say(f"{output}: {len(flows)} flows, root mean square {float(np.sqrt(np.mean(flows**2))):.2f} pixels", quiet)
 
@@ -119,6 +125,7 @@ def identify(
     /,
     *,
     dynamics: DynamicsParams = DynamicsParams(),
+    machine: Annotated[Machine, Parameter(name="*")] = Machine(),
     overwrite: Flag = False,
     quiet: Flag = False,
 ) -> None:
@@ -143,7 +150,7 @@ def identify(
     modes = min(most, dynamics.max_rank if dynamics.rank is None else len(measured))
     # The mean flow is one more.
     check_space(output, _flow_bytes(modes + 1, measured.shape))
-    found = identify_flows(measured, dynamics)
+    found = identify_flows(measured, dynamics, machine.runtime())
     save_artifact(output, found, overwrite)
     for note in found.notes:
         say(f"{output}: {note}", quiet)
@@ -160,6 +167,7 @@ def filter_(
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
     filter: FilterParams = FilterParams(),
     flow: FlowParams = FlowParams(),
+    machine: Annotated[Machine, Parameter(name="*")] = Machine(),
     overwrite: Flag = False,
     quiet: Flag = False,
 ) -> None:
@@ -190,9 +198,13 @@ def filter_(
     check_space(output, _image_bytes(source.shape))
     total = len(source) * filter.inner_iterations - len(start.flows)
     with progress_bars(quiet) as progress:
-        filtered = filter_frames(
-            source, start.image, model, filter, flow, start.flows, stage_counter(progress, "filter", total)
-        )
+
+        def observe(step: FilterStep) -> None:
+            if progress is not None:
+                progress("filter", step.flows_measured, total)
+
+        steps = filter_steps(source, start.image, model, filter, flow, start.flows, machine.runtime())
+        filtered = finish(steps, observe)
     _write(output, filtered, source.bit_depth, overwrite)
     say(f"{output}: {len(source)} frames filtered", quiet)
 
@@ -208,6 +220,7 @@ def deconvolve(
     guards: GuardParams = GuardParams(),
     bit_depth: int | None = None,
     max_pixels: int | None = None,
+    machine: Annotated[Machine, Parameter(name="*")] = Machine(),
     overwrite: Flag = False,
     quiet: Flag = False,
 ) -> None:
@@ -246,8 +259,8 @@ def deconvolve(
     image = read_input_image(input, limits)
     guide_image = image if guide is None else read_input_image(guide, limits)
     with progress_bars(quiet) as progress:
-        counter = stage_counter(progress, "deconvolve", deconvolution.iterations)
-        deblurred = remove_blur(image, guide_image, deconvolution, guards, progress=counter)
+        steps = remove_blur_steps(image, guide_image, deconvolution, guards, machine.runtime())
+        deblurred = finish(steps, step_counter(progress, "deconvolve", deconvolution.iterations))
     if bit_depth is None:
         bit_depth = 16 if input.suffix.lower() in ARTIFACT else read_image(input, limits).bit_depth
     _write(output, deblurred.deconvolution, bit_depth, overwrite)

@@ -1,12 +1,12 @@
-"""Where a stage computes: on the processor with NumPy and OpenCV, or on a device with torch.
+"""Where a stage computes: on the CPU with NumPy and OpenCV, or on a device with torch.
 
 A device is a word: ``"cpu"`` is NumPy and OpenCV, ``"cuda"`` a GPU, and ``"auto"`` a GPU where torch sees one and else
 ``"cpu"``.  Any other name that torch gives a device may be used from Python: ``"cuda:1"``, or ``"cpu:0"``, which is
-torch on the processor, for tests.  Every stage takes and gives NumPy arrays wherever it computes, and finds the same to
+torch on the CPU, for tests.  Every stage takes and returns NumPy arrays wherever it computes, and the results agree to
 rounding.
 
-torch is loaded when a device is asked for, and not before: that takes two seconds and 200 MB.  ``"auto"`` loads it only
-where there may be a GPU.
+torch is imported only when a device is asked for, because that takes two seconds and 200 MB.  ``"auto"`` imports it
+only where there may be a GPU.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import functools
 import importlib.util
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,8 +24,6 @@ from ..core.decision import Decision
 from ..core.errors import ConfigurationError, require
 
 PROCESSOR = "cpu"
-# Name of the stage whose methods do not all run on a device.
-FLOW = "optical flow"
 # Memory of the process that torch 2.13 takes once it is imported and has computed something on the processor, bytes:
 # 200 MB, and 270 MB the first time, when its modules are compiled as well.  Builds with CUDA take more.
 TORCH_BYTES = 2.8e8
@@ -35,7 +33,7 @@ _INSTALL = "install turbrestore[torch] or use 'cpu'"
 # Windows beneath Linux.  torch has no GPU of this kind under macOS; of other systems nothing is known.
 _NODES = {"linux": ("nvidia*", "nvhost*", "nvmap", "kfd", "dxg"), "darwin": ()}
 _DEVICES = Path("/dev")
-_NO_GPU = "no GPU that torch sees"
+_NO_GPU = "torch sees no GPU"
 _NO_MEMORY = ("out of memory", "not enough memory")
 
 
@@ -128,47 +126,39 @@ def needs_torch(wanted: str | None) -> bool:
     return wanted is not None and wanted != PROCESSOR
 
 
-def explain_device(wanted: str, found: str, stages: Mapping[str, str], flow_method: str) -> tuple[Decision, ...]:
-    """Say where the stages computed.
+def explain_device(wanted: str, found: str, flow_method: str) -> tuple[Decision, ...]:
+    """Put into words where a restoration computes.
 
     Parameters
     ----------
     wanted : str
-        What was asked for.
+        The device that was asked for.
     found : str
         From :func:`find_device`.
-    stages : mapping of str to str
-        Device of every stage, by the name of the stage.
     flow_method : str
-        Method of the optical flow; those of OpenCV stay on the processor.
+        Method of the optical flow; those of OpenCV run on the CPU.
 
     Returns
     -------
     tuple of Decision
-        Empty where the processor was asked for, and nothing else by any stage.
+        Empty where the CPU was asked for.
 
     Examples
     --------
-    >>> explain_device("cpu", "cpu", {"filter": "cpu"}, "dis")
+    >>> explain_device("cpu", "cpu", "dis")
     ()
-    >>> explain_device("cuda", "cuda", {"optical flow": "cuda", "filter": "cpu"}, "dis")[1].choice
-    'on the processor'
+    >>> explain_device("cuda", "cuda", "dis")[1].choice
+    'on the CPU'
     """
-    return tuple(_explanations(wanted, found, stages, flow_method))
-
-
-def _explanations(wanted: str, found: str, stages: Mapping[str, str], flow_method: str) -> Iterator[Decision]:
-    if wanted != PROCESSOR and found == PROCESSOR:
-        yield Decision("device", "processor", _NO_GPU)
-    elif wanted != PROCESSOR:
-        yield Decision("device", found, "asked for" if wanted == found else "a GPU that torch sees")
-    for stage, device in stages.items():
-        if stage == FLOW and device != PROCESSOR and flow_method != "tvl1":
-            reason = f"the method {flow_method} is OpenCV's and runs there only; tvl1 runs on a device"
-            yield Decision(stage, "on the processor", reason)
-        elif device != found:
-            where = "the processor" if device == PROCESSOR else device
-            yield Decision(stage, f"on {where}", "a setting of its own")
+    if wanted == PROCESSOR:
+        return ()
+    if found == PROCESSOR:
+        return (Decision("device", "CPU", _NO_GPU),)
+    device = Decision("device", found, "asked for" if wanted == found else "torch sees this GPU")
+    if flow_method == "tvl1":
+        return (device,)
+    reason = f"the method {flow_method} is OpenCV's, which runs on the CPU only; tvl1 runs on a device"
+    return device, Decision("optical flow", "on the CPU", reason)
 
 
 @contextmanager

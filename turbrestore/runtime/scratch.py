@@ -8,10 +8,8 @@ there: they are handed back after every frame, and the system keeps in its cache
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import mmap
 import os
-import platform
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -30,10 +28,6 @@ _SHARED = ("r", "r+", "w+")
 _SPARE = 1 << 26
 # Numbers that a piece of a large array has.
 _PART = 1 << 22
-# M_MMAP_THRESHOLD, M_TRIM_THRESHOLD and M_TOP_PAD of mallopt; bytes from which an array is large, and of the largest
-# kept; of the last setting what it is by default, and more than the heap of a thread has.
-_MMAP_THRESHOLD, _TRIM_THRESHOLD, _TOP_PAD, _LARGE, _LARGEST = -3, -1, -2, 1 << 20, 32 << 20
-_LITTLE_PAD, _LARGE_PAD = 128 << 10, 128 << 20
 
 
 def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.float32]:
@@ -78,6 +72,42 @@ def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.
             return np.memmap(file, np.float32, "r+", shape=shape)
     except OSError as error:
         raise StorageError(f"{folder}: cannot hold a file of {size / 1e9:.1f} GB ({error.strerror})") from error
+
+
+def fill_stack(
+    shape: tuple[int, ...], items: Iterator[NDArray[np.float32]], folder: Path | None = None
+) -> NDArray[np.float32]:
+    """Return an array with the next items of an iterator, in memory or in a file.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        (T, ...); T items are taken.
+    items : iterator of ndarray, float32, shape (...)
+    folder : Path, optional
+        Folder of the file; without it the array is in memory.
+
+    Returns
+    -------
+    ndarray, float32
+        A :class:`numpy.memmap` where it is in a file.
+
+    Raises
+    ------
+    StorageError
+        The folder has no room for the file, or cannot be written to.
+
+    Examples
+    --------
+    >>> fill_stack((2, 3), iter([np.zeros(3, np.float32), np.ones(3, np.float32)])).tolist()
+    [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
+    """
+    stack = new_stack(shape, folder)
+    for index in range(len(stack)):
+        # In a loop over the items, one would stay in memory while the next is made.
+        stack[index] = next(items)
+        drop_pages(stack)
+    return stack
 
 
 def to_scratch(array: NDArray[np.float32], folder: Path | None = None) -> NDArray[np.float32]:
@@ -242,75 +272,6 @@ def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
             strip += np.square(part - mean)
         strip /= np.float32(len(stack))
     return variance
-
-
-@contextlib.contextmanager
-def returning_freed(wanted: bool = True) -> Iterator[None]:
-    """Have large arrays given back to the system as soon as they are freed, meanwhile.
-
-    The allocator of glibc otherwise raises the size from which it does so with every large array that is freed, and
-    what lies between those that are in use stays with the process: a third of the peak at 1920×1080.  Afterwards small
-    ones have been given back too, and it keeps arrays up to the size that it would have come to by itself.  The setting
-    is that of the process: where two work at the same time, it is that of the one that came or left last, which costs
-    one of them time or memory.
-
-    Parameters
-    ----------
-    wanted : bool
-        Whether to do so, or nothing.
-
-    Examples
-    --------
-    >>> with returning_freed():
-    ...     float(np.ones(2).sum())
-    2.0
-    """
-    with _adjusted(wanted, (_MMAP_THRESHOLD, _LARGE), (_TRIM_THRESHOLD, 2 * _LARGE)):
-        yield
-
-
-@contextlib.contextmanager
-def keeping_freed(wanted: bool = True) -> Iterator[None]:
-    """Have the process keep what is freed, meanwhile.
-
-    The allocator of glibc gives the heap of a thread back to the system as soon as nothing is in it any more, which at
-    1920×1080 is several times a frame: to fill new pages with zeros takes a ninth of the time of flow and filter there.
-    It keeps a heap that has less room than M_TOP_PAD, so more than all heaps have keeps them all.  Afterwards all but
-    the last heap of each thread, 64 MB at most, has been given back.  The setting is that of the process, and ends that
-    of :func:`returning_freed` around it.
-
-    Parameters
-    ----------
-    wanted : bool
-        Whether to do so, or nothing.
-
-    Examples
-    --------
-    >>> with keeping_freed():
-    ...     float(np.ones(2).sum())
-    2.0
-    """
-    with _adjusted(wanted, (_MMAP_THRESHOLD, _LARGEST), (_TRIM_THRESHOLD, -1), (_TOP_PAD, _LARGE_PAD)):
-        yield
-
-
-@contextlib.contextmanager
-def _adjusted(wanted: bool, *settings: tuple[int, int]) -> Iterator[None]:
-    if not wanted or platform.libc_ver()[0] != "glibc":
-        yield
-        return
-    library = ctypes.CDLL(None)
-    try:
-        for setting in settings:
-            library.mallopt(*setting)
-        yield
-    finally:
-        # Any of these ends the adjustment by itself for good, so they are set to where it ends.
-        library.mallopt(_MMAP_THRESHOLD, _LARGEST)
-        library.mallopt(_TRIM_THRESHOLD, 2 * _LARGEST)
-        library.mallopt(_TOP_PAD, _LITTLE_PAD)
-        # Of small arrays, and of all threads.
-        library.malloc_trim(0)
 
 
 def _another(folder: Path) -> str:

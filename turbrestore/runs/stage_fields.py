@@ -139,7 +139,6 @@ FIELDS: dict[str, dict[str, Field]] = {
         "widths": Array("f8", "k", low=0),
         "costs": Array("f8", "k", low=-_INFINITE, high=_INFINITE),
     },
-    "blur_bounds": {"low": Number(), "high": Number(high=_INFINITE)},
 }
 
 

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..blur.blur_cues import BlurBounds
 from ..blur.estimation import BlurEstimate
 from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import DataError, InputNotFoundError
@@ -26,7 +25,7 @@ from ..io.files import check_input
 from ..io.images import atomic_output, check_output, read_image
 from ..io.npy import map_npy, read_npz, write_npz
 from ..registration.centroid import Centroid
-from .artifact_fields import check_fields
+from .stage_fields import check_fields
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -38,7 +37,6 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "filtered": Filtered,
     "deconvolution": Deconvolution,
     "blur": BlurEstimate,
-    "blur_bounds": BlurBounds,
 }
 _HEADER = "header"
 
@@ -52,7 +50,7 @@ def save_artifact(path: str | os.PathLike[str], result: DataclassInstance, overw
     ----------
     path : path
         Must end in ``.npz``.
-    result : Centroid, FlowDynamics, Filtered, Deconvolution, BlurEstimate or BlurBounds
+    result : Centroid, FlowDynamics, Filtered, Deconvolution or BlurEstimate
     overwrite : bool
         Replace an existing file.
 
@@ -94,7 +92,7 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Pat
     Parameters
     ----------
     path : path
-        File written by :func:`save_artifact`.
+        File written by :func:`save_stage`.
     kind : type
         Class that is expected.
     scratch : Path, optional
@@ -121,12 +119,12 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Pat
     """
     name, (found, fields) = _kind_of(kind), _read(Path(path), scratch)
     if found != name:
-        raise DataError(f"{path}: expected a {name} artifact, found a {found} artifact")
+        raise DataError(f"{path}: expected a {name} stage file, found a {found} stage file")
     return _build(kind, fields)
 
 
 def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
-    """Read an image file, or the image of an artifact that has one.
+    """Read an image file, or the image of a stage file that has one.
 
     Parameters
     ----------
@@ -156,7 +154,7 @@ def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
         return read_image(source).image
     kind, fields = _read(source)
     if "image" not in fields:
-        raise DataError(f"{source}: expected an artifact with an image, found a {kind} artifact")
+        raise DataError(f"{source}: expected a stage file with an image, found a {kind} stage file")
     return check_image(fields["image"], str(source))
 
 
@@ -194,7 +192,7 @@ def save_flows(path: str | os.PathLike[str], flows: ArrayLike, overwrite: bool =
 
 
 def load_flows(path: str | os.PathLike[str]) -> FloatArray:
-    """Read flows from a ``.npy`` file, or those of a centroid artifact.
+    """Read flows from a ``.npy`` file, or those of a centroid stage file.
 
     Parameters
     ----------
@@ -235,7 +233,7 @@ def load_flows(path: str | os.PathLike[str]) -> FloatArray:
 
 
 def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any]]:
-    """Kind and fields of an artifact."""
+    """Kind and fields of a stage file."""
     if source.is_dir() or not source.exists():
         raise InputNotFoundError(f"{source}: no such file")
     check_input(source)
@@ -245,10 +243,10 @@ def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any
         kind, schema, fields = header["kind"], header["schema"], {**header["fields"], **arrays}
         known = kind in KINDS
     except (DataError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise DataError(f"{source}: expected an artifact of turbrestore, found something else or damage") from error
+        raise DataError(f"{source}: expected a stage file of turbrestore, found something else or damage") from error
     if type(schema) is not int or schema != SCHEMA or not known:
         raise DataError(
-            f"{source}: expected an artifact of layout {SCHEMA}, found a {kind!r:.40} of layout {schema!r:.40}"
+            f"{source}: expected a stage file of layout {SCHEMA}, found a {kind!r:.40} of layout {schema!r:.40}"
         )
     check_fields(kind, fields, str(source))
     return kind, fields
@@ -262,4 +260,4 @@ def _kind_of(cls: type) -> str:
     for name, known in KINDS.items():
         if known is cls:
             return name
-    raise DataError(f"artifact: expected one of {', '.join(KINDS)}, found {cls.__name__}")
+    raise DataError(f"stage file: expected one of {', '.join(KINDS)}, found {cls.__name__}")

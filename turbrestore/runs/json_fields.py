@@ -16,7 +16,7 @@ Kind = TypeVar("Kind")
 
 
 @dataclass(frozen=True)
-class RecordFields:
+class JsonFields:
     """Part of a JSON record; every method raises :class:`turbrestore.core.errors.DataError` on what is of another type.
 
     Attributes
@@ -28,7 +28,7 @@ class RecordFields:
 
     Examples
     --------
-    >>> RecordFields(Path("run.json"), {"train": "8"}).value("train", int)
+    >>> JsonFields(Path("run.json"), {"train": "8"}).value("train", int)
     Traceback (most recent call last):
     ...
     turbrestore.core.errors.DataError: run.json: expected train to be int, found '8'
@@ -53,18 +53,18 @@ class RecordFields:
             raise self._wrong(name, "true or false")
         return found
 
-    def part(self, name: str) -> RecordFields:
+    def part(self, name: str) -> JsonFields:
         """Return a record in the record."""
-        return RecordFields(self.path, self.value(name, dict))
+        return JsonFields(self.path, self.value(name, dict))
 
-    def parts(self, name: str) -> list[RecordFields]:
+    def parts(self, name: str) -> list[JsonFields]:
         """Return a list of records."""
         items = self.value(name, list)
-        return [RecordFields(self.path, {name: item}).part(name) for item in items]
+        return [JsonFields(self.path, {name: item}).part(name) for item in items]
 
     def texts(self, name: str) -> tuple[str, ...]:
         """Return a list of texts."""
-        return tuple(RecordFields(self.path, {name: item}).value(name, str) for item in self.value(name, list))
+        return tuple(JsonFields(self.path, {name: item}).value(name, str) for item in self.value(name, list))
 
     def numbers(self, name: str) -> dict[str, float]:
         """Return a record of numbers."""

@@ -1,0 +1,112 @@
+"""What the result of each stage depends on, so that a later run can tell which results still hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from ..io.source import FrameSource
+from ..memory_plan import MemoryPlan
+from ..settings import RestoreParams
+from .digests import content_digest
+from .run_record import versions
+
+# Raised where the same frames and settings begin to give another image.
+_RESULTS = 8
+
+
+def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryPlan) -> dict[str, dict[str, Any]]:
+    """List what each stage depends on beside the stage before it; reads the input once.
+
+    Parameters
+    ----------
+    source : FrameSource
+    params : RestoreParams
+    plan : MemoryPlan
+        Of this restoration.
+
+    Returns
+    -------
+    dict of str to dict
+        As JSON holds it.
+
+    Examples
+    --------
+    >>> source, params = FrameSource.from_array(np.zeros((5, 16, 16))), RestoreParams()
+    >>> facts = stage_dependencies(source, params, plan_memory(source.shape, params, DEFAULT))
+    >>> list(facts), facts["filtered"]["frames"]
+    (['centroid', 'dynamics', 'filtered', 'deblurred'], [0, 5, 1])
+    """
+    settings = dataclasses.asdict(params)
+    rows, columns = source.window
+    facts = {
+        "centroid": {
+            "input": content_digest(source),
+            "training_frames": _span(source.numbers[: plan.train]),
+            # What is repaired is found by looking at all frames.
+            "repaired": None if source.repair is None else [_span(source.numbers), *source.warnings],
+            **({} if plan.tile is None else {"tile": plan.tile}),
+            "region": [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start],
+            "device": plan.runtime.device,
+            "flow": settings["flow"],
+            "centroid": settings["centroid"],
+            "versions": versions(),
+            "results": _RESULTS,
+        },
+        "dynamics": {"dynamics": settings["dynamics"]},
+        "filtered": {"frames": _span(source.numbers), **{name: settings[name] for name in ("keep_best", "filter")}},
+        "deblurred": {name: settings[name] for name in ("deconvolution", "guards")},
+    }
+    return json.loads(json.dumps(facts))
+
+
+def filter_key(facts: dict[str, dict[str, Any]]) -> str:
+    """Return a checksum of all that the filter depends on.
+
+    Parameters
+    ----------
+    facts : dict
+        From :func:`stage_dependencies`.
+
+    Returns
+    -------
+    str
+        Hexadecimal.
+    """
+    parts = [facts[stage] for stage in ("centroid", "dynamics", "filtered")]
+    return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def _span(numbers: Sequence[int]) -> list[int]:
+    return [numbers.start, numbers.stop, numbers.step] if isinstance(numbers, range) else list(numbers)
+
+
+def list_changes(before: Any, now: Any, name: str = "") -> Iterator[str]:
+    """Say what differs between two records, one line for each value.
+
+    Parameters
+    ----------
+    before, now : object
+        As JSON holds them.
+    name : str
+        Dotted name of the value.
+
+    Yields
+    ------
+    str
+
+    Examples
+    --------
+    >>> list(list_changes({"flow": {"method": "dis"}}, {"flow": {"method": "tvl1"}}))
+    ['flow.method was dis and is tvl1']
+    """
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in {**before, **now}:
+            yield from list_changes(before.get(key), now.get(key), f"{name}.{key}" if name else key)
+    elif name == "input" and before != now:
+        yield "the content of the input has changed"
+    elif before != now:
+        yield f"{name} was {before} and is {now}"

@@ -1,0 +1,277 @@
+"""Files of a run: the results of its stages, its images, and ``run.json``, from which a report can be made later.
+
+The folder holds one stage file for each result (``centroid.npz``, …), the images in full precision (``images.npz``)
+and ``run.json``, which says that the run is complete once it holds the part ``restoration``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from ..blur.estimation import BlurEstimate
+from ..core.arrays import FloatArray, check_image
+from ..core.errors import DataError, InputNotFoundError, OutputError
+from ..deconvolution.deconvolve import Deconvolution
+from ..dynamics.flow_model import FlowDynamics
+from ..filtering.alternating import Filtered
+from ..io.images import atomic_output, atomic_write
+from ..io.npy import read_npz, write_npz
+from ..registration.centroid import Centroid
+from ..registration.coverage import Rectangle
+from ..results import Restoration
+from ..settings import RestoreParams
+from .json_fields import JsonFields
+from .run_record import RunRecord
+from .stage_files import load_artifact, save_artifact
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+SCHEMA = 2
+RECORD, IMAGES, MEAN = "run.json", "images.npz", "mean.npy"
+RESULTS = ("centroid", "dynamics", "filtered", "blur", "deconvolution")
+# All files of a kept run.
+RUN_FILES = (*(f"{name}.npz" for name in RESULTS), MEAN, IMAGES, RECORD)
+# Where `turbrestore report` writes by default.
+REPORT = "report.html"
+
+Stage = TypeVar("Stage", bound="DataclassInstance")
+
+
+def save_run(folder: str | os.PathLike[str], restoration: Restoration, run: RunRecord) -> None:
+    """Keep a run in a folder; what an earlier one left there is replaced.
+
+    Parameters
+    ----------
+    folder : path
+        Created if its parent exists.
+    restoration : Restoration
+    run : RunRecord
+
+    Raises
+    ------
+    OutputError
+        The folder cannot be created or written to.
+    StorageError
+        Writing failed.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile
+    >>> from turbrestore.pipeline import restore
+    >>> frames = np.random.default_rng(0).uniform(size=(4, 32, 32)).astype(np.float32)
+    >>> restoration = restore(frames, RestoreParams(until="centroid"))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_run(folder, restoration, RunRecord("noise", frames[2]))
+    ...     again, run = load_run(folder)
+    >>> run.name, bool((again.image == restoration.image).all())
+    ('noise', True)
+    """
+    place = Path(folder)
+    try:
+        place.mkdir(exist_ok=True)
+        # Whoever looks while the files are written must not take them for one run.
+        (place / RECORD).unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{place}: cannot be written to ({error.strerror})") from error
+    write_record(place, save_results(place, restoration, run, ()))
+
+
+def save_results(folder: Path, restoration: Restoration, run: RunRecord, stored: Collection[str]) -> dict[str, Any]:
+    """Write the images, and the results of the stages that are not there yet.
+
+    Parameters
+    ----------
+    folder : Path
+        An existing folder.
+    restoration : Restoration
+    run : RunRecord
+    stored : collection of str
+        Names of files that are there already.
+
+    Returns
+    -------
+    dict
+        What the record has to say of a complete run.
+
+    Raises
+    ------
+    OutputError, StorageError
+        Writing failed.
+    """
+    # A report would be of an earlier run.
+    (folder / REPORT).unlink(missing_ok=True)
+    results = {name: getattr(restoration, name) for name in RESULTS}
+    for name, result in results.items():
+        if result is None:
+            (folder / f"{name}.npz").unlink(missing_ok=True)
+        elif f"{name}.npz" not in stored:
+            save_artifact(folder / f"{name}.npz", result, overwrite=True)
+    with atomic_output(folder / IMAGES, overwrite=True) as temporary, temporary.open("wb") as stream:
+        write_npz(stream, {"frame": run.frame, "mean": restoration.mean, "image": restoration.image})
+    described = {item.name: getattr(run, item.name) for item in dataclasses.fields(run) if item.name != "frame"}
+    restored = {
+        "results": [name for name, result in results.items() if result is not None],
+        "crop": list(restoration.crop),
+        "guard_readings": [dataclasses.asdict(reading) for reading in restoration.guard_readings],
+        "decisions": [dataclasses.asdict(decision) for decision in restoration.decisions],
+        "train": restoration.train,
+        "frame_count": restoration.frame_count,
+        "seconds": restoration.seconds,
+    }
+    return {"run": described, "restoration": restored}
+
+
+def write_record(folder: Path, parts: Mapping[str, Any]) -> None:
+    """Write ``run.json``; an older one is replaced when the new one is complete.
+
+    Parameters
+    ----------
+    folder : Path
+    parts : mapping
+        What the record holds beside the version of its layout.
+
+    Raises
+    ------
+    OutputError, StorageError
+        Writing failed.
+    """
+    text = json.dumps({"schema": SCHEMA, **parts}, indent=1, sort_keys=True) + "\n"
+    atomic_write(folder / RECORD, text.encode(), overwrite=True)
+
+
+def read_record(folder: Path) -> dict[str, Any] | None:
+    """Read ``run.json``.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    dict or None
+        None where there is no such file.
+
+    Raises
+    ------
+    DataError
+        The record is damaged or of another version of the layout.
+
+    Examples
+    --------
+    >>> read_record(Path("nowhere")) is None
+    True
+    """
+    path = folder / RECORD
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path}: expected the record of a run, found no file")
+    try:
+        record = json.loads(path.read_text("utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: expected the record of a run, found something else or damage") from error
+    found = record.get("schema") if isinstance(record, dict) else "none"
+    if type(found) is not int or found != SCHEMA:
+        raise DataError(f"{path}: expected the record of a run, layout {SCHEMA}, found layout {found!r:.40}")
+    return record
+
+
+def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
+    """Read a kept run back.
+
+    Parameters
+    ----------
+    folder : path
+        Written by :func:`save_run`.
+
+    Returns
+    -------
+    restoration : Restoration
+    run : RunRecord
+
+    Raises
+    ------
+    InputNotFoundError
+        There is no such folder, or the run in it is not complete.
+    DataError
+        A file is damaged, or of another version of the layout.
+
+    Examples
+    --------
+    >>> load_run("missing")
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.InputNotFoundError: missing: expected a folder written by --keep, ...
+    """
+    place = Path(folder)
+    record = read_record(place)
+    if record is None or "restoration" not in record:
+        raise InputNotFoundError(f"{place}: expected a folder written by --keep, found no complete {RECORD} in it")
+    fields = JsonFields(place / RECORD, record)
+    facts, run = fields.part("restoration"), fields.part("run")
+    names = facts.texts("results")
+    if "centroid" not in names or not set(names) <= set(RESULTS):
+        raise DataError(f"{fields.path}: expected results among {', '.join(RESULTS)}, found {', '.join(names)}")
+    crop = _crop(facts)
+    images = _read_images(place / IMAGES, crop)
+    restoration = Restoration(
+        image=images["image"],
+        crop=crop,
+        mean=images["mean"],
+        centroid=load_artifact(place / "centroid.npz", Centroid),
+        dynamics=_stage(place, names, "dynamics", FlowDynamics),
+        filtered=_stage(place, names, "filtered", Filtered),
+        blur=_stage(place, names, "blur", BlurEstimate),
+        deconvolution=_stage(place, names, "deconvolution", Deconvolution),
+        guard_readings=facts.guard_readings("guard_readings"),
+        decisions=facts.decisions("decisions"),
+        train=facts.value("train", int),
+        frame_count=facts.value("frame_count", int),
+        seconds=facts.numbers("seconds"),
+    )
+    return restoration, RunRecord(
+        name=run.value("name", str),
+        frame=images["frame"],
+        frame_number=run.value("frame_number", int),
+        source=run.value("source", str),
+        settings=run.part("settings").like(dataclasses.asdict(RestoreParams())),
+        command=run.texts("command"),
+        warnings=run.texts("warnings"),
+        versions={name: str(text) for name, text in run.value("versions", dict).items()},
+        finished=run.value("finished", str),
+    )
+
+
+def _stage(place: Path, names: tuple[str, ...], name: str, kind: type[Stage]) -> Stage | None:
+    return load_artifact(place / f"{name}.npz", kind) if name in names else None
+
+
+def _crop(fields: JsonFields) -> Rectangle:
+    found = fields.value("crop", list)
+    if len(found) != 4 or not all(type(number) is int and number >= 0 for number in found):
+        raise DataError(f"{fields.path}: expected crop to be x, y, width and height, found {found!r:.40}")
+    x, y, width, height = found
+    return x, y, width, height
+
+
+def _read_images(path: Path, crop: Rectangle) -> dict[str, FloatArray]:
+    if not path.is_file():
+        raise InputNotFoundError(f"{path}: no such file")
+    try:
+        found = read_npz(path)
+        arrays = {name: found[name] for name in ("frame", "mean", "image")}
+    except (DataError, KeyError) as error:
+        raise DataError(f"{path}: expected the images of a run, found something else or damage") from error
+    images = {name: check_image(array, f"{path}: {name}") for name, array in arrays.items()}
+    x, y, width, height = crop
+    if images["frame"].shape != images["mean"].shape or images["image"].shape[:2] != (height, width):
+        raise DataError(f"{path}: expected images of one size, found {[image.shape for image in images.values()]}")
+    if x + width > images["mean"].shape[1] or y + height > images["mean"].shape[0]:
+        raise DataError(f"{path}: expected the result to lie within the frames, found it at {crop}")
+    return images

@@ -1,0 +1,439 @@
+"""The folder of a run: results of stages are kept as they are made, and a later run continues from them.
+
+``run.json`` (:mod:`turbrestore.runs.run_files`) says what each stage depends on and holds a checksum of each file.  A
+stage is taken over if nothing that it or an earlier stage depends on has changed, and its files are as they were
+written:
+
+==========  =========================================================================================================
+stage       depends on
+==========  =========================================================================================================
+centroid    content of the input, training frames, region, settings of flow and centroid, versions of all packages
+dynamics    the centroid, settings of the dynamics
+filtered    the dynamics, all selected frames, settings of the filter, the share of best frames
+deblurred   the filtered image, settings of deconvolution and guards
+==========  =========================================================================================================
+
+Threads and a memory limit change no result, so nothing depends on them; but where a limit leaves fewer training frames,
+or whole frames do not fit, the centroid depends on those frames and on the size of the tiles.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from ..blind.remove_blur import Deblurred
+from ..blur.estimation import BlurEstimate
+from ..core.arrays import check_image
+from ..core.errors import DataError, OutputError, require
+from ..deconvolution.deconvolve import Deconvolution
+from ..dynamics.flow_model import FlowDynamics
+from ..filtering.alternating import FilterCheckpoint, Filtered
+from ..io.images import atomic_output
+from ..io.npy import map_npy
+from ..io.source import FrameSource
+from ..memory_plan import plan_memory
+from ..registration.centroid import Centroid
+from ..results import Restoration
+from ..runtime.runtime import DEFAULT, Runtime
+from ..settings import RestoreParams
+from .checkpoint import load_checkpoint, save_checkpoint
+from .dependencies import filter_key, list_changes, stage_dependencies
+from .digests import file_digest
+from .json_fields import JsonFields
+from .run_files import MEAN, RECORD, RUN_FILES, read_record, save_results, write_record
+from .run_record import RunRecord
+from .stage_files import load_artifact, save_artifact
+
+CHECKPOINT = "checkpoint.npz"
+FILES = {
+    "centroid": ("centroid.npz",),
+    "dynamics": ("dynamics.npz",),
+    "filtered": ("filtered.npz", MEAN),
+    "deblurred": ("deconvolution.npz", "blur.npz"),
+}
+TITLES = {"centroid": "centroid", "dynamics": "flow model", "filtered": "filter", "deblurred": "deconvolution"}
+_KINDS: dict[str, type] = {"centroid": Centroid, "dynamics": FlowDynamics, "filtered": Filtered}
+_TILE = re.compile(r"filtered_tile_\d+")
+# Left by a writer that was killed.
+_PART = re.compile(r"\.[0-9a-f]{16}\.part")
+_ANEW = "start anew with --overwrite, or keep the stages in another folder"
+
+Result = TypeVar("Result")
+
+
+class RunFolder:
+    """Results of one restoration in a folder, and what an earlier run of it has left there.
+
+    It is a :class:`turbrestore.results.Store`.  The folder should be held by
+    :func:`turbrestore.runs.folder_lock.lock_folder`.
+
+    Parameters
+    ----------
+    folder : path
+        An existing folder.
+    source : FrameSource
+        Frames to restore.
+    params : RestoreParams
+        Settings.
+    runtime : Runtime
+        What the restoration may use of the machine.
+    resume : bool
+        Take over what still holds; otherwise everything starts anew.
+    every : int
+        Frames between two checkpoints of the filter.
+
+    Attributes
+    ----------
+    folder : Path
+    notes : tuple of str
+        What was taken over, and what starts again and why.
+
+    Raises
+    ------
+    ConfigurationError
+        ``every`` is below 1.
+    OutputError
+        The folder cannot be written to.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from turbrestore.pipeline import restore
+    >>> frames = FrameSource.from_array(np.random.default_rng(0).uniform(size=(4, 32, 32)))
+    >>> params = RestoreParams(until="centroid")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = restore(frames, params, store=RunFolder(folder, frames, params))
+    ...     RunFolder(folder, frames, RestoreParams(), resume=True).notes
+    ('continues after the centroid',)
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        source: FrameSource,
+        params: RestoreParams,
+        runtime: Runtime = DEFAULT,
+        resume: bool = False,
+        every: int = 50,
+    ) -> None:
+        require(every >= 1, f"checkpoint_every: expected at least 1 frame, found {every}")
+        self.folder, self._every, self._block = Path(folder), every, params.filter.block
+        plan = plan_memory(source.shape, params, runtime)
+        self._scratch = plan.runtime.scratch
+        self._facts = stage_dependencies(source, params, plan)
+        self._key = filter_key(self._facts)
+        self._files: dict[str, str] = {}
+        self._verdict: dict[str, Any] = {}
+        self._outputs: tuple[str, ...] = ()
+        self._completed: dict[str, Any] = {}
+        self._newest: FilterCheckpoint | None = None
+        self._written = 0
+        self.notes = tuple[str, ...]()
+        record = read_stages(self.folder) if resume else None
+        if record is not None:
+            self._take_over(record)
+        self._remove_the_rest()
+
+    @property
+    def stored(self) -> frozenset[str]:
+        """Names of the files on disk that hold the results of stages."""
+        return frozenset(self._files)
+
+    def get(self, name: str, compute: Callable[[], Result]) -> Result:
+        """Return a result that was kept, else compute and keep it.
+
+        Parameters
+        ----------
+        name : str
+            Name of a stage, ``mean``, or ``filtered_tile_N``.
+        compute : callable
+
+        Returns
+        -------
+        object
+
+        Raises
+        ------
+        OutputError, StorageError
+            The result cannot be written.
+        """
+        kept = self._load(name)
+        if kept is not None:
+            return cast(Result, kept)
+        result = compute()
+        self._save(name, result)
+        return result
+
+    def filter_start(self) -> FilterCheckpoint | None:
+        """Return the checkpoint from which the filter continues."""
+        return self._newest
+
+    def checkpoint(self, state: FilterCheckpoint) -> None:
+        """Take the newest checkpoint of the filter, and write it if enough frames have passed since the last.
+
+        Parameters
+        ----------
+        state : FilterCheckpoint
+
+        Raises
+        ------
+        OutputError, StorageError
+            It cannot be written.
+        """
+        self._newest = state
+        if len(state.records) + self._block > self._written + self._every:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the newest checkpoint, if it is not written yet.
+
+        Raises
+        ------
+        OutputError, StorageError
+            It cannot be written.
+        """
+        if self._newest is None or len(self._newest.records) <= self._written:
+            return
+        save_checkpoint(self.folder / CHECKPOINT, self._newest, self._key)
+        self._written = len(self._newest.records)
+
+    def expect(self, *outputs: Path) -> None:
+        """Note which outputs are about to be written, so that a run that dies meanwhile may replace its own.
+
+        Parameters
+        ----------
+        *outputs : Path
+            None once they are complete.
+        """
+        self._outputs = tuple(str(path.absolute()) for path in outputs)
+        self._write_record()
+
+    def progress(self) -> str:
+        """Say how far the results on disk go.
+
+        Returns
+        -------
+        str
+        """
+        stages = itertools.takewhile(lambda stage: FILES[stage][0] in self._files, FILES)
+        last = [TITLES[stage] for stage in stages][-1:]
+        words = f"after the {last[0]}" if last else "from the start"
+        tiles = sum(1 for name in self._files if _TILE.fullmatch(name.removesuffix(".npz")))
+        if tiles:
+            return f"{words} and {tiles} tiles of the filter"
+        return f"{words} and {self._written} frames of the filter" if self._written else words
+
+    def withdraw(self) -> None:
+        """Leave no record of a run that has failed before it had anything to keep."""
+        if self._files or self._written:
+            return
+        for name in (*RUN_FILES, CHECKPOINT):
+            (self.folder / name).unlink(missing_ok=True)
+
+    def complete(self, restoration: Restoration, run: RunRecord) -> None:
+        """Write what :func:`turbrestore.load_run` needs beside the results of the stages.
+
+        Parameters
+        ----------
+        restoration : Restoration
+        run : RunRecord
+
+        Raises
+        ------
+        OutputError, StorageError
+            It cannot be written.
+        """
+        self._completed = save_results(self.folder, restoration, run, self.stored)
+        self._write_record()
+
+    def _take_over(self, record: dict[str, Any]) -> None:
+        """Find what still holds, and say where and why something starts again."""
+        notes: list[str] = []
+        holds = []
+        for stage, expected in self._facts.items():
+            changes = list(list_changes(record["facts"].get(stage, {}), expected))
+            if changes:
+                notes.append(f"starts again at the {TITLES[stage]}: {'; '.join(changes)}")
+                break
+            holds.append(stage)
+        names = [name for stage in holds for name in FILES[stage]]
+        if "filtered" in holds:
+            names += [name for name in record["files"] if _TILE.fullmatch(name.removesuffix(".npz"))]
+        for name in names:
+            wanted = record["files"].get(name)
+            if wanted is not None and _is_whole(self.folder / name, wanted):
+                self._files[name] = wanted
+            elif wanted is not None:
+                notes.append(f"{name} is missing or damaged and is made again")
+        self._verdict = record["deblurred"]
+        if "filtered" in holds and "filtered.npz" not in self._files and (self.folder / CHECKPOINT).exists():
+            try:
+                self._newest = load_checkpoint(self.folder / CHECKPOINT, self._key)
+                self._written = len(self._newest.records)
+            except DataError as error:
+                notes.append(str(error))
+        self.notes = (*notes, *([] if notes and not self._files else [f"continues {self.progress()}"]))
+
+    def _load(self, name: str) -> object | None:
+        """Read a result whose files are as they were written."""
+        if name == "mean":
+            return check_image(map_npy(self.folder / MEAN), MEAN) if MEAN in self._files else None
+        if name == "deblurred":
+            return self._load_deblurred()
+        if f"{name}.npz" not in self._files:
+            return None
+        return load_artifact(self.folder / f"{name}.npz", _KINDS[_kind(name)], self._scratch)
+
+    def _load_deblurred(self) -> Deblurred | None:
+        if "deconvolution.npz" not in self._files or self._verdict.get("estimated") is not ("blur.npz" in self._files):
+            return None
+        result = load_artifact(self.folder / "deconvolution.npz", Deconvolution, self._scratch)
+        blur = load_artifact(self.folder / "blur.npz", BlurEstimate) if "blur.npz" in self._files else None
+        fields = JsonFields(self.folder / RECORD, self._verdict)
+        return Deblurred(result, blur, None, fields.guard_readings("readings"), fields.decisions("decisions"))
+
+    def _save(self, name: str, result: Any) -> None:
+        """Write the files of a result, and then the record that they are there."""
+        results = {name: result}
+        if name == "mean":
+            with atomic_output(self.folder / MEAN, overwrite=True) as temporary, temporary.open("wb") as stream:
+                np.save(stream, np.asarray(result), allow_pickle=False)
+            self._files[MEAN] = file_digest(self.folder / MEAN)
+            results = {}
+        elif name == "deblurred":
+            results = {"deconvolution": result.deconvolution, "blur": result.blur}
+            self._verdict = _verdict(result)
+        for part, value in results.items():
+            self._files.pop(f"{part}.npz", None)
+            if value is not None:
+                save_artifact(self.folder / f"{part}.npz", value, overwrite=True)
+                self._files[f"{part}.npz"] = file_digest(self.folder / f"{part}.npz")
+        self._write_record()
+        if name == "filtered":
+            self._remove_filter_states()
+
+    def _remove_filter_states(self) -> None:
+        """Remove checkpoint and tiles once the filter is done."""
+        tiles = [name for name in self._files if _TILE.fullmatch(name.removesuffix(".npz"))]
+        for name in (CHECKPOINT, *tiles):
+            self._files.pop(name, None)
+            (self.folder / name).unlink(missing_ok=True)
+        self._newest, self._written = None, 0
+        if tiles:
+            self._write_record()
+
+    def _remove_the_rest(self) -> None:
+        """Remove what does not belong to this run, so that nobody takes it for a part of it."""
+        kept = {*self._files, *([CHECKPOINT] if self._written else [])}
+        try:
+            tiles = {path.name for path in self.folder.iterdir() if _TILE.fullmatch(path.stem)}
+            for name in {*RUN_FILES, CHECKPOINT, *tiles} - kept:
+                (self.folder / name).unlink(missing_ok=True)
+            for path in [path for path in self.folder.iterdir() if is_part(path)]:
+                path.unlink(missing_ok=True)
+            # First of all, so that whatever is found in the folder later is known to be of this run.
+            self._write_record()
+        except OSError as error:
+            raise OutputError(f"{self.folder}: cannot be written to ({error.strerror or error})") from error
+
+    def _record(self) -> dict[str, Any]:
+        return {
+            "facts": self._facts,
+            "files": self._files,
+            "deblurred": self._verdict,
+            "outputs": list(self._outputs),
+            **self._completed,
+        }
+
+    def _write_record(self) -> None:
+        write_record(self.folder, self._record())
+
+
+def read_stages(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """Read the record of the stages that are kept in a folder.
+
+    Parameters
+    ----------
+    folder : path
+
+    Returns
+    -------
+    dict or None
+        None where there is no such record.
+
+    Raises
+    ------
+    DataError
+        The record is damaged or of another version of the layout.
+
+    Examples
+    --------
+    >>> read_stages("nowhere") is None
+    True
+    """
+    place = Path(folder)
+    try:
+        record = read_record(place)
+        if record is None or "facts" not in record:
+            return None
+        fields = JsonFields(place / RECORD, record)
+        facts = fields.part("facts")
+        for stage in facts.record:
+            facts.part(stage)
+        fields.named_texts("files")
+        fields.texts("outputs")
+        verdict = fields.part("deblurred")
+        if verdict.record:
+            verdict.flag("estimated")
+            verdict.guard_readings("readings")
+            verdict.decisions("decisions")
+    except DataError as error:
+        raise DataError(f"{error}; {_ANEW}") from error
+    return record
+
+
+def is_part(path: Path) -> bool:
+    """Tell whether a file is what a writer leaves that is killed.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    bool
+
+    Examples
+    --------
+    >>> is_part(Path(".0123456789abcdef.part")), is_part(Path("letter.part"))
+    (True, False)
+    """
+    return _PART.fullmatch(path.name) is not None
+
+
+def _kind(name: str) -> str:
+    return "filtered" if _TILE.fullmatch(name) else name
+
+
+def _is_whole(path: Path, digest: str) -> bool:
+    try:
+        return file_digest(path) == digest
+    except OSError:
+        return False
+
+
+def _verdict(deblurred: Deblurred) -> dict[str, Any]:
+    """List what of a deblurred image is in no stage file."""
+    return {
+        "estimated": deblurred.blur is not None,
+        "readings": [dataclasses.asdict(item) for item in deblurred.readings],
+        "decisions": [dataclasses.asdict(item) for item in deblurred.decisions],
+    }
