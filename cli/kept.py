@@ -10,7 +10,8 @@ from turbrestore.io.images import check_space
 from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import plan_memory
 from turbrestore.runs.folder_lock import lock_folder
-from turbrestore.runs.run_folder import RunFolder, read_stages
+from turbrestore.runs.run_files import read_stages
+from turbrestore.runs.run_folder import RunFolder
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.settings import RestoreParams
 

@@ -19,8 +19,8 @@ from turbrestore.io.images import atomic_write, check_output, write_image
 from turbrestore.metrics import compare
 from turbrestore.results import Restoration
 from turbrestore.runs.folder_lock import LOCK
-from turbrestore.runs.run_files import RUN_FILES
-from turbrestore.runs.run_folder import CHECKPOINT, RunFolder, is_part, read_stages
+from turbrestore.runs.run_files import RUN_FILES, read_stages
+from turbrestore.runs.run_folder import CHECKPOINT, RunFolder, is_part
 from turbrestore.runs.run_record import RunRecord
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.scratch import iter_frames

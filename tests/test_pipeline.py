@@ -4,9 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import SCENES, make_sequence
+from conftest import make_sequence
 from turbrestore.blind.remove_blur import blur_to_remove
-from turbrestore.blur.blur_cues import BlurBounds, bound_blur
 from turbrestore.blur.estimation import BlurEstimate
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
@@ -15,9 +14,7 @@ from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
-from turbrestore.registration import flow
 from turbrestore.registration.centroid import CentroidParams
-from turbrestore.registration.flow import FlowParams
 from turbrestore.settings import RestoreParams
 
 QUICK = RestoreParams(centroid=CentroidParams(iterations=2))
@@ -70,7 +67,7 @@ def test_until_stops_there(blurred, until):
     assert short.image is expected
 
 
-def test_a_source_is_read_once_and_front_to_back(blurred):
+def test_a_source_is_read_front_to_back_for_the_filter_and_for_the_mean(blurred):
     reads = []
     array = FrameSource.from_array(blurred.frames[:8])
 
@@ -80,7 +77,7 @@ def test_a_source_is_read_once_and_front_to_back(blurred):
             yield from array.pixels(range(number, number + 1))
 
     restore(replace(array, pixels=pixels), replace(QUICK, train=4, until="filter"))
-    assert reads == list(range(8))
+    assert reads == 2 * list(range(8))
 
 
 def test_the_result_is_the_same_every_time(blurred):
@@ -123,7 +120,7 @@ def test_paper_settings_run(blurred):
 
 def test_progress_reaches_every_stage(blurred):
     seen = {}
-    restore(blurred.frames[:6], QUICK, lambda stage, done, total: seen.__setitem__(stage, (done, total)))
+    restore(blurred.frames[:6], QUICK, progress=lambda stage, done, total: seen.__setitem__(stage, (done, total)))
     assert set(seen) == {"centroid", "filter", "deconvolve"}
     assert all(0 < done <= total for done, total in seen.values())
     assert seen["filter"][0] == seen["filter"][1]
@@ -162,60 +159,6 @@ def test_half_of_the_uncertainty_is_left_in_and_an_image_that_says_nothing_is_le
     assert blur_to_remove(estimate_of(2.0), DeconvolutionParams())[0] == pytest.approx(1.95)
     nothing = replace(estimate_of(0.0), uncertainty=np.inf)
     assert blur_to_remove(nothing, DeconvolutionParams())[0] == 0
-
-
-@pytest.mark.parametrize(("estimated", "removed"), [(0.4, 0.7), (1.0, 0.95), (3.0, 1.5)])
-def test_an_estimated_width_is_kept_within_bounds_and_a_given_one_is_not(estimated, removed):
-    bounds = BlurBounds(0.7, 1.5)
-    width, settings = blur_to_remove(estimate_of(estimated), DeconvolutionParams(), bounds)
-    assert (width, settings.exponent) == (removed, 5 / 3)
-    assert blur_to_remove(estimate_of(estimated), DeconvolutionParams(sigma=4.0), bounds)[0] == 4.0
-
-
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize(("sharpest", "fused", "mean"), [(0.6, 1.2, 1.9), (1.0, 1.1, 2.5), (0.6, 2.0, 2.5)])
-def test_bounds_hold_the_true_width_and_are_of_use(scene, sharpest, fused, mean):
-    image, rng = SCENES[scene](160), np.random.default_rng(0)
-
-    def blurred(sigma, noise):
-        return (cv2.GaussianBlur(image, (0, 0), sigma) + rng.normal(0, noise, image.shape)).astype(np.float32)
-
-    training = np.stack([blurred(sigma, 0.01) for sigma in (sharpest, 2.2, 2.2, sharpest)])
-    bounds = bound_blur(blurred(fused, 0.002), blurred(mean, 0.005), training, count=4, exponent=2.0)
-    assert bounds.low <= fused <= bounds.high
-    # What is known: the fused image is blurred beyond the sharpest frame, and less so than the mean; a width estimated
-    # blindly may be a third off.
-    assert bounds.low > 0.6 * np.sqrt(fused**2 - sharpest**2) - 0.2
-    assert bounds.high**2 < (1.35 * mean) ** 2 - (mean**2 - fused**2)
-
-
-def test_cues_are_reported_when_on(blurred):
-    plain = restore(blurred.frames[:10], replace(QUICK, displacement_cue=False))
-    assert plain.blur_bounds is None
-    assert (plain.dynamics.motion_factor == 1).all()
-    cued = restore(blurred.frames[:10], replace(QUICK, displacement_cue=True, blur_bounds=True))
-    assert cued.blur_bounds.low <= cued.deconvolution.sigma <= cued.blur_bounds.high
-    assert (cued.dynamics.motion_factor != 1).any()
-    assert (cued.centroid.flows == plain.centroid.flows).all()
-
-
-@pytest.mark.parametrize("scene", SCENES)
-def test_where_noise_moves_flows_the_displacement_cue_knows_better(scene):
-    noisy = make_sequence(seed=13, count=30, size=128, scene=scene, noise=0.05, blur=1.2, rms=0.4)
-    true = float(noisy.flows.var(axis=0, ddof=1).mean())
-    # Flow as it is measured: where it is drawn to its surroundings, noise moves it little.
-    settings = replace(QUICK, until="identify", displacement_cue=True, flow=FlowParams(confidence=False))
-    dynamics = restore(noisy.frames, settings).dynamics
-    found = float(dynamics.flow_variance.mean())
-    motion = float((dynamics.motion_factor * dynamics.flow_variance).mean())
-    assert found > 1.3 * true
-    assert abs(motion - true) < abs(found - true) / 2
-
-
-def test_bounds_that_would_have_no_effect_are_refused():
-    for other in ({"until": "filter"}, {"deconvolution": DeconvolutionParams(sigma=1.0)}):
-        with pytest.raises(ConfigurationError, match="^blur_bounds: has an effect only where"):
-            RestoreParams(blur_bounds=True, **other)
 
 
 def test_lucky_imaging_takes_the_sharpest_frames_only():
@@ -262,15 +205,3 @@ def test_every_stage_says_what_it_decided(blurred):
 def test_settings_that_make_no_sense_are_refused(settings, message):
     with pytest.raises(ConfigurationError, match=message):
         RestoreParams(**settings)
-
-
-def test_a_frame_is_prepared_for_flow_once(monkeypatch):
-    prepared = []
-    monkeypatch.setattr(
-        "turbrestore.registration.flow._levels", lambda *a, find=flow._levels: prepared.append(1) or find(*a)
-    )
-    frames = make_sequence(seed=1, count=20).frames[:, :48, :48]
-    found = restore(frames, RestoreParams(train=12, until="filter"))
-    # One for each pass of the centroid, one for the training frames with the rest and one for the rest in the filter.
-    references = found.centroid.mean_flow_sizes.size + 2
-    assert len(prepared) == len(frames) + references

@@ -7,20 +7,21 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore import pipeline
-from turbrestore.core.errors import DataError
-from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.filtering.alternating import Filtered
 from turbrestore.io.source import FrameSource
+from turbrestore.memory_plan import plan_memory
 from turbrestore.metrics import psnr
 from turbrestore.registration.centroid import CentroidParams, find_centroid
 from turbrestore.registration.flow import FlowParams
-from turbrestore.runs import resumption
-from turbrestore.runs.checkpoint import load_tiles, save_tiles
-from turbrestore.runs.resumption import KeptStages
+from turbrestore.runs import run_folder as run_folder_module
+from turbrestore.runs.run_folder import RunFolder
+from turbrestore.runtime.runtime import Runtime
+from turbrestore.runtime.steps import finish
 from turbrestore.runtime.tiling import halo_tiles
 from turbrestore.settings import RestoreParams
-from turbrestore.tiled_stages import filter_tiles, find_tiled_centroid
+from turbrestore.tiled_stages import join_filtered, tiled_centroid_steps
 
 HALO = 24
 TILES = halo_tiles((128, 128), 112, HALO)
@@ -42,7 +43,8 @@ def test_there_are_four_tiles():
 
 def test_a_centroid_in_tiles_is_as_good_as_that_of_the_whole(sequence, tmp_path):
     whole = find_centroid(sequence.frames)
-    tiled = find_tiled_centroid(sequence.frames, TILES, scratch=tmp_path)
+    steps = tiled_centroid_steps(sequence.frames, TILES, CentroidParams(), FlowParams(), Runtime(scratch=tmp_path))
+    tiled = finish(steps)
     assert isinstance(tiled.flows, np.memmap) and isinstance(tiled.image, np.memmap)
     inner = slice(8, -8)
     found, usual = (psnr(centroid.image[inner, inner], sequence.scene[inner, inner]) for centroid in (tiled, whole))
@@ -53,22 +55,22 @@ def test_a_centroid_in_tiles_is_as_good_as_that_of_the_whole(sequence, tmp_path)
 
 def test_one_tile_is_the_whole(sequence, blurred):
     tiles = halo_tiles((128, 128), 128, HALO)
-    whole, tiled = find_centroid(sequence.frames), find_tiled_centroid(sequence.frames, tiles)
+    whole = find_centroid(sequence.frames)
+    tiled = finish(tiled_centroid_steps(sequence.frames, tiles, CentroidParams(), FlowParams(), Runtime()))
     for name in ("image", "flows", "mean_flow_sizes"):
         assert np.array_equal(getattr(whole, name), getattr(tiled, name))
 
 
 def test_figures_of_the_filter_are_means_over_tiles():
     tiles = halo_tiles((40, 80), 44, 8)
-    values = iter((1.0, 2.0, 6.0))
 
-    def part(tile):
-        value, image = next(values), np.full(tile.shape, 0.5, np.float32)
+    def part(tile, value):
+        image = np.full(tile.shape, 0.5, np.float32)
         one = np.array([value, np.nan])
         share = np.array([0.25, 0.75])
-        return Filtered(image, 2 * image, np.ones((2, 3)), one, one, one, share, value, value), 3 * image
+        return Filtered(image, 2 * image, np.ones((2, 3)), one, one, one, share, value, value)
 
-    filtered, mean = filter_tiles(part, tiles, (40, 80))
+    filtered = join_filtered(map(part, tiles, (1.0, 2.0, 6.0)), tiles, (40, 80))
     weights = [tile.row_weights.sum() * tile.column_weights.sum() for tile in tiles]
     expected = np.average([1, 2, 6], weights=weights)
     for name in ("gains", "sharpness"):
@@ -78,7 +80,7 @@ def test_figures_of_the_filter_are_means_over_tiles():
     assert filtered.image_noise == filtered.motion_share == pytest.approx(expected)
     assert filtered.shares == pytest.approx([0.25, 0.75])
     assert filtered.flow_states.shape == (2, 9)
-    for image, level in ((filtered.image, 0.5), (filtered.variance, 1.0), (mean, 1.5)):
+    for image, level in ((filtered.image, 0.5), (filtered.variance, 1.0)):
         np.testing.assert_allclose(image, level, atol=1e-6)
 
 
@@ -86,36 +88,33 @@ QUICK = RestoreParams(
     train=9,
     centroid=CentroidParams(iterations=2),
     dynamics=DynamicsParams(rank=2),
-    displacement_cue=True,
     deconvolution=DeconvolutionParams(sigma=1.0, iterations=30),
 )
 
 
 @pytest.fixture
-def in_tiles(monkeypatch):
+def in_tiles(monkeypatch, tmp_path):
     """Restore in tiles from now on, whatever the limit."""
+    (scratch := tmp_path / "scratch").mkdir()
 
-    def begin(source):
-        plan = replace(pipeline.memory_plan(source, QUICK), in_file=True, tile=112)
-        for module in (pipeline, resumption):
-            monkeypatch.setattr(module, "memory_plan", lambda *_: plan)
-        monkeypatch.setattr(pipeline, "halo_tiles", lambda shape, side, halo=HALO: halo_tiles(shape, side, halo))
+    def plan(shape, params, runtime):
+        found = plan_memory(shape, params, runtime)
+        return replace(found, runtime=replace(found.runtime, scratch=scratch), tile=112)
 
-    return begin
+    for module in (pipeline, run_folder_module):
+        monkeypatch.setattr(module, "plan_memory", plan)
+    monkeypatch.setattr(pipeline, "halo_tiles", lambda shape, side, halo=HALO: halo_tiles(shape, side, halo))
+    return scratch
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, tmp_path, in_tiles, channels):
+def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, request, channels):
     frames, truth = (
         image if channels == 1 else np.stack([image] * 3, axis=-1) for image in (sequence.frames, sequence.scene)
     )
-    source = FrameSource.from_array(frames)
-    whole = pipeline.restore(source, QUICK)
-    in_tiles(source)
-    told = []
-    tiled = pipeline.restore(
-        source, QUICK, progress=lambda stage, done, total: told.append((stage, done, total)), scratch=tmp_path
-    )
+    whole = pipeline.restore(frames, QUICK)
+    scratch, told = request.getfixturevalue("in_tiles"), []
+    tiled = pipeline.restore(frames, QUICK, progress=lambda stage, done, total: told.append((stage, done, total)))
     inner = slice(8, -8)
     for name in ("mean", "image"):
         found, usual = (psnr(getattr(run, name)[inner, inner], truth[inner, inner]) for run in (tiled, whole))
@@ -124,7 +123,7 @@ def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, tmp
     assert tiled.filtered.shares.sum() == pytest.approx(1)
     assert tiled.filtered.gains.shape == (12,)
     assert tiled.frame_count == 12
-    assert not list(tmp_path.iterdir())
+    assert not list(scratch.iterdir())
     for stage in ("centroid", "filter", "deconvolve"):
         done = [count for name, count, _ in told if name == stage]
         totals = {total for name, _, total in told if name == stage}
@@ -132,29 +131,10 @@ def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, tmp
     assert [done for name, done, total in told if name == "filter"][-1] == 4 * (2 * 12 - 9)
 
 
-@pytest.mark.parametrize("memory", [None, 1e6])
-def test_a_restoration_in_tiles_is_deblurred_as_a_whole(sequence, in_tiles, tmp_path, memory):
-    source = FrameSource.from_array(sequence.frames)
-    in_tiles(source)
-    params = replace(QUICK, deconvolution=replace(QUICK.deconvolution, memory=memory))
-    tiled = pipeline.restore(source, params, scratch=tmp_path)
-    whole = deconvolve(tiled.filtered.image, 1.0, QUICK.deconvolution, tiled.centroid.image)
-    assert isinstance(tiled.deconvolution.image, np.memmap)
-    assert np.array_equal(tiled.deconvolution.image, whole.image)
-
-
-def test_a_restoration_in_tiles_is_the_same_bytes_whatever_the_number_of_threads(sequence, in_tiles, monkeypatch):
-    source = FrameSource.from_array(sequence.frames)
-    in_tiles(source)
-    # Several strips in the deconvolution.
-    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_tv.STRIP_PIXELS", 2000)
-    monkeypatch.setattr("turbrestore.deconvolution.strip_grid._ONE_STRIP", 1)
-    monkeypatch.setattr("turbrestore.deconvolution.strip_grid._STRIP", 2000)
-
+@pytest.mark.usefixtures("in_tiles")
+def test_a_restoration_in_tiles_is_the_same_bytes_whatever_the_number_of_threads(sequence):
     def run(threads):
-        for module in ("runtime.threads", "deconvolution.deconvolve", "deconvolution.nonlocal_tv"):
-            monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: threads)
-        restored = pipeline.restore(source, replace(QUICK, flow=FlowParams(threads=threads)))
+        restored = pipeline.restore(sequence.frames, QUICK, Runtime(threads=threads))
         return [
             getattr(stage, name).tobytes()
             for stage, names in (
@@ -169,65 +149,62 @@ def test_a_restoration_in_tiles_is_the_same_bytes_whatever_the_number_of_threads
     assert all(other == one for other in others)
 
 
-def test_frames_that_do_not_count_do_not_in_any_tile(sequence, in_tiles):
-    source = FrameSource.from_array(sequence.frames)
-    in_tiles(source)
-    restored = pipeline.restore(source, replace(QUICK, keep_best=0.5))
+@pytest.mark.usefixtures("in_tiles")
+def test_frames_that_do_not_count_do_not_in_any_tile(sequence):
+    restored = pipeline.restore(sequence.frames, replace(QUICK, keep_best=0.5))
     assert np.count_nonzero(restored.filtered.shares) == 6
     assert np.isnan(restored.filtered.sharpness).sum() == 6
     assert np.isfinite(restored.image).all()
 
 
+@pytest.mark.usefixtures("in_tiles")
 @pytest.mark.parametrize("finished", [1, 3])
-def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tmp_path, in_tiles, finished):
+def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tmp_path, monkeypatch, finished):
     source = FrameSource.from_array(sequence.frames)
-    in_tiles(source)
     whole = pipeline.restore(source, QUICK)
-    kept = KeptStages(tmp_path, source, QUICK)
+    (folder := tmp_path / "kept").mkdir()
+    kept, real = RunFolder(folder, source, QUICK), pipeline._filter_tile
 
-    def keep(done):
-        kept.keep(done)
-        if done.filtered is None and done.tiles is not None and len(done.tiles.parts) == finished:
+    def interrupted(run, centroid, training, counted, number):
+        if number == finished:
             raise KeyboardInterrupt
+        return real(run, centroid, training, counted, number)
 
-    with pytest.raises(KeyboardInterrupt):
-        pipeline.restore(source, QUICK, on_result=keep)
-    later = KeptStages(tmp_path, source, QUICK, resume=True)
-    assert later.notes == (f"goes on after the flow model and {finished} tiles of the filter",)
-    assert all(isinstance(part.image, np.memmap) for part in later.done.tiles.parts)
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "_filter_tile", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            pipeline.restore(source, QUICK, store=kept)
+    later = RunFolder(folder, source, QUICK, resume=True)
+    assert later.notes == (f"continues after the flow model and {finished} tiles of the filter",)
     told = []
-    resumed = pipeline.restore(
-        source, QUICK, lambda stage, done, _: told.append((stage, done)), later.done, later.keep, tmp_path
-    )
+    resumed = pipeline.restore(source, QUICK, store=later, progress=lambda stage, done, _: told.append((stage, done)))
     for name in ("image", "variance", "flow_states", "gains", "innovations", "sharpness", "shares"):
         assert np.array_equal(getattr(resumed.filtered, name), getattr(whole.filtered, name))
     assert resumed.filtered.image_noise == whole.filtered.image_noise
     assert np.array_equal(resumed.image, whole.image) and np.array_equal(resumed.mean, whole.mean)
-    assert next(done for stage, done in told if stage == "filter") == finished * (2 * 12 - 9)
-    assert not (tmp_path / "checkpoint.npz").exists()
+    first = next(done for stage, done in told if stage == "filter")
+    assert finished * (2 * 12 - 9) < first <= finished * (2 * 12 - 9) + 12
+    assert not list(folder.glob("filtered_tile_*"))
 
 
-def test_tiles_of_another_run_are_not_taken_over(sequence, tmp_path, in_tiles):
-    source = FrameSource.from_array(sequence.frames)
-    in_tiles(source)
-    kept = KeptStages(tmp_path, source, QUICK)
-    found = []
+@pytest.mark.usefixtures("in_tiles")
+def test_a_damaged_tile_is_filtered_again(sequence, tmp_path, monkeypatch):
+    source, real = FrameSource.from_array(sequence.frames), pipeline._filter_tile
+    (folder := tmp_path / "kept").mkdir()
 
-    def keep(done):
-        kept.keep(done)
-        if done.tiles is not None:
-            found.append(done.tiles)
+    def interrupted(run, centroid, training, counted, number):
+        if number == 2:
             raise KeyboardInterrupt
+        return real(run, centroid, training, counted, number)
 
-    with pytest.raises(KeyboardInterrupt):
-        pipeline.restore(source, QUICK, on_result=keep)
-    path = tmp_path / "checkpoint.npz"
-    save_tiles(path, found[0], "another")
-    notes = KeptStages(tmp_path, source, QUICK, resume=True).notes
-    assert notes[0].startswith(f"{path}: expected a checkpoint of this run")
-    save_tiles(path, found[0], "another")
-    with np.load(path) as arrays:
-        kept_ones = {name: arrays[name] for name in arrays if name != "shares_0"}
-    np.savez(path, **kept_ones)
-    with pytest.raises(DataError, match="expected a checkpoint of the filter, found something else"):
-        load_tiles(path, "another")
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "_filter_tile", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            pipeline.restore(source, QUICK, store=RunFolder(folder, source, QUICK))
+    damaged = folder / "filtered_tile_0.npz"
+    damaged.write_bytes(damaged.read_bytes()[:-40])
+    notes = RunFolder(folder, source, QUICK, resume=True).notes
+    assert notes == (
+        "filtered_tile_0.npz is missing or damaged and is made again",
+        "continues after the flow model and 1 tiles of the filter",
+    )

@@ -13,7 +13,7 @@ from turbrestore.io.images import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.metrics import psnr
 from turbrestore.registration.warp import warp
-from turbrestore.runs.artifacts import load_flows
+from turbrestore.runs.stage_files import load_flows
 from turbrestore.synthesis.atmosphere import fried_parameter
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore_cli.__main__ import main

@@ -25,7 +25,7 @@ from turbrestore.io.limits import Limits
 from turbrestore.io.npy import map_npy, read_npz
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.registration.centroid import Centroid
-from turbrestore.runs.artifacts import KINDS, load_artifact, save_artifact
+from turbrestore.runs.stage_files import KINDS, load_artifact, save_artifact
 
 SMALL = Limits(max_pixels=10_000, max_frames=200, max_bytes=10**6)
 FRAMES = np.random.default_rng(0).random((3, 8, 10), dtype=np.float32)

@@ -19,8 +19,8 @@ from turbrestore.filtering.kalman import Gaussian, PixelGaussian
 from turbrestore.io.images import atomic_write, check_space, write_image
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, write_video
 from turbrestore.registration.centroid import Centroid
-from turbrestore.runs.artifacts import save_artifact, save_flows
 from turbrestore.runs.checkpoint import save_checkpoint
+from turbrestore.runs.stage_files import save_artifact, save_flows
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.output import write_settings
 

@@ -22,8 +22,9 @@ from turbrestore.io.video import open_frames, write_video
 from turbrestore.pipeline import Restoration, RestoreParams
 from turbrestore.registration.centroid import Centroid, CentroidParams
 from turbrestore.registration.flow import FlowParams
-from turbrestore.runs.artifacts import KINDS, load_artifact, load_flows, save_artifact, save_flows
-from turbrestore.runs.run_record import RunRecord, load_run, save_run
+from turbrestore.runs.run_files import load_run, save_run
+from turbrestore.runs.run_record import RunRecord
+from turbrestore.runs.stage_files import KINDS, load_artifact, load_flows, save_artifact, save_flows
 from turbrestore_cli.application import build
 from turbrestore_cli.options import Selection
 from turbrestore_cli.output import settings_record, write_settings

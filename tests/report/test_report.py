@@ -29,7 +29,8 @@ from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.report import check_report, facts, panels, pictures, render_report, write_report
 from turbrestore.report.vector import inline_svg
-from turbrestore.runs.run_record import RUN_FILES, RunRecord, describe_run, load_run, save_run
+from turbrestore.runs.run_files import RUN_FILES, load_run, save_run
+from turbrestore.runs.run_record import RunRecord, describe_run
 from turbrestore.runtime.scratch import new_stack
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.application import build

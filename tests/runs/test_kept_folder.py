@@ -14,7 +14,7 @@ from turbrestore.io.images import write_image
 from turbrestore.io.video import open_frames
 from turbrestore.runs.digests import content_digest
 from turbrestore.runs.folder_lock import LOCK, lock_folder
-from turbrestore.runs.resumption import STAGES_RECORD, read_stages
+from turbrestore.runs.run_files import RECORD, read_stages
 from turbrestore_cli.__main__ import main
 
 SETTINGS = ["--train=6", "--centroid.iterations=1", "--deconvolution.iterations=2"]
@@ -44,11 +44,11 @@ def ended(place):
 # The process dies at once in the first stage: before anything is written, and between two files.
 DYING = """
 import os, sys
-from turbrestore.runs import resumption
+from turbrestore.runs import run_files, run_folder
 from turbrestore.io import images
 from turbrestore_cli.__main__ import main
 where = sys.argv.pop(1)
-real = resumption.save_artifact
+real = run_folder.save_artifact
 def dying(path, *words, **named):
     if where == "after":
         real(path, *words, **named)
@@ -56,9 +56,9 @@ def dying(path, *words, **named):
 def half(path, *words, **named):
     path.with_name(".0123456789abcdef.part").write_bytes(b"half")
     os._exit(9)
-resumption.save_artifact = half if where == "within" else dying
+run_folder.save_artifact = half if where == "within" else dying
 if where == "record":
-    resumption.atomic_write = half
+    run_files.atomic_write = half
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -77,22 +77,22 @@ def test_a_run_that_fails_before_it_has_anything_leaves_nothing(place, monkeypat
     def fail(*_):
         raise DataError("no such luck")
 
-    monkeypatch.setattr("turbrestore.pipeline.find_centroid", fail)
+    monkeypatch.setattr("turbrestore.pipeline.centroid_steps", fail)
     assert main(WORDS) == DataError.exit_code
     assert [path.name for path in place.iterdir()] == ["clip.npy"]
 
 
 def test_an_interruption_right_after_a_file_is_written(place, monkeypatch, capsys):
-    real = sys.modules["turbrestore.runs.resumption"].save_artifact
+    real = sys.modules["turbrestore.runs.run_folder"].save_artifact
 
     def interrupted(*words, **named):
         real(*words, **named)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("turbrestore.runs.resumption.save_artifact", interrupted)
+        patch.setattr("turbrestore.runs.run_folder.save_artifact", interrupted)
         assert main(WORDS) == 130
-    assert "--resume goes on from the start" in capsys.readouterr().err
+    assert "--resume continues from the start" in capsys.readouterr().err
     assert main([*WORDS, "--resume"]) == 0
 
 
@@ -127,7 +127,7 @@ def test_the_lock_is_made_where_it_belongs(tmp_path):
     assert not (tmp_path / "elsewhere").exists()
 
 
-@pytest.mark.parametrize("name", ["centroid.npz", STAGES_RECORD])
+@pytest.mark.parametrize("name", ["centroid.npz", RECORD])
 def test_a_pipe_in_the_folder_holds_nobody_up(ended, capsys, name):
     (ended / "kept" / name).unlink()
     os.mkfifo(ended / "kept" / name)
@@ -156,24 +156,24 @@ DAMAGE = {
 
 @pytest.mark.parametrize("case", DAMAGE)
 def test_a_record_with_wrong_content_is_one_line_that_says_what_to_do(ended, capsys, case):
-    path = ended / "kept" / STAGES_RECORD
+    path = ended / "kept" / RECORD
     path.write_text(json.dumps(DAMAGE[case](json.loads(path.read_text()))))
     with pytest.raises(DataError):
         read_stages("kept")
     assert main([*WORDS, "--resume", "--overwrite"]) == DataError.exit_code
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    assert STAGES_RECORD in err
+    assert RECORD in err
     assert "start anew with --overwrite" in err
 
 
 @pytest.mark.parametrize(
     ("lost", "said"),
     [
-        (["filtered.npz"], "goes on after the flow model"),
-        (["mean.npy"], "goes on after the flow model"),
-        (["centroid.npz"], "goes on from the start"),
-        (["deconvolution.npz"], "goes on after the filter"),
+        (["filtered.npz"], "continues after the flow model"),
+        (["mean.npy"], "continues after the deconvolution"),
+        (["centroid.npz"], "continues from the start"),
+        (["deconvolution.npz"], "continues after the filter"),
     ],
     ids=str,
 )
@@ -183,7 +183,7 @@ def test_what_is_said_ends_at_the_first_gap(ended, capsys, lost, said):
     assert main([*WORDS, "--resume", "--overwrite"]) == 0
     err = capsys.readouterr().err
     assert said in err
-    assert err.count("goes on") == 1
+    assert err.count("continues") == 1
 
 
 class TestFolderOfImages:

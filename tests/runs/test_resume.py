@@ -20,17 +20,21 @@ from turbrestore.filtering.alternating import FilterCheckpoint, FilterParams, Fi
 from turbrestore.filtering.kalman import Gaussian, PixelGaussian
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
+from turbrestore.memory_plan import plan_memory
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.runs.checkpoint import load_checkpoint, save_checkpoint
+from turbrestore.runs.dependencies import stage_dependencies
 from turbrestore.runs.digests import content_digest
 from turbrestore.runs.folder_lock import LOCK, lock_folder
-from turbrestore.runs.resumption import KeptStages, read_stages, stage_facts
+from turbrestore.runs.run_files import read_stages
+from turbrestore.runs.run_folder import RunFolder
+from turbrestore.runtime.runtime import DEFAULT
 from turbrestore_cli.__main__ import main
 
 SETTINGS = ["--train=8", "--centroid.iterations=1", "--filter.block=8", "--deconvolution.iterations=3"]
 OFTEN = "--checkpoint-every=8"
-STAGES = ("find_centroid", "identify", "filter_frames", "remove_blur")
+STAGES = ("centroid_steps", "identify", "filter_steps", "remove_blur_steps")
 WORDS = ["restore", "clip.mkv", "sharp.png", "--keep=kept", OFTEN, *SETTINGS]
 
 
@@ -99,11 +103,11 @@ def spy(monkeypatch):
 
 
 PLACES = {
-    "centroid": ("turbrestore.pipeline.find_centroid", 1),
+    "centroid": ("turbrestore.pipeline.centroid_steps", 1),
     "flow model": ("turbrestore.pipeline.identify", 1),
     "first block": ("turbrestore.filtering.alternating._filter_window", 1),
     "third block": ("turbrestore.filtering.alternating._filter_window", 4),
-    "deconvolution": ("turbrestore.pipeline.remove_blur", 1),
+    "deconvolution": ("turbrestore.pipeline.remove_blur_steps", 1),
     "kept images": ("turbrestore_cli.output.write_image", 2),
     "output": ("turbrestore_cli.restore.write_image", 1),
     "settings": ("turbrestore_cli.restore.write_settings", 1),
@@ -116,7 +120,7 @@ def test_an_interrupted_run_ends_as_if_nothing_had_happened(whole, place, capsys
         interrupt(patch, *PLACES[where])
         assert main(WORDS) == 130
     message = capsys.readouterr().err.splitlines()[-1]
-    assert message.startswith("turbrestore: interrupted; --keep kept --resume goes on")
+    assert message.startswith("turbrestore: interrupted; --keep kept --resume continues")
     assert not (place / "kept" / LOCK).exists()
     assert main([*WORDS, "--resume"]) == 0
     assert contents(place) == contents(whole)
@@ -127,15 +131,15 @@ def test_what_is_done_is_not_done_again(place, monkeypatch):
         interrupt(patch, "turbrestore.filtering.alternating._filter_window", 4)
         main(WORDS)
     # Eight training frames, then blocks of eight: two are done and kept.
-    key = KeptStages("kept", open_frames("clip.mkv"), params_of(WORDS), resume=True)
-    assert len(key.done.checkpoint.records) == 16
+    kept = RunFolder("kept", open_frames("clip.mkv"), params_of(WORDS), resume=True)
+    assert len(kept.filter_start().records) == 16
     called, blocks = spy(monkeypatch), []
     real = sys.modules["turbrestore.filtering.alternating"]._filter_window
     monkeypatch.setattr(
         "turbrestore.filtering.alternating._filter_window", lambda *words: blocks.append(words[2]) or real(*words)
     )
     assert main([*WORDS, "--resume"]) == 0
-    assert called == ["filter_frames", "remove_blur"]
+    assert called == ["filter_steps", "remove_blur_steps"]
     # The third block begins anew, then it is finished while the fourth begins.
     assert blocks == [0, 8, 4]
 
@@ -150,7 +154,7 @@ def params_of(words):
 def test_a_checkpoint_is_as_far_back_as_asked_for_at_most(place, monkeypatch):
     saved = []
     monkeypatch.setattr(
-        "turbrestore.runs.resumption.save_checkpoint", lambda _, checkpoint, key: saved.append(len(checkpoint.records))
+        "turbrestore.runs.run_folder.save_checkpoint", lambda _, checkpoint, key: saved.append(len(checkpoint.records))
     )
     main([word.replace("every=8", "every=18") for word in WORDS])
     # The next block of eight would end 24 frames after the last checkpoint.
@@ -165,12 +169,11 @@ def test_a_checkpoint_is_as_far_back_as_asked_for_at_most(place, monkeypatch):
         (["--train=9"], 0, "centroid: training_frames was [0, 8, 1] and is [0, 9, 1]"),
         (["--roi=0,0,32,30"], 0, "centroid: region was"),
         (["--dynamics.rank=2"], 1, "flow model: dynamics.rank was None and is 2"),
-        (["--displacement-cue"], 1, "flow model: displacement_cue was False and is True"),
         (["--filter.sharpness=1"], 2, "filter: filter.sharpness was 2.0 and is 1"),
         (["--keep-best=50%"], 2, "filter: keep_best was 1"),
         (["--frames=0:20"], 2, "filter: frames was [0, 28, 1] and is [0, 20, 1]"),
         (["--sigma=1"], 3, "deconvolution: deconvolution.sigma was None and is 1"),
-        (["--flow.threads=1", "--border=crop"], 4, "goes on after the deconvolution"),
+        (["--threads=1", "--border=crop"], 4, "continues after the deconvolution"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
@@ -193,19 +196,20 @@ def test_what_starts_again_is_what_a_new_run_gives(ended):
 
 def test_every_setting_belongs_to_one_stage_or_changes_nothing_that_is_kept():
     source = FrameSource.from_array(np.zeros((60, 32, 32), np.float32))
-    facts = stage_facts(source, RestoreParams())
+    params = RestoreParams()
+    facts = stage_dependencies(source, params, plan_memory(source.shape, params, DEFAULT))
     held = {name for stage in facts.values() for name in stage}
-    # The device is found first and held with each stage, and what a memory limit changes is the training frames.
-    idle = {"until", "border", "train", "device", "memory_limit"}
+    # What the number of training frames changes is which frames these are.
+    idle = {"until", "border", "train"}
     assert {item.name for item in dataclasses.fields(RestoreParams)} - held == idle
     assert sum(len(stage) for stage in facts.values()) == len(held)
-    assert set(dataclasses.asdict(RestoreParams().flow)) - set(facts["centroid"]["flow"]) == {"threads"}
+    assert set(dataclasses.asdict(params.flow)) == set(facts["centroid"]["flow"])
 
 
 def test_another_version_starts_again(ended, monkeypatch, capsys):
     called = spy(monkeypatch)
-    newer = {**sys.modules["turbrestore.runs.resumption"].versions(), "numpy": "9.9"}
-    monkeypatch.setattr("turbrestore.runs.resumption.versions", lambda: newer)
+    newer = {**sys.modules["turbrestore.runs.dependencies"].versions(), "numpy": "9.9"}
+    monkeypatch.setattr("turbrestore.runs.dependencies.versions", lambda: newer)
     assert main([*WORDS, "--resume", "--overwrite"]) == 0
     assert called == list(STAGES)
     assert "versions.numpy was" in capsys.readouterr().err
@@ -213,7 +217,7 @@ def test_another_version_starts_again(ended, monkeypatch, capsys):
 
 def test_a_version_with_other_results_starts_again(ended, monkeypatch, capsys):
     called = spy(monkeypatch)
-    monkeypatch.setattr("turbrestore.runs.resumption._RESULTS", 1000)
+    monkeypatch.setattr("turbrestore.runs.dependencies._RESULTS", 1000)
     assert main([*WORDS, "--resume", "--overwrite"]) == 0
     assert called == list(STAGES)
     assert "results was" in capsys.readouterr().err
@@ -256,13 +260,13 @@ def test_a_damaged_checkpoint_costs_the_filter_only(whole, place, monkeypatch, c
     path.write_bytes(path.read_bytes()[:-40])
     called = spy(monkeypatch)
     assert main([*WORDS, "--resume"]) == 0
-    assert called == ["filter_frames", "remove_blur"]
+    assert called == ["filter_steps", "remove_blur_steps"]
     assert "checkpoint.npz: expected a checkpoint" in capsys.readouterr().err
     assert contents(place) == contents(whole)
 
 
 def test_a_damaged_record_is_one_line(ended, capsys):
-    (ended / "kept" / "stages.json").write_text('{"schema": 1}')
+    (ended / "kept" / "run.json").write_text('{"schema": 1}')
     assert main([*WORDS, "--resume", "--overwrite"]) == DataError.exit_code
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -325,15 +329,15 @@ class TestFolder:
 # before the wait as well: hence the alarm.
 WAITING = """
 import signal, sys
-from turbrestore.runs import resumption
+from turbrestore.runs import run_folder
 from turbrestore_cli.__main__ import main
-save = resumption.save_checkpoint
+save = run_folder.save_checkpoint
 signal.signal(signal.SIGALRM, lambda *_: None)
 def save_and_wait(*words):
     save(*words)
     signal.alarm(2)
     signal.pause()
-resumption.save_checkpoint = save_and_wait
+run_folder.save_checkpoint = save_and_wait
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -413,27 +417,47 @@ def test_a_checkpoint_comes_back_bit_for_bit(tmp_path):
         load_checkpoint(tmp_path / "c.npz", "other")
 
 
+class Recorder:
+    """A store that keeps everything in memory, and starts from a part of it."""
+
+    def __init__(self, results=(), start=None):
+        self.results, self.start, self.checkpoints = dict(results), start, []
+
+    def get(self, name, compute):
+        if name not in self.results:
+            self.results[name] = compute()
+        return self.results[name]
+
+    def filter_start(self):
+        return self.start
+
+    def checkpoint(self, state):
+        self.checkpoints.append(state)
+
+
 def test_from_every_point_the_library_ends_the_same():
     grey = make_sequence(seed=42, count=16, size=32, scene="camera", rms=0.6).frames
     frames = grey[..., None] * np.float32([1, 0.8, 0.6])
     params = RestoreParams(
         train=8,
         keep_best=0.6,
-        displacement_cue=True,
-        blur_bounds=True,
         centroid=CentroidParams(iterations=1),
         filter=FilterParams(block=4, image_drift=1e-5),
     )
     params = replace(params, deconvolution=replace(params.deconvolution, iterations=2))
-    points = []
-    expected = restore(frames, params, on_result=points.append)
-    assert len(points) == 2 + 3 + 2
-    for done in points[1::2]:
-        found = restore(frames, params, done=done)
+    first = Recorder()
+    expected = restore(frames, params, store=first)
+    names = list(first.results)
+    assert names == ["centroid", "dynamics", "filtered", "mean", "deblurred"]
+    assert [len(state.records) for state in first.checkpoints] == [8, 12, 16]
+    points = [Recorder([(name, first.results[name]) for name in names[:count]]) for count in range(1, len(names) + 1)]
+    points += [Recorder([(name, first.results[name]) for name in names[:2]], state) for state in first.checkpoints]
+    for store in points:
+        found = restore(frames, params, store=store)
         assert np.array_equal(found.image, expected.image)
         assert np.array_equal(found.mean, expected.mean)
         assert np.array_equal(found.filtered.shares, expected.filtered.shares)
-        assert (found.blur_bounds, found.decisions) == (expected.blur_bounds, expected.decisions)
+        assert found.decisions == expected.decisions
 
 
 def test_the_record_names_the_outputs_only_while_they_are_written(place):

@@ -43,7 +43,7 @@ from turbrestore.registration.centroid import CentroidParams
 from turbrestore.registration.flow import FlowParams, estimate_flow
 from turbrestore.registration.tvl1 import refer_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
-from turbrestore.runs.resumption import stage_facts
+from turbrestore.runs.run_folder import stage_facts
 from turbrestore.runtime import device as device_module
 from turbrestore.runtime.device import TORCH_BYTES, check_device, explain_device, find_device, memory_of, needs_torch
 from turbrestore.settings import RestoreParams, explain_devices, place_stages

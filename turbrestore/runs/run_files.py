@@ -37,6 +37,7 @@ RECORD, IMAGES, MEAN = "run.json", "images.npz", "mean.npy"
 RESULTS = ("centroid", "dynamics", "filtered", "blur", "deconvolution")
 # All files of a kept run.
 RUN_FILES = (*(f"{name}.npz" for name in RESULTS), MEAN, IMAGES, RECORD)
+_ANEW = "start anew with --overwrite, or keep the stages in another folder"
 # Where `turbrestore report` writes by default.
 REPORT = "report.html"
 
@@ -179,6 +180,49 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     found = record.get("schema") if isinstance(record, dict) else "none"
     if type(found) is not int or found != SCHEMA:
         raise DataError(f"{path}: expected the record of a run, layout {SCHEMA}, found layout {found!r:.40}")
+    return record
+
+
+def read_stages(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """Read the record of the stages that are kept in a folder.
+
+    Parameters
+    ----------
+    folder : path
+
+    Returns
+    -------
+    dict or None
+        None where there is no such record.
+
+    Raises
+    ------
+    DataError
+        The record is damaged or of another version of the layout.
+
+    Examples
+    --------
+    >>> read_stages("nowhere") is None
+    True
+    """
+    place = Path(folder)
+    try:
+        record = read_record(place)
+        if record is None or "facts" not in record:
+            return None
+        fields = JsonFields(place / RECORD, record)
+        facts = fields.part("facts")
+        for stage in facts.record:
+            facts.part(stage)
+        fields.named_texts("files")
+        fields.texts("outputs")
+        verdict = fields.part("deblurred")
+        if verdict.record:
+            verdict.flag("estimated")
+            verdict.guard_readings("readings")
+            verdict.decisions("decisions")
+    except DataError as error:
+        raise DataError(f"{error}; {_ANEW}") from error
     return record
 
 

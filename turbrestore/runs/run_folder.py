@@ -48,7 +48,7 @@ from .checkpoint import load_checkpoint, save_checkpoint
 from .dependencies import filter_key, list_changes, stage_dependencies
 from .digests import file_digest
 from .json_fields import JsonFields
-from .run_files import MEAN, RECORD, RUN_FILES, read_record, save_results, write_record
+from .run_files import MEAN, RECORD, RUN_FILES, read_stages, save_results, write_record
 from .run_record import RunRecord
 from .stage_files import load_artifact, save_artifact
 
@@ -64,7 +64,6 @@ _KINDS: dict[str, type] = {"centroid": Centroid, "dynamics": FlowDynamics, "filt
 _TILE = re.compile(r"filtered_tile_\d+")
 # Left by a writer that was killed.
 _PART = re.compile(r"\.[0-9a-f]{16}\.part")
-_ANEW = "start anew with --overwrite, or keep the stages in another folder"
 
 Result = TypeVar("Result")
 
@@ -355,49 +354,6 @@ class RunFolder:
 
     def _write_record(self) -> None:
         write_record(self.folder, self._record())
-
-
-def read_stages(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Read the record of the stages that are kept in a folder.
-
-    Parameters
-    ----------
-    folder : path
-
-    Returns
-    -------
-    dict or None
-        None where there is no such record.
-
-    Raises
-    ------
-    DataError
-        The record is damaged or of another version of the layout.
-
-    Examples
-    --------
-    >>> read_stages("nowhere") is None
-    True
-    """
-    place = Path(folder)
-    try:
-        record = read_record(place)
-        if record is None or "facts" not in record:
-            return None
-        fields = JsonFields(place / RECORD, record)
-        facts = fields.part("facts")
-        for stage in facts.record:
-            facts.part(stage)
-        fields.named_texts("files")
-        fields.texts("outputs")
-        verdict = fields.part("deblurred")
-        if verdict.record:
-            verdict.flag("estimated")
-            verdict.guard_readings("readings")
-            verdict.decisions("decisions")
-    except DataError as error:
-        raise DataError(f"{error}; {_ANEW}") from error
-    return record
 
 
 def is_part(path: Path) -> bool:

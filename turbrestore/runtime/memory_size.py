@@ -51,21 +51,6 @@ class MemorySize(float):
         return super().__new__(cls, size)
 
 
-class DeconvolutionMemory(MemorySize):
-    """Number of bytes for the deconvolution alone.
-
-    Examples
-    --------
-    >>> DeconvolutionMemory("plenty")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.ConfigurationError: --deconvolution.memory: expected a size such as 2GB, 800MB or 1.5GiB, \
-found 'plenty'
-    """
-
-    _option = "--deconvolution.memory"
-
-
 def size_text(size: float) -> str:
     """Write a number of bytes with a unit in which it is no less than one.
 

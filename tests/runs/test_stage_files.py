@@ -14,8 +14,8 @@ from turbrestore.io.images import write_image
 from turbrestore.io.npy import write_npz
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import Centroid, CentroidParams
-from turbrestore.runs.artifact_fields import FIELDS
-from turbrestore.runs.artifacts import KINDS, load_artifact, load_flows, load_stage_image, save_artifact, save_flows
+from turbrestore.runs.stage_fields import FIELDS
+from turbrestore.runs.stage_files import KINDS, load_artifact, load_flows, load_stage_image, save_artifact, save_flows
 from turbrestore.runtime.scratch import new_stack
 
 
