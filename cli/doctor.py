@@ -24,7 +24,7 @@ from turbrestore.core.errors import TurbrestoreError
 
 from .streams import put
 
-# Module and distribution of what every run needs, and of what extras add.
+# Modules and distributions that every run needs, and those that extras add.
 REQUIRED = {
     "numpy": "numpy",
     "scipy": "scipy",
@@ -33,6 +33,7 @@ REQUIRED = {
     "PIL": "pillow",
     "av": "av",
     "tifffile": "tifffile",
+    "numba": "numba",
     "threadpoolctl": "threadpoolctl",
 }
 EXTRAS = {"torch": "torch", "matplotlib": "report", "jinja2": "report"}

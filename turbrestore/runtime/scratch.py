@@ -1,8 +1,8 @@
-"""Stacks that are too large for memory: kept in a file without a name, and walked frame by frame.
+"""Stacks that are too large for memory: they lie in a scratch file and are read frame by frame.
 
 The file is deleted as soon as it is open, so that nothing is left behind however the process ends; its space is free
-again when the last array that shows it goes.  What is mapped counts as memory of the process while its pages are
-there: they are handed back after every frame, and the system keeps in its cache what it has room for.
+again when the last array that maps it goes.  Mapped pages count as memory of the process: the functions here that hand
+out frames drop the pages of each frame after its use, and the system keeps in its cache what it has room for.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 from ..core.errors import StorageError
 
 Item = TypeVar("Item")
-# Pages of a private map would lose what has been written to them.
+# A private map would lose what has been written to the pages that are dropped.
 _SHARED = ("r", "r+", "w+")
 # Left free beside the file: others write to the disk as well.
 _SPARE = 1 << 26
-# Numbers that a piece of a large array has.
+# Numbers in a part of a large array.
 _PART = 1 << 22
 
 
 def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.float32]:
-    """Return an array to be filled, in memory or in a file; one in a file is full of zeros.
+    """Return an array to be filled, in memory or in a file; an array in a file is full of zeros.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.
     if folder is None or size == 0:
         return np.empty(shape, np.float32)
     try:
-        # Past the end of a full disk a mapped page kills the process: better to hear of it now.
+        # A page that is mapped beyond the end of a full disk kills the process, so the space is checked now.
         free = shutil.disk_usage(folder).free
         if free < size + _SPARE:
             raise StorageError(
@@ -143,7 +143,7 @@ def to_scratch(array: NDArray[np.float32], folder: Path | None = None) -> NDArra
 
 
 def drop_pages(array: object) -> None:
-    """Hand back the memory that the pages of a mapped file take; they are read again when they are needed.
+    """Hand back the memory of the pages of a mapped file; they are read again when they are needed.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def drop_pages(array: object) -> None:
         mode = array.mode if isinstance(array, np.memmap) else mode
         array = array.base
     if isinstance(array, mmap.mmap) and mode in _SHARED and hasattr(mmap, "MADV_DONTNEED"):
-        # A map that is locked in memory cannot be handed back, and need not be.
+        # The pages of a map that is locked in memory cannot be dropped, and need not be.
         with contextlib.suppress(OSError):
             array.madvise(mmap.MADV_DONTNEED)
 
