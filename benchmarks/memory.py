@@ -313,7 +313,6 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     from turbrestore.blur.psf import estimate_noise
     from turbrestore.deconvolution.planes import split_planes
     from turbrestore.dynamics.dynamic_texture import identify
-    from turbrestore.explanation import explain_input, explain_motion
     from turbrestore.footage.content import check_content
     from turbrestore.io.images import write_image
     from turbrestore.io.source import FrameSource
@@ -323,6 +322,7 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     from turbrestore.report.pictures import encode_gallery, stages
     from turbrestore.runs.run_record import describe_run
     from turbrestore.runtime.scratch import new_stack, release, walk
+    from turbrestore.wording import explain_input, explain_motion
 
     # Video is always read in colour.
     encoded = [folder / "images", *([folder / "clip.mkv"] if clip.channels == 3 else [])]

@@ -20,16 +20,6 @@ from .core.errors import DataError, require
 from .dynamics.displacement import with_displacement
 from .dynamics.dynamic_texture import identify
 from .dynamics.flow_model import FlowDynamics
-from .explanation import (
-    explain_border,
-    explain_camera,
-    explain_centroid,
-    explain_dynamics,
-    explain_frames,
-    explain_input,
-    explain_motion,
-    explain_training,
-)
 from .filtering.alternating import Filtered, filter_frames
 from .footage.frame_selection import best_frames, frame_quality
 from .io.images import check_space
@@ -44,6 +34,16 @@ from .runtime.scratch import drop_pages, iter_frames, keeping_freed, mean_of, ne
 from .runtime.tiling import HaloTile, cut_tile, halo_tiles
 from .settings import STAGES, Restoration, RestoreParams, StageResults, explain_devices, place_stages
 from .tiled_stages import FilteredTiles, filter_tiles, find_tiled_centroid
+from .wording import (
+    explain_border,
+    explain_camera,
+    explain_centroid,
+    explain_dynamics,
+    explain_frames,
+    explain_input,
+    explain_motion,
+    explain_training,
+)
 
 # Share of the training frames that show every pixel of a cropped image.
 _SEEN = 0.9
