@@ -1,7 +1,9 @@
 """What each choice of the defaults buys, and what blindness costs: PSNR of clips with known truth.
 
-Run ``python benchmarks/ablation.py``; it prints a Markdown document, and ``--write FILE`` writes it too.  Clips are
-those of ``benchmarks/quality.py`` that have a truth; ``--clips`` takes names or patterns.
+    TURBRESTORE_DATA=DIR python benchmarks/ablation.py --write benchmarks/results/ablation.md
+
+prints a Markdown document and writes it.  Clips are those of ``benchmarks/quality.py`` that have a truth; ``--clips``
+takes names or patterns.
 """
 
 from __future__ import annotations
@@ -114,8 +116,8 @@ def document(rows: dict[str, Row]) -> str:
     variants = ["default", *VARIANTS, *DEBLURRED, "Gaussian blur", "not deblurred"]
     lines = [
         "# Ablation\n",
-        "What `TURBRESTORE_DATA=DIR python benchmarks/ablation.py --write docs/ablation.md` measures, on the clips of "
-        "`benchmarks/quality.py` that have a truth.\n",
+        "What `TURBRESTORE_DATA=DIR python benchmarks/ablation.py --write benchmarks/results/ablation.md` measures, on "
+        "the clips of `benchmarks/quality.py` that have a truth.\n",
         "## What each choice buys\n",
         "PSNR, dB, of the default, and what is added to it when one choice is changed: negative where the choice is "
         "worth having.  TV and Wiener use the width that the default removes; "

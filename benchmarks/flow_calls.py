@@ -1,6 +1,6 @@
 """What flow calls buy: PSNR of the fused and of the restored image against passes of the centroid and of the filter.
 
-    TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --write docs/flow_calls.md
+    TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --write benchmarks/results/flow_calls.md
 
 prints a Markdown document and writes it, with a picture of the curves beside it.  Clips are those of
 ``benchmarks/quality.py`` that have a truth, cut to their first frames and their middle; ``--clips`` takes names or
@@ -71,7 +71,7 @@ def main() -> int:
     print(text, end="")
     if options.write is not None:
         atomic_write(options.write, text.encode(), overwrite=True)
-        draw(measured, options.write.parent / "images" / "flow_calls.png")
+        draw(measured, options.write.with_suffix(".png"))
     return int(not at_knee)
 
 
@@ -108,10 +108,11 @@ def document(measured: dict[str, Curves]) -> tuple[str, bool]:
     """Markdown of the tables, and whether the default is at the knee."""
     lines = [
         "# What flow calls buy\n",
-        "Optical flow takes most of the time of a restoration. This page says what its repetitions are worth, as "
-        "`TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --write docs/flow_calls.md` measures it on "
-        f"{len(measured)} simulated clips: the first {FRAMES} frames, the middle {SIDE}×{SIDE} pixels, two threads.\n",
-        "![PSNR against seconds of flow calls](images/flow_calls.png)\n",
+        "Optical flow takes most of the time of a restoration. This page shows the value of its repetitions, as "
+        "`TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --write benchmarks/results/flow_calls.md` measures it "
+        f"on {len(measured)} simulated clips: the first {FRAMES} frames, the middle {SIDE}×{SIDE} pixels, two "
+        "threads.\n",
+        "![PSNR against seconds of flow calls](flow_calls.png)\n",
         "## Mean over the clips\n",
         "PSNR, dB, of the fused image (after the filter) and of the restored one; seconds of the flow calls, each as "
         "one by itself from a frame takes (those from an earlier flow, which most repetitions are, take two thirds, so "
@@ -164,7 +165,6 @@ def draw(measured: dict[str, Curves], path: Path) -> None:
         axis.margins(y=0.15)
     axes[0].set_ylabel("PSNR beside the default, dB")
     axes[1].legend()
-    path.parent.mkdir(exist_ok=True)
     figure.savefig(path, dpi=110)
 
 

@@ -2,7 +2,7 @@
 
 ``python benchmarks/memory.py`` prints a table of frames × size × limit and exits with 1 when a bound is broken:
 300 grey frames of 1920×1080 within 2 GB, every other limit kept, and 2,000 frames no more than 20 MB above 200.
-``--write`` makes a document of it.
+``--write benchmarks/results/memory.md`` writes the table as a document.
 ``--quick`` takes 40 frames of that size, with the same training frames.
 ``--largest`` adds frames of 3840×2160 and 7680×4320.
 ``--stages`` prints the peak of every stage, in bytes a pixel, with training frames in memory and in a file, and of what
@@ -459,7 +459,7 @@ def document(arguments: argparse.Namespace) -> tuple[str, bool]:
             print(line if good else f"{line} broken", flush=True)
             lines.append(line)
             held &= good
-    intro = INTRO.format(command=f"{command} --write docs/memory.md")
+    intro = INTRO.format(command=f"{command} --write benchmarks/results/memory.md")
     return "\n".join(["# Memory\n", intro, HEAD, *lines]) + "\n", held
 
 

@@ -1,7 +1,7 @@
 """Time of whole restorations against the bare flow calls they make, how it grows, memory against frames, and the help.
 
-    python benchmarks/speed.py --write docs/speed.md
-    python benchmarks/speed.py --full --before 890600a --write docs/speed.md
+    python benchmarks/speed.py --write benchmarks/results/speed.md
+    python benchmarks/speed.py --full --before 890600a --write benchmarks/results/speed.md
 
 prints a Markdown document, writes it, and exits with 1 when a bound is broken.  Times of a row are taken in one child
 process, flow calls before and after the restoration, because machines differ and drift; of the shorter clips five
@@ -103,8 +103,8 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
     command = f"python benchmarks/speed.py{' --full' if full else ''}{f' --before {before}' if before else ''}"
     lines = [
         "# Speed\n",
-        f"What `{command} --write docs/speed.md` measures: scenes under smooth random flow, {THREADS} threads on two "
-        f"cores, {_machine()}, {_compiled()}.  It ends with 1 where a bound is broken.\n",
+        f"What `{command} --write benchmarks/results/speed.md` measures: scenes under smooth random flow, {THREADS} "
+        f"threads on two cores, {_machine()}, {_compiled()}.  It ends with 1 where a bound is broken.\n",
         "## Against the flow calls\n",
         "Seconds of a whole restoration with the default settings, and of the optical flow alone that it asks for, "
         f"each call by itself from a frame. The bound of both ratios is {TIME_BOUND}. It is broken where what is done "
@@ -184,7 +184,7 @@ def _plain_lines() -> list[str]:
     found = sorted((child(__file__, task) for _ in range(RUNS)), key=_ratio)[RUNS // 2]
     ratio, work = _ratio(found), found["whole_work"] / found["bare_work"]
     return [
-        f"\nBounds are those with Numba, the extra `fast`. Without it {count} frames of {width}×{height} take "
+        f"\nBounds are those with Numba. Without it {count} frames of {width}×{height} take "
         f"{found['whole']:.1f} s, {ratio:.2f} times their flow calls, and {work:.2f} times their processor time."
     ]
 
