@@ -120,7 +120,7 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
         f"{TRAINED} frames to train.\n",
         *_growth_table(tree, broken),
         "\n## Parts\n",
-        f"TV-L1: processor time a frame of {tvl1.SIDE}×{tvl1.SIDE}, {tvl1.THREADS} threads, on the sets of "
+        f"TV-L1: CPU time for a frame of {tvl1.SIDE}×{tvl1.SIDE}, {tvl1.THREADS} threads, on the sets of "
         "`benchmarks/tvl1.py`; the rest: clock, on the image of `benchmarks/deconvolution.py`. These two hold the "
         "bounds. Smallest of a few runs, of iterations the median.\n",
         *_parts_table(tree),
@@ -148,7 +148,7 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
 def _time_table(rows: tuple[Row, ...], tree: Path | None, broken: list[str]) -> list[str]:
     stages = ("centroid", "identify", "filter", "deconvolve")
     earlier = ["before: whole, s", "flow calls", "ratio"] if tree else []
-    names = ["whole, s", "flow calls", "alone, s", "ratio", "of processor time", "as made, s", "ratio"]
+    names = ["whole, s", "flow calls", "alone, s", "ratio", "of CPU time", "as made, s", "ratio"]
     names += [*(f"{stage}, s" for stage in stages), "peak, MB"]
     names = ["frames", "size", "scene", *earlier, *names]
     lines = [f"| {' | '.join(names)} |", f"|{'---:|' * len(names)}"]
@@ -185,7 +185,7 @@ def _plain_lines() -> list[str]:
     ratio, work = _ratio(found), found["whole_work"] / found["bare_work"]
     return [
         f"\nBounds are those with Numba. Without it {count} frames of {width}×{height} take "
-        f"{found['whole']:.1f} s, {ratio:.2f} times their flow calls, and {work:.2f} times their processor time."
+        f"{found['whole']:.1f} s, {ratio:.2f} times their flow calls, and {work:.2f} times their CPU time."
     ]
 
 
@@ -342,7 +342,7 @@ def started(stack: np.ndarray, params: FlowParams, start_level: int) -> float:
 
 
 def clocked(call: Callable[[], Result]) -> tuple[tuple[float, float], Result]:
-    """Seconds of wall and of processor time that a call takes, and what it returns."""
+    """Seconds of wall and of CPU time that a call takes, and what it returns."""
     begun, worked = time.perf_counter(), time.process_time()
     result = call()
     return (time.perf_counter() - begun, time.process_time() - worked), result
