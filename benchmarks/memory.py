@@ -36,7 +36,7 @@ EVERYTHING = ("--report={folder}/report.html", "--keep={folder}/stages", "--bit-
 COMPARED = ("--truth={folder}/scene.png", "--json")
 INTRO = (
     "What `{command}` measures: the largest resident set of `turbrestore restore`, mapped files included, on two "
-    "cores.  Clips are a random scene under smooth random motion.  It ends with 1 where a limit is not kept.\n"
+    "cores.  Clips are a random scene under smooth random motion.  It ends with 1 where a limit is exceeded.\n"
 )
 HEAD = """| frames | read from | options | limit, MB | peak, MB |
 |---|---|---|---:|---:|"""
