@@ -1,7 +1,9 @@
-"""What each choice of the defaults buys, and what blindness costs: PSNR of clips with known truth.
+"""What each choice of the defaults is worth, and what the blind estimate costs: PSNR of clips with known truth.
 
-Run ``python benchmarks/ablation.py``; it prints a Markdown document, and ``--write FILE`` writes it too.  Clips are
-those of ``benchmarks/quality.py`` that have a truth; ``--clips`` takes names or patterns.
+    TURBRESTORE_DATA=DIR python benchmarks/ablation.py --write benchmarks/results/ablation.md
+
+prints a Markdown document and writes it.  Clips are those of ``benchmarks/quality.py`` that have a truth; ``--clips``
+takes names or patterns.
 """
 
 from __future__ import annotations
@@ -114,12 +116,12 @@ def document(rows: dict[str, Row]) -> str:
     variants = ["default", *VARIANTS, *DEBLURRED, "Gaussian blur", "not deblurred"]
     lines = [
         "# Ablation\n",
-        "What `TURBRESTORE_DATA=DIR python benchmarks/ablation.py --write docs/ablation.md` measures, on the clips of "
-        "`benchmarks/quality.py` that have a truth.\n",
-        "## What each choice buys\n",
-        "PSNR, dB, of the default, and what is added to it when one choice is changed: negative where the choice is "
-        "worth having.  TV and Wiener use the width that the default removes; "
-        "'Gaussian blur' estimates and removes a Gaussian.\n",
+        "What `TURBRESTORE_DATA=DIR python benchmarks/ablation.py --write benchmarks/results/ablation.md` measures, on "
+        "the clips of `benchmarks/quality.py` that have a truth.\n",
+        "## What each choice is worth\n",
+        "PSNR, dB, of the default, and the change when one choice is changed: negative where the default is "
+        "better.  TV and Wiener use the width that the default removes; 'Gaussian blur' estimates and removes a "
+        "Gaussian.\n",
         f"| clip | {' | '.join(variants)} |",
         f"|---|{'---:|' * len(variants)}",
     ]
@@ -127,16 +129,16 @@ def document(rows: dict[str, Row]) -> str:
         changes = [f"{row[variant] - row['default']:+.2f}" for variant in variants[1:]]
         lines.append(f"| {name} | {row['default']:.2f} | {' | '.join(changes)} |")
     lines += [
-        "\n## The price of blindness\n",
+        "\n## The cost of the blind estimate\n",
         "The same filtered image deblurred with the σ that is best for PSNR, among values a fifth apart, against the σ "
         "that is removed blindly.\n",
-        "| clip | σ removed, px | best σ, px | default, dB | best, dB | price, dB |",
+        "| clip | σ removed, px | best σ, px | default, dB | best, dB | cost, dB |",
         "|---|---:|---:|---:|---:|---:|",
     ]
     for name, row in _with_mean(rows).items():
         sigmas = f"{row['σ removed']:.2f} | {row['σ by hand']:.2f}"
-        price = row["best σ"] - row["default"]
-        lines.append(f"| {name} | {sigmas} | {row['default']:.2f} | {row['best σ']:.2f} | {price:.2f} |")
+        cost = row["best σ"] - row["default"]
+        lines.append(f"| {name} | {sigmas} | {row['default']:.2f} | {row['best σ']:.2f} | {cost:.2f} |")
     return "\n".join(lines) + "\n"
 
 

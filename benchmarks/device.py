@@ -1,9 +1,10 @@
-"""Milliseconds of every stage on the processor and on a device, its share of the memory bandwidth, and agreement.
+"""Milliseconds of every stage on the CPU and on a device, its share of the memory bandwidth, and agreement.
 
-Run ``python benchmarks/device.py --device cuda --size 1080 1920``; it prints a table and exits with 1 where device and
-processor differ by more than 0.02 dB or 0.02 px.  Without ``--device`` it takes a GPU where torch sees one and else
-torch on the processor.  Times are the best of some runs, all in one process; they include the way to the device and
-back.
+    python benchmarks/device.py --device cuda --size 1080 1920 --write benchmarks/results/device.md
+
+prints a Markdown document, writes it, and exits with 1 where device and CPU differ by more than 0.02 dB or 0.02 px.
+Without ``--device`` it takes a GPU where torch sees one, else torch on the CPU.  Times are the best of some runs, all
+in one process; they include the transfer to the device and back.
 
 Bytes are those that a stage cannot do without: every array that a step takes and gives, once for each step, 4 bytes a
 number, and none of the intermediate results.  The bandwidth that they are held against is that of copying 256 MB.
@@ -16,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -25,6 +27,7 @@ from turbrestore.deconvolution.nonlocal_tv import NonlocalParams, nonlocal_weigh
 from turbrestore.deconvolution.torch_weights import weights_on_device
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import FilterParams, filter_frames
+from turbrestore.io.images import atomic_write
 from turbrestore.metrics import psnr
 from turbrestore.pipeline import restore
 from turbrestore.registration.flow import FlowParams, estimate_flow
@@ -154,35 +157,47 @@ def agreement(clip: Clip, device: str) -> tuple[float, float, float]:
     return psnr(there.image, clip.scene) - psnr(here.image, clip.scene), float(apart.mean()), float(apart.max())
 
 
+def document(size: tuple[int, int], device: str, runs: int) -> tuple[str, bool]:
+    """Markdown of the table, and whether device and CPU agree."""
+    clip = make_clip(*size)
+    bandwidth = copy_bandwidth(device)
+    lines = [
+        "# Computing on a device\n",
+        "What `python benchmarks/device.py --write benchmarks/results/device.md` measures: every stage on the CPU "
+        "and on the device, against the bandwidth of copying.\n",
+        f"{size[1]}×{size[0]}; device {device} copies {bandwidth / 1e9:.1f} GB/s\n",
+        "| stage, one frame or iteration | CPU, ms | device, ms | ratio | GB/s | share of copying |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    rows = []
+    for stage in stages(clip, device):
+        times = [milliseconds(lambda s=stage, n=name: s.run(n), runs) / stage.count for name in (PROCESSOR, device)]
+        rows.append((stage.name, *times, stage.numbers))
+    here, (there, numbers) = solver(clip, PROCESSOR, runs)[0], solver(clip, device, runs)
+    for name, on_cpu, on_device, a_pixel in [*rows, ("iteration of nltv", here, there, numbers)]:
+        moved = 4e3 * a_pixel * clip.scene.size / on_device
+        cells = f"{on_cpu:.1f} | {on_device:.1f} | {on_cpu / on_device:.2f} | {moved / 1e9:.1f}"
+        lines.append(f"| {name} | {cells} | {moved / bandwidth:.0%} |")
+    decibels, mean, largest = agreement(clip, device)
+    good = abs(decibels) <= DECIBELS and mean <= PIXELS
+    lines.append(f"\nRestoration {decibels:+.4f} dB; flows {mean:.5f} px apart, {largest:.3f} at most.")
+    lines.append(f"Within {DECIBELS} dB and {PIXELS} px: {'yes' if good else 'NO'}.")
+    return "\n".join(lines) + "\n", good
+
+
 def main() -> int:
-    """Measure, print, and judge."""
+    """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device")
     parser.add_argument("--size", type=int, nargs=2, default=(256, 256), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
     options = parser.parse_args()
     device = find_device(options.device or "auto")
-    device = "cpu:0" if device == PROCESSOR else device
-    clip = make_clip(*options.size)
-    bandwidth = copy_bandwidth(device)
-    print(f"{options.size[1]}×{options.size[0]}; device {device} copies {bandwidth / 1e9:.1f} GB/s\n")
-    print("| stage, one frame or iteration | processor, ms | device, ms | ratio | GB/s | share of copying |")
-    print("|---|---:|---:|---:|---:|---:|")
-    rows = []
-    for stage in stages(clip, device):
-        times = [
-            milliseconds(lambda s=stage, n=name: s.run(n), options.runs) / stage.count for name in (PROCESSOR, device)
-        ]
-        rows.append((stage.name, *times, stage.numbers))
-    here, (there, numbers) = solver(clip, PROCESSOR, options.runs)[0], solver(clip, device, options.runs)
-    for name, on_processor, on_device, a_pixel in [*rows, ("iteration of nltv", here, there, numbers)]:
-        moved = 4e3 * a_pixel * clip.scene.size / on_device
-        cells = f"{on_processor:.1f} | {on_device:.1f} | {on_processor / on_device:.2f} | {moved / 1e9:.1f}"
-        print(f"| {name} | {cells} | {moved / bandwidth:.0%} |")
-    decibels, mean, largest = agreement(clip, device)
-    print(f"\nRestoration {decibels:+.4f} dB; flows {mean:.5f} px apart, {largest:.3f} at most.")
-    good = abs(decibels) <= DECIBELS and mean <= PIXELS
-    print(f"Within {DECIBELS} dB and {PIXELS} px: {'yes' if good else 'NO'}.")
+    text, good = document(options.size, "cpu:0" if device == PROCESSOR else device, options.runs)
+    print(text, end="")
+    if options.write is not None:
+        atomic_write(options.write, text.encode(), overwrite=True)
     return int(not good)
 
 

@@ -1,6 +1,6 @@
-"""What flow calls buy: PSNR of the fused and of the restored image against passes of the centroid and of the filter.
+"""What flow calls are worth: PSNR of the fused and the restored image against passes of the centroid and of the filter.
 
-    TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --write docs/flow_calls.md
+    TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --write benchmarks/results/flow_calls.md
 
 prints a Markdown document and writes it, with a picture of the curves beside it.  Clips are those of
 ``benchmarks/quality.py`` that have a truth, cut to their first frames and their middle; ``--clips`` takes names or
@@ -71,7 +71,7 @@ def main() -> int:
     print(text, end="")
     if options.write is not None:
         atomic_write(options.write, text.encode(), overwrite=True)
-        draw(measured, options.write.parent / "images" / "flow_calls.png")
+        draw(measured, options.write.with_suffix(".png"))
     return int(not at_knee)
 
 
@@ -107,20 +107,21 @@ def measure(frames: FloatArray, truth: FloatArray) -> Curves:
 def document(measured: dict[str, Curves]) -> tuple[str, bool]:
     """Markdown of the tables, and whether the default is at the knee."""
     lines = [
-        "# What flow calls buy\n",
-        "Optical flow takes most of the time of a restoration. This page says what its repetitions are worth, as "
-        "`TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --write docs/flow_calls.md` measures it on "
-        f"{len(measured)} simulated clips: the first {FRAMES} frames, the middle {SIDE}×{SIDE} pixels, two threads.\n",
-        "![PSNR against seconds of flow calls](images/flow_calls.png)\n",
+        "# What flow calls are worth\n",
+        "Optical flow takes most of the time of a restoration. This page shows the value of its repetitions, as "
+        "`TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --write benchmarks/results/flow_calls.md` measures it "
+        f"on {len(measured)} simulated clips: the first {FRAMES} frames, the middle {SIDE}×{SIDE} pixels, two "
+        "threads.\n",
+        "![PSNR against seconds of flow calls](flow_calls.png)\n",
         "## Mean over the clips\n",
-        "PSNR, dB, of the fused image (after the filter) and of the restored one; seconds of the flow calls, each as "
-        "one by itself from a frame takes (those from an earlier flow, which most repetitions are, take two thirds, so "
-        "that they buy more in a second); and what one more repetition adds. The number of passes of the centroid is "
-        "the largest allowed, without tolerance: it stops by itself where its mean flow no longer shrinks. The default "
-        "stops as soon as that is below the tolerance, after two passes at least. What has not converged recentres its "
-        "flows once more at the end, so two "
-        "passes without tolerance are not the two of the default.\n",
-        "| setting | calls | seconds | fused | restored | one more adds: fused | restored | dB a second, restored |",
+        "PSNR, dB, of the fused image (after the filter) and of the restored one; seconds of the flow calls, each "
+        "timed by itself and without a start (most repetitions start from an earlier flow and take two thirds of "
+        "that, so they gain more for each second); and the gain of one more repetition. The number of passes of the "
+        "centroid is the largest allowed, without tolerance: it stops where its mean flow no longer shrinks. The "
+        "default stops as soon as the mean flow is below the tolerance, after two passes at least. A centroid that "
+        "has not converged recentres its flows once more at the end, so two passes without tolerance are not the "
+        "two of the default.\n",
+        "| setting | calls | seconds | fused | restored | gain of one more: fused | restored | dB a second, restored |",
         "|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
     mean = {name: _mean([curves[name] for curves in measured.values()]) for name in settings()}
@@ -133,7 +134,7 @@ def document(measured: dict[str, Curves]) -> tuple[str, bool]:
     lines.append(_row("**default**", mean["default"], None))
     lines += [
         "\n## Every clip\n",
-        "PSNR, dB, of the restored image: of the default, and what another setting adds to it.\n",
+        "PSNR, dB, of the restored image: the default, and the change by another setting.\n",
         f"| clip | default | {' | '.join(list(settings())[1:])} |",
         f"|---|---:|{'---:|' * (len(settings()) - 1)}",
     ]
@@ -164,7 +165,6 @@ def draw(measured: dict[str, Curves], path: Path) -> None:
         axis.margins(y=0.15)
     axes[0].set_ylabel("PSNR beside the default, dB")
     axes[1].legend()
-    path.parent.mkdir(exist_ok=True)
     figure.savefig(path, dpi=110)
 
 
@@ -175,8 +175,8 @@ def _verdict(measured: dict[str, Curves], mean: Curves) -> tuple[list[str], bool
     """
     lines = [
         "\n## The knee\n",
-        "What a second of flow calls buys from a cheaper setting to the default, and from the default to a dearer one. "
-        f"A default may change only where it costs no clip more than {TOLERATED} dB.\n",
+        "Change in dB for each second of flow calls, from a cheaper setting to the default and from the default to "
+        f"a more expensive one. A default may change only where it costs no clip more than {TOLERATED} dB.\n",
         "| setting | largest loss on a clip, dB | mean change, dB | flow calls | dB a second |",
         "|---|---:|---:|---:|---:|",
     ]
@@ -192,7 +192,7 @@ def _verdict(measured: dict[str, Curves], mean: Curves) -> tuple[list[str], bool
             harmless.append(name)
     cheaper = min(rate for name, rate in rates.items() if mean[name].calls < default.calls)
     dearer = max(rate for name, rate in rates.items() if mean[name].calls > default.calls)
-    text = f"A second more buys {cheaper:+.2f} dB or more up to the default, and {dearer:+.2f} or less beyond it"
+    text = f"One more second gains {cheaper:+.2f} dB or more up to the default, and {dearer:+.2f} or less beyond it"
     at_knee = cheaper > max(dearer, 0) and not harmless
     text += f": the default is {'' if at_knee else 'not '}at the knee."
     few = f"With fewer flow calls, no clip loses more than {TOLERATED} dB by {', '.join(harmless)}."

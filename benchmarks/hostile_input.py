@@ -211,7 +211,7 @@ def refusal(ended: Ended, output: Path | None = None) -> str:
         return f"expected one line, found {ended.stderr[-500:]!r}"
     if ended.stdout or (output is not None and output.exists()):
         return "left output"
-    return f"took {ended.seconds:.1f} s of processor time" if ended.seconds > SECONDS else ""
+    return f"took {ended.seconds:.1f} s of CPU time" if ended.seconds > SECONDS else ""
 
 
 def run_forked(words: list[str]) -> Ended:
@@ -242,7 +242,7 @@ def run_apart(words: list[str]) -> Ended:
         return Ended(ended_code, *texts, seconds, peak)
 
 
-_REFUSED = "exit 65, one line, no traceback, no output, 10 s of processor time at most"
+_REFUSED = "exit 65, one line, no traceback, no output, 10 s of CPU time at most"
 GROUPS: dict[str, Callable[[Path, bool], list[Row]]] = {
     "malformed": malformed_files,
     "flips": flipped_bytes,
@@ -318,7 +318,7 @@ def _as_command(words: list[str], out: int, err: int) -> None:
 
 
 def _wait(child: int, started: float) -> tuple[int, float, int]:
-    """Exit code, below 0 for a signal, processor time, and peak memory in bytes; a child that hangs is killed."""
+    """Exit code, below 0 for a signal, CPU time, and peak memory in bytes; a child that hangs is killed."""
     while True:
         done, status, usage = os.wait4(child, os.WNOHANG)
         if done:

@@ -2,7 +2,7 @@
 
 ``python benchmarks/memory.py`` prints a table of frames × size × limit and exits with 1 when a bound is broken:
 300 grey frames of 1920×1080 within 2 GB, every other limit kept, and 2,000 frames no more than 20 MB above 200.
-``--write`` makes a document of it.
+``--write benchmarks/results/memory.md`` writes the table as a document.
 ``--quick`` takes 40 frames of that size, with the same training frames.
 ``--largest`` adds frames of 3840×2160 and 7680×4320.
 ``--stages`` prints the peak of every stage, in bytes a pixel, with training frames in memory and in a file, and of what
@@ -36,7 +36,7 @@ EVERYTHING = ("--report={folder}/report.html", "--keep={folder}/stages", "--bit-
 COMPARED = ("--truth={folder}/scene.png", "--json")
 INTRO = (
     "What `{command}` measures: the largest resident set of `turbrestore restore`, mapped files included, on two "
-    "cores.  Clips are a random scene under smooth random motion.  It ends with 1 where a limit is not kept.\n"
+    "cores.  Clips are a random scene under smooth random motion.  It ends with 1 where a limit is exceeded.\n"
 )
 HEAD = """| frames | read from | options | limit, MB | peak, MB |
 |---|---|---|---:|---:|"""
@@ -313,7 +313,6 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     from turbrestore.blur.psf import estimate_noise
     from turbrestore.deconvolution.planes import split_planes
     from turbrestore.dynamics.dynamic_texture import identify
-    from turbrestore.explanation import explain_input, explain_motion
     from turbrestore.footage.content import check_content
     from turbrestore.io.images import write_image
     from turbrestore.io.source import FrameSource
@@ -323,6 +322,7 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     from turbrestore.report.pictures import encode_gallery, stages
     from turbrestore.runs.run_record import describe_run
     from turbrestore.runtime.scratch import new_stack, release, walk
+    from turbrestore.wording import explain_input, explain_motion
 
     # Video is always read in colour.
     encoded = [folder / "images", *([folder / "clip.mkv"] if clip.channels == 3 else [])]
@@ -459,7 +459,7 @@ def document(arguments: argparse.Namespace) -> tuple[str, bool]:
             print(line if good else f"{line} broken", flush=True)
             lines.append(line)
             held &= good
-    intro = INTRO.format(command=f"{command} --write docs/memory.md")
+    intro = INTRO.format(command=f"{command} --write benchmarks/results/memory.md")
     return "\n".join(["# Memory\n", intro, HEAD, *lines]) + "\n", held
 
 

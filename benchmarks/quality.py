@@ -2,13 +2,13 @@
 
 Run ``python benchmarks/quality.py``; it prints a Markdown document.  Clips: synthetic ones made here, and those under
 the folder that ``TURBRESTORE_DATA`` names, where there are any.  ``--clips`` takes names or patterns, ``--images``
-writes the images side by side, ``--json`` the figures, ``--write`` the document.
+writes the images side by side, ``--json`` the figures, ``--write benchmarks/results/quality.md`` the document.
 
 ``--bounds`` instead restores a few simulated clips with the blur given by hand, and exits with 1 when a bound is
 broken or a stage is worse than the one before; without the data it says so and exits with 0.
 
 ``--before`` instead restores the clips with truth or text by an earlier revision too, and exits with 1 where the
-filtered image or the result has lost more than 0.05 dB.
+filtered image or the result has lost more than 0.05 dB; its document is ``benchmarks/results/quality_change.md``.
 """
 
 from __future__ import annotations
@@ -158,8 +158,8 @@ def document(results: Results) -> str:
     """Markdown of everything that was measured."""
     parts = [
         "# Quality\n",
-        "What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --write docs/quality.md` measures: clips restored by "
-        "simple methods, by every stage of the pipeline and by its defaults.\n",
+        "What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --write benchmarks/results/quality.md` measures: "
+        "clips restored by simple methods, by every stage of the pipeline and by its defaults.\n",
         "".join(f"- **{method}**: {meaning}.\n" for method, meaning in METHODS.items()),
         f"Clips called `smooth_…` ({COUNT} frames of {SMOOTH_SIDE}×{SMOOTH_SIDE}: smooth random flow, Gaussian blur of "
         f"1 to 2 px, noise 0.01) and `screens_…` ({COUNT} frames of {SCREEN_SIDE}×{SCREEN_SIDE} through phase screens, "

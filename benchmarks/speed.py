@@ -1,7 +1,7 @@
 """Time of whole restorations against the bare flow calls they make, how it grows, memory against frames, and the help.
 
-    python benchmarks/speed.py --write docs/speed.md
-    python benchmarks/speed.py --full --before 890600a --write docs/speed.md
+    python benchmarks/speed.py --write benchmarks/results/speed.md
+    python benchmarks/speed.py --full --before 890600a --write benchmarks/results/speed.md
 
 prints a Markdown document, writes it, and exits with 1 when a bound is broken.  Times of a row are taken in one child
 process, flow calls before and after the restoration, because machines differ and drift; of the shorter clips five
@@ -103,16 +103,14 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
     command = f"python benchmarks/speed.py{' --full' if full else ''}{f' --before {before}' if before else ''}"
     lines = [
         "# Speed\n",
-        f"What `{command} --write docs/speed.md` measures: scenes under smooth random flow, {THREADS} threads on two "
-        f"cores, {_machine()}, {_compiled()}.  It ends with 1 where a bound is broken.\n",
+        f"What `{command} --write benchmarks/results/speed.md` measures: scenes under smooth random flow, {THREADS} "
+        f"threads on two cores, {_machine()}, {_compiled()}.  It ends with 1 where a bound is broken.\n",
         "## Against the flow calls\n",
-        "Seconds of a whole restoration with the default settings, and of the optical flow alone that it asks for, "
-        f"each call by itself from a frame. The bound of both ratios is {TIME_BOUND}. It is broken where what is done "
-        "once, above all the deconvolution, takes long beside the flow: by clips of less than a second. "
-        "As made, most calls start from an earlier flow of the frame, which has been prepared already, and "
-        "are cheaper: no bound holds for the ratio to these. The process keeps freed memory meanwhile, as a "
-        "restoration has it. "
-        "Frames are in memory, so nothing is decoded.\n",
+        "Seconds of a whole restoration with the default settings, and of its optical flow alone, each call timed "
+        f"by itself and without a start. The bound of both ratios is {TIME_BOUND}. It is exceeded where work that is "
+        "done once, above all the deconvolution, takes long compared with the flow: by clips of less than a second. "
+        "As made, most calls start from an earlier flow of the frame and use what has been prepared, so they are "
+        "cheaper: no bound holds for the ratio to these. Frames are in memory, so nothing is decoded.\n",
         *_time_table((*ROWS, *FULL_ROWS) if full else ROWS, tree, broken),
         *_plain_lines(),
         "\n## Growth\n",
@@ -120,7 +118,7 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
         f"{TRAINED} frames to train.\n",
         *_growth_table(tree, broken),
         "\n## Parts\n",
-        f"TV-L1: processor time a frame of {tvl1.SIDE}×{tvl1.SIDE}, {tvl1.THREADS} threads, on the sets of "
+        f"TV-L1: CPU time for a frame of {tvl1.SIDE}×{tvl1.SIDE}, {tvl1.THREADS} threads, on the sets of "
         "`benchmarks/tvl1.py`; the rest: clock, on the image of `benchmarks/deconvolution.py`. These two hold the "
         "bounds. Smallest of a few runs, of iterations the median.\n",
         *_parts_table(tree),
@@ -148,7 +146,7 @@ def document(full: bool, before: str | None, tree: Path | None) -> tuple[str, li
 def _time_table(rows: tuple[Row, ...], tree: Path | None, broken: list[str]) -> list[str]:
     stages = ("centroid", "identify", "filter", "deconvolve")
     earlier = ["before: whole, s", "flow calls", "ratio"] if tree else []
-    names = ["whole, s", "flow calls", "alone, s", "ratio", "of processor time", "as made, s", "ratio"]
+    names = ["whole, s", "flow calls", "alone, s", "ratio", "of CPU time", "as made, s", "ratio"]
     names += [*(f"{stage}, s" for stage in stages), "peak, MB"]
     names = ["frames", "size", "scene", *earlier, *names]
     lines = [f"| {' | '.join(names)} |", f"|{'---:|' * len(names)}"]
@@ -184,8 +182,8 @@ def _plain_lines() -> list[str]:
     found = sorted((child(__file__, task) for _ in range(RUNS)), key=_ratio)[RUNS // 2]
     ratio, work = _ratio(found), found["whole_work"] / found["bare_work"]
     return [
-        f"\nBounds are those with Numba, the extra `fast`. Without it {count} frames of {width}×{height} take "
-        f"{found['whole']:.1f} s, {ratio:.2f} times their flow calls, and {work:.2f} times their processor time."
+        f"\nBounds are those with Numba. Without it {count} frames of {width}×{height} take "
+        f"{found['whole']:.1f} s, {ratio:.2f} times their flow calls, and {work:.2f} times their CPU time."
     ]
 
 
@@ -342,7 +340,7 @@ def started(stack: np.ndarray, params: FlowParams, start_level: int) -> float:
 
 
 def clocked(call: Callable[[], Result]) -> tuple[tuple[float, float], Result]:
-    """Seconds of wall and of processor time that a call takes, and what it returns."""
+    """Seconds of wall and of CPU time that a call takes, and what it returns."""
     begun, worked = time.perf_counter(), time.process_time()
     result = call()
     return (time.perf_counter() - begun, time.process_time() - worked), result

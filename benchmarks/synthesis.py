@@ -1,7 +1,7 @@
 """Cost of phase-screen synthesis against frames and pixels, as a ratio to a plain warp and blur, and peak memory.
 
 Run ``python benchmarks/synthesis.py``; it prints tables and exits with 1 when a bound is broken.  Every cost is
-processor time, taken beside that of ``cv2.remap`` and ``cv2.GaussianBlur`` on frames of the same size in the same
+CPU time, taken beside that of ``cv2.remap`` and ``cv2.GaussianBlur`` on frames of the same size in the same
 process, because machines differ and drift; exponents are fitted to the costs.  Peak memory is that of a child process.
 """
 
@@ -28,7 +28,7 @@ BASELINE_PIXELS = 200 * 256**2
 
 
 def synthesis_seconds(count: int, size: int) -> tuple[float, float, float]:
-    """Elapsed seconds for ``count`` frames, processor seconds, and those for all but the first few frames.
+    """Elapsed seconds for ``count`` frames, CPU seconds, and those for all but the first few frames.
 
     The first frames wait for the screens and the basis of the blur.
     """
@@ -43,7 +43,7 @@ def synthesis_seconds(count: int, size: int) -> tuple[float, float, float]:
 
 
 def baseline_seconds(size: int) -> float:
-    """Processor seconds that one warp and blur of a frame takes, the smallest of three means."""
+    """CPU seconds that one warp and blur of a frame takes, the smallest of three means."""
     scene = resolution_chart(size, size)
     y, x = np.mgrid[:size, :size].astype(np.float32)
     repeats = max(1, BASELINE_PIXELS // size**2)
@@ -66,7 +66,7 @@ def exponent(sizes: list[int], costs: list[float]) -> float:
 
 def frame_table() -> tuple[float, float]:
     """Print cost against frames; elapsed seconds of the longest clip, and the exponent."""
-    print("| frames of 256×256 | elapsed, s | processor, s | ratio to one warp and blur each |\n|---|---|---|---|")
+    print("| frames of 256×256 | elapsed, s | CPU, s | ratio to one warp and blur each |\n|---|---|---|---|")
     counts, costs, elapsed = [30, 60, FRAMES], [], 0.0
     for count in counts:
         plain = baseline_seconds(SIZE)
@@ -78,7 +78,7 @@ def frame_table() -> tuple[float, float]:
 
 def pixel_table() -> float:
     """Print cost of a frame against pixels; the exponent."""
-    print("\n| size | processor, s a frame | one warp and blur, ms | ratio |\n|---|---|---|---|")
+    print("\n| size | CPU, s a frame | one warp and blur, ms | ratio |\n|---|---|---|---|")
     # Threads have begun some frames when the first is handed over, the same number at every size.
     sizes, costs, count = [128, 192, 256, 384], [], 17
     for size in sizes:

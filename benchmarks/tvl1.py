@@ -5,7 +5,7 @@ phase screens, smooth random flows, and a dynamic texture learned from a clip.  
 and end where they end: no shift is taken out and no flow regularised.  Errors are mean end-point errors over all pixels
 and over the half with the larger gradients.
 
-Every method solves the frames of a set on two threads.  Time is processor time of the process, which a busy machine
+Every method solves the frames of a set on two threads.  Time is CPU time of the process, which a busy machine
 disturbs less than the clock; the methods take turns, and the smallest of the runs counts.  Ends with 1 if the flow is
 less than five times faster than OpenCV's on any set, or its error is larger.
 
@@ -68,7 +68,7 @@ class KnownMotion:
 
 @dataclass(frozen=True)
 class Score:
-    """Seconds of processor and of clock for a frame, and errors in pixels."""
+    """CPU seconds and clock seconds for a frame, and errors in pixels."""
 
     processor: float
     clock: float
@@ -154,7 +154,7 @@ def main() -> int:
         base, ours = scores[BASELINE], scores[OURS]
         lengths = np.linalg.norm(motion.truth, axis=-1)
         print(f"## {name}: {count} frames of {SIDE}×{SIDE}, mean motion {lengths.mean():.2f} px\n")
-        print("| method | processor, ms a frame | ratio | clock, ms a frame | error, px | textured half, px |")
+        print("| method | CPU, ms a frame | ratio | clock, ms a frame | error, px | textured half, px |")
         print("|---|---:|---:|---:|---:|---:|")
         for method, score in scores.items():
             ratio = base.processor / score.processor
@@ -183,7 +183,7 @@ def compare_starts() -> None:
         before, own = found[IDENTIFIED - 1 : -1], found[IDENTIFIED:]
         predicted = np.stack([predict_flow(dynamics, project(dynamics, flow)) for flow in before])
         starts = {"nothing": np.zeros_like(own), "frame before": before, "prediction": predicted, "frame itself": own}
-        print(f"## {name}\n\n| levels | start | its error, px | processor, ms a frame | warps | error, px |")
+        print(f"## {name}\n\n| levels | start | its error, px | CPU, ms a frame | warps | error, px |")
         print("|---:|---|---:|---:|---:|---:|")
         for levels in STARTED_LEVELS:
             referred = refer_tvl1(reference, TvL1Params(levels=levels))
@@ -197,7 +197,7 @@ def compare_starts() -> None:
 
 
 def compare_clips() -> None:
-    """Print the processor time of whole restorations, and PSNR of the filtered and the deblurred image."""
+    """Print the CPU time of whole restorations, and PSNR of the filtered and the deblurred image."""
     from clips import find_clips
 
     from turbrestore.metrics import compare
@@ -228,7 +228,7 @@ def compare_clips() -> None:
 
 
 def _clocked(call: Callable[[], Found]) -> tuple[Found, float]:
-    """Return what a call gives, and the processor time that it took, s."""
+    """Return what a call gives, and the CPU time that it took, s."""
     begun = time.process_time()
     return call(), time.process_time() - begun
 

@@ -32,7 +32,7 @@ exclude_patterns = [
 ]
 source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
 
-# Notebooks are percent scripts, run anew for every build; `-D nb_execution_mode=off` leaves them out.
+# Notebooks are percent scripts and run at every build; `-D nb_execution_mode=off` only shows their text.
 nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
 nb_execution_mode = "force"
 nb_execution_timeout = 180
@@ -42,10 +42,10 @@ nb_merge_streams = True
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 3
-# `$` of shell prompts is rare here, mathematics is not.
+# `$$` may also be used inside a line of text.
 myst_dmath_double_inline = True
 
-# Dashes only; quotation marks stay as they are written.
+# Only dashes are replaced; quotation marks remain as they are written.
 smartquotes_action = "D"
 toc_object_entries = False
 
@@ -55,15 +55,16 @@ napoleon_google_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
 
-# Formulas become MathML while the pages are built: no script, no font to load.
+# Formulas are MathML, made when the pages are built: the site needs no script for them.
 html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
 html_static_path = ["_static"]
 html_css_files = ["turbrestore.css"]
 html_title = "turbrestore"
 html_show_sourcelink = False
-# Pages without pages below them need no list of those.
-html_sidebars = {name: [] for name in ("index", "getting_started", "command_line", "report", "limits")}
+# Pages without subpages need no list of them.
+_SINGLE = "index getting_started command_line report limits memory device robustness interruptions"
+html_sidebars = {name: [] for name in _SINGLE.split()}
 html_theme_options = {
     "navbar_align": "left",
     "header_links_before_dropdown": 8,

@@ -18,16 +18,6 @@ from .core.decision import Decision
 from .core.errors import DataError, require
 from .dynamics.dynamic_texture import identify
 from .dynamics.flow_model import FlowDynamics
-from .explanation import (
-    explain_border,
-    explain_camera,
-    explain_centroid,
-    explain_dynamics,
-    explain_frames,
-    explain_input,
-    explain_motion,
-    explain_training,
-)
 from .filtering.alternating import Filtered, FilterStep, filter_steps
 from .footage.frame_selection import best_frames, frame_quality
 from .io.images import check_space
@@ -44,6 +34,16 @@ from .runtime.steps import finish
 from .runtime.tiling import HaloTile, cut_tile, halo_tiles
 from .settings import RestoreParams
 from .tiled_stages import join_filtered, tiled_centroid_steps
+from .wording import (
+    explain_border,
+    explain_camera,
+    explain_centroid,
+    explain_dynamics,
+    explain_frames,
+    explain_input,
+    explain_motion,
+    explain_training,
+)
 
 # Share of the training frames that show every pixel of a cropped image.
 _SEEN = 0.9

@@ -1,8 +1,9 @@
-"""Sphinx extension: parts of pages that are made while they are read, so that they cannot go stale.
+"""Sphinx extension: parts of pages that are generated when they are read, so that they are always up to date.
 
-``<!-- command-line -->`` becomes a section for every command, from the application itself; ``<!-- gallery -->`` becomes
-a list of the notebooks in ``examples/``, with the first sentences of each; ``<!-- api: centroid flow -->`` becomes the
-reference of all public names that these modules define, and ``<!-- api-table -->`` a table of all of them.
+``<!-- command-line -->`` becomes a section for every command, taken from the application itself; ``<!-- gallery -->``
+becomes a list of the notebooks in ``examples/``, with the first paragraph of each; ``<!-- api: centroid flow -->``
+becomes the reference of all public names that these modules define, and ``<!-- api-table -->`` a table of all of them.
+Links to the tables in ``benchmarks/``, which are not pages of the site, become links to copies of these files.
 """
 
 from __future__ import annotations
@@ -23,17 +24,18 @@ if TYPE_CHECKING:
 
 DOCS = Path(__file__).parents[1]
 EXAMPLES_FOLDER = DOCS / "examples"
+BENCHMARKS = re.compile(r"\]\((?=(?:\.\./)+benchmarks/[\w/]+\.md\))")
 API_MARK = re.compile(r"<!-- api: ([\w. ]+) -->")
 KINDS = {bool: "", int: "INT", float: "NUMBER", str: "TEXT", Path: "PATH"}
 
 
 def fill(app: Sphinx, name: str, source: list[str]) -> None:
-    """Replace the marks of a page that is read."""
-    source[0] = filled(source[0])
+    """Replace the marks of a page that is being read, and its links to benchmarks."""
+    source[0] = BENCHMARKS.sub("](path:", filled(source[0]))
 
 
 def filled(text: str) -> str:
-    """Replace marks by what they stand for."""
+    """Replace the marks of a text by the generated parts."""
     for mark, make in (
         ("<!-- command-line -->", command_line),
         ("<!-- gallery -->", gallery),
@@ -45,7 +47,7 @@ def filled(text: str) -> str:
 
 
 def command_line() -> str:
-    """Every command as Markdown: what it does, how it is called, examples, and all options."""
+    """Describe every command in Markdown: what it does, its usage, examples, and all options."""
     app = build()
     return "\n".join(line for words in COMMANDS for line in _command(app, words))
 
@@ -83,7 +85,7 @@ def _table(head: str, arguments: list[Any]) -> Iterator[str]:
 
 
 def _kinds(item: Any) -> list[str]:
-    """Name what an option takes; types of their own are named after those that they extend."""
+    """Names of the types that an option takes; subclasses have the name of the type that they extend."""
     kinds = [kind for kind in get_args(item.hint) or (item.hint,) if isinstance(kind, type) and kind is not NoneType]
     names = [next((KINDS[known] for known in KINDS if issubclass(kind, known)), "") for kind in kinds]
     return [name for name in names if name]
@@ -101,7 +103,7 @@ def _default(item: Any) -> str:
 
 
 def _description(docstring: str) -> str:
-    """Cut a docstring where its sections begin, and take the marks of roles out."""
+    """Docstring up to its first section, without the markup of roles."""
     lines = re.split(r"\n\s*Parameters\n", docstring)[0].splitlines()
     return _plain("\n".join(line.strip() for line in lines)) + "\n"
 
@@ -115,14 +117,14 @@ def _plain(text: str) -> str:
 
 
 def public_names(modules: list[str]) -> list[str]:
-    """Public names that modules or folders of the package define, functions first, in the order of the package."""
+    """Public names that some modules or folders of the package define, functions first."""
     named = [(name, getattr(turbrestore, name)) for name in turbrestore.__all__]
     here = [(inspect.isclass(item), _position(item, modules), name) for name, item in named]
     return [name for _, place, name in sorted(here, key=lambda entry: entry[:2]) if place >= 0]
 
 
 def _position(item: Any, modules: list[str]) -> int:
-    """Where a name stands among some modules or folders; -1 if none of them defines it."""
+    """Index of the module or folder that defines a name; -1 if none of them does."""
     module = item.__module__.removeprefix("turbrestore.")
     return next((index for index, name in enumerate(modules) if f"{module}.".startswith(f"{name}.")), -1)
 
@@ -140,14 +142,14 @@ def reference(modules: list[str]) -> str:
 
 
 def api_pages() -> dict[Path, list[str]]:
-    """Pages of the reference in their order, each with the names that it shows."""
+    """Pages of the reference in order, each with the names that it shows."""
     order = re.findall(r"(?m)^\w+$", (DOCS / "api" / "index.md").read_text("utf-8").split("toctree")[1])
     pages = [DOCS / "api" / f"{name}.md" for name in order]
     return {page: public_names(API_MARK.search(page.read_text("utf-8"))[1].split()) for page in pages}
 
 
 def api_table() -> str:
-    """Pages of the reference with what they hold."""
+    """Table of the pages of the reference with their names."""
     rows = []
     for page, names in api_pages().items():
         title = page.read_text("utf-8").splitlines()[0].lstrip("# ")
@@ -157,7 +159,7 @@ def api_table() -> str:
 
 
 def gallery() -> str:
-    """List the notebooks by number, each with its title as a link and its first paragraph."""
+    """List the notebooks in order, each with its title as a link and its first paragraph."""
     found = sorted(path for path in EXAMPLES_FOLDER.glob("*.py") if path.name[:2].isdigit())
     items = []
     for path in found:
@@ -170,6 +172,6 @@ def gallery() -> str:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Fill the pages as they are read."""
+    """Register the extension."""
     app.connect("source-read", fill)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

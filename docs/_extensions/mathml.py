@@ -1,7 +1,7 @@
-"""Sphinx extension: formulas as MathML, which browsers draw themselves, by the converter of docutils.
+"""Sphinx extension: formulas as MathML, which browsers render themselves, by the converter of docutils.
 
-Brackets and sums grow only in fonts for mathematics.  The style sheet names those that systems have; where there is
-none, browsers take DejaVu Serif, which comes with matplotlib and is copied into the pages.
+Brackets and sums have the right size only in fonts for mathematics.  The style sheet names those that are common; where
+there is none, browsers use DejaVu Serif, which is part of matplotlib and is copied into the site.
 """
 
 import shutil
@@ -30,7 +30,7 @@ def block(translator: Any, node: nodes.math_block) -> None:
 
 
 def convert(node: nodes.Element, block: bool) -> str:
-    """Turn one formula into MathML; one that cannot be read is a warning, and so an error of the strict build."""
+    """Convert a formula to MathML; where it cannot be parsed, warn, which is an error of the strict build."""
     try:
         return tex2mathml(node.astext(), as_block=block)
     except Exception as error:

@@ -1,7 +1,7 @@
-"""Sphinx extension: in the types of docstrings only names of classes are links.
+"""Sphinx extension: in the types of docstrings only class names are links.
 
-Types are words, such as ``ndarray, float32, shape (H, W)``; Sphinx takes each word for a reference, and ``shape`` for
-an attribute of whichever class has one.
+Types are words, such as ``ndarray, float32, shape (H, W)``.  Sphinx would treat each word as a reference, and link
+``shape`` to the attribute of any class that has one.
 """
 
 from docutils import nodes
@@ -10,7 +10,7 @@ from sphinx.application import Sphinx
 
 
 def unlink_words(app: Sphinx, document: nodes.document) -> None:
-    """Turn references to words in small letters back into words."""
+    """Turn references to lower-case words back into text."""
     for reference in list(document.findall(addnodes.pending_xref)):
         target = reference.get("reftarget", "").rsplit(".", 1)[-1]
         if reference.get("refdomain") == "py" and reference.get("reftype") == "class" and not target[:1].isupper():
@@ -18,6 +18,6 @@ def unlink_words(app: Sphinx, document: nodes.document) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Look at every page once it is read."""
+    """Register the extension."""
     app.connect("doctree-read", unlink_words)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -18,6 +18,7 @@ from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.display import plots
+from turbrestore.display.figure import ACCENT, INK, REST
 from turbrestore.display.preview import encode_image, preview
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
@@ -27,7 +28,7 @@ KNOWN_BLUR = DeconvolutionParams(sigma=1.0, iterations=20)
 FLOWS = RNG.normal(size=(7, 40, 60, 2)).astype(np.float32)
 
 
-def curves(axes, colour=plots.ACCENT):
+def curves(axes, colour=ACCENT):
     return [line for line in axes.lines if line.get_color() == colour]
 
 
@@ -88,7 +89,7 @@ class TestCurves:
     def test_kept_singular_values_are_coloured_and_rounding_is_left_out(self):
         values = np.array([9.0, 5.0, 2.0, 0.5, 1e-9])
         axes = plots.plot_singular_values(values, 2).axes[0]
-        (kept,), (rest,) = curves(axes), curves(axes, plots.REST)
+        (kept,), (rest,) = curves(axes), curves(axes, REST)
         assert kept.get_xydata().tolist() == [[1, 9], [2, 5]]
         assert rest.get_xydata().tolist() == [[3, 2], [4, 0.5]]
         assert "2 of 5" in axes.get_title(loc="left")
@@ -114,8 +115,8 @@ class TestCurves:
     def test_convergence_and_tolerance(self):
         axes = plots.plot_convergence([0.8, 0.1], 0.2).axes[0]
         assert curves(axes)[0].get_xydata().tolist() == [[1, 0.8], [2, 0.1]]
-        assert curves(axes, plots.INK)[0].get_ydata()[0] == 0.2
-        assert not curves(plots.plot_convergence([0.8]).axes[0], plots.INK)
+        assert curves(axes, INK)[0].get_ydata()[0] == 0.2
+        assert not curves(plots.plot_convergence([0.8]).axes[0], INK)
 
     def test_frames_against_an_equal_share(self):
         sharpness, shares = np.array([0.9, 1.1, 1.0, 1.0]), np.array([0.1, 0.4, 0.25, 0.25])
@@ -143,7 +144,7 @@ class TestCurves:
         figure = plots.plot_blur([0.5, 1.0, 1.5], [0.5, 0.2, 0.4], 1.1, 0.25)
         axes = figure.axes[0]
         assert np.allclose(curves(axes)[0].get_ydata(), [0.3, 0, 0.2])
-        assert curves(axes, plots.INK)[0].get_xdata()[0] == 1.1
+        assert curves(axes, INK)[0].get_xdata()[0] == 1.1
         box = axes.patches[0].get_extents().transformed(axes.transData.inverted())
         assert (box.x0, box.x1) == pytest.approx((0.85, 1.35))
         assert not plots.plot_blur([0.5, 1.0], [0.5, 0.2], 1.1, np.inf).axes[0].patches
@@ -185,7 +186,7 @@ def luminance(colour):
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-@pytest.mark.parametrize("colour", [plots.INK, plots.ACCENT])
+@pytest.mark.parametrize("colour", [INK, ACCENT])
 def test_colours_read_on_white_and_on_black(colour):
     on_white, on_black = 1.05 / (luminance(colour) + 0.05), (luminance(colour) + 0.05) / 0.05
     assert min(on_white, on_black) > 4

@@ -1,4 +1,4 @@
-"""What the documentation promises: every name, every command and option, every link, and examples that run."""
+"""The documentation is complete: every name, every command and option, every link, and examples that run."""
 
 import doctest
 import importlib.util
@@ -17,12 +17,13 @@ DOCS = ROOT / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if not {"_build", "jupyter_execute"} & set(path.parts))
 NOTEBOOKS = sorted((DOCS / "examples").glob("*.py"))
 ROOT_PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+TABLES = sorted((ROOT / "benchmarks" / "results").glob("*.md"))
 LINK = re.compile(r"\[[^\]\[]*\]\(([^)\s]+)\)")
 
 
 @pytest.fixture(scope="module")
 def generated():
-    """The parts of pages that are made while they are read."""
+    """The extension that generates parts of pages when they are read."""
     spec = importlib.util.spec_from_file_location("generated_pages", DOCS / "_extensions" / "generated_pages.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -57,7 +58,7 @@ def options(app, words):
 
 
 class TestReference:
-    def test_every_public_name_stands_once(self, generated):
+    def test_every_public_name_is_shown_once(self, generated):
         shown = [name for names in generated.api_pages().values() for name in names]
         assert sorted(shown) == sorted(turbrestore.__all__)
 
@@ -77,7 +78,7 @@ class TestReference:
         if inspect.isfunction(item):
             heading, examples = inspect.getdoc(item).partition("Examples\n--------\n")[1:]
             assert heading
-            # The examples run with the rest of the tests, which look at the whole package.
+            # The examples run with the other tests, which include the doctests of the whole package.
             assert doctest.DocTestParser().get_examples(examples)
 
     def test_examples_of_the_package_run_with_the_tests(self, pytestconfig):
@@ -105,7 +106,9 @@ class TestReference:
 
 
 class TestLinks:
-    @pytest.mark.parametrize("path", [*PAGES, *NOTEBOOKS, *ROOT_PAGES], ids=lambda path: str(path.relative_to(ROOT)))
+    @pytest.mark.parametrize(
+        "path", [*PAGES, *NOTEBOOKS, *ROOT_PAGES, *TABLES], ids=lambda path: str(path.relative_to(ROOT))
+    )
     def test_links_lead_somewhere(self, generated, path):
         for link in LINK.findall(prose(generated.filled(text_of(path)))):
             if link.startswith(("http://", "https://")):
@@ -128,6 +131,14 @@ class TestLinks:
                         targets = {path for suffix in (".md", ".py") for path in page.parent.glob(f"{name}{suffix}")}
                         waiting += sorted(targets - found)
         assert set(PAGES) | set(NOTEBOOKS) == found | {DOCS / "README.md"}
+
+
+def test_every_table_of_the_benchmarks_is_linked_and_made_by_a_script():
+    text = "\n".join(text_of(path) for path in PAGES)
+    for table in TABLES:
+        assert f"benchmarks/results/{table.name})" in text
+        script = re.search(r"python (benchmarks/\w+\.py)", text_of(table))[1]
+        assert (ROOT / script).exists()
 
 
 def test_options_that_pages_name_exist(generated):

@@ -1,1 +1,1 @@
-"""Figures and previews of results: arrays in, pictures out."""
+"""Figures and previews of results, made from plain arrays."""

@@ -1,4 +1,4 @@
-"""Images and key figures as HTML: what notebooks show of a result, and the pictures of a report."""
+"""Images as files and data URIs, and the HTML card that notebooks show for a result."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, from_unit
 from ..core.errors import DataError
 
-# cv2 takes a quality above 100 for lossless.
+# OpenCV writes lossless WebP where the quality is above 100.
 _LOSSLESS = 101
+# Longest side of the image on a card, pixels.
 _THUMBNAIL = 224
 
 
 def encode_image(
     pixels: NDArray[np.unsignedinteger], kind: Literal["png", "webp"] = "png", quality: int | None = None
 ) -> bytes:
-    """Image file of 8 bits.
+    """Encode an image of 8 bits as a file.
 
     Parameters
     ----------
     pixels : ndarray, uint8, shape (H, W) or (H, W, 3)
     kind : {"png", "webp"}
     quality : int, optional
-        Of WebP, 1 to 100; lossless by default.
+        Quality of WebP, 1 to 100; lossless by default.
 
     Returns
     -------
@@ -56,12 +57,12 @@ def encode_image(
 
 
 def data_uri(data: bytes, kind: str = "png") -> str:
-    """Address that holds the image itself.
+    """Make a data URI, an address that contains the image file itself.
 
     Parameters
     ----------
     data : bytes
-        Image file.
+        Content of an image file.
     kind : str
         ``"png"`` or ``"webp"``.
 
@@ -77,8 +78,33 @@ def data_uri(data: bytes, kind: str = "png") -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
+def shrink(image: FloatArray, longest: int) -> FloatArray:
+    """Reduce an image by averaging, if its longest side is larger than allowed.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+    longest : int
+        Longest side of the result, pixels.
+
+    Returns
+    -------
+    ndarray, float32
+
+    Examples
+    --------
+    >>> shrink(np.zeros((10, 400), np.float32), 200).shape
+    (5, 200)
+    """
+    factor = longest / max(image.shape[:2])
+    if factor >= 1:
+        return image
+    height, width = (max(round(side * factor), 1) for side in image.shape[:2])
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
 def preview(title: str, facts: Iterable[tuple[str, str]], image: FloatArray | None = None) -> str:
-    """Small card for notebooks: a thumbnail beside key figures.
+    """Make a small HTML card for notebooks: a thumbnail beside key figures.
 
     Parameters
     ----------
@@ -86,7 +112,7 @@ def preview(title: str, facts: Iterable[tuple[str, str]], image: FloatArray | No
     facts : iterable of (str, str)
         Name and value.
     image : ndarray, float32, shape (H, W) or (H, W, 3), optional
-        Reduced to at most 224 pixels.
+        It is reduced to at most 224 pixels a side.
 
     Returns
     -------
@@ -103,17 +129,9 @@ def preview(title: str, facts: Iterable[tuple[str, str]], image: FloatArray | No
         f"<td style='text-align:left;padding:1px 0;font-variant-numeric:tabular-nums'>{html.escape(value)}</td></tr>"
         for name, value in facts
     )
-    address = "" if image is None else data_uri(encode_image(from_unit(_thumbnail(image), 8)))
+    address = "" if image is None else data_uri(encode_image(from_unit(shrink(image, _THUMBNAIL), 8)))
     picture = f"<img alt='' style='flex:none' src='{address}'>" if address else ""
     return (
         f"<div style='display:flex;flex-wrap:wrap;gap:16px;align-items:flex-start'>{picture}"
         f"<div><strong>{html.escape(title)}</strong><table style='border:0;margin:4px 0 0'>{rows}</table></div></div>"
     )
-
-
-def _thumbnail(image: FloatArray) -> FloatArray:
-    factor = _THUMBNAIL / max(image.shape[:2])
-    if factor >= 1:
-        return image
-    size = [max(round(side * factor), 1) for side in image.shape[1::-1]]
-    return np.clip(cv2.resize(image, size, interpolation=cv2.INTER_AREA), 0, 1)

@@ -1,4 +1,4 @@
-"""A restoration as one HTML file that needs nothing else: no network, no other file, no server."""
+"""The report of a restoration: one self-contained HTML file."""
 
 from .page import check_report as check_report
 from .page import render_report as render_report

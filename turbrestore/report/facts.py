@@ -1,4 +1,4 @@
-"""What the report says in words and figures."""
+"""The figures and sentences of the report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from ..metrics import sharpness
 from ..runs.run_record import RunRecord
-from ..runtime.scratch import drop_pages, variance_of
+from ..runtime.scratch import variance_of
 from ..settings import Restoration, RestoreParams
 
 _STAGE_NAMES = {
@@ -31,9 +31,9 @@ class Fact:
     Attributes
     ----------
     name, value, note : str
-        The note says how to read it, or is empty.
+        The note says how to read the value, or is empty.
     doubtful : bool
-        Whether a person should have a look.
+        Whether the value should be checked by a person.
     """
 
     name: str
@@ -60,14 +60,14 @@ class Setting:
 
 @dataclass(frozen=True)
 class Lap:
-    """Time of one stage.
+    """Time that one stage took.
 
     Attributes
     ----------
     name : str
     seconds : float
     start, share : float
-        Percent of the whole run.
+        Percent of the time of the whole run.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Lap:
 
 
 def headline(restoration: Restoration) -> list[Fact]:
-    """Key figures.
+    """Return the key figures, which stand at the top of the page.
 
     Parameters
     ----------
@@ -87,17 +87,16 @@ def headline(restoration: Restoration) -> list[Fact]:
     -------
     list of Fact
     """
-    spread = float(np.sqrt(variance_of(restoration.centroid.flows).sum(axis=-1).mean()))
+    deviation = float(np.sqrt(variance_of(restoration.centroid.flows).sum(axis=-1).mean()))
     facts = [
-        Fact("Frames", str(restoration.frame_count), f"{restoration.train} trained the model"),
-        Fact("Motion", f"{spread:.2f} px", "root mean square"),
+        Fact("Frames", str(restoration.frame_count), f"{restoration.train} of them for training"),
+        Fact("Motion", f"{deviation:.2f} px", "root mean square"),
     ]
     x, y, width, height = restoration.crop
     mean = restoration.mean[y : y + height, x : x + width]
     contrast = np.ptp(mean)
-    drop_pages(mean)
     if contrast > 0:
-        facts.append(Fact("Sharpness", f"×{sharpness(restoration.image, mean):.2f}", "that of the mean"))
+        facts.append(Fact("Sharpness", f"×{sharpness(restoration.image, mean):.2f}", "relative to the mean"))
     if restoration.deconvolution is not None:
         sigma = restoration.deconvolution.sigma
         facts.append(Fact("Blur removed", f"{sigma:.2f} px" if sigma > 0 else "none", _blur_note(restoration)))
@@ -106,7 +105,7 @@ def headline(restoration: Restoration) -> list[Fact]:
 
 
 def findings(restoration: Restoration) -> list[Fact]:
-    """Figures that every stage found.
+    """Return the results of every stage.
 
     Parameters
     ----------
@@ -117,15 +116,15 @@ def findings(restoration: Restoration) -> list[Fact]:
     list of Fact
     """
     return [
-        *_of_motion(restoration),
-        *_of_filter(restoration),
-        *_of_blur(restoration),
-        *_of_guards(restoration),
+        *_motion_facts(restoration),
+        *_filter_facts(restoration),
+        *_blur_facts(restoration),
+        *_guard_facts(restoration),
     ]
 
 
 def remarks(restoration: Restoration, run: RunRecord) -> list[str]:
-    """Warnings of the reader and notes of the stages.
+    """Return the warnings of the reader and the notes of the stages.
 
     Parameters
     ----------
@@ -141,7 +140,7 @@ def remarks(restoration: Restoration, run: RunRecord) -> list[str]:
 
 
 def settings(run: RunRecord) -> list[Setting]:
-    """All settings, with dots between their levels as the command line has them.
+    """Return all settings, named as on the command line, with dots between the levels.
 
     Parameters
     ----------
@@ -159,7 +158,7 @@ def settings(run: RunRecord) -> list[Setting]:
 
 
 def laps(restoration: Restoration) -> list[Lap]:
-    """Time of every stage, one after the other.
+    """Return the time of every stage, in the order of the run.
 
     Parameters
     ----------
@@ -177,11 +176,11 @@ def laps(restoration: Restoration) -> list[Lap]:
     return found
 
 
-def _of_motion(restoration: Restoration) -> Iterator[Fact]:
+def _motion_facts(restoration: Restoration) -> Iterator[Fact]:
     centroid, dynamics = restoration.centroid, restoration.dynamics
     yield Fact(
         "Centroid",
-        f"{centroid.mean_flow_sizes.size} iterations, {centroid.mean_flow_sizes[-1]:.2f} px of mean flow left",
+        f"{centroid.mean_flow_sizes.size} iterations, {centroid.mean_flow_sizes[-1]:.2f} px mean flow remaining",
         "converged" if centroid.converged else "not converged: allow more iterations",
         not centroid.converged,
     )
@@ -194,31 +193,37 @@ def _of_motion(restoration: Restoration) -> Iterator[Fact]:
         dynamics.overfitted,
     )
     largest = float(np.abs(dynamics.eigenvalues).max(initial=0.0))
-    note = "the motion dies out" if largest < 1 else "the motion does not die out"
+    note = "stable: the simulated motion decays" if largest < 1 else "the simulated motion does not decay"
     yield Fact("Largest eigenvalue", f"{largest:.3f}", note)
     yield Fact("Flow outside the model", f"{math.sqrt(dynamics.R):.2f} px", "standard deviation")
 
 
-def _of_filter(restoration: Restoration) -> Iterator[Fact]:
+def _filter_facts(restoration: Restoration) -> Iterator[Fact]:
     filtered = restoration.filtered
     if filtered is None:
         return
-    yield Fact("Innovation", f"{np.nanmean(filtered.innovations):.2f} px", "motion that was not foreseen, mean")
-    yield Fact("Noise of a frame", f"{100 * math.sqrt(filtered.image_noise):.2f} %", "of full scale, about the image")
-    yield Fact("Motion outside the model", f"{100 * filtered.motion_share:.0f} %", "taken as motion, the rest as noise")
+    yield Fact("Innovation", f"{np.nanmean(filtered.innovations):.2f} px", "mean motion that the model did not predict")
+    yield Fact(
+        "Noise of a frame", f"{100 * math.sqrt(filtered.image_noise):.2f} %", "of full scale, deviation from the image"
+    )
+    yield Fact("Motion outside the model", f"{100 * filtered.motion_share:.0f} %", "kept as motion, the rest is noise")
     effective = 1 / float(np.square(filtered.shares).sum())
-    yield Fact("Effective frames", f"{effective:.1f} of {filtered.shares.size}", "as many equal shares tell as much")
+    yield Fact(
+        "Effective frames",
+        f"{effective:.1f} of {filtered.shares.size}",
+        "if all had equal weight",
+    )
 
 
-def _of_blur(restoration: Restoration) -> Iterator[Fact]:
+def _blur_facts(restoration: Restoration) -> Iterator[Fact]:
     blur, bounds, done = restoration.blur, restoration.blur_bounds, restoration.deconvolution
     if blur is not None:
         known = math.isfinite(blur.uncertainty)
         value = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} px" if known else f"{blur.sigma:.2f} px"
-        note = f"evidence {blur.evidence:.2f}, image reduced {blur.reduction}×" if known else "the image says nothing"
+        note = f"evidence {blur.evidence:.2f}, image reduced {blur.reduction}×" if known else "cannot be measured"
         yield Fact("Estimated blur", value, note, not known)
     if bounds is not None:
-        yield Fact("Bounds of the blur", f"{bounds.low:.2f} to {bounds.high:.2f} px", "from frames and mean")
+        yield Fact("Bounds of the blur", f"{bounds.low:.2f} to {bounds.high:.2f} px", "from the frames and their mean")
     if done is not None:
         yield Fact("Noise before deblurring", f"{100 * done.noise:.2f} %", "of full scale")
         if done.sigma > 0:
@@ -227,24 +232,24 @@ def _of_blur(restoration: Restoration) -> Iterator[Fact]:
             yield Fact("Deconvolution", value, note, not done.converged)
 
 
-def _of_guards(restoration: Restoration) -> Iterator[Fact]:
+def _guard_facts(restoration: Restoration) -> Iterator[Fact]:
     for reading in restoration.guard_readings:
         value = f"{100 * reading.overshoot:.1f} % overshoots, noise ×{reading.noise_gain:.1f}"
-        note = "passed" if reading.passed else "too much: less blur is removed"
+        note = "passed" if reading.passed else "failed: less blur is removed"
         yield Fact(f"Guards at {reading.sigma:.2f} px", value, note, not reading.passed)
 
 
 def _blur_note(restoration: Restoration) -> str:
     blur = restoration.blur
     if blur is None:
-        return "as asked for"
+        return "as requested"
     if not math.isfinite(blur.uncertainty):
         return "could not be estimated"
     return f"estimated {blur.sigma:.2f} ± {blur.uncertainty:.2f}"
 
 
 def _as_written(value: Any) -> str:
-    """Value as a settings file has it; None is left to be measured."""
+    """Value as a settings file writes it; None means that it is measured."""
     if isinstance(value, bool):
         return str(value).lower()
     return "automatic" if value is None else str(value)

@@ -1,7 +1,7 @@
 """The page: a template filled with pictures, plots and facts.
 
-Nothing in it comes from elsewhere.  Its content security policy allows images in data URIs and the one style sheet and
-the one script that it carries, by their hashes; file names and remarks are text, never markup.
+The page is self-contained. Its content security policy allows only images in data URIs and its own style sheet and
+script, which it names by their hashes. File names and remarks are escaped, so they are never markup.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 from ..core.errors import ConfigurationError
 from ..io.images import atomic_write, check_output
 from ..runs.run_record import RunRecord
-from ..runtime.scratch import returning_freed
 from ..settings import Restoration
 from .facts import findings, headline, laps, remarks, settings
 from .panels import draw_panels
@@ -34,23 +33,23 @@ _PACKAGES = ("matplotlib", "jinja2")
 def check_report(
     path: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = (), overwrite: bool = False
 ) -> None:
-    """Refuse a report that could not be written, before any work begins.
+    """Raise an error before the work begins if the report could not be written.
 
     Parameters
     ----------
     path : path
-        File to be written.
+        File to write.
     inputs : iterable of path
-        Files that are read.
+        Files that the run reads.
     overwrite : bool
         Whether an existing file may be replaced.
 
     Raises
     ------
     ConfigurationError
-        Another suffix than .html, or a package is not installed.
+        The suffix is not .html or .htm, or a package is not installed.
     OutputError
-        The file exists, is an input, or its folder does not exist.
+        The file exists or is an input, or its folder does not exist.
 
     Examples
     --------
@@ -60,7 +59,7 @@ def check_report(
     turbrestore.core.errors.ConfigurationError: report.txt: expected a name that ends in .html or .htm, found .txt
     """
     check_output(path, inputs, overwrite, _SUFFIXES)
-    # They are loaded when they are used: a restoration has no room for them.
+    # The packages are only looked for here; loading them takes memory that the restoration needs.
     for package in _PACKAGES:
         if find_spec(package) is None:
             raise _missing(package)
@@ -76,16 +75,16 @@ def write_report(
     path : path
         Ends in .html or .htm.
     restoration : Restoration
-        Whole or in part.
+        Complete, or stopped after an earlier stage.
     run : RunRecord
-        Where it comes from, see :func:`turbrestore.runs.run_record.describe_run`.
+        Input, settings and versions, see :func:`turbrestore.runs.run_record.describe_run`.
     overwrite : bool
         Replace an existing file.
 
     Raises
     ------
     ConfigurationError
-        Another suffix, or a package is not installed.
+        The suffix is not .html or .htm, or a package is not installed.
     OutputError
         The file exists, or its folder does not.
     StorageError
@@ -103,20 +102,19 @@ def write_report(
     '<!doctype html>'
     """
     check_report(path, overwrite=overwrite)
-    # Names of files are bytes on most systems, and need not be text.
+    # On most systems file names are bytes, which need not be valid text.
     atomic_write(path, render_report(restoration, run).encode(errors="replace"), overwrite)
 
 
-@returning_freed()
 def render_report(restoration: Restoration, run: RunRecord) -> str:
-    """HTML of a restoration.
+    """Return the report of a restoration as HTML.
 
     Parameters
     ----------
     restoration : Restoration
-        Whole or in part.
+        Complete, or stopped after an earlier stage.
     run : RunRecord
-        Where it comes from.
+        Input, settings and versions.
 
     Returns
     -------
@@ -175,7 +173,7 @@ def _missing(package: str) -> ConfigurationError:
 
 
 def _policy(style: str, script: str) -> str:
-    """Content security policy that allows what the page carries and nothing else."""
+    """Content security policy that allows only what the page itself contains."""
     hashes = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script))
     style_hash, script_hash = hashes
     return (

@@ -1,4 +1,4 @@
-"""Plots of the report: which there are, what they are called, and what they show, in words."""
+"""The plots of the report, with their captions and their descriptions for screen readers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from ..display.plots import (
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
 from ..runs.run_record import RunRecord
-from ..runtime.scratch import drop_pages
 from ..settings import Restoration
 from .vector import inline_svg
 
@@ -32,9 +31,9 @@ class Panel:
     Attributes
     ----------
     svg : str
-        Element.
+        The ``<svg>`` element.
     caption : str
-        What to look for.
+        What the plot shows, and what to look for.
     """
 
     svg: str
@@ -42,7 +41,7 @@ class Panel:
 
 
 def draw_panels(restoration: Restoration, run: RunRecord) -> list[Panel]:
-    """Draw whatever the stages that ran have to show.
+    """Draw the plots of all stages that have run.
 
     Parameters
     ----------
@@ -60,7 +59,7 @@ def draw_panels(restoration: Restoration, run: RunRecord) -> list[Panel]:
         panels += _filter(restoration.filtered)
     if restoration.blur is not None:
         blur = restoration.blur
-        caption = "The lowest point is the width of the blur; the band is its uncertainty."
+        caption = "The minimum is the estimated width; the band shows its uncertainty."
         figure = plot_blur(blur.widths, blur.costs, blur.sigma, blur.uncertainty)
         panels.append(Panel(inline_svg(figure, "blur", "Cost of every width of the blur"), caption))
     if restoration.deconvolution is not None and restoration.deconvolution.recorded.size:
@@ -72,33 +71,32 @@ def _motion(restoration: Restoration, run: RunRecord) -> Iterator[Panel]:
     centroid = restoration.centroid
     number = len(centroid.flows) // 2
     figure = plot_flow(centroid.flows[number], centroid.image, f"Displacement of training frame {number}")
-    caption = "From the centroid to one frame. The image shows through."
+    caption = "Flow from the centroid to one frame, over the faint image."
     yield Panel(inline_svg(figure, "flow", "Map of the displacement of one frame"), caption)
     figure = plot_displacements(centroid.flows, centroid.image)
-    caption = "Over the training frames. Strokes lie along the axis that moves most."
+    caption = "Over the training frames. Strokes show the direction of the largest motion."
     yield Panel(inline_svg(figure, "spread", "Map of the standard deviation of the displacement"), caption)
-    drop_pages(centroid.image)
     tolerance = run.settings.get("centroid", {}).get("tolerance")
     figure = plot_convergence(centroid.mean_flow_sizes, tolerance)
-    caption = "At the centre of the motion the mean flow vanishes; what is left is the bias of the flow method."
+    caption = "At the centroid the mean flow should vanish; what remains is the bias of the flow method."
     yield Panel(inline_svg(figure, "convergence", "Mean flow in each iteration of the centroid"), caption)
 
 
 def _dynamics(dynamics: FlowDynamics) -> Iterator[Panel]:
     figure = plot_singular_values(dynamics.singular_values, dynamics.rank)
-    caption = f"Coloured: the states of the flow model, {100 * dynamics.energy_share:.0f} % of the variance."
+    caption = f"Coloured: the states of the flow model, which hold {100 * dynamics.energy_share:.0f} % of the variance."
     yield Panel(inline_svg(figure, "singular", "Singular values of the flows"), caption)
     figure = plot_eigenvalues(dynamics.eigenvalues)
-    caption = "Inside the circle the motion forgets. All on the circle: the model only repeats the training flows."
-    yield Panel(inline_svg(figure, "eigen", "Eigenvalues of the transition and the unit circle"), caption)
+    caption = "Inside the circle motion decays. If all lie on it, the model only repeats the training flows."
+    yield Panel(inline_svg(figure, "eigen", "Eigenvalues of the transition matrix and the unit circle"), caption)
 
 
 def _filter(filtered: Filtered) -> Iterator[Panel]:
     figure = plot_filter(filtered.gains, filtered.innovations)
-    caption = "How much each frame changed the image, and the motion that the model had not foreseen."
+    caption = "How much each frame changed the image, and the motion that the model did not predict."
     yield Panel(inline_svg(figure, "filter", "Gain and innovation of each frame"), caption)
     figure = plot_frames(filtered.sharpness, filtered.shares)
-    caption = "Sharp frames count more. Dashed: as sharp as the centroid, and an equal share."
+    caption = "Sharp frames have more weight. Dashed: the sharpness of the centroid, and equal weights."
     yield Panel(inline_svg(figure, "frames", "Sharpness and share of each frame"), caption)
 
 

@@ -1,8 +1,8 @@
-"""Images of the report, coded so that they can be compared and the file stays small.
+"""The images of the report, encoded so that they can be compared and the file stays small.
 
-All images of a report are coded alike: beside a lossless one, what a lossy coder did to another would pass for the
-work of the restoration.  They are lossless if all of them together are small enough, else WebP of high quality.
-Lossless WebP is a seventh smaller than PNG on noisy frames, and quality 95 about half of that, with errors of
+All images of a report have the same encoding: beside a lossless image, the artefacts of a lossy one could be mistaken
+for the work of the restoration. They are lossless WebP if all of them together are small enough, else WebP of high
+quality. Lossless WebP is a seventh smaller than PNG on noisy frames, and quality 95 about half of that, with errors of
 1.3 grey levels root mean square.
 """
 
@@ -10,19 +10,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, from_unit
-from ..display.preview import data_uri, encode_image
+from ..display.preview import data_uri, encode_image, shrink
 from ..runtime.scratch import iter_frames, iter_parts
 from ..settings import Restoration
 
-# All images together, bytes before base64, which with half a megabyte of plots and text stays below 2 MB; quality
-# beyond it; longest side that is shown, pixels.
+# Most bytes of all lossless images together, before base64: with half a megabyte of plots the page is below 2 MB.
 _LOSSLESS_BYTES = 1_050_000
+# Quality of the images where they would take more.
 _QUALITY = 95
+# Longest side of an image, pixels.
 _LONGEST = 2048
 _TITLES = {
     "frame": "Frame",
@@ -40,7 +40,7 @@ class Picture:
     Attributes
     ----------
     key, title : str
-        For the program and for people.
+        Name in the page's code, and name that is shown.
     address : str
         Data URI.
     width, height : int
@@ -56,27 +56,27 @@ class Picture:
 
 @dataclass(frozen=True)
 class Gallery:
-    """All images of a report, and how they are coded.
+    """All images of a report, and their encoding.
 
     Attributes
     ----------
     pictures : tuple of Picture
-    coding : str
-        For people.
+    encoding : str
+        Description that is shown.
     """
 
     pictures: tuple[Picture, ...]
-    coding: str
+    encoding: str
 
 
 def stages(restoration: Restoration, frame: FloatArray) -> dict[str, FloatArray]:
-    """Images from the first to the last stage, all of the part that the result shows; the result only once.
+    """Return the images of all stages, cropped like the result.  A last stage equal to the result is left out.
 
     Parameters
     ----------
     restoration : Restoration
     frame : ndarray, float32
-        One frame as it was read.
+        One frame of the input.
 
     Returns
     -------
@@ -96,38 +96,34 @@ def stages(restoration: Restoration, frame: FloatArray) -> dict[str, FloatArray]
 
 
 def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
-    """Encode images for a page.
+    """Encode images for the page.
 
     Parameters
     ----------
     images : dict of str to ndarray, float32, shape (H, W) or (H, W, 3)
-        Of one size.
+        All of the same size.
     frame_number : int
-        Which frame ``images["frame"]`` is.
+        Number of the frame ``images["frame"]``.
 
     Returns
     -------
     Gallery
     """
     shown = dict(zip(images, map(_levels, iter_frames(images.values())), strict=True))
-    coding = "8 bits, lossless"
+    encoding = "8 bits, lossless"
     files = {key: encode_image(levels, "webp") for key, levels in shown.items()}
     if sum(map(len, files.values())) > _LOSSLESS_BYTES:
         files = {key: encode_image(levels, "webp", _QUALITY) for key, levels in shown.items()}
-        coding = f"8 bits, WebP of quality {_QUALITY}"
+        encoding = f"8 bits, WebP of quality {_QUALITY}"
     if max(images["result"].shape[:2]) > _LONGEST:
-        coding += f", reduced to {_LONGEST} pixels"
+        encoding += f", reduced to {_LONGEST} pixels"
     titles = {**_TITLES, "frame": f"{_TITLES['frame']} {frame_number}"}
     pictures = (
         Picture(key, titles[key], data_uri(data, "webp"), shown[key].shape[1], shown[key].shape[0])
         for key, data in files.items()
     )
-    return Gallery(tuple(pictures), coding)
+    return Gallery(tuple(pictures), encoding)
 
 
 def _levels(image: FloatArray) -> NDArray[np.unsignedinteger]:
-    factor = _LONGEST / max(image.shape[:2])
-    if factor < 1:
-        height, width = (max(round(side * factor), 1) for side in image.shape[:2])
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    return from_unit(image, 8)
+    return from_unit(shrink(image, _LONGEST), 8)

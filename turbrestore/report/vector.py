@@ -1,8 +1,8 @@
 """Figures as SVG elements for the body of a page.
 
-The page's content security policy allows no style attributes, so styles become attributes of the elements; colours
-stay what they are, and the page's style sheet replaces those of :mod:`turbrestore.display.plots` by its own, which
-differ between light and dark.  Text stays text, in the page's font.
+The page's content security policy allows no style attributes, so styles become attributes of the elements. The page's
+style sheet replaces the colours of :mod:`turbrestore.display.figure` by its own, which differ between light and dark.
+Text remains text, in the font of the page.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from ..display.preview import data_uri
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Of maps inside figures, which are looked at and not compared.
+# Quality of the maps inside figures; they are looked at, not compared.
 _MAP_QUALITY = 85
 _DROPPED = {"metadata", "style"}
-# What the page sets for every text of a figure.
+# Matplotlib's font declaration; the page sets the font, only the size is kept.
 _FONT = re.compile(r"font:[^;]*?([\d.]+)px[^;]*;?")
 
 
@@ -35,9 +35,9 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     ----------
     figure : matplotlib.figure.Figure
     name : str
-        Unique on the page; every id begins with it.
+        Unique on the page; all ids in the element begin with it.
     description : str
-        What the figure shows, for who cannot see it.
+        What the figure shows, for screen readers.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def _local(name: str) -> str:
 
 
 def _unstyled(style: str) -> dict[str, str]:
-    """Turn declarations of a style attribute into attributes of their own."""
+    """Turn the declarations of a style attribute into single attributes."""
     size = _FONT.search(style)
     rules = (rule.partition(":") for rule in _FONT.sub("", style).split(";"))
     found = {key.strip(): value.strip() for key, _, value in rules if key.strip()}
@@ -94,7 +94,7 @@ def _unstyled(style: str) -> dict[str, str]:
 
 
 def _scoped(key: str, value: str, name: str) -> str:
-    """Attribute with the ids in it made unique on the page."""
+    """Value of an attribute, with the ids in it made unique on the page."""
     if key == "id":
         return f"{name}-{value}"
     if key == "href" and value.startswith("#"):
@@ -103,7 +103,7 @@ def _scoped(key: str, value: str, name: str) -> str:
 
 
 def _smaller(address: str) -> str:
-    """Matplotlib's PNG as WebP, a fifth of its size."""
+    """Matplotlib's PNG as WebP, a fifth of the size."""
     data = base64.b64decode(address.partition(",")[2])
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     done, small = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, _MAP_QUALITY])

@@ -1,4 +1,4 @@
-"""Decisions of a restoration in words: what was chosen from the data, and the figures that led to it."""
+"""The decisions of a restoration in words: what was chosen from the data, and the figures that led to it."""
 
 from __future__ import annotations
 
@@ -13,25 +13,27 @@ from .registration.coverage import Rectangle
 from .registration.global_shift import DEAD_ZONE
 from .runtime.scratch import iter_frames
 
-# A frame that counts for less than this share of the average hardly counts.
-_HARDLY = 0.2
-# Half a grey level of an 8-bit camera below full scale; a share of such pixels that is worth a word.
-_FULL, _MUCH = 1 - 0.5 / 255, 0.01
-# A frame of less than this share of the contrast of the best one has none.
-_FAINT = 0.1
-# Motion of this share of the shorter side is more than flow follows everywhere.
-_FAR = 1 / 12
+# A frame counts if its weight is at least this share of the average weight.
+_COUNTS = 0.2
+# Intensity from which a pixel is saturated: half a grey level of 8 bits below full scale.
+_SATURATED = 1 - 0.5 / 255
+# Share of saturated pixels above which they are reported.
+_REPORTED_SHARE = 0.01
+# A frame is flat if its contrast is below this share of that of the best frame.
+_FLAT = 0.1
+# Motion beyond this share of the shorter side is too large for optical flow in some places.
+_LARGE_MOTION = 1 / 12
 
 
 def explain_training(train: int, frame_count: int, wanted: int | None) -> Decision:
-    """Which frames the centroid and the flow model are taken from.
+    """Say which frames the centroid and the flow model are computed from.
 
     Parameters
     ----------
     train, frame_count : int
-        Training frames, and all.
+        Number of training frames, and of all frames.
     wanted : int or None
-        What was asked for.
+        Number of training frames that the user asked for.
 
     Returns
     -------
@@ -50,12 +52,12 @@ def explain_training(train: int, frame_count: int, wanted: int | None) -> Decisi
     elif train == half:
         reason = "half of the clip"
     else:
-        reason = "more than half of a short clip" if train > half else "enough of a long clip, or all that memory holds"
+        reason = "more than half of a short clip" if train > half else "enough for a long clip, or limited by memory"
     return Decision("training", f"first {train} of {frame_count} frames", reason)
 
 
 def explain_input(training: FloatArray) -> tuple[Decision, ...]:
-    """Say what of the frames tells little: saturated pixels, frames without texture.
+    """Report frames with little information: saturated pixels, and frames without texture.
 
     Parameters
     ----------
@@ -64,7 +66,7 @@ def explain_input(training: FloatArray) -> tuple[Decision, ...]:
     Returns
     -------
     tuple of Decision
-        Empty where there is nothing to say.
+        Empty if there is nothing to report.
 
     Examples
     --------
@@ -74,26 +76,26 @@ def explain_input(training: FloatArray) -> tuple[Decision, ...]:
     >>> [(decision.subject, decision.choice) for decision in explain_input(frames)]
     [('saturation', 'left as it is'), ('flat frames', '1 of 4, kept')]
     """
-    said = []
+    decisions = []
     saturated, contrast = 0.0, np.zeros(len(training))
     for index, frame in enumerate(iter_frames(training)):
-        saturated += float(np.mean(frame >= _FULL)) / len(training)
+        saturated += float(np.mean(frame >= _SATURATED)) / len(training)
         grey = luminance(frame)
-        # A saturated part is no texture.
-        textured = grey[grey < _FULL]
+        # Saturated pixels are not texture.
+        textured = grey[grey < _SATURATED]
         contrast[index] = textured.std() if textured.size else 0.0
-    if saturated > _MUCH:
-        reason = f"{saturated:.0%} of the training frames is at full scale: detail is lost there, and edges may ring"
-        said.append(Decision("saturation", "left as it is", reason))
-    faint = int(np.sum(contrast < _FAINT * contrast.max()))
-    if faint:
-        reason = "hardly any contrast: their flow follows noise, and their weight is what their sharpness gives them"
-        said.append(Decision("flat frames", f"{faint} of {len(training)}, kept", reason))
-    return tuple(said)
+    if saturated > _REPORTED_SHARE:
+        reason = f"{saturated:.0%} of the pixels are at full scale: detail is lost there, and edges may ring"
+        decisions.append(Decision("saturation", "left as it is", reason))
+    flat = int(np.sum(contrast < _FLAT * contrast.max()))
+    if flat:
+        reason = "hardly any contrast: their flow follows noise; their sharpness determines their weight"
+        decisions.append(Decision("flat frames", f"{flat} of {len(training)}, kept", reason))
+    return tuple(decisions)
 
 
 def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
-    """Say that the motion is larger than flow follows well, if it is.
+    """Report motion that is too large for optical flow.
 
     Parameters
     ----------
@@ -103,7 +105,7 @@ def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
     Returns
     -------
     tuple of Decision
-        Empty where there is nothing to say.
+        Empty if there is nothing to report.
 
     Examples
     --------
@@ -112,16 +114,16 @@ def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
     'taken as measured'
     """
     squares = sum(float(np.mean(np.square(flow), dtype=np.float64)) for flow in iter_frames(flows))
-    size = float(np.sqrt(2 * squares / len(flows)))
+    rms = float(np.sqrt(2 * squares / len(flows)))
     side = min(flows.shape[1:3])
-    if size < _FAR * side:
+    if rms < _LARGE_MOTION * side:
         return ()
-    reason = f"{size:.1f} pixels on {side} is more than flow follows everywhere; the result may be doubled"
+    reason = f"{rms:.1f} pixels, with {side} a side, is too large for optical flow in places; details may be doubled"
     return (Decision("motion", "taken as measured", reason),)
 
 
 def explain_camera(flows: FloatArray) -> tuple[Decision, ...]:
-    """Say how far the camera moved, if it did.
+    """Report how far the camera moved, if it did.
 
     Parameters
     ----------
@@ -131,7 +133,7 @@ def explain_camera(flows: FloatArray) -> tuple[Decision, ...]:
     Returns
     -------
     tuple of Decision
-        None where frames are shifted by two pixels at most.
+        Empty if no frame is shifted by more than two pixels.
 
     Examples
     --------
@@ -149,7 +151,7 @@ def explain_camera(flows: FloatArray) -> tuple[Decision, ...]:
 
 
 def explain_centroid(centroid: Centroid) -> Decision:
-    """How the centroid was found.
+    """Say how the centroid was found.
 
     Parameters
     ----------
@@ -169,12 +171,12 @@ def explain_centroid(centroid: Centroid) -> Decision:
     return Decision(
         "centroid",
         f"{sizes.size} iteration{'s' * (sizes.size > 1)}, {'' if centroid.converged else 'not '}converged",
-        f"mean flow of {sizes[0]:.2f} pixels at first, {sizes[-1]:.2f} at last",
+        f"mean flow of {sizes[0]:.2f} pixels in the first iteration, {sizes[-1]:.2f} in the last",
     )
 
 
 def explain_dynamics(dynamics: FlowDynamics) -> tuple[Decision, ...]:
-    """Rank of the flow model, and what had to be done to it.
+    """Say which rank the flow model has, and how it was adjusted.
 
     Parameters
     ----------
@@ -202,13 +204,13 @@ def explain_dynamics(dynamics: FlowDynamics) -> tuple[Decision, ...]:
 
 
 def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
-    """Which frames the image is made of.
+    """Say how many frames the image is made of.
 
     Parameters
     ----------
     filtered : Filtered
     chosen : int or None
-        How many of the sharpest frames were asked for.
+        Number of the sharpest frames that the user asked for.
 
     Returns
     -------
@@ -225,21 +227,22 @@ def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
     """
     count = filtered.shares.size
     mean = 1 / (count if chosen is None else chosen)
-    counting = int(np.sum(filtered.shares >= _HARDLY * mean))
-    reason = f"by sharpness, registration and outliers; the best frame counts {filtered.shares.max() / mean:.1f} times"
-    asked = "" if chosen is None else f", {chosen} of them asked for as the sharpest"
-    return Decision("frames", f"{counting} of {count} frames count", f"{reason} the average{asked}")
+    counting = int(np.sum(filtered.shares >= _COUNTS * mean))
+    reason = "weighted by sharpness, registration and outliers"
+    largest = f"the largest weight is {filtered.shares.max() / mean:.1f} times the average"
+    asked = "" if chosen is None else f"; only the {chosen} sharpest were asked for"
+    return Decision("frames", f"{counting} of {count} frames count", f"{reason}; {largest}{asked}")
 
 
-def explain_border(seen: float, crop: Rectangle | None) -> Decision:
-    """Say what became of the border.
+def explain_border(least_seen: float, crop: Rectangle | None) -> Decision:
+    """Say whether the border was kept or cropped.
 
     Parameters
     ----------
-    seen : float
-        Share of the frames that show the pixel that is seen least.
+    least_seen : float
+        Share of the training frames that show the pixel seen in the fewest of them.
     crop : tuple of int, or None
-        x, y, width and height that are left.
+        x, y, width and height of the part that is kept.
 
     Returns
     -------
@@ -251,4 +254,4 @@ def explain_border(seen: float, crop: Rectangle | None) -> Decision:
     'kept'
     """
     choice = "kept" if crop is None else f"cropped to {crop[2]}×{crop[3]} pixels from ({crop[0]}, {crop[1]})"
-    return Decision("border", choice, f"the pixel that is seen least is in {seen:.0%} of the training frames")
+    return Decision("border", choice, f"every pixel is visible in at least {least_seen:.0%} of the training frames")

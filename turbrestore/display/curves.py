@@ -1,0 +1,221 @@
+"""Curves over iterations, frames and widths of the blur: arrays in, a matplotlib figure out.
+
+Symbol: σ is the width of a blur.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .figure import ACCENT, FONT, INK, WIDTH, add_axes, new_figure, use_integer_ticks, write_instead
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Largest number of points along a curve over the frames.
+_POINTS = 600
+
+
+def plot_convergence(mean_flow_sizes: ArrayLike, tolerance: float | None = None) -> Figure:
+    """Show the length of the mean flow in every iteration of the centroid.
+
+    Parameters
+    ----------
+    mean_flow_sizes : array_like, shape (iterations,)
+        Pixels.
+    tolerance : float, optional
+        Pixels.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> len(plot_convergence([0.8, 0.3, 0.1], 0.2).axes)
+    1
+    """
+    sizes = np.asarray(mean_flow_sizes, float)
+    figure = new_figure()
+    axes = add_axes(figure, "Centroid: remaining mean flow in each iteration", "iteration", "pixels")
+    steps = np.arange(1, sizes.size + 1)
+    axes.plot(steps, sizes, color=ACCENT, marker="o", markersize=4, linewidth=1.4)
+    if tolerance is not None:
+        axes.axhline(tolerance, color=INK, linewidth=0.9, linestyle="--")
+        axes.text(0.99, tolerance, "tolerance", transform=axes.get_yaxis_transform(), ha="right", va="bottom",
+                  color=INK, fontsize=FONT)  # fmt: skip
+    axes.set_ylim(bottom=0)
+    axes.set_xlim(0.6, sizes.size + 0.4)
+    use_integer_ticks(axes)
+    return figure
+
+
+def plot_filter(gains: ArrayLike, innovations: ArrayLike) -> Figure:
+    """Show the gain of the image and the innovation of the flow, frame by frame.
+
+    Parameters
+    ----------
+    gains : array_like, shape (N,)
+        0 to 1.
+    innovations : array_like, shape (N,)
+        Pixels; NaN leaves a gap.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> len(plot_filter([1.0, 0.5, 0.3], [0.2, 0.2, 0.1]).axes)
+    2
+    """
+    figure = new_figure(WIDTH, WIDTH * 0.84)
+    rows = {"Gain of the image": np.asarray(gains, float), "Innovation of the flow, pixels": np.asarray(innovations)}
+    _draw_rows(figure, rows)
+    return figure
+
+
+def plot_frames(sharpness: ArrayLike, shares: ArrayLike) -> Figure:
+    """Show how sharp each frame is, and how much weight it has.
+
+    Parameters
+    ----------
+    sharpness : array_like, shape (N,)
+        Relative to the image that the filter started from; NaN leaves a gap.
+    shares : array_like, shape (N,)
+        They sum to 1, and are drawn times N, so that 1 is an equal share.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> len(plot_frames([0.9, 1.0, 1.1], [0.2, 0.3, 0.5]).axes)
+    2
+    """
+    figure = new_figure(WIDTH, WIDTH * 0.84)
+    weights = np.asarray(shares, float)
+    rows = {"Sharpness": np.asarray(sharpness, float), "Share of the result, 1 = equal": weights * weights.size}
+    for axes in _draw_rows(figure, rows):
+        axes.axhline(1, color=INK, linewidth=0.9, linestyle="--")
+    return figure
+
+
+def plot_objective(recorded: ArrayLike, objective: ArrayLike) -> Figure:
+    """Show the energy that the deconvolution minimises, over the iterations.
+
+    Parameters
+    ----------
+    recorded : array_like, int, shape (n,)
+        Iterations.
+    objective : array_like, shape (n,)
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> len(plot_objective([1, 10, 20], [9.0, 5.0, 4.5]).axes)
+    1
+    """
+    figure = new_figure()
+    axes = add_axes(figure, "Deconvolution: energy", "iteration", "")
+    energy = np.asarray(objective, float)
+    if energy.size == 0:
+        return write_instead(figure, axes, "no blur was removed, so there were no iterations")
+    axes.plot(np.asarray(recorded), energy, color=ACCENT, linewidth=1.4, marker="o", markersize=3)
+    return figure
+
+
+def plot_blur(widths: ArrayLike, costs: ArrayLike, sigma: float, uncertainty: float) -> Figure:
+    """Show the likelihood of every blur width that was tried, and the estimated width.
+
+    Parameters
+    ----------
+    widths : array_like, shape (k,)
+        Pixels.
+    costs : array_like, shape (k,)
+        Negative logarithm of the likelihood per value; drawn relative to the lowest.
+    sigma, uncertainty : float
+        Pixels; the uncertainty may be infinite.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> len(plot_blur([0.5, 1.0, 1.5], [0.3, 0.0, 0.2], 1.05, 0.1).axes)
+    1
+    """
+    figure = new_figure()
+    axes = add_axes(figure, "Blur: cost of every width that was tried", "width σ, pixels", "−log likelihood − minimum")
+    tried, cost = np.asarray(widths, float), np.asarray(costs, float)
+    if tried.size == 0:
+        return write_instead(figure, axes, "the blur could not be estimated from this image")
+    axes.plot(tried, cost - cost.min(), color=ACCENT, linewidth=1.4, marker="o", markersize=3.5)
+    axes.axvline(sigma, color=INK, linewidth=0.9, linestyle="--")
+    if np.isfinite(uncertainty):
+        axes.axvspan(sigma - uncertainty, sigma + uncertainty, color=ACCENT, alpha=0.15, linewidth=0)
+    axes.set_ylim(bottom=0)
+    return figure
+
+
+def _draw_rows(figure: Figure, rows: Mapping[str, NDArray[Any]]) -> list[Axes]:
+    """One curve a row over the frames; long curves show means of neighbouring frames."""
+    drawn = []
+    for number, (title, values) in enumerate(rows.items(), 1):
+        last = number == len(rows)
+        axes = add_axes(figure, title, "frame" if last else "", place=(len(rows), 1, number))
+        step = -(-values.size // _POINTS) or 1
+        edges = np.arange(0, values.size, step)
+        means = _bin_means(np.asarray(values, float), edges)
+        axes.plot(edges, means, color=ACCENT, linewidth=1.2, marker="o" if values.size <= 60 else None, markersize=2.5)
+        axes.set_ylim(bottom=0)
+        use_integer_ticks(axes)
+        if not last:
+            axes.tick_params(labelbottom=False)
+        drawn.append(axes)
+    return drawn
+
+
+def _bin_means(values: NDArray[np.float64], edges: NDArray[Any]) -> NDArray[np.float64]:
+    """Mean of the finite values of each bin; NaN where there are none."""
+    if values.size == 0:
+        return values
+    known = np.isfinite(values)
+    counts = np.add.reduceat(known.astype(float), edges)
+    sums = np.add.reduceat(np.where(known, values, 0.0), edges)
+    return np.divide(sums, counts, out=np.full(counts.shape, np.nan), where=counts > 0)

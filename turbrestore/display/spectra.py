@@ -1,0 +1,137 @@
+"""Singular values and eigenvalues of the flow model: arrays in, a matplotlib figure out.
+
+Symbols: ξ and C are states and modes of the flow, A the transition, τ the number of flows.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .figure import ACCENT, HEIGHT, INK, REST, WIDTH, add_axes, new_figure, set_labels, use_integer_ticks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Singular values below this share of the largest are rounding errors.
+_ROUNDING = 1e-5
+
+
+def plot_singular_values(singular_values: ArrayLike, rank: int) -> Figure:
+    """Show the singular values of the flows, with those of the chosen states marked.
+
+    Parameters
+    ----------
+    singular_values : array_like, shape (τ,)
+        In descending order.
+    rank : int
+        Number of states.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> len(plot_singular_values([3.0, 1.0, 0.1], 2).axes)
+    1
+    """
+    figure = new_figure()
+    _draw_singular_values(add_axes(figure), np.asarray(singular_values, float), rank)
+    return figure
+
+
+def plot_eigenvalues(eigenvalues: ArrayLike) -> Figure:
+    """Show the eigenvalues of the transition matrix and the unit circle (paper 3, Figure 7).
+
+    Parameters
+    ----------
+    eigenvalues : array_like, complex, shape (n,)
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> len(plot_eigenvalues([0.9 + 0.1j, 0.9 - 0.1j]).axes)
+    1
+    """
+    figure = new_figure(WIDTH, WIDTH * 0.84)
+    _draw_eigenvalues(add_axes(figure), np.asarray(eigenvalues, complex))
+    return figure
+
+
+def plot_dynamics(singular_values: ArrayLike, eigenvalues: ArrayLike) -> Figure:
+    """Show the singular values of the flows beside the eigenvalues of the transition matrix.
+
+    Parameters
+    ----------
+    singular_values : array_like, shape (τ,)
+    eigenvalues : array_like, complex, shape (n,)
+        One for each chosen state.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> len(plot_dynamics([3.0, 1.0, 0.1], [0.5, -0.5]).axes)
+    2
+    """
+    figure = new_figure(2 * WIDTH, HEIGHT * 1.2)
+    values = np.asarray(eigenvalues, complex)
+    _draw_singular_values(add_axes(figure, place=(1, 2, 1)), np.asarray(singular_values, float), values.size)
+    _draw_eigenvalues(add_axes(figure, place=(1, 2, 2)), values)
+    return figure
+
+
+def _draw_singular_values(axes: Axes, values: NDArray[np.float64], rank: int) -> None:
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    set_labels(axes, f"Singular values of the flows: {rank} of {values.size} kept", "number", "pixels")
+    # The mean is subtracted, so the last value is zero up to rounding, which would stretch the logarithmic axis.
+    shown = np.flatnonzero(values > _ROUNDING * values.max(initial=0.0))
+    kept = shown[shown < rank]
+    left_out = shown[shown >= rank]
+    axes.plot(left_out + 1, values[left_out], linestyle="none", marker="o", markersize=3.5, color=REST)
+    axes.plot(kept + 1, values[kept], linestyle="none", marker="o", markersize=3.5, color=ACCENT)
+    if 0 < rank < values.size:
+        axes.axvline(rank + 0.5, color=INK, linewidth=0.9, linestyle="--")
+    if shown.size:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.set_ylim(bottom=values[shown].min() * 0.7)
+    use_integer_ticks(axes)
+
+
+def _draw_eigenvalues(axes: Axes, values: NDArray[np.complex128]) -> None:
+    from matplotlib.patches import Circle
+
+    set_labels(axes, "Eigenvalues of the transition matrix", "real part", "imaginary part")
+    axes.add_patch(Circle((0, 0), 1, fill=False, edgecolor=INK, linewidth=0.9))
+    axes.plot(values.real, values.imag, linestyle="none", marker="o", markersize=4, color=ACCENT, alpha=0.85)
+    limit = 1.1 * max(1.0, float(np.abs(values).max(initial=0.0)))
+    axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
+    axes.set(xticks=[-1, -0.5, 0, 0.5, 1], yticks=[-1, -0.5, 0, 0.5, 1])
