@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import DataError, InputNotFoundError
-from ..filtering.alternating import FilterCheckpoint, Filtered, FilterState, FrameRecord
-from ..filtering.kalman import Gaussian, PixelGaussian
+from ..filtering.filter_records import FilterCheckpoint, Filtered, FilterState, FrameRecord
+from ..filtering.image_state import PixelGaussian
+from ..filtering.kalman import Gaussian
 from ..io.images import atomic_output
 from ..io.npy import read_npz, write_npz
 from ..tiled_stages import FilteredTiles
