@@ -16,8 +16,9 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError, OutputError
-from turbrestore.filtering.alternating import FilterCheckpoint, FilterParams, FilterState, FrameRecord
-from turbrestore.filtering.kalman import Gaussian, PixelGaussian
+from turbrestore.filtering.filter_records import FilterCheckpoint, FilterParams, FilterState, FrameRecord
+from turbrestore.filtering.image_state import PixelGaussian
+from turbrestore.filtering.kalman import Gaussian
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.memory_plan import plan_memory

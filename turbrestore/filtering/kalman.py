@@ -99,44 +99,6 @@ class Innovation:
     observed: NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
-class PixelGaussian:
-    """Mean and variance of every pixel, pixels independent of each other; channels share the variance.
-
-    Parameters
-    ----------
-    mean : ndarray, float32 or float64, shape (H, W) or (H, W, 3)
-        ρ̂, intensities.
-    variance : ndarray, dtype of ``mean``, shape (H, W)
-        Σ, squared intensities, not negative.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, values are not finite, or a variance is negative.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> PixelGaussian(np.zeros((2, 3), np.float32), np.ones((2, 3))).variance.dtype
-    dtype('float32')
-    """
-
-    mean: NDArray[np.floating]
-    variance: NDArray[np.floating]
-
-    def __post_init__(self) -> None:
-        mean = _floating(self.mean)
-        variance = np.asarray(self.variance, mean.dtype)
-        _check_pixels(mean, variance.shape, "mean")
-        if not np.isfinite(np.sum(mean, dtype=np.float64)):
-            raise DataError("mean: expected finite values, found NaN or infinite ones")
-        if not np.isfinite(np.sum(variance, dtype=np.float64)) or (variance < 0).any():
-            raise DataError("variance: expected finite values of at least 0, found others")
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "variance", variance)
-
-
 def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
     """Time update: A ξ̂ and A P Aᵀ + Q (paper 3, eqs. 14b and 14d).
 
@@ -307,100 +269,6 @@ def update_information(
     return _information_step(state, G, Hz, zz, log_det_noise, m - missing.sum(-1))
 
 
-def predict_pixels(state: PixelGaussian, drift_variance: ArrayLike) -> PixelGaussian:
-    """Time update of an image that drifts: the mean stays, Σ + S (paper 3, eqs. 14a and 14c).
-
-    Parameters
-    ----------
-    state : PixelGaussian
-    drift_variance : float or array_like, shape (H, W)
-        S, not negative.
-
-    Returns
-    -------
-    PixelGaussian
-
-    Raises
-    ------
-    DataError
-        A drift variance is negative or not finite, or its shape does not fit.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> predict_pixels(PixelGaussian(np.zeros((1, 2)), np.ones((1, 2))), 0.25).variance
-    array([[1.25, 1.25]])
-    """
-    drift = _pixel_variance(drift_variance, state, "drift_variance")
-    if not (np.isfinite(drift) & (drift >= 0)).all():
-        raise DataError("drift_variance: expected finite values of at least 0, found others")
-    return PixelGaussian(state.mean, state.variance + drift)
-
-
-def update_pixels(
-    state: PixelGaussian, measurement: ArrayLike, noise_variance: ArrayLike
-) -> tuple[PixelGaussian, NDArray[np.floating]]:
-    """Measurement update of every pixel by a registered frame: L = Σ / (Σ + Z) (paper 3, eqs. 15 and 16).
-
-    The paper takes Σ and Z to be one number each; here both may vary from pixel to pixel.
-
-    Parameters
-    ----------
-    state : PixelGaussian
-        Prediction.
-    measurement : array_like, shape of ``state.mean``
-        I ∘ w; a pixel with NaN in any channel is missing.
-    noise_variance : float or array_like, shape (H, W)
-        Z, positive; infinite where the frame is not to be trusted at all.
-
-    Returns
-    -------
-    state : PixelGaussian
-        In the dtype of the prediction.
-    gain : ndarray, shape (H, W)
-        L, 0 where nothing was measured.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, a noise variance is not positive, or the measurement is infinite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> prior = PixelGaussian(np.zeros((1, 3)), np.ones((1, 3)))
-    >>> after, gain = update_pixels(prior, [[1.0, 1.0, np.nan]], [[1.0, 3.0, 1.0]])
-    >>> after.mean, gain
-    (array([[0.5 , 0.25, 0.  ]]), array([[0.5 , 0.25, 0.  ]]))
-    """
-    mean, prior = state.mean, state.variance
-    z = np.asarray(measurement, mean.dtype)
-    noise = _pixel_variance(noise_variance, state, "noise_variance")
-    if z.shape != mean.shape:
-        raise DataError(f"measurement: expected shape {mean.shape}, found {z.shape}")
-    if not noise.min() > 0:
-        raise DataError("noise_variance: expected values above 0, found others; give the noise a floor")
-    difference = z - mean
-    # Where nothing is missing, as in most frames, two sums say so.
-    with np.errstate(invalid="ignore"):
-        some = not np.isfinite(difference.sum(dtype=np.float64) + noise.sum(dtype=np.float64))
-    if some:
-        if np.isinf(z).any():
-            raise DataError("measurement: expected finite values, or NaN where missing, found infinite ones")
-        absent = np.isnan(difference)
-        missing = (absent.any(-1) if mean.ndim > prior.ndim else absent) | np.isinf(noise)
-        noise = np.where(missing, noise.dtype.type(1), noise)
-        difference = np.where(absent, mean.dtype.type(0), difference)
-    gain = prior / (prior + noise)
-    # L Z equals (1 − L) Σ of eq. 16 without the cancellation when Z is small.
-    variance = gain * noise
-    if some:
-        gain, variance = np.where(missing, noise.dtype.type(0), gain), np.where(missing, prior, variance)
-    difference *= gain[..., None] if mean.ndim > prior.ndim else gain
-    difference += mean
-    return PixelGaussian(difference, variance), gain
-
-
 def _information_step(
     state: Gaussian,
     G: Float64Array,
@@ -492,18 +360,6 @@ def _symmetric(matrix: Float64Array) -> Float64Array:
 def _floating(values: ArrayLike) -> NDArray[np.floating]:
     array = np.asarray(values)
     return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
-
-
-def _pixel_variance(variance: ArrayLike, state: PixelGaussian, name: str) -> NDArray[np.floating]:
-    array = np.asarray(variance, state.variance.dtype)
-    if array.shape not in ((), state.variance.shape):
-        raise DataError(f"{name}: expected one number or shape {state.variance.shape}, found {array.shape}")
-    return array
-
-
-def _check_pixels(mean: NDArray[np.floating], pixels: tuple[int, ...], name: str) -> None:
-    if mean.shape not in (pixels, (*pixels, 3)):
-        raise DataError(f"{name}: expected the shape of variance {pixels} or {(*pixels, 3)}, found {mean.shape}")
 
 
 def _check_matrix(matrix: NDArray[np.floating], rows: int, columns: int, name: str) -> None:

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import DataError, InputNotFoundError
-from ..filtering.alternating import FilterCheckpoint, FilterState, FrameRecord
-from ..filtering.kalman import Gaussian, PixelGaussian
+from ..filtering.filter_records import FilterCheckpoint, FilterState, FrameRecord
+from ..filtering.image_state import PixelGaussian
+from ..filtering.kalman import Gaussian
 from ..io.images import atomic_output
 from ..io.npy import read_npz
 

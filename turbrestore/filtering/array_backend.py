@@ -1,0 +1,123 @@
+"""Where frames are registered and fused: with NumPy and OpenCV on the CPU, or with torch on a device.
+
+The formulas of the filter are written once for both.  What differs is here: how arrays come to the device and back, and
+how a frame is warped by the estimated flow, ``I ∘ ŵ`` (paper 3, eq. 15).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..core.arrays import FloatArray, luminance
+from ..registration.warp import inside, warp
+from ..runtime.device import PROCESSOR, find_device
+from ..runtime.image_stacks import Stack, StackOps, numpy_ops, torch_ops, warp_stack
+from .frame_noise import FrameStatistics
+from .image_state import PixelGaussian, PixelStacks
+
+# Registered channels (C, H, W), their luminance (H, W), and where the warp samples the frame (H, W), 1 to 0.
+Warped = tuple[Stack, Stack, Stack]
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayBackend:
+    """Arrays of one library on one device.
+
+    Attributes
+    ----------
+    device : str
+        ``"cpu"`` is NumPy and OpenCV; any other is the name of a device of torch.
+    ops : StackOps
+        Operations on its arrays.
+    warp : callable
+        From a frame (a NumPy array) and a flow to the registered frame.
+    """
+
+    device: str
+    ops: StackOps
+    warp: Callable[[FloatArray, Stack], Warped]
+
+    @property
+    def is_cpu(self) -> bool:
+        """Whether it is NumPy, whose operations run side by side in threads."""
+        return self.device == PROCESSOR
+
+    def load_pixels(self, pixels: PixelGaussian) -> PixelStacks:
+        """Bring ρ̂ and Σ to the device."""
+        mean, variance = np.asarray(pixels.mean, np.float32), np.asarray(pixels.variance, np.float32)
+        return PixelStacks(self.ops.load(_channels_first(mean)), self.ops.load(variance))
+
+    def store_pixels(self, pixels: PixelStacks) -> PixelGaussian:
+        """Bring ρ̂ and Σ back to NumPy arrays."""
+        return PixelGaussian(self.store_image(pixels), self.ops.store(pixels.variance))
+
+    def store_image(self, pixels: PixelStacks) -> FloatArray:
+        """Bring ρ̂ back to a NumPy array."""
+        mean = self.ops.store(pixels.mean)
+        return mean[0] if len(mean) == 1 else np.ascontiguousarray(np.moveaxis(mean, 0, -1))
+
+    def load_statistics(self, statistics: FrameStatistics) -> FrameStatistics:
+        """Bring the maps that Z follows from to the device."""
+        names = ("mean_sharpness", "score_scale", "score_variance", "mean_frame", "deviation")
+        maps = {name: self.ops.load(getattr(statistics, name)) for name in names}
+        along, across = statistics.template
+        return replace(statistics, template=(self.ops.load(along), self.ops.load(across)), **maps)
+
+
+def array_backend(device: str) -> ArrayBackend:
+    """Backend of a device.
+
+    Parameters
+    ----------
+    device : str
+        ``"cpu"``, ``"cuda"``, ``"auto"`` or another name that torch gives a device.
+
+    Returns
+    -------
+    ArrayBackend
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such device, or torch is not installed.
+
+    Examples
+    --------
+    >>> backend = array_backend("cpu")
+    >>> registered, grey, seen = backend.warp(np.ones((4, 5, 3), np.float32), np.zeros((4, 5, 2), np.float32))
+    >>> registered.shape, grey.shape, float(seen.min())
+    ((3, 4, 5), (4, 5), 1.0)
+    """
+    found = find_device(device)
+    if found == PROCESSOR:
+        return ArrayBackend(found, numpy_ops(), _warp_on_cpu)
+    ops = torch_ops(found)
+    return ArrayBackend(found, ops, lambda frame, flow: _warp_in_torch(frame, flow, ops))
+
+
+def _warp_on_cpu(frame: FloatArray, flow: FloatArray) -> Warped:
+    registered = warp(frame, flow)
+    return _channels_first(registered), luminance(registered), inside(flow)
+
+
+def _warp_in_torch(frame: FloatArray, flow: Stack, ops: StackOps) -> Warped:
+    registered = warp_stack(ops.load(_channels_first(frame)), flow, ops)
+    # The luminance of the three unit colours is the weight of each channel.
+    weights = luminance(np.eye(3, dtype=np.float32)[None])[0].tolist() if len(registered) == 3 else [1.0]
+    grey = sum(weight * channel for weight, channel in zip(weights, registered, strict=True))
+    height, width = flow.shape[:2]
+    y, x = (ops.load(axis) for axis in np.mgrid[:height, :width].astype(np.float32))
+    seen = _within(x + flow[..., 0], width) * _within(y + flow[..., 1], height)
+    return registered, grey, seen
+
+
+def _within(position: Stack, length: int) -> Stack:
+    """1 where a position lies between the first and the last pixel, falling to 0 one pixel beyond."""
+    return (1 - (-position).maximum(position - (length - 1))).clamp(0, 1)
+
+
+def _channels_first(image: FloatArray) -> FloatArray:
+    return image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)

@@ -1,0 +1,203 @@
+"""Settings, states and results of the alternating filter.
+
+Symbols as in :mod:`turbrestore.filtering.alternating`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from ..core.arrays import FloatArray
+from ..core.errors import require, require_between
+from ..display.plots import plot_frames
+from ..display.preview import preview
+from .image_state import PixelGaussian
+from .kalman import Gaussian
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RESIDUALS = ("keep", "drop")
+
+
+@dataclass(frozen=True)
+class FilterParams:
+    """How frames are filtered.
+
+    Parameters
+    ----------
+    residual : {"keep", "drop"}
+        Whether measured flow outside the subspace of the flow model is kept; ``"drop"`` is the paper as printed.
+    inner_iterations : int
+        Times that flow is measured, and image and flow updated, for each block of frames.
+    block : int
+        Frames whose flows are measured against the same image; 1 is closest to the paper, more run side by side.
+    sharpness : float
+        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.
+    sharpness_window : float
+        Standard deviation of the window in which sharpness is measured, pixels.
+    image_noise : float, optional
+        Z: variance of a registered frame about the image, squared intensity; by default measured on the first block.
+    image_drift : float
+        S: variance by which the image may drift from one frame to the next, squared intensity.
+    prior_frames : float
+        Number of frames whose information the starting image is worth; 0 lets the first frames replace it.
+    """
+
+    residual: Literal["keep", "drop"] = "keep"
+    inner_iterations: int = 2
+    block: int = 24
+    sharpness: float = 2.0
+    sharpness_window: float = 3.0
+    image_noise: float | None = None
+    image_drift: float = 0.0
+    prior_frames: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(
+            self.residual in RESIDUALS,
+            f"residual: expected one of {', '.join(RESIDUALS)}, found {self.residual!r}",
+        )
+        require_between("inner_iterations", self.inner_iterations, 1, 100)
+        require_between("block", self.block, 1, 10_000, "frames")
+        require_between("sharpness", self.sharpness, 0, 10)
+        require_between("sharpness_window", self.sharpness_window, 0.3, 100, "pixels")
+        if self.image_noise is not None:
+            require_between("image_noise", self.image_noise, 1e-12, 1)
+        require_between("image_drift", self.image_drift, 0, 1)
+        require_between("prior_frames", self.prior_frames, 0, 1e6)
+
+
+@dataclass(frozen=True)
+class FilterState:
+    """Image and flow state after a frame.
+
+    Attributes
+    ----------
+    image : PixelGaussian
+        ρ̂ and Σ.
+    flow : Gaussian
+        ξ̂ and P.
+    """
+
+    image: PixelGaussian
+    flow: Gaussian
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """Figures of one frame; :class:`Filtered` says what each means.
+
+    Attributes
+    ----------
+    flow_state : ndarray, float64, shape (n,)
+    gain, innovation, sharpness : float
+    information : float
+        Mean of 1 / Z over the pixels, before it becomes a share.
+    """
+
+    flow_state: np.ndarray
+    gain: float
+    innovation: float
+    sharpness: float
+    information: float
+
+
+@dataclass(frozen=True)
+class FilterCheckpoint:
+    """The filter between two blocks of frames, from which it can be resumed with the same frames.
+
+    Attributes
+    ----------
+    state : FilterState
+        After the blocks that are done.
+    records : tuple of FrameRecord
+        One for each of their frames.
+    reference : ndarray, float32, shape (H, W) or (H, W, 3)
+        Image that the flows of the next block are first measured from.
+    """
+
+    state: FilterState
+    records: tuple[FrameRecord, ...]
+    reference: FloatArray
+
+
+@dataclass(frozen=True)
+class FilterStep:
+    """Progress of the filter: there is one after each measured flow, and one at the end of each block.
+
+    Attributes
+    ----------
+    flows_measured : int
+        Flows measured so far, including frames that do not count and the run that was resumed; of N frames, the first
+        K of which have known flows, ``inner_iterations * N - K`` in all.
+    checkpoint : FilterCheckpoint or None
+        At the end of a block, the state from which the filter can be resumed.
+    """
+
+    flows_measured: int
+    checkpoint: FilterCheckpoint | None = None
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """The filtered image and the record of the run.
+
+    Attributes
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        ρ̂ after the last frame, still blurred by Kρ.
+    variance : ndarray, float32, shape (H, W)
+        Σ after the last frame, squared intensity.
+    flow_states : ndarray, float64, shape (N, n)
+        ξ̂ after each frame.
+    gains : ndarray, float64, shape (N,)
+        L of each frame, mean over the pixels.
+    innovations : ndarray, float64, shape (N,)
+        Root mean square of W^meas − W̄ − C A ξ̂ for each frame, pixels, the error of the prediction; NaN where the
+        frame does not count.
+    sharpness : ndarray, float64, shape (N,)
+        Gradient of each registered frame, projected on that of the image that the filter started from; 1 if they are
+        equal, NaN where the frame does not count.
+    shares : ndarray, float64, shape (N,)
+        Share of the information that each frame brought, mean over the pixels; they sum to 1.
+    image_noise : float
+        Z, squared intensity.
+    motion_share : float
+        G, mean over the pixels; 0 with ``residual="drop"``.
+    """
+
+    image: FloatArray
+    variance: FloatArray
+    flow_states: np.ndarray
+    gains: np.ndarray
+    innovations: np.ndarray
+    sharpness: np.ndarray
+    shares: np.ndarray
+    image_noise: float
+    motion_share: float
+
+    def plot(self) -> Figure:
+        """Draw how sharp each frame is and how much it counts.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ConfigurationError
+            Matplotlib is not installed.
+        """
+        return plot_frames(self.sharpness, self.shares)
+
+    def _repr_html_(self) -> str:
+        facts = [
+            ("frames", str(self.gains.size)),
+            ("innovation", f"{np.nanmean(self.innovations):.2f} pixels"),
+            ("noise of a frame", f"{100 * self.image_noise**0.5:.2f} % of full scale"),
+        ]
+        return preview("Filtered image", facts, self.image)

@@ -1,0 +1,147 @@
+"""The flow's half of the alternating filter: measured flows update the state of the flow (paper 3, eqs. 13b to 19).
+
+Symbols
+-------
+ξ̂, P : state of the flow and its covariance, :class:`turbrestore.filtering.kalman.Gaussian`
+A, C, Q, R, W̄ : flow model of :mod:`turbrestore.dynamics.flow_model` (eqs. 10, 13b)
+W^meas : measured flow (eq. 17); Ŵ estimated flow
+M : gain (eq. 19)
+z : Cᵀ(W^meas − W̄)
+G : share of the flow outside the subspace of C that is motion and not noise
+
+As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R``: a measured flow enters the update only through z,
+which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the expensive part and needs
+no state, and predictions and updates have the size n.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..core.arrays import FloatArray
+from ..dynamics.flow_model import Float64Array, FlowDynamics, project_deviation
+from ..runtime.image_stacks import Stack
+from .kalman import Gaussian, predict, update_information
+
+# Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
+_FLOW_NOISE_FLOOR = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedFlow:
+    """A measured flow, as far as the update of the state needs it.
+
+    Attributes
+    ----------
+    state : ndarray, float64, shape (n,)
+        z.
+    squared : float
+        Sum of squares of W^meas − W̄, squared pixels.
+    size : int
+        Components of the flow, 2 H W.
+    """
+
+    state: Float64Array
+    squared: float
+    size: int
+
+
+def project_measured(measured: FloatArray, dynamics: FlowDynamics) -> ProjectedFlow:
+    """Project a measured flow on the subspace of the model.
+
+    Parameters
+    ----------
+    measured : ndarray, float32, shape (H, W, 2)
+        W^meas, pixels.
+    dynamics : FlowDynamics
+
+    Returns
+    -------
+    ProjectedFlow
+
+    Examples
+    --------
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> dynamics = identify(np.zeros((3, 2, 2, 2), np.float32))
+    >>> project_measured(np.ones((2, 2, 2), np.float32), dynamics).squared
+    8.0
+    """
+    deviation = measured - dynamics.mean_flow
+    state = project_deviation(dynamics, deviation)
+    return ProjectedFlow(state, float(np.square(deviation, out=deviation).sum(dtype=np.float64)), deviation.size)
+
+
+def predict_state(state: Gaussian, dynamics: FlowDynamics) -> Gaussian:
+    """Predict the state of the flow one frame ahead (paper 3, eqs. 14b and 14d).
+
+    Parameters
+    ----------
+    state : Gaussian
+        ξ̂ and P after the frame before.
+    dynamics : FlowDynamics
+
+    Returns
+    -------
+    Gaussian
+
+    Examples
+    --------
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> flows = np.zeros((6, 2, 2, 2)); flows[::2, ..., 0], flows[1::2, ..., 0] = 1, -1
+    >>> predict_state(Gaussian(np.ones(1), np.eye(1)), identify(flows)).mean.round(3)
+    array([-1.])
+    """
+    return predict(state, dynamics.A, dynamics.Q)
+
+
+def update_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
+    """Update the state of the flow by a measured flow (paper 3, eqs. 17 and 19).
+
+    Parameters
+    ----------
+    predicted : Gaussian
+        ξ̂ and P, predicted.
+    measured : ProjectedFlow
+    dynamics : FlowDynamics
+
+    Returns
+    -------
+    state : Gaussian
+    innovation : float
+        Root mean square of W^meas − W̄ − C ξ̂ for the predicted ξ̂, pixels.
+
+    Examples
+    --------
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> flows = np.zeros((6, 2, 2, 2)); flows[::2, ..., 0], flows[1::2, ..., 0] = 1, -1
+    >>> dynamics = identify(flows)
+    >>> state, innovation = update_state(
+    ...     Gaussian(np.zeros(1), np.eye(1)), project_measured(np.float32(flows[0]), dynamics), dynamics
+    ... )
+    >>> np.abs(state.mean).round(3), round(innovation, 3)
+    (array([2.]), 0.707)
+    """
+    noise = max(dynamics.R, _FLOW_NOISE_FLOOR)
+    state, _ = update_information(predicted, measured.state, np.eye(dynamics.rank), noise)
+    # |W − W̄ − C ξ̂|² without the product C ξ̂, by CᵀC = I.
+    squared = measured.squared - float(predicted.mean @ (2 * measured.state - predicted.mean))
+    return state, (max(squared, 0.0) / measured.size) ** 0.5
+
+
+def estimate_flow(modelled: Stack, measured: Stack, motion_share: Stack) -> Stack:
+    """Ŵ = C ξ̂ + G (W^meas − C ξ̂), the mean of the flow C ξ + r of eq. 10.
+
+    Parameters
+    ----------
+    modelled, measured : array, float32, shape (H, W, 2)
+        W̄ + C ξ̂ and W^meas, pixels.
+    motion_share : array, float32, shape (H, W, 2)
+        G for both components; 0 gives Ŵ = C ξ̂ as printed in the paper.
+
+    Returns
+    -------
+    array, float32, shape (H, W, 2)
+    """
+    return modelled + motion_share * (measured - modelled)

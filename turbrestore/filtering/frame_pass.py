@@ -1,0 +1,242 @@
+"""One pass over consecutive frames: measure their flows, follow the flow state, register them (paper 3, section 4).
+
+Symbols as in :mod:`turbrestore.filtering.flow_state` and :mod:`turbrestore.filtering.frame_noise`.
+
+Threads measure and project the flows of several frames side by side, the flow state is updated for one frame after the
+other in their order, and the frames are then registered side by side again.  On a device of torch frames are
+registered by whoever fuses them, so that no more than one registered frame lies there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.arrays import FloatArray
+from ..dynamics.flow_model import FlowDynamics, flow_of
+from ..registration.flow import FlowFrame, FlowParams, prepare_reference
+from ..runtime.image_stacks import Stack
+from ..runtime.runtime import Runtime
+from ..runtime.scratch import iter_frames
+from ..runtime.threads import in_batches, map_in_turns
+from .array_backend import ArrayBackend
+from .flow_state import ProjectedFlow, estimate_flow, predict_state, project_measured, update_state
+from .frame_noise import FrameStatistics, frame_noise_variance
+from .kalman import Gaussian
+
+# A frame as it was read, or prepared for flow; None for a frame that does not count.
+Frame = FloatArray | FlowFrame | None
+
+
+@dataclass(frozen=True, eq=False)
+class PassSettings:
+    """What is the same for every frame.
+
+    Attributes
+    ----------
+    dynamics : FlowDynamics
+    statistics : FrameStatistics
+        On the backend.
+    motion_share : array, float32, shape (H, W, 2)
+        G for both components, on the backend: arrays of one shape multiply several times as fast.
+    sharpness, drift : float
+        β, and S in squared intensity.
+    flow : FlowParams
+    runtime : Runtime
+    backend : ArrayBackend
+    """
+
+    dynamics: FlowDynamics
+    statistics: FrameStatistics
+    motion_share: Stack
+    sharpness: float
+    drift: float
+    flow: FlowParams
+    runtime: Runtime
+    backend: ArrayBackend
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredFrame:
+    """A frame on the image (eq. 15).
+
+    Attributes
+    ----------
+    channels : array, float32, shape (C, H, W)
+        I ∘ ŵ.
+    noise : array, float32, shape (H, W)
+        Z, squared intensity.
+    sharpness : float
+    """
+
+    channels: Stack
+    noise: Stack
+    sharpness: float
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """A frame whose flow has been measured.
+
+    Attributes
+    ----------
+    frame : Frame
+        With its flow, where a later pass starts from it.
+    state : Gaussian
+        ξ̂ and P after the frame.
+    innovation : float
+        Root mean square of W^meas − W̄ − C A ξ̂, pixels; NaN if the frame does not count.
+    registered : callable or None
+        Gives the RegisteredFrame; None if the frame does not count.
+    """
+
+    frame: Frame
+    state: Gaussian
+    innovation: float
+    registered: Callable[[], RegisteredFrame] | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Item:
+    """A frame on its way through a pass; ``start`` is a known flow to it, ``kept`` whether a later pass follows."""
+
+    frame: Frame
+    start: FloatArray | None
+    kept: bool
+    measured: FloatArray | None = None
+    projected: ProjectedFlow | None = None
+
+
+def pass_over(
+    frames: Iterable[Frame],
+    starts: Iterable[FloatArray | None],
+    image: FloatArray | None,
+    state: Gaussian,
+    settled: int,
+    settings: PassSettings,
+) -> Iterator[TrackedFrame]:
+    """Measure flows from an image to frames, update the flow state by them, and register the frames.
+
+    Parameters
+    ----------
+    frames : iterable of Frame
+        Consumed lazily.
+    starts : iterable of ndarray or None
+        Known flow to each frame, pixels, which its flow starts from; at least as many as frames.
+    image : ndarray, float32, shape (H, W) or (H, W, 3), or None
+        Where flows start; None takes the known flows as the measured ones.
+    state : Gaussian
+        ξ̂ and P before the first frame.
+    settled : int
+        No pass follows over so many frames, the first ones.
+    settings : PassSettings
+
+    Yields
+    ------
+    TrackedFrame
+    """
+    pairs = zip(iter_frames(frames), iter_frames(starts), strict=False)
+    items = (_Item(*pair, number >= settled) for number, pair in enumerate(pairs))
+    measure, batch, threads = _take_known, 1, settings.runtime.threads
+    if image is not None:
+        reference = prepare_reference(image, settings.flow, settings.runtime)
+        batch, threads = reference.batch, reference.threads
+
+        def measure(some: list[_Item]) -> list[_Item]:
+            prepared = [_prepared(item, reference.prepare) for item in some]
+            counted = [item.frame for item in prepared if isinstance(item.frame, FlowFrame)]
+            flows = iter(reference.solve(counted) if counted else [])
+            return [item if item.frame is None else _with_flow(item, next(flows)) for item in prepared]
+
+    def project(some: list[_Item]) -> list[_Item]:
+        return [_projected(item, settings.dynamics) for item in measure(some)]
+
+    def follow(some: list[_Item]) -> list[tuple[_Item, Gaussian, float]]:
+        nonlocal state
+        followed = []
+        for item in some:
+            state, innovation = predict_state(state, settings.dynamics), np.nan
+            if item.projected is not None:
+                state, innovation = update_state(state, item.projected, settings.dynamics)
+            followed.append((item, state, innovation))
+        return followed
+
+    def finish(followed: list[tuple[_Item, Gaussian, float]]) -> list[TrackedFrame]:
+        return [_tracked(*one, settings) for one in followed]
+
+    for tracked in map_in_turns(project, follow, finish, in_batches(items, batch), threads):
+        yield from tracked
+
+
+def register(image: FloatArray, measured: FloatArray, state: Gaussian, settings: PassSettings) -> RegisteredFrame:
+    """Warp a frame onto the image by Ŵ and estimate its noise Z (eq. 15).
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        The frame.
+    measured : ndarray, float32, shape (H, W, 2)
+        W^meas, pixels.
+    state : Gaussian
+        ξ̂ and P after the frame.
+    settings : PassSettings
+
+    Returns
+    -------
+    RegisteredFrame
+    """
+    backend = settings.backend
+    modelled = flow_of(settings.dynamics, state.mean)
+    flow = estimate_flow(backend.ops.load(modelled), backend.ops.load(measured), settings.motion_share)
+    channels, grey, seen = backend.warp(image, flow)
+    noise, sharpness = frame_noise_variance(grey, flow, seen, settings.statistics, settings.sharpness, backend.ops)
+    return RegisteredFrame(channels, noise, sharpness)
+
+
+def _take_known(items: list[_Item]) -> list[_Item]:
+    return [item if item.frame is None else replace(item, measured=item.start) for item in items]
+
+
+def _prepared(item: _Item, prepare: Callable[[FloatArray], FlowFrame]) -> _Item:
+    """Prepare a frame for flow, unless an earlier pass has."""
+    if item.frame is None:
+        return item
+    frame = item.frame if isinstance(item.frame, FlowFrame) else prepare(item.frame)
+    return replace(item, frame=frame if item.start is None else replace(frame, start=item.start))
+
+
+def _with_flow(item: _Item, flow: FloatArray) -> _Item:
+    """Note the flow to a frame; that of a later pass starts from it, unless there is a known flow."""
+    if item.kept and item.start is None and isinstance(item.frame, FlowFrame):
+        return replace(item, measured=flow, frame=replace(item.frame, start=_half_resolution(flow)))
+    return replace(item, measured=flow)
+
+
+def _half_resolution(flow: FloatArray) -> NDArray[np.float16]:
+    """Flow at half the resolution, a byte a pixel of the image.
+
+    For a start that is enough: it is exact to a pixel up to 2,000 pixels, and the search recovers from several.
+    """
+    height, width = flow.shape[:2]
+    return cv2.resize(flow, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.float16)
+
+
+def _projected(item: _Item, dynamics: FlowDynamics) -> _Item:
+    return item if item.measured is None else replace(item, projected=project_measured(item.measured, dynamics))
+
+
+def _tracked(item: _Item, state: Gaussian, innovation: float, settings: PassSettings) -> TrackedFrame:
+    """Register a frame on the CPU, or leave that to whoever fuses it."""
+    frame = item.frame if item.kept else None
+    image = item.frame.image if isinstance(item.frame, FlowFrame) else item.frame
+    if image is None or item.measured is None:
+        return TrackedFrame(frame, state, innovation, None)
+    if settings.backend.is_cpu:
+        registered = register(image, item.measured, state, settings)
+        return TrackedFrame(frame, state, innovation, lambda: registered)
+    measured = item.measured
+    return TrackedFrame(frame, state, innovation, lambda: register(image, measured, state, settings))

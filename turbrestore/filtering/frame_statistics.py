@@ -1,0 +1,192 @@
+"""Temporal statistics of the first block of registered frames, from which Z of every frame follows.
+
+Symbols
+-------
+Z₀ : variance of a registered frame about the image before sharpness is taken into account (paper 3, eq. 15)
+G : share of the flow outside the model's subspace that is motion and not noise
+R : variance of that flow (eq. 10)
+
+Frames are warped twice: once for mean and variance, and once more to leave out what deviates from all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+
+from ..core.arrays import FloatArray, luminance
+from ..core.errors import DataError
+from ..registration.warp import warp
+from ..runtime.image_stacks import numpy_ops
+from ..runtime.scratch import iter_frames
+from ..runtime.threads import sum_in_threads
+from .frame_noise import (
+    OUTLIER,
+    OUTLIER_WINDOW,
+    FrameStatistics,
+    gradient,
+    project_gradient,
+    smooth,
+    squared_deviation,
+)
+
+# Smallest variance, so that noise-free synthetic data keep every gain defined: (1/4096 of full scale)².
+_IMAGE_NOISE_FLOOR = 6e-8
+# Sharpness that differs by less than this share does not justify averaging fewer frames.
+_LEAST_SPREAD = 0.03
+# Share of the mean variance by which every pixel varies at least.
+_LEAST_DEVIATION = 0.1
+# Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels over which such
+# derivatives correlate.
+_SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
+_OPS = numpy_ops()
+
+
+def measure_frame_statistics(
+    frames: Iterable[FloatArray],
+    flows: Iterable[FloatArray],
+    image: FloatArray,
+    residual_variance: FloatArray,
+    window: float = 3.0,
+    image_noise: float | None = None,
+    threads: int = 0,
+) -> FrameStatistics:
+    """Temporal statistics of frames registered by their flows.
+
+    Parameters
+    ----------
+    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
+        Iterated twice; at least one.
+    flows : iterable of ndarray, float32, shape (H, W, 2)
+        From the image to each frame, pixels; iterated twice.
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        Image that the frames are registered to.
+    residual_variance : ndarray, shape (H, W)
+        R, squared pixels.
+    window : float
+        Standard deviation of the window in which sharpness is measured, pixels.
+    image_noise : float, optional
+        Z₀, squared intensity; by default the mean temporal variance of the registered frames.
+    threads : int
+        Frames warped side by side; 0 means one per available core.
+
+    Returns
+    -------
+    FrameStatistics
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frames = list(np.random.default_rng(0).normal(0.5, 0.1, (50, 16, 16)).astype(np.float32))
+    >>> still, image = np.zeros((50, 16, 16, 2), np.float32), np.full((16, 16), 0.5, np.float32)
+    >>> round(measure_frame_statistics(frames, still, image, np.ones((16, 16), np.float32)).image_noise, 3)
+    0.01
+    """
+    if residual_variance.shape != image.shape[:2]:
+        raise DataError(f"residual_variance: expected shape {image.shape[:2]}, found {residual_variance.shape}")
+    template = gradient(luminance(image), _OPS)
+
+    def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
+        sums = tuple(np.zeros(image.shape[:2]) for _ in range(4))
+        for frame, flow in pairs:
+            registered = luminance(warp(frame, flow))
+            _add_moments(registered, *sums[:2])
+            _add_moments(smooth(project_gradient(registered, template, _OPS), window, _OPS), *sums[2:])
+        return *sums, np.array(float(len(pairs)))
+
+    pairs = zip(iter_frames(frames), iter_frames(flows), strict=True)
+    total, squares, sharpness, spread, number = sum_in_threads(add, pairs, threads)
+    count = float(number)
+    mean, variance = _mean_and_variance(total, squares, count)
+    variance *= count / max(count - 1, 1)
+    sharpness, spread = _mean_and_variance(sharpness, spread, count)
+    mean_frame, deviation = _without_outliers(frames, flows, mean, variance, threads)
+    # The flattest fifth of the image varies by sensor noise alone; elsewhere blur and misregistration add to it.
+    square = template[0] ** 2 + template[1] ** 2
+    energy = smooth(square, window, _OPS)
+    sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
+    scale = _score_scale(sharpness, spread, energy * np.float32(_SOBEL_NOISE * sensor_noise), window)
+    return FrameStatistics(
+        image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
+        template=template,
+        template_energy=float(square.sum(dtype=np.float64)),
+        mean_sharpness=sharpness.astype(np.float32),
+        score_scale=scale,
+        score_variance=(scale**2 * spread).astype(np.float32),
+        motion_share=_motion_share(energy, sensor_noise, residual_variance, window),
+        window=window,
+        mean_frame=mean_frame,
+        deviation=deviation,
+    )
+
+
+def _add_moments(plane: FloatArray, total: np.ndarray, squares: np.ndarray) -> None:
+    cv2.accumulate(plane, total)
+    cv2.accumulateSquare(plane, squares)
+
+
+def _mean_and_variance(total: np.ndarray, squares: np.ndarray, count: float) -> tuple[np.ndarray, np.ndarray]:
+    mean = total / count
+    return mean, np.maximum(squares / count - mean**2, 0.0)
+
+
+def _without_outliers(
+    frames: Iterable[FloatArray],
+    flows: Iterable[FloatArray],
+    mean: np.ndarray,
+    variance: np.ndarray,
+    threads: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean of the registered frames and their variance about it, without the pixels that deviate from all others."""
+    centre, usual = mean.astype(np.float32), _deviation(variance)
+
+    def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
+        counts, total, squares = (np.zeros(mean.shape) for _ in range(3))
+        for frame, flow in pairs:
+            registered = luminance(warp(frame, flow))
+            kept = (squared_deviation(registered, centre, usual, _OPS) <= OUTLIER).view(np.uint8)
+            cv2.accumulate(kept, counts)
+            cv2.accumulate(registered, total, kept)
+            cv2.accumulateSquare(registered - centre, squares, kept)
+        return counts, total, squares
+
+    pairs = zip(iter_frames(frames), iter_frames(flows), strict=True)
+    counts, total, squares = sum_in_threads(add, pairs, threads)
+    some = np.maximum(counts, 1)
+    trimmed = np.where(counts > 0, total / some, mean)
+    return trimmed.astype(np.float32), _deviation(np.maximum(squares / some - (trimmed - centre) ** 2, 0.0))
+
+
+def _deviation(variance: np.ndarray) -> FloatArray:
+    floor = max(_LEAST_DEVIATION * float(variance.mean()), _IMAGE_NOISE_FLOOR)
+    return smooth(variance.astype(np.float32), OUTLIER_WINDOW, _OPS) + np.float32(floor)
+
+
+def _score_scale(sharpness: np.ndarray, spread: np.ndarray, noise: np.ndarray, window: float) -> FloatArray:
+    """Factor from a deviation of the sharpness to the best estimate of its standardised noise-free part.
+
+    Noise of the gradient, projected on the template, explains ``noise`` over the number of independent pixels in the
+    window of the variance ``spread``; the rest is sharpness.
+    """
+    explained = noise / (4 * np.pi * window**2 / _SOBEL_AREA)
+    deviation = np.sqrt(np.maximum(spread - explained, 0.0))
+    return (deviation / np.maximum(spread + (_LEAST_SPREAD * sharpness) ** 2, 1e-18)).astype(np.float32)
+
+
+def _motion_share(energy: FloatArray, noise: float, residual_variance: np.ndarray, window: float) -> FloatArray:
+    """G = R_motion / (R_motion + R_noise), with R_noise the Cramér–Rao bound of a shift seen through the window.
+
+    A shift of a patch with gradients ∇ρ in noise of variance σ² cannot be measured better than
+    σ² / (½ Σ |∇ρ|²) per axis; what the residual varies beyond that is motion.
+    """
+    area = 4 * np.pi * window**2
+    noise_variance = noise / np.maximum(area * 0.5 * energy, 1e-12)
+    total = np.maximum(residual_variance, 0.0)
+    return (1.0 - np.minimum(noise_variance / np.maximum(total, 1e-12), 1.0)).astype(np.float32)

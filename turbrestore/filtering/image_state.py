@@ -1,0 +1,104 @@
+"""The image's half of the alternating filter: registered frames update every pixel (paper 3, eqs. 13a to 16).
+
+Symbols
+-------
+ρ̂, Σ : image and its variance per pixel, :class:`PixelGaussian`
+S : variance by which the image drifts from frame to frame (eq. 13a)
+I ∘ ŵ, Z : registered frame and its variance about the image (eq. 15)
+L : gain (eq. 16)
+
+The paper takes Σ, Z and L to be one number each; here they vary from pixel to pixel.  Pixels are independent of each
+other, and channels share the variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import DataError
+from ..runtime.image_stacks import Stack
+
+
+@dataclass(frozen=True, eq=False)
+class PixelGaussian:
+    """Mean and variance of every pixel.
+
+    Parameters
+    ----------
+    mean : ndarray, float32 or float64, shape (H, W) or (H, W, 3)
+        ρ̂, intensities.
+    variance : ndarray, dtype of ``mean``, shape (H, W)
+        Σ, squared intensities, not negative.
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, values are not finite, or a variance is negative.
+
+    Examples
+    --------
+    >>> PixelGaussian(np.zeros((2, 3), np.float32), np.ones((2, 3))).variance.dtype
+    dtype('float32')
+    """
+
+    mean: NDArray[np.floating]
+    variance: NDArray[np.floating]
+
+    def __post_init__(self) -> None:
+        mean = np.asarray(self.mean)
+        mean = mean if mean.dtype in (np.float32, np.float64) else mean.astype(np.float64)
+        variance = np.asarray(self.variance, mean.dtype)
+        pixels = variance.shape
+        if mean.shape not in (pixels, (*pixels, 3)):
+            raise DataError(f"mean: expected the shape of variance {pixels} or {(*pixels, 3)}, found {mean.shape}")
+        if not np.isfinite(np.sum(mean, dtype=np.float64)):
+            raise DataError("mean: expected finite values, found NaN or infinite ones")
+        if not np.isfinite(np.sum(variance, dtype=np.float64)) or (variance < 0).any():
+            raise DataError("variance: expected finite values of at least 0, found others")
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "variance", variance)
+
+
+class PixelStacks(NamedTuple):
+    """ρ̂ and Σ as arrays or tensors with the channels first: shapes (C, H, W) and (H, W)."""
+
+    mean: Stack
+    variance: Stack
+
+
+def update_pixels(state: PixelStacks, registered: Stack, noise: Stack, drift: float) -> tuple[PixelStacks, Stack]:
+    """Predict the image and update it by a registered frame (paper 3, eqs. 14a, 14c, 15 and 16).
+
+    Parameters
+    ----------
+    state : PixelStacks
+        ρ̂ and Σ after the frame before.
+    registered : array, float32, shape (C, H, W)
+        I ∘ ŵ.
+    noise : array, float32, shape (H, W)
+        Z, squared intensity, positive.
+    drift : float
+        S, squared intensity.
+
+    Returns
+    -------
+    state : PixelStacks
+    gain : array, float32, shape (H, W)
+        L.
+
+    Examples
+    --------
+    >>> state = PixelStacks(np.zeros((1, 1, 2), np.float32), np.ones((1, 2), np.float32))
+    >>> after, gain = update_pixels(state, state.mean + 1, np.full((1, 2), 3, np.float32), drift=0.0)
+    >>> after.mean, after.variance, gain
+    (array([[[0.25, 0.25]]], dtype=float32), array([[0.75, 0.75]], dtype=float32), array([[0.25, 0.25]], dtype=float32))
+    """
+    prior = state.variance + drift  # (14c); by (14a) the mean stays
+    gain = prior / (prior + noise)  # L of (16)
+    mean = state.mean + gain * (registered - state.mean)  # (16)
+    # L Z equals (1 − L) Σ of (16) without its cancellation where Z is small.
+    return PixelStacks(mean, gain * noise), gain
