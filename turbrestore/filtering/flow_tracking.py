@@ -227,7 +227,9 @@ def track_measured(
     reference = prepare_reference(image, tracking.flow, tracking.runtime)
 
     def prepare(index: int, frame: FloatArray) -> FlowFrame:
-        found = reference.frame(index, frame, prepared, index < number + done)
+        found = prepared.pop(index, None) or reference.prepare(frame)
+        if index >= number + done:
+            prepared[index] = found
         return replace(found, start=known[index]) if index < len(known) else found
 
     def measure(batch: list[tuple[int, FloatArray | None]]) -> list[_Pair]:
