@@ -31,7 +31,7 @@ from turbrestore.io.images import atomic_write
 from turbrestore.metrics import psnr
 from turbrestore.pipeline import restore
 from turbrestore.registration.flow import FlowParams, estimate_flow
-from turbrestore.registration.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
+from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.device import PROCESSOR, find_device
 from turbrestore.settings import RestoreParams
@@ -73,7 +73,7 @@ def make_clip(height: int, width: int) -> Clip:
 def stages(clip: Clip, device: str) -> list[Stage]:
     """List what is measured, up to the iterations of the deconvolution."""
     grey, image = 255 * clip.frames, clip.frames.mean(axis=0)
-    referred = {name: refer_tvl1(grey.mean(axis=0), device=name) for name in (PROCESSOR, device)}
+    referred = {name: prepare_tvl1(grey.mean(axis=0), device=name) for name in (PROCESSOR, device)}
     params, dynamics = TvL1Params(), identify(clip.flows)
     warps = float(tvl1_flows(grey[:1], referred[PROCESSOR]).warps[0])
     # Flow, its extrapolation and the dual variable come and go in a sweep, and four maps of the data term come; a warp

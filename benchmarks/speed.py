@@ -330,12 +330,11 @@ def as_restored() -> AbstractContextManager[None]:
 def started(stack: np.ndarray, params: FlowParams, start_level: int) -> float:
     """Seconds of a flow of a frame that has been prepared, from an earlier flow."""
     # Other trees, which are measured by this script too, have none of these.
-    from turbrestore.registration.flow import FlowFrame, fill_flows, prepare_reference
+    from turbrestore.registration.flow import measure_flows, prepare_reference
 
-    reference, prepared = prepare_reference(stack.mean(axis=0), params, start_level), dict[int, FlowFrame]()
-    flows = np.zeros((*stack.shape[:3], 2), np.float32)
-    fill_flows(reference, stack, flows, prepared)
-    (seconds, _), _ = clocked(lambda: fill_flows(reference, stack, flows, prepared, again=True))
+    reference = prepare_reference(stack.mean(axis=0), params, start_level=start_level)
+    prepared, flows = zip(*measure_flows(reference, stack), strict=True)
+    (seconds, _), _ = clocked(lambda: list(measure_flows(reference, prepared, flows)))
     return seconds / len(stack)
 
 

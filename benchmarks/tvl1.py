@@ -23,19 +23,21 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 from unittest import mock
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.metrics import endpoint_error
-from turbrestore.registration.flow import FlowParams, Solver, iterate_flows, normalise_contrast
-from turbrestore.registration.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
+from turbrestore.registration.contrast import normalise_contrast
+from turbrestore.registration.flow import FlowParams, iterate_flows
+from turbrestore.registration.opencv_flow import FlowSolver, GreyImage
+from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
+from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.threads import map_ahead
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
@@ -106,9 +108,9 @@ SETS = {"Phase screens": phase_screens, "Smooth flows": smooth_motion, "Dynamic 
 
 def methods() -> dict[str, Callable[[KnownMotion], FloatArray]]:
     """Return what is compared: from a set to its flows."""
-    plain = FlowParams(threads=THREADS, global_shift=False, confidence=False)
-    ours = FlowParams(method="tvl1", threads=THREADS, global_shift=False, confidence=False)
-    total = FlowParams(method="tvl1", threads=THREADS, global_shift=False, confidence=False, tvl1=TvL1Params(huber=0.0))
+    plain = FlowParams(global_shift=False, confidence=False)
+    ours = replace(plain, method="tvl1")
+    total = replace(ours, tvl1=TvL1Params(huber=0.0))
     return {
         BASELINE: lambda motion: _opencv(motion, lambda solver: None),
         "DualTVL1, 3 warps, 2 × 10 iterations, no median": lambda motion: _opencv(motion, _hurry),
@@ -178,7 +180,7 @@ def compare_starts() -> None:
         frames = np.stack([_grey_levels(frame) for frame in motion.frames]).astype(np.float32)
         later = frames[IDENTIFIED:]
         reference, truth = _grey_levels(motion.reference).astype(np.float32), motion.truth[IDENTIFIED:]
-        found = tvl1_flows(frames, refer_tvl1(reference)).flows
+        found = tvl1_flows(frames, prepare_tvl1(reference)).flows
         dynamics = identify(found[:IDENTIFIED])
         before, own = found[IDENTIFIED - 1 : -1], found[IDENTIFIED:]
         predicted = np.stack([predict_flow(dynamics, project(dynamics, flow)) for flow in before])
@@ -186,7 +188,7 @@ def compare_starts() -> None:
         print(f"## {name}\n\n| levels | start | its error, px | CPU, ms a frame | warps | error, px |")
         print("|---:|---|---:|---:|---:|---:|")
         for levels in STARTED_LEVELS:
-            referred = refer_tvl1(reference, TvL1Params(levels=levels))
+            referred = prepare_tvl1(reference, TvL1Params(levels=levels))
             for label, start in starts.items():
                 runs = [_clocked(partial(tvl1_flows, later, referred, start)) for _ in range(3)]
                 flows, spent = runs[0][0], min(seconds for _, seconds in runs)
@@ -206,8 +208,8 @@ def compare_clips() -> None:
 
     started = FLOW_METHODS["tvl1"]
 
-    def begin_anew(params: FlowParams, reference: NDArray[np.uint8], start_level: int) -> Solver:
-        solve = started(params, reference, start_level)
+    def begin_anew(params: FlowParams, reference: GreyImage, start_level: int, device: str) -> FlowSolver:
+        solve = started(params, reference, start_level, device)
         return lambda frames, starts: solve(frames, [None] * len(starts))
 
     # What the others take is not to be that of the compiler.
@@ -239,7 +241,9 @@ def _distorted(scene: FloatArray, flows: FloatArray, rng: np.random.Generator) -
 
 
 def _flows(motion: KnownMotion, params: FlowParams) -> FloatArray:
-    return np.stack([flow for _, flow in iterate_flows(motion.reference, motion.frames, params)])
+    return np.stack(
+        [flow for _, flow in iterate_flows(motion.reference, motion.frames, params, Runtime(threads=THREADS))]
+    )
 
 
 def _opencv(motion: KnownMotion, change: Callable[[cv2.optflow.DualTVL1OpticalFlow], None]) -> FloatArray:

@@ -4,10 +4,19 @@ import pytest
 from conftest import natural_scene
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.metrics import psnr
-from turbrestore.registration import centroid
-from turbrestore.registration.centroid import CentroidParams, find_centroid, mean_registered
+from turbrestore.registration import centroid, flow
+from turbrestore.registration.centroid import (
+    CentroidParams,
+    CentroidState,
+    centroid_steps,
+    find_centroid,
+    mean_registered,
+)
 from turbrestore.registration.flow import FlowParams
 from turbrestore.registration.warp import warp
+from turbrestore.runtime.runtime import Runtime
+from turbrestore.runtime.scratch import to_scratch
+from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 INSIDE = (slice(12, -12), slice(12, -12))
@@ -66,10 +75,14 @@ def test_flows_start_from_the_centroid_and_average_out(sequence, mode):
 def test_a_mean_flow_that_stalls_has_converged_and_one_that_grows_has_not(monkeypatch, sizes, converged):
     found = iter(sizes)
 
-    def fill(reference, stack, flows, *_, again):
-        flows[:] = (next(found), 0.0)
+    def measure(reference, frames, starts):
+        size = next(found)
+        return [
+            (reference.prepare(frame), np.full((16, 16, 2), (size, 0.0), np.float32))
+            for frame in np.zeros((2, 16, 16), np.float32)
+        ]
 
-    monkeypatch.setattr("turbrestore.registration.centroid.fill_flows", fill)
+    monkeypatch.setattr("turbrestore.registration.centroid.measure_flows", measure)
     centroid = find_centroid(np.zeros((2, 16, 16)))
     assert centroid.converged == converged
     assert centroid.mean_flow_sizes == pytest.approx(sizes)
@@ -141,13 +154,47 @@ def test_bad_input_is_refused(sequence):
 
 
 def test_starts_from_a_blurred_mean_are_mended_a_level_above_the_finest(monkeypatch):
-    levels, refer = [], centroid.prepare_reference
+    levels, prepare = [], centroid.prepare_reference
 
-    def spied(image, params, start_level=0):
+    def spied(image, params, runtime, start_level=0):
         levels.append(start_level)
-        return refer(image, params, start_level)
+        return prepare(image, params, runtime, start_level)
 
     monkeypatch.setattr(centroid, "prepare_reference", spied)
     frames = np.random.default_rng(0).random((3, 32, 32)).astype(np.float32)
     centroid.find_centroid(frames, centroid.CentroidParams(iterations=2))
     assert set(levels) == {1}
+
+
+def test_a_state_follows_each_flow_and_the_result_is_returned(sequence):
+    frames = sequence.frames[:3]
+    steps, states = centroid_steps(frames, CentroidParams(iterations=2)), []
+    result = finish(steps, states.append)
+    assert states == [CentroidState(iteration, measured) for iteration in (1, 2) for measured in (1, 2, 3)]
+    expected = find_centroid(frames, CentroidParams(iterations=2))
+    assert result.image.tobytes() == expected.image.tobytes()
+    assert result.flows.tobytes() == expected.flows.tobytes()
+
+
+def test_flows_in_a_file_are_those_in_memory(sequence, tmp_path):
+    frames = sequence.frames[:4]
+    here, there = (
+        find_centroid(to_scratch(frames, folder), runtime=Runtime(scratch=folder)) for folder in (None, tmp_path)
+    )
+    assert isinstance(there.flows, np.memmap)
+    assert np.array_equal(here.flows, there.flows)
+    assert np.array_equal(here.image, there.image)
+
+
+@pytest.mark.parametrize("scratch", [False, True])
+def test_frames_are_prepared_once_where_memory_allows(monkeypatch, tmp_path, scratch):
+    calls = []
+    monkeypatch.setattr(
+        "turbrestore.registration.flow.grey_levels", lambda *a, find=flow.grey_levels: calls.append(1) or find(*a)
+    )
+    frames = np.random.default_rng(0).random((3, 32, 32)).astype(np.float32)
+    runtime = Runtime(scratch=tmp_path if scratch else None)
+    passes = find_centroid(frames, CentroidParams(iterations=2), runtime=runtime).mean_flow_sizes.size
+    # The reference of each pass is prepared too.
+    assert passes == 2
+    assert len(calls) == passes + 3 * (passes if scratch else 1)

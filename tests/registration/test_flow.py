@@ -7,20 +7,20 @@ import pytest
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.metrics import endpoint_error
-from turbrestore.pipeline import RestoreParams, restore
+from turbrestore.registration.contrast import normalise_contrast
 from turbrestore.registration.flow import (
     FLOW_METHODS,
-    DisParams,
-    FarnebackParams,
     FlowParams,
     estimate_flow,
-    fill_flows,
+    flow_memory,
     iterate_flows,
-    normalise_contrast,
+    measure_flows,
     prepare_reference,
 )
-from turbrestore.registration.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
+from turbrestore.registration.opencv_flow import DisParams, FarnebackParams
+from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
+from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 
 
@@ -111,7 +111,7 @@ def test_flat_regions_invent_no_motion(noise):
 
 def test_threads_do_not_change_the_result():
     frames = np.stack([pair(seed)[1] for seed in range(5)])
-    one, three = (estimate_flow(texture(), frames, FlowParams(threads=n)) for n in (1, 3))
+    one, three = (estimate_flow(texture(), frames, runtime=Runtime(threads=n)) for n in (1, 3))
     assert (one == three).all()
 
 
@@ -136,12 +136,6 @@ def test_colour_is_measured_on_luminance():
     assert np.abs(grey - colour).max() < 0.05
 
 
-def test_progress_is_told_of_every_frame():
-    calls = []
-    estimate_flow(texture(), np.stack([texture()] * 4), progress=calls.append)
-    assert calls == [1, 1, 1, 1]
-
-
 def test_frames_are_read_only_a_few_ahead():
     taken = 0
 
@@ -151,23 +145,25 @@ def test_frames_are_read_only_a_few_ahead():
             taken += 1
             yield texture()
 
-    flows = iterate_flows(texture(), stream(), FlowParams(threads=2))
+    flows = iterate_flows(texture(), stream(), runtime=Runtime(threads=2))
     next(flows)
     assert taken <= 6
     flows.close()
     assert threading.active_count() < 10
 
 
+def measure(reference, frames, starts):
+    """Flows that start from others."""
+    return np.stack([flow for _, flow in measure_flows(reference, frames, starts)])
+
+
 def test_what_is_prepared_of_a_frame_serves_every_reference():
     stack = np.stack([pair(seed)[1] for seed in range(3)])
     one, other = pair(0)[0], pair(1)[0]
-    kept, flows = {}, np.empty((3, *stack.shape[1:], 2), np.float32)
-    fill_flows(prepare_reference(one), stack, flows, kept)
-    assert sorted(kept) == [0, 1, 2]
+    prepared, flows = zip(*measure_flows(prepare_reference(one), stack), strict=True)
     assert np.array_equal(flows, estimate_flow(one, stack))
-    # From what was kept, not from the stack.
-    fill_flows(prepare_reference(other), np.zeros_like(stack), flows, kept)
-    assert np.array_equal(flows, estimate_flow(other, stack))
+    again = [flow for _, flow in measure_flows(prepare_reference(other), prepared)]
+    assert np.array_equal(again, estimate_flow(other, stack))
 
 
 @pytest.mark.parametrize("method", ["dis", "tvl1"])
@@ -175,7 +171,7 @@ def test_a_flow_from_a_good_start_is_as_good_as_one_from_none(method):
     reference, frame, truth = pair(rms=2.0)
     params, found = FlowParams(method=method, confidence=False), (truth + np.float32(0.5))[None]
     anew = estimate_flow(reference, frame[None], params)[0]
-    fill_flows(prepare_reference(reference, params), frame[None], found, again=True)
+    found = measure(prepare_reference(reference, params), [frame], found)
     errors = [endpoint_error(one[8:-8, 8:-8], truth[8:-8, 8:-8]) for one in (found[0], anew)]
     assert errors[0] <= 1.05 * errors[1] + 0.005
 
@@ -187,7 +183,7 @@ def test_a_flow_begins_at_its_start(finest):
     image, errors = texture(size=160), []
     for start in (10, 10 + 12 * 2**finest):
         flows = np.full((1, 160, 160, 2), (start, 0), np.float32)
-        fill_flows(prepare_reference(image, params), np.roll(image, 10, axis=1)[None], flows, again=True)
+        flows = measure(prepare_reference(image, params), [np.roll(image, 10, axis=1)], flows)
         errors.append(float(np.abs(flows[0, 40:-40, 40:-40, 0] - 10).mean()))
     assert errors[0] < 0.1
     assert errors[1] > 2
@@ -198,8 +194,7 @@ def test_a_start_includes_the_shift_of_the_frame(method):
     reference, frame, params = texture(size=128), texture(size=128), FlowParams(method=method)
     frame = np.roll(frame, 20, axis=1)
     flows = estimate_flow(reference, frame[None], params)
-    again = flows.copy()
-    fill_flows(prepare_reference(reference, params), frame[None], again, again=True)
+    again = measure(prepare_reference(reference, params), [frame], flows)
     inside = np.s_[0, 30:-30, 30:-30, 0]
     assert np.median(flows[inside]) == pytest.approx(20, abs=0.1)
     assert again[inside] == pytest.approx(flows[inside], abs=0.2)
@@ -214,11 +209,10 @@ def test_the_shift_of_a_start_is_not_measured_again(monkeypatch, method, most):
     def refuse(*arguments):
         raise AssertionError("measured again")
 
-    monkeypatch.setattr("turbrestore.registration.flow.shift_against", refuse)
-    before = flows.copy()
-    fill_flows(target, frame[None], flows, again=True)
-    # Without the shift what nobody saw would not stay where the reference has it.
-    assert np.abs(flows[0, :, -18:] - before[0, :, -18:]).max() < most
+    monkeypatch.setattr("turbrestore.registration.global_shift.measure_shift", refuse)
+    again = measure(target, [frame], flows)
+    # Without the shift, pixels that the frame does not show would not stay where the reference has them.
+    assert np.abs(again[0, :, -18:] - flows[0, :, -18:]).max() < most
 
 
 @pytest.mark.parametrize("motion", [6, 12, 20])
@@ -229,7 +223,7 @@ def test_where_half_of_the_scene_moves_the_other_stays(motion):
     frame[:, 80:] = np.roll(reference, motion, axis=1)[:, 80:]
     flows = estimate_flow(reference, frame[None])
     for _ in range(2):
-        fill_flows(prepare_reference(reference), frame[None], flows, again=True)
+        flows = measure(prepare_reference(reference), [frame], flows)
         assert np.abs(flows[0, :, :12]).max() < 0.05
 
 
@@ -237,8 +231,7 @@ def test_where_half_of_the_scene_moves_the_other_stays(motion):
 def test_a_flow_with_a_start_begins_at_its_level_and_is_refined_half_as_often(refinements, half, level):
     image, params = texture(size=64), FlowParams(confidence=False, dis=DisParams(refinements=refinements))
     frame, start = np.roll(image, 2, axis=1), np.full((1, 64, 64, 2), (1, 0), np.float32)
-    found = start.copy()
-    fill_flows(prepare_reference(image, params, level), frame[None], found, again=True)
+    found = measure(prepare_reference(image, params, start_level=level), [frame], start)
     solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     solver.setCoarsestScale(level)
     solver.setFinestScale(0)
@@ -252,12 +245,12 @@ def test_a_flow_with_a_start_begins_at_its_level_and_is_refined_half_as_often(re
 @pytest.mark.parametrize("level", [0, 1])
 def test_tvl1_with_a_start_goes_through_two_levels(level):
     reference, frame, truth = pair(rms=2.0)
-    params, found = FlowParams(method="tvl1", confidence=False), truth[None].copy()
-    fill_flows(prepare_reference(reference, params, level), frame[None], found, again=True)
+    params = FlowParams(method="tvl1", confidence=False)
+    found = measure(prepare_reference(reference, params, start_level=level), [frame], [truth])
     grey = [
         prepare_reference(reference, params).prepare(image).levels.astype(np.float32) for image in (reference, frame)
     ]
-    anew = refer_tvl1(grey[0], TvL1Params(levels=2))
+    anew = prepare_tvl1(grey[0], TvL1Params(levels=2))
     assert np.array_equal(found[0], tvl1_flows(grey[1][None], anew, truth[None]).flows[0])
 
 
@@ -279,7 +272,7 @@ def test_of_a_batch_some_have_a_start_and_some_have_none(method):
 def test_a_start_in_the_smallest_images(shape, method):
     image = texture(size=64)[: shape[0], : shape[1]]
     flows, params = np.zeros((1, *shape, 2), np.float32), FlowParams(method=method)
-    fill_flows(prepare_reference(image, params, start_level=1), image[None], flows, again=True)
+    flows = measure(prepare_reference(image, params, start_level=1), [image], flows)
     assert np.abs(flows).max() < 0.1
 
 
@@ -301,7 +294,6 @@ def test_frames_of_another_size_are_refused():
         (lambda: FlowParams(method="sift"), "method"),
         (lambda: FlowParams(contrast_window=-1), "contrast_window"),
         (lambda: FlowParams(contrast_floor=0), "contrast_floor"),
-        (lambda: FlowParams(threads=-1), "threads"),
         (lambda: DisParams(patch_stride=9), "patch_stride"),
         (lambda: DisParams(finest_scale=9), "finest_scale"),
         (lambda: FarnebackParams(neighbourhood=6), "neighbourhood"),
@@ -312,25 +304,8 @@ def test_bad_settings_name_themselves(make, name):
         make()
 
 
-@pytest.mark.parametrize("train", [4, 9])
-def test_a_restoration_measures_no_flow_twice(monkeypatch, train):
-    """The flows of the last pass of the centroid serve the identification and the first pass of the filter."""
-    solved, dis = [], FLOW_METHODS["dis"]
-
-    def counting(params, reference, start_level):
-        solve = dis(params, reference, start_level)
-
-        def counted(frames, starts):
-            solved.extend(frame.tobytes() + reference.tobytes() for frame in frames)
-            return solve(frames, starts)
-
-        return counted
-
-    monkeypatch.setitem(FLOW_METHODS, "dis", counting)
-    rng = np.random.default_rng(2)
-    flows = smooth_flows(9, 48, 48, rng, SmoothFlowParams(rms=1.0, correlation_length=8.0))
-    frames = np.stack([warp(texture(size=48), flow) for flow in flows])
-    restoration = restore(frames, RestoreParams(train=train))
-    passes = restoration.centroid.mean_flow_sizes.size
-    assert len(solved) == (passes - 1) * train + RestoreParams().filter.inner_iterations * len(frames)
-    assert len(set(solved)) == len(solved)
+def test_memory_of_flow_grows_with_pixels_channels_and_threads():
+    grey, colour = flow_memory((9, 100, 200), 1), flow_memory((9, 100, 200, 3), 1)
+    assert flow_memory((5, 200, 200), 1) == 2 * grey
+    assert grey < colour
+    assert flow_memory((9, 100, 200), 3) - flow_memory((9, 100, 200), 2) == flow_memory((9, 100, 200), 2) - grey > 0

@@ -9,9 +9,9 @@ from turbrestore.core.errors import DataError
 from turbrestore.registration.global_shift import (
     global_shifts,
     mean_stabilised,
+    measure_shift,
     overlap,
-    refer_shift,
-    shift_against,
+    prepare_shift_reference,
 )
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
@@ -28,17 +28,19 @@ def seen_from(dx, dy, side=256, noise=0.0, rng=None):
 @pytest.mark.parametrize("shift", [(4, 3), (-12, 5), (20, -20), (-45, 30), (0, 60), (-60, 0)])
 def test_shifts_are_found_by_the_sign_rule(shift, noise):
     rng = np.random.default_rng(0)
-    found = shift_against(seen_from(*shift, noise=noise, rng=rng), refer_shift(seen_from(0, 0, noise=noise, rng=rng)))
+    found = measure_shift(
+        seen_from(*shift, noise=noise, rng=rng), prepare_shift_reference(seen_from(0, 0, noise=noise, rng=rng))
+    )
     assert found == pytest.approx(shift, abs=0.5)
 
 
 def test_shifts_are_found_through_turbulence():
     rng = np.random.default_rng(1)
     flows = smooth_flows(6, 256, 256, rng, SmoothFlowParams(rms=2.0))
-    reference = refer_shift(seen_from(0, 0))
+    reference = prepare_shift_reference(seen_from(0, 0))
     for flow, shift in zip(flows, [(30, 10), (-30, 10), (5, -40), (15, 0), (0, 15), (50, 20)], strict=True):
         frame = distort(seen_from(*shift), flow[None], rng, noise=0.02)[0]
-        assert shift_against(frame, reference) == pytest.approx(shift, abs=4.0)
+        assert measure_shift(frame, reference) == pytest.approx(shift, abs=4.0)
 
 
 @pytest.mark.parametrize("rms", [0.5, 1.5, 3.0])
@@ -46,30 +48,30 @@ def test_turbulence_alone_is_no_shift(rms):
     rng = np.random.default_rng(2)
     flows = smooth_flows(8, 256, 256, rng, SmoothFlowParams(rms=rms))
     flows -= flows.mean(axis=0)
-    reference = refer_shift(seen_from(0, 0))
-    found = [shift_against(frame, reference) for frame in distort(seen_from(0, 0), flows, rng, noise=0.01)]
+    reference = prepare_shift_reference(seen_from(0, 0))
+    found = [measure_shift(frame, reference) for frame in distort(seen_from(0, 0), flows, rng, noise=0.01)]
     assert (np.array(found) == 0).all()
 
 
 def test_unlike_images_have_no_shift():
     a, b = np.random.default_rng(3).normal(0.5, 0.02, (2, 128, 128)).astype(np.float32)
-    assert shift_against(b, refer_shift(a)) is None
+    assert measure_shift(b, prepare_shift_reference(a)) is None
     flat = np.full((64, 64), 0.5, np.float32)
-    assert shift_against(flat, refer_shift(flat)) is None
+    assert measure_shift(flat, prepare_shift_reference(flat)) is None
 
 
 def test_large_images_are_measured_on_reduced_ones():
     scene = cv2.resize(PHOTO, (1400, 1200))
-    reference = refer_shift(scene[100:1060, 100:1300])
+    reference = prepare_shift_reference(scene[100:1060, 100:1300])
     assert max(reference.reduced.shape) <= 192
-    found = shift_against(scene[40:1000, 150:1350], reference)
+    found = measure_shift(scene[40:1000, 150:1350], reference)
     assert found == pytest.approx((-50, 60), abs=1.5)
 
 
 def test_colour_is_measured_on_luminance():
     reference, frame = seen_from(0, 0), seen_from(20, 5)
-    grey = shift_against(frame, refer_shift(reference))
-    colour = shift_against(np.dstack([frame] * 3), refer_shift(np.dstack([reference] * 3)))
+    grey = measure_shift(frame, prepare_shift_reference(reference))
+    colour = measure_shift(np.dstack([frame] * 3), prepare_shift_reference(np.dstack([reference] * 3)))
     assert colour == pytest.approx(grey, abs=1e-3)
 
 
@@ -122,7 +124,7 @@ def test_overlap_holds_the_same_pixels(height, width, dx, dy):
 
 def test_other_sizes_are_refused():
     with pytest.raises(DataError, match="as the reference has"):
-        shift_against(np.zeros((32, 32)), refer_shift(np.zeros((32, 40))))
+        measure_shift(np.zeros((32, 32)), prepare_shift_reference(np.zeros((32, 40))))
     with pytest.raises(DataError, match="frames: expected shape"):
         global_shifts(np.zeros((32, 32)))
 

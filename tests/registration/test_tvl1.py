@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.registration.flow import FlowParams, estimate_flow
-from turbrestore.registration.tvl1 import TvL1Params, refer_tvl1, tvl1_flows
+from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.tvl1_sweeps import (
     FlowProblem,
     SweepParams,
@@ -20,6 +20,7 @@ from turbrestore.registration.tvl1_sweeps import (
 )
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.image_stacks import numpy_ops
+from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 
 SIZE = 96
@@ -201,7 +202,7 @@ class TestMotion:
         flow = np.full((SIZE, SIZE, 2), shift, np.float32)
         frame = texture(3)
         params = TvL1Params(tolerance=0.01, warps=10)
-        found = tvl1_flows(frame[None], refer_tvl1(warp(frame, flow), params)).flows[0]
+        found = tvl1_flows(frame[None], prepare_tvl1(warp(frame, flow), params)).flows[0]
         assert np.abs(found - flow)[12:-12, 12:-12].max() < 0.01
 
     @pytest.mark.parametrize("matrix", [((0.02, 0), (0, 0.02)), ((0, -0.03), (0.03, 0)), ((0, 0.02), (0, 0))])
@@ -211,20 +212,20 @@ class TestMotion:
         frame = texture(4)
         # Smoothness is at odds with any gradient of the flow: little of it here.
         params = TvL1Params(attachment=0.5, huber=1.0)
-        found = tvl1_flows(frame[None], refer_tvl1(warp(frame, flow), params)).flows[0]
+        found = tvl1_flows(frame[None], prepare_tvl1(warp(frame, flow), params)).flows[0]
         error = np.linalg.norm(found - flow, axis=-1)[INNER, INNER]
         assert error.mean() < 0.03
         assert error.max() < 0.15
 
     def test_equal_images_do_not_move(self):
         image = texture()
-        assert np.abs(tvl1_flows(image[None], refer_tvl1(image)).flows).max() < 1e-4
+        assert np.abs(tvl1_flows(image[None], prepare_tvl1(image)).flows).max() < 1e-4
 
     def test_smooth_motion_is_followed_better_than_by_total_variation(self):
         frame, truth = texture(5), smooth_flows(1, SIZE, SIZE, np.random.default_rng(5))[0]
         errors = [
             np.linalg.norm(
-                tvl1_flows(frame[None], refer_tvl1(warp(frame, truth), TvL1Params(huber=h))).flows[0] - truth, axis=-1
+                tvl1_flows(frame[None], prepare_tvl1(warp(frame, truth), TvL1Params(huber=h))).flows[0] - truth, axis=-1
             )[INNER, INNER].mean()
             for h in (0.3, 0.0)
         ]
@@ -237,13 +238,13 @@ class TestMotion:
         spoilt = frame.copy()
         rng = np.random.default_rng(0)
         spoilt[tuple(rng.integers(0, SIZE, (2, 200)))] = 255
-        found = tvl1_flows(spoilt[None], refer_tvl1(reference)).flows[0]
+        found = tvl1_flows(spoilt[None], prepare_tvl1(reference)).flows[0]
         assert np.median(np.linalg.norm(found - truth, axis=-1)) < 0.1
 
     def test_beyond_the_frame_there_is_no_data(self):
         flow = np.full((SIZE, SIZE, 2), (9.0, 0.0), np.float32)
         scene = texture(7, 128)
-        found = tvl1_flows(scene[None, :96, 7:103], refer_tvl1(scene[:96, 16:112])).flows[0]
+        found = tvl1_flows(scene[None, :96, 7:103], prepare_tvl1(scene[:96, 16:112])).flows[0]
         # The last nine columns of the reference are not in the frame and move with their neighbours.
         assert np.abs(found - flow)[12:-12, 4:].max() < 0.5
 
@@ -253,16 +254,16 @@ class TestMotion:
         def misfit(flow):
             return np.abs(warp(frames[0], flow) - reference).mean()
 
-        found = tvl1_flows(frames, refer_tvl1(reference)).flows[0]
+        found = tvl1_flows(frames, prepare_tvl1(reference)).flows[0]
         assert misfit(found) < 0.15 * misfit(np.zeros_like(found))
 
 
 class TestEnd:
     def test_settled_flow_is_near_that_of_many_iterations(self):
         reference, frames, _ = pairs(2, seed=9, noise=8)
-        found = tvl1_flows(frames, refer_tvl1(reference))
+        found = tvl1_flows(frames, prepare_tvl1(reference))
         params = TvL1Params(warps=15, sweeps=60, tolerance=0)
-        long = tvl1_flows(frames, refer_tvl1(reference, params))
+        long = tvl1_flows(frames, prepare_tvl1(reference, params))
         assert found.settled.all()
         assert (found.warps < TvL1Params().warps).all()
         assert not long.settled.any()
@@ -273,7 +274,7 @@ class TestEnd:
     def test_smaller_tolerance_comes_nearer(self):
         reference, frames, _ = pairs(1, seed=10, rms=2.5, noise=4)
         ends = [
-            tvl1_flows(frames, refer_tvl1(reference, TvL1Params(warps=40, sweeps=5, tolerance=t)))
+            tvl1_flows(frames, prepare_tvl1(reference, TvL1Params(warps=40, sweeps=5, tolerance=t)))
             for t in (0.5, 0.1, 0.02, 0.0)
         ]
         distances = [median_length(end.flows - ends[-1].flows) for end in ends]
@@ -284,14 +285,14 @@ class TestEnd:
     def test_any_start_ends_in_the_same_flow(self):
         reference, frames, truth = pairs(2, seed=11)
         params = TvL1Params(warps=20, tolerance=0.01)
-        cold = tvl1_flows(frames, refer_tvl1(reference, params)).flows
+        cold = tvl1_flows(frames, prepare_tvl1(reference, params)).flows
         for levels, start in ((5, truth), (5, np.zeros_like(truth) + 1), (2, truth * 0.8)):
-            warm = tvl1_flows(frames, refer_tvl1(reference, params), start, levels)
+            warm = tvl1_flows(frames, prepare_tvl1(reference, params), start, levels)
             assert median_length(warm.flows - cold) < 0.02
 
     def test_good_start_replaces_the_pyramid(self):
         frame, flow = texture(12), np.full((SIZE, SIZE, 2), (8.0, -5.0), np.float32)
-        referred = refer_tvl1(warp(frame, flow))
+        referred = prepare_tvl1(warp(frame, flow))
         cold = tvl1_flows(frame[None], referred, levels=1)
         warm = tvl1_flows(frame[None], referred, flow[None] + 0.4, levels=1)
         assert median_length((cold.flows[0] - flow)[12:-12, 12:-12]) > 2
@@ -301,14 +302,14 @@ class TestEnd:
     @pytest.mark.parametrize("levels", [1, 2, 9])
     def test_levels_left_out_are_those_of_a_smaller_pyramid(self, levels):
         reference, frames, truth = pairs(2, seed=12)
-        fewer = tvl1_flows(frames, refer_tvl1(reference), truth, levels).flows
-        small = tvl1_flows(frames, refer_tvl1(reference, TvL1Params(levels=levels)), truth).flows
+        fewer = tvl1_flows(frames, prepare_tvl1(reference), truth, levels).flows
+        small = tvl1_flows(frames, prepare_tvl1(reference, TvL1Params(levels=levels)), truth).flows
         assert fewer.tobytes() == small.tobytes()
 
     def test_no_level_is_refused(self):
         reference, frames, _ = pairs(1)
         with pytest.raises(ConfigurationError, match="^levels: expected"):
-            tvl1_flows(frames, refer_tvl1(reference), levels=0)
+            tvl1_flows(frames, prepare_tvl1(reference), levels=0)
 
 
 class TestManyToOne:
@@ -316,7 +317,7 @@ class TestManyToOne:
     def test_flow_of_a_frame_does_not_depend_on_the_batch(self, device):
         reference, frames, _ = pairs(4, seed=13, rms=2.5, noise=16)
         frames[1] = reference
-        referred = refer_tvl1(reference, device=device)
+        referred = prepare_tvl1(reference, device=device)
         together = tvl1_flows(frames, referred)
         alone = [tvl1_flows(frame[None], referred) for frame in frames]
         assert np.abs(together.flows - np.concatenate([one.flows for one in alone])).max() < 0.01
@@ -327,7 +328,8 @@ class TestManyToOne:
     def test_threads_do_not_change_a_byte(self):
         reference, frames, _ = pairs(7, seed=15)
         one, two, many = (
-            estimate_flow(reference / 255, frames / 255, FlowParams(method="tvl1", threads=n)) for n in (1, 2, 5)
+            estimate_flow(reference / 255, frames / 255, FlowParams(method="tvl1"), Runtime(threads=n))
+            for n in (1, 2, 5)
         )
         assert one.tobytes() == two.tobytes() == many.tobytes()
 
@@ -336,7 +338,7 @@ class TestManyToOne:
         reference, frames, start = pairs(2, seed=16)
         copies = reference.copy(), frames.copy(), start.copy()
         for levels in (1, 3):
-            referred = refer_tvl1(reference, TvL1Params(levels=levels), device)
+            referred = prepare_tvl1(reference, TvL1Params(levels=levels), device)
             first = tvl1_flows(frames, referred, start).flows
             assert (tvl1_flows(frames, referred, start).flows == first).all()
         assert all((a == b).all() for a, b in zip(copies, (reference, frames, start), strict=True))
@@ -344,15 +346,15 @@ class TestManyToOne:
 
 def test_colour_is_measured_on_luminance():
     reference, frames, _ = pairs(1, seed=17)
-    grey = tvl1_flows(frames, refer_tvl1(reference)).flows
-    colour = tvl1_flows(np.repeat(frames[..., None], 3, 3), refer_tvl1(np.repeat(reference[..., None], 3, 2))).flows
+    grey = tvl1_flows(frames, prepare_tvl1(reference)).flows
+    colour = tvl1_flows(np.repeat(frames[..., None], 3, 3), prepare_tvl1(np.repeat(reference[..., None], 3, 2))).flows
     assert np.abs(grey - colour).max() < 0.02
 
 
 @pytest.mark.parametrize("size", [(16, 16), (17, 61)])
 def test_small_images(size):
     image = texture()[: size[0], : size[1]]
-    found = tvl1_flows(image[None], refer_tvl1(image))
+    found = tvl1_flows(image[None], prepare_tvl1(image))
     assert found.flows.shape == (1, *size, 2)
     assert np.abs(found.flows).max() < 1e-4
 
@@ -360,10 +362,10 @@ def test_small_images(size):
 @pytest.mark.parametrize(
     ("act", "message"),
     [
-        (lambda: refer_tvl1(np.zeros((15, 40))), "reference: expected at least 16×16 pixels, found 40×15"),
-        (lambda: tvl1_flows(np.zeros((2, 20, 20)), refer_tvl1(np.zeros((20, 21)))), r"frames: expected \(20, 21\)"),
+        (lambda: prepare_tvl1(np.zeros((15, 40))), "reference: expected at least 16×16 pixels, found 40×15"),
+        (lambda: tvl1_flows(np.zeros((2, 20, 20)), prepare_tvl1(np.zeros((20, 21)))), r"frames: expected \(20, 21\)"),
         (
-            lambda: tvl1_flows(np.zeros((2, 20, 20)), refer_tvl1(np.zeros((20, 20))), np.zeros((1, 20, 20, 2))),
+            lambda: tvl1_flows(np.zeros((2, 20, 20)), prepare_tvl1(np.zeros((20, 20))), np.zeros((1, 20, 20, 2))),
             r"start: expected shape \(2, 20, 20, 2\)",
         ),
     ],

@@ -41,7 +41,7 @@ from turbrestore.io.source import FrameSource
 from turbrestore.pipeline import restore
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.registration.flow import FlowParams, estimate_flow
-from turbrestore.registration.tvl1 import refer_tvl1, tvl1_flows
+from turbrestore.registration.tvl1 import prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runs.run_folder import stage_facts
 from turbrestore.runtime import device as device_module
@@ -219,7 +219,7 @@ class TestFlow:
     def test_large_motion_and_a_start(self, device):
         frames, flows = frames_of(SCENES["brick"](SIZE, SIZE), 2, rms=3.0, seed=1)
         grey = 255 * frames
-        here, there = (tvl1_flows(grey, refer_tvl1(grey.mean(axis=0), device=d), flows) for d in ("cpu", device))
+        here, there = (tvl1_flows(grey, prepare_tvl1(grey.mean(axis=0), device=d), flows) for d in ("cpu", device))
         assert np.linalg.norm(here.flows - there.flows, axis=-1).mean() < 1e-3
         assert (here.warps == there.warps).all()
         assert (here.settled == there.settled).all()

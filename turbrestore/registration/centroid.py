@@ -14,8 +14,9 @@ paper (``single``) keeps one warped frame with all of its noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import repeat
 from typing import TYPE_CHECKING, Literal
 
 import cv2
@@ -27,9 +28,10 @@ from ..core.errors import require, require_between
 from ..display.plots import plot_displacements
 from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
-from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
+from ..runtime.scratch import fill_frames, iter_frames, mean_of, new_stack
+from ..runtime.steps import finish
 from ..runtime.threads import map_ahead, sum_in_threads
-from .flow import FlowFrame, FlowParams, fill_flows, prepare_reference
+from .flow import FlowFrame, FlowParams, measure_flows, prepare_reference
 from .global_shift import mean_stabilised
 from .warp import compose_flows, inside, invert_flow, warp
 
@@ -122,13 +124,27 @@ class Centroid:
         return preview("Centroid", facts, self.image)
 
 
+@dataclass(frozen=True)
+class CentroidState:
+    """How far the iteration is.
+
+    Attributes
+    ----------
+    iteration : int
+        From 1.
+    measured : int
+        Flows measured so far in this iteration.
+    """
+
+    iteration: int
+    measured: int
+
+
 def find_centroid(
     frames: ArrayLike,
     params: CentroidParams | None = None,
     flow_params: FlowParams | None = None,
     runtime: Runtime = DEFAULT,
-    prepared: dict[int, FlowFrame] | None = None,
-    progress: Callable[[int], None] | None = None,
 ) -> Centroid:
     """Iterate to the centroid of ``frames``.
 
@@ -142,10 +158,6 @@ def find_centroid(
         How flow is measured.
     runtime : Runtime
         Threads, device, and a folder for the flows; without one they stay in memory.
-    prepared : dict, optional
-        From the number of a frame to what flow prepares of it: filled here, and of use to the filter.
-    progress : callable, optional
-        Called with 1 after each flow.
 
     Returns
     -------
@@ -167,49 +179,93 @@ def find_centroid(
     >>> centroid.converged, centroid.image.shape
     (True, (48, 48))
     """
+    return finish(centroid_steps(frames, params, flow_params, runtime))
+
+
+def centroid_steps(
+    frames: ArrayLike,
+    params: CentroidParams | None = None,
+    flow_params: FlowParams | None = None,
+    runtime: Runtime = DEFAULT,
+) -> Generator[CentroidState, None, Centroid]:
+    """Iterate to the centroid of ``frames`` flow by flow.
+
+    Parameters
+    ----------
+    frames, params, flow_params, runtime
+        As for :func:`find_centroid`.
+
+    Yields
+    ------
+    CentroidState
+        After each measured flow.
+
+    Returns
+    -------
+    Centroid
+
+    Raises
+    ------
+    DataError, ConfigurationError
+        As for :func:`find_centroid`, when the first state is asked for.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> list(centroid_steps(np.ones((2, 16, 16)), CentroidParams(iterations=1)))
+    [CentroidState(iteration=1, measured=1), CentroidState(iteration=1, measured=2)]
+    """
     params, flow_params = params or CentroidParams(), flow_params or FlowParams()
     stack = check_frames(frames, at_least=2)
     require(params.start < len(stack), f"start: expected a frame below {len(stack)}, found {params.start}")
-    image = _start(stack, params, flow_params, runtime)
+    image = _first_image(stack, params, flow_params, runtime)
     total = np.zeros((*stack.shape[1:3], 2), np.float32)
     flows = new_stack((*stack.shape[:3], 2), runtime.scratch)
-    if prepared is None and runtime.scratch is None:
-        # Where even the frames are in a file, what is prepared of them is not kept.
-        prepared = {}
+    prepared: list[FlowFrame] = []
     sizes: list[float] = []
     while True:
-        # The first image is a blurred mean, so what was measured from it needs a coarser level to be mended.
+        # The first image is a blurred mean, so flows that start from those to it are corrected on a coarser level.
         reference = prepare_reference(image, flow_params, runtime, start_level=1)
-        fill_flows(reference, stack, flows, prepared, progress, again=bool(sizes))
-        mean_flow = mean_of(flows)
+        solved = measure_flows(reference, prepared or iter_frames(stack), iter_frames(flows) if sizes else repeat(None))
+        # If even the frames are in a file, there is no memory to keep what is prepared of them.
+        keep = runtime.scratch is None and not prepared
+        for measured in fill_frames(flows, _flows_of(solved, prepared if keep else None)):
+            yield CentroidState(len(sizes) + 1, measured)
+        mean_flow = mean_of(flows)  # W̄
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
         change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
         # The temporal mean is a blurred reference: flow from the first registered mean is better, wherever it lies.
         settled = len(sizes) > 1 or params.mode == "single" or params.iterations == 1
         converged = (sizes[-1] <= params.tolerance and settled) or _STALLED < change <= _DIVERGED
         if not converged:
-            recentre = invert_flow(mean_flow)
+            recentre = invert_flow(mean_flow)  # V
             total = compose_flows(total, recentre) if params.mode == "single" else total
             _recentre(flows, recentre, runtime.threads)
+        # Eq. 12: q ← q ∘ (id + W̄)⁻¹.
         image = mean_registered(stack, flows, runtime) if params.mode == "fused" else warp(stack[params.start], total)
         if converged or change > _DIVERGED or len(sizes) == params.iterations:
             return Centroid(image, flows, np.array(sizes), converged)
 
 
-def _start(stack: FloatArray, params: CentroidParams, flow_params: FlowParams, runtime: Runtime) -> FloatArray:
+def _first_image(stack: FloatArray, params: CentroidParams, flow_params: FlowParams, runtime: Runtime) -> FloatArray:
     if params.mode == "single":
         return stack[params.start]
     return mean_stabilised(stack, runtime.threads) if flow_params.global_shift else mean_of(stack)
 
 
+def _flows_of(solved: Iterable[tuple[FlowFrame, FloatArray]], prepared: list[FlowFrame] | None) -> Iterator[FloatArray]:
+    """Flows alone; their frames are appended to ``prepared``."""
+    for frame, flow in solved:
+        if prepared is not None:
+            prepared.append(frame)
+        yield flow
+
+
 def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:
     """Let flows start from where ``recentre`` leads, in place."""
-
-    def move(index: int) -> None:
-        flows[index] = compose_flows(flows[index], recentre)
-
-    for _ in map_ahead(move, range(len(flows)), threads):
-        drop_pages(flows)
+    moved = map_ahead(lambda flow: compose_flows(flow, recentre), iter_frames(flows), threads)
+    for _ in fill_frames(flows, (flow for _, flow in moved)):
+        pass
 
 
 def mean_registered(frames: FloatArray, flows: FloatArray, runtime: Runtime = DEFAULT) -> FloatArray:

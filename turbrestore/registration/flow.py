@@ -1,133 +1,54 @@
 """Optical flow from one common reference to every frame.
 
-The contract of every method: ``reference(x, y) ≈ frame(x + dx, y + dy)``, flow in pixels, shape (H, W, 2),
-so that ``warp(frame, flow)`` lies on the reference (W_k of paper 3, eq. 6: ``I_k ∘ w_k = Kρ``).
+The contract of every method: ``reference(x, y) ≈ frame(x + dx, y + dy)``, flow in pixels, shape (H, W, 2), so that
+``warp(frame, flow)`` lies on the reference (W_k of paper 3, eq. 6: ``I_k ∘ w_k = Kρ``).  A frame may bring a start: an
+earlier flow to it from a similar reference.
 
-Three methods share one driver: ``dis`` (dense inverse search with variational refinement, Kroeger et al. 2016, the
-default), ``tvl1`` (Zach, Pock and Bischof 2007, in :mod:`turbrestore.registration.tvl1`) and ``farneback`` (2003).
-Paper 3 uses Black–Anandan flow, which these supersede.
+The three methods are ``dis``, the default, and ``farneback`` (:mod:`turbrestore.registration.opencv_flow`), and
+``tvl1`` (:mod:`turbrestore.registration.tvl1`).  Paper 3 uses Black–Anandan flow, which these supersede.  One driver
+surrounds them all:
 
-Local contrast is normalised first (zero mean, unit deviation in a Gaussian window), so that dark and low-contrast
-regions register as well as bright ones; ``contrast_floor`` keeps noise in flat regions from being blown up.
-
-A shift of the whole frame beyond two pixels is measured first (:mod:`turbrestore.registration.global_shift`) and taken
-out by whole
-pixels, which interpolates nothing: the flow is that shift plus the flow of the shifted frame.  Beyond the edge of the
-shifted frame the reference stands in, so that what nobody saw moves with the shift.
-
-A flow may start from an earlier one of the same frame: dense inverse search then leaves out the coarse levels of its
-pyramid, whose only use is to find a start, and half of its refinements, for what it starts from is smooth; it takes two
-thirds of the time.  Where the start was measured from an image much less sharp, the level above the finest has to mend
-it first (``start_level``).  TV-L1 leaves out all levels but two, the coarser of which makes its dual variable too.  The
-shift is that of the start, if the frame moved as one.  Farneback's method begins anew.
-
-Where the texture of the reference tells little of the motion, the flow is drawn towards its neighbourhood
-(:mod:`turbrestore.registration.confidence`); flat regions move as what surrounds them.
+1. Local contrast is normalised (zero mean, unit deviation in a Gaussian window), so that dark and low-contrast regions
+   register as well as bright ones; ``contrast_floor`` keeps noise in flat regions from being amplified.
+2. A shift of the whole frame by more than two pixels is measured (:mod:`turbrestore.registration.global_shift`) and
+   removed by whole pixels, which needs no interpolation.  The flow is that shift plus the flow to the shifted frame.
+   Pixels beyond the edge of the shifted frame are filled from the reference, so that they move with the shift.  If a
+   frame has a start that moves as a whole, the shift is taken from the start.
+3. The method measures the flow.
+4. Where the texture of the reference does not determine the motion, the flow is drawn towards its neighbourhood
+   (:mod:`turbrestore.registration.confidence`), so that flat regions move as their surroundings do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_frames, check_image, luminance
+from ..core.arrays import FloatArray, check_frames, check_image
 from ..core.errors import DataError, require, require_between
 from ..core.noise import estimate_noise
-from ..runtime.device import PROCESSOR, find_device, memory_of
+from ..runtime.device import PROCESSOR, find_device
 from ..runtime.runtime import DEFAULT, Runtime
-from ..runtime.scratch import drop_pages, new_stack
+from ..runtime.scratch import fill_frames, iter_frames, new_stack
 from ..runtime.threads import in_batches, map_ahead
 from .confidence import flow_confidence, regularise_flow
-from .global_shift import DEAD_ZONE, ShiftReference, overlap, refer_shift, shift_against
-from .tvl1 import TvL1Params, refer_tvl1, tvl1_flows
+from .contrast import grey_levels
+from .global_shift import ShiftReference, frame_shift, prepare_shift_reference, shift_frame
+from .opencv_flow import DisParams, FarnebackParams, FlowSolver, GreyImage, dis_solver, farneback_solver
+from .tvl1 import TvL1Params, tvl1_solver
 
 MIN_SIDE = 16
-# Grey levels per local standard deviation in the 8-bit image that the solvers see: ±4 deviations fit.
-_LEVELS_PER_DEVIATION = 32.0
-# A frame is shifted as a whole where this share of its flow is no further than the dead zone from the median; both are
-# those of so many rows and columns.
-_TOGETHER, _SAMPLE = 0.75, 64
-# Finest levels that TV-L1 goes through from a start.  One alone loses 0.1 dB on some clips, three save half as much.
-_STARTED_LEVELS = 2
-
-GreyBytes = NDArray[np.uint8]
-# From a frame (H, W) and a flow to start from, or None, to the flow (H, W, 2); threads share it.
-FrameSolver = Callable[[GreyBytes, FloatArray | None], FloatArray]
-# From frames (B, H, W) and their starts to flows (B, H, W, 2).
-Solver = Callable[[GreyBytes, list[FloatArray | None]], FloatArray]
-
-
-@dataclass(frozen=True)
-class DisParams:
-    """Settings of dense inverse search.
-
-    Parameters
-    ----------
-    finest_scale : int
-        Pyramid level at which the search ends; 0 is full resolution, 1 is about five times faster.
-    patch_size : int
-        Side of the matched patches, pixels.
-    patch_stride : int
-        Distance between patches, pixels.
-    refinements : int
-        Iterations of the variational refinement; half as many where a flow starts from an earlier one.
-    smoothness : float
-        Weight of the smoothness term in the refinement.
-    """
-
-    finest_scale: int = 0
-    patch_size: int = 8
-    patch_stride: int = 3
-    refinements: int = 8
-    smoothness: float = 6.0
-
-    def __post_init__(self) -> None:
-        require(0 <= self.finest_scale <= 4, f"finest_scale: expected 0 to 4, found {self.finest_scale}")
-        require(4 <= self.patch_size <= 32, f"patch_size: expected 4 to 32 pixels, found {self.patch_size}")
-        require(
-            1 <= self.patch_stride <= self.patch_size,
-            f"patch_stride: expected 1 to patch_size ({self.patch_size}), found {self.patch_stride}",
-        )
-        require_between("refinements", self.refinements, 0, 1000)
-        require_between("smoothness", self.smoothness, 1e-3, 1e4)
-
-
-@dataclass(frozen=True)
-class FarnebackParams:
-    """Settings of Farneback's polynomial expansion.
-
-    Parameters
-    ----------
-    window : int
-        Side of the averaging window, pixels.
-    levels : int
-        Pyramid levels.
-    iterations : int
-        Iterations per level.
-    neighbourhood : int
-        Side of the polynomial neighbourhood, pixels (5 or 7).
-    """
-
-    window: int = 15
-    levels: int = 4
-    iterations: int = 3
-    neighbourhood: int = 5
-
-    def __post_init__(self) -> None:
-        require_between("window", self.window, 3, 255, "pixels")
-        require_between("levels", self.levels, 1, 20)
-        require_between("iterations", self.iterations, 1, 1000)
-        require(self.neighbourhood in (5, 7), f"neighbourhood: expected 5 or 7 pixels, found {self.neighbourhood}")
 
 
 @dataclass(frozen=True)
 class FlowParams:
-    """How flow is estimated.
+    """How flow is measured.
 
     Parameters
     ----------
@@ -139,7 +60,7 @@ class FlowParams:
     contrast_floor : float
         Intensity deviation (0 to 1) below which a region counts as flat.
     global_shift : bool
-        Take large shifts of whole frames out first.
+        Remove large shifts of whole frames first.
     confidence : bool
         Draw the flow of flat regions, and along edges, towards its neighbourhood.
     dis : DisParams
@@ -170,41 +91,41 @@ class FlowParams:
 
 @dataclass(frozen=True)
 class FlowFrame:
-    """A frame with all that is computed once for it, whatever it is compared with.
+    """A frame and everything that is computed from it once, whatever reference it is compared with.
 
     Attributes
     ----------
     image : ndarray, float32, shape (H, W) or (H, W, 3)
     levels : ndarray, uint8, shape (H, W)
-        What the solvers see.
+        The contrast-normalised image that the solvers see.
     noise : float
-        σ of the frame, intensity; 0 where nothing asks for it.
+        Standard deviation of the noise, intensity; 0 if ``confidence`` is off.
     start : ndarray, shape (H, W, 2) or on a coarser grid, or None
-        Flow to it from a reference much like the next, pixels, that its flow can start from.
+        Flow to this frame from a similar reference, pixels, from which the solver starts.
     """
 
     image: FloatArray
-    levels: GreyBytes
+    levels: GreyImage
     noise: float
     start: NDArray[np.floating] | None = None
 
 
 @dataclass(frozen=True)
 class FlowReference:
-    """An image that flows start from, with all that is computed once for it.
+    """The image that flows start from, and everything that is computed from it once.
 
     Attributes
     ----------
     prepare : callable
-        From an image of the size of the reference to a FlowFrame; the same for every reference with these settings.
+        From an image of the size of the reference to a FlowFrame; the same for all references with these settings.
     solve : callable
         From a list of FlowFrame to the list of their flows, pixels.
     shape : tuple of int
-        Height and width.
+        (H, W).
     batch : int
-        Frames that are best solved at once.
+        Frames to hand to ``solve`` together.
     threads : int
-        Batches that are best solved side by side; 0 means one per available core.
+        Batches to solve side by side; 0 means one for each available core.
     """
 
     prepare: Callable[[FloatArray], FlowFrame]
@@ -213,15 +134,6 @@ class FlowReference:
     batch: int
     threads: int
 
-    def frame(
-        self, number: int, image: FloatArray, prepared: dict[int, FlowFrame] | None, last: bool = False
-    ) -> FlowFrame:
-        """Take a frame from those prepared already, or prepare it; it is kept for the next reference unless last."""
-        found = (prepared or {}).pop(number, None) or self.prepare(image)
-        if prepared is not None and not last:
-            prepared[number] = found
-        return found
-
 
 def estimate_flow(
     reference: ArrayLike,
@@ -229,7 +141,7 @@ def estimate_flow(
     params: FlowParams | None = None,
     runtime: Runtime = DEFAULT,
 ) -> FloatArray:
-    """Flows from ``reference`` to each of ``frames``.
+    """Measure the flow from ``reference`` to each of ``frames``.
 
     Parameters
     ----------
@@ -240,7 +152,7 @@ def estimate_flow(
     params : FlowParams, optional
         Method and settings.
     runtime : Runtime
-        Threads, device of ``tvl1`` (the other methods are OpenCV's and run on the CPU), and a folder for the flows.
+        Threads, device of ``tvl1`` (OpenCV's methods run on the CPU), and a folder for the flows.
 
     Returns
     -------
@@ -264,63 +176,11 @@ def estimate_flow(
     True
     """
     stack = check_frames(frames)
+    target = prepare_reference(reference, params, runtime)
     flows = new_stack((*stack.shape[:3], 2), runtime.scratch)
-    fill_flows(prepare_reference(reference, params, runtime), stack, flows)
+    for _ in fill_frames(flows, (flow for _, flow in measure_flows(target, iter_frames(stack)))):
+        pass
     return flows
-
-
-def fill_flows(
-    reference: FlowReference,
-    stack: FloatArray,
-    flows: FloatArray,
-    prepared: dict[int, FlowFrame] | None = None,
-    progress: Callable[[int], None] | None = None,
-    again: bool = False,
-) -> None:
-    """Measure the flow to each of ``stack``, put it into ``flows``, and keep what was prepared of a frame.
-
-    Parameters
-    ----------
-    reference : FlowReference
-    stack : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
-    flows : ndarray, float32, shape (T, H, W, 2)
-        In memory or in a mapped file.
-    prepared : dict, optional
-        From number to frame, for the next reference; nothing is kept by default.  A byte a pixel of every frame.
-    progress : callable, optional
-        Called with 1 after each frame, in the calling thread.
-    again : bool
-        Start from ``flows``, which are those from a reference much like this one.
-
-    Raises
-    ------
-    DataError
-        The frames have another size than the reference.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> stack, flows, prepared = np.ones((2, 16, 16), np.float32), np.ones((2, 16, 16, 2), np.float32), {}
-    >>> fill_flows(prepare_reference(stack[0]), stack, flows, prepared)
-    >>> float(flows.max()), sorted(prepared)
-    (0.0, [0, 1])
-    """
-    if stack.shape[1:3] != reference.shape:
-        raise DataError(f"frames: expected {reference.shape} pixels, found {stack.shape[1:3]}")
-
-    def fill(numbers: list[int]) -> None:
-        frames = [reference.frame(number, stack[number], prepared) for number in numbers]
-        if again:
-            frames = [replace(frame, start=flows[number]) for number, frame in zip(numbers, frames, strict=True)]
-        for number, flow in zip(numbers, reference.solve(frames), strict=True):
-            flows[number] = flow
-        drop_pages(flows)
-        drop_pages(stack)
-
-    for numbers, _ in map_ahead(fill, in_batches(range(len(stack)), reference.batch), reference.threads):
-        if progress is not None:
-            for _ in numbers:
-                progress(1)
 
 
 def iterate_flows(
@@ -329,9 +189,9 @@ def iterate_flows(
     params: FlowParams | None = None,
     runtime: Runtime = DEFAULT,
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield ``(frame, flow)`` in order while a pool of threads solves a few frames ahead.
+    """Yield ``(frame, flow)`` in order while threads solve a few frames ahead.
 
-    Memory is bounded by a handful of frames, however long ``frames`` is.
+    A handful of frames are in memory at a time, however long ``frames`` is.
 
     Parameters
     ----------
@@ -364,19 +224,57 @@ def iterate_flows(
     [0.0, 0.0]
     """
     target = prepare_reference(reference, params, runtime)
+    checked = (check_image(frame, f"frame {number}") for number, frame in enumerate(frames))
+    return ((frame.image, flow) for frame, flow in measure_flows(target, checked))
 
-    def checked() -> Iterator[FloatArray]:
-        for index, frame in enumerate(frames):
-            image = check_image(frame, f"frame {index}")
-            if image.shape[:2] != target.shape:
-                raise DataError(f"frame {index}: expected {target.shape} pixels, found {image.shape[:2]}")
-            yield image
 
-    def solve(batch: list[FloatArray]) -> list[FloatArray]:
-        return target.solve([target.prepare(frame) for frame in batch])
+def measure_flows(
+    reference: FlowReference,
+    frames: Iterable[FloatArray | FlowFrame],
+    starts: Iterable[FloatArray | None] = repeat(None),
+) -> Iterator[tuple[FlowFrame, FloatArray]]:
+    """Measure flows from a prepared reference while threads solve a few frames ahead.
 
-    for batch, flows in map_ahead(solve, in_batches(checked(), target.batch), target.threads):
-        yield from zip(batch, flows, strict=True)
+    Parameters
+    ----------
+    reference : FlowReference
+    frames : iterable of ndarray or FlowFrame
+        Images, float32, shape (H, W) or (H, W, 3), or frames that were prepared for an earlier reference.
+    starts : iterable of ndarray or None
+        For each frame the flow from a similar reference, pixels, or None.
+
+    Yields
+    ------
+    frame : FlowFrame
+        May serve the next reference.
+    flow : ndarray, float32, shape (H, W, 2)
+        Pixels.
+
+    Raises
+    ------
+    DataError
+        A frame has another size than the reference.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> image = np.ones((16, 16), np.float32)
+    >>> [(frame, flow)] = measure_flows(prepare_reference(image), [image])
+    >>> [(_, again)] = measure_flows(prepare_reference(image), [frame], [flow])
+    >>> float(abs(again).max())
+    0.0
+    """
+
+    def solve(batch: list[tuple[FloatArray | FlowFrame, FloatArray | None]]) -> list[tuple[FlowFrame, FloatArray]]:
+        prepared = [
+            replace(frame if isinstance(frame, FlowFrame) else reference.prepare(frame), start=start)
+            for frame, start in batch
+        ]
+        return list(zip(prepared, reference.solve(prepared), strict=True))
+
+    batches = in_batches(zip(frames, starts, strict=False), reference.batch)
+    for _, solved in map_ahead(solve, batches, reference.threads):
+        yield from solved
 
 
 def prepare_reference(
@@ -422,175 +320,79 @@ def prepare_reference(
             f"reference: expected at least {MIN_SIDE}×{MIN_SIDE} pixels for optical flow, found "
             f"{target.shape[1]}×{target.shape[0]}"
         )
-    prepared = _levels(target, params)
-    position = refer_shift(target) if params.global_shift else None
+    levels = grey_levels(target, params.contrast_window, params.contrast_floor)
+    position = prepare_shift_reference(target) if params.global_shift else None
     confidence = flow_confidence(target) if params.confidence else None
     device = find_device(runtime.device) if params.method == "tvl1" else PROCESSOR
-    solver = FLOW_METHODS[params.method](params, prepared, start_level, device)
+    solver = FLOW_METHODS[params.method](params, levels, start_level, device)
 
     def prepare(image: FloatArray) -> FlowFrame:
-        return FlowFrame(image, _levels(image, params), estimate_noise(image) if confidence is not None else 0.0)
+        if image.shape[:2] != levels.shape:
+            raise DataError(f"frames: expected {levels.shape} pixels, found {image.shape[:2]}")
+        seen = grey_levels(image, params.contrast_window, params.contrast_floor)
+        return FlowFrame(image, seen, estimate_noise(image) if confidence is not None else 0.0)
 
     def solve(batch: list[FlowFrame]) -> list[FloatArray]:
-        starts = [None if params.method == "farneback" else _start(frame) for frame in batch]
-        shifts = [_whole_shift(frame, start, position) for frame, start in zip(batch, starts, strict=True)]
-        levels = [_shifted(frame.levels, s, prepared) for frame, s in zip(batch, shifts, strict=True)]
-        pairs = zip(starts, shifts, strict=True)
-        starts = [start - shift if start is not None and shift.any() else start for start, shift in pairs]
-        flows = list(solver(np.stack(levels), starts))
+        # Farneback's method takes no start.
+        usable = [replace(frame, start=None) for frame in batch] if params.method == "farneback" else batch
+        placed = [_place(frame, levels, position) for frame in usable]
+        flows = list(solver(np.stack([p.levels for p in placed]), [p.start for p in placed]))
         if confidence is not None:
             flows = [regularise_flow(f, confidence, frame.noise) for f, frame in zip(flows, batch, strict=True)]
-        return [flow + shift if shift.any() else flow for shift, flow in zip(shifts, flows, strict=True)]
+        return [flow + p.shift if p.shift.any() else flow for flow, p in zip(flows, placed, strict=True)]
 
-    # A device solves a batch at once, while the next is prepared; on the processor every frame has a thread.
+    # A device solves a batch at once while the next one is prepared; on the CPU every frame has a thread.
     batch, threads = (1, runtime.threads) if device == PROCESSOR else (params.tvl1.batch, 2)
     return FlowReference(prepare, solve, target.shape[:2], batch, threads)
 
 
-def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> FloatArray:
-    """Zero mean and unit deviation in a Gaussian window.
+def flow_memory(shape: tuple[int, ...], threads: int) -> float:
+    """Memory that measuring flow takes beside the frames and their flows.
 
     Parameters
     ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        Intensities; colour is reduced to luminance.
-    window : float
-        Standard deviation of the window, pixels.
-    floor : float
-        Deviation that is added in quadrature, so that flat regions stay flat.
+    shape : tuple of int
+        Of the frames: (T, H, W) or (T, H, W, 3).
+    threads : int
+        Frames solved side by side.
 
     Returns
     -------
-    ndarray, float32, shape (H, W)
-        Dimensionless.
+    float
+        Bytes, of ``dis``, which takes most; measured, with a twentieth added.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> normalise_contrast(np.full((4, 4), 0.3, np.float32), window=2.0).max().item()
-    0.0
+    >>> flow_memory((60, 1000, 1000), threads=2) / 1e6
+    515.0
     """
-    grey = luminance(check_image(image))
-    # Centred first: E[x²] − E[x]² loses all digits of a faint texture on a bright ground.
-    centred = grey - cv2.GaussianBlur(grey, (0, 0), window)
-    deviation = cv2.GaussianBlur(centred * centred, (0, 0), window)
-    deviation += np.float32(floor) ** 2
-    centred /= np.sqrt(deviation, out=deviation)
-    return centred
+    pixels, channels = shape[1] * shape[2], shape[3] if len(shape) > 3 else 1
+    return float(pixels * (120 + 5 * channels + threads * (185 + 10 * channels)))
 
 
-def _levels(image: FloatArray, params: FlowParams) -> GreyBytes:
-    """8-bit image for the solvers: DIS takes nothing else, and the others lose nothing measurable."""
-    if params.contrast_window > 0:
-        normalised = normalise_contrast(image, params.contrast_window, params.contrast_floor)
-        normalised *= _LEVELS_PER_DEVIATION
-        normalised += 128.0
-        levels = normalised
-    else:
-        levels = luminance(image) * 255.0
-    return np.clip(np.rint(levels, out=levels), 0, 255, out=levels).astype(np.uint8)
+@dataclass(frozen=True)
+class _PlacedFrame:
+    """A frame moved onto the grid of the reference by whole pixels, and its start relative to that."""
+
+    levels: GreyImage
+    start: FloatArray | None
+    shift: FloatArray
 
 
-def _whole_shift(frame: FlowFrame, start: FloatArray | None, position: ShiftReference | None) -> FloatArray:
-    """Shift of the frame in whole pixels, zero where dense flow needs no help."""
-    none = np.zeros(2, np.float32)
-    if position is None:
-        return none
-    known = None if start is None else _common_shift(start)
-    shift = shift_against(frame.image, position) if known is None else known
-    return none if shift is None or np.abs(shift).max() <= DEAD_ZONE else np.rint(shift).astype(np.float32)
-
-
-def _common_shift(flow: FloatArray) -> FloatArray | None:
-    """Median of a flow, none where a part of the scene moves by itself: what it leaves is no border of the frame."""
-    sample = flow[:: -(-len(flow) // _SAMPLE), :: -(-flow.shape[1] // _SAMPLE)].reshape(-1, 2)
-    shift = np.median(sample, axis=0).astype(np.float32)
-    together = (np.abs(sample - shift) <= DEAD_ZONE).all(axis=1).mean()
-    return shift if together >= _TOGETHER else None
-
-
-def _start(frame: FlowFrame) -> FloatArray | None:
-    """Flow to start from, on the grid of the frame."""
-    if frame.start is None:
-        return None
-    height, width = frame.levels.shape
-    return cv2.resize(frame.start.astype(np.float32, copy=False), (width, height), interpolation=cv2.INTER_LINEAR)
-
-
-def _shifted(frame: GreyBytes, shift: FloatArray, outside: GreyBytes) -> GreyBytes:
-    """Frame on the grid of the reference, which shows where the frame does not reach."""
+def _place(frame: FlowFrame, outside: GreyImage, position: ShiftReference | None) -> _PlacedFrame:
+    """Remove the shift of the whole frame; ``outside`` supplies the pixels that the frame does not show."""
+    start = None
+    if frame.start is not None:
+        size = frame.levels.shape[::-1]
+        start = cv2.resize(frame.start.astype(np.float32, copy=False), size, interpolation=cv2.INTER_LINEAR)
+    shift = np.zeros(2, np.float32) if position is None else frame_shift(frame.image, start, position)
     if not shift.any():
-        return frame
-    to, origin = overlap(frame.shape, shift)
-    result = outside.copy()
-    result[to] = frame[origin]
-    return result
+        return _PlacedFrame(frame.levels, start, shift)
+    return _PlacedFrame(shift_frame(frame.levels, shift, outside), None if start is None else start - shift, shift)
 
 
-def _dis(params: FlowParams, reference: GreyBytes, start_level: int, _device: str) -> Solver:
-    def solve(frame: GreyBytes, start: FloatArray | None) -> FloatArray:
-        # A solver object keeps buffers that must not be shared between threads, and is cheap beside a flow.
-        solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        solver.setFinestScale(params.dis.finest_scale)
-        refinements = params.dis.refinements
-        if start is not None:
-            # Images made of such flows differ by hundredths of a dB from those of all refinements.
-            refinements -= refinements // 2
-            solver.setCoarsestScale(params.dis.finest_scale + start_level)
-        solver.setPatchSize(params.dis.patch_size)
-        solver.setPatchStride(params.dis.patch_stride)
-        solver.setVariationalRefinementIterations(refinements)
-        solver.setVariationalRefinementAlpha(params.dis.smoothness)
-        return solver.calc(reference, frame, start)
-
-    return _one_by_one(solve)
-
-
-def _tvl1(params: FlowParams, reference: GreyBytes, _start_level: int, device: str) -> Solver:
-    def solve(frames: GreyBytes, starts: list[FloatArray | None]) -> FloatArray:
-        flows = np.empty((*frames.shape, 2), np.float32)
-        started = {number: start for number, start in enumerate(starts) if start is not None}
-        anew = [number for number in range(len(frames)) if number not in started]
-        with memory_of(device, "lower --flow.tvl1.batch"):
-            if anew:
-                flows[anew] = tvl1_flows(frames[anew].astype(np.float32), referred).flows
-            if started:
-                known, grey = np.stack(list(started.values())), frames[list(started)].astype(np.float32)
-                flows[list(started)] = tvl1_flows(grey, referred, known, _STARTED_LEVELS).flows
-        return flows
-
-    with memory_of(device, "take a smaller --roi"):
-        referred = refer_tvl1(reference.astype(np.float32), params.tvl1, device)
-    return solve
-
-
-def _farneback(params: FlowParams, reference: GreyBytes, _start_level: int, _device: str) -> Solver:
-    settings = params.farneback
-    spread = {5: 1.1, 7: 1.5}[settings.neighbourhood]
-
-    def solve(frame: GreyBytes, _: FloatArray | None) -> FloatArray:
-        return cv2.calcOpticalFlowFarneback(
-            reference,
-            frame,
-            None,
-            0.5,
-            settings.levels,
-            settings.window,
-            settings.iterations,
-            settings.neighbourhood,
-            spread,
-            cv2.OPTFLOW_FARNEBACK_GAUSSIAN,
-        )
-
-    return _one_by_one(solve)
-
-
-def _one_by_one(solve: FrameSolver) -> Solver:
-    return lambda frames, starts: np.stack([solve(*pair) for pair in zip(frames, starts, strict=True)])
-
-
-FLOW_METHODS: dict[str, Callable[[FlowParams, GreyBytes, int, str], Solver]] = {
-    "dis": _dis,
-    "tvl1": _tvl1,
-    "farneback": _farneback,
+FLOW_METHODS: dict[str, Callable[[FlowParams, GreyImage, int, str], FlowSolver]] = {
+    "dis": lambda params, reference, start_level, _: dis_solver(params.dis, reference, start_level),
+    "tvl1": lambda params, reference, _, device: tvl1_solver(params.tvl1, reference, device),
+    "farneback": lambda params, reference, *_: farneback_solver(params.farneback, reference),
 }

@@ -1,4 +1,4 @@
-"""Global shifts: what a shaking or drifting camera adds to the motion of turbulence, taken out before dense flow.
+"""Global shifts: the motion that a shaking or drifting camera adds to turbulence, removed before dense flow.
 
 Symbols
 -------
@@ -6,18 +6,19 @@ s : shift (dx, dy) of a whole frame, pixels, ``reference(x, y) ≈ frame(x + dx,
 F, R : spectra of the windowed frame and reference; ``R* F / |R* F|`` peaks at s (phase correlation, Kuglin and Hines
     1975)
 
-Dense flow follows a texture over a tenth of the image side and no further; phase correlation finds shifts of a
-quarter of it and more, and costs little, because reduced images are enough: dense flow measures the rest.  A peak is
-believed only if moving the frame by it makes the images clearly more alike where they overlap.  Turbulence alone does
-not pass that test, so that its frames are left as they are.
+Dense flow follows a texture over at most a tenth of the image side; phase correlation finds shifts of a quarter of it
+and more.  It is cheap, because it runs on reduced images: dense flow measures the rest.  A peak is accepted only if
+moving the frame by it makes the images clearly more alike where they overlap.  Turbulence alone does not pass that
+test, so its frames are left as they are.
 
-Small rotations need no such help: 2° move the corners of an image by a fortieth of its side.
+Small rotations need no such step: 2° move the corners of an image by a fortieth of its side.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -26,39 +27,43 @@ from scipy import fft
 
 from ..core.arrays import FloatArray, check_frames, check_image, luminance
 from ..core.errors import DataError
-from ..runtime.scratch import drop_pages, mean_of
+from ..runtime.scratch import iter_frames, mean_of
 from ..runtime.threads import map_ahead
 
-# Images are reduced by a whole factor until no side is longer: beyond it only the time grows.
+# Images are reduced by a whole factor until no side is longer; larger ones would only take longer.
 _LONGEST_SIDE = 192
-# Local contrast is normalised in a window of this many pixels of the reduced image; deviations below the floor,
-# intensity, count as flat.
+# Window of the local contrast normalisation, pixels of the reduced image, and intensity deviation below which a region
+# counts as flat.
 _WINDOW, _FLOOR = 6.0, 0.01
-# Standard deviation of the peak that is looked for, pixels of the reduced image: turbulence smears it.
+# Standard deviation of the expected peak, pixels of the reduced image: turbulence smears it.
 _PEAK_WIDTH = 1.0
-# Correlation that a shift must reach, and what it must gain on no shift at all.
+# Correlation that a shift must reach, and its least gain over the correlation without a shift.
 _LEAST_CORRELATION, _LEAST_GAIN = 0.3, 0.1
-# Parts of the image below this share say nothing about the whole.
+# Share of the image below which an overlap says nothing about the whole.
 _LEAST_OVERLAP = 0.1
 # Shifts up to this many pixels are left to dense flow.
 DEAD_ZONE = 2.0
+# A flow moves as a whole if this share of it lies within the dead zone around its median; both are computed from at
+# most so many rows and columns.
+_SHARE_OF_WHOLE, _SAMPLE = 0.75, 64
 
 Shift = NDArray[np.float64]
 Slices = tuple[slice, slice]
+Pixels = TypeVar("Pixels", bound=NDArray[Any])
 
 
 @dataclass(frozen=True)
 class ShiftReference:
-    """What shifts are measured against.
+    """An image that shifts are measured against.
 
     Attributes
     ----------
     reduced : ndarray, float32, shape (h, w)
-        The image, reduced, with normalised contrast.
+        The reduced image with normalised contrast.
     spectrum : ndarray, complex64, shape (h, w // 2 + 1)
-        Conjugate spectrum of it under a Hann window.
+        Its conjugate spectrum under a Hann window.
     shape : tuple of int
-        (H, W) of the image itself.
+        (H, W) of the image at full size.
     """
 
     reduced: FloatArray
@@ -66,7 +71,7 @@ class ShiftReference:
     shape: tuple[int, int]
 
 
-def refer_shift(image: ArrayLike) -> ShiftReference:
+def prepare_shift_reference(image: ArrayLike) -> ShiftReference:
     """Prepare an image that the shifts of many frames are measured against.
 
     Parameters
@@ -86,7 +91,7 @@ def refer_shift(image: ArrayLike) -> ShiftReference:
     Examples
     --------
     >>> import numpy as np
-    >>> refer_shift(np.zeros((480, 640))).reduced.shape
+    >>> prepare_shift_reference(np.zeros((480, 640))).reduced.shape
     (120, 160)
     """
     checked = check_image(image)
@@ -94,7 +99,7 @@ def refer_shift(image: ArrayLike) -> ShiftReference:
     return ShiftReference(reduced, np.conj(_spectrum(reduced)), checked.shape[:2])
 
 
-def shift_against(image: ArrayLike, reference: ShiftReference) -> Shift | None:
+def measure_shift(image: ArrayLike, reference: ShiftReference) -> Shift | None:
     """Shift of a frame against a reference.
 
     Parameters
@@ -102,13 +107,13 @@ def shift_against(image: ArrayLike, reference: ShiftReference) -> Shift | None:
     image : array_like, shape (H, W) or (H, W, 3)
         The frame.
     reference : ShiftReference
-        What :func:`refer_shift` made of the reference.
+        From :func:`prepare_shift_reference`.
 
     Returns
     -------
     ndarray, float64, shape (2,), or None
-        (dx, dy) in pixels, zero where no shift explains the frame clearly better; None where the images are not alike
-        with any shift.
+        (dx, dy) in pixels, zero if no shift explains the frame clearly better; None if the images are not alike with
+        any shift.
 
     Raises
     ------
@@ -119,7 +124,7 @@ def shift_against(image: ArrayLike, reference: ShiftReference) -> Shift | None:
     --------
     >>> import numpy as np
     >>> scene = np.random.default_rng(0).random((64, 80)).astype(np.float32)
-    >>> shift_against(scene[3:51, 5:69], refer_shift(scene[8:56, 9:73])).round(1)
+    >>> measure_shift(scene[3:51, 5:69], prepare_shift_reference(scene[8:56, 9:73])).round(1)
     array([4., 5.])
     """
     checked = check_image(image)
@@ -140,8 +145,8 @@ def shift_against(image: ArrayLike, reference: ShiftReference) -> Shift | None:
 def global_shifts(frames: ArrayLike) -> Shift:
     """Shift of each frame against the mean position of all.
 
-    Frames are held against the middle one, and where that is too far away, against the last one whose shift is known.
-    A frame that is like neither, black or of something else, is taken to lie between its neighbours.
+    Frames are compared with the middle one, and if that is too far away, with the last one whose shift is known.  A
+    frame that resembles neither, because it is black or shows something else, gets a shift between its neighbours'.
 
     Parameters
     ----------
@@ -171,7 +176,7 @@ def global_shifts(frames: ArrayLike) -> Shift:
 def mean_stabilised(frames: ArrayLike, threads: int = 0) -> FloatArray:
     """Temporal mean of the frames, each moved by whole pixels to the mean position.
 
-    Where all frames lie within two pixels of it they are averaged as they are; else frames that cannot be placed are
+    If all frames lie within two pixels of it they are averaged as they are; otherwise frames whose shift is unknown are
     left out.
 
     Parameters
@@ -179,7 +184,7 @@ def mean_stabilised(frames: ArrayLike, threads: int = 0) -> FloatArray:
     frames : array_like, shape (T, H, W) or (T, H, W, 3)
         Frames of one scene.
     threads : int
-        Frames looked at side by side; 0 means one per available core.
+        Frames compared side by side; 0 means one for each available core.
 
     Returns
     -------
@@ -205,18 +210,73 @@ def mean_stabilised(frames: ArrayLike, threads: int = 0) -> FloatArray:
         return mean
     total = np.zeros(mean.shape)
     count = np.zeros(mean.shape[:2])
-    for index in np.flatnonzero(known):
-        to, origin = overlap(count.shape, np.rint(shifts[index]))
-        total[to] += stack[index][origin]
+    found = np.flatnonzero(known)
+    for shift, frame in zip(shifts[found], iter_frames(stack[number] for number in found), strict=True):
+        to, origin = overlap(count.shape, np.rint(shift))
+        total[to] += frame[origin]
         count[to] += 1
-        drop_pages(stack)
     seen = count > 0
     mean[seen] = (total[seen].T / count[seen]).T
     return mean
 
 
+def frame_shift(image: FloatArray, start: FloatArray | None, reference: ShiftReference) -> FloatArray:
+    """Shift of a frame in whole pixels, zero if it is so small that dense flow finds it.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        The frame.
+    start : ndarray, float32, shape (H, W, 2), or None
+        An earlier flow to the frame, pixels; if it moves as a whole, the shift is its median and is not measured again.
+    reference : ShiftReference
+
+    Returns
+    -------
+    ndarray, float32, shape (2,)
+        (dx, dy) in whole pixels.
+
+    Examples
+    --------
+    >>> scene = np.random.default_rng(0).random((64, 80)).astype(np.float32)
+    >>> frame_shift(scene[3:51, 5:69], None, prepare_shift_reference(scene[8:56, 9:73]))
+    array([4., 5.], dtype=float32)
+    """
+    known = None if start is None else _common_shift(start)
+    shift = measure_shift(image, reference) if known is None else known
+    if shift is None or np.abs(shift).max() <= DEAD_ZONE:
+        return np.zeros(2, np.float32)
+    return np.rint(shift).astype(np.float32)
+
+
+def shift_frame(frame: Pixels, shift: ArrayLike, outside: Pixels) -> Pixels:
+    """Frame moved onto the grid of the reference by whole pixels.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (H, W)
+    shift : array_like, shape (2,)
+        Whole pixels (dx, dy).
+    outside : ndarray, shape (H, W)
+        Supplies the pixels that the frame does not show.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+
+    Examples
+    --------
+    >>> shift_frame(np.array([[1, 2, 3]]), (1, 0), np.array([[7, 8, 9]]))
+    array([[2, 3, 9]])
+    """
+    to, origin = overlap(frame.shape, shift)
+    result = outside.copy()
+    result[to] = frame[origin]
+    return result
+
+
 def overlap(shape: tuple[int, ...], shift: ArrayLike) -> tuple[Slices, Slices]:
-    """Where a reference and a frame that is shifted by whole pixels show the same.
+    """Where a reference and a frame that is shifted by whole pixels overlap.
 
     Parameters
     ----------
@@ -248,44 +308,50 @@ def _overlap_of_axis(length: int, step: int) -> Slices:
 def _known_shifts(stack: FloatArray, threads: int = 0) -> tuple[Shift, NDArray[np.bool_]]:
     """Shifts of all frames, and which of them were found."""
     numbers = np.arange(len(stack))
-    # The middle frame may itself be the odd one out.
+    # The middle frame may itself show something else.
     for anchor in (len(stack) // 2, len(stack) // 4, 3 * len(stack) // 4):
         shifts, known = np.zeros((len(stack), 2)), numbers == anchor
         for order in (numbers[anchor + 1 :], numbers[:anchor][::-1]):
-            _walk(stack, anchor, order, shifts, known, threads)
+            _follow(stack, anchor, order.tolist(), shifts, known, threads)
         if 2 * known.sum() > len(stack):
             break
     shifts = np.column_stack([np.interp(numbers, numbers[known], axis) for axis in shifts[known].T])
     return shifts - shifts.mean(axis=0), known
 
 
-def _walk(
-    stack: FloatArray, anchor: int, order: Iterable[int], shifts: Shift, known: NDArray[np.bool_], threads: int
+def _follow(
+    stack: FloatArray, anchor: int, order: Sequence[int], shifts: Shift, known: NDArray[np.bool_], threads: int
 ) -> None:
     """Fill in the shifts of frames on one side of the anchor, from near to far."""
-    key, key_shift, last = refer_shift(stack[anchor]), shifts[anchor], anchor
-    first = key
+    at_anchor = prepare_shift_reference(stack[anchor])
 
-    def held(index: int) -> Shift | None:
-        found = shift_against(stack[index], first)
-        drop_pages(stack)
-        return found
+    def frames() -> Iterator[FloatArray]:
+        return iter_frames(stack[number] for number in order)
 
-    # Most frames are like the anchor: all are held against it side by side, and the others one after the other.
-    for index, against in list(map_ahead(held, order, threads)):
-        found = against if key is first else shift_against(stack[index], key)
+    # Most frames resemble the anchor: all are compared with it side by side, and the others one after the other.
+    against_anchor = [shift for _, shift in map_ahead(lambda f: measure_shift(f, at_anchor), frames(), threads)]
+    key, key_shift, last = at_anchor, shifts[anchor], anchor
+    for number, frame, against in zip(order, frames(), against_anchor, strict=True):
+        found = against if key is at_anchor else measure_shift(frame, key)
         if found is None:
-            nearer = refer_shift(stack[last])
-            found = shift_against(stack[index], nearer)
+            nearer = prepare_shift_reference(stack[last])
+            found = measure_shift(frame, nearer)
             if found is not None:
                 key, key_shift = nearer, shifts[last]
         if found is not None:
-            shifts[index], known[index], last = key_shift + found, True, index
-        drop_pages(stack)
+            shifts[number], known[number], last = key_shift + found, True, number
+
+
+def _common_shift(flow: FloatArray) -> FloatArray | None:
+    """Median of a flow, or None if only a part of the scene moves: that uncovers no border of the frame."""
+    sample = flow[:: -(-len(flow) // _SAMPLE), :: -(-flow.shape[1] // _SAMPLE)].reshape(-1, 2)
+    shift = np.median(sample, axis=0).astype(np.float32)
+    together = (np.abs(sample - shift) <= DEAD_ZONE).all(axis=1).mean()
+    return shift if together >= _SHARE_OF_WHOLE else None
 
 
 def _reduce(image: FloatArray) -> FloatArray:
-    """Smaller luminance with zero mean and unit deviation in a Gaussian window."""
+    """Reduced luminance with zero mean and unit deviation in a Gaussian window."""
     height, width = image.shape[:2]
     factor = -(-max(height, width) // _LONGEST_SIDE)
     size = max(width // factor, 1), max(height // factor, 1)
@@ -300,7 +366,7 @@ def _spectrum(reduced: FloatArray) -> NDArray[np.complex64]:
 
 
 def _peak(product: NDArray[np.complex64], shape: tuple[int, ...]) -> Shift:
-    """Place (x, y) of the largest phase correlation, to a fraction of a pixel."""
+    """Position (x, y) of the largest phase correlation, to a fraction of a pixel."""
     height, width = shape
     y, x = fft.fftfreq(height)[:, None], fft.rfftfreq(width)[None]
     blur = np.exp(-2 * np.pi**2 * _PEAK_WIDTH**2 * (x * x + y * y)).astype(np.float32)
@@ -315,7 +381,7 @@ def _peak(product: NDArray[np.complex64], shape: tuple[int, ...]) -> Shift:
 
 
 def _vertex(three: FloatArray) -> float:
-    """Vertex of the parabola through three values, from the middle one."""
+    """Vertex of the parabola through three values, counted from the middle one."""
     bend = float(three[0] - 2 * three[1] + three[2])
     return 0.5 * float(three[0] - three[2]) / bend if bend < 0 else 0.0
 

@@ -199,6 +199,32 @@ def iter_frames(items: Iterable[Item]) -> Iterator[Item]:
             drop_pages(item)
 
 
+def fill_frames(stack: NDArray[Any], items: Iterable[NDArray[Any]]) -> Iterator[int]:
+    """Write items into a stack one after the other, and hand back the memory of each if the stack is a mapped file.
+
+    Parameters
+    ----------
+    stack : ndarray, shape (T, ...)
+    items : iterable of ndarray, shape (...)
+        At most T; each is asked for once the one before has been written.
+
+    Yields
+    ------
+    int
+        Number of items written so far.
+
+    Examples
+    --------
+    >>> stack = new_stack((2, 3), Path(tempfile.gettempdir()))
+    >>> list(fill_frames(stack, np.eye(2, 3))), stack.tolist()
+    ([1, 2], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    """
+    for written, item in enumerate(items, 1):
+        stack[written - 1] = item
+        drop_pages(stack)
+        yield written
+
+
 def iter_parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
     """Yield consecutive pieces of an array, each small, and hand back their memory if it is a mapped file.
 
