@@ -1,18 +1,20 @@
-"""Blur that differs over the image: found by tiles where it does, not where it does not."""
+"""A blur that differs between parts of an image is found and removed; one that does not is taken as one."""
 
 import threading
-from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blind.blur_map import deconvolve_varying, estimate_blur_map, sigma_map
+from turbrestore.blind.blur_map import blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
 from turbrestore.blind.remove_blur import remove_blur
 from turbrestore.blur.estimation import choose_blur, estimate_blur, find_candidates
 from turbrestore.core.arrays import luminance
-from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve, deconvolve_steps
 from turbrestore.metrics import psnr
+from turbrestore.runtime.runtime import Runtime
+from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.scenes import SCENES
 
 SIDE = 384
@@ -58,7 +60,7 @@ def test_a_blur_that_is_the_same_everywhere_is_taken_as_one(name):
 
 
 @pytest.mark.parametrize(("name", "right", "agree"), [("camera", 1.4, True), ("brick", 2.6, False)])
-def test_how_sure_widths_are_is_asked_only_where_they_may_differ(monkeypatch, name, right, agree):
+def test_uncertainties_are_computed_only_if_widths_may_differ(monkeypatch, name, right, agree):
     _, image, _ = blurred(name, 1.4 if agree else 0.8, right)
     asked = []
 
@@ -72,14 +74,14 @@ def test_how_sure_widths_are_is_asked_only_where_they_may_differ(monkeypatch, na
     assert (asked == []) == agree
     assert np.isinf(found.uncertainties).all() == agree
     monkeypatch.setattr("turbrestore.blind.blur_map._agree", lambda tiles: False)
-    surely = estimate_blur_map(image, whole)
-    assert found.varies == surely.varies == (not agree)
-    assert found.sigmas == pytest.approx(surely.sigmas, rel=0.3 if agree else 0)
+    with_uncertainties = estimate_blur_map(image, whole)
+    assert found.varies == with_uncertainties.varies == (not agree)
+    assert found.sigmas == pytest.approx(with_uncertainties.sigmas, rel=0.3 if agree else 0)
 
 
 def test_true_widths_beat_every_single_width(brick):
     scene, image, widths = brick
-    by_pixel = deconvolve_varying(lambda width: deconvolve(image, width, WIENER), widths)
+    by_pixel = finish(varying_deconvolution_steps(partial(deconvolve_steps, image, params=WIENER), widths))
     singles = [deconvolve(image, width, WIENER).image for width in (0.8, 1.2, 1.5, 1.8, 2.2)]
     assert psnr(by_pixel.image, scene) > max(psnr(single, scene) for single in singles) + 1
     assert by_pixel.sigma == pytest.approx(1.5, abs=0.02)
@@ -91,7 +93,8 @@ def test_images_in_strips_and_in_a_file_are_the_same(brick, tmp_path, monkeypatc
     results = []
     for rows, folder in ((1000, None), (100, tmp_path)):
         monkeypatch.setattr("turbrestore.blind.blur_map._STRIP_ROWS", rows)
-        results.append(deconvolve_varying(lambda width: deconvolve(colour, width, WIENER), widths, folder).image)
+        attempt, runtime = partial(deconvolve_steps, colour, params=WIENER), Runtime(scratch=folder)
+        results.append(finish(varying_deconvolution_steps(attempt, widths, runtime)).image)
     assert np.array_equal(*results)
     assert isinstance(results[1], np.memmap)
 
@@ -132,24 +135,31 @@ def test_small_images_have_no_tiles():
     assert estimate_blur_map(small, estimate_blur(small)) is None
 
 
-@pytest.mark.parametrize(("right", "calls"), [(1.4, 1), (2.6, None)])
-def test_widths_are_found_beside_a_deconvolution_that_is_used_where_they_agree(monkeypatch, right, calls):
-    _, image, _ = blurred("brick", 1.4 if calls else 0.8, right)
+@pytest.fixture
+def counted(monkeypatch):
+    """Widths that are deconvolved by."""
     widths = []
 
-    def counted(image, width, *rest):
+    def steps(image, width, *rest):
         widths.append(width)
-        return deconvolve(image, width, *rest)
+        return (yield from deconvolve_steps(image, width, *rest))
 
-    monkeypatch.setattr("turbrestore.blind.remove_blur.deconvolve", counted)
+    monkeypatch.setattr("turbrestore.blind.tiled_deconvolution.deconvolve_steps", steps)
+    return widths
+
+
+@pytest.mark.parametrize(("right", "varies"), [(1.4, False), (2.6, True)])
+def test_the_deconvolution_beside_the_widths_of_tiles_is_used_where_these_agree(counted, right, varies):
+    _, image, _ = blurred("brick", 0.8 if varies else 1.4, right)
     result = remove_blur(image, image, WIENER)
-    tried = widths.copy()
-    in_turn = remove_blur(image, image, replace(WIENER, memory=1e9))
+    tried = counted.copy()
+    counted.clear()
+    in_turn = remove_blur(image, image, WIENER, runtime=Runtime(memory_limit=1e9))
     assert np.array_equal(result.deconvolution.image, in_turn.deconvolution.image)
     assert result.decisions == in_turn.decisions
-    assert result.tiles.varies == (calls is None)
-    # Where they differ the one beside them is in vain.
-    assert len(tried) == (calls or 1 + len(widths) - len(tried))
+    assert result.tiles.varies == varies
+    # If the widths differ, the deconvolution by one width is discarded.
+    assert len(tried) == (1 + len(counted) if varies else 1)
 
 
 def test_widths_and_deconvolution_do_not_wait_for_each_other(monkeypatch):
@@ -159,16 +169,16 @@ def test_widths_and_deconvolution_do_not_wait_for_each_other(monkeypatch):
     def waiting(function):
         def wait(*arguments):
             both.wait()
-            return function(*arguments)
+            return (yield from function(*arguments))
 
         return wait
 
-    monkeypatch.setattr("turbrestore.blind.remove_blur.deconvolve", waiting(deconvolve))
-    monkeypatch.setattr("turbrestore.blind.remove_blur.estimate_blur_map", waiting(estimate_blur_map))
+    monkeypatch.setattr("turbrestore.blind.tiled_deconvolution.deconvolve_steps", waiting(deconvolve_steps))
+    monkeypatch.setattr("turbrestore.blind.remove_blur.blur_map_steps", waiting(blur_map_steps))
     assert remove_blur(image, image, WIENER).tiles is not None
 
 
-def test_after_an_interrupt_nobody_waits_for_all_tiles(monkeypatch):
+def test_after_an_interrupt_the_remaining_tiles_are_left_out(monkeypatch):
     _, image, _ = blurred("brick", 1.4, 1.4)
     tiles, begun = [], threading.Event()
 
@@ -182,10 +192,11 @@ def test_after_an_interrupt_nobody_waits_for_all_tiles(monkeypatch):
         begun.wait(20)
         threading.Timer(0.2, interrupted.set).start()
         raise KeyboardInterrupt
+        yield
 
     interrupted = threading.Event()
     monkeypatch.setattr("turbrestore.blind.blur_map.find_candidates", estimated)
-    monkeypatch.setattr("turbrestore.blind.remove_blur.deconvolve", interrupt)
+    monkeypatch.setattr("turbrestore.blind.tiled_deconvolution.deconvolve_steps", interrupt)
     with pytest.raises(KeyboardInterrupt):
         remove_blur(image, image, WIENER)
     assert len(tiles) == 1

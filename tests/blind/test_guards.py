@@ -1,11 +1,11 @@
-"""Guards: right widths pass, wrong ones are lowered, none is invented."""
+"""Guards: right widths pass, ringing and amplified noise are found."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blind.guards import GuardParams, deconvolve_guarded, judge
+from turbrestore.blind.guards import GuardParams, evaluate_guards
 from turbrestore.blur.psf import blur_otf
 from turbrestore.core.arrays import luminance
 from turbrestore.core.errors import ConfigurationError, DataError
@@ -27,53 +27,35 @@ def blurred(name, sigma, noise=0.002, side=128):
 @pytest.mark.parametrize("sigma", [1.0, 2.0])
 def test_the_right_width_passes(name, sigma):
     _, image = blurred(name, sigma)
-    assert judge(deconvolve(image, sigma, WIENER).image, image, sigma).passed
+    assert evaluate_guards(deconvolve(image, sigma, WIENER).image, image, sigma).passed
 
 
-@pytest.mark.parametrize("name", ["chart", "camera", "brick", "grass", "words"])
-def test_a_width_far_too_large_is_lowered(name):
-    _, image = blurred(name, 2.0)
-    result, readings = deconvolve_guarded(lambda width: deconvolve(image, width, WIENER), image, 4.4)
-    assert not readings[0].passed
-    assert readings[-1].passed
-    assert 0 < result.sigma == readings[-1].sigma < 4.4
-
-
-def test_where_no_width_passes_nothing_is_removed():
-    _, image = blurred("camera", 1.0)
-    strict = GuardParams(overshoot=0.0, noise_gain=1.0, tries=2)
-    result, readings = deconvolve_guarded(lambda width: deconvolve(image, width, WIENER), image, 2.0, strict)
-    assert len(readings) == 2
-    assert result.sigma == 0
-    assert np.array_equal(result.image, image)
-
-
-def test_noise_that_was_amplified_is_found():
+def test_amplified_noise_is_found():
     rng = np.random.default_rng(0)
     before = (0.5 + rng.normal(0, 0.01, (64, 64))).astype(np.float32)
     before[:, 32:] += 0.3
     after = before + rng.normal(0, 0.05, before.shape)
-    reading = judge(after, before, 1.0)
+    reading = evaluate_guards(after, before, 1.0)
     assert reading.noise_gain == pytest.approx(np.hypot(0.05, 0.01) / 0.01, rel=0.1)
     assert not reading.passed
 
 
-def test_grey_as_colour_reads_the_same():
+def test_a_grey_image_in_colour_gives_the_same_reading():
     _, image = blurred("camera", 1.0)
     colour = np.repeat(image[..., None], 3, axis=2)
-    assert judge(colour, colour, 1.0) == judge(image, image, 1.0)
+    assert evaluate_guards(colour, colour, 1.0) == evaluate_guards(image, image, 1.0)
 
 
-def test_images_of_a_file_read_the_same(tmp_path):
+def test_images_in_files_give_the_same_reading(tmp_path):
     _, image = blurred("chart", 2.0)
     colour = np.stack([image, image[::-1], image.T], axis=-1)
     sharp = deconvolve(colour, 2.0, WIENER).image
-    reading = judge(to_scratch(sharp, tmp_path), to_scratch(colour, tmp_path), 2.0)
+    reading = evaluate_guards(to_scratch(sharp, tmp_path), to_scratch(colour, tmp_path), 2.0)
     planes = [
         (luminance(sharp), luminance(colour)),
         *zip(sharp.transpose(2, 0, 1), colour.transpose(2, 0, 1), strict=True),
     ]
-    alone = [judge(after, before, 2.0) for after, before in planes]
+    alone = [evaluate_guards(after, before, 2.0) for after, before in planes]
     for name in ("overshoot", "noise_gain"):
         found = [getattr(one, name) for one in alone]
         assert getattr(reading, name) == max(found) and len(set(found)) == 4
@@ -84,23 +66,23 @@ def test_rings_of_colour_without_luminance_are_found():
     before[:, 32:] = 0.6
     after = before.copy()
     after[:, 24:32] += np.float32([0.587, -0.299, 0.0]) * 0.8
-    assert judge(luminance(after), luminance(before), 1.0).overshoot < 0.01
-    assert not judge(after, before, 1.0).passed
+    assert evaluate_guards(luminance(after), luminance(before), 1.0).overshoot < 0.01
+    assert not evaluate_guards(after, before, 1.0).passed
 
 
 @given(gain=st.floats(0.1, 1.0), offset=st.floats(-0.2, 0.2))
 @settings(deadline=None)
 def test_the_reading_depends_on_neither_gain_nor_offset(gain, offset):
     scene, image = blurred("camera", 2.0, side=48)
-    first = judge(scene, image, 2.0)
-    second = judge(gain * scene + offset, gain * image + offset, 2.0)
+    first = evaluate_guards(scene, image, 2.0)
+    second = evaluate_guards(gain * scene + offset, gain * image + offset, 2.0)
     assert second.overshoot == pytest.approx(first.overshoot, abs=0.002)
     assert second.noise_gain == pytest.approx(first.noise_gain, rel=0.1)
 
 
-def test_what_cannot_be_judged_is_refused():
+def test_different_shapes_and_bad_bounds_are_refused():
     with pytest.raises(DataError, match="expected the shape"):
-        judge(np.zeros((8, 8)), np.zeros((8, 9)), 1.0)
+        evaluate_guards(np.zeros((8, 8)), np.zeros((8, 9)), 1.0)
     with pytest.raises(ConfigurationError, match="back_off"):
         GuardParams(back_off=1.0)
     with pytest.raises(ConfigurationError, match="overshoot"):

@@ -4,11 +4,9 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blur.estimation import descend_loops, estimate_blur
 from turbrestore.blur.psf import KOLMOGOROV, blur_otf, laplacian_symbol
 from turbrestore.core.errors import DataError
 from turbrestore.deconvolution.conjugate_gradient import (
@@ -45,10 +43,8 @@ from turbrestore.registration.confidence import draw_pixels, flow_confidence, lo
 from turbrestore.registration.tvl1_sweeps import FlowProblem, SweepParams, sweep, sweep_frame
 from turbrestore.registration.warp import sample_spline, warp
 from turbrestore.runtime import jit as compiling
-from turbrestore.synthesis.scenes import SCENES
 
 USERS = (
-    "blur.estimation",
     "filtering.frame_noise",
     "deconvolution.nonlocal_penalty",
     "deconvolution.nonlocal_tv",
@@ -207,7 +203,6 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
         add_sums,
         apply_loops,
         choose_offsets,
-        descend_loops,
         draw_back,
         draw_pixels,
         follow_loops,
@@ -424,15 +419,6 @@ def test_pairs_of_the_widest_images_have_their_numbers(plain):
     assert fast.heads.size > 0
     for one, other in zip(fast, slow, strict=True):
         assert np.array_equal(one, other)
-
-
-@needs_compiler
-def test_a_blur_is_estimated_alike(plain):
-    image = cv2.GaussianBlur(SCENES["camera"](96, 96), (0, 0), 1.3)
-    fast, slow = both(plain, lambda: estimate_blur(image, exponent=2.0))
-    assert fast.blurred
-    assert fast.sigma == pytest.approx(slow.sigma, abs=1e-3)
-    assert fast.costs == pytest.approx(slow.costs, abs=1e-3)
 
 
 @needs_compiler

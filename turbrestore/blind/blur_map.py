@@ -1,19 +1,18 @@
-"""Blur that differs from one part of an image to another: widths of tiles, and deconvolution by a width per pixel.
+"""Blur that differs between parts of an image: widths of tiles, and deconvolution by a width for every pixel.
 
-A scene in depth, or air that is rougher near the ground, blurs parts of an image differently.  Widths of single tiles
-are less sure than that of the whole, so they are used only where they differ by more than their uncertainties allow.
-A tile without texture says nothing, and has the width of the whole.
+Depth in the scene, or stronger turbulence near the ground, blurs parts of an image differently.  The width of a tile is
+less certain than that of the whole image, so tiles are used only if their widths differ by clearly more than their
+uncertainties.  A tile without texture is given the width of the whole image.
 
-How sure a width is takes twice the time of the width, and is asked only where it matters: the width of a tile is one of
-those of its reductions, and where all of them agree those that would be chosen do too.
+The uncertainty of a width takes twice as long as the width itself and is computed only if it matters: the width of a
+tile is that of one of its reductions, and if all plausible ones agree, so do the widths that would be chosen.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,22 +21,24 @@ from numpy.typing import ArrayLike
 from ..blur.estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidates
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.noise import estimate_noise
-from ..deconvolution.deconvolve import Deconvolution
-from ..runtime.scratch import drop_pages
-from ..runtime.threads import ThreadTeam, one_thread_each
+from ..deconvolution.deconvolve import Deconvolution, DeconvolutionState
+from ..runtime.runtime import DEFAULT, Runtime
+from ..runtime.scratch import iter_frames
+from ..runtime.steps import finish
+from ..runtime.threads import one_thread_each
 from ..runtime.tiling import new_mosaic
 
-# Tiles of fewer pixels a side say too little.
+# Smallest side of a tile, pixels, and largest number of tiles along a side.
 _LEAST_TILE, _MOST_TILES = 240, 3
 # Tiles overlap by this share of their distance.
 _OVERLAP = 0.25
-# Widths vary clearly if the largest exceeds the smallest by this factor, and by so many standard deviations.
+# Widths differ clearly if the largest exceeds the smallest by this factor and by this many standard deviations.
 _CLEAR_FACTOR, _CLEAR_DEVIATIONS = 1.5, 3.0
-# Fine detail of a tile exceeds its noise by this factor, or a width that finds no blur means nothing.
+# A tile in which no blur is found counts as sharp only if its fine detail exceeds the noise by this factor.
 _DETAIL = 2.0
-# Neighbouring widths that images are interpolated between differ by this factor, or more where there would be too many.
+# Ratio of neighbouring widths between whose images is interpolated, and largest number of widths.
 _STEP, _MOST_WIDTHS = 1.35, 5
-# Rows that images are interpolated in at a time.
+# Rows that are interpolated at a time.
 _STRIP_ROWS = 256
 
 
@@ -48,9 +49,9 @@ class BlurMap:
     Attributes
     ----------
     sigmas : ndarray, float64, shape (rows, columns)
-        Width found in each tile, pixels; that of the whole image where the tile says nothing.
+        Width of each tile, pixels; that of the whole image if the tile does not determine it.
     uncertainties : ndarray, float64, shape (rows, columns)
-        Their standard deviations, pixels; infinite where they were not needed to see that widths do not differ.
+        Uncertainty of each, pixels; infinite if the widths agree without it.
     varies : bool
         Whether the widths differ clearly.
     """
@@ -61,13 +62,11 @@ class BlurMap:
 
     @property
     def removable(self) -> np.ndarray:
-        """Widths that are safe to remove: half of the uncertainty is left in; 0 where that was not needed."""
+        """Widths that are safe to remove, pixels: half of the uncertainty is left in; 0 if it is infinite."""
         return np.maximum(self.sigmas - 0.5 * self.uncertainties, 0.0)
 
 
-def estimate_blur_map(
-    image: ArrayLike, whole: BlurEstimate, given_up: Callable[[], bool] | None = None
-) -> BlurMap | None:
+def estimate_blur_map(image: ArrayLike, whole: BlurEstimate, runtime: Runtime = DEFAULT) -> BlurMap | None:
     """Estimate the blur of overlapping tiles, two or three along each side.
 
     Parameters
@@ -75,19 +74,19 @@ def estimate_blur_map(
     image : array_like, shape (H, W) or (H, W, 3)
         Blurred image.
     whole : BlurEstimate
-        Of the whole image.
-    given_up : callable, optional
-        Asked before each tile whether the rest is of no use any more.
+        Estimate of the whole image.
+    runtime : Runtime
+        Number of threads, of which at most two are used; it does not change the result.
 
     Returns
     -------
     BlurMap or None
-        None if the image is too small for tiles of 240 pixels, or if it was given up.
+        None if the image is too small for tiles of 240 pixels.
 
     Raises
     ------
     DataError
-        Wrong shape, or values are not finite.
+        The shape is wrong, or values are not finite.
 
     Examples
     --------
@@ -97,33 +96,66 @@ def estimate_blur_map(
     >>> estimate_blur_map(small, estimate_blur(small)) is None
     True
     """
+    return finish(blur_map_steps(image, whole, runtime))
+
+
+def blur_map_steps(
+    image: ArrayLike, whole: BlurEstimate, runtime: Runtime = DEFAULT
+) -> Generator[int, None, BlurMap | None]:
+    """Estimate the blur of overlapping tiles, one tile per step; see :func:`estimate_blur_map`.
+
+    Parameters
+    ----------
+    image, whole, runtime
+        See :func:`estimate_blur_map`.
+
+    Yields
+    ------
+    int
+        Number of tiles done, first those whose widths were found, then those for which one of them was chosen.
+
+    Returns
+    -------
+    BlurMap or None
+
+    Raises
+    ------
+    DataError
+        The shape is wrong, or values are not finite.
+
+    Examples
+    --------
+    >>> from turbrestore.blur.estimation import estimate_blur
+    >>> flat = np.zeros((480, 480))
+    >>> list(blur_map_steps(flat, estimate_blur(flat)))
+    [1, 2, 3, 4]
+    """
     grey = luminance(check_image(image))
     rows, columns = _spans(grey.shape[0]), _spans(grey.shape[1])
     if len(rows) == 1 or len(columns) == 1:
         return None
     noise, shape = estimate_noise(grey), (len(rows), len(columns))
     found = dict[tuple[int, ...], tuple[BlurCandidate, ...]]()
-    with one_thread_each(), ThreadTeam(1) as team:
-        for place in np.ndindex(shape):
-            if given_up is not None and given_up():
-                return None
-            tile = np.ascontiguousarray(grey[rows[place[0]], columns[place[1]]])
+    for number, place in enumerate(np.ndindex(shape), 1):
+        tile = np.ascontiguousarray(grey[rows[place[0]], columns[place[1]]])
+        with one_thread_each():
             candidates = find_candidates(tile, exponent=whole.exponent)
-            if any(one.convinces for one in candidates) or (candidates and _fine_detail(tile) > _DETAIL * noise):
-                found[place] = candidates
-        sigmas, uncertainties = np.full(shape, whole.sigma), np.full(shape, whole.uncertainty)
-        agree = _agree(found.values())
-        for place, candidates in found.items():
-            if given_up is not None and given_up():
-                return None
-            chosen = _like(whole, candidates) if agree else choose_blur(candidates, None, whole.exponent, team)
-            sigmas[place], uncertainties[place] = chosen.sigma, chosen.uncertainty
-    spoken = tuple(np.array(list(found), int).reshape(-1, 2).T)
-    return BlurMap(sigmas, uncertainties, not agree and _clearly_differ(sigmas[spoken], uncertainties[spoken]))
+        if any(one.plausible for one in candidates) or (candidates and _fine_detail(tile) > _DETAIL * noise):
+            found[place] = candidates
+        yield number
+    sigmas, uncertainties = np.full(shape, whole.sigma), np.full(shape, whole.uncertainty)
+    agree = _agree(found.values())
+    for number, (place, candidates) in enumerate(found.items(), 1):
+        with one_thread_each():
+            chosen = _nearest_reduction(candidates, whole) if agree else choose_blur(candidates, runtime)
+        sigmas[place], uncertainties[place] = chosen.sigma, chosen.uncertainty
+        yield number
+    known = tuple(np.array(list(found), int).reshape(-1, 2).T)
+    return BlurMap(sigmas, uncertainties, not agree and _clearly_differ(sigmas[known], uncertainties[known]))
 
 
 def sigma_map(tiles: ArrayLike, shape: tuple[int, int]) -> FloatArray:
-    """Width for every pixel, interpolated between the centres of the tiles.
+    """Interpolate the widths of tiles between their centres, to a width for every pixel.
 
     Parameters
     ----------
@@ -151,56 +183,71 @@ def sigma_map(tiles: ArrayLike, shape: tuple[int, int]) -> FloatArray:
     return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def deconvolve_varying(
-    attempt: Callable[[float], Deconvolution], sigmas: FloatArray, scratch: Path | None = None
-) -> Deconvolution:
-    """Deconvolve by a width per pixel: by a few widths, and interpolate between their images.
+def varying_deconvolution_steps(
+    attempt: Callable[[float], Generator[DeconvolutionState, None, Deconvolution]],
+    sigmas: FloatArray,
+    runtime: Runtime = DEFAULT,
+) -> Generator[DeconvolutionState, None, Deconvolution]:
+    """Deconvolve by a width for every pixel: by a few widths, between whose images is interpolated.
 
     Parameters
     ----------
     attempt : callable
-        Deconvolves the whole image by one width in pixels.
+        Returns the generator that deconvolves the whole image by one width in pixels.
     sigmas : ndarray, float32, shape (H, W)
         Width for every pixel.
-    scratch : Path, optional
-        Folder of a file that holds the image; by default it is in memory.
+    runtime : Runtime
+        Folder of a file that holds the image; without one it stays in memory.
+
+    Yields
+    ------
+    DeconvolutionState
+        After each iteration for each width.
 
     Returns
     -------
     Deconvolution
-        Its ``sigma`` is the mean width; the record of the run is that of the widest.
+        Its ``sigma`` is the mean width; the record of the iterations is that of the largest width.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+    >>> from functools import partial
+    >>> from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve, deconvolve_steps
     >>> image = np.random.default_rng(0).uniform(size=(32, 32)).astype(np.float32)
-    >>> wiener = DeconvolutionParams(method="wiener")
-    >>> result = deconvolve_varying(lambda s: deconvolve(image, s, wiener), np.full((32, 32), 1.0, np.float32))
-    >>> bool((result.image == deconvolve(image, 1.0, wiener).image).all())
-    True
+    >>> by_wiener = partial(deconvolve_steps, image, params=DeconvolutionParams(method="wiener"))
+    >>> result = finish(varying_deconvolution_steps(by_wiener, np.linspace(1, 2, 32 * 32).reshape(32, 32)))
+    >>> round(result.sigma, 3)
+    1.5
     """
-    low, high = float(sigmas.min()), float(sigmas.max())
-    steps = int(np.ceil(np.log(max(high, 1e-6) / max(low, 1e-6)) / np.log(_STEP) - 1e-6))
-    count = min(steps + 1, _MOST_WIDTHS)
-    widths = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, _MOST_WIDTHS)
-    widths = np.unique(widths) if high > low else np.array([high])
+    widths = _widths_between(float(sigmas.min()), float(sigmas.max()))
     for index, width in enumerate(widths):
-        result = attempt(float(width))
+        result = yield from attempt(float(width))
         if index == 0:
-            image = new_mosaic(result.image.shape, scratch)
-        for start in range(0, len(image), _STRIP_ROWS):
-            rows = slice(start, start + _STRIP_ROWS)
-            # Hat functions: one at their width, zero at its neighbours'.
-            share = np.interp(sigmas[rows], widths, np.eye(len(widths))[index]).astype(np.float32)
-            image[rows] += result.image[rows] * (share if image.ndim == 2 else share[..., None])
-            drop_pages(result.image)
-            drop_pages(image)
+            image = new_mosaic(result.image.shape, runtime.scratch)
+        for part, found, sigma in zip(_strips(image), _strips(result.image), _strips(sigmas), strict=True):
+            # Linear interpolation: the share is one at this width and falls to zero at the neighbouring ones.
+            share = np.interp(sigma, widths, np.eye(len(widths))[index]).astype(np.float32)
+            np.add(part, found * share.reshape(*share.shape, *[1] * (found.ndim - 2)), out=part)
     return dataclasses.replace(result, image=image, sigma=float(sigmas.mean()))
 
 
+def _widths_between(low: float, high: float) -> np.ndarray:
+    if low == high:
+        return np.array([high])
+    if low <= 0:
+        return np.linspace(low, high, _MOST_WIDTHS)
+    steps = int(np.ceil(np.log(high / low) / np.log(_STEP) - 1e-6))
+    return np.unique(np.geomspace(low, high, min(steps + 1, _MOST_WIDTHS)))
+
+
+def _strips(image: FloatArray) -> Iterator[FloatArray]:
+    """Consecutive rows of an image, whose memory is handed back if the image is in a file."""
+    return iter_frames(image[start : start + _STRIP_ROWS] for start in range(0, len(image), _STRIP_ROWS))
+
+
 def _spans(length: int) -> list[slice]:
-    """Overlapping stretches of equal length that cover a side."""
+    """Overlapping spans of equal length that cover a side."""
     count = min(_MOST_TILES, max(1, int(length / (_LEAST_TILE / (1 + _OVERLAP)))))
     size = min(length, round(length / count * (1 + _OVERLAP)))
     starts = np.linspace(0, length - size, count).round().astype(int)
@@ -208,25 +255,25 @@ def _spans(length: int) -> list[slice]:
 
 
 def _fine_detail(tile: FloatArray) -> float:
-    """Deviation of what the mask of the noise estimate lets through; that of the noise where there is nothing else."""
+    """Measure the second differences from which noise is estimated; in a flat tile they equal the noise."""
     second = np.array([1, -2, 1], np.float32)
     return float(cv2.sepFilter2D(tile, cv2.CV_32F, second, second).std()) / 6
 
 
 def _agree(tiles: Iterable[tuple[BlurCandidate, ...]]) -> bool:
-    """Whether all widths that may be chosen are too near to each other to differ clearly."""
-    convincing = [[one.estimate.sigma for one in tile if one.convinces] for tile in tiles]
-    if not all(convincing):
-        # One looks sharp.
+    """Whether all widths that might be chosen are too close to each other to differ clearly."""
+    plausible = [[one.estimate.sigma for one in tile if one.plausible] for tile in tiles]
+    if not all(plausible):
+        # A tile looks sharp.
         return False
-    widths = [width for tile in convincing for width in tile]
+    widths = [width for tile in plausible for width in tile]
     return not widths or max(widths) <= _CLEAR_FACTOR * min(widths)
 
 
-def _like(whole: BlurEstimate, candidates: tuple[BlurCandidate, ...]) -> BlurEstimate:
-    """Estimate from the reduction nearest to that which decided of the whole."""
-    convincing = (one.estimate for one in candidates if one.convinces)
-    return min(convincing, key=lambda estimate: abs(estimate.reduction - whole.reduction))
+def _nearest_reduction(candidates: tuple[BlurCandidate, ...], whole: BlurEstimate) -> BlurEstimate:
+    """Plausible estimate whose reduction is nearest to that of the whole image."""
+    plausible = (one.estimate for one in candidates if one.plausible)
+    return min(plausible, key=lambda estimate: abs(estimate.reduction - whole.reduction))
 
 
 def _clearly_differ(sigmas: np.ndarray, uncertainties: np.ndarray) -> bool:

@@ -1,15 +1,24 @@
-"""Guards: a deconvolved image is held against the image it came from before anyone sees it.
+"""Guards: bounds on ringing and on amplified noise that a deconvolved image must keep.
 
-A right width restores contrast that fine detail has lost, so that the result leaves the range of the blurred image
-next to it: a correct chart does so at every third pixel.  Beyond the range of a window wider than the blur it has
-little to gain: the plateaus on either side of an edge are in it.  Too wide a width rings, and rings overshoot
-plateaus.  The share of pixels that leave the range of a window of four widths by more than 30 % of that range tells
-the two apart; see ``docs/decisions/guards.md`` for what it is on right and wrong widths.
+Symbols
+-------
+f : blurred image; u : deconvolved image; σ : width of the blur that was removed, pixels
+W(x) : window of 4σ around pixel x, at least 8 pixels; ``range(x) = max f − min f`` over W(x)
+
+Overshoot is the share of pixels with ``u > max f + 0.3 range`` or ``u < min f − 0.3 range``, where range is at least a
+tenth of the contrast of f.  The right width restores the contrast of fine detail, so u leaves the range of the pixels
+right next to it: a correctly restored chart does so at every third pixel.  But it hardly leaves the range of a window
+wider than the blur, which contains the plateaus on either side of an edge.  Too large a width causes ringing, which
+overshoots the plateaus.
+
+Noise gain is the ratio, after to before, of the standard deviation of fine detail in the flattest fifth of f.
+
+``docs/decisions/guards.md`` lists both for right and for wrong widths.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -18,32 +27,33 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import DataError, require_between
-from ..deconvolution.deconvolve import Deconvolution
-from ..runtime.scratch import drop_pages
+from ..runtime.scratch import iter_parts
 
 _WINDOW_SIGMAS = 4.0
 _SMALLEST_WINDOW = 8
 _BEYOND = 0.3
-# A range below this share of the contrast of the whole image is noise.
+# A range below this share of the contrast of the whole image is taken for noise.
 _LEAST_RANGE = 0.1
 _FLAT_SHARE = 0.2
+# Standard deviation of the Gaussian that separates fine detail, pixels.
 _DETAIL_WINDOW = 4.0
+_LEAST_DEVIATION = 1e-4
 
 
 @dataclass(frozen=True)
 class GuardParams:
-    """What a deconvolved image must not exceed.
+    """Bounds that a deconvolved image must keep, and what is done if it does not.
 
     Parameters
     ----------
     overshoot : float
         Largest share of pixels beyond the local range of the blurred image by 30 % of that range.
     noise_gain : float
-        Largest ratio of the deviation in the flattest fifth of the image after to before.
+        Largest ratio, after to before, of the standard deviation in the flattest fifth of the image.
     back_off : float
-        Factor on the width of the blur when a guard objects.
+        Factor on the width of the blur after a failed attempt.
     tries : int
-        Widths that are tried at most; after the last nothing is removed.
+        Largest number of attempts; if the last one fails, no blur is removed.
     """
 
     overshoot: float = 0.12
@@ -60,7 +70,7 @@ class GuardParams:
 
 @dataclass(frozen=True)
 class GuardReading:
-    """What the guards saw on one deconvolved image.
+    """What the guards measured on one deconvolved image.
 
     Attributes
     ----------
@@ -69,9 +79,9 @@ class GuardReading:
     overshoot : float
         Share of pixels beyond the local range.
     noise_gain : float
-        Deviation in flat regions after over before.
+        Ratio of the standard deviations in flat regions, after to before.
     passed : bool
-        Whether both are within bounds.
+        Whether both are within their bounds.
     """
 
     sigma: float
@@ -80,15 +90,17 @@ class GuardReading:
     passed: bool
 
 
-def judge(result: ArrayLike, blurred: ArrayLike, sigma: float, params: GuardParams | None = None) -> GuardReading:
-    """Hold a deconvolved image against the image it was deconvolved from; of colour, luminance and every channel.
+def evaluate_guards(
+    result: ArrayLike, blurred: ArrayLike, sigma: float, params: GuardParams | None = None
+) -> GuardReading:
+    """Compare a deconvolved image with the blurred one.
 
     Parameters
     ----------
     result : array_like, shape (H, W) or (H, W, 3)
-        Deconvolved image.
+        Deconvolved image, u.
     blurred : array_like, shape of ``result``
-        What it came from.
+        Blurred image, f.
     sigma : float
         Width of the blur that was removed, pixels.
     params : GuardParams, optional
@@ -97,93 +109,43 @@ def judge(result: ArrayLike, blurred: ArrayLike, sigma: float, params: GuardPara
     Returns
     -------
     GuardReading
+        For colour images, the largest figures of the luminance and of each channel.
 
     Raises
     ------
     DataError
-        Shapes do not agree, or values are not finite.
+        The shapes differ, or values are not finite.
 
     Examples
     --------
     >>> import numpy as np
     >>> edge = np.repeat([[0.2] * 24 + [0.8] * 24], 48, axis=0)
-    >>> judge(edge, edge, 1.0).overshoot
+    >>> evaluate_guards(edge, edge, 1.0).overshoot
     0.0
-    >>> rung = edge + 0.3 * (abs(np.arange(48) - 27) < 3.5)
-    >>> judge(rung, edge, 1.0).passed
+    >>> ringing = edge + 0.3 * (abs(np.arange(48) - 27) < 3.5)
+    >>> evaluate_guards(ringing, edge, 1.0).passed
     False
     """
     params = params or GuardParams()
     after, before = check_image(result, "result"), check_image(blurred, "blurred")
     if after.shape != before.shape:
         raise DataError(f"result: expected the shape {before.shape} of the blurred image, found {after.shape}")
-    # One pair of planes at a time: of a large image they are a good part of what memory holds.
-    channels = [None, *range(3)] if after.ndim == 3 else [None]
-    seen = [_figures(_plane(after, channel), _plane(before, channel), sigma) for channel in channels]
-    overshoot, gain = (max(figures) for figures in zip(*seen, strict=True))
+    # One pair of planes at a time, because those of a large image take a good part of the memory.
+    pairs = zip(_planes(after), _planes(before), strict=True)
+    figures = [(_overshoot(*pair, sigma), _noise_gain(*pair)) for pair in pairs]
+    overshoot, gain = (max(values) for values in zip(*figures, strict=True))
     return GuardReading(float(sigma), overshoot, gain, overshoot <= params.overshoot and gain <= params.noise_gain)
 
 
-def deconvolve_guarded(
-    attempt: Callable[[float], Deconvolution], blurred: ArrayLike, sigma: float, params: GuardParams | None = None
-) -> tuple[Deconvolution, tuple[GuardReading, ...]]:
-    """Deconvolve with a width that is lowered until no guard objects.
-
-    Parameters
-    ----------
-    attempt : callable
-        Deconvolves ``blurred`` for a width in pixels.
-    blurred : array_like, shape (H, W) or (H, W, 3)
-        Image that is deconvolved.
-    sigma : float
-        First width, pixels.
-    params : GuardParams, optional
-        Bounds.
-
-    Returns
-    -------
-    result : Deconvolution
-        The first that passes; without blur removed if none does.
-    readings : tuple of GuardReading
-        Of every width that was tried.
-
-    Raises
-    ------
-    DataError
-        Values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.deconvolution.deconvolve import deconvolve
-    >>> image = np.random.default_rng(0).uniform(size=(32, 32)).astype(np.float32)
-    >>> result, readings = deconvolve_guarded(lambda width: deconvolve(image, width), image, 0.0)
-    >>> result.sigma, readings
-    (0.0, ())
-    """
-    params = params or GuardParams()
-    readings: list[GuardReading] = []
-    while sigma > 0 and len(readings) < params.tries:
-        result = attempt(sigma)
-        readings.append(judge(result.image, blurred, sigma, params))
-        if readings[-1].passed:
-            return result, tuple(readings)
-        sigma *= params.back_off
-    return attempt(0.0), tuple(readings)
-
-
-def _plane(image: FloatArray, channel: int | None) -> FloatArray:
-    """Channel of an image, or luminance."""
-    if channel is None:
-        return luminance(image)
-    plane = image[..., channel].copy()
-    # All channels of a mapped image came into memory.
-    drop_pages(image)
-    return plane
-
-
-def _figures(after: FloatArray, before: FloatArray, sigma: float) -> tuple[float, float]:
-    return _overshoot(after, before, sigma), _noise_gain(after, before)
+def _planes(image: FloatArray) -> Iterator[FloatArray]:
+    """Luminance and, for a colour image, a copy of each channel."""
+    yield luminance(image)
+    for channel in range(3 if image.ndim == 3 else 0):
+        plane, done = np.empty(image.shape[:2], np.float32), 0
+        for part in iter_parts(image):
+            plane[done : done + len(part)] = part[..., channel]
+            done += len(part)
+        yield plane
 
 
 def _overshoot(after: FloatArray, before: FloatArray, sigma: float) -> float:
@@ -208,4 +170,4 @@ def _noise_gain(after: FloatArray, before: FloatArray) -> float:
     deviations = [
         float(np.std((image - cv2.GaussianBlur(image, (0, 0), _DETAIL_WINDOW))[flat])) for image in (after, before)
     ]
-    return deviations[0] / max(deviations[1], 1e-4)
+    return deviations[0] / max(deviations[1], _LEAST_DEVIATION)

@@ -1,37 +1,78 @@
-"""Blind deconvolution: estimate the blur of the fused image, remove it, and check what came out."""
+"""Blind deconvolution: estimate the blur of the fused image, remove it, and check the result.
+
+The width is given or estimated.  A given width is removed whatever the guards say; guards are evaluated but do not
+override an explicit width.  From an estimated width on, attempts with smaller and smaller widths are made until the
+guards pass.  If the blur clearly differs between parts of the image, each attempt removes a width of its own at every
+pixel.
+"""
 
 from __future__ import annotations
 
+import itertools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 from ..blur.blur_cues import BlurBounds
 from ..blur.estimation import BlurEstimate, estimate_blur
 from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray
 from ..core.decision import Decision
-from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, deconvolve
+from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, DeconvolutionState
+from ..deconvolution.memory import deconvolution_memory
 from ..runtime.runtime import DEFAULT, Runtime
-from ..runtime.scratch import to_scratch
-from .blur_map import BlurMap, deconvolve_varying, estimate_blur_map, sigma_map
-from .guards import GuardParams, GuardReading, deconvolve_guarded, judge
+from ..runtime.steps import finish
+from ..runtime.tiling import largest_tile
+from .blur_map import BlurMap, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
+from .decisions import explain_blur, explain_blur_map, explain_guards
+from .guards import GuardParams, GuardReading, evaluate_guards
+from .tiled_deconvolution import MOST_THREADS, deconvolution_tiles, tiled_deconvolution_steps
+
+Result = TypeVar("Result")
+
+# Bytes per pixel, and per pixel and channel, of what is computed before and after the deconvolution; the guards take
+# most.
+_BYTES, _CHANNEL_BYTES = 22, 2
+# The widest blur that an estimate finds, pixels.
+_WIDEST = 21.0
+# Bytes per pixel of the maps of widths, and per pixel and channel of the results of two attempts.
+_WIDTHS_BYTES, _RESULTS_BYTES = 8, 8
+
+
+@dataclass(frozen=True)
+class DeblurState:
+    """Progress of :func:`remove_blur_steps`.
+
+    Attributes
+    ----------
+    sigma : float
+        Width of the blur that is being removed, pixels; the largest one if it differs between pixels.
+    attempt : int
+        Number of the attempt, from 1.
+    iteration : int
+        Iterations done in this attempt, over all its tiles and widths.
+    """
+
+    sigma: float
+    attempt: int
+    iteration: int
 
 
 @dataclass(frozen=True)
 class Deblurred:
-    """A deblurred image and what was decided on the way.
+    """A deblurred image and the decisions on the way to it.
 
     Attributes
     ----------
     deconvolution : Deconvolution
     blur : BlurEstimate or None
-        None where the width was given.
+        None if the width was given.
     tiles : BlurMap or None
-        Widths of tiles; None where the width was given, nothing is blurred or the image is small.
+        Widths of tiles; None if the width or bounds on it were given, or the image is not blurred or small.
     readings : tuple of GuardReading
-        What the guards saw of every width that was tried; empty where no blur was removed.
+        One for each width that was removed; empty if no blur was removed.
     decisions : tuple of Decision
         On the blur and on the guards.
     """
@@ -43,6 +84,9 @@ class Deblurred:
     decisions: tuple[Decision, ...]
 
 
+Steps = Generator[DeblurState, None, Result]
+
+
 def remove_blur(
     image: FloatArray,
     guide: FloatArray,
@@ -50,31 +94,28 @@ def remove_blur(
     guards: GuardParams | None = None,
     bounds: BlurBounds | None = None,
     runtime: Runtime = DEFAULT,
-    progress: Callable[[int], None] | None = None,
+    *,
+    held: float = 0.0,
 ) -> Deblurred:
-    """Deblur an image by the width asked for, else by the width estimated, as far as the guards allow.
-
-    Where the blur clearly differs between tiles of the image, every pixel gets a width of its own.  Tiles are looked at
-    in another thread while the image is deblurred by one width, or before that where memory is limited.
-
-    A width asked for is removed whatever the guards say; they are heard all the same.
+    """Remove a blur of given or of estimated width.
 
     Parameters
     ----------
     image : ndarray, float32, shape (H, W) or (H, W, 3)
         Blurred image.
     guide : ndarray, float32, shape of ``image``
-        What the nonlocal weights are taken from.
+        Image that the nonlocal weights are computed from.
     deconvolution : DeconvolutionParams, optional
-        Method, and width where it is known.
+        Method, and the width if it is known.
     guards : GuardParams, optional
         Bounds that the result must keep.
     bounds : BlurBounds, optional
-        What an estimated width is kept within.
+        Bounds on an estimated width; the width is then the same for the whole image.
     runtime : Runtime
-        Threads, device, most memory to take, and a folder for the images; without one they stay in memory.
-    progress : callable, optional
-        Called with the number of iterations done, in an attempt by one width.
+        Threads, device, memory limit, and the folder of files that hold images; without one they stay in memory.  If
+        the memory limit is too small for the whole image, it is deconvolved in tiles.
+    held : float
+        Bytes that the process already takes, the images included; they count towards the memory limit.
 
     Returns
     -------
@@ -83,9 +124,11 @@ def remove_blur(
     Raises
     ------
     DataError
-        Shapes do not agree, or values are not finite.
+        The shapes differ, or values are not finite.
+    ConfigurationError
+        The memory limit is too small even for tiles.
     StorageError
-        There is no room for the file.
+        The folder has no room for the images.
 
     Examples
     --------
@@ -96,60 +139,133 @@ def remove_blur(
     >>> result.decisions
     (Decision(subject='blur', choice='none removed', reason='asked for'),)
     """
-    folder = runtime.scratch
-    deconvolution, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
-    blind = deconvolution.sigma is None
-    exponent = deconvolution.exponent or KOLMOGOROV
-    blur = estimate_blur(image, exponent=exponent, threads=runtime.workers) if blind else None
-    sigma, settings = blur_to_remove(blur, deconvolution, bounds)
+    return finish(remove_blur_steps(image, guide, deconvolution, guards, bounds, runtime, held=held))
 
-    def remove(width: float, progress: Callable[[int], None] | None = None) -> Deconvolution:
-        result = deconvolve(image, width, settings, guide, runtime, progress)
-        return replace(result, image=to_scratch(result.image, folder))
 
-    tiles, first = None, None
+def remove_blur_steps(
+    image: FloatArray,
+    guide: FloatArray,
+    deconvolution: DeconvolutionParams | None = None,
+    guards: GuardParams | None = None,
+    bounds: BlurBounds | None = None,
+    runtime: Runtime = DEFAULT,
+    *,
+    held: float = 0.0,
+) -> Steps[Deblurred]:
+    """Remove a blur step by step; see :func:`remove_blur`.
+
+    Parameters
+    ----------
+    image, guide, deconvolution, guards, bounds, runtime, held
+        See :func:`remove_blur`.
+
+    Yields
+    ------
+    DeblurState
+        After each iteration of each attempt.
+
+    Returns
+    -------
+    Deblurred
+
+    Raises
+    ------
+    DataError, ConfigurationError, StorageError
+        See :func:`remove_blur`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> flat, params = np.full((32, 32), 0.5, np.float32), DeconvolutionParams(method="wiener", sigma=1.5, iterations=1)
+    >>> list(remove_blur_steps(flat, flat, params))
+    [DeblurState(sigma=1.5, attempt=1, iteration=1)]
+    """
+    params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
+    exponent = params.exponent or KOLMOGOROV
+    blur = estimate_blur(image, exponent=exponent, runtime=runtime) if params.sigma is None else None
+    sigma, params = blur_to_remove(blur, params, bounds)
+    memory = None
+    if runtime.memory_limit is not None:
+        memory = runtime.memory_limit - held - _image_bytes(image.shape, runtime.scratch is not None)
+    numbers = itertools.count(1)
+
+    def remove(width: float) -> Generator[DeconvolutionState, None, Deconvolution]:
+        tiles = deconvolution_tiles(image.shape, replace(params, sigma=width), memory)
+        return tiled_deconvolution_steps(image, width, params, guide, runtime, tiles)
+
+    tiles, first, widths = None, None, None
     if blur is not None and blur.blurred and bounds is None:
-        if runtime.memory_limit is not None:
-            # Both at once may take more than is allowed.
-            tiles = estimate_blur_map(image, blur)
+        if memory is None:
+            tiles, first = yield from _map_meanwhile(image, blur, _label(remove(sigma), sigma, next(numbers)))
         else:
-            tiles, first = _map_meanwhile(image, blur, lambda: remove(sigma, progress))
-    widths = None if tiles is None or not tiles.varies else sigma_map(tiles.removable, image.shape[:2])
-    if widths is not None:
+            tiles = estimate_blur_map(image, blur, runtime)
+    if tiles is not None and tiles.varies:
+        widths, first = sigma_map(tiles.removable, image.shape[:2]), None
         sigma = float(widths.max())
 
-    def attempt(width: float) -> Deconvolution:
-        if widths is not None and width > 0:
-            return deconvolve_varying(remove, widths * (width / sigma), folder)
-        return first if first is not None and first.sigma == width else remove(width, progress)
+    def attempt(width: float) -> Steps[Deconvolution]:
+        one = widths is None or width == 0
+        steps = remove(width) if one else varying_deconvolution_steps(remove, widths * (width / sigma), runtime)
+        return _label(steps, width, next(numbers))
 
-    if blind:
-        result, readings = deconvolve_guarded(attempt, image, sigma, guards)
+    if blur is None:
+        result = yield from attempt(sigma)
+        readings = (evaluate_guards(result.image, image, sigma, guards),) if sigma > 0 else ()
     else:
-        result = attempt(sigma)
-        readings = (judge(result.image, image, sigma, guards),) if sigma > 0 else ()
-    decisions = (_on_blur(blur, sigma, tiles), *_on_tiles(tiles), *_on_guards(result, readings, guards))
+        result, readings = yield from guarded_steps(attempt, image, sigma, guards, first)
+    on_guards = explain_guards(result.sigma, readings, guards)
+    decisions = (explain_blur(blur, sigma, tiles), *explain_blur_map(tiles), *on_guards)
     return Deblurred(result, blur, tiles, readings, decisions)
+
+
+def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side: int | None = None) -> float:
+    """Return the memory that :func:`remove_blur` takes beside the blurred image and its guide.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        (H, W) or (H, W, 3).
+    params : DeconvolutionParams
+        Method, and the width if it is known; otherwise the memory is that of the widest blur.
+    side : int, optional
+        Longest side of the tiles, pixels; by default the image is not split.
+
+    Returns
+    -------
+    float
+        Bytes; results are in memory, not in files.
+
+    Examples
+    --------
+    >>> params = DeconvolutionParams(sigma=1.5)
+    >>> remove_blur_memory((2000, 2000), params, side=512) < remove_blur_memory((2000, 2000), params)
+    True
+    """
+    pixels, channels = shape[0] * shape[1], shape[2] if len(shape) == 3 else 1
+    part = shape if side is None else (*largest_tile((shape[0], shape[1]), side), *shape[2:])
+    beside = float(pixels * (_BYTES + channels * _CHANNEL_BYTES))
+    params = params if params.sigma is not None else replace(params, sigma=_WIDEST)
+    return _image_bytes(shape, in_file=False) + max(beside, deconvolution_memory(part, params, MOST_THREADS))
 
 
 def blur_to_remove(
     estimate: BlurEstimate | None, deconvolution: DeconvolutionParams, bounds: BlurBounds | None = None
 ) -> tuple[float, DeconvolutionParams]:
-    """Width of the blur, and settings that know its shape: those asked for, else those estimated.
+    """Decide on the width to remove, and complete the settings by the shape of the blur.
 
     Parameters
     ----------
     estimate : BlurEstimate or None
-        Needed where ``deconvolution.sigma`` is None.
+        Needed if ``deconvolution.sigma`` is None.
     deconvolution : DeconvolutionParams
         Settings.
     bounds : BlurBounds, optional
-        What an estimated width is kept within.
+        Bounds on an estimated width.
 
     Returns
     -------
     sigma : float
-        Pixels.
+        The given width, otherwise the one that is safe to remove within the bounds; pixels.
     deconvolution : DeconvolutionParams
 
     Examples
@@ -166,58 +282,106 @@ def blur_to_remove(
     return sigma, replace(deconvolution, exponent=estimate.exponent)
 
 
-def _map_meanwhile(
-    image: FloatArray, blur: BlurEstimate, remove: Callable[[], Deconvolution]
-) -> tuple[BlurMap | None, Deconvolution]:
-    """Widths of tiles, and the image without a blur of one width.
+def guarded_steps(
+    attempt: Callable[[float], Steps[Deconvolution]],
+    blurred: FloatArray,
+    sigma: float,
+    guards: GuardParams,
+    first: Deconvolution | None = None,
+) -> Steps[tuple[Deconvolution, tuple[GuardReading, ...]]]:
+    """Deconvolve by smaller and smaller widths until the guards pass.
 
-    Widths keep one core busy, the deconvolution all of them but for pauses; and seldom does the blur vary.
+    Parameters
+    ----------
+    attempt : callable
+        Returns the generator that deconvolves ``blurred`` by a width in pixels.
+    blurred : ndarray, float32, shape (H, W) or (H, W, 3)
+    sigma : float
+        First width, pixels.
+    guards : GuardParams
+        Bounds.
+    first : Deconvolution, optional
+        Result of the first attempt, if it has already been made.
+
+    Yields
+    ------
+    DeblurState
+
+    Returns
+    -------
+    result : Deconvolution
+        The first that passes; the image without any blur removed if none does.
+    readings : tuple of GuardReading
+        One for each attempt.
+
+    Raises
+    ------
+    DataError
+        Values are not finite.
+
+    Examples
+    --------
+    >>> from turbrestore.deconvolution.deconvolve import deconvolve_steps
+    >>> import numpy as np
+    >>> image = np.full((32, 32), 0.5, np.float32)
+    >>> steps = guarded_steps(lambda width: deconvolve_steps(image, width), image, 0.0, GuardParams())
+    >>> result, readings = finish(steps)
+    >>> result.sigma, readings
+    (0.0, ())
     """
-    ended = threading.Event()
-    with ThreadPoolExecutor(1) as pool:
-        tiles = pool.submit(estimate_blur_map, image, blur, ended.is_set)
+    readings: list[GuardReading] = []
+    while sigma > 0 and len(readings) < guards.tries:
+        result, first = first or (yield from attempt(sigma)), None
+        readings.append(evaluate_guards(result.image, blurred, sigma, guards))
+        if readings[-1].passed:
+            return result, tuple(readings)
+        sigma *= guards.back_off
+    result = yield from attempt(0.0)
+    return result, tuple(readings)
+
+
+def _label(steps: Generator[Any, None, Result], sigma: float, attempt: int) -> Steps[Result]:
+    """Pass on the steps of a deconvolution as those of an attempt."""
+    iteration = 0
+    while True:
         try:
-            result = remove()
-            return tiles.result(), result
+            next(steps)
+        except StopIteration as end:
+            return end.value
+        iteration += 1
+        yield DeblurState(sigma, attempt, iteration)
+
+
+def _map_meanwhile(
+    image: FloatArray, blur: BlurEstimate, steps: Steps[Deconvolution]
+) -> Steps[tuple[BlurMap | None, Deconvolution]]:
+    """Estimate the widths of tiles in another thread while the image is deconvolved by one width.
+
+    The estimate keeps one core busy, whereas the deconvolution leaves cores idle now and then; and its result can be
+    used, because the blur rarely varies.
+    """
+    stopped = threading.Event()
+
+    def find_map() -> BlurMap | None:
+        tiles = blur_map_steps(image, blur, Runtime(threads=1))
+        while not stopped.is_set():
+            try:
+                next(tiles)
+            except StopIteration as end:
+                return end.value
+        return None
+
+    with ThreadPoolExecutor(1) as pool:
+        found = pool.submit(find_map)
+        try:
+            result = yield from steps
+            return found.result(), result
         finally:
-            # After an error or an interrupt nobody waits for all tiles.
-            ended.set()
+            # After an error, or if the caller leaves, the remaining tiles are not needed.
+            stopped.set()
 
 
-def _on_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None) -> Decision:
-    choice = f"{sigma:.2f} pixels removed" if sigma > 0 else "none removed"
-    if blur is None:
-        return Decision("blur", choice, "asked for")
-    if tiles is not None and tiles.varies:
-        choice = f"{tiles.removable.min():.2f} to {tiles.removable.max():.2f} pixels removed"
-    found = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels found in the whole image"
-    where = "" if blur.reduction == 1 else f", reduced by {blur.reduction}"
-    left = ", half of the uncertainty is left in" if sigma > 0 else ", no more than a sharp image has"
-    return Decision("blur", choice, found + where + left)
-
-
-def _on_tiles(tiles: BlurMap | None) -> tuple[Decision, ...]:
-    if tiles is None:
-        return ()
-    choice = "a width for every pixel" if tiles.varies else "one width for the whole image"
-    rows, columns = tiles.sigmas.shape
-    found = f"{tiles.sigmas.min():.2f} to {tiles.sigmas.max():.2f} pixels in {rows}×{columns} tiles"
-    return (Decision("blur by tiles", choice, f"{found}, {'more' if tiles.varies else 'no more'} than chance allows"),)
-
-
-def _on_guards(result: Deconvolution, readings: tuple[GuardReading, ...], guards: GuardParams) -> tuple[Decision, ...]:
-    if not readings:
-        return ()
-    first, last = readings[0], readings[-1]
-    if last.passed:
-        choice = "passed" if len(readings) == 1 else f"blur lowered from {first.sigma:.2f} to {last.sigma:.2f} pixels"
-    else:
-        choice = "failed, kept as asked" if result.sigma > 0 else "failed at every width, no blur removed"
-    return (
-        Decision(
-            "guards",
-            choice,
-            f"at {first.sigma:.2f} px {first.overshoot:.1%} of the image overshoots (bound {guards.overshoot:.0%}), "
-            f"noise of flat regions × {first.noise_gain:.2f} (bound {guards.noise_gain:g})",
-        ),
-    )
+def _image_bytes(shape: tuple[int, ...], in_file: bool) -> float:
+    """Bytes of the maps of widths and of the results of two attempts, unless these are in files."""
+    channels = shape[2] if len(shape) == 3 else 1
+    return float(shape[0] * shape[1] * (_WIDTHS_BYTES + (0 if in_file else channels * _RESULTS_BYTES)))

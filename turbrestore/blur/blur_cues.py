@@ -1,7 +1,12 @@
-"""What the pipeline takes from the relative blur of its images: size of the motion, bounds on the width of the blur.
+"""Cues from the relative blur of images of one scene: bounds on the width of a blur, and the size of the motion.
 
-Second moments of blur add, so the difference of two images of one scene is known without knowing the scene
-(:mod:`turbrestore.blur_moments.cues`).
+The second moments of successive blurs add, so the difference between the blurs of two images of one scene can be
+measured without knowing the scene (:mod:`turbrestore.blur_moments.cues`).
+
+Symbols
+-------
+σ² : second moment of a blur, squared pixels
+F, M, R : the fused image, the temporal mean of the frames, the sharpest frames
 """
 
 from __future__ import annotations
@@ -20,19 +25,23 @@ from ..runtime.scratch import iter_frames
 from .estimation import estimate_blur
 from .psf import KOLMOGOROV
 
-# Frames that the noise of a frame is measured on.
+# Number of frames on which the noise of a frame is measured.
 _NOISE_FRAMES = 8
-# Tiles overlap by half along both axes: of four, one is independent.
+# Tiles overlap by half along both axes, so one in four is independent.
 _TILE_OVERLAP = 4
-# Standard deviation of tiles from which on they say nothing of the blur, squared pixels.
-_NOTHING_SEEN = 0.5
-# Widths of two images, estimated blindly, agree within this share: they depend on the scene in the same way.
+# Tiles whose measured variance has a standard deviation of this or more are ignored, squared pixels.
+_LARGEST_DEVIATION = 0.5
+# Smallest relative error of a width that is estimated blindly.
 _WIDTH_ERROR = 0.1
+# Bytes per pixel that the cues take; per pixel and frame that they are measured on; and of the tiles that are fitted
+# together: at most, per pixel of two images, and per pixel and frame.
+_BYTES, _FRAME_BYTES = 17.0, 0.25
+_FIT_BYTES, _PAIR_FIT, _FRAME_FIT = 200e6, 80.0, 4.7
 
 
 @dataclass(frozen=True)
 class BlurBounds:
-    """What the width of a blur may be.
+    """Bounds on the width of a blur.
 
     Attributes
     ----------
@@ -47,35 +56,34 @@ class BlurBounds:
 def bound_blur(
     fused: ArrayLike, mean: ArrayLike, training: FloatArray, count: int, exponent: float = KOLMOGOROV
 ) -> BlurBounds:
-    """Bounds on the width of the blur of a fused image, from images of the same scene.
+    """Bound the width of the blur of a fused image by comparing it with other images of the same scene.
 
-    Second moments of blur add, so the difference of two is known without knowing the scene.  The fused image is at
-    least as blurred as it is more so than the sharpest frames; and the blur of the temporal mean, estimated blindly,
-    less what the mean is wider, is what the fused image has at most.  Both bounds are moved outwards by two standard
-    deviations, of which the estimated width has at least 10 %.
+    ``σ_F² ≥ σ_F² − σ_R²``, where the difference is measured against the sharpest frames, and
+    ``σ_F² = σ_M² − (σ_M² − σ_F²)``, where σ_M is estimated blindly and the difference is measured.  Both bounds are
+    moved outwards by two standard deviations; that of σ_M is taken to be at least 10 %.
 
     Parameters
     ----------
     fused : array_like, shape (H, W) or (H, W, 3)
         Registered and averaged frames.
     mean : array_like, shape of ``fused``
-        Temporal mean of ``count`` frames as they are.
+        Temporal mean of ``count`` frames, not registered.
     training : ndarray, float32, shape (T, H, W) or (T, H, W, 3), at least two
         Some of the frames.
     count : int
-        Number of frames that the mean is one of.
+        Number of frames that were averaged in ``mean``.
     exponent : float
         Shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`.
 
     Returns
     -------
     BlurBounds
-        Zero and infinity where the bounds found contradict each other.
+        Zero and infinity if the two bounds contradict each other.
 
     Raises
     ------
     DataError
-        Shapes do not agree.
+        The shapes differ.
 
     Examples
     --------
@@ -89,10 +97,11 @@ def bound_blur(
     noise, own_noise = typical_noise(training), estimate_noise(fused)
     sharpest, _ = refer_blur(training, noise)
     above = blur_against(np.asarray(fused)[None], sharpest, own_noise)
-    seen = above.deviation < _NOTHING_SEEN
-    precision = np.sum(above.deviation[seen] ** -2.0)
-    low = np.sum(above.extra[seen] / above.deviation[seen] ** 2) / precision if seen.any() else 0.0
-    low -= 2 * np.sqrt(_TILE_OVERLAP / precision) if seen.any() else 0.0
+    usable = above.deviation < _LARGEST_DEVIATION
+    low = 0.0
+    if usable.any():
+        weights = above.deviation[usable] ** -2.0
+        low = np.average(above.extra[usable], weights=weights) - 2 * np.sqrt(_TILE_OVERLAP / weights.sum())
     wider = relative_blur(mean, fused, (noise / np.sqrt(count), own_noise))
     widest = estimate_blur(mean, exponent=exponent)
     error = max(widest.uncertainty, _WIDTH_ERROR * widest.sigma)
@@ -101,8 +110,33 @@ def bound_blur(
     return BlurBounds(low, high) if low <= high else BlurBounds(0.0, float("inf"))
 
 
+def bound_blur_memory(shape: tuple[int, ...], frame_count: int) -> float:
+    """Return the memory that :func:`bound_blur` takes beside its images.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        (H, W) or (H, W, 3).
+    frame_count : int
+        Number of ``training`` frames.
+
+    Returns
+    -------
+    float
+        Bytes.
+
+    Examples
+    --------
+    >>> bound_blur_memory((1000, 1000), frame_count=10)
+    146500000.0
+    """
+    pixels = shape[0] * shape[1]
+    fit = min(_FIT_BYTES, (_PAIR_FIT + _FRAME_FIT * frame_count) * pixels)
+    return (_BYTES + _FRAME_BYTES * frame_count) * pixels + fit
+
+
 def displacement_maps(training: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Displacement variance at every pixel, from the blur of the mean of frames, and its standard deviation.
+    """Map the variance of the displacement, measured from the blur of the temporal mean, and its standard deviation.
 
     Parameters
     ----------
@@ -111,7 +145,7 @@ def displacement_maps(training: FloatArray) -> tuple[FloatArray, FloatArray]:
     Returns
     -------
     variance, deviation : ndarray, float32, shape (H, W)
-        Squared pixels, mean of both axes; the deviation is infinite where nothing is to be seen.
+        Squared pixels, mean over both axes; the deviation is infinite where the scene has no texture.
 
     Examples
     --------
@@ -123,15 +157,15 @@ def displacement_maps(training: FloatArray) -> tuple[FloatArray, FloatArray]:
     cue = displacement_variance(training, typical_noise(training))
     precision = tile_map(cue.tile_deviation**-2.0, cue.grid)
     weighted = tile_map(cue.tile_variance * cue.tile_deviation**-2.0, cue.grid)
-    seen = precision > 0
-    variance = np.divide(weighted, precision, out=np.zeros_like(weighted), where=seen)
+    known = precision > 0
+    variance = np.divide(weighted, precision, out=np.zeros_like(weighted), where=known)
     deviation = np.full_like(variance, np.inf)
-    deviation[seen] = precision[seen] ** -0.5
+    deviation[known] = precision[known] ** -0.5
     return variance, deviation
 
 
 def typical_noise(frames: FloatArray) -> float:
-    """Measure the noise of a frame: standard deviation, median over a few frames.
+    """Estimate the noise of a single frame: median over a few frames of its standard deviation.
 
     Parameters
     ----------

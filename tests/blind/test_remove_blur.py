@@ -1,0 +1,107 @@
+"""Blind deconvolution: which width is removed, what the guards do about it, and how that is explained."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from turbrestore.blind.guards import GuardParams
+from turbrestore.blind.remove_blur import DeblurState, guarded_steps, remove_blur, remove_blur_memory, remove_blur_steps
+from turbrestore.blur.psf import KOLMOGOROV, blur_otf
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps
+from turbrestore.metrics import psnr
+from turbrestore.runtime.runtime import Runtime
+from turbrestore.runtime.steps import finish
+from turbrestore.synthesis.scenes import SCENES
+
+WIENER = DeconvolutionParams(method="wiener")
+
+
+@pytest.fixture(scope="module")
+def camera():
+    scene = SCENES["camera"](128, 128)
+    spectrum = np.fft.rfft2(scene) * blur_otf(scene.shape, 1.6, KOLMOGOROV)
+    noise = np.random.default_rng(0).normal(0, 0.002, scene.shape)
+    return scene, (np.fft.irfft2(spectrum, scene.shape) + noise).astype(np.float32)
+
+
+def test_a_blind_result_is_sharper_and_closer_to_the_scene(camera):
+    scene, image = camera
+    result = remove_blur(image, image, WIENER)
+    assert result.blur.sigma == pytest.approx(1.6, rel=0.25)
+    assert result.deconvolution.sigma == result.blur.removable == result.readings[0].sigma
+    assert psnr(result.deconvolution.image, scene) > psnr(image, scene) + 1
+    assert [decision.subject for decision in result.decisions] == ["blur", "guards"]
+    assert result.decisions[1].choice == "passed"
+
+
+def test_a_failed_guard_lowers_the_width(camera):
+    _, image = camera
+    free = remove_blur(image, image, WIENER)
+    bound = free.readings[0].noise_gain * 0.9
+    result = remove_blur(image, image, WIENER, GuardParams(noise_gain=bound))
+    assert 0 < result.deconvolution.sigma < free.deconvolution.sigma
+    assert [reading.passed for reading in result.readings][-2:] == [False, True]
+    assert result.decisions[1].choice.startswith(f"blur lowered from {free.deconvolution.sigma:.2f} to")
+
+
+def test_if_every_width_fails_nothing_is_removed(camera):
+    _, image = camera
+    result = remove_blur(image, image, WIENER, GuardParams(noise_gain=1.0, overshoot=0.0, tries=2))
+    assert result.deconvolution.sigma == 0
+    assert np.array_equal(result.deconvolution.image, image)
+    assert "no blur removed" in result.decisions[1].choice
+
+
+def test_guards_do_not_override_a_given_width(camera):
+    _, image = camera
+    result = remove_blur(image, image, replace(WIENER, sigma=4.0))
+    assert result.blur is None
+    assert result.deconvolution.sigma == 4.0
+    assert not result.readings[0].passed
+    assert result.decisions[0].reason == "asked for"
+    assert result.decisions[1].choice == "failed, kept because the width was given"
+
+
+@pytest.mark.parametrize("name", ["chart", "camera", "brick", "grass", "words"])
+def test_a_width_far_too_large_is_lowered(name):
+    scene = SCENES[name](128, 128)
+    spectrum = np.fft.rfft2(scene) * blur_otf(scene.shape, 2.0, 2.0)
+    noise = np.random.default_rng(1).normal(0, 0.002, scene.shape)
+    image = (np.fft.irfft2(spectrum, scene.shape) + noise).astype(np.float32)
+    attempt = partial(deconvolve_steps, image, params=replace(WIENER, exponent=2.0))
+    result, readings = finish(guarded_steps(attempt, image, 4.4, GuardParams()))
+    assert not readings[0].passed
+    assert readings[-1].passed
+    assert 0 < result.sigma == readings[-1].sigma < 4.4
+
+
+def test_every_iteration_of_every_attempt_is_a_step(camera):
+    _, image = camera
+    bound = GuardParams(noise_gain=1.0, overshoot=0.0, tries=2)
+    states = list[DeblurState]()
+    result = finish(remove_blur_steps(image, image, replace(WIENER, iterations=3, tolerance=0), bound), states.append)
+    widths = [reading.sigma for reading in result.readings]
+    expected = [DeblurState(widths[attempt - 1], attempt, step) for attempt in (1, 2) for step in (1, 2, 3)]
+    assert states == expected
+
+
+def test_a_run_may_end_between_two_steps(camera):
+    _, image = camera
+    steps = remove_blur_steps(image, image, WIENER)
+    assert next(steps).iteration == 1
+    steps.close()
+
+
+def test_a_memory_limit_splits_the_image_only_where_it_is_needed(camera):
+    _, image = camera
+    wide = np.tile(image, (4, 5))
+    fixed = replace(WIENER, sigma=1.6, tolerance=1e-4)
+    whole = remove_blur(wide, wide, fixed)
+    enough = remove_blur_memory(wide.shape, fixed)
+    assert remove_blur_memory(wide.shape, fixed, side=384) < enough
+    for limit, same in ((1.01 * enough, True), (0.95 * enough, False)):
+        limited = remove_blur(wide, wide, fixed, runtime=Runtime(memory_limit=limit + 1e6), held=1e6)
+        assert np.array_equal(limited.deconvolution.image, whole.deconvolution.image) == same
+        assert np.abs(limited.deconvolution.image - whole.deconvolution.image).max() < 0.02

@@ -1,0 +1,107 @@
+"""Wording of the decisions on the blur and on the guards."""
+
+from __future__ import annotations
+
+from ..blur.estimation import BlurEstimate
+from ..core.decision import Decision
+from .blur_map import BlurMap
+from .guards import GuardParams, GuardReading
+
+
+def explain_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None = None) -> Decision:
+    """Explain which width is removed.
+
+    Parameters
+    ----------
+    blur : BlurEstimate or None
+        None if the width was given.
+    sigma : float
+        Width of the first attempt, pixels.
+    tiles : BlurMap, optional
+        Widths of tiles.
+
+    Returns
+    -------
+    Decision
+
+    Examples
+    --------
+    >>> explain_blur(None, 1.5)
+    Decision(subject='blur', choice='1.50 pixels removed', reason='asked for')
+    """
+    choice = f"{sigma:.2f} pixels removed" if sigma > 0 else "none removed"
+    if blur is None:
+        return Decision("blur", choice, "asked for")
+    if tiles is not None and tiles.varies:
+        choice = f"{tiles.removable.min():.2f} to {tiles.removable.max():.2f} pixels removed"
+    found = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels found in the whole image"
+    where = "" if blur.reduction == 1 else f", reduced by {blur.reduction}"
+    remark = ", half of the uncertainty is left in" if sigma > 0 else ", no more than a sharp image has"
+    return Decision("blur", choice, found + where + remark)
+
+
+def explain_blur_map(tiles: BlurMap | None) -> tuple[Decision, ...]:
+    """Explain whether every pixel gets a width of its own.
+
+    Parameters
+    ----------
+    tiles : BlurMap or None
+        None if the image was not split into tiles.
+
+    Returns
+    -------
+    tuple of Decision
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> [decision] = explain_blur_map(BlurMap(np.ones((2, 2)), np.zeros((2, 2)), varies=False))
+    >>> decision.choice, decision.reason
+    ('one width for the whole image', '1.00 to 1.00 pixels in 2×2 tiles, equal within their uncertainties')
+    """
+    if tiles is None:
+        return ()
+    choice = "a width for every pixel" if tiles.varies else "one width for the whole image"
+    rows, columns = tiles.sigmas.shape
+    found = f"{tiles.sigmas.min():.2f} to {tiles.sigmas.max():.2f} pixels in {rows}×{columns} tiles"
+    remark = "clearly different" if tiles.varies else "equal within their uncertainties"
+    return (Decision("blur by tiles", choice, f"{found}, {remark}"),)
+
+
+def explain_guards(sigma: float, readings: tuple[GuardReading, ...], guards: GuardParams) -> tuple[Decision, ...]:
+    """Explain what the guards measured and what followed from it.
+
+    Parameters
+    ----------
+    sigma : float
+        Width that was removed in the end, pixels; 0 if none was.
+    readings : tuple of GuardReading
+        One for each attempt.
+    guards : GuardParams
+        The bounds.
+
+    Returns
+    -------
+    tuple of Decision
+        Empty without a reading.
+
+    Examples
+    --------
+    >>> [decision] = explain_guards(2.0, (GuardReading(2.0, 0.01, 1.5, passed=True),), GuardParams())
+    >>> decision.choice
+    'passed'
+    >>> decision.reason
+    'at 2.00 px 1.0% of the image overshoots (bound 12%), noise of flat regions × 1.50 (bound 6)'
+    """
+    if not readings:
+        return ()
+    first, last = readings[0], readings[-1]
+    if last.passed:
+        choice = "passed" if len(readings) == 1 else f"blur lowered from {first.sigma:.2f} to {last.sigma:.2f} pixels"
+    else:
+        choice = "failed, kept because the width was given" if sigma > 0 else "failed at every width, no blur removed"
+    reason = (
+        f"at {first.sigma:.2f} px {first.overshoot:.1%} of the image overshoots (bound {guards.overshoot:.0%}), "
+        f"noise of flat regions × {first.noise_gain:.2f} (bound {guards.noise_gain:g})"
+    )
+    return (Decision("guards", choice, reason),)
