@@ -30,7 +30,7 @@ from .filtering.alternating import filter_memory
 from .registration.flow import MIN_SIDE, flow_memory
 from .runtime.device import TORCH_BYTES, find_device, needs_torch
 from .runtime.jit import COMPILER_BYTES
-from .runtime.memory_size import size_text
+from .runtime.memory_size import MemorySize, size_text
 from .runtime.runtime import Runtime
 from .runtime.tiling import HALO, halo_tiles, largest_tile
 from .settings import RestoreParams
@@ -68,7 +68,7 @@ class MemoryPlan:
         Longest side of the tiles in which frames are processed, pixels; None for whole frames.
     scratch_bytes : int
         Size of all scratch files.
-    deconvolution : float or None
+    deconvolution : MemorySize or None
         Bytes that are left for the deconvolution; None where there is no limit.
     decisions : tuple of Decision
         What the limit has caused, in words.
@@ -78,7 +78,7 @@ class MemoryPlan:
     runtime: Runtime
     tile: int | None = None
     scratch_bytes: int = 0
-    deconvolution: float | None = None
+    deconvolution: MemorySize | None = None
     decisions: tuple[Decision, ...] = ()
 
 
@@ -143,7 +143,7 @@ def plan_memory(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime)
         chosen,
         choice.tile,
         _scratch_bytes(shape, params, choice) if choice.in_scratch else 0,
-        limit - base - _held_by_deconvolution(shape, params, choice),
+        MemorySize(limit - base - _held_by_deconvolution(shape, params, choice)),
         tuple(_decisions(shape, params, choice, _Choice(train, most), base, limit)),
     )
 

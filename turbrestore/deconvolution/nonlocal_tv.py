@@ -68,7 +68,7 @@ class NonlocalPenalty:
         return self.graph.norm_squared()
 
     def zero_dual(self, u: FloatArray) -> PairDual:
-        """p = 0."""
+        """P = 0."""
         return PairDual(np.zeros((2, len(self.graph.heads)), np.float32), *np.zeros((2, u.size), np.float32))
 
     def ascend(self, p: PairDual, u: FloatArray, step: float, relaxation: float) -> tuple[PairDual, FloatArray]:

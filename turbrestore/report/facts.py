@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from ..metrics import sharpness
+from ..results import Restoration
 from ..runs.run_record import RunRecord
 from ..runtime.scratch import variance_of
-from ..settings import Restoration, RestoreParams
+from ..settings import RestoreParams
 
 _STAGE_NAMES = {
     "read": "Reading",

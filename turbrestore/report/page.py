@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigurationError
 from ..io.images import atomic_write, check_output
+from ..results import Restoration
 from ..runs.run_record import RunRecord
-from ..settings import Restoration
 from .facts import findings, headline, laps, remarks, settings
 from .panels import draw_panels
 from .pictures import encode_gallery, stages

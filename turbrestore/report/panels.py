@@ -19,8 +19,8 @@ from ..display.plots import (
 )
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
+from ..results import Restoration
 from ..runs.run_record import RunRecord
-from ..settings import Restoration
 from .vector import inline_svg
 
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, from_unit
 from ..display.preview import data_uri, encode_image, shrink
+from ..results import Restoration
 from ..runtime.scratch import iter_frames, iter_parts
-from ..settings import Restoration
 
 # Most bytes of all lossless images together, before base64: with half a megabyte of plots the page is below 2 MB.
 _LOSSLESS_BYTES = 1_050_000
