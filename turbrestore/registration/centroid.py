@@ -32,8 +32,9 @@ from ..runtime.scratch import fill_frames, iter_frames, mean_of, new_stack
 from ..runtime.steps import finish
 from ..runtime.threads import map_ahead, sum_in_threads
 from .flow import FlowFrame, FlowParams, measure_flows, prepare_reference
+from .flow_algebra import compose_flows, invert_flow
 from .global_shift import mean_stabilised
-from .warp import compose_flows, inside, invert_flow, warp
+from .warp import inside, warp
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
