@@ -96,10 +96,10 @@ def flow_confidence(reference: ArrayLike) -> FlowConfidence:
     image = luminance(check_image(reference, "reference"))
     smooth = cv2.GaussianBlur(image, (0, 0), _GRADIENT_WINDOW)
     dx, dy = cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32
-    xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW) for product in (dx * dx, dx * dy, dy * dy))
+    xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW).ravel() for product in (dx * dx, dx * dy, dy * dy))
     noise = np.float32(_NOISE_MARGIN * _GRADIENT_NOISE * estimate_noise(image) ** 2)
     tensor = np.empty((3, *image.shape), np.float32)
-    subtract_noise(noise, *(plane.reshape(-1) for plane in (xx, xy, yy)), tensor.reshape(3, -1))
+    subtract_noise(noise, xx, xy, yy, tensor.reshape(3, -1))
     tensors = [tensor]
     while min(tensors[-1].shape[1:]) > 1:
         tensors.append(np.stack([cv2.pyrDown(plane) for plane in tensors[-1]]))

@@ -123,8 +123,9 @@ def sweep(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams, o
         return _sweep_on_device(problem, flow, dual, params)
     steps = np.array([params.step, params.dual_step, params.shrink, params.count], flow.dtype)
     u, ahead = flow.copy(), flow.copy()
-    for frame in zip(problem.direction, problem.offset, problem.bound, u, ahead, dual, strict=True):
-        sweep_frame(*frame, steps)
+    for number, p in enumerate(dual):
+        data_term = problem.direction[number], problem.offset[number], problem.bound[number]
+        sweep_frame(*data_term, u[number], ahead[number], p, steps)
     return u
 
 

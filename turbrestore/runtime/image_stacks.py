@@ -150,9 +150,9 @@ def torch_ops(device: str) -> StackOps:
     def filtered(stack: Stack, kernel_x: FloatArray, kernel_y: FloatArray) -> Stack:
         half = len(kernel_y) // 2, len(kernel_x) // 2
         planes = _reflect(planes_of(stack), half, half, torch)
-        kernels = (torch.from_numpy(kernel)[None].to(stack.device) for kernel in (kernel_x, kernel_y))
+        along, across = (torch.from_numpy(kernel)[None].to(stack.device) for kernel in (kernel_x, kernel_y))
         with full_precision():
-            return filter2d_separable(planes, *kernels, padding="valid").reshape(stack.shape)
+            return filter2d_separable(planes, along, across, padding="valid").reshape(stack.shape)
 
     def resized(stack: Stack, size: Shape) -> Stack:
         planes = functional.interpolate(planes_of(stack), size=size, mode="bilinear", align_corners=False)
