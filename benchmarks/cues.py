@@ -22,7 +22,8 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.metrics import psnr
 from turbrestore.registration.flow import estimate_flow
-from turbrestore.registration.warp import invert_flow, warp
+from turbrestore.registration.flow_algebra import invert_flow
+from turbrestore.registration.warp import warp
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 

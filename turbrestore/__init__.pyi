@@ -38,9 +38,9 @@ from .registration.centroid import CentroidParams as CentroidParams
 from .registration.centroid import find_centroid as find_centroid
 from .registration.flow import FlowParams as FlowParams
 from .registration.flow import estimate_flow as estimate_flow
+from .registration.flow_algebra import compose_flows as compose_flows
+from .registration.flow_algebra import invert_flow as invert_flow
 from .registration.global_shift import global_shifts as global_shifts
-from .registration.warp import compose_flows as compose_flows
-from .registration.warp import invert_flow as invert_flow
 from .report import write_report as write_report
 from .results import Restoration as Restoration
 from .runs.run_files import load_run as load_run

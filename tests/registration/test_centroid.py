@@ -1,3 +1,5 @@
+import threading
+
 import numpy as np
 import pytest
 
@@ -174,6 +176,19 @@ def test_a_state_follows_each_flow_and_the_result_is_returned(sequence):
     expected = find_centroid(frames, CentroidParams(iterations=2))
     assert result.image.tobytes() == expected.image.tobytes()
     assert result.flows.tobytes() == expected.flows.tobytes()
+
+
+def test_threads_do_not_change_a_byte(sequence):
+    one, three = (find_centroid(sequence.frames[:6], runtime=Runtime(threads=n)) for n in (1, 3))
+    assert one.image.tobytes() == three.image.tobytes()
+    assert one.flows.tobytes() == three.flows.tobytes()
+
+
+def test_a_centroid_may_be_left_early(sequence):
+    steps = centroid_steps(sequence.frames[:6], runtime=Runtime(threads=2))
+    assert next(steps) == CentroidState(1, 1)
+    steps.close()
+    assert threading.active_count() == 1
 
 
 def test_flows_in_a_file_are_those_in_memory(sequence, tmp_path):

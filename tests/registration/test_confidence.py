@@ -3,7 +3,13 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.registration.confidence import FlowConfidence, flow_confidence, regularise_flow
+from turbrestore.registration.confidence import (
+    FlowConfidence,
+    flow_confidence,
+    posterior_mean,
+    regularise_flow,
+    subtract_noise,
+)
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 
 
@@ -121,3 +127,40 @@ def test_bad_input_is_refused():
     for noise in (-1.0, float("nan"), float("inf")):
         with pytest.raises(ConfigurationError, match="^noise: expected"):
             regularise_flow(np.zeros((16, 20, 2)), confidence, noise)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 0.1])
+def test_eigenvalues_of_tensors_are_lowered_by_the_noise(noise):
+    """Of flat pixels, whose tensors vanish, of edges, which have one eigenvalue, and of texture, which has two."""
+    gradients = np.random.default_rng(24).normal(0, 0.3, (60, 2, 2)).astype(np.float32)
+    gradients[:20, 1] = 0
+    gradients[:3] = 0
+    tensors = np.einsum("pki,pkj->pij", gradients, gradients)
+    planes = tuple(tensors[:, i, j].copy() for i, j in ((0, 0), (0, 1), (1, 1)))
+    fast, slow = np.empty((3, 60), np.float32), np.empty((3, 60), np.float32)
+    subtract_noise(np.float32(noise), *planes, fast)
+    subtract_noise.py_func(np.float32(noise), *planes, slow)
+    assert fast == pytest.approx(slow, rel=1e-4, abs=1e-6)
+    values, vectors = np.linalg.eigh(tensors.astype(np.float64))
+    expected = np.einsum("pij,pj,pkj->pik", vectors, np.maximum(values - noise, 0), vectors)
+    found = np.array([[fast[0], fast[1]], [fast[1], fast[2]]]).transpose(2, 0, 1)
+    assert found == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_compiled_posterior_mean_is_that_of_the_plain_loop():
+    rng = np.random.default_rng(25)
+    xx, yy, weighted_x, weighted_y, expected_x, expected_y = rng.random((6, 50), np.float32)
+    xy = 0.9 * np.sqrt(xx * yy)
+    results = np.empty((2, 2, 50), np.float32)
+    for loop, result in zip((posterior_mean, posterior_mean.py_func), results, strict=True):
+        loop(np.float32(0.01), xx, xy, yy, weighted_x, weighted_y, expected_x, expected_y, *result)
+    assert results[0] == pytest.approx(results[1], abs=1e-4)
+
+
+def test_arguments_are_not_changed():
+    rng = np.random.default_rng(26)
+    image, flow = rng.random((40, 31), np.float32), rng.normal(0, 2, (40, 31, 2)).astype(np.float32)
+    confidence, before = flow_confidence(image), (image.copy(), flow.copy())
+    tensors = [tensor.copy() for tensor in confidence.tensors]
+    regularise_flow(flow, confidence, 0.02)
+    assert all(map(np.array_equal, (image, flow, *confidence.tensors), (*before, *tensors)))

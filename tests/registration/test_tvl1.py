@@ -17,9 +17,10 @@ from turbrestore.registration.tvl1_sweeps import (
     divergence,
     resize_dual,
     sweep,
+    sweep_frame,
 )
 from turbrestore.registration.warp import warp
-from turbrestore.runtime.image_stacks import numpy_ops
+from turbrestore.runtime.image_stacks import numpy_ops, torch_ops
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 
@@ -63,15 +64,17 @@ def energy(problem, flow, huber):
     return data.sum() + np.where(length <= huber, length**2 / (2 * huber), length - huber / 2).sum()
 
 
-both_ways = pytest.mark.parametrize("way", ["compiled", "arrays"])
+both_ways = pytest.mark.parametrize("way", ["loop", pytest.param("torch", marks=NO_TORCH)])
 
 
 def sweep_by(way, problem, flow, dual, params):
-    """Sweep compiled, where there is a compiler, or by array operations."""
-    with pytest.MonkeyPatch.context() as patch:
-        if way == "arrays":
-            patch.setattr("turbrestore.registration.tvl1_sweeps.compiled", lambda loops: None)
-        return sweep(problem, flow, dual, params, np)
+    """Sweep by the compiled loop, or by torch."""
+    if way == "loop":
+        return sweep(problem, flow, dual, params, numpy_ops())
+    import torch
+
+    problem = FlowProblem(*map(torch.from_numpy, (problem.direction, problem.offset, problem.bound)))
+    return sweep(problem, torch.from_numpy(flow), torch.from_numpy(dual), params, torch_ops("cpu")).numpy()
 
 
 class TestSweeps:
@@ -82,7 +85,7 @@ class TestSweeps:
         px[:, -1] = py[-1] = 0
         gx, gy, out = np.zeros(shape), np.zeros(shape), np.empty(shape)
         add_differences(u, gx, gy)
-        divergence(px, py, out, np)
+        divergence(px, py, out)
         assert (gx * px + gy * py).sum() == pytest.approx(-(u * out).sum(), abs=1e-12)
 
     def test_step_sizes_respect_the_norm_of_the_gradient(self):
@@ -91,7 +94,7 @@ class TestSweeps:
         for _ in range(200):
             gx, gy = np.zeros_like(u), np.zeros_like(u)
             add_differences(u / np.linalg.norm(u), gx, gy)
-            divergence(gx, gy, out, np)
+            divergence(gx, gy, out)
             u = -out
         params = SweepParams(1, 0.7, 0.3)
         assert 0.97 < params.step * params.dual_step * np.linalg.norm(u) < 1
@@ -125,6 +128,29 @@ class TestSweeps:
         assert np.abs(found[0] - slow_flow).max() < 1e-12
         assert np.abs(dual[0] - slow_dual).max() < 1e-12
 
+    @pytest.mark.parametrize("huber", [0.0, 0.3])
+    @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (9, 1), (2, 2), (31, 45)])
+    def test_the_compiled_loop_does_what_it_says(self, shape, huber):
+        """From any dual variable that vanishes across the border."""
+        rng = np.random.default_rng(23)
+        angle, offset, bound = rng.uniform(0, 6, (3, *shape)).astype(np.float32)
+        direction = np.stack([np.cos(angle), np.sin(angle)])
+        start, dual = (
+            rng.normal(0, s, size).astype(np.float32) for s, size in ((1, (2, *shape)), (0.5, (2, 2, *shape)))
+        )
+        dual[0, :, :, -1] = dual[1, :, -1, :] = 0
+        params = SweepParams(15, 0.7, huber)
+        steps = np.array([params.step, params.dual_step, params.shrink, params.count], np.float32)
+        results = []
+        for loop in (sweep_frame, sweep_frame.py_func):
+            flow, p = start.copy(), dual.copy()
+            loop(direction, 2 * offset - 6, bound / 3, flow, flow.copy(), p, steps)
+            results.append((flow, p))
+        for fast, slow in zip(*results, strict=True):
+            assert fast.dtype == slow.dtype == np.float32
+            assert fast == pytest.approx(slow, abs=2e-5)
+        assert np.abs(results[0][0] - start).max() > 0.1
+
     @both_ways
     def test_dual_variable_stays_admissible(self, way):
         problem, flow, dual = problem_of(3)
@@ -137,7 +163,7 @@ class TestSweeps:
         dual = np.random.default_rng(5).uniform(-0.7, 0.7, (1, 2, 2, 8, 9)).astype(np.float32)
         finer = resize_dual(dual, (15, 18), numpy_ops())
         out = np.empty((1, 2, 15, 18), np.float32)
-        divergence(finer[:, 0], finer[:, 1], out, np)
+        divergence(finer[:, 0], finer[:, 1], out)
         assert np.abs(out.sum((-1, -2))).max() < 1e-4
         assert np.hypot(finer[:, 0], finer[:, 1]).max() < 1
 
@@ -158,7 +184,7 @@ class TestSweeps:
             rounded = np.sqrt(rho**2 + 1e-8)
             p, div = np.zeros((2, *u.shape)), np.empty_like(u)
             add_differences(u, *p)
-            divergence(*(p / np.maximum(np.hypot(*p), huber)), div, np)
+            divergence(*(p / np.maximum(np.hypot(*p), huber)), div)
             slope = (problem.bound * rho / rounded)[:, None] * problem.direction - div
             return energy(problem, u, huber) + (problem.bound * (rounded - np.abs(rho))).sum(), slope.ravel()
 
@@ -218,7 +244,7 @@ class TestMotion:
         assert error.max() < 0.15
 
     def test_equal_images_do_not_move(self):
-        image = texture()
+        image = texture(2)
         assert np.abs(tvl1_flows(image[None], prepare_tvl1(image)).flows).max() < 1e-4
 
     def test_smooth_motion_is_followed_better_than_by_total_variation(self):

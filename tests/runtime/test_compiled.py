@@ -39,9 +39,6 @@ from turbrestore.dynamics.flow_model import SUMMED, add_products, project_deviat
 from turbrestore.filtering.frame_noise import _folded, judge_frame, mark_folds, measure_frame_noise, weigh_pixels
 from turbrestore.filtering.kalman import PixelGaussian
 from turbrestore.filtering.pixel_fusion import PixelFusion, take_in_pixels
-from turbrestore.registration.confidence import draw_pixels, flow_confidence, lower_pixels, regularise_flow
-from turbrestore.registration.tvl1_sweeps import FlowProblem, SweepParams, sweep, sweep_frame
-from turbrestore.registration.warp import sample_spline, warp
 from turbrestore.runtime import jit as compiling
 
 USERS = (
@@ -50,13 +47,10 @@ USERS = (
     "deconvolution.nonlocal_tv",
     "deconvolution.patch_search",
     "filtering.pixel_fusion",
-    "registration.warp",
     "deconvolution.paired_transform",
     "deconvolution.patch_pairs",
     "deconvolution.primal_dual",
-    "registration.confidence",
     "dynamics.flow_model",
-    "registration.tvl1_sweeps",
     "deconvolution.conjugate_gradient",
 )
 rng = np.random.default_rng(0)
@@ -80,16 +74,6 @@ def both(plain, function):
     return function(), plain(function)
 
 
-@needs_compiler
-@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (2, 2), (9, 1), (31, 45), (12, 20, 3)])
-def test_a_spline_is_sampled_alike(plain, shape):
-    image = rng.random(shape, np.float32)
-    flow = rng.normal(0, 3, (*shape[:2], 2)).astype(np.float32)
-    fast, slow = both(plain, lambda: warp(image, flow))
-    assert fast.dtype == slow.dtype == np.float32
-    assert fast == pytest.approx(slow, abs=2e-5)
-
-
 def model_of(frames, flows):
     image = frames.mean(axis=0)
     return measure_frame_noise(list(frames), flows, image, np.ones(image.shape, np.float32))
@@ -110,43 +94,6 @@ def test_a_frame_is_judged_alike(plain, amplitude):
 
 
 @needs_compiler
-@pytest.mark.parametrize("contrast", [0.0, 0.01, 0.5])
-@pytest.mark.parametrize("shape", [(16, 16), (33, 50)])
-def test_a_flow_is_drawn_alike(plain, shape, contrast):
-    """Without texture, with little, and with much; edges among it, whose tensors have no inverse."""
-    random = np.random.default_rng(21)
-    image = 0.5 + contrast * random.uniform(-1, 1, shape).astype(np.float32)
-    image[:, shape[1] // 2 :] = 0.5
-    image[:, -5:] += np.float32(contrast)
-    flow, confidence = random.normal(0, 2, (*shape, 2)).astype(np.float32), flow_confidence(image)
-    tensors = [tensor.copy() for tensor in confidence.tensors]
-    for noise in (0.0, 0.02):
-        fast, slow = both(plain, lambda n=noise: regularise_flow(flow, confidence, n))
-        assert fast.dtype == slow.dtype == np.float32
-        assert fast == pytest.approx(slow, abs=2e-4)
-        assert np.abs(fast - slow).mean() < 1e-5
-        assert (np.abs(slow).max() > 0.01) == (contrast > 0)
-    # Threads share them.
-    assert all(map(np.array_equal, confidence.tensors, tensors))
-
-
-@needs_compiler
-@pytest.mark.parametrize("noise", [0.0, 0.01])
-@pytest.mark.parametrize("shape", [(16, 16), (33, 50)])
-def test_tensors_are_lowered_alike(plain, shape, noise):
-    """Of flat ground, whose tensors vanish, of an edge, which has one eigenvalue, and of noise, which has two."""
-    random = np.random.default_rng(24)
-    image = np.full(shape, 0.5, np.float32)
-    image[:, shape[1] // 2 :] += random.normal(0, noise, (shape[0], shape[1] - shape[1] // 2)).astype(np.float32)
-    image[:, -5:] += 0.3
-    fast, slow = both(plain, lambda: flow_confidence(image).tensors)
-    for one, other in zip(fast, slow, strict=True):
-        assert one.dtype == other.dtype == np.float32
-        assert one == pytest.approx(other, rel=1e-4, abs=1e-6 * float(np.abs(slow[0]).max()))
-    assert np.ptp(slow[0][0]) > 1e-3
-
-
-@needs_compiler
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("shape", [(2, 3), (16, SUMMED // 32), (31, 45)])
 @pytest.mark.parametrize("rank", [0, 1, 7])
@@ -161,28 +108,6 @@ def test_a_flow_is_projected_alike(plain, shape, rank, order):
     assert fast.dtype == slow.dtype == np.float64
     assert fast == pytest.approx(exact, abs=1e-4)
     assert slow == pytest.approx(exact, abs=1e-4)
-
-
-@needs_compiler
-@pytest.mark.parametrize("huber", [0.0, 0.3])
-@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (9, 1), (2, 2), (31, 45)])
-def test_flows_are_swept_alike(plain, shape, huber):
-    """The same flow and dual variable, from any that vanishes across the border; each frame of a batch by itself."""
-    random = np.random.default_rng(23)
-    angle, offset, bound = random.uniform(0, 6, (3, 2, *shape)).astype(np.float32)
-    problem = FlowProblem(np.stack([np.cos(angle), np.sin(angle)], 1), 2 * offset - 6, bound / 3)
-    start, pull = random.normal(0, 1, (2, 2, *shape)), random.normal(0, 0.5, (2, 2, 2, *shape))
-    pull[:, 0, :, :, -1] = pull[:, 1, :, -1, :] = 0
-
-    def swept():
-        dual = pull.astype(np.float32)
-        return sweep(problem, start.astype(np.float32), dual, SweepParams(15, 0.7, huber), np), dual
-
-    (fast, fast_dual), (slow, slow_dual) = both(plain, swept)
-    assert fast.dtype == slow.dtype == np.float32
-    assert fast == pytest.approx(slow, abs=2e-5)
-    assert fast_dual == pytest.approx(slow_dual, abs=2e-5)
-    assert np.abs(slow - start).max() > 0.1
 
 
 @needs_compiler
@@ -204,14 +129,10 @@ def test_folds_are_found_where_the_jacobian_vanishes(plain):
         apply_loops,
         choose_offsets,
         draw_back,
-        draw_pixels,
         follow_loops,
         join_choices,
-        lower_pixels,
         mark_folds,
         move_loops,
-        sample_spline,
-        sweep_frame,
         take_in_pixels,
         turn_loops,
         weigh_pixels,

@@ -40,10 +40,8 @@ from turbrestore.footage.frame_selection import Share
 from turbrestore.io.source import FrameSource
 from turbrestore.pipeline import restore
 from turbrestore.registration.centroid import CentroidParams
-from turbrestore.registration.flow import FlowParams, estimate_flow
-from turbrestore.registration.tvl1 import prepare_tvl1, tvl1_flows
-from turbrestore.registration.warp import warp
-from turbrestore.runs.run_folder import stage_facts
+from turbrestore.registration.flow import FlowParams
+from turbrestore.runs.resumption import stage_facts
 from turbrestore.runtime import device as device_module
 from turbrestore.runtime.device import TORCH_BYTES, check_device, explain_device, find_device, memory_of, needs_torch
 from turbrestore.settings import RestoreParams, explain_devices, place_stages
@@ -207,44 +205,10 @@ class TestChoice:
 
 
 @on_devices
-class TestFlow:
-    def test_flows_are_those_of_the_processor(self, device):
-        frames, _ = frames_of(SCENES["camera"](SIZE, SIZE + 9), 3)
-        mean = frames.mean(axis=0)
-        here, there = (estimate_flow(mean, frames, FlowParams(method="tvl1", device=d)) for d in ("cpu", device))
-        apart = np.linalg.norm(here - there, axis=-1)
-        assert apart.mean() < 1e-3
-        assert apart.max() < 0.02
-
-    def test_large_motion_and_a_start(self, device):
-        frames, flows = frames_of(SCENES["brick"](SIZE, SIZE), 2, rms=3.0, seed=1)
-        grey = 255 * frames
-        here, there = (tvl1_flows(grey, prepare_tvl1(grey.mean(axis=0), device=d), flows) for d in ("cpu", device))
-        assert np.linalg.norm(here.flows - there.flows, axis=-1).mean() < 1e-3
-        assert (here.warps == there.warps).all()
-        assert (here.settled == there.settled).all()
-
-    @pytest.mark.parametrize("batch", [1, 2, 5])
-    def test_batches_do_not_matter(self, device, batch):
-        frames, _ = frames_of(SCENES["camera"](48, 48), 5, seed=2)
-        params = FlowParams(method="tvl1", device=device)
-        small = replace(params, tvl1=replace(params.tvl1, batch=batch))
-        apart = estimate_flow(frames[0], frames, params) - estimate_flow(frames[0], frames, small)
-        assert np.abs(apart).max() < 1e-3
-
-    def test_methods_of_opencv_stay_where_they_are(self, device):
-        frames, _ = frames_of(SCENES["camera"](48, 48), 2, seed=3)
-        here, there = (estimate_flow(frames[0], frames, FlowParams(device=d)) for d in ("cpu", device))
-        assert here.tobytes() == there.tobytes()
-
-
-@on_devices
 class TestMemory:
     @pytest.mark.parametrize(
         ("place", "advice", "settings"),
         [
-            ("registration.flow.tvl1_flows", "lower --flow.tvl1.batch", {"flow": FlowParams(method="tvl1")}),
-            ("registration.warp.warp_stack", "take a smaller --roi", {}),
             ("filtering.torch_fusion.warp_stack", "take a smaller --roi", {}),
             ("deconvolution.torch_deconvolution.weights_on_device", "take a smaller --roi", {}),
         ],
@@ -311,12 +275,6 @@ class TestFusion:
             assert found.variance.min() > 0
         assert np.abs(here.image - there.image).max() < 1e-4
         assert here.shares[8] < 0.01
-
-    def test_warp(self, device):
-        scene = SCENES["camera"](50, 64)
-        flow = smooth_flows(1, 50, 64, np.random.default_rng(6), SmoothFlowParams(rms=6.0, correlation_length=5.0))[0]
-        for image in (scene, coloured(scene)):
-            assert np.abs(warp(image, flow) - warp(image, flow, device=device)).max() < 1e-5
 
 
 GUIDES = {

@@ -1,16 +1,21 @@
 import numpy as np
 import pytest
 
-from turbrestore.registration.warp import warp
-from turbrestore.runtime.image_stacks import numpy_ops, spline_coefficients, torch_ops, warp_stack
+from turbrestore.runtime.image_stacks import (
+    full_precision,
+    numpy_ops,
+    sample_spline,
+    spline_coefficients,
+    torch_ops,
+    warp_stack,
+)
 
 RNG = np.random.default_rng(0)
 STACK = RNG.random((3, 20, 27)).astype(np.float32)
 KERNEL = np.array([0.1, -0.3, 0.5, 0.2, 0.4], np.float32)
 ONE = np.ones(1, np.float32)
-Y, X = (np.broadcast_to(axis, STACK.shape).astype(np.float32) for axis in np.mgrid[:20, :27])
 FLOW = RNG.uniform(-4, 4, (20, 27, 2)).astype(np.float32)
-SHIFTED = [axis + RNG.uniform(-4, 4, STACK.shape).astype(np.float32) for axis in (X, Y)]
+FLOWS = RNG.uniform(-4, 4, (3, 2, 20, 27)).astype(np.float32)
 
 
 @pytest.mark.parametrize(
@@ -22,8 +27,8 @@ SHIFTED = [axis + RNG.uniform(-4, 4, STACK.shape).astype(np.float32) for axis in
         lambda ops, stack: ops.filter(stack[:, None, None], KERNEL, ONE),
         lambda ops, stack: ops.resize(stack, (10, 14)),
         lambda ops, stack: ops.resize(stack[None], (41, 53)),
-        lambda ops, stack: ops.sample(stack, *map(ops.load, SHIFTED)),
-        lambda ops, stack: ops.sample(spline_coefficients(stack, ops), *map(ops.load, SHIFTED)),
+        lambda ops, stack: ops.sample(stack, ops.load(FLOWS)),
+        lambda ops, stack: ops.sample(spline_coefficients(stack, ops), ops.load(FLOWS)),
         lambda ops, stack: warp_stack(stack, ops.load(FLOW), ops),
         lambda ops, stack: ops.median(stack, 3),
         lambda ops, stack: ops.median(stack[None], 5),
@@ -44,12 +49,25 @@ def test_filter_correlates_and_reflects_the_image():
     assert np.abs(numpy_ops().filter(STACK, KERNEL, ONE) - by_hand).max() < 1e-6
 
 
-def test_splines_are_those_of_warp():
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (2, 2), (9, 1), (31, 45)])
+def test_the_compiled_spline_does_what_it_says(shape):
+    coefficients = RNG.random((shape[0] + 3, shape[1] + 3), np.float32)
+    flow = RNG.normal(0, 3, (*shape, 2)).astype(np.float32)
+    fast, slow = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    sample_spline(coefficients, flow, fast)
+    sample_spline.py_func(coefficients, flow, slow)
+    assert fast == pytest.approx(slow, abs=1e-6)
+
+
+def test_a_spline_is_that_of_scipy():
+    from scipy.ndimage import map_coordinates
+
     ops = numpy_ops()
-    sampled = ops.sample(spline_coefficients(STACK, ops), *SHIFTED)
-    flow = np.stack([SHIFTED[0] - X, SHIFTED[1] - Y], axis=-1)
-    for image, displacement, found in zip(STACK, flow, sampled, strict=True):
-        assert np.abs(warp(image, displacement) - found).max() < 1e-5
+    sampled = ops.sample(spline_coefficients(STACK, ops), FLOWS)
+    y, x = np.mgrid[:20, :27]
+    for image, (dx, dy), found in zip(STACK, FLOWS, sampled, strict=True):
+        place = np.clip(y + dy, 0, 19), np.clip(x + dx, 0, 26)
+        assert np.abs(map_coordinates(image, place, order=3, mode="mirror") - found).max() < 1e-5
 
 
 def test_median_is_that_of_the_window():
@@ -60,11 +78,9 @@ def test_median_is_that_of_the_window():
 
 def test_torch_samples_wide_images_as_exactly_as_narrow_ones():
     pytest.importorskip("torch", reason="torch is not installed")
-    wide = RNG.random((1, 16, 4000)).astype(np.float32)
-    t = np.float32(0.375)
-    y, x = (axis[None] + t for axis in np.mgrid[:16, :4000].astype(np.float32))
+    wide, t = RNG.random((1, 16, 4000)).astype(np.float32), np.float32(0.375)
     ops = torch_ops("cpu")
-    sampled = ops.store(ops.sample(ops.load(wide), ops.load(x), ops.load(y)))
+    sampled = ops.store(ops.sample(ops.load(wide), ops.load(np.full((1, 2, 16, 4000), t))))
     weights = np.array([(1 - t) ** 3, 4 - 6 * t**2 + 3 * t**3, 1 + 3 * t + 3 * t**2 - 3 * t**3, t**3]) / 6
     windows = np.lib.stride_tricks.sliding_window_view(wide[0], (4, 4))
     assert np.abs(np.einsum("yxij,i,j->yx", windows, weights, weights) - sampled[0, 1:-2, 1:-2]).max() < 1e-6
@@ -76,3 +92,13 @@ def test_torch_filters_with_kernels_longer_than_the_image():
     here, there = numpy_ops(), torch_ops("cpu")
     a, b = here.filter(STACK, kernel, ONE), there.store(there.filter(there.load(STACK), kernel, ONE))
     assert np.abs(a - b).max() < 1e-5 * np.abs(a).max()
+
+
+def test_the_settings_of_cudnn_are_restored_by_the_last_one_out():
+    cudnn = pytest.importorskip("torch.backends.cudnn", reason="torch is not installed")
+    before = cudnn.enabled, cudnn.benchmark, cudnn.deterministic, cudnn.allow_tf32
+    with full_precision():
+        with full_precision():
+            assert (cudnn.enabled, cudnn.deterministic, cudnn.allow_tf32) == (before[0], True, False)
+        assert not cudnn.allow_tf32
+    assert (cudnn.enabled, cudnn.benchmark, cudnn.deterministic, cudnn.allow_tf32) == before

@@ -1,1 +1,1 @@
-"""What every other folder shares: arrays, errors, decisions and the noise of an image."""
+"""Shared by every other folder: checks of arrays, errors, decisions and the noise of an image."""

@@ -1,4 +1,4 @@
-"""What an image, a stack of frames and a flow are, checked in one place.
+"""Checks and conversions of images, stacks of frames and flows.
 
 =========  ==================================  =======  ================================================
 name       shape                               dtype    unit
@@ -25,9 +25,9 @@ from .errors import DataError
 FloatArray = NDArray[np.float32]
 
 CHANNELS = (3,)
-# Numbers in a part of a large array.
+# Numbers in each part of a large array that is processed in parts.
 _PART = 1 << 22
-# Rec. 601, as OpenCV and most cameras weigh RGB.
+# Weights of RGB by Rec. 601, as OpenCV and most cameras use them.
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
 
@@ -40,7 +40,7 @@ def check_image(image: ArrayLike, name: str = "image") -> FloatArray:
         Floating point intensities (0 to 1), or unsigned integers, which are divided by the largest value of
         their type.
     name : str
-        How error messages call the array.
+        Name of the array in error messages.
 
     Returns
     -------
@@ -73,7 +73,7 @@ def check_frames(frames: ArrayLike, name: str = "frames", at_least: int = 1) -> 
         Floating point intensities (0 to 1), or unsigned integers, which are divided by the largest value of
         their type.
     name : str
-        How error messages call the array.
+        Name of the array in error messages.
     at_least : int
         Smallest number of frames that the caller can work with.
 
@@ -109,7 +109,7 @@ def check_flow(flow: ArrayLike, name: str = "flow") -> FloatArray:
     flow : array_like, shape (H, W, 2) or (T, H, W, 2)
         Displacements in pixels, last axis (dx, dy).
     name : str
-        How error messages call the array.
+        Name of the array in error messages.
 
     Returns
     -------
@@ -137,17 +137,16 @@ def check_flow(flow: ArrayLike, name: str = "flow") -> FloatArray:
 
 
 def luminance(image: FloatArray) -> FloatArray:
-    """Luminance of an image or of frames: the last axis of three channels is weighed by Rec. 601.
+    """Luminance of an image or of frames, by the weights of Rec. 601.
 
     Parameters
     ----------
     image : ndarray, float32, shape (..., H, W) or (..., H, W, 3)
-        Two axes, or three of which the last is not 3, are taken to be grey already.
+        Arrays with two axes, or whose last axis is not 3, are grey already.
 
     Returns
     -------
-    ndarray, float32
-        Without the channel axis.
+    ndarray, float32, shape (..., H, W)
 
     Examples
     --------
@@ -189,7 +188,7 @@ def from_unit(image: FloatArray, bit_depth: int) -> NDArray[np.unsignedinteger]:
     top = 2**bit_depth - 1
     dtype = np.uint8 if bit_depth <= 8 else np.uint16
     levels, done = np.empty(image.shape, dtype), 0
-    # In parts, for they are computed in double precision.
+    # In parts, because they are computed in double precision.
     for part in _parts(image):
         levels[done : done + len(part)] = np.rint(np.clip(part, 0.0, 1.0) * np.float64(top))
         done += len(part)

@@ -1,4 +1,4 @@
-"""What was decided on the way to a result, and why."""
+"""A record of each choice that was made on the way to a result, and why."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Decision:
-    """One choice that was made from the data.
+    """One choice made from the data.
 
     Attributes
     ----------
     subject : str
-        What it is about, a word or two: ``"blur"``, ``"overshoot"``, ``"border"``.
+        Subject in a word or two: ``"blur"``, ``"overshoot"``, ``"border"``.
     choice : str
-        What was done, one line.
+        The choice, one line.
     reason : str
-        The figures that led to it, one line.
+        The figures that led to the choice, one line.
 
     Examples
     --------

@@ -1,12 +1,12 @@
 """Errors that turbrestore raises on purpose.
 
-Each message is one line: what was expected, what was found, what to do. ``exit_code`` is what the command line
-ends with; the numbers follow the BSD ``sysexits`` convention.
+Each message is one line: what was expected, what was found, what to do.  ``exit_code`` is the exit status of the
+command line; the numbers follow the BSD ``sysexits`` convention.
 """
 
 
 class TurbrestoreError(Exception):
-    """Base of every expected failure."""
+    """Base class of every expected failure."""
 
     exit_code = 1
 
@@ -49,16 +49,16 @@ def require_between(name: str, value: float, low: float, high: float, unit: str 
     name : str
         Name of the setting.
     value : float
-        What was set.
+        Its value.
     low, high : float
-        Smallest and largest value that make sense.
+        Smallest and largest value allowed.
     unit : str
         Unit of the value, for the message.
 
     Raises
     ------
     ConfigurationError
-        The value lies outside.
+        The value is outside the range.
 
     Examples
     --------
@@ -76,14 +76,14 @@ def require(condition: bool, message: str) -> None:
     Parameters
     ----------
     condition : bool
-        What a setting must fulfil.
+        Condition that a setting must meet.
     message : str
-        Expected, found, and what to do, in one line.
+        One line: expected, found, and what to do.
 
     Raises
     ------
     ConfigurationError
-        If ``condition`` is false.
+        The condition is false.
 
     Examples
     --------

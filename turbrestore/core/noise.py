@@ -1,4 +1,4 @@
-"""The noise of an image."""
+"""Estimation of the noise of an image."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from numpy.typing import ArrayLike
 
 from .arrays import check_image, luminance
 
-# Rows in which noise is estimated at once.
+# Rows that are filtered at once.
 _NOISE_ROWS = 256
 
 
 def estimate_noise(image: ArrayLike) -> float:
-    """Estimate the noise: median of |second difference in x and y|, scaled to a standard deviation.
+    """Estimate the standard deviation of the noise from the median of |second differences in x and y|.
 
     The mask ``[1 −2 1]ᵀ[1 −2 1] / 6`` (Immerkær 1996) keeps the deviation of white noise and cancels planes; the
-    median, unlike the mean, is not moved by edges. A fused image has smoother noise than a frame, because
-    registration interpolates; its low frequencies hold more noise than this figure says.
+    median, unlike the mean, is insensitive to edges.  A fused image has smoother noise than a frame, because
+    registration interpolates; its low frequencies contain more noise than this estimate.
 
     Parameters
     ----------

@@ -1,15 +1,16 @@
-"""The centroid: the image at the mean geometry of the frames (paper 3, §3.2, eq. 12).
+"""The centroid: the image at the mean geometry of the frames (paper 3, §3.2).
 
 Symbols
 -------
 q : current estimate of the centroid
-W_i : flow from q to frame I_i; W̄ their mean, which vanishes at the centroid
+W_i : flow from q to frame I_i; W̄ their mean (eq. 12), which vanishes at the centroid
 V : inverse flow, ``(id + V) = (id + W̄)^{-1}``
 
-The image moves *with* the mean flow, so backward warping needs the inverse, ``q ← q ∘ (id + W̄)^{-1}``; the paper
-leaves this open.  Two departures from it: flows are composed and frames are interpolated once, where the paper warps
-the warped image again in every iteration; and ``fused`` (the default) averages all registered frames, where the
-paper (``single``) keeps one warped frame with all of its noise.
+The paper warps q by the mean flow, and repeats.  The image moves *with* the mean flow, so backward warping needs the
+inverse, which the paper leaves open: ``q ← q ∘ (id + W̄)^{-1}``.  There are two departures from the paper: flows are
+composed and frames are interpolated once, where the paper warps the warped image again in every iteration; and
+``fused`` (the default) averages all registered frames, where the paper (``single``) keeps one warped frame with all of
+its noise.
 """
 
 from __future__ import annotations
@@ -32,18 +33,19 @@ from ..runtime.scratch import fill_frames, iter_frames, mean_of, new_stack
 from ..runtime.steps import finish
 from ..runtime.threads import map_ahead, sum_in_threads
 from .flow import FlowFrame, FlowParams, measure_flows, prepare_reference
+from .flow_algebra import compose_flows, invert_flow
 from .global_shift import mean_stabilised
-from .warp import compose_flows, inside, invert_flow, warp
+from .warp import inside, warp
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MODES = ("fused", "single")
-# A mean flow that keeps this share of its length from one iteration to the next is the bias of the flow method.
+# If the mean flow keeps this share of its length from one iteration to the next, it is the bias of the flow method.
 _STALLED = 0.8
-# One that grows by more than this has lost the frames.
+# If it grows by more than this factor, registration has failed.
 _DIVERGED = 1.25
-# Weight of the repeated border beside that of a pixel that was seen.
+# Weight of a sample of the repeated border, where a sample inside the frame has 1.
 _UNSEEN = 1e-3
 
 
@@ -59,12 +61,12 @@ class CentroidParams:
         Largest number of iterations; each costs one flow per frame.  The paper runs 10.
     tolerance : float
         Stop when the mean flow is shorter than this, pixels (mean over the image), or shrinks by less than a fifth;
-        stop without convergence when it grows by more than a quarter.  ``fused`` does two iterations at least, for the
-        temporal mean that it starts from is a blurred reference.
-        What is left is the bias of the flow method; it is not corrected, which would bend the image.
+        stop without convergence when it grows by more than a quarter.  ``fused`` runs at least two iterations, because
+        it starts from the temporal mean, which is a blurred reference.
+        The mean flow that remains is the bias of the flow method; correcting it would bend the image.
     start : int
-        Frame that ``single`` warps; ``fused`` starts from the temporal mean, of stabilised frames if flow takes shifts
-        of whole frames out.
+        Frame that ``single`` warps; ``fused`` starts from the temporal mean, of stabilised frames if
+        ``FlowParams.global_shift`` is on.
     """
 
     mode: Literal["fused", "single"] = "fused"
@@ -90,10 +92,10 @@ class Centroid:
     flows : ndarray, float32, shape (T, H, W, 2)
         Flows from the centroid to each frame, pixels.
     mean_flow_sizes : ndarray, float64, shape (iterations,)
-        Mean length of W̄ found in each iteration, pixels.  All but the last have been corrected, and the last too if
-        the iteration has not converged.
+        Mean length of W̄ in each iteration, pixels.  All but the last have been corrected, and the last too if the
+        iteration has not converged.
     converged : bool
-        Whether the last of them is below the tolerance, or no longer shrinks without growing either.
+        Whether the last length is below the tolerance, or neither shrank nor grew.
     """
 
     image: FloatArray
@@ -224,24 +226,24 @@ def centroid_steps(
     prepared: list[FlowFrame] = []
     sizes: list[float] = []
     while True:
-        # The first image is a blurred mean, so flows that start from those to it are corrected on a coarser level.
+        # The first image is a blurred mean; flows that start from its flows must be corrected on a coarser level.
         reference = prepare_reference(image, flow_params, runtime, start_level=1)
         solved = measure_flows(reference, prepared or iter_frames(stack), iter_frames(flows) if sizes else repeat(None))
-        # If even the frames are in a file, there is no memory to keep what is prepared of them.
+        # Prepared frames are kept for the next iteration, unless memory is so short that stacks are in files.
         keep = runtime.scratch is None and not prepared
         for measured in fill_frames(flows, _flows_of(solved, prepared if keep else None)):
             yield CentroidState(len(sizes) + 1, measured)
-        mean_flow = mean_of(flows)  # W̄
+        mean_flow = mean_of(flows)  # W̄, eq. 12
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
         change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
-        # The temporal mean is a blurred reference: flow from the first registered mean is better, wherever it lies.
+        # The temporal mean is a blurred reference, so flow is measured from the first registered mean in any case.
         settled = len(sizes) > 1 or params.mode == "single" or params.iterations == 1
         converged = (sizes[-1] <= params.tolerance and settled) or _STALLED < change <= _DIVERGED
         if not converged:
             recentre = invert_flow(mean_flow)  # V
             total = compose_flows(total, recentre) if params.mode == "single" else total
             _recentre(flows, recentre, runtime.threads)
-        # Eq. 12: q ← q ∘ (id + W̄)⁻¹.
+        # q ← q ∘ (id + W̄)⁻¹.
         image = mean_registered(stack, flows, runtime) if params.mode == "fused" else warp(stack[params.start], total)
         if converged or change > _DIVERGED or len(sizes) == params.iterations:
             return Centroid(image, flows, np.array(sizes), converged)
@@ -262,7 +264,7 @@ def _flows_of(solved: Iterable[tuple[FlowFrame, FloatArray]], prepared: list[Flo
 
 
 def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:
-    """Let flows start from where ``recentre`` leads, in place."""
+    """Compose flows with ``recentre``, in place, so that they start from the recentred image."""
     moved = map_ahead(lambda flow: compose_flows(flow, recentre), iter_frames(flows), threads)
     for _ in fill_frames(flows, (flow for _, flow in moved)):
         pass
@@ -271,7 +273,7 @@ def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:
 def mean_registered(frames: FloatArray, flows: FloatArray, runtime: Runtime = DEFAULT) -> FloatArray:
     """Average of frames warped onto the reference that their flows start from.
 
-    At each pixel those frames count that show it; where none does, all of them, with their borders repeated.
+    Each pixel is averaged over the frames that show it; if none does, over all of them, with their borders repeated.
 
     Parameters
     ----------
@@ -279,7 +281,7 @@ def mean_registered(frames: FloatArray, flows: FloatArray, runtime: Runtime = DE
     flows : ndarray, float32, shape (T, H, W, 2)
         Pixels.
     runtime : Runtime
-        Threads, and the device that warps the frames.
+        Threads, and the device on which frames are warped.
 
     Returns
     -------

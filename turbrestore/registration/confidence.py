@@ -1,27 +1,27 @@
-"""How far a measured flow can be believed, and what stands in where it cannot: flat regions and single edges.
+"""How far the texture of an image determines a flow, and what replaces the flow in flat regions and along edges.
 
 Symbols
 -------
 g : gradient of the reference, intensity per pixel
 J : structure tensor, ``g gᵀ`` averaged over a window of area A
 σ : noise of a frame, intensity
-W : measured flow; W̄ what is expected before it is measured; τ deviation of W from W̄
+W : measured flow; W̄ its prior mean, τ the prior deviation of W from W̄
 
 From a window the displacement is known at best to the covariance ``σ² (A J)⁻¹`` (the Cramér–Rao bound; Robinson and
-Milanfar 2004): well across an edge, not at all along it, and not at all where nothing is seen.  Flow methods give a
-number all the same.  In flat regions dense inverse search matches noise with noise, over 5 px and more.
+Milanfar 2004): well across an edge, not at all along it, and not at all in a flat region.  Flow methods return a number
+all the same; in flat regions dense inverse search matches noise with noise, over 5 px and more.
 
-With W̄ known to τ the posterior mean is ``Ŵ = (J + ε)⁻¹ (J W + ε W̄)``, ``ε = m σ² / (A τ²) + κ tr(J) / 2``, where J and
-J W are averages over the window.  W̄ is the same in a window twice as wide, and so on until the window is the image, for
-which it is zero: this is normalised convolution (Knutsson and Westin 1993) with tensors and growing windows.  Texture
-keeps its flow, an edge takes the component along it from its neighbourhood, and a flat region takes both.
+Given W̄ and τ, the posterior mean is ``Ŵ = (J + ε)⁻¹ (J W + ε W̄)``, ``ε = m σ² / (A τ²) + κ tr(J) / 2``, where J and
+J W are averages over the window.  W̄ is the same estimate in a window twice as wide, and so on until the window is the
+image, for which it is zero: this is normalised convolution (Knutsson and Westin 1993) with tensors and growing windows.
+Texture keeps its flow, an edge takes the component along it from its neighbourhood, and a flat region takes both.
 
-Three things keep it from believing too much.  A flow method errs by more than noise explains, by a factor m in
-variance.  Its errors at neighbouring pixels have one origin, so ε is the same for every window.  And the direction of
-an edge is known to a few degrees only: without κ the tilt of the tensor from one pixel to the next would pass for a
-measurement of what lies along the edge.  What comes out lies within the range of what went in.
+Three things keep the estimate from trusting the measurement too much.  A flow method errs by more than noise explains,
+by a factor m in variance.  Its errors at neighbouring pixels are correlated, so ε is the same for every window.  And
+the direction of an edge is known to a few degrees only: without κ, changes of the tensor's direction from one pixel to
+the next would pass for a measurement along the edge.  Results lie within the range of the measured flow.
 
-J holds the noise of the reference as well, which must not pass for texture: the eigenvalues are lowered by it.
+J also contains the noise of the reference, which must not pass for texture, so its eigenvalues are lowered by it.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, check_flow, check_image, luminance
 from ..core.errors import DataError, require
 from ..core.noise import estimate_noise
-from ..runtime.jit import compiled
+from ..runtime.jit import jit
 
 # Standard deviations of the windows of the gradient and of the tensor, pixels.
 _GRADIENT_WINDOW, _TENSOR_WINDOW = 1.0, 2.0
 _AREA = 4 * np.pi * _TENSOR_WINDOW**2
-# Variance of a derivative in that window of white noise of unit variance; three times it bounds what noise looks like.
+# Variance of a derivative, in that window, of white noise of unit variance; noise rarely exceeds three times that.
 _GRADIENT_NOISE = 1 / (8 * np.pi * _GRADIENT_WINDOW**4)
 _NOISE_MARGIN = 3.0
 # τ, pixels; m and κ.
@@ -50,19 +50,19 @@ _TILT = 0.01
 # Smallest noise, so that every tensor has an inverse: 1/4096 of full scale.
 _LEAST_NOISE = 1 / 4096
 
-# Components of a field of vectors: planes are read several times as fast as every second number of an array.
+# Components of a vector field: separate planes are read several times as fast as every second number of an array.
 Planes = tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
 class FlowConfidence:
-    """What the texture of a reference tells of displacements.
+    """What the texture of a reference tells about displacements.
 
     Attributes
     ----------
     tensors : tuple of ndarray, float32, shape (3, h, w)
-        J as planes xx, xy and yy, squared intensity per squared pixel: of the image, then of windows and grids twice
-        as wide each.
+        J as planes xx, xy and yy, squared intensity per squared pixel: of the image, then of ever twice as wide windows
+        and grids.
     """
 
     tensors: tuple[FloatArray, ...]
@@ -96,16 +96,18 @@ def flow_confidence(reference: ArrayLike) -> FlowConfidence:
     image = luminance(check_image(reference, "reference"))
     smooth = cv2.GaussianBlur(image, (0, 0), _GRADIENT_WINDOW)
     dx, dy = cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32
-    xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW) for product in (dx * dx, dx * dy, dy * dy))
+    xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW).ravel() for product in (dx * dx, dx * dy, dy * dy))
     noise = np.float32(_NOISE_MARGIN * _GRADIENT_NOISE * estimate_noise(image) ** 2)
-    tensors = [_without_noise(xx, xy, yy, noise)]
+    tensor = np.empty((3, *image.shape), np.float32)
+    subtract_noise(noise, xx, xy, yy, tensor.reshape(3, -1))
+    tensors = [tensor]
     while min(tensors[-1].shape[1:]) > 1:
         tensors.append(np.stack([cv2.pyrDown(plane) for plane in tensors[-1]]))
     return FlowConfidence(tuple(tensors))
 
 
 def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -> FloatArray:
-    """Draw a flow towards its neighbourhood where the texture tells little.
+    """Draw a flow towards its neighbourhood where the texture does not determine it.
 
     Parameters
     ----------
@@ -114,7 +116,7 @@ def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -
     confidence : FlowConfidence
         Of the reference that the flow starts from.
     noise : float
-        σ of the frame that it leads to, intensity.
+        σ of the frame that the flow leads to, intensity.
 
     Returns
     -------
@@ -150,30 +152,18 @@ def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -
         height, width = tensors[level].shape[1:]
         if u.shape != (height, width):
             u, v = (cv2.pyrUp(part, dstsize=(width, height)) for part in (u, v))
-        u, v = _solve(tensors[level], weighted[level], (u, v), prior)
-    for expected, plane in zip((u, v), planes, strict=True):
+        expected, (u, v) = (u, v), np.empty((2, height, width), np.float32)
+        planes_of_level = (*tensors[level], *weighted[level], *expected, u, v)
+        posterior_mean(np.float32(prior), *(plane.reshape(-1) for plane in planes_of_level))
+    for part, plane in zip((u, v), planes, strict=True):
         low, high, _, _ = cv2.minMaxLoc(plane)
-        np.clip(expected, np.float32(min(low, 0)), np.float32(max(high, 0)), out=expected)
+        np.clip(part, np.float32(min(low, 0)), np.float32(max(high, 0)), out=part)
     return cv2.merge([u, v])
 
 
-def _without_noise(xx: FloatArray, xy: FloatArray, yy: FloatArray, noise: np.float32) -> FloatArray:
-    """Lower both eigenvalues by ``noise``, to zero at most."""
-    lower = compiled(lower_pixels)
-    if lower is not None:
-        lowered = np.empty((3, *xx.shape), np.float32)
-        lower(noise, xx.reshape(-1), xy.reshape(-1), yy.reshape(-1), lowered.reshape(3, -1))
-        return lowered
-    half, tilt = (xx + yy) / 2, (xx - yy) / 2
-    spread = np.sqrt(tilt * tilt + xy * xy)
-    larger, smaller = np.maximum(half + spread - noise, 0), np.maximum(half - spread - noise, 0)
-    kept = (larger - smaller) / np.maximum(2 * spread, np.finfo(np.float32).tiny)
-    mean, tilt = (larger + smaller) / 2, kept * tilt
-    return np.stack([mean + tilt, kept * xy, mean - tilt])
-
-
-def lower_pixels(noise: np.float32, xx: FloatArray, xy: FloatArray, yy: FloatArray, lowered: FloatArray) -> None:
-    """Lower both eigenvalues of each pixel by ``noise``, to zero at most; to be compiled.
+@jit
+def subtract_noise(noise: np.float32, xx: FloatArray, xy: FloatArray, yy: FloatArray, lowered: FloatArray) -> None:
+    """Lower both eigenvalues of the tensor of each pixel by ``noise``, but not below zero.
 
     Parameters
     ----------
@@ -187,7 +177,7 @@ def lower_pixels(noise: np.float32, xx: FloatArray, xy: FloatArray, yy: FloatArr
     Examples
     --------
     >>> lowered = np.empty((3, 1), np.float32)
-    >>> lower_pixels(np.float32(1), np.float32([5]), np.float32([0]), np.float32([0.5]), lowered)
+    >>> subtract_noise(np.float32(1), np.float32([5]), np.float32([0]), np.float32([0.5]), lowered)
     >>> lowered[:, 0]
     array([4., 0., 0.], dtype=float32)
     """
@@ -214,30 +204,8 @@ def _sum_of_products(a: FloatArray, x: FloatArray, b: FloatArray, y: FloatArray)
     return total
 
 
-def _solve(tensor: FloatArray, weighted: Planes, expected: Planes, noise: float) -> Planes:
-    """``(J + ε)⁻¹ (J W + ε W̄)`` of each pixel.
-
-    Where J is singular, along an edge, its determinant is what cancellation leaves; as ε is at least κ tr(J) / 2,
-    single precision keeps four digits and a half of the flow there.
-    """
-    xx, xy, yy = tensor
-    draw = compiled(draw_pixels)
-    if draw is not None:
-        result = np.empty(xx.shape, np.float32), np.empty(xx.shape, np.float32)
-        planes = xx, xy, yy, *weighted, *expected, *result
-        draw(np.float32(noise), *(plane.reshape(-1) for plane in planes))
-        return result
-    prior = xx + yy
-    prior *= np.float32(_TILT / 2)
-    prior += np.float32(noise)
-    u, v = (prior * mean + part for mean, part in zip(expected, weighted, strict=True))
-    xx, yy = xx + prior, yy + prior
-    determinant = xx * yy
-    determinant -= xy * xy
-    return (yy * u - xy * v) / determinant, (xx * v - xy * u) / determinant
-
-
-def draw_pixels(
+@jit
+def posterior_mean(
     noise: np.float32,
     xx: FloatArray,
     xy: FloatArray,
@@ -249,7 +217,10 @@ def draw_pixels(
     x: FloatArray,
     y: FloatArray,
 ) -> None:
-    """``(J + ε)⁻¹ (J W + ε W̄)`` of each pixel; to be compiled.
+    """``Ŵ = (J + ε)⁻¹ (J W + ε W̄)`` of each pixel.
+
+    Where J is singular, along an edge, cancellation leaves few digits of its determinant; as ε is at least κ tr(J) / 2,
+    single precision keeps four digits and a half of the flow there.
 
     Parameters
     ----------
@@ -265,7 +236,7 @@ def draw_pixels(
     Examples
     --------
     >>> one, zero, x, y = np.float32([1]), np.float32([0]), np.empty(1, np.float32), np.empty(1, np.float32)
-    >>> draw_pixels(np.float32(1), one, zero, zero, 3 * one, zero, zero, 5 * one, x, y)
+    >>> posterior_mean(np.float32(1), one, zero, zero, 3 * one, zero, zero, 5 * one, x, y)
     >>> x.round(2), y.round(2)
     (array([1.5], dtype=float32), array([5.], dtype=float32))
     """

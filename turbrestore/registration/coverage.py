@@ -1,4 +1,4 @@
-"""What of an image was seen by the frames: near its border the motion carries pixels out of view."""
+"""How many frames show each pixel: near the border of an image, motion carries pixels out of view."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ def coverage(flows: ArrayLike) -> FloatArray:
 
 
 def well_seen(seen: ArrayLike, least: float = 0.9, margin: int = 0, smallest: int = 16) -> Rectangle:
-    """Rectangle that enough frames show.
+    """Rectangle whose border enough frames show.
 
-    The side with the worst pixel is trimmed until no pixel of the border is below ``least``; what lies within is not
-    looked at.  Where nothing of the smallest size is left, nothing is trimmed.
+    The side with the worst pixel is trimmed until no pixel of the border is below ``least``; pixels inside are not
+    examined.  If less than the smallest size would be left, nothing is trimmed.
 
     Parameters
     ----------
@@ -60,9 +60,9 @@ def well_seen(seen: ArrayLike, least: float = 0.9, margin: int = 0, smallest: in
     least : float
         Share of the frames, 0 to 1.
     margin : int
-        Pixels to leave out beyond that on every side.
+        Further pixels to trim on every side.
     smallest : int
-        Shortest side that may be left, pixels.
+        Shortest side of the result, pixels.
 
     Returns
     -------

@@ -13,24 +13,27 @@ Energy
 gradients below α and linear above.  α = 0 is the total variation of Zach, Pock and Bischof (2007), which makes flows
 of flat patches; the flow of turbulence is smooth, and α > 0 (Werlberger et al. 2009) takes the patches away.
 
-How it is minimised
--------------------
+Algorithm
+---------
 From the coarsest level of a pyramid (factor 2) to the image: warp the frame by the present flow, linearise, minimise
-the convex problem by a few primal-dual sweeps (:mod:`turbrestore.registration.tvl1_sweeps`), take the median of the
-flow in 5×5
-windows, which removes outliers (Wedel et al. 2009), and again, until half of the pixels move by less than a tolerance.
+the convex problem by a few primal-dual sweeps (:mod:`turbrestore.registration.tvl1_sweeps`), filter the flow by a
+median of 5×5, which removes outliers (Wedel et al. 2009), and repeat until half of the pixels move by less than a
+tolerance.  A flow that starts from an earlier one goes through the two finest levels only, the coarser of which also
+builds up its dual variable.
 
 Departures from Zach et al. and OpenCV's DualTVL1
 --------------------------------------------------
 - All frames share one reference: its pyramid and gradients are computed once.
-- g is the mean of the gradients of the reference and of the warped frame.  Both are the same where the flow is right;
-  their mean makes the linearisation exact to second order (Malis 2004) and halves the variance of the noise in g.
-  The gradient of the reference alone (inverse compositional: Baker and Matthews 2004) saves a twentieth of the time
-  and makes the end-point error 2 to 8 % larger.
-- No second flow that is coupled by θ: the proximal map of the data term is known, so the problem itself is solved.
+- g is the mean of the gradients of the reference and the warped frame.  Both are equal where the flow is right; their
+  mean makes the linearisation exact to second order (Malis 2004) and halves the variance of the noise in g.  The
+  gradient of the reference alone (inverse compositional: Baker and Matthews 2004) saves a twentieth of the time and
+  makes the end-point error 2 to 8 % larger.
+- There is no second flow coupled by θ: the proximal map of the data term is known, so the problem itself is solved.
 - The dual variable is kept from warp to warp and from level to level: p is a field of directions, which a finer grid
   changes little.  Half of the sweeps then come as near to the minimum.
 - Frames are sampled by cubic B-splines.  Where a sample falls outside the frame there is no data term.
+
+Everything but the sweeps is written once for the CPU and for devices (:mod:`turbrestore.runtime.image_stacks`).
 """
 
 from __future__ import annotations
@@ -48,9 +51,9 @@ from .opencv_flow import FlowSolver, GreyImage
 from .tvl1_sweeps import FlowProblem, SweepParams, resize_dual, sweep
 
 MEDIANS = (1, 3, 5)
-# A level of the pyramid has at least half of this many pixels a side.
+# An image with a shorter side is not reduced further, so levels have at least half of this many pixels a side.
 _LEAST_SIDE = 32
-# Gradient, per pixel, below which nothing is seen.
+# Gradient, intensity per pixel, that regularises the division by |g|.
 _FLAT = 1e-6
 # Finest levels that a flow with a start goes through.  One alone loses 0.1 dB on some clips, three save half as much.
 _STARTED_LEVELS = 2
@@ -70,7 +73,7 @@ class TvL1Params:
     ----------
     attachment : float
         Weight of the data term (λ), per unit of intensity; smaller is smoother.  The default is for 8-bit grey levels
-        with 32 of them a local standard deviation, as :mod:`turbrestore.registration.flow` makes them.
+        with 32 of them for each local standard deviation (:func:`turbrestore.registration.contrast.grey_levels`).
     huber : float
         Gradient of the flow (α), pixels per pixel, up to which smoothness is quadratic; 0 is the total variation.
     warps : int
@@ -86,7 +89,7 @@ class TvL1Params:
     tolerance : float
         A level ends when half of its pixels move by less than this in a warp, pixels.
     batch : int
-        Frames that a device solves together; memory grows with it.  A processor solves one after the other.
+        Frames that a device solves together; memory grows with it.  The CPU solves one after the other.
     """
 
     attachment: float = 0.08
@@ -129,7 +132,7 @@ class ReferenceLevel:
 
 @dataclass(frozen=True, eq=False)
 class TvL1Reference:
-    """What is computed once for all frames; threads may share it.
+    """A reference and everything that is computed from it once for all frames; threads may share it.
 
     Attributes
     ----------
@@ -137,15 +140,12 @@ class TvL1Reference:
         From the image to the coarsest.
     params : TvL1Params
     ops : StackOps
-        Operations of where it is computed.
-    together : bool
-        Whether frames are solved together, as on a device.
+        Operations of the CPU, or of the device.
     """
 
     levels: tuple[ReferenceLevel, ...]
     params: TvL1Params
     ops: StackOps
-    together: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ class TvL1Flows:
     flows : ndarray, float32, shape (T, H, W, 2)
         (dx, dy), pixels.
     warps : ndarray, int, shape (T,)
-        Warps that each frame took at full resolution.
+        Warps of each frame at full resolution.
     settled : ndarray, bool, shape (T,)
         Whether the last of them moved half of the pixels by less than the tolerance.
     """
@@ -177,7 +177,7 @@ def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device:
     params : TvL1Params, optional
         Settings of all flows from this reference.
     device : str
-        Where they are computed, see :mod:`turbrestore.runtime.device`.
+        Where flows are computed, see :mod:`turbrestore.runtime.device`.
 
     Returns
     -------
@@ -188,7 +188,7 @@ def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device:
     DataError
         Wrong shape, too small, or values that are not finite.
     ConfigurationError
-        The device is not there.
+        The device does not exist.
 
     Examples
     --------
@@ -202,8 +202,8 @@ def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device:
         raise DataError(f"reference: expected at least 16×16 pixels, found {image.shape[1]}×{image.shape[0]}")
     found = find_device(device)
     ops = numpy_ops() if found == PROCESSOR else torch_ops(found)
-    levels = (_refer_level(stack, ops) for stack in _pyramid(ops.load(image[None]), params.levels, ops))
-    return TvL1Reference(tuple(levels), params, ops, found != PROCESSOR)
+    levels = (_prepare_level(stack, ops) for stack in _pyramid(ops.load(image[None]), params.levels, ops))
+    return TvL1Reference(tuple(levels), params, ops)
 
 
 def tvl1_flows(
@@ -216,14 +216,14 @@ def tvl1_flows(
     frames : array_like, shape (T, H, W) or (T, H, W, 3)
         In the intensity unit of the reference; a device solves them together, so memory grows with T.
     reference : TvL1Reference
-        What :func:`prepare_tvl1` made of it.
+        From :func:`prepare_tvl1`.
     start : array_like, shape (T, H, W, 2), optional
-        Flows to begin with on the coarsest level, zero by default: earlier flows of these frames from much the same
-        reference, or, where a frame shows little, a prediction.  The flow of the frame before, or the one that a
-        dynamic texture predicts, is hardly nearer than zero where turbulence changes from frame to frame.
+        Flows to begin with on the coarsest level, zero by default: earlier flows to these frames from a similar
+        reference.  The flow to the frame before, or the one that a dynamic texture predicts, is hardly better than zero
+        where turbulence changes from frame to frame.
     levels : int, optional
-        Finest levels that are gone through; all by default.  A good start replaces the others: two save a tenth of the
-        time.
+        Number of finest levels to go through; all by default.  A good start replaces the others, and two save a tenth
+        of the time.
 
     Returns
     -------
@@ -256,8 +256,8 @@ def tvl1_flows(
     if levels is not None:
         require_between("levels", levels, 1, 10_000)
         reference = replace(reference, levels=reference.levels[:levels])
-    # On a processor one frame after the other stays in the cache.
-    size = len(stack) if reference.together else 1
+    # On the CPU a single frame stays in the cache.
+    size = 1 if reference.ops.arrays is np else len(stack)
     groups = [slice(first, first + size) for first in range(0, len(stack), size)]
     parts = [_solve(stack[group], reference, None if flows is None else flows[group]) for group in groups]
     return TvL1Flows(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("flows", "warps", "settled")))
@@ -308,7 +308,7 @@ def tvl1_solver(params: TvL1Params, reference: GreyImage, device: str) -> FlowSo
     return solve
 
 
-def _refer_level(image: Stack, ops: StackOps) -> ReferenceLevel:
+def _prepare_level(image: Stack, ops: StackOps) -> ReferenceLevel:
     y, x = np.mgrid[: image.shape[-2], : image.shape[-1]].astype(np.float32)
     return ReferenceLevel(image, _gradient(image, ops), ops.load(x), ops.load(y))
 
@@ -343,7 +343,7 @@ def _solve(frames: FloatArray, reference: TvL1Reference, start: FloatArray | Non
 
 
 def _resized(flow: Stack, shape: Shape, ops: StackOps) -> Stack:
-    """Flow on another grid; displacements grow with it."""
+    """Flow on another grid; displacements scale with it."""
     height, width = flow.shape[-2:]
     result = ops.resize(flow, shape)
     result[:, 0] *= shape[1] / width
@@ -354,11 +354,12 @@ def _resized(flow: Stack, shape: Shape, ops: StackOps) -> Stack:
 def _settle(
     level: ReferenceLevel, frames: Stack, flow: Stack, dual: Stack, reference: TvL1Reference
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Warp and minimise until the flow of each frame, given as spline coefficients, stays.
+    """Warp and minimise until the flow of each frame, given as spline coefficients, has settled.
 
     ``flow`` and ``dual`` are overwritten.
     """
     params, ops = reference.params, reference.ops
+    sweeps = SweepParams(params.sweeps, params.step, params.huber)
     warps, settled = np.zeros(len(frames), np.intp), np.zeros(len(frames), np.bool_)
     for _ in range(params.warps):
         running = np.flatnonzero(~settled)
@@ -366,28 +367,28 @@ def _settle(
             break
         before, p = flow[running], dual[running]
         problem = _linearise(level, frames[running], before, reference)
-        after = _minimise(problem, before, p, reference)
+        after = sweep(problem, before, p, sweeps, ops)
         if params.median > 1:
             after = ops.median(after, params.median)
-        little = ops.arrays.square(after - before).sum(1) < params.tolerance**2
-        # Counted where the flow is, so that a device gives back one number a frame.
-        still = ops.store(little.reshape(len(running), -1).sum(1))
+        unchanged = ops.arrays.square(after - before).sum(1) < params.tolerance**2
+        # Counted where the flow is, so that a device gives back one number for each frame.
+        still = ops.store(unchanged.reshape(len(running), -1).sum(1))
         flow[running], dual[running] = after, p
         warps[running] += 1
-        settled[running] = 2 * still > little.shape[-2] * little.shape[-1]
+        settled[running] = 2 * still > unchanged.shape[-2] * unchanged.shape[-1]
     return warps, settled
 
 
 def _linearise(level: ReferenceLevel, frames: Stack, flow: Stack, reference: TvL1Reference) -> FlowProblem:
-    """Take the data term about a flow."""
+    """Linearise the data term about a flow u₀: ``ρ(u) = f_w − r + g·(u − u₀)``, divided by |g|."""
     ops = reference.ops
     x, y = level.x + flow[:, 0], level.y + flow[:, 1]
     height, width = x.shape[-2:]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    warped = ops.sample(frames, x, y)
+    warped = ops.sample(frames, flow)  # f_w
     g = _gradient(warped, ops)
     g += level.gradient
-    # Where nothing is seen g vanishes, and with it the way that the data term can push.
+    # Outside the frame g vanishes, and with it the largest step that the data term can make.
     g *= 0.5 * inside[:, None]
     offset = warped - level.image
     offset -= (g * flow).sum(1)
@@ -395,11 +396,3 @@ def _linearise(level: ReferenceLevel, frames: Stack, flow: Stack, reference: TvL
     offset /= length
     g /= length[:, None]
     return FlowProblem(g, offset, length * reference.params.attachment)
-
-
-def _minimise(problem: FlowProblem, flow: Stack, dual: Stack, reference: TvL1Reference) -> Stack:
-    params, ops = reference.params, reference.ops
-    sweeps = SweepParams(params.sweeps, params.step, params.huber)
-    work = ops.arrays.empty_like(flow)
-    work[:] = flow
-    return sweep(problem, work, dual, sweeps, ops.arrays)

@@ -16,25 +16,25 @@ Pock (2011) is
 - primal: ``u⁺ = v − clip(ρ(v)/|g|, ±τλ|g|) ĝ``, ``v = u + τ div p``
 
 The primal step is the exact proximal map of ``τλ|ρ|``: v moves along g until ρ vanishes, but no further than τλ|g|.
-These are the three cases of the thresholding of Zach, Pock and Bischof (2007), who put it beside a second flow that is
-coupled by ``|u − v|²/2θ``; here nothing is coupled and θ does not exist.
+These are the three cases of the thresholding of Zach, Pock and Bischof (2007), who apply it to a second flow that is
+coupled by ``|u − v|²/2θ``; here nothing is coupled and there is no θ.
 
 ∇ takes forward differences, zero across the last row and column; div is its negative adjoint.
 
-A sweep of array operations goes through memory thirty times.  Compiled, it goes through it once: a row of p asks for ū
-in it and in the row below, and a row of u for p in it and in the row above, so both steps go down the image together.
+On the CPU a compiled loop goes through memory once a sweep: a row of p needs ū in this row and the row below, and a row
+of u needs p in this row and the row above, so both steps go down the image together.  A device sweeps a batch by
+operations on whole arrays.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ..core.arrays import FloatArray
 from ..runtime.image_stacks import Shape, Stack, StackOps
-from ..runtime.jit import compiled
+from ..runtime.jit import jit
 
 # Bound of the squared norm of the gradient by forward differences.
 _SQUARED_NORM = 8.0
@@ -88,7 +88,7 @@ class SweepParams:
         return 1 / (1 + self.dual_step * self.huber)
 
 
-def sweep(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams, arrays: Any) -> Stack:
+def sweep(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams, ops: StackOps) -> Stack:
     """Sweep the flows of a batch.
 
     Parameters
@@ -96,69 +96,40 @@ def sweep(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams, a
     problem : FlowProblem
         Data term.
     flow : stack, shape (B, 2, H, W)
-        u to begin with; overwritten.
+        u to begin with.
     dual : stack, shape (B, 2, 2, H, W)
-        p: axis (x, y), component; overwritten by what it ends as.  Its x vanishes in the last column, its y in the
-        last row.
+        p: axis (x, y), component; overwritten by its final value.  Its x vanishes in the last column, its y in the last
+        row.
     params : SweepParams
         Step and count.
-    arrays : module
-        ``numpy`` or ``torch``.
+    ops : StackOps
+        Operations of the CPU, or of the device.
 
     Returns
     -------
     stack, shape (B, 2, H, W)
-        u; perhaps ``flow`` itself.
+        u.
 
     Examples
     --------
-    >>> import numpy as np
+    >>> from turbrestore.runtime.image_stacks import numpy_ops
     >>> one = np.ones((1, 4, 4), np.float32)
     >>> along_x = np.stack([one, 0 * one], axis=1)
     >>> u, p = np.zeros((1, 2, 4, 4), np.float32), np.zeros((1, 2, 2, 4, 4), np.float32)
-    >>> sweep(FlowProblem(along_x, -2 * one, 5 * one), u, p, SweepParams(10, 0.7, 0.3), np)[0, :, 0, 0]
+    >>> sweep(FlowProblem(along_x, -2 * one, 5 * one), u, p, SweepParams(10, 0.7, 0.3), numpy_ops())[0, :, 0, 0]
     array([2., 0.], dtype=float32)
     """
-    if arrays is np and (loops := compiled(sweep_frame)):
-        steps = np.array([params.step, params.dual_step, params.shrink, params.count], flow.dtype)
-        for frame in zip(problem.direction, problem.offset, problem.bound, flow, flow.copy(), dual, strict=True):
-            loops(*frame, steps)
-        return flow
-    px, py = dual[:, 0], dual[:, 1]
-    upper = problem.bound * params.step
-    lower = -upper
-    # Scaled at once, so that the dual step only adds.
-    scale = params.dual_step * params.shrink
-    ahead = flow * scale
-    u, v, work, clipped = flow, arrays.empty_like(flow), arrays.empty_like(flow), arrays.empty_like(upper)
-    one = arrays.ones_like(upper[:1, :1, :1])
-    for _ in range(params.count):
-        dual *= params.shrink
-        add_differences(ahead, px, py)
-        arrays.multiply(px, px, out=v)
-        arrays.multiply(py, py, out=work)
-        v += work
-        arrays.sqrt(v, out=v)
-        arrays.maximum(v, one, out=v)
-        px /= v
-        py /= v
-        divergence(px, py, v, arrays)
-        v *= params.step
-        v += u
-        arrays.multiply(v, problem.direction, out=work)
-        arrays.add(work[:, 0], work[:, 1], out=clipped)
-        clipped += problem.offset
-        arrays.minimum(clipped, upper, out=clipped)
-        arrays.maximum(clipped, lower, out=clipped)
-        arrays.multiply(problem.direction, clipped[:, None], out=work)
-        v -= work
-        arrays.multiply(v, 2 * scale, out=ahead)
-        u *= scale
-        ahead -= u
-        u, v = v, u
+    if ops.arrays is not np:
+        return _sweep_on_device(problem, flow, dual, params)
+    steps = np.array([params.step, params.dual_step, params.shrink, params.count], flow.dtype)
+    u, ahead = flow.copy(), flow.copy()
+    for number, p in enumerate(dual):
+        data_term = problem.direction[number], problem.offset[number], problem.bound[number]
+        sweep_frame(*data_term, u[number], ahead[number], p, steps)
     return u
 
 
+@jit
 def sweep_frame(
     direction: FloatArray,
     offset: FloatArray,
@@ -168,7 +139,7 @@ def sweep_frame(
     dual: FloatArray,
     steps: FloatArray,
 ) -> None:
-    """Sweep the flow of one frame; to be compiled.
+    """Sweep the flow of one frame.
 
     Parameters
     ----------
@@ -225,35 +196,74 @@ def sweep_frame(
                 u1[column] = v1
 
 
+def _sweep_on_device(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams) -> Stack:
+    """Sweep a batch by operations of torch, in place as far as possible."""
+    import torch
+
+    px, py = dual[:, 0], dual[:, 1]
+    upper = problem.bound * params.step  # τλ|g|
+    lower = -upper
+    # σ ū / (1 + σα), so that the dual step only adds.
+    scale = params.dual_step * params.shrink
+    ahead = flow * scale
+    u, v, work = flow.clone(), torch.empty_like(flow), torch.empty_like(flow)
+    for _ in range(params.count):
+        dual *= params.shrink
+        add_differences(ahead, px, py)
+        torch.hypot(px, py, out=v).clamp_(min=1)
+        px /= v
+        py /= v
+        divergence(px, py, v)
+        v *= params.step
+        v += u
+        torch.mul(v, problem.direction, out=work)
+        push = (work.sum(1) + problem.offset).clamp_(lower, upper)
+        v -= torch.mul(problem.direction, push[:, None], out=work)
+        torch.mul(v, 2 * scale, out=ahead)
+        ahead -= u.mul_(scale)
+        u, v = v, u
+    return u
+
+
 def add_differences(u: Stack, px: Stack, py: Stack) -> None:
-    """Add ∇u to p."""
+    """Add ∇u to p, for arrays of NumPy or torch.
+
+    Parameters
+    ----------
+    u, px, py : stack, shape (..., H, W)
+
+    Examples
+    --------
+    >>> px, py = np.zeros((2, 1, 3))
+    >>> add_differences(np.array([[1.0, 3.0, 2.0]]), px, py)
+    >>> px
+    array([[ 2., -1.,  0.]])
+    """
     px[..., :-1] += u[..., 1:]
     px[..., :-1] -= u[..., :-1]
     py[..., :-1, :] += u[..., 1:, :]
     py[..., :-1, :] -= u[..., :-1, :]
 
 
-def divergence(px: Stack, py: Stack, out: Stack, arrays: Any) -> None:
+def divergence(px: Stack, py: Stack, out: Stack) -> None:
     """Negative adjoint of the forward differences, for p that vanishes across the last column and row.
 
     Parameters
     ----------
     px, py : stack, shape (..., H, W)
-        Components of p.
+        Components of p, arrays of NumPy or torch.
     out : stack, shape (..., H, W)
         Receives div p.
-    arrays : module
-        ``numpy`` or ``torch``.
 
     Examples
     --------
-    >>> import numpy as np
     >>> px, out = np.array([[1.0, 2.0, 0.0]]), np.empty((1, 3))
-    >>> divergence(px, np.zeros((1, 3)), out, np)
+    >>> divergence(px, np.zeros((1, 3)), out)
     >>> out
     array([[ 1.,  1., -2.]])
     """
-    arrays.add(px, py, out=out)
+    out[...] = px
+    out += py
     out[..., 1:] -= px[..., :-1]
     out[..., 1:, :] -= py[..., :-1, :]
 
@@ -274,14 +284,13 @@ def resize_dual(dual: Stack, shape: Shape, ops: StackOps) -> Stack:
 
     Examples
     --------
-    >>> import numpy as np
     >>> from turbrestore.runtime.image_stacks import numpy_ops
     >>> resize_dual(np.ones((1, 2, 2, 2, 2), np.float32), (3, 3), numpy_ops())[0, :, 0, 1]
     array([[1., 1., 0.],
            [1., 1., 1.]], dtype=float32)
     """
     result = ops.resize(dual, shape)
-    # No differences are taken across the border.
+    # There are no differences across the border.
     result[:, 0, :, :, -1] = 0
     result[:, 1, :, -1, :] = 0
     return result

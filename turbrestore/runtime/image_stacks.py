@@ -1,17 +1,20 @@
-"""The few operations on stacks of images that an iterative solver needs, in NumPy with OpenCV and in torch.
+"""Operations on stacks of images that have another name in torch than on the CPU: filter, resize, sample, median.
 
-A stack has the shape (..., H, W), float32.  Arithmetic is spelled alike in both libraries
-(``arrays.add(a, b, out=c)``), so that a solver is written once; filtering, resizing, sampling and the median are not,
-and are here.  Both agree to rounding.  Pixel centres lie at whole numbers.  Images are continued by reflection about
-their outermost pixels; the median repeats those.
+A stack has the shape (..., H, W), float32.  Arithmetic is spelled alike in NumPy and torch (``ops.arrays.sqrt(a)``), so
+a solver is written once; the operations here are not.  On the CPU they are OpenCV's and one compiled loop, on a device
+those of torch and kornia.  Both agree to rounding.  Pixel centres lie at whole numbers.  Images are continued by
+reflection about their outermost pixels; the median repeats those.
 
-Sampling is by cubic B-splines, as in :mod:`turbrestore.registration.warp`: the cubic convolution that both libraries
-have does not reproduce a ramp, and biases flows by up to 0.04 px.
+Images are sampled by cubic B-splines: the cubic convolution that the libraries offer does not reproduce a ramp, and
+biases flows by up to 0.04 px.
 """
 
 from __future__ import annotations
 
+import functools
+import threading
 from collections.abc import Callable
+from contextlib import ContextDecorator, ExitStack
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,10 +22,13 @@ import cv2
 import numpy as np
 
 from ..core.arrays import FloatArray
+from .jit import jit
 
-# Pole of the cubic B-spline prefilter; its impulse response below is cut off where it falls under 1e-7.
+# Pole of the cubic B-spline prefilter; its impulse response is cut off where it falls below 1e-7.
 _POLE = np.sqrt(3.0) - 2.0
 PREFILTER = (-6 * _POLE / (1 - _POLE**2) * _POLE ** np.abs(np.arange(-12, 13))).astype(np.float32)
+# Coefficients that a spline needs before the image and beyond it.
+_BEFORE, _BEYOND = 1, 2
 
 # ndarray or torch tensor, float32.
 Stack = Any
@@ -31,7 +37,7 @@ Shape = tuple[int, ...]
 
 @dataclass(frozen=True, eq=False)
 class StackOps:
-    """One library's operations.
+    """The operations of one library.
 
     Attributes
     ----------
@@ -46,8 +52,8 @@ class StackOps:
     resize : callable
         ``resize(stack, (H, W))`` interpolates linearly.
     sample : callable
-        ``sample(coefficients, x, y)`` sums 4×4 B-spline coefficients (B, H, W) about positions x and y (B, H, W); those
-        outside are moved to the border.
+        ``sample(coefficients, flow)`` evaluates the cubic B-spline with these coefficients, shape (B, H, W), where each
+        pixel leads by its flow, shape (B, 2, H, W), pixels; positions outside the image are moved to its border.
     median : callable
         ``median(stack, side)`` of windows of 3×3 or 5×5 pixels.
     """
@@ -58,10 +64,11 @@ class StackOps:
     zeros: Callable[[Shape], Stack]
     filter: Callable[[Stack, FloatArray, FloatArray], Stack]
     resize: Callable[[Stack, Shape], Stack]
-    sample: Callable[[Stack, Stack, Stack], Stack]
+    sample: Callable[[Stack, Stack], Stack]
     median: Callable[[Stack, int], Stack]
 
 
+@functools.cache
 def numpy_ops() -> StackOps:
     """Operations of NumPy and OpenCV.
 
@@ -89,6 +96,13 @@ def numpy_ops() -> StackOps:
 
         return each(correlate, stack, stack.shape[-2:])
 
+    def sampled(coefficients: FloatArray, flow: FloatArray) -> FloatArray:
+        result = np.empty(coefficients.shape, np.float32)
+        for plane, displacement, out in zip(coefficients, flow, result, strict=True):
+            around = cv2.copyMakeBorder(plane, _BEFORE, _BEYOND, _BEFORE, _BEYOND, cv2.BORDER_REFLECT_101)
+            sample_spline(around, np.ascontiguousarray(np.moveaxis(displacement, 0, -1)), out)
+        return result
+
     return StackOps(
         arrays=np,
         load=lambda array: array,
@@ -96,23 +110,23 @@ def numpy_ops() -> StackOps:
         zeros=lambda shape: np.zeros(shape, np.float32),
         filter=filtered,
         resize=lambda stack, size: each(lambda plane, out: cv2.resize(plane, size[::-1], dst=out), stack, size),
-        sample=_sample_blended,
+        sample=sampled,
         median=lambda stack, side: each(
             lambda plane, out: cv2.medianBlur(plane, side, dst=out), stack, stack.shape[-2:]
         ),
     )
 
 
+@functools.cache
 def torch_ops(device: str) -> StackOps:
-    """Operations of torch, made of additions, comparisons and gathers alone.
+    """Operations of torch and kornia.
 
-    Each sums in one fixed order, so that results repeat from run to run on a GPU too, and in full single precision;
-    convolutions of cuDNN, which may round to ten bits, and scattering are avoided.
+    A repeated run gives the same bytes, in full single precision (see :func:`full_precision`): nothing is scattered.
 
     Parameters
     ----------
     device : str
-        What torch calls it, such as ``"cuda"``; ``"cpu"`` is torch on the processor.  It has to be there.
+        Name that torch gives it, such as ``"cuda"``; ``"cpu"`` is torch on the CPU.  It must exist.
 
     Returns
     -------
@@ -127,20 +141,26 @@ def torch_ops(device: str) -> StackOps:
     array([0.5, 2.5, 4.5, 6.5], dtype=float32)
     """
     import torch
+    from kornia.filters import filter2d_separable, median_blur
     from torch.nn import functional
 
+    def planes_of(stack: Stack) -> Stack:
+        return stack.reshape(-1, 1, *stack.shape[-2:])
+
+    def filtered(stack: Stack, kernel_x: FloatArray, kernel_y: FloatArray) -> Stack:
+        half = len(kernel_y) // 2, len(kernel_x) // 2
+        planes = _reflect(planes_of(stack), half, half, torch)
+        along, across = (torch.from_numpy(kernel)[None].to(stack.device) for kernel in (kernel_x, kernel_y))
+        with full_precision():
+            return filter2d_separable(planes, along, across, padding="valid").reshape(stack.shape)
+
     def resized(stack: Stack, size: Shape) -> Stack:
-        planes = stack.reshape(-1, 1, *stack.shape[-2:])
-        planes = functional.interpolate(planes, size=size, mode="bilinear", align_corners=False)
+        planes = functional.interpolate(planes_of(stack), size=size, mode="bilinear", align_corners=False)
         return planes.reshape(*stack.shape[:-2], *size)
 
     def median(stack: Stack, side: int) -> Stack:
-        height, width = stack.shape[-2:]
-        # Padding by repetition takes stacks of four axes at most.
-        planes = functional.pad(stack.reshape(-1, 1, height, width), (side // 2,) * 4, mode="replicate")
-        shifts = ((y, x) for y in range(side) for x in range(side))
-        windows = [planes[..., y : y + height, x : x + width] for y, x in shifts]
-        return _median_of(windows, torch).reshape(stack.shape)
+        with full_precision():
+            return median_blur(planes_of(stack), side, border_type="replicate").reshape(stack.shape)
 
     return StackOps(
         arrays=torch,
@@ -148,84 +168,11 @@ def torch_ops(device: str) -> StackOps:
         load=lambda array: torch.from_numpy(np.require(array, requirements=["C", "W"])).to(device),
         store=lambda stack: stack.cpu().numpy(),
         zeros=lambda shape: torch.zeros(shape, device=device),
-        filter=lambda stack, kernel_x, kernel_y: _correlate(
-            _correlate(stack, kernel_x, -1, torch), kernel_y, -2, torch
-        ),
+        filter=filtered,
         resize=resized,
-        sample=lambda coefficients, x, y: _sample_gathered(coefficients, x, y, torch),
+        sample=lambda coefficients, flow: _sample_gathered(coefficients, flow, torch),
         median=median,
     )
-
-
-def _correlate(stack: Stack, kernel: FloatArray, axis: int, torch: Any) -> Stack:
-    """Sum of shifted copies; the same to the bit as a convolution, which is three times slower on a processor."""
-    half, length = len(kernel) // 2, stack.shape[axis]
-    if half == 0:
-        return stack * float(kernel[0])
-    reflected = torch.from_numpy(np.pad(np.arange(length), half, mode="reflect")).to(stack.device)
-    longer = stack.index_select(axis, reflected)
-    result = longer.narrow(axis, 0, length) * float(kernel[0])
-    for shift, weight in enumerate(kernel.tolist()):
-        if shift and weight:
-            result.add_(longer.narrow(axis, shift, length), alpha=weight)
-    return result
-
-
-def _sample_gathered(coefficients: Stack, x: Stack, y: Stack, torch: Any) -> Stack:
-    """Sixteen gathers; torch's grid_sample rounds positions to 1e-7 of the width, which is 2e-4 px of 1920."""
-    count, height, width = coefficients.shape
-    x, y = x.clip(0, width - 1), y.clip(0, height - 1)
-    left, top = x.floor(), y.floor()
-    columns, rows = _spline_weights(x - left), _spline_weights(y - top)
-    # One coefficient more on the near side and two on the far side, so that no index has to be reflected.
-    across, down = (
-        torch.from_numpy(np.pad(np.arange(length), (1, 2), mode="reflect")).to(coefficients.device)
-        for length in (width, height)
-    )
-    around = coefficients.index_select(2, across).index_select(1, down).reshape(-1)
-    first = torch.arange(count, device=x.device, dtype=torch.int32) * ((height + 3) * (width + 3))
-    index = (first[:, None, None] + top.int() * (width + 3) + left.int()).reshape(-1)
-    result = torch.zeros_like(x)
-    for row, of_row in enumerate(rows):
-        line = torch.zeros_like(x)
-        for column, of_column in enumerate(columns):
-            step = row * (width + 3) + column
-            taken = around.narrow(0, step, around.numel() - step).index_select(0, index)
-            line.addcmul_(taken.reshape(x.shape), of_column)
-        result.addcmul_(line, of_row)
-    return result
-
-
-def _spline_weights(t: Stack) -> tuple[Stack, Stack, Stack, Stack]:
-    """Weights of the cubic B-spline for the pixels at −1, 0, 1 and 2, t beyond 0."""
-    rest = 1 - t
-    first, second, last = rest * rest * rest / 6, 2 / 3 - t * t * (1 - t / 2), t * t * t / 6
-    return first, second, 1 - first - second - last, last
-
-
-def _median_of(planes: list[Stack], arrays: Any) -> Stack:
-    """Median of an odd number of planes by minima and maxima.
-
-    Of any ``n // 2 + 2`` values neither the smallest nor the largest is the median of all n: they are dropped, the next
-    one joins, and again, until one is left.
-    """
-    kept, rest = planes[: len(planes) // 2 + 2], planes[len(planes) // 2 + 2 :]
-
-    def order(low: int, high: int) -> None:
-        a, b = kept[low], kept[high]
-        kept[low], kept[high] = arrays.minimum(a, b), arrays.maximum(a, b)
-
-    while len(kept) > 1:
-        last = len(kept) - 1
-        for i in range(len(kept) // 2):
-            order(i, last - i)
-        for i in range(1, (last + 2) // 2):
-            order(0, i)
-        for i in range((last + 1) // 2, last):
-            order(i, last)
-        kept = kept[1:last] + rest[:1]
-        rest = rest[1:]
-    return kept[0]
 
 
 def spline_coefficients(stack: Stack, ops: StackOps) -> Stack:
@@ -251,7 +198,7 @@ def spline_coefficients(stack: Stack, ops: StackOps) -> Stack:
 
 
 def warp_stack(stack: Stack, flow: Stack, ops: StackOps) -> Stack:
-    """Backward warp by cubic B-splines, as :func:`turbrestore.registration.warp.warp`.
+    """Backward warp by cubic B-splines: the equation behind :func:`turbrestore.registration.warp.warp`.
 
     Parameters
     ----------
@@ -272,35 +219,127 @@ def warp_stack(stack: Stack, flow: Stack, ops: StackOps) -> Stack:
     >>> warp_stack(ramp, np.full((16, 16, 2), 0.25, np.float32), numpy_ops())[0, 0, 6:10].round(3)
     array([6.25, 7.25, 8.25, 9.25], dtype=float32)
     """
-    y, x = (ops.load(axis) for axis in np.mgrid[: stack.shape[-2], : stack.shape[-1]].astype(np.float32))
-    x, y = (ops.arrays.broadcast_to(axis, stack.shape) for axis in (x + flow[..., 0], y + flow[..., 1]))
-    return ops.sample(spline_coefficients(stack, ops), x, y)
+    planes = ops.arrays.moveaxis(flow, -1, 0)
+    return ops.sample(spline_coefficients(stack, ops), ops.arrays.broadcast_to(planes, (len(stack), *planes.shape)))
 
 
-def _sample_blended(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Sum of 4×4 B-spline coefficients as a blend of four bilinear samples (Sigg and Hadwiger 2005)."""
+@jit
+def sample_spline(coefficients: FloatArray, flow: FloatArray, result: FloatArray) -> None:
+    """Sum 4×4 B-spline coefficients at each position that a flow leads to.
 
-    def bilinear(map_x: FloatArray, map_y: FloatArray) -> FloatArray:
-        result = np.empty(x.shape, np.float32)
-        for plane, u, v, out in zip(coefficients, map_x, map_y, result, strict=True):
-            cv2.remap(plane, u, v, cv2.INTER_LINEAR, dst=out, borderMode=cv2.BORDER_REFLECT_101)
-        return result
+    Parameters
+    ----------
+    coefficients : ndarray, float32, shape (H + 3, W + 3)
+        With one pixel before the image and two beyond it.
+    flow : ndarray, float32, shape (H, W, 2)
+        Displacements (dx, dy) in pixels.
+    result : ndarray, float32, shape (H, W)
+        Filled.
 
-    height, width = coefficients.shape[-2:]
-    left, right, to_right = _spline_pair(x, width)
-    upper, lower, to_lower = _spline_pair(y, height)
-    top, bottom = (
-        a + to_right * (bilinear(right, row) - a) for row, a in ((row, bilinear(left, row)) for row in (upper, lower))
-    )
-    return top + to_lower * (bottom - top)
+    Examples
+    --------
+    >>> shifted = np.empty((2, 3), np.float32)
+    >>> sample_spline(np.ones((5, 6), np.float32), np.full((2, 3, 2), 0.5, np.float32), shifted)
+    >>> shifted.round(6).tolist()
+    [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
+    """
+    zero, one, sixth = np.float32(0), np.float32(1), np.float32(1 / 6)
+    three, four, six = np.float32(3), np.float32(4), np.float32(6)
+    bottom, right = np.float32(result.shape[0] - 1), np.float32(result.shape[1] - 1)
+    for row in range(result.shape[0]):
+        for column in range(result.shape[1]):
+            x = min(max(np.float32(column) + flow[row, column, 0], zero), right)
+            y = min(max(np.float32(row) + flow[row, column, 1], zero), bottom)
+            # An unsigned index cannot count from the end, which would be checked at every access.
+            j, i = np.uint32(x), np.uint32(y)
+            t, u = x - np.float32(j), y - np.float32(i)
+            left, upper = (one - t) * (one - t) * (one - t) * sixth, (one - u) * (one - u) * (one - u) * sixth
+            centre, middle = (four - (six - three * t) * t * t) * sixth, (four - (six - three * u) * u * u) * sixth
+            far, lower = t * t * t * sixth, u * u * u * sixth
+            beside, below = one - left - centre - far, one - upper - middle - lower
+            rows = coefficients[i], coefficients[i + 1], coefficients[i + 2], coefficients[i + 3]
+            a = rows[0][j] * left + rows[0][j + 1] * centre + rows[0][j + 2] * beside + rows[0][j + 3] * far
+            b = rows[1][j] * left + rows[1][j + 1] * centre + rows[1][j + 2] * beside + rows[1][j + 3] * far
+            c = rows[2][j] * left + rows[2][j + 1] * centre + rows[2][j + 2] * beside + rows[2][j + 3] * far
+            d = rows[3][j] * left + rows[3][j + 1] * centre + rows[3][j + 2] * beside + rows[3][j + 3] * far
+            result[row, column] = a * upper + b * middle + c * below + d * lower
 
 
-def _spline_pair(position: FloatArray, length: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Two positions and a blend whose bilinear samples weigh four neighbours as the cubic B-spline does."""
-    position = np.clip(position, 0, length - 1)
-    whole = np.floor(position)
-    t = position - whole
+def _sample_gathered(coefficients: Stack, flow: Stack, torch: Any) -> Stack:
+    """Sixteen gathers; torch's grid_sample rounds positions to 1e-7 of the width, which is 2e-4 px of 1920."""
+    count, height, width = coefficients.shape
+    y, x = (torch.arange(length, dtype=torch.float32, device=flow.device) for length in (height, width))
+    x, y = (x + flow[:, 0]).clip(0, width - 1), (y[:, None] + flow[:, 1]).clip(0, height - 1)
+    left, top = x.floor(), y.floor()
+    columns, rows = _spline_weights(x - left), _spline_weights(y - top)
+    around = _reflect(coefficients, (_BEFORE, _BEFORE), (_BEYOND, _BEYOND), torch).reshape(-1)
+    longer = width + _BEFORE + _BEYOND
+    first = torch.arange(count, device=x.device, dtype=torch.int32) * ((height + _BEFORE + _BEYOND) * longer)
+    index = (first[:, None, None] + top.int() * longer + left.int()).reshape(-1)
+    result = torch.zeros_like(x)
+    for row, row_weight in enumerate(rows):
+        line = torch.zeros_like(x)
+        for column, column_weight in enumerate(columns):
+            step = row * longer + column
+            taken = around.narrow(0, step, around.numel() - step).index_select(0, index)
+            line.addcmul_(taken.reshape(x.shape), column_weight)
+        result.addcmul_(line, row_weight)
+    return result
+
+
+def _spline_weights(t: Stack) -> tuple[Stack, Stack, Stack, Stack]:
+    """Weights of the cubic B-spline for the pixels at −1, 0, 1 and 2, t beyond 0."""
     rest = 1 - t
-    before = rest * rest * rest / 6 + (2 / 3 - t * t * (1 - t / 2))
-    after = 1 - before
-    return whole - 1 + (before - rest * rest * rest / 6) / before, whole + 1 + t * t * t / (6 * after), after
+    first, second, last = rest * rest * rest / 6, 2 / 3 - t * t * (1 - t / 2), t * t * t / 6
+    return first, second, 1 - first - second - last, last
+
+
+def _reflect(stack: Stack, before: Shape, beyond: Shape, torch: Any) -> Stack:
+    """Continue images by so many rows and columns; unlike torch's padding, by more than there are too."""
+    for axis, *sides in zip((-2, -1), before, beyond, strict=True):
+        order = np.pad(np.arange(stack.shape[axis]), sides, mode="reflect")
+        stack = stack.index_select(axis, torch.from_numpy(order).to(stack.device))
+    return stack
+
+
+class _FullPrecision(ContextDecorator):
+    """Settings of cuDNN while anybody is inside; they belong to the process, so the last one out restores them."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._restore = threading.Lock(), 0, ExitStack()
+
+    def __enter__(self) -> None:
+        from torch.backends import cudnn
+
+        with self._lock:
+            if self._inside == 0:
+                settings = cudnn.flags(enabled=cudnn.enabled, deterministic=True, allow_tf32=False)
+                self._restore.enter_context(settings)
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._restore.close()
+
+
+@functools.cache
+def full_precision() -> _FullPrecision:
+    """Keep the convolutions of cuDNN, which kornia's filters and median use, in single precision and reproducible.
+
+    A GPU otherwise rounds their factors to ten bits.
+
+    Returns
+    -------
+    context manager
+        The same every time; threads may enter it side by side.
+
+    Examples
+    --------
+    >>> from torch.backends import cudnn
+    >>> with full_precision():
+    ...     cudnn.allow_tf32
+    False
+    """
+    return _FullPrecision()

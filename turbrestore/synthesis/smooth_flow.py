@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import require
-from ..registration.warp import invert_flow, warp
+from ..registration.flow_algebra import invert_flow
+from ..registration.warp import warp
 
 
 @dataclass(frozen=True)
