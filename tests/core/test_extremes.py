@@ -126,7 +126,7 @@ def walk(seed, radius, noises, seen, steps, every):
     for step, noise in enumerate(10.0 ** rng.uniform(-9, 4, steps)):
         state = predict(state, A, Q)
         if measured[step]:
-            state, _ = update_information(state, values[step], C, noise, orthonormal=True)
+            state, _ = update_information(state, values[step], C, noise)
         assert (state.cov == state.cov.T).all()
         if step % every == every - 1:
             assert np.linalg.eigvalsh(state.cov).min() > 0, step

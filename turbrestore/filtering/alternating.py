@@ -16,8 +16,9 @@ Given Ŵ the image is a linear state, given ρ the flow is, so each frame update
 3. warp the frame by Ŵ and update ρ̂ (eqs. 15, 16);
 4. return to 2 with the new image, ``inner_iterations`` times in all.
 
-The equations: :mod:`turbrestore.filtering.flow_state` has 14b, 14d, 17 and 19, :mod:`turbrestore.filtering.image_state`
-14a, 14c and 16, :mod:`turbrestore.filtering.frame_noise` Z.  :mod:`turbrestore.filtering.frame_pass` does one iteration.
+Eqs. 14b, 14d, 17 and 19 are in :mod:`turbrestore.filtering.flow_state`, eqs. 14a, 14c, 15 and 16 in
+:mod:`turbrestore.filtering.image_state`, and Z is in :mod:`turbrestore.filtering.frame_noise`.
+:mod:`turbrestore.filtering.frame_pass` measures, follows and registers the frames of one iteration.
 
 Departures from the paper, each with its reason:
 
@@ -208,7 +209,7 @@ def _filter_blocks(
     params: FilterParams,
     settings: PassSettings,
 ) -> Generator[FilterStep, None, _Position]:
-    """Steps 1 to 4 of the module docstring for one block after the other."""
+    """Do steps 1 to 4 of the module docstring for one block after the other."""
     iterations, size, last = params.inner_iterations, params.block, params.inner_iterations == 1
     if at.block:
         # The flows of the first block are known in its first iteration.
