@@ -10,8 +10,8 @@ G : Gram matrix Xᵀ X = V Σ² Vᵀ
 C : first n columns of U; Ξ : first n rows of Σ Vᵀ
 
 U is never formed: G is summed over strips of image rows, and C = X V Σ⁻¹ is computed strip by strip. The sums are
-float64: float32 would save less than a tenth of a second at τ = 100 and 256², and rounding would hide the small singular
-values.
+float64: float32 would save less than a tenth of a second at τ = 100 and 256², and rounding would hide the small
+singular values.
 """
 
 from __future__ import annotations
