@@ -8,14 +8,15 @@ import pytest
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
-from turbrestore.filtering.alternating import FilterParams, filter_frames
-from turbrestore.filtering.flow_tracking import state_covariances
-from turbrestore.filtering.kalman import Gaussian, PixelGaussian, predict, update, update_pixels
+from turbrestore.filtering.alternating import filter_frames, filter_steps
+from turbrestore.filtering.filter_records import FilterParams, filter_memory
+from turbrestore.filtering.image_state import PixelStacks, update_pixels
+from turbrestore.filtering.kalman import Gaussian, predict, update
 from turbrestore.metrics import psnr
-from turbrestore.registration import flow
 from turbrestore.registration.centroid import find_centroid
-from turbrestore.registration.flow import FlowParams
 from turbrestore.registration.warp import warp
+from turbrestore.runtime.runtime import DEFAULT, Runtime
+from turbrestore.runtime.steps import finish
 
 INSIDE = (slice(12, -12), slice(12, -12))
 
@@ -93,7 +94,7 @@ def test_in_the_subspace_it_is_the_linear_kalman_filter(sequence):
     filtered = filter_frames(frames, reference, model, params, known_flows=flows)
 
     flow = Gaussian(np.zeros(rank), model.state_covariance)
-    image = PixelGaussian(reference, np.full((96, 96), noise / prior_frames, np.float32))
+    image = PixelStacks(reference, np.full((96, 96), noise / prior_frames, np.float32))
     for frame, xi, found, unforeseen in zip(frames, states, filtered.flow_states, filtered.innovations, strict=True):
         missed = (model.C @ (xi - predict(flow, model.A, model.Q).mean).astype(np.float32)).astype(np.float64)
         assert unforeseen == pytest.approx(np.sqrt(np.mean(missed**2)), rel=1e-3)
@@ -101,7 +102,7 @@ def test_in_the_subspace_it_is_the_linear_kalman_filter(sequence):
         flow, _ = update(predict(flow, model.A, model.Q), xi, np.eye(rank), model.R * np.eye(rank))
         assert np.allclose(found, flow.mean, rtol=1e-4, atol=1e-4)
         estimate = model.mean_flow + (model.C @ flow.mean.astype(np.float32)).reshape(96, 96, 2)
-        image, _ = update_pixels(image, warp(frame, estimate), noise)
+        image, _ = update_pixels(image, warp(frame, estimate), noise, 0.0)
     assert np.abs(filtered.image - image.mean).max() < 1e-3
     assert np.allclose(filtered.variance, image.variance)
 
@@ -183,29 +184,13 @@ def test_frames_are_streamed_a_block_at_a_time(sequence):
             taken += 1
             yield frame
 
-    def progress(_):
-        nonlocal furthest
-        furthest = max(furthest, taken - progress.done)
-        progress.done += 1
-
-    progress.done = 0
     params = FilterParams(block=5, inner_iterations=1)
-    filtered = filter_frames(stream(), centroid.image, dynamics, params, known_flows=centroid.flows, progress=progress)
-    assert len(filtered.gains) == 40
-    # Four training frames need no new flow; beyond them at most a block is in hand.
-    assert furthest <= 4 + 5
-
-
-def test_covariances_of_a_block_are_those_of_the_filter_step_by_step(sequence):
-    _, dynamics = start(sequence)[:2]
-    noise, state = dynamics.R * np.eye(dynamics.rank), Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance)
-    frames = [sequence.frames[0], None, sequence.frames[1], None, None, sequence.frames[2]]
-    found = state_covariances(state, [frame is not None for frame in frames], dynamics)
-    for frame, covariance in zip(frames, found, strict=True):
-        state = predict(state, dynamics.A, dynamics.Q)
-        if frame is not None:
-            state, _ = update(state, np.zeros(dynamics.rank), np.eye(dynamics.rank), noise)
-        assert covariance == pytest.approx(state.cov, rel=1e-9, abs=1e-12 * state.cov.max())
+    steps = filter_steps(stream(), centroid.image, dynamics, params, known_flows=centroid.flows)
+    for step in steps:
+        furthest = max(furthest, taken - 4 - step.flows_measured)
+    assert (taken, step.flows_measured) == (40, 36)
+    # Four training frames need no new flow; beyond them at most a block is in memory.
+    assert furthest <= 5
 
 
 @pytest.mark.parametrize(
@@ -217,48 +202,41 @@ def test_from_every_checkpoint_a_run_goes_on_bit_for_bit(sequence, iterations, t
     frames = np.stack([frames, 0.5 * frames, frames**2], axis=-1) if colour else frames
     centroid = find_centroid(frames[:train])
     params = FilterParams(inner_iterations=iterations, block=4)
-    counted, kept = np.isin(np.arange(15), left_out, invert=True), []
+    counted = [None if number in left_out else frame for number, frame in enumerate(frames)]
 
-    def run(**options):
-        options = {"known_flows": centroid.flows, "counted": counted, **options}
+    def run(steps, start=None, runtime=DEFAULT):
         dynamics = identify(centroid.flows, DynamicsParams(rank=2))
-        found = filter_frames(frames, centroid.image, dynamics, params, **options)
+        arguments = counted, centroid.image, dynamics, params, None, centroid.flows, runtime, start
+        found = finish(filter_steps(*arguments), steps.append)
         arrays = found.image, found.variance, found.flow_states, found.shares, found.innovations
         return [array.tobytes() for array in arrays]
 
-    whole = run(on_checkpoint=kept.append)
+    total, whole, steps = 15 * iterations - train, [], []
+    whole = run(steps)
+    kept = [step.checkpoint for step in steps if step.checkpoint is not None]
     assert [len(one.records) for one in kept] == list(dict.fromkeys([*range(train, 15, 4), 15]))
-    steps = []
+    assert [step.flows_measured for step in steps if step.checkpoint is None] == list(range(1, total + 1))
     for checkpoint in kept:
-        steps.clear()
-        assert run(start=checkpoint, progress=steps.append) == whole
-        assert sum(steps) == 15 * iterations - train
-    assert run(flow_params=FlowParams(threads=3)) == whole
-    assert run(prepared={}) == whole
+        again = []
+        assert run(again, checkpoint) == whole
+        assert [step.flows_measured for step in again][-1:] in ([total], [])
+    assert run([], runtime=Runtime(threads=3)) == whole
 
 
-def test_what_was_prepared_before_changes_nothing_and_is_not_kept(sequence, monkeypatch):
-    prepared = {}
-    centroid = find_centroid(sequence.frames, prepared=prepared)
-    dynamics = identify(centroid.flows)
-    assert sorted(prepared) == list(range(len(sequence.frames)))
-    again = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows)
-    levels = []
-    monkeypatch.setattr(
-        "turbrestore.registration.flow._levels", lambda *a, find=flow._levels: levels.append(1) or find(*a)
-    )
-    filtered = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows, prepared=prepared)
-    # That of the one reference, and of no frame.
-    assert len(levels) == 1
-    assert prepared == {}
-    assert filtered.image.tobytes() == again.image.tobytes()
+def test_a_checkpoint_of_other_frames_is_refused(sequence):
+    centroid, dynamics = start(sequence, 4, rank=2)
+    arguments = sequence.frames, centroid.image, dynamics, FilterParams(block=4), None, centroid.flows
+    steps = list(filter_steps(*arguments))
+    early = next(step.checkpoint for step in steps if step.checkpoint is not None)
+    for bad in (replace(early, records=early.records[:2]), replace(early, reference=early.reference[1:])):
+        with pytest.raises(DataError, match="^start: expected a checkpoint of these frames"):
+            finish(filter_steps(*arguments, start=bad))
 
 
 def test_threads_do_not_change_the_result(sequence):
     centroid, dynamics = start(sequence)
     one, three = (
-        filter_frames(sequence.frames, centroid.image, dynamics, flow_params=FlowParams(threads=n)).image
-        for n in (1, 3)
+        filter_frames(sequence.frames, centroid.image, dynamics, runtime=Runtime(threads=n)).image for n in (1, 3)
     )
     assert (one == three).all()
 
@@ -289,7 +267,6 @@ def test_bad_input_is_refused(sequence):
         filter_frames(sequence.frames[:, :64], centroid.image[:64], dynamics)
     for bad in (
         {"residual": "half"},
-        {"frame_noise": "contrast"},
         {"inner_iterations": 0},
         {"block": 0},
         {"sharpness": -1.0},
@@ -319,40 +296,6 @@ def test_frames_whose_flow_folds_count_for_little(sequence):
     assert np.abs(plain - frames[0])[region].max() > 0.1
     # Three of six frames are all the information there is.
     assert np.median(filtered.variance[region]) > 1.7 * np.median(filtered.variance[70:, 70:])
-
-
-def still_frames(sequence, sigmas):
-    """Frames without motion, each with its own blur and noise."""
-    rng = np.random.default_rng(0)
-    frames = [cv2.GaussianBlur(sequence.scene, (0, 0), sigma) for sigma in sigmas]
-    return np.stack(frames) + rng.normal(0, 0.01, (len(sigmas), 96, 96)).astype(np.float32)
-
-
-def test_by_blur_sharp_frames_weigh_more_also_among_those_that_come_later(sequence):
-    sigmas = np.tile([0.8, 1.8], 12)
-    frames = still_frames(sequence, sigmas)
-    dynamics = identify(np.zeros((8, 96, 96, 2), np.float32))
-    params = FilterParams(frame_noise="blur", inner_iterations=1, image_drift=1e-5, prior_frames=1.0)
-    known = np.zeros((8, 96, 96, 2), np.float32)
-    filtered = filter_frames(frames, frames[:8].mean(axis=0), dynamics, params, known_flows=known)
-    sharp, blurry = filtered.gains[0::2], filtered.gains[1::2]
-    assert blurry[1:].max() < 0.6 * sharp[1:].min()
-    assert quality(filtered.image, sequence, 0.8) > quality(frames.mean(axis=0), sequence, 0.8) + 2
-
-
-def test_by_blur_frames_alike_carry_the_same_information(sequence):
-    frames = still_frames(sequence, np.full(20, 1.0))
-    dynamics = identify(np.zeros((20, 96, 96, 2), np.float32))
-    params = FilterParams(frame_noise="blur", inner_iterations=1)
-    known = np.zeros((20, 96, 96, 2), np.float32)
-    filtered = filter_frames(frames, frames.mean(axis=0), dynamics, params, known_flows=known)
-    assert np.median(filtered.variance) * 20 / filtered.image_noise == pytest.approx(1, abs=0.15)
-
-
-def test_by_blur_one_frame_a_block_is_enough(sequence):
-    dynamics = identify(np.zeros((4, 96, 96, 2), np.float32))
-    params = FilterParams(frame_noise="blur", block=1, inner_iterations=1)
-    assert np.isfinite(filter_frames(sequence.frames[:3], sequence.frames[0], dynamics, params).image).all()
 
 
 def test_no_more_of_the_residual_is_kept_than_the_model_says_is_motion(sequence):
@@ -407,28 +350,37 @@ def test_frames_that_do_not_count_change_the_flow_state_only():
     centroid, dynamics = start(sequence, 8)
     counted = np.ones(16, bool)
     counted[[3, 9, 10, 15]] = False
-    garbage = sequence.frames.copy()
-    garbage[~counted] = np.random.default_rng(0).uniform(size=garbage[~counted].shape)
-    options = {"params": FilterParams(image_noise=1e-3), "counted": counted}
-    first, second = (
-        filter_frames(frames, centroid.image, dynamics, known_flows=centroid.flows, **options)
-        for frames in (sequence.frames, garbage)
-    )
+    frames = [frame if counts else None for frame, counts in zip(sequence.frames, counted, strict=True)]
+    params = FilterParams(image_noise=1e-3)
+    first = filter_frames(frames, centroid.image, dynamics, params, known_flows=centroid.flows)
     assert np.isnan(first.innovations[~counted]).all()
     assert np.isfinite(first.innovations[counted]).all()
     assert (first.gains[~counted] == 0).all()
     assert (first.shares[~counted] == 0).all()
     assert np.allclose(first.flow_states[9], dynamics.A @ first.flow_states[8])
-    # The noise model is read off all training frames, so frame 3 is not quite without effect.
-    assert np.abs(first.image - second.image).mean() < 0.01
+    rest, flows = sequence.frames[counted], centroid.flows[counted[:8]]
+    alone = filter_frames(rest, centroid.image, dynamics, params, known_flows=flows)
+    assert np.abs(first.image - alone.image).mean() < 0.01
 
 
-def test_marks_that_do_not_fit_are_refused():
-    sequence = make_sequence(seed=24, count=12, size=64)
+def test_at_least_one_frame_has_to_count(sequence):
     centroid, dynamics = start(sequence, 4)
-    for marks, message in (([False] * 12, "at least one"), ([True] * 10, "found 10 marks"), ([True] * 13, "13 marks")):
-        with pytest.raises(DataError, match=message):
-            filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows, counted=marks)
+    with pytest.raises(DataError, match="^frames: expected at least one frame to count, found none$"):
+        filter_frames([None] * 9, centroid.image, dynamics, known_flows=centroid.flows)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_no_frame_of_the_first_block_has_to_count(sequence, known):
+    """The flow state is predicted through it, and the first frames that count are filtered as the first block."""
+    centroid, dynamics = start(sequence, 4)
+    params, flows = FilterParams(block=4), centroid.flows if known else None
+    frames = [*[None] * 4, *sequence.frames[4:12]]
+    later = filter_frames(frames, centroid.image, dynamics, params, known_flows=flows)
+    alone = filter_frames(sequence.frames[4:12], centroid.image, dynamics, params)
+    assert (later.shares[:4] == 0).all() and np.isnan(later.innovations[:4]).all()
+    assert later.image_noise == alone.image_noise
+    assert np.abs(later.image - alone.image).max() < 0.02
+    assert len(later.gains) == 12
 
 
 def test_a_border_that_was_not_seen_is_not_made_of_its_repetition():
@@ -446,3 +398,11 @@ def test_a_border_that_was_not_seen_is_not_made_of_its_repetition():
     filtered = filter_frames(frames, centroid.image, identify(centroid.flows), known_flows=centroid.flows)
     error = np.abs(filtered.image - truth)
     assert np.median(error[:, :2]) < 3 * np.median(error[:, 20:-20])
+
+
+def test_memory_grows_with_channels_threads_and_the_block():
+    grey, colour = (filter_memory((100, 10, 10, *channels), 50, FilterParams(block=4)) for channels in ((), (3,)))
+    assert grey == 100 * (15 + 10 + 5 + 4 * 6)
+    assert colour == 100 * (45 + 10 + 15 + 4 * 14)
+    assert filter_memory((100, 10, 10), 50, FilterParams(block=4), threads=3) == grey + 100 * 2 * 15
+    assert filter_memory((100, 10, 10), 50, FilterParams(inner_iterations=3, block=4)) == grey + 100 * (50 - 24)

@@ -9,12 +9,9 @@ from scipy.stats import multivariate_normal
 from turbrestore.core.errors import DataError
 from turbrestore.filtering.kalman import (
     Gaussian,
-    PixelGaussian,
     predict,
-    predict_pixels,
     update,
     update_information,
-    update_pixels,
 )
 
 
@@ -109,34 +106,6 @@ def test_information_form_takes_a_singular_prior(rng):
     assert_same(update(prior, z, H, 0.5 * np.eye(m))[0], update_information(prior, z, H, 0.5)[0])
 
 
-def test_tall_orthonormal_matrix_needs_no_more_than_its_transpose(rng):
-    m, n = 40000, 5
-    C = np.linalg.qr(rng.standard_normal((m, n)))[0]
-    prior = Gaussian(rng.standard_normal(n), covariance(rng, n))
-    z = C @ rng.standard_normal(n) + 0.1 * rng.standard_normal(m)
-    general, general_record = update_information(prior, z, C, 0.3)
-    fast, record = update_information(prior, z, C, 0.3, orthonormal=True)
-    assert_same(general, fast)
-    np.testing.assert_allclose(record.log_likelihood, general_record.log_likelihood, rtol=1e-10)
-    posterior = np.linalg.inv(np.eye(n) / 0.3 + np.linalg.inv(prior.cov))
-    np.testing.assert_allclose(fast.cov, posterior, rtol=1e-9)
-    np.testing.assert_allclose(fast.mean, prior.mean + posterior @ (C.T @ z - prior.mean) / 0.3, rtol=1e-9)
-    single, _ = update_information(prior, z.astype(np.float32), C.astype(np.float32), 0.3, orthonormal=True)
-    assert_same(single, fast, 1e-5)
-
-
-def test_tall_orthonormal_matrix_with_gaps_or_varying_noise_takes_the_general_way(rng):
-    m, n = 50, 3
-    C = np.linalg.qr(rng.standard_normal((m, n)))[0]
-    prior, z = Gaussian(np.zeros(n), np.eye(n)), rng.standard_normal(m)
-    variance = rng.uniform(0.1, 2.0, m)
-    exact, _ = update(prior, z, C, np.diag(variance))
-    assert_same(exact, update_information(prior, z, C, variance, orthonormal=True)[0])
-    z[:20] = np.nan
-    exact, _ = update(prior, z, C, 0.5 * np.eye(m))
-    assert_same(exact, update_information(prior, z, C, 0.5, orthonormal=True)[0])
-
-
 def test_information_form_with_no_state_at_all():
     state, record = update_information(Gaussian(np.zeros(0), np.zeros((0, 0))), np.ones(4), np.zeros((4, 0)), 0.5)
     assert state.mean.shape == (0,)
@@ -192,11 +161,11 @@ def test_one_covariance_serves_a_batch_of_means(rng):
     )
     together, _ = update(Gaussian(means, P), z, H, np.eye(1))
     assert together.cov.shape == (n, n)
-    orthonormal = update_information(Gaussian(means, P), z, H / np.sqrt(n), 1.0)[0]
+    information = update_information(Gaussian(means, P), z, H / np.sqrt(n), 1.0)[0]
     for i in range(batch):
         assert_same(update(Gaussian(means[i], P), z[i], H, np.eye(1))[0], Gaussian(together.mean[i], together.cov))
         alone = update_information(Gaussian(means[i], P), z[i], H / np.sqrt(n), 1.0)[0]
-        np.testing.assert_allclose(orthonormal.mean[i], alone.mean, rtol=1e-12)
+        np.testing.assert_allclose(information.mean[i], alone.mean, rtol=1e-12)
 
 
 def test_missing_measurement_is_no_update(rng):
@@ -339,18 +308,6 @@ def test_nearly_exact_measurements_leave_their_own_variance(rng):
         (lambda: update_information(GOOD, [1.0], np.ones((1, 2)), 0.0), "noise_variance: expected finite"),
         (lambda: update_information(GOOD, [1.0], np.ones((1, 2)), [1.0, 2.0]), "noise_variance: expected one"),
         (lambda: update_information(GOOD, [1.0], np.full((1, 2), np.nan), 1.0), "expected finite"),
-        (lambda: predict_pixels(PIXELS, -0.1), "drift_variance"),
-        (lambda: update_pixels(PIXELS, np.zeros((3, 2)), 1.0), "measurement: expected shape"),
-        (lambda: update_pixels(PIXELS, np.full((2, 3), np.inf), 1.0), "measurement: expected finite"),
-        (
-            lambda: update_pixels(PIXELS, np.array([[np.inf, -np.inf, 0], [0, 0, 0]]), 1.0),
-            "measurement: expected finite",
-        ),
-        (lambda: update_pixels(PIXELS, np.zeros((2, 3)), 0.0), "noise_variance: expected values"),
-        (lambda: update_pixels(PIXELS, np.zeros((2, 3)), np.ones(3)), "noise_variance: expected one"),
-        (lambda: PixelGaussian(np.zeros((2, 3)), -np.ones((2, 3))), "variance: expected finite"),
-        (lambda: PixelGaussian(np.zeros((2, 3, 2)), np.ones((2, 3))), "mean: expected the shape"),
-        (lambda: PixelGaussian(np.full((2, 3), np.nan), np.ones((2, 3))), "mean: expected finite"),
     ],
 )
 def test_unusable_input_is_a_clear_error(call, words):
@@ -360,7 +317,6 @@ def test_unusable_input_is_a_clear_error(call, words):
 
 
 GOOD = Gaussian(np.zeros(2), np.eye(2))
-PIXELS = PixelGaussian(np.zeros((2, 3)), np.ones((2, 3)))
 
 
 def test_an_unstable_system_ends_in_an_error_not_in_nan():
@@ -370,56 +326,13 @@ def test_an_unstable_system_ends_in_an_error_not_in_nan():
             state = predict(state, 10.0 * np.eye(2), np.eye(2))
 
 
-@pytest.mark.parametrize("channels", [(), (3,)])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_pixels_equal_one_kalman_filter_each(rng, channels, dtype):
-    shape = (3, 4)
-    state = PixelGaussian(rng.random((*shape, *channels)).astype(dtype), rng.uniform(0.1, 2.0, shape).astype(dtype))
-    noise, z = rng.uniform(0.1, 2.0, shape), rng.random((*shape, *channels))
-    z[1, 2] = np.nan
-    prior = predict_pixels(state, 0.25)
-    after, gain = update_pixels(prior, z, noise)
-    assert after.mean.dtype == after.variance.dtype == gain.dtype == dtype
-    tolerance = 1e-12 if dtype is np.float64 else 1e-5
-    for y, x in np.ndindex(shape):
-        k = 3 if channels else 1
-        one = predict(
-            Gaussian(state.mean[y, x].reshape(k), state.variance[y, x] * np.eye(k)), np.eye(k), 0.25 * np.eye(k)
-        )
-        one, _ = update(one, z[y, x].reshape(k), np.eye(k), noise[y, x] * np.eye(k))
-        np.testing.assert_allclose(after.mean[y, x].reshape(k), one.mean, rtol=tolerance)
-        np.testing.assert_allclose(after.variance[y, x], one.cov[0, 0], rtol=tolerance)
-    assert gain[1, 2] == 0
-    np.testing.assert_array_equal(after.variance[1, 2], prior.variance[1, 2])
-
-
-def test_pixel_with_infinite_noise_or_one_missing_channel_stays(rng):
-    prior = PixelGaussian(rng.random((2, 2, 3)).astype(np.float32), np.ones((2, 2), np.float32))
-    z, noise = rng.random((2, 2, 3)), np.ones((2, 2))
-    z[0, 0, 1], noise[1, 1] = np.nan, np.inf
-    after, gain = update_pixels(prior, z, noise)
-    np.testing.assert_array_equal(gain, [[0, 0.5], [0.5, 0]])
-    for y, x in ((0, 0), (1, 1)):
-        np.testing.assert_array_equal(after.mean[y, x], prior.mean[y, x])
-    assert (after.mean[0, 1] != prior.mean[0, 1]).all()
-
-
-def test_pixel_variance_survives_nearly_exact_measurements():
-    prior = PixelGaussian(np.zeros((1, 1), np.float32), np.ones((1, 1), np.float32))
-    after, _ = update_pixels(prior, np.ones((1, 1)), 1e-9)
-    assert after.variance[0, 0] == pytest.approx(1e-9, rel=1e-5)
-
-
 def test_inputs_are_left_alone(rng):
     prior = Gaussian(rng.standard_normal(2), covariance(rng, 2))
-    pixels = PixelGaussian(rng.random((2, 3)), np.ones((2, 3)))
     H, z, R = rng.standard_normal((3, 2)), np.array([1.0, np.nan, 2.0]), np.eye(3)
-    image = np.array([[0.1, np.nan, 0.3], [0.4, 0.5, 0.6]])
-    arrays = [prior.mean, prior.cov, H, z, R, pixels.mean, pixels.variance, image]
+    arrays = [prior.mean, prior.cov, H, z, R]
     before = [array.copy() for array in arrays]
     update(prior, z, H, R)
     update_information(prior, z, H, 1.0)
     predict(prior, np.eye(2), np.eye(2))
-    update_pixels(predict_pixels(pixels, 0.1), image, 1.0)
     for array, copy in zip(arrays, before, strict=True):
         np.testing.assert_array_equal(array, copy)

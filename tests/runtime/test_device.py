@@ -34,13 +34,14 @@ from turbrestore.deconvolution.torch_weights import (
     device_projection,
     weights_on_device,
 )
-from turbrestore.dynamics.dynamic_texture import identify
-from turbrestore.filtering.alternating import FilterParams, filter_frames
+from turbrestore.filtering.filter_records import FilterParams
 from turbrestore.footage.frame_selection import Share
 from turbrestore.io.source import FrameSource
 from turbrestore.pipeline import restore
 from turbrestore.registration.centroid import CentroidParams
-from turbrestore.registration.flow import FlowParams
+from turbrestore.registration.flow import FlowParams, estimate_flow
+from turbrestore.registration.tvl1 import refer_tvl1, tvl1_flows
+from turbrestore.registration.warp import warp
 from turbrestore.runs.resumption import stage_facts
 from turbrestore.runtime import device as device_module
 from turbrestore.runtime.device import TORCH_BYTES, check_device, explain_device, find_device, memory_of, needs_torch
@@ -205,11 +206,45 @@ class TestChoice:
 
 
 @on_devices
+class TestFlow:
+    def test_flows_are_those_of_the_processor(self, device):
+        frames, _ = frames_of(SCENES["camera"](SIZE, SIZE + 9), 3)
+        mean = frames.mean(axis=0)
+        here, there = (estimate_flow(mean, frames, FlowParams(method="tvl1", device=d)) for d in ("cpu", device))
+        apart = np.linalg.norm(here - there, axis=-1)
+        assert apart.mean() < 1e-3
+        assert apart.max() < 0.02
+
+    def test_large_motion_and_a_start(self, device):
+        frames, flows = frames_of(SCENES["brick"](SIZE, SIZE), 2, rms=3.0, seed=1)
+        grey = 255 * frames
+        here, there = (tvl1_flows(grey, refer_tvl1(grey.mean(axis=0), device=d), flows) for d in ("cpu", device))
+        assert np.linalg.norm(here.flows - there.flows, axis=-1).mean() < 1e-3
+        assert (here.warps == there.warps).all()
+        assert (here.settled == there.settled).all()
+
+    @pytest.mark.parametrize("batch", [1, 2, 5])
+    def test_batches_do_not_matter(self, device, batch):
+        frames, _ = frames_of(SCENES["camera"](48, 48), 5, seed=2)
+        params = FlowParams(method="tvl1", device=device)
+        small = replace(params, tvl1=replace(params.tvl1, batch=batch))
+        apart = estimate_flow(frames[0], frames, params) - estimate_flow(frames[0], frames, small)
+        assert np.abs(apart).max() < 1e-3
+
+    def test_methods_of_opencv_stay_where_they_are(self, device):
+        frames, _ = frames_of(SCENES["camera"](48, 48), 2, seed=3)
+        here, there = (estimate_flow(frames[0], frames, FlowParams(device=d)) for d in ("cpu", device))
+        assert here.tobytes() == there.tobytes()
+
+
+@on_devices
 class TestMemory:
     @pytest.mark.parametrize(
         ("place", "advice", "settings"),
         [
-            ("filtering.torch_fusion.warp_stack", "take a smaller --roi", {}),
+            ("registration.flow.tvl1_flows", "lower --flow.tvl1.batch", {"flow": FlowParams(method="tvl1")}),
+            ("registration.warp.warp_stack", "take a smaller --roi", {}),
+            ("filtering.array_backend.warp_stack", "take a smaller --roi", {}),
             ("deconvolution.torch_deconvolution.weights_on_device", "take a smaller --roi", {}),
         ],
     )
@@ -225,56 +260,12 @@ class TestMemory:
 
 
 @on_devices
-class TestFusion:
-    def run(self, scene, device, spread=0.0, **settings):
-        """Fuse frames here and there; the flows have some noise, and so fold, where ``spread`` is large."""
-        frames, flows = frames_of(scene, 6, seed=4)
-        flows += np.random.default_rng(5).normal(0, spread, flows.shape).astype(np.float32)
-        image, dynamics = frames.mean(axis=0), identify(flows)
-        params = FilterParams(inner_iterations=1, **settings)
-        here, there = (
-            filter_frames(frames, image, dynamics, replace(params, device=d), known_flows=flows)
-            for d in ("cpu", device)
-        )
-        for name in ("gains", "sharpness", "shares", "innovations"):
-            assert getattr(there, name) == pytest.approx(getattr(here, name), rel=1e-3)
-        assert there.image.dtype == there.variance.dtype == np.float32
-        assert there.variance == pytest.approx(here.variance, rel=1e-3)
-        return here, there
-
-    @pytest.mark.parametrize("colour", [False, True])
-    @pytest.mark.parametrize("sharpness", [2.0, 0.0])
-    def test_image_and_variance_are_those_of_the_processor(self, device, colour, sharpness):
-        scene = SCENES["camera"](SIZE, SIZE + 5)
-        scene = coloured(scene) if colour else scene
-        here, there = self.run(scene, device, sharpness=sharpness, image_drift=1e-4, prior_frames=2)
-        assert np.abs(here.image - there.image).max() < 1e-5
-
-    def test_folds_and_samples_beyond_the_frame_count_as_little(self, device):
-        scene = SCENES["camera"](SIZE, SIZE)
-        here, there = self.run(scene, device, spread=0.8)
-        calm, _ = self.run(scene, device)
-        assert here.variance.mean() > 2 * calm.variance.mean()
-        assert np.abs(here.image - there.image).max() < 1e-4
-
-    def test_a_foreign_frame_has_a_finite_noise_however_much_sharpness_counts(self, device):
-        scene = SCENES["camera"](SIZE, SIZE)
-        frames, flows = frames_of(scene, 12, seed=4)
-        image, dynamics = frames.mean(axis=0), identify(flows)
-        # Its gradient is against that of the scene, and its flow folds.
-        frames[8] = 1 - frames[8]
-        flows[8] += np.random.default_rng(5).normal(0, 3, flows[8].shape).astype(np.float32)
-        params = FilterParams(inner_iterations=1, sharpness=10.0)
-        here, there = (
-            filter_frames(frames, image, dynamics, replace(params, device=d), known_flows=flows)
-            for d in ("cpu", device)
-        )
-        for found in (here, there):
-            assert np.isfinite(found.image).all()
-            assert np.isfinite(found.variance).all()
-            assert found.variance.min() > 0
-        assert np.abs(here.image - there.image).max() < 1e-4
-        assert here.shares[8] < 0.01
+class TestWarp:
+    def test_warp(self, device):
+        scene = SCENES["camera"](50, 64)
+        flow = smooth_flows(1, 50, 64, np.random.default_rng(6), SmoothFlowParams(rms=6.0, correlation_length=5.0))[0]
+        for image in (scene, coloured(scene)):
+            assert np.abs(warp(image, flow) - warp(image, flow, device=device)).max() < 1e-5
 
 
 GUIDES = {
@@ -400,14 +391,13 @@ class TestRestoration:
         restore(frames, RestoreParams(flow=self.FLOW, device=device))
         assert frames.tobytes() == before.tobytes()
 
-    def test_frames_that_do_not_count_and_blur_as_noise(self, device):
+    def test_frames_that_do_not_count(self, device):
         scene = coloured(SCENES["camera"](64, 64))
         frames, _ = frames_of(scene, 8, seed=14)
-        for changes in ({"keep_best": Share(0.5)}, {"filter": FilterParams(frame_noise="blur", inner_iterations=1)}):
-            params = RestoreParams(until="filter", **changes)
-            here, there = (restore(frames, replace(params, device=d)) for d in ("cpu", device))
-            assert abs(psnr(here.image, scene) - psnr(there.image, scene)) < 0.02
-            assert (np.isnan(here.filtered.sharpness) == np.isnan(there.filtered.sharpness)).all()
+        params = RestoreParams(until="filter", keep_best=Share(0.5))
+        here, there = (restore(frames, replace(params, device=d)) for d in ("cpu", device))
+        assert abs(psnr(here.image, scene) - psnr(there.image, scene)) < 0.02
+        assert (np.isnan(here.filtered.sharpness) == np.isnan(there.filtered.sharpness)).all()
 
 
 class TestPlacing:

@@ -1,4 +1,4 @@
-"""The size of the motion in a flow model, drawn towards what blur says of it."""
+"""Correct the size of the motion in a flow model by the displacement variance that blur shows."""
 
 from __future__ import annotations
 
@@ -11,31 +11,32 @@ from numpy.typing import ArrayLike
 from ..core.errors import DataError
 from .flow_model import FlowDynamics
 
-# Standard deviation of the variance of measured flows about that of the motion, and error of a displacement variance
-# besides its deviation, as shares of each.
+# Standard error of the variance of measured flows as an estimate of the variance of the motion, and standard error of a
+# displacement variance beside its own deviation, as shares of each.
 _FLOW_ERROR, _CUE_ERROR = 0.3, 0.15
-# What moves by more than this in variance, squared pixels, leaves the tiles that a displacement variance is seen in.
+# With a larger variance of the motion, squared pixels, structure leaves the tiles in which a displacement variance is
+# measured.
 _LARGEST_VARIANCE = 20.0
-# Standard deviation of the square of a Hann window of 64 pixels, through which a displacement variance is seen; pixels.
+# Standard deviation of the square of a Hann window of 64 pixels, in which a displacement variance is measured; pixels.
 _TILE_WINDOW = 9.0
 # Variance of flows below which nothing moves, squared pixels.
 _LEAST_VARIANCE = 1e-12
-# A model without motion would never follow a frame.
+# A model without motion could not follow any frame.
 _LEAST_FACTOR = 0.05
 
 
 def with_displacement(dynamics: FlowDynamics, variance: ArrayLike, deviation: ArrayLike) -> FlowDynamics:
-    """Draw the size of the motion towards a displacement variance that was found without the flows.
+    """Correct the size of the motion by a displacement variance that was measured without the flows.
 
-    Measured flows hold noise besides motion, and smooth some of the motion away: their variance, seen through the
-    window of a tile, is taken to be that of the motion within 30 %.  The displacement variance is taken to be right
-    within its deviation and 15 %; and as structure leaves the tiles that large motion is seen in (of 34 squared pixels
-    a third to a half was missing, of 5 to 13 up to 30 %), the square of the larger variance over 20 squared pixels adds
-    to its error.
+    Measured flows contain noise beside motion, and flow methods smooth some of the motion away: their variance,
+    averaged over the window of a tile, is assumed to be that of the motion within 30 %.  The displacement variance is
+    assumed to be right within its deviation and 15 %.  Large motion moves structure out of the tiles (of 34 squared
+    pixels a third to a half was missing, of 5 to 13 up to 30 %), so the square of the larger variance over 20 squared
+    pixels is added to its error.
 
-    The mean of both, weighted by inverse variance, over the variance of the flows is ``motion_factor``.  Q and the
-    stationary covariance of the state change by its mean: noise and motion are thought to share the directions of the
-    flow alike.  A filter takes at most this share of what C leaves out to be motion.
+    The mean of both, weighted by inverse variance, divided by the variance of the flows is ``motion_factor``.  Q and
+    the stationary covariance of the state are scaled by its mean, which assumes that noise and motion have the same
+    directions.  The filter takes at most this share of the flow outside the subspace of C to be motion.
 
     Parameters
     ----------
@@ -44,12 +45,12 @@ def with_displacement(dynamics: FlowDynamics, variance: ArrayLike, deviation: Ar
         Variance of the displacement per axis, squared pixels, as of
         :func:`turbrestore.blur_moments.cues.displacement_variance`.
     deviation : float or array_like, shape (H, W)
-        Its standard deviation, squared pixels; infinite where nothing is known.
+        Its standard deviation, squared pixels; infinite where it is unknown.
 
     Returns
     -------
     FlowDynamics
-        With another ``motion_factor``, at least 0.05, and Q scaled by the change of its mean.
+        With a new ``motion_factor``, at least 0.05, and Q scaled by the change of its mean.
 
     Raises
     ------
@@ -72,8 +73,8 @@ def with_displacement(dynamics: FlowDynamics, variance: ArrayLike, deviation: Ar
         if given.shape not in ((), dynamics.shape):
             raise DataError(f"{name}: expected one number or shape {dynamics.shape}, found {given.shape}")
     measured = np.maximum(cv2.GaussianBlur(dynamics.flow_variance, (0, 0), _TILE_WINDOW), _LEAST_VARIANCE)
-    lost = np.maximum(measured, cue) ** 2 / _LARGEST_VARIANCE
-    own, other = (_FLOW_ERROR * measured) ** -2, 1 / (error**2 + (_CUE_ERROR * cue) ** 2 + lost**2)
+    missing = np.maximum(measured, cue) ** 2 / _LARGEST_VARIANCE
+    own, other = (_FLOW_ERROR * measured) ** -2, 1 / (error**2 + (_CUE_ERROR * cue) ** 2 + missing**2)
     motion = (own * measured + other * cue) / (own + other)
     factor = np.maximum(motion / measured, _LEAST_FACTOR).astype(np.float32)
     change = float(factor.mean() / dynamics.motion_factor.mean())

@@ -1,22 +1,30 @@
-"""Dynamic texture of the flow: identify a small linear system from flows.
+"""Identification of the dynamic texture model of the flow (paper 3, sections 3.1 and 3.2).
 
-The model is ``ξ_{k+1} = A ξ_k + q_k``, ``W_k = W̄ + C ξ_k + r_k`` (paper 3, eqs. 7 to 10, written for flows).
+The model is ``ξ_{k+1} = A ξ_k + q_k``, ``W_k = W̄ + C ξ_k + r_k`` (eq. 10, which is eq. 7 for flows), see
+:mod:`turbrestore.dynamics.flow_model`.  The maximum likelihood estimate (eq. 8) is replaced by the paper's closed form:
 
-Symbols (paper 3, sections 3.1 and 3.2)
----------------------------------------
-τ, n : number of flows, number of states.
-W, W̄ : flow and its mean over time. X : matrix of W − W̄, one column of 2HW numbers a flow.
-U Σ Vᵀ : singular value decomposition of X, from :mod:`turbrestore.dynamics.flow_subspace`.
-C : first n columns of U, rows in the order of ``flow.reshape(-1)``. Ξ : states, first n rows of Σ Vᵀ.
-A : transition. Q, R : covariances of q and r. e : residuals of the one-step prediction, ξ_{k+1} − A ξ_k.
+1. C and Ξ minimise ``|X − C Ξ|`` under CᵀC = I (eq. 9): C is the first n columns of U, Ξ the first n rows of Σ Vᵀ;
+2. A minimises ``|Ξ_{2:τ} − A Ξ_{1:τ−1}|``: ``A = Ξ_{2:τ} Ξ_{1:τ−1}⁺``;
+3. Q is the covariance of e, and R the variance of X − C Ξ.
+
+Symbols
+-------
+τ, n : number of flows, number of states
+W, W̄ : flow and its mean over time
+X : matrix of W − W̄, 2HW × τ, one flow in each column
+U Σ Vᵀ : singular value decomposition of X, from :mod:`turbrestore.dynamics.flow_subspace`
+C : modes, rows in the order of ``flow.reshape(-1)``; Ξ : states
+A : transition; Q, R : covariances of q and r
+e : residuals of the one-step prediction, ξ_{k+1} − A ξ_k
 
 Departures from the paper
 -------------------------
 - Ξ is Σ Vᵀ, where the paper prints Σ V.
 - Q is divided by τ − 2 − n, the paper by τ − 2. Each of the n regressors takes one degree of freedom, as the mean
-  takes one; without the n, Q is a third too small at τ = 3n.
+  does; without the n, Q is a third too small at τ = 3n.
 - R is one number (the paper says m×m and advises a multiple of the identity), with a map per pixel beside it,
   divided by τ − 1 − n for the same reason.
+- A may be damped (``ridge``).
 """
 
 from __future__ import annotations
@@ -34,8 +42,11 @@ from ..runtime.threads import one_thread_each
 from .flow_model import Float64Array, FlowDynamics
 from .flow_subspace import FlowStrips, gram_matrix, singular_vectors, spatial_modes
 
-# Flows are float32, so singular values below this share of the norm of all flows are rounding.
+# Flows are float32, so singular values below this share of the norm of all flows are rounding errors.
 _ROUNDING = 1e-6
+# Bytes of the strips of all threads with what is computed from them, and bytes for each pixel of each flow where all
+# flows fit into one strip.
+_STRIPS, _STRIP_NUMBER = 140e6, 70.0
 
 
 @dataclass(frozen=True)
@@ -45,18 +56,18 @@ class DynamicsParams:
     Parameters
     ----------
     rank : int or None
-        Number of states n. None chooses the smallest n that holds ``energy``, but never singular values below
-        the optimal hard threshold for white noise of unknown level (Gavish and Donoho, 2014), never more than
-        ``max_rank``, and never more than one state for every ``frames_per_state`` flows.
+        Number of states n. None chooses the smallest n whose modes hold the share ``energy`` of the variance, but
+        leaves out singular values below the optimal hard threshold for white noise of unknown level (Gavish and
+        Donoho, 2014), and chooses at most ``max_rank`` states and one for every ``frames_per_state`` flows.
     energy : float
         Share of the variance that the automatic choice keeps, in (0, 1].
     max_rank : int
         Largest automatic n.
     frames_per_state : float
-        At least 1. With fewer flows a state the system is flagged as overfitted (paper 3, Figure 7a).
+        At least 1. With fewer flows for each state the system is flagged as overfitted (paper 3, Figure 7a).
     ridge : float
-        Damping of A: this share of the mean state variance is added to each state's own in the least squares. 0
-        is the pseudo-inverse of the paper.
+        Damping of A: this share of the mean variance of the states is added to the variance of each state in the
+        least-squares fit. 0 is the pseudo-inverse of the paper.
 
     Raises
     ------
@@ -90,17 +101,17 @@ def identify(
     params: DynamicsParams | None = None,
     runtime: Runtime = DEFAULT,
 ) -> FlowDynamics:
-    """Fit the dynamic texture to a training sequence of flows (paper 3, sections 3.1 and 3.2).
+    """Identify the dynamic texture model from a training sequence of flows (paper 3, sections 3.1 and 3.2).
 
     Parameters
     ----------
     flows : ndarray of shape (τ, H, W, 2), or iterable of arrays of shape (H, W, 2)
         Flows from the reference to successive frames, in pixels. A memory map is read strip by strip and never
-        held as a whole. An iterable is run through once for the shapes and twice for every 32 MB that its flows
-        take as float64, which is free for a list of arrays and dear for flows made on the fly.
+        in memory as a whole. An iterable is iterated once for the shapes and twice for every 32 MB that its flows
+        take as float64, which costs nothing for a list of arrays but much if flows are computed on the fly.
     params : DynamicsParams, optional
     runtime : Runtime
-        Threads, and a folder for C and the maps; without one they stay in memory.
+        Threads, and the scratch folder for C and the maps; without one they stay in memory.
 
     Returns
     -------
@@ -110,8 +121,8 @@ def identify(
     Raises
     ------
     DataError
-        Fewer than two flows, shapes that differ, values that are not finite, or an iterator that can be run
-        through only once.
+        Fewer than two flows, shapes that differ, values that are not finite, or an iterator that can be iterated
+        only once.
 
     Examples
     --------
@@ -130,7 +141,7 @@ def identify(
     pixels = 2 * strips.height * strips.width
     present = int(np.count_nonzero(singular_values > _ROUNDING * norm))
     n = _rank(singular_values, present, pixels, params)
-    states = singular_values[:n, None] * V[:, :n].T
+    states = singular_values[:n, None] * V[:, :n].T  # Ξ
     C, residual_energy = spatial_modes(strips, mean, singular_values[:n], V[:, :n], runtime.scratch)
     residual_variance = np.divide(residual_energy, max(strips.count - 1 - n, 1), out=residual_energy)
     A, Q = _transition(states, params.ridge)
@@ -152,6 +163,56 @@ def identify(
     )
 
 
+def identify_memory(shape: tuple[int, ...], train: int) -> float:
+    """Bytes that identification takes beside the flows and the model itself (:func:`modes_memory`).
+
+    The constants were measured by ``benchmarks/memory.py --stages`` at 1280×720, grey and in colour, with one, two and
+    four threads, and rounded up by at least a twentieth.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Of the frames, (T, H, W) or (T, H, W, 3).
+    train : int
+        τ, number of flows.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> identify_memory((120, 256, 256), 60) / 1e6
+    140.0
+    """
+    return min(_STRIPS, _STRIP_NUMBER * shape[1] * shape[2] * train)
+
+
+def modes_memory(shape: tuple[int, ...], train: int, params: DynamicsParams | None = None) -> float:
+    """Largest size of C, bytes: 8 for each pixel and state.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Of the frames, (T, H, W) or (T, H, W, 3).
+    train : int
+        τ, number of flows.
+    params : DynamicsParams, optional
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> modes_memory((120, 256, 256), 60) == 8 * 256 * 256 * 20
+    True
+    """
+    params = params or DynamicsParams()
+    automatic = min(params.max_rank, int(train / params.frames_per_state))
+    return 8.0 * shape[1] * shape[2] * min(automatic if params.rank is None else params.rank, train - 1)
+
+
 def _rank(singular_values: Float64Array, present: int, pixels: int, params: DynamicsParams) -> int:
     if params.rank is not None:
         return min(params.rank, present)
@@ -165,7 +226,7 @@ def _rank(singular_values: Float64Array, present: int, pixels: int, params: Dyna
 
 def _noise_threshold(singular_values: Float64Array, pixels: int) -> float:
     """Optimal hard threshold for white noise of unknown level (Gavish and Donoho, 2014, eq. 5)."""
-    # Taking off the mean makes one singular value zero: the matrix is as good as one column narrower.
+    # Subtracting the mean makes one singular value zero, as if the matrix had one column less.
     columns = len(singular_values) - 1
     beta = min(pixels, columns) / max(pixels, columns)
     omega = 0.56 * beta**3 - 0.95 * beta**2 + 1.82 * beta + 1.43
@@ -173,17 +234,17 @@ def _noise_threshold(singular_values: Float64Array, pixels: int) -> float:
 
 
 def _transition(states: Float64Array, ridge: float) -> tuple[Float64Array, Float64Array]:
-    """Fit A = Ξ_{2:τ} Ξ_{1:τ−1}⁺, damped by ``ridge``, and Q without bias."""
+    """Fit A = Ξ_{2:τ} Ξ_{1:τ−1}⁺, damped by ``ridge``, and the unbiased Q."""
     n, count = states.shape
     if n == 0:
         return np.zeros((0, 0)), np.zeros((0, 0))
     before, after = states[:, :-1], states[:, 1:]
     u, s, vt = np.linalg.svd(before, full_matrices=False)
-    # The states sum to zero over time, so those before the last have full rank too: no s is zero.
+    # The states sum to zero over time, so Ξ_{1:τ−1} has full rank too and no s is zero.
     inverse = s / (s**2 + ridge * np.sum(s**2) / n)
     A = after @ (vt.T * inverse) @ u.T
     residual = after - A @ before
-    # Damped regressors count for less than one degree of freedom each.
+    # A damped regressor takes less than one degree of freedom.
     used = float(np.sum(s * inverse))
     return A, residual @ residual.T / max(count - 2 - used, 1.0)
 

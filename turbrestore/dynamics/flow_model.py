@@ -1,13 +1,16 @@
-"""Linear system that flows follow: what identification finds, and the flow that belongs to a state.
+"""Dynamic texture model of the flow: a linear system with a small state (paper 3, eq. 10).
 
-The model is ``ξ_{k+1} = A ξ_k + q_k``, ``W_k = W̄ + C ξ_k + r_k`` (paper 3, eqs. 7 to 10, written for flows).
+The model is ``ξ_{k+1} = A ξ_k + q_k``, ``W_k = W̄ + C ξ_k + r_k`` with ``q ~ N(0, Q)`` and ``r ~ N(0, R)``; the paper
+leaves the mean flow W̄ out of its notation.  :mod:`turbrestore.dynamics.dynamic_texture` identifies it.
 
-Symbols (paper 3, sections 3.1 and 3.2)
----------------------------------------
-τ, n : number of flows, number of states.
-W, W̄ : flow and its mean over time.
-A : transition. C : n flows, one a column, rows in the order of ``flow.reshape(-1)``. Ξ : states, one column a flow.
-Q, R : covariances of q and r.
+Symbols (paper 3, section 3.2)
+------------------------------
+τ, n : number of flows, number of states
+W, W̄ : flow and its mean over time
+ξ, Ξ : state; states of the training flows, one in each column
+A, Q : transition of the state and covariance of its noise q
+C : flows that span the subspace, one in each column with rows in the order of ``flow.reshape(-1)``; CᵀC = I (eq. 9)
+R : variance of r, the flow outside the subspace
 """
 
 from __future__ import annotations
@@ -22,54 +25,55 @@ from ..core.arrays import FloatArray, check_flow
 from ..core.errors import DataError
 from ..display.plots import plot_dynamics
 from ..display.preview import preview
-from ..runtime.jit import compiled
-from ..runtime.scratch import drop_pages, iter_parts
+from ..runtime.jit import jit
+from ..runtime.scratch import iter_parts, iter_slices
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Float64Array = NDArray[np.float64]
 
-# Products that are summed in single precision, before their sum is added in double; they stay in the first cache.
+# Products that are summed in single precision before their sum is added in double; they fit into the first cache.
 SUMMED = 2048
-# Numbers of the modes that are in hand at a time.
+# Numbers of C that are in memory at a time if it is mapped.
 PIECE = 1 << 22
 
 
 @dataclass(frozen=True, eq=False)
 class FlowDynamics:
-    """Linear system that the flows follow.
+    """Identified dynamic texture model of the flow (paper 3, eq. 10).
 
     Parameters
     ----------
     A : ndarray, float64, shape (n, n)
-        Transition of the state, as fitted: its eigenvalues may reach or leave the unit circle.
+        Transition of the state as fitted; eigenvalues may lie on the unit circle or outside.
     C : ndarray, float32, shape (2 H W, n)
         Orthonormal columns; ``C[:, i].reshape(H, W, 2)`` is the flow of state i.
     Q : ndarray, float64, shape (n, n)
         Covariance of the process noise, in squared units of the states.
     R : float
-        Variance of what C leaves out, per component, in squared pixels; mean of ``residual_variance``. Zero when
-        C holds everything, so a filter needs a floor for it.
+        Variance of the flow outside the subspace of C, per component, in squared pixels; mean of
+        ``residual_variance``. It is zero if C holds everything, so a filter needs a floor for it.
     residual_variance : ndarray, float32, shape (H, W)
         The same at every pixel, mean of the two components.
     mean_flow : ndarray, float32, shape (H, W, 2)
         W̄, pixels.
     states : ndarray, float64, shape (n, τ)
-        Ξ, one column a flow; the squared length of a column is that of its flow, summed over the grid.
+        Ξ; the squared length of a column is that of its flow, summed over the grid.
     singular_values : ndarray, float64, shape (τ,)
-        All of them, falling.
+        All τ of them, in descending order.
     energy_share : float
-        Share of the flows' variance that C holds; 1 when nothing moves.
+        Share of the variance of the flows that lies in the subspace of C; 1 when nothing moves.
     overfitted : bool
-        Fewer flows a state than asked for. At n = τ − 1, the largest n there is, A only repeats the flows: its
-        eigenvalues are the τ-th roots of unity other than 1 (paper 3, Figure 7a), and Q is meaningless.
+        Whether there are fewer flows for each state than asked for. At n = τ − 1, the largest possible n, A only
+        repeats the flows: its eigenvalues are the τ-th roots of unity other than 1 (paper 3, Figure 7a), and Q is
+        meaningless.
     notes : tuple of str
-        What a person should know about this fit, one line each.
+        Warnings about this fit, one line each.
     motion_factor : ndarray, float32, shape (H, W)
-        Variance of the motion over that of the measured flows; 1 unless
-        :func:`turbrestore.dynamics.displacement.with_displacement` found another. Q and ``state_covariance`` hold its
-        mean; states, singular values and R are those of the flows as measured.
+        Variance of the motion divided by that of the measured flows; 1 unless
+        :func:`turbrestore.dynamics.displacement.with_displacement` has changed it. Q and ``state_covariance`` are
+        scaled by its mean; states, singular values and R are those of the flows as measured.
     """
 
     A: Float64Array
@@ -147,7 +151,7 @@ class FlowDynamics:
         states = self.singular_values[: self.rank] ** 2 / free
         weights = states.astype(np.float32)
         modelled = np.concatenate([np.einsum("pi,pi,i->p", part, part, weights) for part in iter_parts(self.C)])
-        # The residual has been divided by its own degrees of freedom.
+        # The residual variance is divided by fewer degrees of freedom than the variance of the flows.
         residual = np.float32(max(free - self.rank, 1) / free) * self.residual_variance
         return modelled.reshape(self.mean_flow.shape).mean(axis=-1) + residual
 
@@ -159,7 +163,7 @@ class FlowDynamics:
 
 
 def project(dynamics: FlowDynamics, flow: ArrayLike) -> Float64Array:
-    """State of a flow: Cᵀ (W − W̄), the least-squares solution since Cᵀ C = I (paper 3, eq. 9).
+    """State of a flow: Cᵀ (W − W̄), the least-squares solution of eq. 10 since Cᵀ C = I (paper 3, eq. 9).
 
     Parameters
     ----------
@@ -192,7 +196,7 @@ def project(dynamics: FlowDynamics, flow: ArrayLike) -> Float64Array:
 
 
 def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64Array:
-    """State of a flow that is given as its deviation from the mean, unchecked: Cᵀ (W − W̄).
+    """State of a flow that is given as its deviation W − W̄ from the mean; nothing is checked.
 
     Parameters
     ----------
@@ -211,38 +215,32 @@ def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64A
     >>> project_deviation(dynamics, dynamics.mean_flow)
     array([], dtype=float64)
     """
-    # Columns of C lie one after the other.
-    modes, rest, state = dynamics.C.T, deviation.reshape(-1), np.zeros(dynamics.C.shape[1])
-    # NumPy's product of a vector and a matrix keeps the interpreter lock.
-    project_part = compiled(add_products)
-    # C may be mapped: all of it at once would come into memory.
+    # C is stored column by column.
+    modes, flat, state = dynamics.C.T, deviation.reshape(-1), np.zeros(dynamics.C.shape[1])
     step = SUMMED * max(1, PIECE // (SUMMED * max(1, len(modes))))
-    for start in range(0, rest.size, step):
-        stop = min(start + step, rest.size)
-        if project_part is not None:
-            project_part(modes, rest, start, stop, state)
-        else:
-            state += modes[:, start:stop] @ rest[start:stop]
-        drop_pages(modes)
+    for rows in iter_slices(flat.size, step, modes):
+        # NumPy's product of a matrix and a vector would keep the interpreter lock.
+        add_products(modes, flat, rows.start, rows.stop, state)
     return state
 
 
+@jit
 def add_products(modes: FloatArray, deviation: FloatArray, first: int, end: int, state: Float64Array) -> None:
-    """Add the inner products of some flows and one, over a range of pixels; to be compiled.
+    """Add the inner products of some flows and one flow over a range of pixels.
 
     Parameters
     ----------
     modes : ndarray, float32, shape (n, P)
     deviation : ndarray, float32, shape (P,)
     first, end : int
-        Range in P, the end left out.
+        Range in P, without the end.
     state : ndarray, float64, shape (n,)
         Added to.
 
     Examples
     --------
     >>> state = np.zeros(2)
-    >>> add_products(np.eye(2, dtype=np.float32), np.float32([3, 5]), 0, 2, state)
+    >>> add_products.py_func(np.eye(2, dtype=np.float32), np.float32([3, 5]), 0, 2, state)
     >>> state
     array([3., 5.])
     """

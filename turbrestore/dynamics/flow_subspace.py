@@ -1,19 +1,22 @@
-"""Subspace of flows by the method of snapshots: singular values and modes through the τ×τ Gram matrix.
+"""Subspace of the flows by the method of snapshots: singular values and modes from the τ×τ Gram matrix.
 
 Symbols (paper 3, sections 3.1 and 3.2)
 ---------------------------------------
-τ, n : number of flows, number of states.
-W̄ : mean flow. X : matrix of the flows less W̄, one column of 2HW numbers a flow.
-U Σ Vᵀ : singular value decomposition of X. G : Gram matrix Xᵀ X = V Σ² Vᵀ.
-C : first n columns of U. Ξ : first n rows of Σ Vᵀ.
+τ, n : number of flows, number of states
+W̄ : mean flow
+X : matrix of the flows minus W̄, 2HW × τ, one flow in each column
+U Σ Vᵀ : singular value decomposition of X
+G : Gram matrix Xᵀ X = V Σ² Vᵀ
+C : first n columns of U; Ξ : first n rows of Σ Vᵀ
 
-U is never formed: G is summed over strips of rows, C = X V Σ⁻¹ follows strip by strip. The sums are float64: in float32
-the small singular values drown in rounding, to save less than a tenth of a second at τ = 100, 256².
+U is never formed: G is summed over strips of image rows, and C = X V Σ⁻¹ is computed strip by strip. The sums are
+float64: float32 would save less than a tenth of a second at τ = 100 and 256², and rounding would hide the small
+singular values.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,18 +24,18 @@ import numpy as np
 
 from ..core.arrays import FloatArray, check_flow
 from ..core.errors import DataError
-from ..runtime.scratch import drop_pages, new_stack
+from ..runtime.scratch import iter_slices, new_stack
 from ..runtime.threads import map_ahead, sum_in_threads
 from .flow_model import Float64Array
 
-# Size of a float64 strip of all flows; each thread has one in memory.  Flows that are made on the fly are made anew for
-# every strip.
+# Bytes of a float64 strip of all flows, of which each thread has one in memory.  Flows that are computed on the fly are
+# computed again for every strip, so their strips are larger.
 _STRIP_BYTES, _STRIP_BYTES_MADE = 2**22, 2**25
 
 
 @dataclass(frozen=True)
 class FlowStrips:
-    """All flows of a few image rows at a time, whatever the flows are kept in.
+    """Reads all flows strip by strip of image rows, whatever container the flows are in.
 
     Parameters
     ----------
@@ -40,8 +43,8 @@ class FlowStrips:
     count, height, width : int
         τ, H and W.
     threads : int
-        Strips of an array worked on side by side, 0 for one per available core; other flows may be made on the fly, and
-        are asked for in turn.
+        Strips of an array that are worked on side by side, 0 for one per available core; flows in other containers may
+        be computed on the fly and are read by one thread.
 
     Examples
     --------
@@ -58,7 +61,7 @@ class FlowStrips:
 
     @classmethod
     def of(cls, flows: FloatArray | Iterable[FloatArray], threads: int = 0) -> FlowStrips:
-        """Look at the shapes of flows.
+        """Check the shapes of flows.
 
         Parameters
         ----------
@@ -73,13 +76,13 @@ class FlowStrips:
         Raises
         ------
         DataError
-            Fewer than two flows, shapes that differ, or an iterator that can be run through only once.
+            Fewer than two flows, shapes that differ, or an iterator that can be iterated only once.
         """
         if isinstance(flows, np.ndarray):
             shapes = [flows.shape[1:]] * len(flows) if flows.ndim else []
         elif not isinstance(flows, Iterable) or iter(flows) is flows:
             raise DataError(
-                f"flows: expected an array or an iterable that can be run through again, "
+                f"flows: expected an array or an iterable that can be iterated again, "
                 f"found {type(flows).__name__}; make a list of it"
             )
         else:
@@ -92,16 +95,21 @@ class FlowStrips:
         height, width = shapes[0][:2]
         return cls(flows, len(shapes), height, width, threads if isinstance(flows, np.ndarray) else 1)
 
-    def rows(self) -> list[slice]:
+    def rows(self, *written: object) -> Iterator[slice]:
         """Rows of each strip.
 
-        Returns
-        -------
-        list of slice
+        Parameters
+        ----------
+        written : object
+            Arrays that are filled strip by strip; the memory of mapped ones is handed back after each.
+
+        Yields
+        ------
+        slice
         """
         size = _STRIP_BYTES if isinstance(self.flows, np.ndarray) else _STRIP_BYTES_MADE
         step = max(size // (16 * self.count * max(self.width, 1)), 1)
-        return [slice(start, start + step) for start in range(0, self.height, step)]
+        return iter_slices(self.height, step, self.flows, *written)
 
     def read(self, rows: slice) -> Float64Array:
         """Flows of these rows.
@@ -122,9 +130,7 @@ class FlowStrips:
         """
         flows = self.flows
         strip = flows[:, rows] if isinstance(flows, np.ndarray) else np.stack([np.asarray(f)[rows] for f in flows])
-        copy = check_flow(strip, "flows").astype(np.float64).reshape(self.count, -1)
-        drop_pages(flows)
-        return copy
+        return check_flow(strip, "flows").astype(np.float64).reshape(self.count, -1)
 
 
 def gram_matrix(strips: FlowStrips) -> tuple[FloatArray, Float64Array, float]:
@@ -178,7 +184,7 @@ def singular_vectors(gram: Float64Array) -> tuple[Float64Array, Float64Array]:
     Returns
     -------
     values : ndarray, float64, shape (τ,)
-        Falling.
+        In descending order.
     V : ndarray, float64, shape (τ, τ)
         Orthonormal columns, the largest entry of each positive.
 
@@ -202,7 +208,7 @@ def spatial_modes(
     V: Float64Array,
     scratch: Path | None = None,
 ) -> tuple[FloatArray, Float64Array]:
-    """C = X V Σ⁻¹ and what it leaves out, strip by strip.
+    """C = X V Σ⁻¹ and the energy outside its subspace, strip by strip.
 
     Parameters
     ----------
@@ -214,7 +220,7 @@ def spatial_modes(
     V : ndarray, float64, shape (τ, n)
         The first n columns.
     scratch : Path, optional
-        Folder of a file that holds C; by default it is in memory.
+        Folder of the file that holds C; by default it is in memory.
 
     Returns
     -------
@@ -233,7 +239,7 @@ def spatial_modes(
     >>> np.abs(C).round(3).tolist(), float(energy.round(3)[0, 0])
     ([[1.0], [0.0]], 0.0)
     """
-    # One mode after the other in memory: products with C, and with Cᵀ, are then twice as fast.
+    # Stored mode after mode: products with C and with Cᵀ are then twice as fast.
     C = new_stack((len(singular_values), *mean.shape), scratch)
     energy = np.empty(mean.shape[:2])
 
@@ -241,12 +247,11 @@ def spatial_modes(
         strip = strips.read(rows)
         strip -= mean[rows].reshape(-1)
         modes = strip.T @ V
-        # V has orthonormal columns: what the modes hold over time is what the residual does not.
+        # V has orthonormal columns, so the energies of modes and residual add up.
         left = np.einsum("tx,tx->x", strip, strip) - np.einsum("xi,xi->x", modes, modes)
         energy[rows] = np.maximum(left, 0.0).reshape(mean[rows].shape).mean(-1)
         C[:, rows] = (modes / singular_values).T.reshape(C[:, rows].shape)
-        drop_pages(C)
 
-    for _ in map_ahead(fill, strips.rows(), strips.threads):
+    for _ in map_ahead(fill, strips.rows(C), strips.threads):
         pass
     return C.reshape(len(singular_values), mean.size).T, energy

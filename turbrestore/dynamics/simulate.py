@@ -1,6 +1,11 @@
-"""Flows that move like the training flows: the system made stationary, and run with noise.
+"""Simulation of flows that move like the training flows: the system is made stationary and driven by noise.
 
-Symbols: A, C, Q, W̄, ξ and n as in :mod:`turbrestore.dynamics.flow_model`; P covariance of the state.
+Paper 3, section 3.2 and Figure 6.
+
+Symbols
+-------
+A, C, Q, W̄, ξ, n : as in :mod:`turbrestore.dynamics.flow_model`
+P : covariance of the state
 """
 
 from __future__ import annotations
@@ -19,14 +24,14 @@ from .flow_model import Float64Array, FlowDynamics, check_state, flow_of
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFlows:
-    """Sequence of simulated flows; each is computed when it is asked for.
+    """Sequence of simulated flows, each computed on access.
 
     Parameters
     ----------
     dynamics : FlowDynamics
-        Where C and W̄ come from.
+        Has C and W̄.
     states : ndarray, float64, shape (n, length)
-        One column a flow.
+        One state in each column.
     """
 
     dynamics: FlowDynamics
@@ -45,18 +50,18 @@ class SimulatedFlows:
 def stable_system(dynamics: FlowDynamics, largest_modulus: float = 0.99) -> tuple[Float64Array, Float64Array]:
     """Return A and Q of a stationary process: A inside the unit circle, P = A P Aᵀ + Q for the training P.
 
-    Eigenvalues of larger modulus are shortened to ``largest_modulus`` and keep their angle, all others stay: the
-    blocks on the diagonal of A's real Schur form are scaled, which is well conditioned even where A has no basis
-    of eigenvectors. Q is ``P − A P Aᵀ`` with its negative eigenvalues set to zero. Where that cuts something off,
-    a change of coordinates (the symmetric map that carries the resulting stationary covariance to P) restores
-    P exactly and leaves the eigenvalues alone. States are measured in units of their own deviation throughout.
+    Eigenvalues of larger modulus are scaled to ``largest_modulus`` and keep their angle; the others do not change. For
+    that the blocks on the diagonal of A's real Schur form are scaled, which is well conditioned even if A has no basis
+    of eigenvectors. Q is ``P − A P Aᵀ`` with its negative eigenvalues set to zero. If there were any, a change of
+    coordinates (the symmetric map from the resulting stationary covariance to P) restores P exactly and does not
+    change the eigenvalues. States are measured in units of their own deviation throughout.
 
     Parameters
     ----------
     dynamics : FlowDynamics
     largest_modulus : float
-        Below 1. At 0.99 a state forgets in a hundred frames, about what training sequences can tell apart from
-        never.
+        Below 1. At 0.99 the memory of a state is a hundred frames, about the longest that a training sequence can
+        distinguish from an infinite one.
 
     Returns
     -------
@@ -85,7 +90,7 @@ def stable_system(dynamics: FlowDynamics, largest_modulus: float = 0.99) -> tupl
     A = _pull_inside(dynamics.A * deviation / deviation[:, None], largest_modulus)
     values, vectors = np.linalg.eigh(np.eye(len(A)) - A @ A.T)
     Q = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    # The stationary covariance is at least the identity, because cutting off only added to Q.
+    # The stationary covariance is at least the identity, because setting eigenvalues to zero only added to Q.
     stationary, vectors = np.linalg.eigh(linalg.solve_discrete_lyapunov(A, Q))
     shrink = (vectors / np.sqrt(stationary)) @ vectors.T
     grow = (vectors * np.sqrt(stationary)) @ vectors.T
@@ -102,8 +107,8 @@ def simulate(
 ) -> SimulatedFlows:
     """Synthesise flows that move like the training flows (paper 3, section 3.2 and Figure 6).
 
-    The system is that of :func:`stable_system`, so that the simulation neither grows nor fades, where the paper
-    runs A and Q as fitted. Like the paper's, the flows are W̄ + C ξ, without the residual r.
+    The paper simulates with A and Q as fitted; here they are those of :func:`stable_system`, so that the simulation
+    neither grows nor fades. As in the paper the flows are W̄ + C ξ, without the residual r.
 
     Parameters
     ----------
@@ -111,7 +116,7 @@ def simulate(
     length : int
         Number of flows, at least 1.
     rng : numpy.random.Generator
-        Source of q; the same state of it gives the same flows.
+        Source of q; the same state of the generator gives the same flows.
     initial : array_like, shape (n,), optional
         State of the first flow. By default drawn from the stationary distribution.
     largest_modulus : float
@@ -154,7 +159,7 @@ def simulate(
 
 
 def _pull_inside(A: Float64Array, largest: float) -> Float64Array:
-    """Shorten the eigenvalues of A to the modulus ``largest`` where they exceed it."""
+    """Scale eigenvalues of A whose modulus exceeds ``largest`` to that modulus."""
     T, Z = linalg.schur(A, output="real")
     start = 0
     while start < len(T):

@@ -16,8 +16,9 @@ Given Ŵ the image is a linear state, given ρ the flow is, so each frame update
 3. warp the frame by Ŵ and update ρ̂ (eqs. 15, 16);
 4. return to 2 with the new image, ``inner_iterations`` times in all.
 
-The equations: :mod:`turbrestore.filtering.flow_state` has 14b, 14d, 17 and 19, :mod:`turbrestore.filtering.image_state`
-14a, 14c and 16, :mod:`turbrestore.filtering.frame_noise` Z.  :mod:`turbrestore.filtering.frame_pass` does one iteration.
+Eqs. 14b, 14d, 17 and 19 are in :mod:`turbrestore.filtering.flow_state`, eqs. 14a, 14c, 15 and 16 in
+:mod:`turbrestore.filtering.image_state`, and Z is in :mod:`turbrestore.filtering.frame_noise`.
+:mod:`turbrestore.filtering.frame_pass` measures, follows and registers the frames of one iteration.
 
 Departures from the paper, each with its reason:
 
@@ -40,7 +41,7 @@ Departures from the paper, each with its reason:
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice, repeat
 
@@ -63,6 +64,8 @@ from .kalman import Gaussian
 
 # Variance of an image of which nothing is known: full scale, squared.
 _DIFFUSE = 1.0
+# Known flows of the first block; None for frames that do not count.
+Flows = FloatArray | Sequence[FloatArray | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,11 +207,11 @@ def filter_steps(
 def _filter_blocks(
     at: _Position,
     stream: Iterator[FloatArray | None],
-    known: Iterable[FloatArray | None],
+    known: Flows,
     params: FilterParams,
     settings: PassSettings,
 ) -> Generator[FilterStep, None, _Position]:
-    """Steps 1 to 4 of the module docstring for one block after the other."""
+    """Do steps 1 to 4 of the module docstring for one block after the other."""
     iterations, size, last = params.inner_iterations, params.block, params.inner_iterations == 1
     if at.block:
         # The flows of the first block are known in its first iteration.
@@ -235,7 +238,7 @@ def _filter_blocks(
 def _iterate(
     at: _Position,
     settings: PassSettings,
-    known: Iterable[FloatArray | None] = (),
+    known: Flows = (),
     settle: bool = False,
     following: Iterable[FloatArray | None] = (),
     from_known: bool = False,
@@ -283,7 +286,7 @@ def _checkpoint(at: _Position, reference: FloatArray) -> FilterCheckpoint:
 
 def _settings(
     block: list[FloatArray | None],
-    known: Iterable[FloatArray | None],
+    known: Flows,
     image: FloatArray,
     dynamics: FlowDynamics,
     params: FilterParams,
@@ -339,12 +342,12 @@ def _checked(frames: Iterable[ArrayLike | None], shape: tuple[int, ...]) -> Iter
 
 def _first_block(
     stream: Iterator[FloatArray | None], size: int, flows: FloatArray | None
-) -> tuple[list[FloatArray | None], Iterable[FloatArray | None] | None]:
+) -> tuple[list[FloatArray | None], Flows | None]:
     """Frames with known flows, else as many as any block has; more where none of them counts, without known flows."""
     block = list(islice(stream, size if flows is None else len(flows)))
     if not block or (flows is not None and len(block) < len(flows)):
         raise DataError(f"frames: expected at least {1 if flows is None else len(flows)}, found {len(block)}")
-    known: Iterable[FloatArray | None] | None = flows
+    known: Flows | None = flows
     while all(frame is None for frame in block):
         known, more = None, list(islice(stream, size))
         if not more:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RESIDUALS = ("keep", "drop")
+# Bytes a pixel while frames are registered and fused: for each channel, for each thread, and for each channel of that.
+_SHARED_CHANNEL, _EACH, _EACH_CHANNEL = 15.0, 10.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -201,3 +203,37 @@ class Filtered:
             ("noise of a frame", f"{100 * self.image_noise**0.5:.2f} % of full scale"),
         ]
         return preview("Filtered image", facts, self.image)
+
+
+def filter_memory(shape: tuple[int, ...], train: int, params: FilterParams | None = None, threads: int = 1) -> float:
+    """Bytes that the filter takes beside flow, the training frames with their flows, and the modes of the flow model.
+
+    The constants were measured by ``benchmarks/memory.py --stages`` at 1280×720, grey and in colour, with one, two and
+    four threads, and rounded up by at least a twentieth.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Of all frames, (T, H, W) or (T, H, W, 3).
+    train : int
+        Frames with known flows.
+    params : FilterParams, optional
+    threads : int
+        Frames that are worked on side by side.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> filter_memory((120, 256, 256), 60, threads=2) / 256**2
+    189.0
+    """
+    params, pixels = params or FilterParams(), float(shape[1] * shape[2])
+    channels = shape[3] if len(shape) == 4 else 1
+    # A frame, what flow prepares of it, and its flow at half the resolution.
+    block = (4.0 * channels + 2.0) * min(params.block, shape[0] - train)
+    # From the third iteration on, what flow prepares of the training frames is kept too.
+    prepared = float(train) if params.inner_iterations > 2 else 0.0
+    return pixels * (_SHARED_CHANNEL * channels + threads * (_EACH + _EACH_CHANNEL * channels) + max(block, prepared))

@@ -9,9 +9,9 @@ M : gain (eq. 19)
 z : Cᵀ(W^meas − W̄)
 G : share of the flow outside the subspace of C that is motion and not noise
 
-As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R``: a measured flow enters the update only through z,
-which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the expensive part and needs
-no state, and predictions and updates have the size n.
+As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R``: a measured flow enters the update only through
+z, which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the expensive part and
+needs no state, and predictions and updates have the size n.
 """
 
 from __future__ import annotations

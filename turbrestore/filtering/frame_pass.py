@@ -2,9 +2,9 @@
 
 Symbols as in :mod:`turbrestore.filtering.flow_state` and :mod:`turbrestore.filtering.frame_noise`.
 
-Threads measure and project the flows of several frames side by side, the flow state is updated for one frame after the
-other in their order, and the frames are then registered side by side again.  On a device of torch frames are
-registered by whoever fuses them, so that no more than one registered frame lies there.
+Threads measure and project the flows of several frames side by side; the flow state is then updated by one frame after
+the other, and the frames are registered side by side again.  On a device of torch a frame is only registered when it is
+fused, so that no more than one registered frame takes memory there.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..dynamics.flow_model import FlowDynamics, flow_of
-from ..registration.flow import FlowFrame, FlowParams, prepare_reference
+from ..registration.flow import FlowFrame, FlowParams, FlowReference, prepare_reference
 from ..runtime.image_stacks import Stack
 from ..runtime.runtime import Runtime
 from ..runtime.scratch import iter_frames
@@ -80,18 +80,18 @@ class RegisteredFrame:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """A frame whose flow has been measured.
+    """A frame after the update of the flow state.
 
     Attributes
     ----------
     frame : Frame
-        With its flow, where a later pass starts from it.
+        With a flow from which that of the next pass starts; None if no pass follows.
     state : Gaussian
         ξ̂ and P after the frame.
     innovation : float
         Root mean square of W^meas − W̄ − C A ξ̂, pixels; NaN if the frame does not count.
     registered : callable or None
-        Gives the RegisteredFrame; None if the frame does not count.
+        Returns the RegisteredFrame; None if the frame does not count.
     """
 
     frame: Frame
@@ -102,7 +102,7 @@ class TrackedFrame:
 
 @dataclass(frozen=True, eq=False)
 class _Item:
-    """A frame on its way through a pass; ``start`` is a known flow to it, ``kept`` whether a later pass follows."""
+    """A frame within a pass: ``start`` is a known flow to it, and ``kept`` says whether another pass follows."""
 
     frame: Frame
     start: FloatArray | None
@@ -128,47 +128,40 @@ def pass_over(
     starts : iterable of ndarray or None
         Known flow to each frame, pixels, which its flow starts from; at least as many as frames.
     image : ndarray, float32, shape (H, W) or (H, W, 3), or None
-        Where flows start; None takes the known flows as the measured ones.
+        Reference of the flows; with None the known flows are taken as the measured ones.
     state : Gaussian
         ξ̂ and P before the first frame.
     settled : int
-        No pass follows over so many frames, the first ones.
+        Number of frames, from the first on, over which no other pass follows.
     settings : PassSettings
 
     Yields
     ------
     TrackedFrame
     """
+    reference = None if image is None else prepare_reference(image, settings.flow, settings.runtime)
+    batch, threads = (1, settings.runtime.threads) if reference is None else (reference.batch, reference.threads)
+
+    def measure(items: list[_Item]) -> list[_Item]:
+        measured = _take_known(items) if reference is None else _measure_flows(items, reference)
+        return [_project(item, settings.dynamics) for item in measured]
+
+    def update(items: list[_Item]) -> list[tuple[_Item, Gaussian, float]]:
+        nonlocal state
+        updated = []
+        for item in items:
+            state, innovation = predict_state(state, settings.dynamics), np.nan  # (14b, 14d)
+            if item.projected is not None:
+                state, innovation = update_state(state, item.projected, settings.dynamics)  # (17, 19)
+            updated.append((item, state, innovation))
+        return updated
+
+    def track(updated: list[tuple[_Item, Gaussian, float]]) -> list[TrackedFrame]:
+        return [_track(*one, settings) for one in updated]
+
     pairs = zip(iter_frames(frames), iter_frames(starts), strict=False)
     items = (_Item(*pair, number >= settled) for number, pair in enumerate(pairs))
-    measure, batch, threads = _take_known, 1, settings.runtime.threads
-    if image is not None:
-        reference = prepare_reference(image, settings.flow, settings.runtime)
-        batch, threads = reference.batch, reference.threads
-
-        def measure(some: list[_Item]) -> list[_Item]:
-            prepared = [_prepared(item, reference.prepare) for item in some]
-            counted = [item.frame for item in prepared if isinstance(item.frame, FlowFrame)]
-            flows = iter(reference.solve(counted) if counted else [])
-            return [item if item.frame is None else _with_flow(item, next(flows)) for item in prepared]
-
-    def project(some: list[_Item]) -> list[_Item]:
-        return [_projected(item, settings.dynamics) for item in measure(some)]
-
-    def follow(some: list[_Item]) -> list[tuple[_Item, Gaussian, float]]:
-        nonlocal state
-        followed = []
-        for item in some:
-            state, innovation = predict_state(state, settings.dynamics), np.nan
-            if item.projected is not None:
-                state, innovation = update_state(state, item.projected, settings.dynamics)
-            followed.append((item, state, innovation))
-        return followed
-
-    def finish(followed: list[tuple[_Item, Gaussian, float]]) -> list[TrackedFrame]:
-        return [_tracked(*one, settings) for one in followed]
-
-    for tracked in map_in_turns(project, follow, finish, in_batches(items, batch), threads):
+    for tracked in map_in_turns(measure, update, track, in_batches(items, batch), threads):
         yield from tracked
 
 
@@ -197,20 +190,28 @@ def register(image: FloatArray, measured: FloatArray, state: Gaussian, settings:
     return RegisteredFrame(channels, noise, sharpness)
 
 
+def _measure_flows(items: list[_Item], reference: FlowReference) -> list[_Item]:
+    """Measure W^meas from the image to the frames that count (eq. 17)."""
+    prepared = [_prepare(item, reference) for item in items]
+    counted = [item.frame for item in prepared if isinstance(item.frame, FlowFrame)]
+    flows = iter(reference.solve(counted) if counted else [])
+    return [item if item.frame is None else _with_flow(item, next(flows)) for item in prepared]
+
+
 def _take_known(items: list[_Item]) -> list[_Item]:
     return [item if item.frame is None else replace(item, measured=item.start) for item in items]
 
 
-def _prepared(item: _Item, prepare: Callable[[FloatArray], FlowFrame]) -> _Item:
+def _prepare(item: _Item, reference: FlowReference) -> _Item:
     """Prepare a frame for flow, unless an earlier pass has."""
     if item.frame is None:
         return item
-    frame = item.frame if isinstance(item.frame, FlowFrame) else prepare(item.frame)
+    frame = item.frame if isinstance(item.frame, FlowFrame) else reference.prepare(item.frame)
     return replace(item, frame=frame if item.start is None else replace(frame, start=item.start))
 
 
 def _with_flow(item: _Item, flow: FloatArray) -> _Item:
-    """Note the flow to a frame; that of a later pass starts from it, unless there is a known flow."""
+    """Add the flow to a frame; that of the next pass starts from it, unless there is a known flow."""
     if item.kept and item.start is None and isinstance(item.frame, FlowFrame):
         return replace(item, measured=flow, frame=replace(item.frame, start=_half_resolution(flow)))
     return replace(item, measured=flow)
@@ -225,12 +226,12 @@ def _half_resolution(flow: FloatArray) -> NDArray[np.float16]:
     return cv2.resize(flow, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.float16)
 
 
-def _projected(item: _Item, dynamics: FlowDynamics) -> _Item:
+def _project(item: _Item, dynamics: FlowDynamics) -> _Item:
     return item if item.measured is None else replace(item, projected=project_measured(item.measured, dynamics))
 
 
-def _tracked(item: _Item, state: Gaussian, innovation: float, settings: PassSettings) -> TrackedFrame:
-    """Register a frame on the CPU, or leave that to whoever fuses it."""
+def _track(item: _Item, state: Gaussian, innovation: float, settings: PassSettings) -> TrackedFrame:
+    """Register a frame now on the CPU, but only when it is fused on a device."""
     frame = item.frame if item.kept else None
     image = item.frame.image if isinstance(item.frame, FlowFrame) else item.frame
     if image is None or item.measured is None:

@@ -1,17 +1,14 @@
-"""Kalman filter in pieces: prediction, update in covariance and in information form, update of every pixel.
+"""Kalman filter: prediction, and measurement update in covariance form and in information form.
 
 Symbols (paper 3, section 4)
 ----------------------------
-ξ̂, P : mean and covariance of the state, :class:`Gaussian`.
-A, Q : state transition and covariance of the process noise (eqs. 13b, 14b, 14d).
-H, R : measurement matrix and covariance of its noise; C and R for the flow (eq. 17).
-M : gain (eq. 18; information form, eq. 19).
-ρ̂, Σ : mean and variance of every pixel of the image, :class:`PixelGaussian`.
-S, Z : variances of the image's drift and of the registered frame (eqs. 13a, 15).
-L : gain of every pixel (eq. 16).
+ξ̂, P : mean and covariance of the state, :class:`Gaussian`
+A, Q : state transition and covariance of the process noise (eqs. 13b, 14b, 14d)
+z, H, R : measurement, its matrix and the covariance of its noise; W^meas, C and R for the flow (eq. 17)
+M : gain (eq. 18; information form, eq. 19)
 
-Matrix operations act on the last two axes, so leading axes are batches and broadcast. NaN in a measurement
-means that this component is missing.
+Matrix operations act on the last two axes, so leading axes are batches and broadcast. A component of a measurement that
+is NaN is missing.
 """
 
 from __future__ import annotations
@@ -22,12 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import DataError
-from ..runtime.scratch import drop_pages
 
 Float64Array = NDArray[np.float64]
 
-# Rows of a tall measurement matrix handled at once: 16384 × 40 float64 are 5 MB.
-_BLOCK_ROWS = 16384
 _LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -72,16 +66,16 @@ class Gaussian:
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """What a measurement said beyond the prediction; the material of consistency checks.
+    """Difference between a measurement and its prediction, for consistency checks.
 
-    Over a filter that fits its model, ``normalised_squared`` averages ``observed``, and the sum of
+    If the model is right, the mean of ``normalised_squared`` over many updates is that of ``observed``, and the sum of
     ``log_likelihood`` is the log-density of all measurements.
 
     Parameters
     ----------
     values : ndarray, float64, shape (..., m) or (..., n)
         Covariance form: z − H ξ̂, NaN where the component is missing. Information form: its projection
-        Hᵀ R⁻¹ (z − H ξ̂), all of it that the update uses.
+        Hᵀ R⁻¹ (z − H ξ̂), which is all that the update needs.
     cov : ndarray, float64, shape (..., m, m) or (..., n, n)
         Covariance of ``values``, NaN where a component is missing.
     normalised_squared : ndarray, float64, shape (...)
@@ -100,7 +94,7 @@ class Innovation:
 
 
 def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
-    """Time update: A ξ̂ and A P Aᵀ + Q (paper 3, eqs. 14b and 14d).
+    """Time update: A ξ̂ (paper 3, eq. 14b) and A P Aᵀ + Q (eq. 14d).
 
     Parameters
     ----------
@@ -131,7 +125,7 @@ def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
     _check_matrix(A, n, n, "A")
     _check_covariance(Q, n, "Q")
     _check_batches(state.mean.shape[:-1], A=A.shape[:-2], Q=Q.shape[:-2])
-    # An overflow is reported by Gaussian in words; NumPy's warning would add nothing.
+    # Gaussian raises a DataError where the result overflows, so NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
         return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ _transposed(A) + Q))
 
@@ -141,15 +135,15 @@ def update(
 ) -> tuple[Gaussian, Innovation]:
     """Measurement update in covariance form, for few components (paper 3, eqs. 17 and 18).
 
-    The covariance follows Joseph, ``(I − M H) P (I − M H)ᵀ + M R Mᵀ``, where the paper has ``(I − M H) P``: the
-    same in exact arithmetic, and symmetric and positive semi-definite in any other.
+    The new covariance is Joseph's ``(I − M H) P (I − M H)ᵀ + M R Mᵀ`` where the paper has ``(I − M H) P``: both are
+    the same in exact arithmetic, but only the first stays symmetric and positive semi-definite in floating point.
 
     Parameters
     ----------
     state : Gaussian
         Prediction.
     measurement : array_like, shape (..., m)
-        z; NaN where missing. With everything missing the state comes back unchanged.
+        z; NaN where missing. If all components are missing the state is returned unchanged.
     H : array_like, shape (..., m, n)
         Measurement matrix, or the Jacobian of a nonlinear measurement at the prediction.
     R : array_like, shape (..., m, m)
@@ -205,29 +199,24 @@ def update(
 
 
 def update_information(
-    state: Gaussian, measurement: ArrayLike, H: ArrayLike, noise_variance: ArrayLike, orthonormal: bool = False
+    state: Gaussian, measurement: ArrayLike, H: ArrayLike, noise_variance: ArrayLike
 ) -> tuple[Gaussian, Innovation]:
     """Measurement update in information form, for many components and few states (paper 3, eq. 19).
 
     ``M = (G + P⁻¹)⁻¹ Hᵀ R⁻¹`` with ``G = Hᵀ R⁻¹ H``: only n×n matrices are decomposed. With ``P = L Lᵀ`` and
     ``Lᵀ G L = V D Vᵀ`` the new covariance is ``T Tᵀ``, ``T = L V (I + D)^(-1/2)``: P may be singular, and the
     result is symmetric and positive semi-definite. Its relative error is about 1e-16 times the largest of D.
-    H is read in blocks of rows; nothing of size m×n is formed.
 
     Parameters
     ----------
     state : Gaussian
         Prediction.
     measurement : array_like, shape (..., m)
-        z, float32 or float64; NaN where missing.
+        z; NaN where missing.
     H : array_like, shape (..., m, n)
-        Measurement matrix, float32 or float64, for example C of the flow.
+        Measurement matrix, for example C of the flow.
     noise_variance : float or array_like, shape (m,)
         Diagonal of R, positive, one number for all components or one each.
-    orthonormal : bool
-        State that Hᵀ H = I, which is not checked. With one noise variance for all components and nothing
-        missing, G = I / R and the product Hᵀ z is all that is left to compute; it is then summed in the type of
-        H within a block and in float64 across blocks. Otherwise this has no effect.
 
     Returns
     -------
@@ -244,12 +233,12 @@ def update_information(
     --------
     >>> import numpy as np
     >>> C = np.array([[0.6], [0.8]], np.float32)
-    >>> after, _ = update_information(Gaussian(np.zeros(1), np.eye(1)), [0.6, 0.8], C, 1.0, orthonormal=True)
-    >>> after.mean.round(6), after.cov
+    >>> after, _ = update_information(Gaussian(np.zeros(1), np.eye(1)), [0.6, 0.8], C, 1.0)
+    >>> after.mean.round(6), after.cov.round(6)
     (array([0.5]), array([[0.5]]))
     """
     n = state.mean.shape[-1]
-    z, H = _floating(measurement), _floating(H)
+    z, H = np.asarray(measurement, np.float64), np.asarray(H, np.float64)
     m = _check_measurement(z, H, n)
     _check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2])
     variance = np.asarray(noise_variance, np.float64)
@@ -258,13 +247,9 @@ def update_information(
     if not (np.isfinite(variance) & (variance > 0)).all():
         raise DataError("noise_variance: expected finite values above 0, found others; give the noise a floor")
     missing = np.isnan(z)
-    if orthonormal and variance.ndim == 0 and not missing.any():
-        G = np.eye(n) / variance
-        Hz, zz = _projection(H, z)
-        Hz, zz = Hz / variance, zz / variance
-    else:
-        weight = np.where(missing, 0.0, 1.0 / variance)
-        G, Hz, zz = _normal_equations(H, np.where(missing, z.dtype.type(0), z), weight)
+    weight, z = np.where(missing, 0.0, 1.0 / variance), np.where(missing, 0.0, z)
+    weighted = _transposed(H * weight[..., None])
+    G, Hz, zz = _symmetric(weighted @ H), _apply(weighted, z), (weight * z**2).sum(-1)
     log_det_noise = np.where(missing, 0.0, np.log(variance)).sum(-1)
     return _information_step(state, G, Hz, zz, log_det_noise, m - missing.sum(-1))
 
@@ -283,7 +268,7 @@ def _information_step(
     G_mean = _apply(G, state.mean)
     score = Hz - G_mean
     step = _apply(cov, score)
-    # zᵀR⁻¹z − 2 ξ̂ᵀHᵀR⁻¹z + ξ̂ᵀGξ̂ spares a pass over H; rounding may leave it a little below zero.
+    # zᵀR⁻¹z − 2 ξ̂ᵀHᵀR⁻¹z + ξ̂ᵀGξ̂ needs no further pass over H; rounding may leave it a little below zero.
     weighted = zz - (state.mean * (Hz + score)).sum(-1)
     squared = np.maximum(weighted - (score * step).sum(-1), 0.0)
     log_det = log_det_noise + np.log1p(gained).sum(-1)
@@ -311,36 +296,6 @@ def _innovation(
     return Innovation(values, cov, np.asarray(squared), np.asarray(log_likelihood), np.asarray(observed))
 
 
-def _blocks(rows: int) -> list[slice]:
-    return [slice(start, start + _BLOCK_ROWS) for start in range(0, rows, _BLOCK_ROWS)]
-
-
-def _projection(H: NDArray[np.floating], z: NDArray[np.floating]) -> tuple[Float64Array, Float64Array]:
-    """Hᵀ z and zᵀ z."""
-    Hz, zz = np.zeros(H.shape[-1]), np.zeros(())
-    for rows in _blocks(H.shape[-2]):
-        part = z[..., rows]
-        Hz = Hz + np.matmul(part.astype(H.dtype, copy=False)[..., None, :], H[..., rows, :])[..., 0, :]
-        zz = zz + np.square(part, dtype=np.float64).sum(-1)
-        drop_pages(H)
-    return Hz, zz
-
-
-def _normal_equations(
-    H: NDArray[np.floating], z: NDArray[np.floating], weight: Float64Array
-) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Hᵀ w H, Hᵀ w z and zᵀ w z."""
-    n = H.shape[-1]
-    G, Hz, zz = np.zeros((n, n)), np.zeros(n), np.zeros(())
-    for rows in _blocks(H.shape[-2]):
-        part, values, w = H[..., rows, :].astype(np.float64), z[..., rows], weight[..., rows]
-        weighted = _transposed(part * w[..., None])
-        G = G + weighted @ part
-        Hz = Hz + _apply(weighted, values.astype(np.float64))
-        zz = zz + (w * np.square(values, dtype=np.float64)).sum(-1)
-    return _symmetric(G), Hz, zz
-
-
 def _apply(matrix: Float64Array, vector: Float64Array) -> Float64Array:
     return np.matmul(matrix, vector[..., None])[..., 0]
 
@@ -355,11 +310,6 @@ def _solve(matrix: Float64Array, right: Float64Array) -> Float64Array:
 
 def _symmetric(matrix: Float64Array) -> Float64Array:
     return 0.5 * (matrix + _transposed(matrix))
-
-
-def _floating(values: ArrayLike) -> NDArray[np.floating]:
-    array = np.asarray(values)
-    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
 
 
 def _check_matrix(matrix: NDArray[np.floating], rows: int, columns: int, name: str) -> None:

@@ -247,6 +247,33 @@ def iter_parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
     yield from iter_frames(array[start : start + step] for start in range(0, len(array), step))
 
 
+def iter_slices(length: int, step: int, *arrays: object) -> Iterator[slice]:
+    """Yield slices of ``step`` rows, and hand back the memory of mapped arrays after the work on each.
+
+    Parameters
+    ----------
+    length, step : int
+        Rows in all, and rows of a slice; the last may be shorter.
+    arrays : object
+        What is read or written meanwhile; nothing happens to arrays in memory.
+
+    Yields
+    ------
+    slice
+
+    Examples
+    --------
+    >>> list(iter_slices(5, 2))
+    [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
+    """
+    for start in range(0, length, step):
+        try:
+            yield slice(start, min(start + step, length))
+        finally:
+            for array in arrays:
+                drop_pages(array)
+
+
 def mean_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
     """Mean over the first axis, as ``stack.mean(axis=0)`` gives it, bit for bit.
 

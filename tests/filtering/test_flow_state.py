@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flow_systems import uneven_flows
+
+from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
+from turbrestore.dynamics.flow_model import flow_of
+from turbrestore.filtering.flow_state import estimate_flow, predict_state, project_measured, update_state
+from turbrestore.filtering.kalman import Gaussian, predict, update
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(4)
+
+
+@pytest.fixture
+def dynamics():
+    return identify(uneven_flows(), DynamicsParams(rank=5))
+
+
+def test_the_projected_update_is_that_of_the_whole_flow(rng, dynamics):
+    """Eq. 19 with z = Cᵀ(W − W̄) against eq. 18 with all 2 H W components."""
+    state = whole = Gaussian(rng.standard_normal(5), dynamics.state_covariance)
+    C, R = dynamics.C.astype(np.float64), dynamics.R * np.eye(len(dynamics.C))
+    for flow in uneven_flows()[:4]:
+        state, whole = predict_state(state, dynamics), predict(whole, dynamics.A, dynamics.Q)
+        expected = (flow - flow_of(dynamics, whole.mean)).ravel()
+        state, innovation = update_state(state, project_measured(flow, dynamics), dynamics)
+        whole, _ = update(whole, (flow - dynamics.mean_flow).ravel(), C, R)
+        np.testing.assert_allclose(state.mean, whole.mean, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(state.cov, whole.cov, rtol=1e-5, atol=1e-6 * whole.cov.max())
+        assert innovation == pytest.approx(np.sqrt(np.mean(expected.astype(np.float64) ** 2)), rel=1e-4)
+
+
+def test_the_gain_is_that_of_the_information_form(rng, dynamics):
+    predicted = Gaussian(rng.standard_normal(5), dynamics.state_covariance)
+    measured = project_measured(uneven_flows()[0], dynamics)
+    M = np.linalg.inv(np.eye(5) / dynamics.R + np.linalg.inv(predicted.cov)) / dynamics.R
+    state, _ = update_state(predicted, measured, dynamics)
+    np.testing.assert_allclose(state.mean, predicted.mean + M @ (measured.state - predicted.mean), rtol=1e-9)
+    np.testing.assert_allclose(state.cov, (np.eye(5) - M) @ predicted.cov, rtol=1e-8, atol=1e-9 * predicted.cov.max())
+
+
+def test_a_model_that_explains_everything_keeps_a_gain(rng, dynamics):
+    exact = replace(dynamics, R=0.0)
+    state, _ = update_state(
+        Gaussian(np.zeros(5), dynamics.state_covariance), project_measured(uneven_flows()[1], dynamics), exact
+    )
+    assert np.linalg.eigvalsh(state.cov).min() > 0
+    np.testing.assert_allclose(state.mean, project_measured(uneven_flows()[1], dynamics).state, rtol=1e-4)
+
+
+def test_the_estimate_lies_between_model_and_measurement(rng):
+    modelled, measured = rng.random((2, 3, 4, 2), np.float32)
+    for share, expected in ((0, modelled), (1, measured), (0.25, 0.75 * modelled + 0.25 * measured)):
+        found = estimate_flow(modelled, measured, np.full((3, 4, 2), share, np.float32))
+        np.testing.assert_allclose(found, expected, atol=1e-6)
