@@ -68,7 +68,7 @@ class NonlocalPenalty:
         return self.graph.norm_squared()
 
     def zero_dual(self, u: FloatArray) -> PairDual:
-        """p = 0."""
+        """P = 0."""
         return PairDual(np.zeros((2, len(self.graph.heads)), np.float32), *np.zeros((2, u.size), np.float32))
 
     def ascend(self, p: PairDual, u: FloatArray, step: float, relaxation: float) -> tuple[PairDual, FloatArray]:
@@ -85,9 +85,7 @@ class NonlocalPenalty:
     def value(self, u: FloatArray) -> float:
         """J(u)."""
         graph, squares = self.graph, np.zeros(u.size, np.float32)
-        self._over_bands(
-            lambda band: add_squares(u.ravel(), graph.starts, graph.heads, graph.roots, band, squares)
-        )
+        self._over_bands(lambda band: add_squares(u.ravel(), graph.starts, graph.heads, graph.roots, band, squares))
         return float(np.sqrt(squares).sum(dtype=np.float64))
 
     def _over_bands(self, work: Callable[[NDArray[np.int64]], None]) -> None:
@@ -112,7 +110,7 @@ def add_gradient(
     values: FloatArray,
     squares: FloatArray,
 ) -> None:
-    """``a ← ga + K change`` on the pairs of a band, and add |a|² to their pixels.
+    """Replace a by ``ga + K change`` on the pairs of a band, and add |a|² to their pixels.
 
     Parameters
     ----------

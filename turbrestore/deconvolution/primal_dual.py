@@ -58,7 +58,7 @@ class Penalty(Protocol):
         ...
 
     def zero_dual(self, u: Array) -> Array:
-        """p = 0 for an image of the size of u."""
+        """P = 0 for an image of the size of u."""
         ...
 
     def ascend(self, p: Array, u: Array, step: float, relaxation: float) -> tuple[Array, Array]:
