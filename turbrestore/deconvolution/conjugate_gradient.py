@@ -15,17 +15,20 @@ needs two transforms.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ..blur.psf import laplacian_symbol
+from ..blur.psf import laplacian_symbol, wiener_fidelity
+from ..core.noise import estimate_noise
 from .array_ops import Array
 from .problem import Problem
 
 # Below this share of the energy of the data, the residual consists of rounding errors.
 ROUNDING = 1e-14
+# Steps to the Wiener solution that nltv and tv start from; later ones change it near the border only.
+_START_STEPS = 40
 
 
 class GradientState(NamedTuple):
@@ -123,6 +126,35 @@ def quadratic_solver(problem: Problem, method: str) -> ConjugateGradients:
     """
     symbol = laplacian_symbol(*problem.shape) if method == "wiener" else np.ones((1, 1), np.float32)
     return ConjugateGradients(problem.ops.load(symbol))
+
+
+def wiener_image(problem: Problem) -> Array:
+    """Wiener solution with its own fidelity, which nltv and tv start from.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its fidelity is not used.
+
+    Returns
+    -------
+    array, float32, shape (P, Q)
+
+    Examples
+    --------
+    >>> from turbrestore.deconvolution.array_ops import numpy_ops
+    >>> image = np.ones((2, 2), np.float32)
+    >>> wiener_image(Problem(image, image, image, 1.0, numpy_ops()))
+    array([[1., 1.],
+           [1., 1.]], dtype=float32)
+    """
+    observed = problem.ops.store(problem.observed)
+    problem = replace(problem, fidelity=wiener_fidelity(observed, estimate_noise(observed)))
+    solver = quadratic_solver(problem, "wiener")
+    state = solver.start(problem)
+    for _ in range(_START_STEPS):
+        state = solver.step(problem, state)
+    return state.image
 
 
 def _inner(problem: Problem, a: Array, b: Array) -> float:

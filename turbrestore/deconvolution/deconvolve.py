@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..blur.estimation import BlurEstimate
-from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, check_psf, psf_to_otf, wiener_fidelity
+from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, psf_to_otf
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import DataError, require, require_between
 from ..core.noise import estimate_noise
@@ -33,11 +33,11 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.threads import ThreadTeam, one_thread_each
 from .array_ops import Array, numpy_ops, torch_ops
-from .conjugate_gradient import quadratic_solver
+from .conjugate_gradient import quadratic_solver, wiener_image
 from .nonlocal_tv import NonlocalPenalty
 from .nonlocal_weights import NonlocalParams, automatic_h, nonlocal_weights
 from .primal_dual import Penalty, PrimalDual
-from .problem import Margin, Problem, automatic_fidelity, join_planes, margin_around, split_planes
+from .problem import Margin, Problem, automatic_fidelity, join_planes, margin_around, read_blur, split_planes
 from .stopping import DeconvolutionState, Solution, iterate
 from .torch_nonlocal import torch_nonlocal_penalty
 from .tv import LocalPenalty
@@ -49,10 +49,6 @@ METHODS = ("nltv", "tv", "wiener", "tikhonov")
 BOUNDARIES = ("unknown", "periodic")
 CHANNELS = ("luminance", "each")
 
-# Smallest margin, in widths of the blur.
-MARGIN_SIGMAS = 4.0
-# Steps to the Wiener solution that nltv and tv start from; later ones change it near the border only.
-_START_STEPS = 40
 # Smaller images are sharpened one after the other: their transforms are shorter than a wait for the interpreter lock.
 _PARALLEL_PIXELS = 1 << 15
 
@@ -261,7 +257,7 @@ def deconvolve_steps(
     if isinstance(sigma_or_psf, BlurEstimate):
         params = dataclasses.replace(params, exponent=params.exponent or sigma_or_psf.exponent)
         sigma_or_psf = sigma_or_psf.removable
-    psf, sigma, reach = _read_blur(sigma_or_psf)
+    psf, sigma, reach = read_blur(sigma_or_psf)
     planes = split_planes(pixels, params.channels)
     noise, fidelity = _noise_and_fidelity(planes, params)
     if sigma == 0:
@@ -311,13 +307,13 @@ def whole_image_params(
     Examples
     --------
     >>> import numpy as np
-    >>> whole_image_params(np.tile(np.linspace(0, 1, 101), (9, 1))).weights.h
+    >>> round(whole_image_params(np.tile(np.linspace(0, 1, 101), (9, 1))).weights.h, 4)
     0.1225
     """
     params = params or DeconvolutionParams()
     pixels = check_image(image)
     _, fidelity = _noise_and_fidelity(split_planes(pixels, params.channels), params)
-    h = params.weights.h or round(automatic_h(luminance(pixels if guide is None else check_image(guide, "guide"))), 9)
+    h = params.weights.h or automatic_h(luminance(pixels if guide is None else check_image(guide, "guide")))
     return dataclasses.replace(params, fidelity=fidelity, weights=dataclasses.replace(params.weights, h=h))
 
 
@@ -367,7 +363,7 @@ def _sharpened(
     if separate:
         blurred.append(dataclasses.replace(problems[0], observed=ops.load(guide)))
     side_by_side = resources.device == PROCESSOR and np.prod(problems[0].shape) >= _PARALLEL_PIXELS
-    sharp = list(resources.team.map(_wiener_image, blurred) if side_by_side else map(_wiener_image, blurred))
+    sharp = list(resources.team.map(wiener_image, blurred) if side_by_side else map(wiener_image, blurred))
     starts = sharp[: len(problems)]
     if separate:
         guide = ops.store(sharp[-1])
@@ -375,17 +371,6 @@ def _sharpened(
         own = starts if params.sharpen_guide else [p.observed for p in problems]
         guide = np.mean([ops.store(u) for u in own], axis=0, dtype=np.float32)
     return starts, guide
-
-
-def _wiener_image(problem: Problem) -> Array:
-    """Wiener solution with its own fidelity."""
-    observed = problem.ops.store(problem.observed)
-    problem = dataclasses.replace(problem, fidelity=wiener_fidelity(observed, estimate_noise(observed)))
-    solver = quadratic_solver(problem, "wiener")
-    state = solver.start(problem)
-    for _ in range(_START_STEPS):
-        state = solver.step(problem, state)
-    return state.image
 
 
 def _padded_guide(guide: ArrayLike | None, margin: Margin) -> FloatArray | None:
@@ -400,18 +385,3 @@ def _padded_guide(guide: ArrayLike | None, margin: Margin) -> FloatArray | None:
 def _noise_and_fidelity(planes: list[FloatArray], params: DeconvolutionParams) -> tuple[float, float]:
     noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))
     return noise, params.fidelity or automatic_fidelity(params.method, planes[0], noise)
-
-
-def _read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:
-    """PSF (None where only the width is known), its standard deviation, and how many pixels it reaches."""
-    if np.ndim(sigma_or_psf) == 0:
-        sigma: Any = sigma_or_psf
-        require(
-            np.isfinite(sigma) and sigma >= 0,
-            f"sigma_or_psf: expected a finite number of 0 or more pixels, found {sigma}",
-        )
-        return None, float(sigma), int(np.ceil(MARGIN_SIGMAS * sigma))
-    psf = check_psf(sigma_or_psf)
-    y, x = (np.arange(size) - size // 2 for size in psf.shape)
-    squares = psf.sum(axis=1) @ y**2 + psf.sum(axis=0) @ x**2
-    return psf, float(np.sqrt(squares / 2)), max(psf.shape) // 2

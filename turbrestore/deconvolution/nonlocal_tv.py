@@ -85,9 +85,7 @@ class NonlocalPenalty:
     def value(self, u: FloatArray) -> float:
         """J(u)."""
         graph, squares = self.graph, np.zeros(u.size, np.float32)
-        self._over_bands(
-            lambda band: add_squares(u.ravel(), graph.starts, graph.heads, graph.roots, band, squares)
-        )
+        self._over_bands(lambda band: add_squares(u.ravel(), graph.starts, graph.heads, graph.roots, band, squares))
         return float(np.sqrt(squares).sum(dtype=np.float64))
 
     def _over_bands(self, work: Callable[[NDArray[np.int64]], None]) -> None:
@@ -112,7 +110,7 @@ def add_gradient(
     values: FloatArray,
     squares: FloatArray,
 ) -> None:
-    """``a ← ga + K change`` on the pairs of a band, and add |a|² to their pixels.
+    """Replace a by ``ga + K change`` on the pairs of a band, and add |a|² to their pixels.
 
     Parameters
     ----------

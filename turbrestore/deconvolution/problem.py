@@ -20,13 +20,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from ..blur.psf import wiener_fidelity
+from ..blur.psf import check_psf, wiener_fidelity
 from ..core.arrays import FloatArray, luminance
+from ..core.errors import require
 from .array_ops import Array, ArrayOps
+
+# Smallest margin, in widths of the blur.
+MARGIN_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,3 +235,45 @@ def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
         return 12.0 / float(np.hypot(noise, 0.003))
     fidelity = wiener_fidelity(image, noise)
     return fidelity if method == "wiener" else fidelity / 2
+
+
+def read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:
+    """Read a blur that is given by its width or by its PSF.
+
+    Parameters
+    ----------
+    sigma_or_psf : float, or array_like of shape (h, w) with odd sizes
+        As of :func:`turbrestore.deconvolution.deconvolve.deconvolve`.
+
+    Returns
+    -------
+    psf : ndarray, float64, or None
+        None where only the width is known.
+    sigma : float
+        Standard deviation, pixels.
+    reach : int
+        Pixels that light is moved by at most.
+
+    Raises
+    ------
+    DataError
+        An unusable PSF.
+    ConfigurationError
+        A width that is negative or not finite.
+
+    Examples
+    --------
+    >>> read_blur(1.5)
+    (None, 1.5, 6)
+    """
+    if np.ndim(sigma_or_psf) == 0:
+        sigma: Any = sigma_or_psf
+        require(
+            np.isfinite(sigma) and sigma >= 0,
+            f"sigma_or_psf: expected a finite number of 0 or more pixels, found {sigma}",
+        )
+        return None, float(sigma), int(np.ceil(MARGIN_SIGMAS * sigma))
+    psf = check_psf(sigma_or_psf)
+    y, x = (np.arange(size) - size // 2 for size in psf.shape)
+    squares = psf.sum(axis=1) @ y**2 + psf.sum(axis=0) @ x**2
+    return psf, float(np.sqrt(squares / 2)), max(psf.shape) // 2

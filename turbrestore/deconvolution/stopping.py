@@ -19,8 +19,8 @@ the prediction is at most ``MOST`` times the last change, and that much as long 
 
 That is too much for an image that oscillates.  So primal-dual splitting also stops when the image is at rest: when it
 differs from the images after each of the last windows (``turbrestore.deconvolution.primal_dual.REST``) by no more than
-the tolerance.  Neither rule is a bound: ``benchmarks/stopping.py`` measures that the remaining change is hardly visible,
-and an image that drifts very slowly may be taken to be at rest.
+the tolerance.  Neither rule is a bound: ``benchmarks/stopping.py`` measures that the remaining change is hardly
+visible, and an image that drifts very slowly may be taken to be at rest.
 """
 
 from __future__ import annotations
@@ -85,8 +85,13 @@ class Solver(Protocol[State]):
     window: ClassVar[int]
     rest: ClassVar[int]
 
-    def step(self, problem: Problem, state: State) -> State: ...
-    def penalty(self, problem: Problem, u: Array) -> float: ...
+    def step(self, problem: Problem, state: State) -> State:
+        """One iteration."""
+        ...
+
+    def penalty(self, problem: Problem, u: Array) -> float:
+        """Value of the penalty."""
+        ...
 
 
 def iterate(

@@ -99,7 +99,7 @@ class TorchNonlocalPenalty:
 
     @cached_property
     def norm_squared(self) -> float:
-        """Upper bound of ‖∇_w‖², as of :meth:`turbrestore.deconvolution.nonlocal_weights.NonlocalGraph.norm_squared`."""
+        """Upper bound of ‖∇_w‖², as of :class:`turbrestore.deconvolution.nonlocal_weights.NonlocalGraph`."""
         x, bound = self.root.new_ones(self.shape[0] * self.shape[1]), np.inf
         for _ in range(10):
             x = (x / x.max()).clamp(min=1e-6)
