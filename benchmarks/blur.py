@@ -1,12 +1,12 @@
-"""Roads to the width of an unknown blur, on scenes blurred by known Gaussians.
+"""Estimators of the width of an unknown blur, on scenes blurred by known Gaussians.
 
-Run ``python benchmarks/blur.py``.  It prints a table of three estimators on scenes of ten kinds, and exits with 1 when
-the one in use misses its bounds.
+Run ``python benchmarks/blur.py``.  It prints a table of three estimators on ten scenes, and exits with 1 if the one in
+use misses its bounds.
 
 * likelihood: :func:`turbrestore.blur.estimation.estimate_blur`, the one in use;
-* spectrum: fit of ``c − 2 log ν − 4π²σ²ν²`` to the logarithm of the radial power spectrum, where it stands clear of
+* spectrum: fit of ``c − 2 log ν − 4π²σ²ν²`` to the logarithm of the radial power spectrum, where it clearly exceeds
   the noise;
-* re-blur: the ratio of gradients before and after another blur, at edges (Zhuo and Sim 2011), their median.
+* re-blur: median ratio of the gradients at edges before and after another blur (Zhuo and Sim 2011).
 """
 
 from __future__ import annotations
@@ -30,41 +30,43 @@ SIDE = 256
 NAMES = ("camera", "brick", "grass", "gravel", "chart", "words", "page", "coins", "moon", "astronaut")
 WIDTHS = (0.0, 0.8, 1.4, 2.2, 3.5, 6.0)
 NOISES = (0.002, 0.02)
-# Share of the truth, of the blurred cases: median and 90th percentile of the error, and the most above the truth.
+# Relative errors of the blurred cases: median and 90th percentile of the size, and largest overestimate.
 BOUNDS = (0.10, 0.25, 0.30)
 
 
 def main() -> int:
     """Print the table."""
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in ROADS}
-    seconds = dict.fromkeys(ROADS, 0.0)
-    print("| scene | sigma | noise | " + " | ".join(ROADS) + " |\n|---|---|---|" + "---|" * len(ROADS))
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in ESTIMATORS}
+    seconds = dict.fromkeys(ESTIMATORS, 0.0)
+    print("| scene | sigma | noise | " + " | ".join(ESTIMATORS) + " |\n|---|---|---|" + "---|" * len(ESTIMATORS))
     for index, (name, sigma, noise) in enumerate(itertools.product(NAMES, WIDTHS, NOISES)):
         image = blurred(name, sigma, noise, index)
         cells = []
-        for road, estimate in ROADS.items():
+        for estimator, estimate in ESTIMATORS.items():
             start = time.perf_counter()
             width = estimate(image)
-            seconds[road] += time.perf_counter() - start
-            found[road].append((sigma, width))
+            seconds[estimator] += time.perf_counter() - start
+            found[estimator].append((sigma, width))
             cells.append(f"{width:.2f}")
         print(f"| {name} | {sigma} | {noise} | " + " | ".join(cells) + " |", flush=True)
-    print("\n| estimator | median error | 90th percentile | most above | widest where sharp | seconds an image |")
+    print(
+        "\n| estimator | median error | 90th percentile | largest overestimate | widest if sharp | s per image |"
+    )
     print("|---|---|---|---|---|---|")
     broken = False
-    for road, pairs in found.items():
+    for estimator, pairs in found.items():
         errors = np.array([width / sigma - 1 for sigma, width in pairs if sigma > 0])
         sharp = max(width for sigma, width in pairs if sigma == 0)
         figures = (float(np.median(abs(errors))), float(np.quantile(abs(errors), 0.9)), float(errors.max()))
         cells = " | ".join(f"{100 * figure:.0f} %" for figure in figures)
-        print(f"| {road} | {cells} | {sharp:.2f} px | {seconds[road] / len(pairs):.2f} |")
-        if road == "likelihood":
+        print(f"| {estimator} | {cells} | {sharp:.2f} px | {seconds[estimator] / len(pairs):.2f} |")
+        if estimator == "likelihood":
             broken = any(figure > bound for figure, bound in zip(figures, BOUNDS, strict=True))
     return int(broken)
 
 
 def blurred(name: str, sigma: float, noise: float, seed: int) -> FloatArray:
-    """Grey scene, blurred and noisy."""
+    """Return a grey scene, blurred and noisy."""
     scene = SCENES[name](SIDE, SIDE)
     scene = scene.mean(axis=-1) if scene.ndim == 3 else scene
     scene = cv2.GaussianBlur(scene, (0, 0), sigma) if sigma else scene
@@ -72,12 +74,12 @@ def blurred(name: str, sigma: float, noise: float, seed: int) -> FloatArray:
 
 
 def likelihood(image: FloatArray) -> float:
-    """Width by the estimator in use."""
+    """Estimate the width as the package does."""
     return estimate_blur(image, exponent=GAUSSIAN).sigma
 
 
 def spectrum(image: FloatArray) -> float:
-    """Width by a fit of the radial power spectrum."""
+    """Estimate the width by a fit of the radial power spectrum."""
     window = np.outer(np.hanning(image.shape[0]), np.hanning(image.shape[1]))
     power = np.abs(fft.fft2((image - image.mean()) * window)) ** 2 / np.sum(window**2)
     radius = np.hypot(fft.fftfreq(image.shape[0])[:, None], fft.fftfreq(image.shape[1]))
@@ -96,7 +98,7 @@ def spectrum(image: FloatArray) -> float:
 
 
 def reblur(image: FloatArray, extra: float = 1.5) -> float:
-    """Width by the ratio of gradients at strong edges after another blur: ``√(σ² + s²) / σ``."""
+    """Estimate the width by the ratio of gradients at strong edges after another blur: ``√(σ² + s²) / σ``."""
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     first, second = (_gradient(one) for one in (smooth, cv2.GaussianBlur(smooth, (0, 0), extra)))
     edges = first >= np.quantile(first, 0.95)
@@ -109,7 +111,7 @@ def _gradient(image: FloatArray) -> FloatArray:
     return np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1))
 
 
-ROADS: dict[str, Callable[[FloatArray], float]] = {
+ESTIMATORS: dict[str, Callable[[FloatArray], float]] = {
     "likelihood": likelihood,
     "spectrum": spectrum,
     "re-blur": reblur,

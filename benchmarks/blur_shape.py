@@ -13,11 +13,11 @@ import numpy as np
 from clips import find_clips
 from scipy import fft
 
+from turbrestore import RestoreParams, restore
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.metrics import align, compare
-from turbrestore.pipeline import RestoreParams, restore
 
 FREQUENCIES = (1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8)
 DIRECTIONS = (0, 45, 90, 135)
@@ -52,7 +52,7 @@ def main() -> int:
 
 
 def transfer_function(image: FloatArray, truth: FloatArray) -> FloatArray:
-    """Share of the truth's amplitude that the image has, in rings 1/32 cycles per pixel apart."""
+    """Return the share of the truth's amplitude that is left in the image, in rings 1/32 cycles per pixel apart."""
     first, second, fy, fx = _spectra(image, truth)
     ring = np.rint(np.hypot(fy, fx) * _RINGS).astype(int).ravel()
     cross = np.bincount(ring, (first * second.conj()).real.ravel())
@@ -60,7 +60,7 @@ def transfer_function(image: FloatArray, truth: FloatArray) -> FloatArray:
 
 
 def by_direction(image: FloatArray, truth: FloatArray) -> list[float]:
-    """Share of the truth's amplitude around ν = 1/8, for waves along 0°, 45°, 90° and 135°."""
+    """Return the share of the truth's amplitude around ν = 1/8, for waves along 0°, 45°, 90° and 135°."""
     first, second, fy, fx = _spectra(image, truth)
     radius, angle = np.hypot(fy, fx), np.degrees(np.arctan2(fy, fx)) % 180
     near, shares = np.abs(radius - 1 / 8) < 1 / 32, []
@@ -72,7 +72,7 @@ def by_direction(image: FloatArray, truth: FloatArray) -> list[float]:
 
 
 def _spectra(image: FloatArray, truth: FloatArray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Windowed spectra of both, aligned, and their frequencies."""
+    """Align both images and return their windowed spectra and the frequencies."""
     a, t = align(image, truth)
     window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
     first, second = (fft.fft2((one - one.mean()) * window) for one in (a, t))
@@ -80,7 +80,7 @@ def _spectra(image: FloatArray, truth: FloatArray) -> tuple[np.ndarray, np.ndarr
 
 
 def best_width(image: FloatArray, truth: FloatArray, guide: FloatArray, exponent: float) -> tuple[float, float]:
-    """Climb the widths until PSNR falls: the best and its PSNR."""
+    """Increase the width until the PSNR falls; return the best width and its PSNR."""
     best = (0.0, compare(luminance(image), truth).psnr)
     for sigma in SIGMAS:
         result = deconvolve(image, sigma, DeconvolutionParams(exponent=exponent), guide=guide)

@@ -307,7 +307,7 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     """Constants of the plan, and calls that they are for."""
     from turbrestore import pipeline
     from turbrestore.blind.blur_map import estimate_blur_map, sigma_map
-    from turbrestore.blind.guards import judge
+    from turbrestore.blind.guards import evaluate_guards
     from turbrestore.blur.blur_cues import bound_blur
     from turbrestore.blur.estimation import estimate_blur
     from turbrestore.blur.psf import estimate_noise
@@ -356,7 +356,7 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
             lambda: estimate_blur_map(image, blur),
             lambda: sigma_map([[1.0, 1.5, 2.0]] * 3, image.shape[:2]),
             lambda: [estimate_noise(plane) for plane in split_planes(image, "each")],
-            lambda: judge(image, other, 2.0),
+            lambda: evaluate_guards(image, other, 2.0),
         ],
     )
     # The plan counts apart what each frame takes, and what is fitted together.

@@ -1,7 +1,7 @@
-"""Restorations of whole frames and in tiles, as where a memory limit leaves no other way; the scenes are known.
+"""Restorations of whole frames and in tiles, as under a small memory limit, of known scenes.
 
 ``python benchmarks/tiles.py`` prints both PSNRs of every scene, in nine tiles, one of which has a halo on every side,
-and ends with 1 where tiles lose more than 0.1 dB.  ``--images FOLDER`` keeps both results beside their difference, ten
+and exits with 1 if tiles lose more than 0.1 dB.  ``--images FOLDER`` keeps both results beside their difference, ten
 times as large.
 """
 
@@ -25,19 +25,19 @@ from turbrestore.synthesis.smooth_flow import distort, smooth_flows
 
 SIDE, TILE, COUNT, SEED = 768, 448, 24, 3
 BOUND_DB = 0.1
-# What is nearer to the border was not always seen.
+# Pixels nearer to the border than this are not in every frame.
 BORDER = 16
 
 
 def restore_in_tiles(source: FrameSource) -> Restoration:
-    """Restore in tiles, without a limit that would leave no other way."""
+    """Restore in tiles although memory is not limited."""
     plan = replace(pipeline.memory_plan(source, RestoreParams()), in_file=True, tile=TILE)
     with mock.patch.object(pipeline, "memory_plan", lambda *_: plan):
         return pipeline.restore(source, RestoreParams())
 
 
 def compare(scene: str, folder: Path | None) -> float:
-    """Print a row; what tiles gain, dB."""
+    """Print a row; return by how much tiles are better, dB."""
     rng = np.random.default_rng(SEED)
     truth = SCENES[scene](SIDE, SIDE)
     source = FrameSource.from_array(distort(truth, smooth_flows(COUNT, SIDE, SIDE, rng), rng, blur=1.2, noise=0.01))

@@ -2,13 +2,13 @@
 
 Symbols (paper 3, section 5)
 ----------------------------
-k : point spread function (PSF), sums to 1; its Fourier transform is the transfer function (OTF).
-σ : width of k, pixels: standard deviation of a Gaussian, or of the Gaussian that passes one half at the same frequency.
-ν : spatial frequency, cycles per pixel; ν_h the one that passes one half.
-p : exponent of the transfer function.
-n : standard deviation of the noise, intensity.
+k : point spread function (PSF), sums to 1; its Fourier transform is the transfer function (OTF)
+σ : width of k, pixels: standard deviation of a Gaussian, or of the Gaussian whose OTF is one half at the same frequency
+ν : spatial frequency, cycles per pixel; ν_h the one at which the OTF is one half
+p : exponent of the transfer function
+n : standard deviation of the noise, intensity
 
-Transfer functions are half-spectra as :func:`scipy.fft.rfft2` lays them out, so
+Transfer functions are half-spectra with the layout of :func:`scipy.fft.rfft2`, so
 ``irfft2(otf * rfft2(u), s=u.shape)`` is the periodic convolution k ∗ u.
 """
 
@@ -32,7 +32,7 @@ GAUSSIAN, KOLMOGOROV = 2.0, 5 / 3
 
 
 def gaussian_psf(sigma: float) -> FloatArray:
-    """Gaussian point spread function, sampled at pixel centres out to 4σ.
+    """Sample a Gaussian point spread function at pixel centres, out to 4σ.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def gaussian_psf(sigma: float) -> FloatArray:
 
 
 def gaussian_otf(shape: tuple[int, int], sigma: float) -> FloatArray:
-    """Transfer function of a Gaussian on a periodic grid: ``exp(−2π²σ²ν²)``.
+    """Return the transfer function of a Gaussian on a periodic grid: ``exp(−2π²σ²ν²)``.
 
     Parameters
     ----------
@@ -94,11 +94,11 @@ def gaussian_otf(shape: tuple[int, int], sigma: float) -> FloatArray:
 
 
 def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -> FloatArray:
-    """Transfer function ``exp(−ln 2 (ν/ν_h)^p)`` on a periodic grid, ``ν_h = √(ln 2 / 2) / (π σ)``.
+    """Return the transfer function ``exp(−ln 2 (ν/ν_h)^p)`` on a periodic grid, ``ν_h = √(ln 2 / 2) / (π σ)``.
 
     p = 2 is the Gaussian of :func:`gaussian_otf`.  p = 5/3 is a long exposure through Kolmogorov turbulence (Fried
-    1966); its point spread function has a narrower core and wider wings.  An average of frames with blurs of different
-    widths has wings as well: on fused frames of two simulators the measured transfer function follows p = 1.2 to 1.8.
+    1966), whose point spread function has a narrower core and wider wings.  An average of frames with blurs of
+    different widths has wings as well: for fused frames of two simulators the measured p is 1.2 to 1.8.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -
 
 
 def half_frequency(sigma: float) -> float:
-    """Frequency at which a Gaussian passes one half: ``√(ln 2 / 2) / (π σ)``.
+    """Return the frequency at which the transfer function of a Gaussian is one half: ``√(ln 2 / 2) / (π σ)``.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def half_frequency(sigma: float) -> float:
 
 
 def check_exponent(exponent: float) -> None:
-    """Refuse an exponent that :func:`blur_otf` does not take.
+    """Check the exponent of :func:`blur_otf`.
 
     Parameters
     ----------
@@ -175,12 +175,12 @@ def check_exponent(exponent: float) -> None:
 
 
 def psf_to_otf(psf: ArrayLike, shape: tuple[int, int]) -> NDArray[np.complex64]:
-    """Transfer function of a sampled point spread function on a periodic grid.
+    """Compute the transfer function of a sampled point spread function on a periodic grid.
 
     Parameters
     ----------
     psf : array_like, shape (h, w), both odd
-        Centred on its middle pixel; divided by its sum.
+        Centred on its middle pixel; it is divided by its sum.
     shape : (int, int)
         Rows and columns of the image, at least (h, w).
 
@@ -191,7 +191,7 @@ def psf_to_otf(psf: ArrayLike, shape: tuple[int, int]) -> NDArray[np.complex64]:
     Raises
     ------
     DataError
-        Even or too large PSF, one that is negative somewhere or sums to nothing.
+        The PSF has an even size, is larger than the image, has negative values, or sums to 0.
 
     Examples
     --------
@@ -224,7 +224,7 @@ def check_psf(psf: ArrayLike) -> Float64Array:
     Raises
     ------
     DataError
-        Not two odd axes, not finite, negative somewhere, or sum 0.
+        The PSF does not have two odd axes, has negative or infinite values, or sums to 0.
 
     Examples
     --------
@@ -241,7 +241,7 @@ def check_psf(psf: ArrayLike) -> Float64Array:
 
 
 def laplacian_symbol(height: int, width: int) -> FloatArray:
-    """Fourier symbol of −Δ for periodic forward differences.
+    """Return the Fourier symbol of −Δ for periodic forward differences.
 
     Parameters
     ----------
@@ -263,11 +263,11 @@ def laplacian_symbol(height: int, width: int) -> FloatArray:
 
 
 def wiener_fidelity(image: FloatArray, noise: float) -> float:
-    """Weight λ of the data for Wiener deconvolution, from contrast and noise: ``6 s / √(n² + 0.002²)``.
+    """Compute the weight λ of the data for Wiener deconvolution: ``6 s / √(n² + 0.002²)``.
 
-    s is the standard deviation of the image. On photographs, brick and text blurred with σ 1–3 the result is within
-    0.5 dB of the best λ for n = .01–.02; below, a perfectly known blur would bear 3 to 10 times more (0.2–1.5 dB,
-    3 dB on thin text). The floor of .002 stands for what is wrong with the blur model.
+    s is the standard deviation of the image.  On photographs, brick and text blurred by σ = 1 to 3 px the result is
+    within 0.5 dB of that of the best λ for n = 0.01 to 0.02.  For less noise, a perfectly known blur would allow 3 to
+    10 times more (0.2 to 1.5 dB better, 3 dB on thin text); the floor of 0.002 accounts for errors of the blur model.
 
     Parameters
     ----------
