@@ -17,7 +17,7 @@ from scipy.special import ndtr
 from turbrestore.blur_moments.cues import displacement_variance, relative_blur
 from turbrestore.blur_moments.frame_blur import FrameBlur, frame_blur
 from turbrestore.blur_moments.fusion import fuse_frames, fusion_rule, fusion_weights, laplacian_energy
-from turbrestore.blur_moments.tiles import tile_map
+from turbrestore.blur_moments.tile_spectra import tile_map
 from turbrestore.core.arrays import FloatArray
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.metrics import psnr

@@ -8,11 +8,11 @@ from scipy.stats import chi2
 
 from turbrestore.blur_moments.augmented import largest_deviation
 from turbrestore.blur_moments.blur_model import predicted_moments
-from turbrestore.blur_moments.bounds import image_information, moment_information, posterior_bound
-from turbrestore.blur_moments.experiments import mirror, wavefront
-from turbrestore.blur_moments.image_prediction import ImageFilter
+from turbrestore.blur_moments.experiments.bounds import image_information, moment_information, posterior_bound
+from turbrestore.blur_moments.experiments.comparison import mirror, wavefront
+from turbrestore.blur_moments.image_observer import ImageFilter
 from turbrestore.blur_moments.observers import steady_kalman
-from turbrestore.blur_moments.scenarios import (
+from turbrestore.blur_moments.experiments.scenarios import (
     MirrorParams,
     WavefrontParams,
     mirror_model,
@@ -22,7 +22,7 @@ from turbrestore.blur_moments.scenarios import (
     wavefront_model,
 )
 from turbrestore.blur_moments.sensor import expose
-from turbrestore.blur_moments.trials import Contestant, Track, follow, join_tracks, score
+from turbrestore.blur_moments.experiments.trials import Contestant, Track, follow, join_tracks, score
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.filtering.kalman import Gaussian
 
@@ -143,7 +143,7 @@ class TestRecordings:
     def test_results_do_not_depend_on_how_seeds_are_grouped(self, monkeypatch):
         params = WavefrontParams(frames=3, burn_in=1)
         whole = wavefront(range(5), params)
-        monkeypatch.setattr("turbrestore.blur_moments.experiments._CHUNK", 2)
+        monkeypatch.setattr("turbrestore.blur_moments.experiments.comparison._CHUNK", 2)
         parts = wavefront(range(5), params)
         for name, result in whole.scores.items():
             assert parts.scores[name].error == pytest.approx(result.error, rel=1e-9)

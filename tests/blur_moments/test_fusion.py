@@ -18,7 +18,7 @@ from turbrestore.blur_moments.fusion import (
     laplacian_energy,
     noise_factor,
 )
-from turbrestore.blur_moments.tiles import TileGrid, tile_map
+from turbrestore.blur_moments.tile_spectra import TileGrid, tile_map
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.metrics import psnr
 

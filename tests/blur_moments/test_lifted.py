@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from turbrestore.blur_moments.augmented import Oscillator, OscillatorMotion, largest_deviation
 from turbrestore.blur_moments.blur_model import BlurModel, predicted_moments
 from turbrestore.blur_moments.kernels import PixelGrid, gaussian_kernel
-from turbrestore.blur_moments.lifted import FastSystem, check_inputs, discretise, is_observable, lift
+from turbrestore.blur_moments.lifting import FastSystem, check_inputs, discretise, is_observable, lift
 from turbrestore.blur_moments.moments import image_moments
 from turbrestore.blur_moments.sensor import ExposureTiming, LineSensor, expose
 from turbrestore.core.errors import ConfigurationError, DataError

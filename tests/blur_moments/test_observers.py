@@ -10,9 +10,9 @@ from scipy.optimize import least_squares, minimize
 
 from turbrestore.blur_moments.augmented import Oscillator, OscillatorMotion
 from turbrestore.blur_moments.blur_model import BlurModel, predicted_moments
-from turbrestore.blur_moments.image_prediction import ImageFilter
+from turbrestore.blur_moments.image_observer import ImageFilter
 from turbrestore.blur_moments.kernels import PixelGrid, delta_kernel, gaussian_kernel
-from turbrestore.blur_moments.lifted import FastSystem, discretise, lift
+from turbrestore.blur_moments.lifting import FastSystem, discretise, lift
 from turbrestore.blur_moments.moments import image_moments, moment_noise
 from turbrestore.blur_moments.observers import (
     FixedGain,
@@ -21,7 +21,7 @@ from turbrestore.blur_moments.observers import (
     run_observer,
     steady_kalman,
 )
-from turbrestore.blur_moments.scenarios import (
+from turbrestore.blur_moments.experiments.scenarios import (
     MirrorParams,
     WavefrontParams,
     mirror_model,

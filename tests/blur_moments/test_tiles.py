@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from turbrestore.blur_moments.tiles import CueParams, TileGrid, tile_map
+from turbrestore.blur_moments.tile_spectra import CueParams, TileGrid, tile_map
 from turbrestore.core.errors import ConfigurationError
 
 

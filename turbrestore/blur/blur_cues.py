@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..blur_moments.cues import displacement_variance, relative_blur
 from ..blur_moments.frame_blur import blur_against, refer_blur
-from ..blur_moments.tiles import tile_map
+from ..blur_moments.tile_spectra import tile_map
 from ..core.arrays import FloatArray
 from ..core.noise import estimate_noise
 from ..runtime.scratch import iter_frames

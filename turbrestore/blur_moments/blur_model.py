@@ -65,7 +65,7 @@ class BlurModel:
 
     Examples
     --------
-    >>> from turbrestore.blur_moments.scenarios import wavefront_model
+    >>> from turbrestore.blur_moments.experiments.scenarios import wavefront_model
     >>> wavefront_model().motion.order
     2
     """
@@ -117,7 +117,7 @@ def predicted_moments(
     --------
     >>> import numpy as np
     >>> from turbrestore.blur_moments.kernels import PixelGrid, gaussian_kernel
-    >>> from turbrestore.blur_moments.lifted import FastSystem, lift
+    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
     >>> timing = ExposureTiming(fast_period=1.0, exposure=2.0, readout=0.0, frame_period=2.0)
     >>> motion = lift(FastSystem([[0.5]], [1.0], [1.0]), timing, [[0.1]])
     >>> sensor = LineSensor(gaussian_kernel(0.1), PixelGrid(-1.0, 1.0, 20, integrating=False), noise=0.1)

@@ -26,7 +26,7 @@ from ..core.arrays import FloatArray, check_frames, check_image, luminance
 from ..core.errors import DataError
 from ..runtime.scratch import iter_frames
 from .exponent_fit import fit_difference
-from .tiles import CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
+from .tile_spectra import CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
 
 # Directions that are told apart in the spectrum of a tile.
 _SECTORS = 6

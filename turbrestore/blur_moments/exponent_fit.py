@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
-from .tiles import CORRELATED, CueParams, Float64Array
+from .tile_spectra import CORRELATED, CueParams, Float64Array
 
 # Newton steps, and squared pixels that each may go.
 _STEPS, _LARGEST_STEP = 12, 4.0

@@ -42,7 +42,7 @@ class ExposureTable:
 
     Examples
     --------
-    >>> from turbrestore.blur_moments.scenarios import mirror_model
+    >>> from turbrestore.blur_moments.experiments.scenarios import mirror_model
     >>> mirror_model().table.image(np.zeros((3, 100))).shape
     (3, 80)
     """

@@ -18,7 +18,7 @@ from ..core.arrays import FloatArray, check_frames, luminance
 from ..core.errors import DataError
 from ..runtime.scratch import iter_frames
 from .exponent_fit import LARGEST_EXPONENT, PRIOR, fit_relative
-from .tiles import CORRELATED, CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
+from .tile_spectra import CORRELATED, CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
 
 # Relative blur variance of frames in some tiles, its deviation, and its best estimate above the sharpest; (T, tiles).
 _Judged = tuple[Float64Array, Float64Array, Float64Array]

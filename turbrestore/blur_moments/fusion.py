@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, check_frames, check_image, luminance
 from ..core.errors import DataError, require, require_between
 from .frame_blur import FrameBlur
-from .tiles import check_noise, tile_map
+from .tile_spectra import check_noise, tile_map
 
 # Rows of the fused image at a time: sorting 500 frames of 1024 columns takes 16 MB.
 _STRIP = 8

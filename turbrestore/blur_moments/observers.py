@@ -37,7 +37,7 @@ from ..filtering.kalman import Gaussian, Innovation, predict, update
 from .blur_model import BlurModel, predicted_moments
 from .exposure_table import ExposureTable
 from .kernels import Float64Array
-from .lifted import LiftedSystem, check_inputs, check_state
+from .lifting import LiftedSystem, check_inputs, check_state
 from .moments import BASES, image_moments, moment_noise
 
 METHODS = ("extended", "iterated", "unscented")
@@ -67,7 +67,7 @@ class FixedGain:
     Examples
     --------
     >>> import numpy as np
-    >>> from turbrestore.blur_moments.scenarios import wavefront_model
+    >>> from turbrestore.blur_moments.experiments.scenarios import wavefront_model
     >>> start, inputs = Gaussian(np.zeros(2), np.eye(2)), np.zeros(200)
     >>> FixedGain(np.zeros(2)).step(wavefront_model(), start, np.ones(100), inputs)[0].mean
     array([0., 0.])
@@ -225,7 +225,7 @@ def run_observer(
     --------
     >>> import numpy as np
     >>> from turbrestore.blur_moments.kernels import PixelGrid, gaussian_kernel
-    >>> from turbrestore.blur_moments.lifted import FastSystem, lift
+    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
     >>> from turbrestore.blur_moments.sensor import ExposureTiming, LineSensor
     >>> timing = ExposureTiming(fast_period=1.0, exposure=2.0, readout=0.0, frame_period=2.0)
     >>> motion = lift(FastSystem([[0.9]], [0.1], [1.0]), timing, [[0.01]])
@@ -269,7 +269,7 @@ def luenberger(motion: LiftedSystem, poles: ArrayLike) -> FixedGain:
 
     Examples
     --------
-    >>> from turbrestore.blur_moments.lifted import FastSystem, lift
+    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
     >>> from turbrestore.blur_moments.sensor import ExposureTiming, LineSensor
     >>> timing = ExposureTiming(fast_period=1.0, exposure=1.0, readout=0.0, frame_period=1.0)
     >>> luenberger(lift(FastSystem([[0.8]], [1.0], [1.0]), timing, [[0.1]]), [0.2]).gain
@@ -311,7 +311,7 @@ def steady_kalman(model: BlurModel) -> tuple[FixedGain, Float64Array]:
     Examples
     --------
     >>> from turbrestore.blur_moments.kernels import PixelGrid, gaussian_kernel
-    >>> from turbrestore.blur_moments.lifted import FastSystem, lift
+    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
     >>> from turbrestore.blur_moments.sensor import ExposureTiming, LineSensor
     >>> timing = ExposureTiming(fast_period=1.0, exposure=1.0, readout=0.0, frame_period=1.0)
     >>> motion = lift(FastSystem([[1.0]], [1.0], [1.0]), timing, [[0.5]])

@@ -17,7 +17,7 @@ from scipy.linalg import expm
 
 from ..core.errors import require
 from .kernels import Float64Array
-from .lifted import FastSystem, LiftedSystem, lift
+from .lifting import FastSystem, LiftedSystem, lift
 from .sensor import ExposureTiming
 
 

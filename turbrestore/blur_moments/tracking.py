@@ -21,7 +21,7 @@ from ..core.errors import ConfigurationError, DataError, require, require_betwee
 from ..filtering.kalman import Gaussian, Innovation
 from .kernels import Float64Array, PixelGrid, gaussian_kernel
 from .moments import plane_moments, total_intensity
-from .plane_filter import PlaneModel, PlaneMomentFilter, PlaneSensor
+from .targets import PlaneModel, PlaneMomentFilter, PlaneSensor
 from .sensor import ExposureTiming
 from .target_motion import Oscillation, RandomWalk, TargetMotion, lift_motion
 

@@ -31,7 +31,7 @@ from ..filtering.kalman import Gaussian, Innovation, update_information
 from .blur_model import BlurModel
 from .exposure_table import ExposureTable
 from .kernels import Float64Array
-from .lifted import check_inputs, check_state
+from .lifting import check_inputs, check_state
 from .sensor import noise_variance
 
 NORMS = ("map", "two", "infinity")

@@ -29,7 +29,7 @@ from scipy.linalg import block_diag
 from ..core.errors import DataError, require
 from ..filtering.kalman import Gaussian, Innovation, update
 from .kernels import Float64Array, Kernel, PixelGrid, check_kernel
-from .lifted import LiftedSystem
+from .lifting import LiftedSystem
 from .moment_algebra import compose_moments, plane_kernel_moments
 from .moments import BASES, basis_change, basis_functions
 from .sensor import ExposureTiming
@@ -90,7 +90,7 @@ class PlaneModel:
     Examples
     --------
     >>> from turbrestore.blur_moments.kernels import gaussian_kernel
-    >>> from turbrestore.blur_moments.lifted import FastSystem, lift
+    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
     >>> timing = ExposureTiming(fast_period=0.25, exposure=0.5, readout=0.0, frame_period=1.0)
     >>> motion = lift(FastSystem([[1.0]], [0.0], [1.0]), timing, [[0.1]])
     >>> pixels = PixelGrid(-8, 8, 16)

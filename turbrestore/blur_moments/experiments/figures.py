@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import ConfigurationError
-from .experiments import Experiment
+from ...core.errors import ConfigurationError
+from .comparison import Experiment
 
 # Colour and dash of every observer, the same in all panels.
 _STYLES = {"O1": ("tab:blue", "--"), "O2": ("tab:orange", ":"), "O3": ("tab:red", "-"), "image_map": ("tab:green", "-")}

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from ..filtering.kalman import Gaussian
-from .blur_model import BlurModel, Motion
-from .kernels import Float64Array
-from .observers import Observer, run_observer
-from .sensor import LineSensor, expose
+from ...filtering.kalman import Gaussian
+from ..blur_model import BlurModel, Motion
+from ..kernels import Float64Array
+from ..observers import Observer, run_observer
+from ..sensor import LineSensor, expose
 
 # Share of the consistency band.
 _BAND = 0.95
@@ -159,7 +159,7 @@ def simulate(
 
     Examples
     --------
-    >>> from turbrestore.blur_moments.scenarios import wavefront_model
+    >>> from turbrestore.blur_moments.experiments.scenarios import wavefront_model
     >>> model, none = wavefront_model(), np.zeros((2, 1, 2))
     >>> still = simulate(model.motion, model.sensor, none[0], np.zeros((2, 1, 200)), none, np.zeros((2, 1, 100)))
     >>> still.frames.shape, float(round(still.frames[1, 0].sum() * 0.02, 6))
@@ -196,7 +196,7 @@ def follow(contestant: Contestant, recording: Recording, of_state: bool) -> Trac
     Examples
     --------
     >>> from turbrestore.blur_moments.observers import MomentFilter
-    >>> from turbrestore.blur_moments.scenarios import WavefrontParams, record_wavefront, wavefront_model
+    >>> from turbrestore.blur_moments.experiments.scenarios import WavefrontParams, record_wavefront, wavefront_model
     >>> contestant = Contestant(MomentFilter(), wavefront_model(), Gaussian(np.zeros(2), 0.01 * np.eye(2)))
     >>> follow(contestant, record_wavefront([0, 1], WavefrontParams(frames=3, burn_in=0)), of_state=True).errors.shape
     (3, 2)

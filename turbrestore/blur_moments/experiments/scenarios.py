@@ -22,13 +22,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.errors import require, require_between
-from .augmented import Oscillator, OscillatorMotion, largest_deviation
-from .blur_model import BlurModel
-from .kernels import Float64Array, PixelGrid, gaussian_kernel
-from .lifted import FastSystem, discretise, lift
-from .observers import steady_kalman
-from .sensor import ExposureTiming, LineSensor
+from ...core.errors import require, require_between
+from ..augmented import Oscillator, OscillatorMotion, largest_deviation
+from ..blur_model import BlurModel
+from ..kernels import Float64Array, PixelGrid, gaussian_kernel
+from ..lifting import FastSystem, discretise, lift
+from ..observers import steady_kalman
+from ..sensor import ExposureTiming, LineSensor
 from .trials import Recording, simulate
 
 

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.errors import require
-from ..filtering.kalman import Gaussian
-from ..runtime.threads import map_ahead
-from .blur_model import BlurModel
+from ...core.errors import require
+from ...filtering.kalman import Gaussian
+from ...runtime.threads import map_ahead
+from ..blur_model import BlurModel
 from .bounds import image_information, moment_information, posterior_bound
-from .image_prediction import ImageFilter
-from .kernels import Float64Array
-from .lifted import LiftedSystem
-from .observers import MomentFilter, luenberger, steady_kalman
+from ..image_observer import ImageFilter
+from ..kernels import Float64Array
+from ..lifting import LiftedSystem
+from ..observers import MomentFilter, luenberger, steady_kalman
 from .scenarios import (
     MirrorParams,
     WavefrontParams,
@@ -28,7 +28,7 @@ from .scenarios import (
     record_wavefront,
     wavefront_model,
 )
-from .sensor import ExposureTiming
+from ..sensor import ExposureTiming
 from .trials import Contestant, Recording, Score, Track, follow, join_tracks, score
 
 # Seeds handled together: enough to spare NumPy's overhead, few enough to stay in the cache.

@@ -14,10 +14,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.errors import DataError
-from .blur_model import BlurModel, predicted_moments
-from .kernels import Float64Array
-from .sensor import noise_variance
+from ...core.errors import DataError
+from ..blur_model import BlurModel, predicted_moments
+from ..kernels import Float64Array
+from ..sensor import noise_variance
 
 
 def moment_information(
@@ -46,7 +46,7 @@ def moment_information(
 
     Examples
     --------
-    >>> from turbrestore.blur_moments.scenarios import wavefront_model
+    >>> from turbrestore.blur_moments.experiments.scenarios import wavefront_model
     >>> moment_information(wavefront_model(), np.zeros(2), np.zeros(200), (1,)).shape
     (2, 2)
     """
@@ -70,7 +70,7 @@ def image_information(model: BlurModel, states: ArrayLike, inputs: ArrayLike) ->
 
     Examples
     --------
-    >>> from turbrestore.blur_moments.scenarios import wavefront_model
+    >>> from turbrestore.blur_moments.experiments.scenarios import wavefront_model
     >>> first = moment_information(wavefront_model(), np.zeros(2), np.zeros(200), (1,))
     >>> bool(np.trace(image_information(wavefront_model(), np.zeros(2), np.zeros(200))) > 10 * np.trace(first))
     True
