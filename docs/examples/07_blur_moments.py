@@ -23,8 +23,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from turbrestore.blur_moments.experiments.comparison import mirror, wavefront
-from turbrestore.blur_moments.moments import image_moments
 from turbrestore.blur_moments.experiments.scenarios import MirrorParams, mirror_model, record_mirror
+from turbrestore.blur_moments.moments import image_moments
 
 plt.style.use("tableau-colorblind10")
 plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "font.size": 9})

@@ -9,9 +9,15 @@ from scipy.stats import chi2
 from turbrestore.blur_moments.augmented import largest_deviation
 from turbrestore.blur_moments.blur_model import predicted_moments
 from turbrestore.blur_moments.experiments.bounds import image_information, moment_information, posterior_bound
-from turbrestore.blur_moments.experiments.comparison import mirror, wavefront
-from turbrestore.blur_moments.image_observer import ImageFilter
-from turbrestore.blur_moments.observers import steady_kalman
+from turbrestore.blur_moments.experiments.comparison import (
+    Contestant,
+    Track,
+    follow,
+    join_tracks,
+    mirror,
+    score,
+    wavefront,
+)
 from turbrestore.blur_moments.experiments.scenarios import (
     MirrorParams,
     WavefrontParams,
@@ -21,8 +27,9 @@ from turbrestore.blur_moments.experiments.scenarios import (
     record_wavefront,
     wavefront_model,
 )
+from turbrestore.blur_moments.image_observer import ImageFilter
+from turbrestore.blur_moments.observers import steady_kalman
 from turbrestore.blur_moments.sensor import expose
-from turbrestore.blur_moments.experiments.trials import Contestant, Track, follow, join_tracks, score
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.filtering.kalman import Gaussian
 

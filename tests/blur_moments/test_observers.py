@@ -10,6 +10,15 @@ from scipy.optimize import least_squares, minimize
 
 from turbrestore.blur_moments.augmented import Oscillator, OscillatorMotion
 from turbrestore.blur_moments.blur_model import BlurModel, predicted_moments
+from turbrestore.blur_moments.experiments.scenarios import (
+    MirrorParams,
+    WavefrontParams,
+    mirror_model,
+    mirror_oscillator,
+    record_mirror,
+    record_wavefront,
+    wavefront_model,
+)
 from turbrestore.blur_moments.image_observer import ImageFilter
 from turbrestore.blur_moments.kernels import PixelGrid, delta_kernel, gaussian_kernel
 from turbrestore.blur_moments.lifting import FastSystem, discretise, lift
@@ -20,15 +29,6 @@ from turbrestore.blur_moments.observers import (
     luenberger,
     run_observer,
     steady_kalman,
-)
-from turbrestore.blur_moments.experiments.scenarios import (
-    MirrorParams,
-    WavefrontParams,
-    mirror_model,
-    mirror_oscillator,
-    record_mirror,
-    record_wavefront,
-    wavefront_model,
 )
 from turbrestore.blur_moments.sensor import ExposureTiming, LineSensor, expose
 from turbrestore.core.errors import ConfigurationError, DataError

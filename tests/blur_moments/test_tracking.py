@@ -7,9 +7,9 @@ from scipy.linalg import expm
 from turbrestore.blur_moments.kernels import PixelGrid, gaussian_kernel
 from turbrestore.blur_moments.lifting import FastSystem, lift
 from turbrestore.blur_moments.observers import BlurModel, MomentFilter, predicted_moments, run_observer
-from turbrestore.blur_moments.targets import PlaneModel, PlaneMomentFilter, PlaneSensor
 from turbrestore.blur_moments.sensor import ExposureTiming, LineSensor, expose_plane
 from turbrestore.blur_moments.target_motion import ConstantVelocity, Oscillation, RandomWalk, lift_motion
+from turbrestore.blur_moments.targets import PlaneModel, PlaneMomentFilter, PlaneSensor
 from turbrestore.blur_moments.tracking import TrackParams, track_blur
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.filtering.kalman import Gaussian

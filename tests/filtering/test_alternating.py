@@ -321,40 +321,6 @@ def test_frames_whose_flow_folds_count_for_little(sequence):
     assert np.median(filtered.variance[region]) > 1.7 * np.median(filtered.variance[70:, 70:])
 
 
-def still_frames(sequence, sigmas):
-    """Frames without motion, each with its own blur and noise."""
-    rng = np.random.default_rng(0)
-    frames = [cv2.GaussianBlur(sequence.scene, (0, 0), sigma) for sigma in sigmas]
-    return np.stack(frames) + rng.normal(0, 0.01, (len(sigmas), 96, 96)).astype(np.float32)
-
-
-def test_by_blur_sharp_frames_weigh_more_also_among_those_that_come_later(sequence):
-    sigmas = np.tile([0.8, 1.8], 12)
-    frames = still_frames(sequence, sigmas)
-    dynamics = identify(np.zeros((8, 96, 96, 2), np.float32))
-    params = FilterParams(frame_noise="blur", inner_iterations=1, image_drift=1e-5, prior_frames=1.0)
-    known = np.zeros((8, 96, 96, 2), np.float32)
-    filtered = filter_frames(frames, frames[:8].mean(axis=0), dynamics, params, known_flows=known)
-    sharp, blurry = filtered.gains[0::2], filtered.gains[1::2]
-    assert blurry[1:].max() < 0.6 * sharp[1:].min()
-    assert quality(filtered.image, sequence, 0.8) > quality(frames.mean(axis=0), sequence, 0.8) + 2
-
-
-def test_by_blur_frames_alike_carry_the_same_information(sequence):
-    frames = still_frames(sequence, np.full(20, 1.0))
-    dynamics = identify(np.zeros((20, 96, 96, 2), np.float32))
-    params = FilterParams(frame_noise="blur", inner_iterations=1)
-    known = np.zeros((20, 96, 96, 2), np.float32)
-    filtered = filter_frames(frames, frames.mean(axis=0), dynamics, params, known_flows=known)
-    assert np.median(filtered.variance) * 20 / filtered.image_noise == pytest.approx(1, abs=0.15)
-
-
-def test_by_blur_one_frame_a_block_is_enough(sequence):
-    dynamics = identify(np.zeros((4, 96, 96, 2), np.float32))
-    params = FilterParams(frame_noise="blur", block=1, inner_iterations=1)
-    assert np.isfinite(filter_frames(sequence.frames[:3], sequence.frames[0], dynamics, params).image).all()
-
-
 def test_no_more_of_the_residual_is_kept_than_the_model_says_is_motion(sequence):
     centroid, dynamics = start(sequence)
     plain, capped = (

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..blur_moments.cues import displacement_variance, relative_blur
-from ..blur_moments.frame_blur import blur_against, refer_blur
+from ..blur_moments.frame_blur import prepare_blur_reference, relative_frame_blur
 from ..blur_moments.tile_spectra import tile_map
 from ..core.arrays import FloatArray
 from ..core.noise import estimate_noise
@@ -87,8 +87,8 @@ def bound_blur(
     True
     """
     noise, own_noise = typical_noise(training), estimate_noise(fused)
-    sharpest, _ = refer_blur(training, noise)
-    above = blur_against(np.asarray(fused)[None], sharpest, own_noise)
+    sharpest, _ = prepare_blur_reference(training, noise)
+    above = relative_frame_blur(np.asarray(fused)[None], sharpest, own_noise)
     seen = above.deviation < _NOTHING_SEEN
     precision = np.sum(above.deviation[seen] ** -2.0)
     low = np.sum(above.extra[seen] / above.deviation[seen] ** 2) / precision if seen.any() else 0.0

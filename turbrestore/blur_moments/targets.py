@@ -1,20 +1,25 @@
-"""Tip-tilt: two linear motions behind a sensor of the plane, and the Kalman filter on the moments of its frames.
+"""A target in the plane: its motion, and the Kalman filter on the moments of the frames that show it.
+
+Both axes follow the same motion independently of each other, ``ẋ = A x + w`` with a random force w of the covariance
+``q δ(t − s)``.
 
 Symbols (paper 1, sections III to V, for two outputs)
 -----------------------------------------------------
+A, q : matrices of the motion of one axis in continuous time, method ``dynamics``.
+Q : covariance that the random force adds in a frame period.
 x, y : outputs, columns and rows.
 z : state, that of x followed by that of y.
 f_i : derivative of an output with respect to the state at fast step i of the exposure.
-h(z) : moments of the frame, of the orders (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), Legendre or monomial.
-H, M : derivative of h, and second derivatives, ``M = 2/N_e Σ f_i f_iᵀ`` for the second moments.
-V, R : density of the pixel noise, covariance of the moments' noise.
+h(z) : moments of the frame of the orders (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), Legendre or monomial.
+H, M : derivative of h, and its second derivatives, ``M = 2/N_e Σ f_i f_iᵀ`` for the second moments.
+V, R : density of the pixel noise; covariance of the noise of the moments.
 
 Departures from the papers
 --------------------------
-The papers use one axis; here the mixed moment (1, 1) joins two, which is what tells a streak along one diagonal from
-one along the other.  Paths are linear in the state and the moments of order 2 quadratic, so mean and variance of
+The papers use one axis.  Here the mixed moment (1, 1) joins two, which distinguishes a streak along one diagonal from
+one along the other.  Paths are linear in the state and the moments of order 2 quadratic, so mean and covariance of
 the predicted moments are exact: ``h(ẑ) + ½ tr M P`` and ``H P Hᵀ + ½ tr M P M P``.  The extended filter of the papers
-leaves the traces out, which matters as long as the velocity is unknown.
+omits the traces, which matters as long as the velocity is unknown.
 """
 
 from __future__ import annotations
@@ -24,135 +29,264 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, expm
 
 from ..core.errors import DataError, require
 from ..filtering.kalman import Gaussian, Innovation, update
-from .kernels import Float64Array, Kernel, PixelGrid, check_kernel
-from .lifting import LiftedSystem
-from .moment_algebra import compose_moments, plane_kernel_moments
-from .moments import BASES, basis_change, basis_functions
-from .sensor import ExposureTiming
+from .lifting import FastSystem, LiftedSystem, lift
+from .moments import BASES, basis_change, basis_functions, kernel_relation
+from .sensor import ExposureTiming, Float64Array, GaussianKernel, PixelGrid
 
 # (p, q) of the moments, x^p y^q; the path has one more, that of order 0.
 _ORDERS = {1: ((1, 0), (0, 1)), 2: ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))}
 
 
-@dataclass(frozen=True, eq=False)
-class PlaneSensor:
-    """Pixels in the plane that watch one target.
+@dataclass(frozen=True)
+class RandomWalk:
+    """A target that performs a random walk.
 
     Parameters
     ----------
-    kernel : Kernel
-        Of the plane.
-    columns, rows : PixelGrid
-    noise : float
-        V, density of the white noise, above 0.
-    total : float
-        Total intensity of an exposure, known.
+    diffusion : float
+        Growth of the variance of each coordinate, squared pixels per second.
 
     Raises
     ------
     ConfigurationError
-        Kernel of a line; noise or total not above 0.
+        Not above 0.
 
     Examples
     --------
-    >>> from turbrestore.blur_moments.kernels import gaussian_kernel
-    >>> PlaneSensor(gaussian_kernel([1.0, 1.0]), PixelGrid(-8, 8, 16), PixelGrid(-8, 8, 16), noise=0.01).total
+    >>> RandomWalk(3.0).smear(exposure=2.0)
     1.0
     """
 
-    kernel: Kernel
+    diffusion: float
+
+    def __post_init__(self) -> None:
+        _check_positive(diffusion=self.diffusion)
+
+    def dynamics(self) -> tuple[Float64Array, Float64Array]:
+        """Return A and q of the position."""
+        return np.zeros((1, 1)), np.array([[self.diffusion]])
+
+    def prior(self, step: float, frame_period: float) -> Float64Array:
+        """Covariance around the first centroid."""
+        return np.array([[step**2]])
+
+    def smear(self, exposure: float) -> float:
+        """Variance of the path about its own mean: for a Brownian path a sixth of the variance gained."""
+        return self.diffusion * exposure / 6
+
+
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """A target whose velocity changes little.
+
+    Parameters
+    ----------
+    acceleration : float
+        Growth of the variance of each velocity, pixels² per second³.
+
+    Raises
+    ------
+    ConfigurationError
+        Not above 0.
+
+    Examples
+    --------
+    >>> ConstantVelocity(0.1).prior(step=1.0, frame_period=0.5).diagonal()
+    array([ 1., 16.])
+    """
+
+    acceleration: float
+
+    def __post_init__(self) -> None:
+        _check_positive(acceleration=self.acceleration)
+
+    def dynamics(self) -> tuple[Float64Array, Float64Array]:
+        """Return A and q of position and velocity."""
+        return np.array([[0.0, 1.0], [0.0, 0.0]]), np.diag([0.0, self.acceleration])
+
+    def prior(self, step: float, frame_period: float) -> Float64Array:
+        """Covariance that covers all velocities compatible with the displacements."""
+        return np.diag([step**2, (2 * step / frame_period) ** 2])
+
+    def smear(self, exposure: float) -> float:
+        """Variance that the random force adds within an exposure: negligible."""
+        return 0.0
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """A target that vibrates about a centre, which may drift.
+
+    Parameters
+    ----------
+    frequency : float
+        Hz; with ``highest`` the lower end of the range to search.
+    damping : float
+        Damping ratio, 0 to below 1.
+    drive : float
+        Growth of the variance of each velocity by the random force, pixels² per second³.
+    drift : float
+        Growth of the variance of the centre, squared pixels per second.
+    highest : float, optional
+        Upper end of the range; the most likely frequency in the range is used.  Above half the frame rate the
+        centroids are aliased, and the second moments tell the aliases apart.
+
+    Raises
+    ------
+    ConfigurationError
+        A number is not above 0, the damping is not below 1, or the range is empty.
+
+    Examples
+    --------
+    >>> len(Oscillation(frequency=12.0, damping=0.1, drive=1.0).dynamics()[0])
+    3
+    """
+
+    frequency: float
+    damping: float
+    drive: float
+    drift: float = 1e-4
+    highest: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_positive(frequency=self.frequency, drive=self.drive, drift=self.drift)
+        require(0 <= self.damping < 1, f"damping: expected 0 to below 1, found {self.damping}")
+        require(
+            self.highest is None or self.frequency < self.highest < np.inf,
+            f"highest: expected a frequency above {self.frequency:g} Hz, found {self.highest}",
+        )
+
+    def dynamics(self) -> tuple[Float64Array, Float64Array]:
+        """Return A and q of position, velocity and centre."""
+        omega = 2 * np.pi * self.frequency
+        A = np.array([[0.0, 1.0, 0.0], [-(omega**2), -2 * self.damping * omega, omega**2], [0.0, 0.0, 0.0]])
+        return A, np.diag([0.0, self.drive, self.drift])
+
+    def prior(self, step: float, frame_period: float) -> Float64Array:
+        """Covariance of an oscillation of the size of the displacements, at any phase."""
+        return np.diag([step**2, (2 * np.pi * self.frequency * step) ** 2, step**2])
+
+    def smear(self, exposure: float) -> float:
+        """Variance that the random force adds within an exposure: negligible."""
+        return 0.0
+
+
+TargetMotion = RandomWalk | ConstantVelocity | Oscillation
+
+
+def lift_motion(motion: TargetMotion, timing: ExposureTiming) -> LiftedSystem:
+    """Lift the motion of one axis to the rate of the frames.
+
+    The output is taken in the middle of the fast steps.  The random force of a frame period is added at its end, with
+    the covariance ``∫ expm(A t) q expm(Aᵀ t) dt`` (Van Loan 1978).
+
+    Parameters
+    ----------
+    motion : RandomWalk, ConstantVelocity or Oscillation
+    timing : ExposureTiming
+
+    Returns
+    -------
+    LiftedSystem
+
+    Raises
+    ------
+    ConfigurationError
+        The frames do not determine the state: an oscillation at a multiple of half the frame rate.
+
+    Examples
+    --------
+    >>> timing = ExposureTiming(fast_period=0.25, exposure=1.0, readout=0.0, frame_period=1.0)
+    >>> lift_motion(ConstantVelocity(3.0), timing).Q.round(6).tolist()
+    [[1.0, 1.5], [1.5, 3.0]]
+    """
+    A, intensity = motion.dynamics()
+    n = len(A)
+    joint = expm(np.block([[-A, intensity], [np.zeros((n, n)), A.T]]) * timing.frame_period)
+    Q = joint[n:, n:].T @ joint[:n, n:]
+    fast = FastSystem(expm(A * timing.fast_period), np.zeros(n), expm(A * timing.fast_period / 2)[0])
+    return lift(fast, timing, 0.5 * (Q + Q.T))
+
+
+@dataclass(frozen=True)
+class PlaneSensor:
+    """Pixels of the plane that record one target.
+
+    Parameters
+    ----------
+    sigma : float
+        σ of the round Gaussian image of the still target, pixels.
+    columns, rows : PixelGrid
+    noise : float
+        V, density of the white noise, above 0.
+    total : float
+        Known total intensity of an exposure.
+
+    Raises
+    ------
+    ConfigurationError
+        Noise or total is not above 0.
+
+    Examples
+    --------
+    >>> PlaneSensor(1.0, PixelGrid(-8, 8, 16), PixelGrid(-8, 8, 16), noise=0.01).total
+    1.0
+    """
+
+    sigma: float
     columns: PixelGrid
     rows: PixelGrid
     noise: float
     total: float = 1.0
 
     def __post_init__(self) -> None:
-        check_kernel(self.kernel, 2)
         require(0 < self.noise < np.inf, f"noise: expected a density above 0, found {self.noise:g} (singular R)")
         require(0 < self.total < np.inf, f"total: expected an intensity above 0, found {self.total:g}")
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneModel:
-    """Two linear motions, one for each axis, and the sensor that watches them.
+    """A motion that both axes follow independently, and the sensor that records it.
 
     Parameters
     ----------
-    along_x, along_y : LiftedSystem
+    axis : LiftedSystem
+        Motion of one axis.
     sensor : PlaneSensor
     centre : tuple of two floats
-        Where x = y = 0 of the sensor lies.
+        Position of the origin of the sensor.
 
     Examples
     --------
-    >>> from turbrestore.blur_moments.kernels import gaussian_kernel
-    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
     >>> timing = ExposureTiming(fast_period=0.25, exposure=0.5, readout=0.0, frame_period=1.0)
-    >>> motion = lift(FastSystem([[1.0]], [0.0], [1.0]), timing, [[0.1]])
     >>> pixels = PixelGrid(-8, 8, 16)
-    >>> model = PlaneModel(motion, motion, PlaneSensor(gaussian_kernel([1.0, 1.0]), pixels, pixels, noise=0.01))
+    >>> model = PlaneModel(lift_motion(RandomWalk(0.1), timing), PlaneSensor(1.0, pixels, pixels, noise=0.01))
     >>> model.advance(Gaussian(np.zeros(2), np.eye(2))).cov
     array([[1.1, 0. ],
            [0. , 1.1]])
     """
 
-    along_x: LiftedSystem
-    along_y: LiftedSystem
+    axis: LiftedSystem
     sensor: PlaneSensor
     centre: tuple[float, float] = (0.0, 0.0)
 
-    @property
-    def motion(self) -> PlaneModel:
-        """Itself: what :func:`~turbrestore.blur_moments.observers.run_observer` asks for timing and advance."""
-        return self
-
-    @property
-    def timing(self) -> ExposureTiming:
-        """When the sensor looks."""
-        return self.along_x.timing
-
-    def advance(self, state: Gaussian, inputs: Float64Array | None = None) -> Gaussian:
-        """From the start of an exposure to the start of the next.
-
-        Parameters
-        ----------
-        state : Gaussian
-            Shape (n,).
-        inputs : None
-            Not used: noise alone drives targets.
-
-        Returns
-        -------
-        Gaussian
-        """
-        A = block_diag(self.along_x.A, self.along_y.A)
-        return Gaussian(A @ state.mean, A @ state.cov @ A.T + block_diag(self.along_x.Q, self.along_y.Q))
+    def advance(self, state: Gaussian) -> Gaussian:
+        """Predict the state, shape (n,), at the start of the next exposure."""
+        A = block_diag(self.axis.A, self.axis.A)
+        return Gaussian(A @ state.mean, A @ state.cov @ A.T + block_diag(self.axis.Q, self.axis.Q))
 
     def outputs(self, steps: int) -> Float64Array:
-        """Differentiate (x, y) with respect to the state at the first fast steps.
-
-        Parameters
-        ----------
-        steps : int
-
-        Returns
-        -------
-        ndarray, float64, shape (steps, 2, n)
-        """
-        n = self.along_x.order
-        result = np.zeros((steps, 2, n + self.along_y.order))
-        result[:, 0, :n] = self.along_x.free[:steps]
-        result[:, 1, n:] = self.along_y.free[:steps]
-        return result
+        """Return the derivatives of (x, y) with respect to the state at the first fast steps, shape (steps, 2, n)."""
+        return np.kron(np.eye(2), self.axis.free[:steps, None, :])
 
 
 @dataclass(frozen=True)
 class PlaneMomentFilter:
-    """Kalman filter on the moments of a frame of the plane, exact in the mean and variance of the moments.
+    """Kalman filter on the moments of a frame, exact in the mean and covariance of the moments.
 
     Parameters
     ----------
@@ -178,10 +312,8 @@ class PlaneMomentFilter:
         require(self.order in _ORDERS, f"order: expected 1 or 2, found {self.order}")
         require(self.basis in BASES, f"basis: expected one of {', '.join(BASES)}, found {self.basis!r}")
 
-    def step(
-        self, model: PlaneModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike | None = None
-    ) -> tuple[Gaussian, Innovation]:
-        """Correct the state at the start of an exposure by its frame.
+    def step(self, model: PlaneModel, state: Gaussian, frame: ArrayLike) -> tuple[Gaussian, Innovation]:
+        """Correct the predicted state at the start of an exposure by its frame.
 
         Parameters
         ----------
@@ -190,8 +322,6 @@ class PlaneMomentFilter:
             Prediction, shape (n,).
         frame : array_like, shape (rows, columns)
             Without background.
-        inputs : None
-            Taken for the sake of the common interface: targets are driven by noise alone.
 
         Returns
         -------
@@ -227,7 +357,7 @@ class PlaneMomentFilter:
         spread : ndarray, float64, shape (m, m)
         """
         _, of_path, _ = _moment_tables(model.sensor, self.order, self.basis)
-        f = model.outputs(model.timing.exposure_steps)
+        f = model.outputs(model.axis.timing.exposure_steps)
         x, y = (f @ state.mean - np.asarray(model.centre)).T
         fx, fy = f[:, 0], f[:, 1]
         steps, n = len(f), len(state.mean)
@@ -249,10 +379,13 @@ def _moment_tables(sensor: PlaneSensor, order: int, basis: str) -> tuple[Float64
     along_x, along_y = (basis_functions(grid, order, basis) for grid in grids)
     cell = sensor.columns.width * sensor.rows.width
     measure = (along_y.T[q][:, :, None] * along_x.T[p][:, None, :]).reshape(len(p), -1) * cell / sensor.total
-    raw = np.zeros((6, 3, 3))
-    for index, entry in enumerate(((0, 0), *_ORDERS[2])):
-        raw[index][entry] = 1.0
-    kernel = plane_kernel_moments(sensor.kernel, 2, *grids)
-    change = [basis_change(grid, 2, basis) for grid in grids]
-    of_path = (change[0] @ compose_moments(raw, kernel, dimensions=2) @ change[1].T)[:, p, q].T
+    kernel = GaussianKernel(sensor.sigma)
+    of_x, of_y = (basis_change(grid, 2, basis) @ kernel_relation(kernel, grid, 2) for grid in grids)
+    i, j = np.transpose(((0, 0), *_ORDERS[2]))
+    of_path = of_x[p[:, None], i] * of_y[q[:, None], j]
     return measure, of_path, sensor.noise / cell * measure @ measure.T
+
+
+def _check_positive(**values: float) -> None:
+    for name, value in values.items():
+        require(0 < value < np.inf, f"{name}: expected a number above 0, found {value}")

@@ -31,8 +31,6 @@ Departures from the paper, each with its reason:
   standardised local sharpness, the gradient of the frame projected on that of the reference; and it rises where the
   frame shows what the others do not (a bird, a flash), where it was not seen, and where the flow folds, which a
   diffeomorphism does not.  β = 0 is the paper's scalar gain.
-  ``frame_noise="blur"`` takes the blur of the frame instead, as its spectra show it, and gives frames the shares of
-  :func:`turbrestore.blur_moments.fusion.fusion_rule`.
 * The image starts from a diffuse prior (``prior_frames=0``) and takes the training frames in first; the paper starts
   from the centroid.
 """
@@ -67,7 +65,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RESIDUALS = ("keep", "drop")
-FRAME_NOISES = ("sharpness", "blur")
+FRAME_NOISES = ("sharpness",)
 # Variance of an image nothing is known of: full scale, squared.
 _DIFFUSE = 1.0
 
@@ -84,12 +82,10 @@ class FilterParams:
         Times that flow is measured, and image and flow updated, for each block of frames.
     block : int
         Frames whose flows are measured against the same image; 1 is closest to the paper, more run side by side.
-    frame_noise : {"sharpness", "blur"}
-        What tells good frames from bad ones: local sharpness, or the blur of tiles of 48 pixels that their spectra
-        show.
+    frame_noise : {"sharpness"}
+        What distinguishes good frames from bad ones: local sharpness.
     sharpness : float
-        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.  Without
-        effect where blur is what counts.
+        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.
     sharpness_window : float
         Standard deviation of the window in which sharpness is measured, pixels.
     image_noise : float, optional
@@ -99,14 +95,14 @@ class FilterParams:
     prior_frames : float
         How many frames' worth of information the starting image carries; 0 lets the first frames replace it.
     device : str, optional
-        Where frames are warped and fused: cpu, cuda or auto; on the processor where blur is what counts.  By
-        default where the whole chain is computed, and cpu for this stage alone.
+        Where frames are warped and fused: cpu, cuda or auto.  By default where the whole chain is
+        computed, and cpu for this stage alone.
     """
 
     residual: Literal["keep", "drop"] = "keep"
     inner_iterations: int = 2
     block: int = 24
-    frame_noise: Literal["sharpness", "blur"] = "sharpness"
+    frame_noise: Literal["sharpness"] = "sharpness"
     sharpness: float = 2.0
     sharpness_window: float = 3.0
     image_noise: float | None = None
@@ -464,7 +460,6 @@ def _noise_model(
         params.sharpness_window,
         params.image_noise,
         threads,
-        by_blur=params.frame_noise == "blur",
     )
     largest = np.float32(0) if params.residual == "drop" else dynamics.motion_factor
     return replace(model, motion_share=np.minimum(model.motion_share, largest))
@@ -538,7 +533,7 @@ def _filter_window(
 def _fusion(model: FrameNoise, params: FilterParams) -> DeviceFusion | None:
     """Bring to a device what fusion needs; None for the processor, where alone blur is measured."""
     device = find_device(params.device or PROCESSOR)
-    if device == PROCESSOR or model.blur is not None:
+    if device == PROCESSOR:
         return None
     return load_fusion(model, params.sharpness, params.image_drift, device)
 

@@ -4,15 +4,12 @@ Symbols
 -------
 Z : variance of a registered frame about the image (paper 3, eq. 15)
 z : sharpness of a frame at a pixel, standardised over the frames; β its weight, ``Z ∝ exp(−β z)``
-s : blur variance of a tile of a frame; w share of the frame in the image that follows, ``Z ∝ 1 / w``
 G : share of the flow outside the model's subspace that is motion and not noise
 R : variance of that flow
 
 The paper takes Z to be one number.  Here it falls where a frame is locally sharper than usual, which is the idea of
 lucky imaging inside the Kalman gain, and rises where a frame shows something that the others do not, and where its
-flow folds or leaves the frame.  Which frames are sharp is read from their local
-gradients, or from the spectra of their tiles (:mod:`turbrestore.blur_moments.frame_blur`); later frames are held
-against the spectra of the first ones, so that none of them has to be kept.
+flow folds or leaves the frame.
 """
 
 from __future__ import annotations
@@ -24,8 +21,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..blur_moments.frame_blur import BlurReference, blur_against, refer_blur
-from ..blur_moments.fusion import FusionRule, fusion_rule, laplacian_energy, noise_factor
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError
 from ..registration.warp import inside, mirror, strips, warp
@@ -80,9 +75,6 @@ class FrameNoise:
         Mean of the registered frames, without what deviates from the rest.
     deviation : ndarray, float32, shape (H, W)
         Variance of the registered frames about it, locally averaged, squared intensity.
-    blur : tuple of BlurReference and FusionRule, or None
-        What the blur of a frame is measured against, and the shares of frames that follow from it; None where
-        sharpness is what counts.
     """
 
     image_noise: float
@@ -95,7 +87,6 @@ class FrameNoise:
     window: float
     usual_frame: FloatArray
     deviation: FloatArray
-    blur: tuple[BlurReference, FusionRule] | None = None
 
 
 def measure_frame_noise(
@@ -106,7 +97,6 @@ def measure_frame_noise(
     window: float = 3.0,
     image_noise: float | None = None,
     threads: int = 0,
-    by_blur: bool = False,
 ) -> FrameNoise:
     """Temporal statistics of frames registered by their flows.
 
@@ -125,8 +115,6 @@ def measure_frame_noise(
         Z, squared intensity; by default the mean temporal variance of the registered frames.
     threads : int
         Frames warped side by side; 0 means one per available core.
-    by_blur : bool
-        Judge frames by the blur that their spectra show; needs two frames, and 4 bytes a pixel of each for a while.
 
     Returns
     -------
@@ -148,20 +136,18 @@ def measure_frame_noise(
     """
     if residual_variance.shape != image.shape[:2]:
         raise DataError(f"residual_variance: expected shape {image.shape[:2]}, found {residual_variance.shape}")
-    template, kept = _gradient(luminance(image)), dict[int, FloatArray]()
+    template = _gradient(luminance(image))
 
-    def measure(batch: list[tuple[int, tuple[FloatArray, FloatArray]]]) -> tuple[np.ndarray, ...]:
+    def measure(batch: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
         sums = tuple(np.zeros(image.shape[:2]) for _ in range(4))
-        for number, pair in batch:
+        for pair in batch:
             registered = luminance(warp(*pair))
             _add_moments(registered, *sums[:2])
             _add_moments(_smooth(_product(registered, template), window), *sums[2:])
-            if by_blur:
-                kept[number] = registered
         return sums
 
     pairs, count = zip(iter_frames(frames), iter_frames(flows), strict=True), len(frames)
-    mean, variance, usual, spread = sum_in_threads(measure, enumerate(pairs), threads)
+    mean, variance, usual, spread = sum_in_threads(measure, pairs, threads)
 
     def average(rows: slice) -> None:
         for total, squares in ((mean, variance), (usual, spread)):
@@ -184,7 +170,6 @@ def measure_frame_noise(
         motion_share[rows] = _motion_share(energy[rows], sensor_noise, residual_variance[rows], window)
 
     _in_strips(scores, energy.shape, threads)
-    registered = [kept[number] for number in range(len(kept))]
     return FrameNoise(
         image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
         template=template,
@@ -196,7 +181,6 @@ def measure_frame_noise(
         window=window,
         usual_frame=usual_frame,
         deviation=deviation,
-        blur=_blur_rule(np.stack(registered), image, sensor_noise) if len(registered) > 1 else None,
     )
 
 
@@ -217,7 +201,7 @@ def judge_frame(
         The flow it was warped by, pixels.
     model : FrameNoise
     sharpness : float
-        β; 0 gives the same Z for every frame and pixel, as in the paper.  Without effect where ``model.blur`` is there.
+        β; 0 gives the same Z for every frame and pixel, as in the paper.
 
     Returns
     -------
@@ -241,18 +225,10 @@ def judge_frame(
     product = _product(grey, model.template)
     # Sums and norms of OpenCV depend on where an array lies in memory, in the last bit.
     sharp = float(product.sum(dtype=np.float64)) / max(model.template_energy, 1e-12)
-    if model.blur is None and sharpness == 0:
+    if sharpness == 0:
         return model.image_noise, sharp
     noise = _deviates(grey, model.usual_frame, model.deviation)
-    lost = _lost(flow)
-    if model.blur is None:
-        _weigh(noise, _smooth(product, model.window), lost, model, sharpness)
-    else:
-        lost *= LOG_DISTRUST
-        excess = np.maximum(noise / OUTLIER, 1)
-        noise = np.float32(model.image_noise) * excess**3 * np.exp(lost)
-        reference, rule = model.blur
-        noise = noise_factor(rule, blur_against(registered[None], reference).extra[0]) * noise
+    _weigh(noise, _smooth(product, model.window), _lost(flow), model, sharpness)
     return noise, sharp
 
 
@@ -340,14 +316,6 @@ def _exponent(seen: FloatArray, excess: FloatArray, model: FrameNoise, rows: sli
     score *= np.float32(-sharpness)
     score += np.float32(0.5 * sharpness**2) * model.score_variance[rows]
     return score
-
-
-def _blur_rule(registered: FloatArray, image: FloatArray, sensor_noise: float) -> tuple[BlurReference, FusionRule]:
-    """Measure the blur of frames, and which shares of them make blur and noise of their average smallest."""
-    noise = float(np.sqrt(sensor_noise))
-    reference, blur = refer_blur(registered, noise)
-    energy = laplacian_energy(image, noise / np.sqrt(len(registered)))
-    return reference, fusion_rule(blur, energy, noise)
 
 
 def _without_outliers(

@@ -1,26 +1,32 @@
-"""The experiments of both papers: how well each observer does, over many seeds at once, and what no observer can beat.
+"""The experiments of both papers: the error of every observer over many seeds, and the Cramér–Rao bounds.
 
-The set-ups are in :mod:`.scenarios`.
+A recording holds many seeds at once, so every observer corrects all of them in one step.  Errors are compared within
+a seed, because the ratio of two observers has a much smaller standard error than either error.  The set-ups are in
+:mod:`.scenarios`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from ...core.errors import require
 from ...filtering.kalman import Gaussian
 from ...runtime.threads import map_ahead
-from ..blur_model import BlurModel
-from .bounds import image_information, moment_information, posterior_bound
 from ..image_observer import ImageFilter
-from ..kernels import Float64Array
 from ..lifting import LiftedSystem
-from ..observers import MomentFilter, luenberger, steady_kalman
+from ..moments import BlurModel
+from ..observers import MomentFilter, Observer, luenberger, run_observer, steady_kalman
+from ..sensor import ExposureTiming, Float64Array
+from .bounds import error_bound, recorded_information
 from .scenarios import (
+    MIRROR,
+    WAVEFRONT,
     MirrorParams,
+    Recording,
     WavefrontParams,
     mirror_model,
     mirror_oscillator,
@@ -28,12 +34,96 @@ from .scenarios import (
     record_wavefront,
     wavefront_model,
 )
-from ..sensor import ExposureTiming
-from .trials import Contestant, Recording, Score, Track, follow, join_tracks, score
 
-# Seeds handled together: enough to spare NumPy's overhead, few enough to stay in the cache.
+# Probability of the consistency band.
+_BAND = 0.95
+# Seeds handled together: enough to amortise the overhead of NumPy, few enough to stay in the cache.
 _CHUNK = 25
 _LEGENDRE = "legendre"
+
+
+@dataclass(frozen=True, eq=False)
+class Contestant:
+    """An observer, the model it uses, and its prior.
+
+    Parameters
+    ----------
+    observer : Observer
+    model : BlurModel
+    start : Gaussian
+        State before the first frame, shape (n,).
+    bound : str
+        Name of the Cramér–Rao bound that holds for it.
+    """
+
+    observer: Observer
+    model: BlurModel
+    start: Gaussian
+    bound: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Errors of an observer on a recording of T frames and S seeds.
+
+    Parameters
+    ----------
+    errors : ndarray, float64, shape (T, S)
+        Of the state, or of the output within the exposure.
+    between : ndarray, float64, shape (T, S)
+        Root mean square error of the output over all fast steps until the next exposure.
+    misfits : ndarray, float64, shape (T, S)
+        Normalised innovation squared.
+    observed : int
+        Degrees of freedom of one of them.
+    example : ndarray, float64, shape (T, N)
+        Estimated output of the first seed.
+    """
+
+    errors: Float64Array
+    between: Float64Array
+    misfits: Float64Array
+    observed: int
+    example: Float64Array
+
+
+@dataclass(frozen=True)
+class Score:
+    """Accuracy of an observer over all seeds, after the frames in which it settles.
+
+    Parameters
+    ----------
+    error : float
+        Mean error.
+    ratio, ratio_error : float
+        Mean error over that of the first observer, and its standard error.
+    rms, rms_error : float
+        Root mean square error, and its standard error.
+    bound : float
+        Cramér–Rao bound on ``rms``; NaN where none is known.
+    between : float
+        Mean error of the output over all fast steps until the next exposure.
+    innovation : float
+        Normalised innovation squared per degree of freedom.
+    innovation_low, innovation_high : float
+        Band that contains it in 95 % of all runs if the model fits.
+    """
+
+    error: float
+    ratio: float
+    ratio_error: float
+    rms: float
+    rms_error: float
+    bound: float
+    between: float
+    innovation: float
+    innovation_low: float
+    innovation_high: float
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the innovations are as large as their covariances say."""
+        return self.innovation_low <= self.innovation <= self.innovation_high
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +156,7 @@ class Experiment:
     errors: dict[str, Float64Array]
 
 
-def wavefront(seeds: Sequence[int], params: WavefrontParams | None = None) -> Experiment:
+def wavefront(seeds: Sequence[int], params: WavefrontParams = WAVEFRONT) -> Experiment:
     """Run the wavefront experiment.
 
     Parameters
@@ -78,8 +168,8 @@ def wavefront(seeds: Sequence[int], params: WavefrontParams | None = None) -> Ex
     Returns
     -------
     Experiment
-        The error is the norm of the error of the state after the frame. O1 is the settled Kalman filter on the first
-        moment, O2 uses the second, O3 both; the rest goes beyond the paper.
+        The error is the norm of the error of the state after the frame.  O1 is the steady-state Kalman filter on the
+        first moment, O2 uses the second, O3 both; the other observers are not in the paper.
 
     Raises
     ------
@@ -92,33 +182,29 @@ def wavefront(seeds: Sequence[int], params: WavefrontParams | None = None) -> Ex
     >>> sorted(result.bounds)
     ['image', 'moments', 'moments_1_to_4']
     """
-    settings = params or WavefrontParams()
-    model = wavefront_model(settings)
+    model = wavefront_model(params)
     observer, cov = steady_kalman(model)
     start = Gaussian(np.zeros(2), cov)
-    two, four = (1, 2), (1, 2, 3, 4)
+    both = (1, 2)
     contestants = {
         "O1": Contestant(observer, model, start, "moments"),
         "O2": Contestant(MomentFilter((2,)), model, start, "moments"),
-        "O3": Contestant(MomentFilter(two), model, start, "moments"),
-        "O3_legendre": Contestant(MomentFilter(two, _LEGENDRE), model, start, "moments"),
-        "O3_unscented": Contestant(MomentFilter(two, _LEGENDRE, "unscented"), model, start, "moments"),
-        "O3_iterated": Contestant(MomentFilter(two, _LEGENDRE, "iterated"), model, start, "moments"),
-        "moments_1_to_4": Contestant(MomentFilter(four, _LEGENDRE), model, start, "moments_1_to_4"),
+        "O3": Contestant(MomentFilter(both), model, start, "moments"),
+        "O3_legendre": Contestant(MomentFilter(both, _LEGENDRE), model, start, "moments"),
+        "O3_unscented": Contestant(MomentFilter(both, _LEGENDRE, "unscented"), model, start, "moments"),
+        "O3_iterated": Contestant(MomentFilter(both, _LEGENDRE, "iterated"), model, start, "moments"),
+        "moments_1_to_4": Contestant(MomentFilter((1, 2, 3, 4), _LEGENDRE), model, start, "moments_1_to_4"),
         "image_one_step": Contestant(ImageFilter(iterations=1), model, start, "image"),
         "image_map": Contestant(ImageFilter(), model, start, "image"),
     }
-    return _run(
-        seeds,
-        lambda chunk: record_wavefront(chunk, settings),
-        contestants,
-        settings.burn_in,
-        of_state=True,
-        linear=model,
-    )
+
+    def record(chunk: Sequence[int]) -> Recording:
+        return record_wavefront(chunk, params)
+
+    return _run(seeds, record, contestants, params.burn_in, of_state=True, linear=model)
 
 
-def mirror(seeds: Sequence[int], params: MirrorParams | None = None) -> Experiment:
+def mirror(seeds: Sequence[int], params: MirrorParams = MIRROR) -> Experiment:
     """Run the mirror experiment.
 
     Parameters
@@ -126,15 +212,15 @@ def mirror(seeds: Sequence[int], params: MirrorParams | None = None) -> Experime
     seeds : sequence of int
         One run each.
     params : MirrorParams
-        With ``deviation`` above 0 the plant is another one for every seed, and the observers do not know it.
+        With ``deviation`` above 0 every seed has another plant, and the observers do not know it.
 
     Returns
     -------
     Experiment
-        The error is the root mean square error of the output within the exposure. O1 is a Luenberger observer on the
-        first moment with the Kalman gain, O2 uses moments 1 and 2, O3 predicts the image; ``augmented`` estimates gain,
-        frequency and damping as well; of 200 runs with an unknown plant about three settle on a wrong one, which
-        their innovations show. Bounds are for the known plant.
+        The error is the root mean square error of the output within the exposure.  O1 is a Luenberger observer on the
+        first moment with the Kalman gain, O2 uses moments 1 and 2, O3 predicts the image.  ``augmented`` also
+        estimates gain, frequency and damping; of 200 runs with an unknown plant about three converge to a wrong one,
+        which their innovations show.  Bounds are for the known plant.
 
     Raises
     ------
@@ -147,8 +233,7 @@ def mirror(seeds: Sequence[int], params: MirrorParams | None = None) -> Experime
     >>> list(result.scores)
     ['O1', 'O2', 'O3', 'O3_map', 'augmented']
     """
-    settings = params or MirrorParams()
-    model = mirror_model(settings)
+    model = mirror_model(params)
     motion = model.motion
     assert isinstance(motion, LiftedSystem)
     observer, cov = steady_kalman(model)
@@ -159,8 +244,8 @@ def mirror(seeds: Sequence[int], params: MirrorParams | None = None) -> Experime
         "O3": Contestant(ImageFilter("two"), model, start, "image"),
         "O3_map": Contestant(ImageFilter(), model, start, "image"),
     }
-    if settings.deviation > 0:
-        augmented = BlurModel(mirror_oscillator(settings), model.sensor)
+    if params.deviation > 0:
+        augmented = BlurModel(mirror_oscillator(params), model.sensor)
         contestants["augmented"] = Contestant(ImageFilter(), augmented, _augmented_start(cov))
     else:
         contestants |= {
@@ -171,13 +256,92 @@ def mirror(seeds: Sequence[int], params: MirrorParams | None = None) -> Experime
             "O3_one_start": Contestant(ImageFilter("two", multistart=False), model, start, "image"),
             "O3_infinity": Contestant(ImageFilter("infinity", iterations=8), model, start, "image"),
         }
-    return _run(
-        seeds,
-        lambda chunk: record_mirror(chunk, settings),
-        contestants,
-        settings.burn_in,
-        of_state=False,
-        linear=None if settings.deviation > 0 else model,
+
+    def record(chunk: Sequence[int]) -> Recording:
+        return record_mirror(chunk, params)
+
+    linear = None if params.deviation > 0 else model
+    return _run(seeds, record, contestants, params.burn_in, of_state=False, linear=linear)
+
+
+def follow(contestant: Contestant, recording: Recording, of_state: bool) -> Track:
+    """Run an observer over a recording and measure its errors.
+
+    Parameters
+    ----------
+    contestant : Contestant
+    recording : Recording
+    of_state : bool
+        Whether the error is the norm of the error of the state, or the root mean square error of the output within
+        the exposure.
+
+    Returns
+    -------
+    Track
+    """
+    motion, start = contestant.model.motion, contestant.start
+    seeds = recording.states.shape[1]
+    prior = Gaussian(np.broadcast_to(start.mean, (seeds, start.mean.size)), start.cov)
+    results = run_observer(contestant.observer, contestant.model, prior, recording.frames, recording.inputs)
+    pairs = zip(results, recording.inputs, strict=True)
+    estimates = np.array([motion.fast_output(state, held)[0] for (state, _), held in pairs])
+    squared = (estimates - recording.outputs) ** 2
+    if of_state:
+        means = np.array([state.mean for state, _ in results])
+        errors = np.linalg.norm(means - recording.states, axis=-1)
+    else:
+        errors = np.sqrt(squared[..., : motion.timing.exposure_steps].mean(-1))
+    return Track(
+        errors=errors,
+        between=np.sqrt(squared.mean(-1)),
+        misfits=np.array([innovation.normalised_squared for _, innovation in results]),
+        observed=int(results[0][1].observed.flat[0]),
+        example=estimates[:, 0],
+    )
+
+
+def score(tracks: Mapping[str, Track], bounds: Mapping[str, float], burn_in: int) -> dict[str, Score]:
+    """Compare observers with the first of them and with the bounds.
+
+    Parameters
+    ----------
+    tracks : mapping of str to Track
+        All over the same recordings.
+    bounds : mapping of str to float
+        Cramér–Rao bound for some of the observers.
+    burn_in : int
+        Frames left out at the start.
+
+    Returns
+    -------
+    dict of str to Score
+    """
+    reference = next(iter(tracks.values())).errors[burn_in:].mean(0)
+    return {
+        name: _score_one(track, reference, bounds.get(name, float("nan")), burn_in) for name, track in tracks.items()
+    }
+
+
+def _score_one(track: Track, reference: Float64Array, bound: float, burn_in: int) -> Score:
+    errors, misfits = track.errors[burn_in:], track.misfits[burn_in:]
+    seeds = errors.shape[1]
+    mean, squares = errors.mean(0), (errors**2).mean(0)
+    ratio, rms = mean.mean() / reference.mean(), np.sqrt(squares.mean())
+    spread = np.std(mean - ratio * reference, ddof=1) if seeds > 1 else np.nan
+    spread_squares = np.std(squares, ddof=1) if seeds > 1 else np.nan
+    freedom = misfits.size * track.observed
+    low, high = chi2.ppf([0.5 - _BAND / 2, 0.5 + _BAND / 2], freedom) / freedom
+    return Score(
+        error=float(mean.mean()),
+        ratio=float(ratio),
+        ratio_error=float(spread / np.sqrt(seeds) / reference.mean()),
+        rms=float(rms),
+        rms_error=float(spread_squares / np.sqrt(seeds) / (2 * rms)),
+        bound=float(bound),
+        between=float(track.between[burn_in:].mean()),
+        innovation=float(misfits.sum() / freedom),
+        innovation_low=float(low),
+        innovation_high=float(high),
     )
 
 
@@ -196,50 +360,34 @@ def _run(
     def work(chunk: Sequence[int]) -> tuple[dict[str, Track], dict[str, Float64Array], Float64Array]:
         recording = record(chunk)
         tracks = {name: follow(contestant, recording, of_state) for name, contestant in contestants.items()}
-        return tracks, _informations(linear, recording), recording.outputs[:, 0]
+        return tracks, recorded_information(linear, recording) if linear else {}, recording.outputs[:, 0]
 
     parts = [part for _, part in map_ahead(work, chunks)]
-    tracks = {name: join_tracks([part[0][name] for part in parts]) for name in contestants}
-    bounds: dict[str, float] = {}
+    tracks = {name: _joined([part[0][name] for part in parts]) for name in contestants}
+    first, bounds = contestants["O1"], dict[str, float]()
     if linear is not None:
-        cov = contestants["O1"].start.cov
-        weights = [len(chunk) / len(seeds) for chunk in chunks]
+        shares = [len(chunk) / len(seeds) for chunk in chunks]
         for name in parts[0][1]:
-            information = sum(w * part[1][name] for w, part in zip(weights, parts, strict=True))
-            bounds[name] = _bound(linear, cov, np.asarray(information), burn_in, of_state)
+            information = np.asarray(sum(share * part[1][name] for share, part in zip(shares, parts, strict=True)))
+            bounds[name] = error_bound(linear, first.start.cov, information, burn_in, of_state)
     of_observers = {name: bounds[c.bound] for name, c in contestants.items() if c.bound in bounds}
-    model = contestants["O1"].model
     return Experiment(
         seeds=len(seeds),
         scores=score(tracks, of_observers, burn_in),
         bounds=bounds,
-        timing=model.motion.timing,
+        timing=first.model.motion.timing,
         truth=parts[0][2],
         estimates={name: track.example for name, track in tracks.items()},
         errors={name: track.errors.mean(1) for name, track in tracks.items()},
     )
 
 
-def _informations(model: BlurModel | None, recording: Recording) -> dict[str, Float64Array]:
-    """Mean information of every frame by what is measured; the known motion has as many states as the model."""
-    if model is None:
-        return {}
-    states = recording.states[..., : model.motion.order]
-    return {
-        "moments": moment_information(model, states, recording.inputs, (1, 2), _LEGENDRE).mean(1),
-        "moments_1_to_4": moment_information(model, states, recording.inputs, (1, 2, 3, 4), _LEGENDRE).mean(1),
-        "image": image_information(model, states, recording.inputs).mean(1),
-    }
-
-
-def _bound(model: BlurModel, cov: Float64Array, information: Float64Array, burn_in: int, of_state: bool) -> float:
-    """Bound on the root mean square error of the state, or of the output within the exposure."""
-    motion = model.motion
-    assert isinstance(motion, LiftedSystem)
-    covariances = posterior_bound(motion.A, motion.Q, cov, information)[burn_in:]
-    free = motion.free[: motion.timing.exposure_steps]
-    weight = np.eye(motion.order) if of_state else free.T @ free / len(free)
-    return float(np.sqrt(np.einsum("ab,tba->t", weight, covariances).mean()))
+def _joined(tracks: list[Track]) -> Track:
+    """Join the tracks of an observer over different seeds."""
+    errors, between, misfits = (
+        np.concatenate([getattr(track, name) for track in tracks], 1) for name in ("errors", "between", "misfits")
+    )
+    return Track(errors, between, misfits, tracks[0].observed, tracks[0].example)
 
 
 def _augmented_start(cov: Float64Array) -> Gaussian:
