@@ -1,4 +1,4 @@
-"""Tiles of an image, and the settings by which their spectra are compared."""
+"""Tiles of an image, and the settings of the comparison of their spectra."""
 
 import numpy as np
 import pytest
