@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from atmosphere_theory import tilt_covariance
 
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.synthesis.atmosphere import PhaseScreenParams, structure_function, tilt_covariance
+from turbrestore.synthesis.atmosphere import PhaseScreenParams, structure_function
 from turbrestore.synthesis.phase_screen import (
     Turbulence,
     draw_screen,
