@@ -26,9 +26,15 @@ from turbrestore.pipeline import Progress, stage_counter
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import DynamicTextureParams, synthesize_like
-from turbrestore.synthesis.exposure import exposed_frame, flows_between
 from turbrestore.synthesis.scenes import SCENES
-from turbrestore.synthesis.sequence import CameraParams, SyntheticFrame, check_scene, record
+from turbrestore.synthesis.sequence import (
+    CameraParams,
+    SyntheticFrame,
+    check_scene,
+    exposed_frame,
+    flows_between,
+    record,
+)
 
 from .options import Flag, limits_of
 from .output import print_json

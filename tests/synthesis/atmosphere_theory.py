@@ -1,12 +1,40 @@
-"""Theory of imaging through turbulence that only tests need: covariance of tilts, and transfer functions."""
+"""Theory of imaging through turbulence and reference implementations that only tests need."""
 
 import numpy as np
 from scipy import special
 
 from turbrestore.synthesis.atmosphere import phase_spectrum
+from turbrestore.synthesis.phase_screen import sample_lattice
 
 # D_φ(r) = 6.884 (r/r0)^(5/3).
 STRUCTURE = 2 * (24 / 5 * special.gamma(6 / 5)) ** (5 / 6)
+
+
+def structure_function(separation, r0, outer_scale, inner_scale=0.0):
+    """Structure function of the phase, ``D_φ(r) = 4π ∫ Φ(f) (1 − J0(2π f r)) f df``, rad².
+
+    Without an inner scale it is 6.884 (r/r0)^(5/3) for r far below L0, and twice the variance far above.
+    """
+    r = np.asarray(separation, np.float64)
+    f = frequencies(outer_scale, inner_scale, float(np.min(r[r > 0], initial=outer_scale)) / 30)
+    power = phase_spectrum(f, r0, outer_scale, inner_scale) * f
+    values = [np.trapezoid(power * (1 - special.j0(2 * np.pi * f * s)) * f, np.log(f)) for s in r.ravel()]
+    return 4 * np.pi * np.reshape(values, r.shape)
+
+
+def frequencies(outer_scale, inner_scale, finest):
+    """Logarithmic grid from where the spectrum is flat to where it, or its factor in an integral, has vanished."""
+    highest = 1 / finest if inner_scale == 0 else min(1 / finest, 4 / inner_scale)
+    return np.geomspace(1e-3 / outer_scale, max(highest, 10 / outer_scale), 6000)
+
+
+def sample_path(screen, x, y):
+    """Difference of optical path of a phase screen at any points, m: lattice plus every plane wave."""
+    u, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+    phases = np.multiply.outer(u, screen.frequencies[:, 0]) + np.multiply.outer(v, screen.frequencies[:, 1])
+    smooth = (np.exp(-2j * np.pi * phases) @ screen.waves).real
+    (flat,) = sample_lattice(screen, [screen.path], u.reshape(1, -1), v.reshape(1, -1))
+    return np.asarray(smooth + flat.reshape(u.shape), np.float32)
 
 
 def tilt_covariance(layers, aperture, wavelength, outer_scale, inner_scale=0.0, angle=(0.0, 0.0), lag=0.0):
@@ -18,8 +46,7 @@ def tilt_covariance(layers, aperture, wavelength, outer_scale, inner_scale=0.0, 
     total = np.zeros(2)
     for layer in layers:
         diameter = layer.shrink * aperture
-        highest = 30 / diameter if inner_scale == 0 else min(30 / diameter, 4 / inner_scale)
-        f = np.geomspace(1e-3 / outer_scale, max(highest, 10 / outer_scale), 6000)
+        f = frequencies(outer_scale, inner_scale, diameter / 30)
         x = np.pi * diameter * f
         power = phase_spectrum(f, layer.r0, outer_scale, inner_scale) * (special.jv(2, x) / x) ** 2 * f
         shift = np.multiply(angle, layer.distance) - np.multiply(layer.velocity, lag)

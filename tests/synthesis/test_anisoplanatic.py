@@ -7,15 +7,21 @@ import cv2
 import numpy as np
 import pytest
 import skimage.data
-from atmosphere_theory import diffraction_mtf, long_exposure_mtf, short_exposure_mtf
+from atmosphere_theory import (
+    diffraction_mtf,
+    long_exposure_mtf,
+    sample_path,
+    short_exposure_mtf,
+    structure_function,
+)
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.metrics import psnr
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
-from turbrestore.synthesis.atmosphere import PhaseScreenParams, structure_function
-from turbrestore.synthesis.phase_screen import Turbulence, draw_screen, draw_turbulence, sample_path, tilt_flow
+from turbrestore.synthesis.atmosphere import PhaseScreenParams
+from turbrestore.synthesis.phase_screen import Turbulence, draw_screen, draw_turbulence, tilt_flow
 from turbrestore.synthesis.pupil import (
     point_spread_functions,
     psf_basis,

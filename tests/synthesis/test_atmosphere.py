@@ -2,7 +2,13 @@
 
 import numpy as np
 import pytest
-from atmosphere_theory import diffraction_mtf, long_exposure_mtf, short_exposure_mtf, tilt_covariance
+from atmosphere_theory import (
+    diffraction_mtf,
+    long_exposure_mtf,
+    short_exposure_mtf,
+    structure_function,
+    tilt_covariance,
+)
 from scipy import special
 
 from turbrestore.core.errors import ConfigurationError
@@ -11,7 +17,6 @@ from turbrestore.synthesis.atmosphere import (
     PhaseScreenParams,
     fried_parameter,
     phase_spectrum,
-    structure_function,
     tilt_variance,
 )
 

@@ -39,7 +39,6 @@ from ..core.errors import require
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_ahead, one_thread_each
 from .atmosphere import PhaseScreenParams
-from .exposure import exposed_frame
 from .phase_screen import Turbulence, draw_turbulence, tilt_flow
 from .pupil import (
     ComplexArray,
@@ -52,7 +51,7 @@ from .pupil import (
     sample_pupil,
     tilt_free_path,
 )
-from .sequence import CameraParams, SyntheticFrame, check_scene, record
+from .sequence import CameraParams, SyntheticFrame, check_scene, exposed_frame, record
 
 # The reflected margin covers displacements up to this many standard deviations.
 _WIDEST_TILT = 4

@@ -8,7 +8,7 @@ Cn² : refractive-index structure constant, m^(-2/3).
 r0 : Fried parameter of a spherical wave unless stated otherwise, m.
 L0, l0 : outer and inner scale, m.
 f : spatial frequency, cycles per metre.
-Φ : power spectrum of the phase, rad² m².  D_φ : structure function of the phase, rad².
+Φ : power spectrum of the phase, rad² m².
 γ : 1 − z/L, by which the cone from the aperture to a point of the scene has narrowed at a layer.
 
 Conventions
@@ -35,7 +35,7 @@ from ..core.errors import ConfigurationError, require, require_between
 
 Float64Array = NDArray[np.float64]
 
-# 0.4230 in r0^(-5/3) = 0.423 k² ∫ Cn² dz follows from D_φ = 2.914 k² r^(5/3) ∫ Cn² dz = 6.884 (r/r0)^(5/3).
+# The structure function 2.914 k² r^(5/3) ∫ Cn² dz = 6.884 (r/r0)^(5/3) implies r0^(-5/3) = 0.423 k² ∫ Cn² dz.
 _FRIED = 0.423
 _STRUCTURE = 2 * (24 / 5 * special.gamma(6 / 5)) ** (5 / 6)
 _SPECTRUM = (_STRUCTURE / 2) * special.gamma(11 / 6) ** 2 / (2 * np.pi ** (11 / 3))
@@ -294,35 +294,6 @@ def phase_spectrum(frequency: ArrayLike, r0: float, outer_scale: float, inner_sc
     return _SPECTRUM * r0 ** (-5 / 3) * (f2 + outer_scale**-2) ** (-11 / 6) * np.exp(-f2 * cut)
 
 
-def structure_function(separation: ArrayLike, r0: float, outer_scale: float, inner_scale: float = 0.0) -> Float64Array:
-    """Structure function of the phase, ``D_φ(r) = 4π ∫ Φ(f) (1 − J0(2π f r)) f df``.
-
-    Without an inner scale it is 6.884 (r/r0)^(5/3) for r far below L0, and twice the variance far above.
-
-    Parameters
-    ----------
-    separation : array_like
-        r, m.
-    r0, outer_scale, inner_scale : float
-        m.
-
-    Returns
-    -------
-    ndarray, float64, shape of ``separation``
-        rad².
-
-    Examples
-    --------
-    >>> float(structure_function(0.1, 0.1, 1e5).round(1))
-    6.8
-    """
-    r = np.asarray(separation, np.float64)
-    f = _frequencies(outer_scale, inner_scale, float(np.min(r[r > 0], initial=outer_scale)) / 30)
-    power = phase_spectrum(f, r0, outer_scale, inner_scale) * f
-    values = [np.trapezoid(power * (1 - special.j0(2 * np.pi * f * s)) * f, np.log(f)) for s in r.ravel()]
-    return 4 * np.pi * np.reshape(values, r.shape)
-
-
 def tilt_variance(
     layers: Sequence[Layer], aperture: float, wavelength: float, outer_scale: float, inner_scale: float = 0.0
 ) -> float:
@@ -355,17 +326,13 @@ def tilt_variance(
     total = 0.0
     for layer in layers:
         diameter = layer.shrink * aperture
-        f = _frequencies(outer_scale, inner_scale, diameter / 30)
+        # From where the spectrum is flat to where the integrand has vanished.
+        highest = 30 / diameter if inner_scale == 0 else min(30 / diameter, 4 / inner_scale)
+        f = np.geomspace(1e-3 / outer_scale, max(highest, 10 / outer_scale), _QUADRATURE)
         x = np.pi * diameter * f
         power = phase_spectrum(f, layer.r0, outer_scale, inner_scale) * (special.jv(2, x) / x) ** 2 * f
         total += float(np.trapezoid(power * f, np.log(f)))
     return total * 16 * np.pi * (2 * wavelength / (np.pi * aperture)) ** 2
-
-
-def _frequencies(outer_scale: float, inner_scale: float, finest: float) -> Float64Array:
-    """Logarithmic grid from where the spectrum is flat to where the integrand has vanished."""
-    highest = 1 / finest if inner_scale == 0 else min(1 / finest, 4 / inner_scale)
-    return np.geomspace(1e-3 / outer_scale, max(highest, 10 / outer_scale), _QUADRATURE)
 
 
 def _positive(name: str, value: float) -> None:
