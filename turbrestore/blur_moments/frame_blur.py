@@ -180,8 +180,10 @@ def prepare_blur_reference(
     found = [
         _reference_statistics(power[:, some], spectrum[some], misfit[some], design, fit) for some in _batches(power)
     ]
-    statistics = (np.concatenate(parts) for parts in zip(*(part for part, _ in found), strict=True))
-    reference = BlurReference(spectrum, misfit, *statistics, noise, spectra.grid.shape, params)
+    residual, offset, spread, sharpest = (
+        np.concatenate(parts) for parts in zip(*(statistics for statistics, _ in found), strict=True)
+    )
+    reference = BlurReference(spectrum, misfit, residual, offset, spread, sharpest, noise, spectra.grid.shape, params)
     return reference, _frame_blur([estimate for _, estimate in found], spectra.grid)
 
 

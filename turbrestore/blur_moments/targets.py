@@ -281,7 +281,7 @@ class PlaneModel:
 
     def outputs(self, steps: int) -> Float64Array:
         """Return the derivatives of (x, y) with respect to the state at the first fast steps, shape (steps, 2, n)."""
-        return np.kron(np.eye(2), self.axis.free[:steps, None, :])
+        return np.asarray(np.kron(np.eye(2), self.axis.free[:steps, None, :]), np.float64)
 
 
 @dataclass(frozen=True)
