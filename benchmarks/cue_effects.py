@@ -1,4 +1,4 @@
-"""What the cues from blur do to restorations, each switched on by itself, as Markdown tables.
+"""Effect of the cues from blur on restorations, each switched on alone, as Markdown tables.
 
 Run ``python benchmarks/cue_effects.py``.  Clips: the simulated ones under the folder that ``TURBRESTORE_DATA`` names,
 or synthetic ones without it; ``--clips`` takes names or patterns.
@@ -29,7 +29,7 @@ from turbrestore.metrics import compare
 from turbrestore.registration.centroid import find_centroid
 
 SETTINGS = DeconvolutionParams()
-VARIANTS = ("default", "frame noise by blur", "displacement cue", "blur bounds")
+VARIANTS = ("default", "displacement cue", "blur bounds")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +47,11 @@ class Effects:
     count : int
         Training frames.
     widths : dict of str to float
-        Width of the blur that was removed, pixels.
+        Width of the removed blur, pixels.
     estimate : BlurEstimate
-        Of the image that the default filter makes.
+        Blur of the image that the default filter makes.
     bounds : BlurBounds
-        On the same.
+        Bounds on the same.
     """
 
     before: dict[str, float]
@@ -66,7 +66,7 @@ class Effects:
 
 
 def measure(clip: Clip) -> Effects:
-    """Restore a clip with each cue by itself."""
+    """Restore a clip with each cue alone."""
     frames, truth = clip.frames, clip.truth
     training = frames[: training_share(len(frames), frames.shape[1:])]
     centroid = find_centroid(training)
@@ -74,12 +74,11 @@ def measure(clip: Clip) -> Effects:
     cue = displacement_variance(training, typical_noise(training))
     motion = with_displacement(flows, *displacement_maps(training))
 
-    def fuse(dynamics: FlowDynamics, params: FilterParams) -> FloatArray:
-        return filter_frames(frames, centroid.image, dynamics, params, known_flows=centroid.flows).image
+    def fuse(dynamics: FlowDynamics) -> FloatArray:
+        return filter_frames(frames, centroid.image, dynamics, FilterParams(), known_flows=centroid.flows).image
 
-    plain = fuse(flows, FilterParams())
-    by_blur, moved = fuse(flows, FilterParams(frame_noise="blur")), fuse(motion, FilterParams())
-    images = dict(zip(VARIANTS, (plain, by_blur, moved, plain), strict=True))
+    plain = fuse(flows)
+    images = dict(zip(VARIANTS, (plain, fuse(motion), plain), strict=True))
     estimate = estimate_blur(plain, exponent=KOLMOGOROV)
     bounds = bound_blur(plain, frames.mean(axis=0), training, len(frames), KOLMOGOROV)
     after, widths = {}, {}
@@ -114,7 +113,7 @@ def print_effects(found: dict[str, Effects]) -> None:
 
 
 def print_displacement(found: dict[str, Effects]) -> None:
-    """Print displacement variance by the cue and by the flows, and what the flow model makes of both."""
+    """Print displacement variance by the cue and by the flows, and the resulting factor of the flow model."""
     columns = ("clip", "true", "flows", "cue", "flows / true", "cue / true", "mean motion factor")
     print(f"\n| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
     for name, effects in found.items():

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from turbrestore.blur_moments.experiments import Experiment
-from turbrestore.blur_moments.experiments import mirror as run_mirror
-from turbrestore.blur_moments.experiments import wavefront as run_wavefront
-from turbrestore.blur_moments.figures import draw_mirror, draw_wavefront, new_figure
-from turbrestore.blur_moments.scenarios import MirrorParams, WavefrontParams
+from turbrestore.blur_moments.experiments.comparison import Experiment
+from turbrestore.blur_moments.experiments.comparison import mirror as run_mirror
+from turbrestore.blur_moments.experiments.comparison import wavefront as run_wavefront
+from turbrestore.blur_moments.experiments.figures import draw_mirror, draw_wavefront, new_figure
+from turbrestore.blur_moments.experiments.scenarios import MirrorParams, WavefrontParams
 from turbrestore.core.errors import require_between
 from turbrestore.io.images import atomic_write, check_output
 

@@ -1,4 +1,4 @@
-"""``turbrestore synthesize``: a turbulent video, and the truth beside it."""
+"""``turbrestore synthesize``: a turbulent video with its truth."""
 
 from __future__ import annotations
 
@@ -26,15 +26,21 @@ from turbrestore.pipeline import Progress, stage_counter
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import DynamicTextureParams, synthesize_like
-from turbrestore.synthesis.exposure import exposed_frame, flows_between
 from turbrestore.synthesis.scenes import SCENES
-from turbrestore.synthesis.sequence import CameraParams, SyntheticFrame, check_scene, record
+from turbrestore.synthesis.sequence import (
+    CameraParams,
+    SyntheticFrame,
+    check_scene,
+    exposed_frame,
+    flows_between,
+    record,
+)
 
 from .options import Flag, limits_of
 from .output import print_json
 from .progress import progress_bars, say
 
-# What is written beside the video, by the end of its name.
+# Endings of the names of the files written beside the video.
 VIDEO, TRUTH, DIFFRACTION, FLOW, PARAMETERS = "", ".truth.png", ".truth_diffraction.png", ".flow.npy", ".json"
 CENTROID = "centroid"
 MOST_FRAMES = 1_000_000
@@ -43,7 +49,7 @@ SIGN = "before blur truth(x, y) = frame(x + dx, y + dy), pixels; mean over the e
 
 @dataclass(frozen=True, eq=False)
 class Synthesis:
-    """What is to be written: the truths, the frames to come, their number, and what they were made with."""
+    """Content of the output: the truths, the frames and their number, and the parameters."""
 
     truth: FloatArray
     diffraction: FloatArray | None
@@ -79,24 +85,24 @@ def synthesize(
     Parameters
     ----------
     scene : str
-        Image file; or a scene that comes along: chart, words, camera, brick, grass, gravel, coins, moon, page,
-        astronaut, cat, coffee, rocket; or ``centroid``, the clean image of the video that ``--like`` names.
+        Image file; or an included scene: chart, words, camera, brick, grass, gravel, coins, moon, page, astronaut,
+        cat, coffee, rocket; or ``centroid``, the clean image of the video that ``--like`` names.
     output : Path
         Video to write: .mkv, .mp4, .ser, .tif or .npy.
     model : {"phase-screen", "dynamic-texture"}
-        Light through layers of turbulence, or motion learned from a clip (of which the path plays no part).
+        Light through layers of turbulence, or motion learned from a clip, on which the path has no effect.
     frames : int
         Number of frames.
     seed : int
-        Of the random numbers; the same seed gives the same bytes.
+        Seed of the random numbers; the same seed gives the same bytes.
     size : str
-        Width and height of a scene that comes along, as ``256x256``, the default.
+        Width and height of an included scene, as ``256x256``, the default.
     strength : {"weak", "medium", "strong"}
         D/r0 of 1.2, 2.5 or 5, in place of ``--d-over-r0``, ``--r0`` or ``--cn2``.
     like : Path
         Video whose motion the dynamic texture continues.
     train : int
-        Frames of it to learn from, from the first on; by default as many as a restoration would take.
+        Number of its first frames to learn from; by default as many as a restoration would use.
     max_pixels : int
         Largest scene, and frame of --like, pixels; by default 67 million.
     overwrite : bool
@@ -137,7 +143,7 @@ def synthesize(
         request = {"scene": scene, "model": model, "like": None if like is None else str(like), "seed": seed}
         facts = _write(outputs, made, camera, request, stage_counter(progress, "synthesize", frames))
     if overwrite and DIFFRACTION not in outputs:
-        # What an earlier run left would not belong to this one.
+        # The file of an earlier run would not belong to this one.
         output.with_name(output.stem + DIFFRACTION).unlink(missing_ok=True)
     if json:
         print_json({**facts, "output": str(output)})
@@ -147,7 +153,7 @@ def synthesize(
 
 
 def _outputs(output: Path, has_diffraction: bool) -> dict[str, Path]:
-    """Files to write, by the end of their names; that of the video is its own."""
+    """Files to write by the endings of their names; that of the video is empty."""
     endings = (TRUTH, *([DIFFRACTION] if has_diffraction else []), FLOW, PARAMETERS)
     return {VIDEO: output, **{ending: output.with_name(output.stem + ending) for ending in endings}}
 
@@ -232,8 +238,8 @@ def _write(
     request: dict[str, Any],
     counter: Callable[[int], None] | None,
 ) -> dict[str, Any]:
-    """Write everything into a hidden folder first, so that a failure leaves nothing; what the JSON file says."""
-    # The flows; how much a codec saves of the frames is not known.
+    """Write everything into a hidden folder first, so that a failure leaves nothing; return the facts."""
+    # Size of the flows; that of the encoded frames is not known beforehand.
     check_space(outputs[VIDEO], 8 * made.count * made.truth.shape[0] * made.truth.shape[1])
     with _hidden_folder(outputs[VIDEO]) as folder:
         staged = {ending: folder / path.name for ending, path in outputs.items()}
@@ -259,7 +265,7 @@ def _write(
 
 @contextmanager
 def _hidden_folder(output: Path) -> Iterator[Path]:
-    """Folder beside an output that is gone afterwards."""
+    """Temporary folder beside an output."""
     try:
         folder = tempfile.TemporaryDirectory(prefix=".synthesis-", dir=output.parent)
     except OSError as error:
@@ -271,7 +277,7 @@ def _hidden_folder(output: Path) -> Iterator[Path]:
 def _write_frames(
     video: Path, flow_file: Path, made: Synthesis, camera: CameraParams, counter: Callable[[int], None] | None
 ) -> list[float]:
-    """Write frames and flows one by one as they are made; root mean square of the flow along x and y."""
+    """Write frames and flows as they are generated; return the root mean square of the flow along x and y."""
     squares = np.zeros(2)
     with flow_file.open("wb") as file:
         shape = (made.count, *made.truth.shape[:2], 2)
@@ -291,6 +297,6 @@ def _write_frames(
 
 
 def _record(camera: CameraParams) -> dict[str, Any]:
-    """Parameters as JSON can hold them: no limit of photons is null."""
+    """Parameters for JSON, in which an infinite number of photons is null."""
     values = dataclasses.asdict(camera)
     return {**values, "photons": values["photons"] if np.isfinite(values["photons"]) else None}

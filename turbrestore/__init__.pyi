@@ -57,8 +57,8 @@ from .synthesis.atmosphere import PhaseScreenParams as PhaseScreenParams
 from .synthesis.dynamic_texture import DynamicTexture as DynamicTexture
 from .synthesis.dynamic_texture import DynamicTextureParams as DynamicTextureParams
 from .synthesis.dynamic_texture import synthesize_like as synthesize_like
-from .synthesis.exposure import exposed_frame as exposed_frame
 from .synthesis.sequence import CameraParams as CameraParams
 from .synthesis.sequence import SyntheticFrame as SyntheticFrame
+from .synthesis.sequence import exposed_frame as exposed_frame
 
 __version__: str

@@ -1,9 +1,7 @@
-"""How good is a restoration: against ground truth, and without it.
+"""Quality of a restoration, with and without ground truth.
 
-A restoration knows the scene only up to the mean displacement of its video, and some methods crop.  :func:`align`
-takes both out once, for every figure: the result is located inside the truth by normalised cross-correlation, a
-remaining sub-pixel shift is found by phase correlation, and a border is left out.  For the same reason measured flows
-are known up to a flow that does not change; :func:`compare_flows` says what is left without it.
+A restoration determines the scene only up to the mean displacement of its video, and some methods crop, so
+:func:`align` locates the result inside the truth and leaves out a border before any comparison.
 """
 
 from __future__ import annotations
@@ -19,23 +17,23 @@ from .core.errors import DataError
 from .runtime.scratch import iter_frames
 
 BORDER = 30
-# A margin that the sub-pixel shift may pull in from outside, cut off after it.
+# Margin that may contain values from outside after the sub-pixel shift; it is cut off.
 _GUARD = 6
 _LARGEST_SHIFT = 3.0
-# What is left after the border must hold the 7×7 window of the structural similarity.
+# The interior must contain the 7×7 window of the structural similarity.
 _SMALLEST = 2 * BORDER + 8
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Figures of a result against the truth.
+    """Quality of a result compared with the truth.
 
     Attributes
     ----------
     psnr : float
         Peak signal-to-noise ratio after alignment, dB.
     psnr_fit : float
-        The same after the best gain and offset, dB.
+        The same after a fit of gain and offset, dB.
     ssim : float
         Structural similarity after that fit.
     sharpness : float
@@ -53,7 +51,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Appearance:
-    """Figures of a result where there is no truth.
+    """Quality of a result without a truth.
 
     Attributes
     ----------
@@ -69,16 +67,16 @@ class Appearance:
 
 @dataclass(frozen=True)
 class FlowComparison:
-    """Figures of flows against the true ones, pixels.
+    """Errors of flows compared with the true ones, pixels.
 
     Attributes
     ----------
     endpoint_error : float
         Mean length of the difference.
     endpoint_error_centred : float
-        The same after the mean difference over time is taken out at every pixel; NaN for a single flow.
+        The same after subtraction of the mean difference over time at every pixel; NaN for a single flow.
     true_length : float
-        Mean length of the true flows, to compare with.
+        Mean length of the true flows, for comparison.
     """
 
     endpoint_error: float
@@ -123,12 +121,12 @@ def compare(result: ArrayLike, truth: ArrayLike) -> Comparison:
 
 
 def appearance(result: ArrayLike, reference: ArrayLike) -> Appearance:
-    """Sharpness and overshoot of a result against a frame, or the temporal mean, that shows the same pixels.
+    """Compare a result with a frame, or the temporal mean, of the same pixels.
 
     Parameters
     ----------
     result, reference : array_like, shape (H, W) or (H, W, 3)
-        Same size; they are not aligned.
+        Of the same size; they are not aligned.
 
     Returns
     -------
@@ -156,7 +154,7 @@ def compare_flows(flows: ArrayLike, truth: ArrayLike) -> FlowComparison:
     Parameters
     ----------
     flows, truth : array_like, shape (T, H, W, 2)
-        Pixels; memory maps are read flow by flow.
+        Pixels; memory maps are read one flow at a time.
 
     Returns
     -------
@@ -165,7 +163,7 @@ def compare_flows(flows: ArrayLike, truth: ArrayLike) -> FlowComparison:
     Raises
     ------
     DataError
-        Shapes differ or are none of flows.
+        Shapes differ, or are not those of flows.
 
     Examples
     --------
@@ -179,15 +177,13 @@ def compare_flows(flows: ArrayLike, truth: ArrayLike) -> FlowComparison:
     offset = np.zeros(t.shape[1:])
     for flow, true in zip(a, t, strict=True):
         offset += (flow - true) / np.float64(len(t))
-    pairs = [
-        (_length(flow - true), _length(flow - true - offset), _length(true)) for flow, true in zip(a, t, strict=True)
-    ]
-    plain, centred, true_length = (float(np.mean(column)) for column in zip(*pairs, strict=True))
+    lengths = [[_length(w - true), _length(w - true - offset), _length(true)] for w, true in zip(a, t, strict=True)]
+    plain, centred, true_length = np.mean(lengths, axis=0).tolist()
     return FlowComparison(plain, centred if len(t) > 1 else float("nan"), true_length)
 
 
 def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Cut result and truth to the same interior, after removing crop and global shift.
+    """Align a result with the truth by cross-correlation, to a fraction of a pixel, and crop both to one interior.
 
     Parameters
     ----------
@@ -235,13 +231,13 @@ def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
 
 def comparable(image: FloatArray, name: str) -> FloatArray:
-    """Return ``image`` if it is large enough for :func:`compare`.
+    """Return an image if it is large enough for :func:`compare`.
 
     Parameters
     ----------
     image : ndarray, shape (H, W) or (H, W, 3)
     name : str
-        How the error message calls it.
+        Name of the image in the error message.
 
     Returns
     -------
@@ -325,7 +321,7 @@ def sharpness(image: ArrayLike, reference: ArrayLike) -> float:
 
 
 def overshoot(image: ArrayLike, reference: ArrayLike, tolerance: float = 0.05) -> float:
-    """Share of pixels outside the local range (7×7) of a reference by more than a tolerance: where ringing shows.
+    """Share of pixels that exceed the local range (7×7) of a reference by more than a tolerance, as ringing does.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@
 # # Blur moments: slow sensors of fast motion
 #
 # A camera adds up what it sees during an exposure, so that motion becomes blur. The moments of the blurred image say
-# how the motion went on within the exposure. This example repeats Figures 4 to 7 of two papers: S. Mishra and J. Wen,
+# how the point moved within the exposure. This example repeats Figures 4 to 7 of two papers: S. Mishra and J. Wen,
 # *Extracting Dynamics from Blur* (a wavefront sensor), and J. Tani, S. Mishra and J. Wen, *State Estimation of
 # Fast-Rate Systems using Slow-Rate Image Sensors* (a steered mirror).
 
@@ -22,9 +22,9 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
-from turbrestore.blur_moments.experiments import mirror, wavefront
+from turbrestore.blur_moments.experiments.comparison import mirror, wavefront
+from turbrestore.blur_moments.experiments.scenarios import MirrorParams, mirror_model, record_mirror
 from turbrestore.blur_moments.moments import image_moments
-from turbrestore.blur_moments.scenarios import MirrorParams, mirror_model, record_mirror
 
 plt.style.use("tableau-colorblind10")
 plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "font.size": 9})
@@ -43,7 +43,7 @@ def legend(figure):
 
 
 def table(experiment, names):
-    """Print what observers reach."""
+    """Print the errors of observers."""
     print(f"{experiment.seeds} seeds        mean error   rms error   ratio of means to O1   innovation (1 is right)")
     for name in names:
         score = experiment.scores[name]

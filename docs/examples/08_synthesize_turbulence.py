@@ -19,11 +19,11 @@
 # %%
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy.special import gamma, kv
 
 import turbrestore as tr
 from turbrestore.registration.warp import warp
-from turbrestore.synthesis.atmosphere import structure_function
-from turbrestore.synthesis.phase_screen import draw_screen, sample_path
+from turbrestore.synthesis.phase_screen import draw_screen, sample_lattice
 from turbrestore.synthesis.scenes import picture, resolution_chart
 from turbrestore.synthesis.smooth_flow import distort
 
@@ -51,6 +51,20 @@ WAVELENGTH, R0, OUTER, INNER = 550e-9, 0.05, 5.0, 0.005
 TO_PHASE = 2 * np.pi / WAVELENGTH
 
 
+def path_difference(drawn, x, y):
+    """Evaluate a screen at points (x, y) in metres: its lattice plus its plane waves."""
+    x, y = np.broadcast_arrays(x, y)
+    (lattice,) = sample_lattice(drawn, [drawn.path], x, y)
+    return lattice + (np.exp(-2j * np.pi * (np.stack([x, y], axis=-1) @ drawn.frequencies.T)) @ drawn.waves).real
+
+
+def von_karman(r):
+    """Structure function of the phase for a finite outer scale (Conan 2000)."""
+    x = 2 * np.pi * r / OUTER
+    front = (OUTER / R0) ** (5 / 3) * (24 / 5 * gamma(6 / 5)) ** (5 / 6) * 2 ** (1 / 6) * gamma(11 / 6)
+    return front / np.pi ** (8 / 3) * (gamma(5 / 6) / 2 ** (1 / 6) - x ** (5 / 6) * kv(5 / 6, x))
+
+
 def screen(seed):
     """Draw a screen of 512 points, 1 cm apart."""
     rng = np.random.default_rng(seed)
@@ -63,18 +77,19 @@ for seed in range(12):
     drawn, rng = screen(seed), np.random.default_rng(100 + seed)
     x, y = rng.uniform(0, 50, (2, 60, 1))
     angle = rng.uniform(0, 2 * np.pi, (60, 1))
-    step = sample_path(drawn, x + distances * np.cos(angle), y + distances * np.sin(angle)) - sample_path(drawn, x, y)
-    measured.append(np.mean((TO_PHASE * step) ** 2, axis=0))
+    ends = path_difference(drawn, x + distances * np.cos(angle), y + distances * np.sin(angle))
+    measured.append(np.mean((TO_PHASE * (ends - path_difference(drawn, x, y))) ** 2, axis=0))
 measured = np.array(measured)
 error = measured.std(axis=0, ddof=1) / np.sqrt(len(measured))
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2))
 grid = np.linspace(0, 2, 96)
-shown = left.imshow(TO_PHASE * sample_path(screen(0), *np.meshgrid(grid, grid)), cmap="viridis", extent=(0, 2, 2, 0))
+phase = TO_PHASE * path_difference(screen(0), *np.meshgrid(grid, grid))
+shown = left.imshow(phase, cmap="viridis", extent=(0, 2, 2, 0))
 left.set(title="phase of one screen", xlabel="x, m", ylabel="y, m")
 figure.colorbar(shown, ax=left, label="rad")
 right.errorbar(distances, measured.mean(axis=0), 2 * error, fmt="o", capsize=3, label="12 screens, ± 2 standard errors")
-right.plot(distances, structure_function(distances, R0, OUTER, INNER), "-", label="von Kármán")
+right.plot(distances, von_karman(distances), "-", label="von Kármán")
 right.plot(distances, 6.884 * (distances / R0) ** (5 / 3), ":", label="Kolmogorov, no outer scale")
 right.set(xscale="log", yscale="log", xlabel="distance r, m", ylabel="structure function, rad²")
 _ = right.legend()

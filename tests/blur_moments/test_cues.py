@@ -6,7 +6,7 @@ import pytest
 
 from conftest import SCENES, blurred
 from turbrestore.blur_moments.cues import displacement_variance, relative_blur
-from turbrestore.blur_moments.tiles import tile_map
+from turbrestore.blur_moments.tile_spectra import tile_map
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 

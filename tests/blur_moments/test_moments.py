@@ -1,4 +1,4 @@
-"""Moments and their algebra, against closed forms; errata 1 to 4 of the blur-moments papers."""
+"""Moments and their noise against closed forms; errata 1 to 4 of the blur-moments papers."""
 
 import numpy as np
 import pytest
@@ -6,117 +6,71 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from turbrestore.blur_moments.kernels import PixelGrid, delta_kernel, gaussian_kernel, sampled_kernel
-from turbrestore.blur_moments.moment_algebra import (
-    central_moments,
-    compose_moments,
-    kernel_moments,
-    path_moments,
-    plane_kernel_moments,
-    remove_kernel,
-)
+from turbrestore.blur_moments.lifting import FastSystem, lift
 from turbrestore.blur_moments.moments import (
+    BlurModel,
     basis_change,
     basis_functions,
     image_moments,
+    kernel_relation,
     moment_noise,
-    plane_moments,
-    total_intensity,
+    predicted_moments,
 )
-from turbrestore.blur_moments.sensor import add_noise, expose, expose_plane
+from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid, expose
 from turbrestore.core.errors import ConfigurationError, DataError
 
 V = 0.1
 PIXELS = PixelGrid(-1.0, 1.0, 400)
 POINTS = PixelGrid(-1.0, 1.0, 100, integrating=False)
-COLUMNS, ROWS = PixelGrid(-1.0, 1.0, 80), PixelGrid(-0.9, 0.9, 60)
 paths = st.lists(st.floats(-0.5, 0.5), min_size=1, max_size=12).map(np.array)
 
 
-def discrete_kernel_moments(kernel, order):
-    """Moments of the density by summing over a fine grid."""
-    fine = PixelGrid(-2.0, 2.0, 200001, integrating=False)
-    density = expose([0.0], kernel, fine)
-    return density @ fine.centres[:, None] ** np.arange(order + 1) * fine.width
+def path_moments(path, order):
+    return np.array([np.mean(np.asarray(path) ** p) for p in range(order + 1)])
+
+
+def white_noise(count, rng):
+    """Frames of white noise of density V."""
+    return np.sqrt(V / POINTS.width) * rng.standard_normal((count, POINTS.count))
 
 
 class TestBinomialRelation:
     @given(paths, st.floats(0.02, 0.08), st.floats(-0.1, 0.1))
     @settings(max_examples=30, deadline=None)
     def test_holds_for_raw_moments(self, path, width, offset):
-        kernel = gaussian_kernel(width, offset)
+        kernel = GaussianKernel(width, offset)
         measured = image_moments(expose(path, kernel, PIXELS), PIXELS, 5)
         # Averages over pixels and values at their centres differ by powers of Δ² / 12 beyond the third order.
-        expected = compose_moments(path_moments(path, 5), kernel_moments(kernel, 5, PIXELS))
+        expected = kernel_relation(kernel, PIXELS, 5) @ path_moments(path, 5)
         np.testing.assert_allclose(measured, expected, atol=2e-5)
 
     def test_erratum_1_the_centred_kernel_of_equation_4_loses_the_offset(self):
         path, offset = 0.6 + 0.02 * np.sin(np.linspace(0, 6, 50)), 0.15
-        kernel = gaussian_kernel(0.04, offset)
+        kernel = GaussianKernel(0.04, offset)
         measured = image_moments(expose(path, kernel, PIXELS), PIXELS, 2)
-        raw = compose_moments(path_moments(path, 2), kernel_moments(kernel, 2, PIXELS))
-        printed = compose_moments(path_moments(path, 2), kernel_moments(gaussian_kernel(0.04), 2, PIXELS))
+        raw = kernel_relation(kernel, PIXELS, 2) @ path_moments(path, 2)
+        printed = kernel_relation(GaussianKernel(0.04), PIXELS, 2) @ path_moments(path, 2)
         np.testing.assert_allclose(measured, raw, atol=1e-5)
         assert measured[1] - printed[1] == pytest.approx(0.15, abs=1e-6)
         assert abs(measured[2] - printed[2]) > 0.1
 
-    @given(paths)
-    @settings(max_examples=30, deadline=None)
-    def test_kernel_is_removed_again(self, path):
-        kernel = kernel_moments(gaussian_kernel(0.3, 0.2), 6)
-        of_image = compose_moments(path_moments(path, 6), kernel)
-        np.testing.assert_allclose(remove_kernel(of_image, kernel), path_moments(path, 6), atol=1e-9)
-
-    def test_kernel_is_removed_in_the_plane(self):
-        path = np.random.default_rng(0).uniform(-0.5, 0.5, (3, 7, 2))
-        kernel = plane_kernel_moments(gaussian_kernel([[0.02, 0.01], [0.01, 0.03]], [0.1, -0.2]), 2)
-        of_path = path_moments(path, 2, dimensions=2)
-        of_image = compose_moments(of_path, kernel, dimensions=2)
-        np.testing.assert_allclose(remove_kernel(of_image, kernel, dimensions=2), of_path, atol=1e-12)
-
-    @pytest.mark.parametrize(
-        "kernel",
-        [
-            gaussian_kernel([0.05, 0.07], [0.02, -0.04]),
-            gaussian_kernel([[0.004, 0.002], [0.002, 0.005]], [0.05, 0.03]),
-            sampled_kernel([[1, 2, 1], [0, 3, 1]], [COLUMNS.width, ROWS.width], [-0.05, -0.02]),
-        ],
-    )
-    def test_covariances_add_in_the_plane(self, kernel):
-        t = np.linspace(0, 1, 200)
-        path = np.stack([0.4 * np.sin(3 * t), 0.3 * t**2 - 0.1], -1)
-        image = expose_plane(path, kernel, COLUMNS, ROWS)
-        measured = central_moments(plane_moments(image, COLUMNS, ROWS, 2), dimensions=2)
-        of_kernel = central_moments(plane_kernel_moments(kernel, 2, COLUMNS, ROWS), dimensions=2)
-        of_path = np.cov(path.T, bias=True)
-        for p, q, i, j in ((2, 0, 0, 0), (0, 2, 1, 1), (1, 1, 0, 1)):
-            assert measured[p, q] == pytest.approx(of_kernel[p, q] + of_path[i, j], abs=2e-5)
-
-    def test_all_moments_of_the_plane(self):
-        kernel = gaussian_kernel([[0.004, 0.002], [0.002, 0.005]], [0.05, 0.03])
-        path = np.random.default_rng(1).uniform(-0.4, 0.4, (20, 2))
-        measured = plane_moments(expose_plane(path, kernel, COLUMNS, ROWS), COLUMNS, ROWS, 2)
-        of_kernel = plane_kernel_moments(kernel, 2, COLUMNS, ROWS)
-        np.testing.assert_allclose(measured, compose_moments(path_moments(path, 2, 2), of_kernel, 2), atol=1e-4)
-
-
-class TestKernelMoments:
-    @pytest.mark.parametrize("kernel", [gaussian_kernel(0.1, 0.2), sampled_kernel([1, 0, 2, 1], 0.1, -0.1)])
-    def test_against_sums_over_a_fine_grid(self, kernel):
-        np.testing.assert_allclose(kernel_moments(kernel, 6), discrete_kernel_moments(kernel, 6), atol=1e-7)
+    def test_moments_of_the_kernel_against_sums_over_a_fine_grid(self):
+        kernel, fine = GaussianKernel(0.1, 0.2), PixelGrid(-2.0, 2.0, 200001, integrating=False)
+        summed = expose([0.0], kernel, fine) @ fine.centres[:, None] ** np.arange(7) * fine.width
+        np.testing.assert_allclose(kernel_relation(kernel, POINTS, 6)[:, 0], summed, atol=1e-7)
 
     def test_erratum_4_kernel_and_pixel_width_are_in_the_second_moment(self):
         wide = PixelGrid(-1.0, 1.0, 25)
         path = 0.3 * np.sin(np.linspace(0, 6, 400))
-        measured = image_moments(expose(path, gaussian_kernel(0.05), wide), wide, 2)[2]
+        measured = image_moments(expose(path, GaussianKernel(0.05), wide), wide, 2)[2]
         without, with_kernel = np.mean(path**2), np.mean(path**2) + 0.05**2
         assert measured - without == pytest.approx(0.05**2 + 0.08**2 / 12, rel=0.02)
         assert measured - with_kernel == pytest.approx(0.08**2 / 12, rel=0.1)
-        corrected = compose_moments(path_moments(path, 2), kernel_moments(gaussian_kernel(0.05), 2, wide))
+        corrected = kernel_relation(GaussianKernel(0.05), wide, 2) @ path_moments(path, 2)
         assert measured == pytest.approx(corrected[2], abs=0.02 * 0.08**2)
 
     def test_erratum_4_the_border_cuts_moments(self):
-        image = expose([0.9], gaussian_kernel(0.05), PIXELS)
+        image = expose([0.9], GaussianKernel(0.05), PIXELS)
         first = image_moments(image, PIXELS, 1)[1]
         assert first - 0.9 == pytest.approx(-0.023, abs=5e-4)
         # What the cut Gaussian leaves, in closed form.
@@ -124,21 +78,8 @@ class TestKernelMoments:
         assert first == pytest.approx(0.9 * inside - 0.05 * norm.pdf(2.0), abs=1e-4)
 
     def test_integrating_pixels_widen_a_delta(self):
-        np.testing.assert_allclose(kernel_moments(delta_kernel(), 4, PixelGrid(0, 1, 1)), [1, 0, 1 / 12, 0, 1 / 80])
-
-    def test_tilted_gaussian_against_quadrature(self):
-        mean, cov = np.array([0.7, -0.4]), np.array([[0.5, 0.3], [0.3, 0.4]])
-        z, weight = np.polynomial.hermite_e.hermegauss(8)
-        grid = np.stack(np.meshgrid(z, z), -1).reshape(-1, 2) @ np.linalg.cholesky(cov).T + mean
-        weights = np.outer(weight, weight).ravel() / (2 * np.pi)
-        found = plane_kernel_moments(gaussian_kernel(cov, mean), 2)
-        for p in range(3):
-            for q in range(3):
-                assert found[p, q] == pytest.approx(weights @ (grid[:, 0] ** p * grid[:, 1] ** q))
-
-    def test_tilted_gaussians_have_two_orders(self):
-        with pytest.raises(ConfigurationError, match="at most 2"):
-            plane_kernel_moments(gaussian_kernel([[1.0, 0.5], [0.5, 1.0]]), 3)
+        moments = kernel_relation(GaussianKernel(0.0), PixelGrid(0, 1, 1), 4)[:, 0]
+        np.testing.assert_allclose(moments, [1, 0, 1 / 12, 0, 1 / 80])
 
 
 class TestNoise:
@@ -149,7 +90,7 @@ class TestNoise:
         assert abs(cov[2, 2] - 3 * V) > 0.25
 
     def test_erratum_2_of_measured_moments(self):
-        noise = add_noise(np.zeros((40000, 100)), POINTS.width, np.random.default_rng(0), V)
+        noise = white_noise(40000, np.random.default_rng(0))
         sampled = np.cov(image_moments(noise, POINTS, 2).T)
         # The largest entry, 2 V, is known to 1.4 %.
         np.testing.assert_allclose(sampled, moment_noise(POINTS, 2, V), atol=0.005)
@@ -163,8 +104,8 @@ class TestNoise:
 
     def test_erratum_3_dividing_by_the_measured_total_is_harmful(self):
         rng = np.random.default_rng(1)
-        image = expose([0.3], gaussian_kernel(0.05), POINTS)
-        frames = add_noise(np.tile(image, (20000, 1)), POINTS.width, rng, V)
+        image = expose([0.3], GaussianKernel(0.05), POINTS)
+        frames = image + white_noise(20000, rng)
         totals = frames.sum(1) * POINTS.width
         # Φ(−1 / √(2 V)) = 1.27 %, known here to 0.08 %.
         assert np.mean(totals <= 0) == pytest.approx(norm.cdf(-1 / np.sqrt(2 * V)), abs=0.003)
@@ -172,19 +113,6 @@ class TestNoise:
         ratio = known / totals
         assert known.std() == pytest.approx(np.sqrt(2 * V / 3), rel=0.03)
         assert ratio.std() > 5 * known.std()
-        with pytest.raises(DataError, match="frames without light"):
-            image_moments(frames, POINTS, 1, total=None)
-
-    def test_shot_noise(self):
-        rng = np.random.default_rng(2)
-        image = expose([0.3, -0.2], gaussian_kernel(0.1), POINTS)
-        frames = add_noise(np.tile(image, (40000, 1)), POINTS.width, rng, 0.0, photons=500.0)
-        sampled = np.cov(image_moments(frames, POINTS, 2).T)
-        np.testing.assert_allclose(sampled, moment_noise(POINTS, 2, 0.0, image=image, photons=500.0), atol=6e-5)
-
-    def test_shot_noise_needs_the_image(self):
-        with pytest.raises(ConfigurationError, match="photons"):
-            moment_noise(POINTS, 2, 0.0, photons=500.0)
 
 
 class TestBasis:
@@ -195,7 +123,7 @@ class TestBasis:
         np.testing.assert_allclose(gram - np.diag(np.diag(gram)), 0, atol=1e-6)
 
     def test_both_bases_hold_the_same_information(self):
-        image = expose([0.2, 0.4], gaussian_kernel(0.1), PIXELS)
+        image = expose([0.2, 0.4], GaussianKernel(0.1), PIXELS)
         change = basis_change(PIXELS, 4, "legendre")
         np.testing.assert_allclose(
             image_moments(image, PIXELS, 4, "legendre"), change @ image_moments(image, PIXELS, 4)
@@ -209,62 +137,30 @@ class TestBasis:
             image_moments(np.ones(400), PIXELS, 2, "fourier")
 
 
-class TestIntensity:
-    def test_background_and_measured_total(self):
-        image = 7.0 * expose([0.25], gaussian_kernel(0.05), PIXELS) + 0.3
-        moments = image_moments(image, PIXELS, 2, total=None, background=0.3)
-        np.testing.assert_allclose(moments, [1.0, 0.25, 0.0625 + 0.0025], atol=1e-5)
-
-    def test_known_total(self):
-        image = 0.2 * expose([0.25], gaussian_kernel(0.05), PIXELS)
-        np.testing.assert_allclose(image_moments(image, PIXELS, 1, total=0.2), [1.0, 0.25], atol=1e-6)
-
-    def test_robust_total_of_several_frames(self):
-        rng = np.random.default_rng(4)
-        frames = add_noise(np.tile(expose([0.0], gaussian_kernel(0.1), POINTS), (400, 1)), POINTS.width, rng, V)
-        frames[:20] += 5.0
-        total, error = total_intensity(frames, POINTS.width)
-        assert error == pytest.approx(np.sqrt(np.pi / 2 * 2 * V / 400), rel=0.2)
-        assert abs(total - 1.0) < 4 * error
-        assert np.isnan(total_intensity(frames[:1], POINTS.width)[1])
-
-    def test_frames_without_light(self):
-        for call in (
-            lambda: image_moments(np.zeros(400), PIXELS, 1, total=None),
-            lambda: plane_moments(np.zeros((60, 80)), COLUMNS, ROWS, 1, total=None),
-            lambda: central_moments([0.0, 1.0, 1.0]),
-            lambda: total_intensity(np.zeros((3, 400)), 0.1),
-        ):
-            with pytest.raises(
-                DataError, match="^frame: expected a total intensity above 0, found [^\n]* without light"
-            ):
-                call()
-
-    @pytest.mark.parametrize(
-        ("call", "error", "named"),
-        [
-            (lambda: image_moments(np.ones(399), PIXELS, 1), DataError, "image"),
-            (lambda: image_moments(np.full(400, np.nan), PIXELS, 1), DataError, "image"),
-            (lambda: plane_moments(np.ones((80, 60)), COLUMNS, ROWS, 1), DataError, "image"),
-            (lambda: image_moments(np.ones(400), PIXELS, -1), ConfigurationError, "order"),
-            (lambda: image_moments(np.ones(400), PIXELS, 1, total=0.0), ConfigurationError, "total"),
-            (lambda: path_moments([], 2), DataError, "path"),
-            (lambda: compose_moments([1.0, 0.0], [1.0]), DataError, "moments"),
-            (lambda: total_intensity(np.ones(4), 0.1), DataError, "frames"),
-            (lambda: moment_noise(PIXELS, 1, -1.0), ConfigurationError, "density"),
-        ],
-    )
-    def test_bad_input_is_named_in_one_line(self, call, error, named):
-        with pytest.raises(error, match=f"^{named}: [^\n]*$"):
-            call()
+class TestPredicted:
+    def test_path_without_an_input_gives_the_moments_of_its_image(self):
+        motion = lift(FastSystem([[0.9]], [0.0], [1.0]), ExposureTiming(1.0, 6.0, 1.0, 7.0), [[0.1]])
+        model = BlurModel(motion, LineSensor(GaussianKernel(0.05), PIXELS, noise=0.1, total=0.2))
+        path, _ = motion.path_and_jacobian(np.array([0.4]), np.zeros(7))
+        image = expose(path, model.sensor.kernel, PIXELS, 0.2)
+        for basis in ("monomial", "legendre"):
+            h, _, R = predicted_moments(model, np.array([0.4]), np.zeros(7), (1, 3), basis)
+            np.testing.assert_allclose(h, image_moments(image, PIXELS, 3, basis, total=0.2)[[1, 3]], atol=1e-5)
+            noise = moment_noise(PIXELS, 3, 0.1, basis)[np.ix_([1, 3], [1, 3])]
+            np.testing.assert_allclose(R, noise / 0.2**2)
 
 
-class TestCentral:
-    @given(paths)
-    @settings(max_examples=30, deadline=None)
-    def test_of_a_path(self, path):
-        central = central_moments(path_moments(path, 4))
-        np.testing.assert_allclose(central, [np.mean((path - path.mean()) ** p) for p in range(5)], atol=1e-9)
-
-    def test_divides_by_order_0(self):
-        np.testing.assert_allclose(central_moments(3.0 * path_moments([0.0, 2.0], 2)), [1.0, 0.0, 1.0])
+@pytest.mark.parametrize(
+    ("call", "error", "named"),
+    [
+        (lambda: image_moments(np.ones(399), PIXELS, 1), DataError, "image"),
+        (lambda: image_moments(np.full(400, np.nan), PIXELS, 1), DataError, "image"),
+        (lambda: image_moments(np.ones(400), PIXELS, -1), ConfigurationError, "order"),
+        (lambda: image_moments(np.ones(400), PIXELS, 1, total=0.0), ConfigurationError, "total"),
+        (lambda: kernel_relation(GaussianKernel(0.1), PIXELS, -1), ConfigurationError, "order"),
+        (lambda: moment_noise(PIXELS, 1, -1.0), ConfigurationError, "density"),
+    ],
+)
+def test_bad_input_is_named_in_one_line(call, error, named):
+    with pytest.raises(error, match=f"^{named}: [^\n]*$"):
+        call()

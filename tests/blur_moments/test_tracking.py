@@ -4,12 +4,19 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from turbrestore.blur_moments.kernels import PixelGrid, gaussian_kernel
-from turbrestore.blur_moments.lifted import FastSystem, lift
-from turbrestore.blur_moments.observers import BlurModel, MomentFilter, predicted_moments, run_observer
-from turbrestore.blur_moments.plane_filter import PlaneModel, PlaneMomentFilter, PlaneSensor
-from turbrestore.blur_moments.sensor import ExposureTiming, LineSensor, expose_plane
-from turbrestore.blur_moments.target_motion import ConstantVelocity, Oscillation, RandomWalk, lift_motion
+from turbrestore.blur_moments.lifting import FastSystem, lift
+from turbrestore.blur_moments.moments import BlurModel, predicted_moments
+from turbrestore.blur_moments.observers import MomentFilter, run_observer
+from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid
+from turbrestore.blur_moments.targets import (
+    ConstantVelocity,
+    Oscillation,
+    PlaneModel,
+    PlaneMomentFilter,
+    PlaneSensor,
+    RandomWalk,
+    lift_motion,
+)
 from turbrestore.blur_moments.tracking import TrackParams, track_blur
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.filtering.kalman import Gaussian
@@ -20,6 +27,15 @@ FIELD = PixelGrid(-0.5, 63.5, 64)
 TIMING = ExposureTiming(fast_period=1 / STEPS, exposure=0.75, readout=0.0, frame_period=1.0)
 
 
+def expose_plane(path, sigma, columns, rows):
+    """Exposure operator of the plane for a round Gaussian: the image of a path (x, y), shape (..., N_e, 2)."""
+    along_x, along_y = (
+        GaussianKernel(sigma).response(grid.centres - path[..., axis, None], grid)
+        for axis, grid in enumerate((columns, rows))
+    )
+    return np.swapaxes(along_y, -1, -2) @ along_x / path.shape[-2]
+
+
 def times(count):
     """Middles of the fast steps, shape (count, STEPS)."""
     return (np.arange(count * STEPS) + 0.5).reshape(count, STEPS) / STEPS
@@ -27,7 +43,7 @@ def times(count):
 
 def film(path, rng, exposed=STEPS, noise=NOISE):
     """Frames of a target on an even background."""
-    frames = LIGHT * expose_plane(path[:, :exposed], gaussian_kernel([SIGMA, SIGMA]), FIELD, FIELD)
+    frames = LIGHT * expose_plane(path[:, :exposed], SIGMA, FIELD, FIELD)
     return 0.1 + frames + rng.normal(0, noise, frames.shape)
 
 
@@ -41,16 +57,15 @@ def plane_model(noise=0.01, size=(24, 20)):
     fast = FastSystem([[1.0, h], [0.0, 0.98]], [0.0, 0.0], [1.0, h / 2])
     motion = lift(fast, TIMING, np.diag([1e-4, 1e-3]))
     columns, rows = (PixelGrid(-n / 2, n / 2, n) for n in size)
-    return PlaneModel(motion, motion, PlaneSensor(gaussian_kernel([1.0, 1.3]), columns, rows, noise, total=2.0))
+    return PlaneModel(motion, PlaneSensor(1.2, columns, rows, noise, total=2.0))
 
 
 def line_models(model):
     """What the sums over rows and over columns show: the noise of a sum over n pixels has n times the density."""
     sensor = model.sensor
-    for axis, (grid, other) in enumerate([(sensor.columns, sensor.rows), (sensor.rows, sensor.columns)]):
-        kernel = gaussian_kernel(float(np.sqrt(sensor.kernel.cov[axis, axis])))
-        line = LineSensor(kernel, grid, sensor.noise * other.count * other.width, sensor.total)
-        yield BlurModel(model.along_x, line)
+    for grid, other in ((sensor.columns, sensor.rows), (sensor.rows, sensor.columns)):
+        line = LineSensor(GaussianKernel(sensor.sigma), grid, sensor.noise * other.count * other.width, sensor.total)
+        yield BlurModel(model.axis, line)
 
 
 def test_separable_motion_in_the_plane_equals_two_runs_on_lines():
@@ -59,7 +74,10 @@ def test_separable_motion_in_the_plane_equals_two_runs_on_lines():
     cov = np.diag([1.0, 4.0])
     start = Gaussian(np.array([0.5, 1.0, -1.0, 0.3]), np.kron(np.eye(2), cov))
     inputs = np.zeros((5, STEPS))
-    plane = run_observer(PlaneMomentFilter(order=1), model, start, frames, inputs)
+    plane, state = [], start
+    for frame in frames:
+        plane.append(PlaneMomentFilter(order=1).step(model, state, frame))
+        state = model.advance(plane[-1][0])
     for axis, line in enumerate(line_models(model)):
         part = slice(2 * axis, 2 * axis + 2)
         sums = frames.sum(axis=1 + axis)
@@ -102,7 +120,7 @@ def test_moments_of_a_rendered_frame_are_predicted():
     model, observer = plane_model(noise=1e-6), PlaneMomentFilter()
     state = Gaussian(np.array([0.5, 2.0, -1.0, 1.0]), np.zeros((4, 4)))
     path = np.einsum("san,n->sa", model.outputs(TIMING.exposure_steps), state.mean)
-    frame = 2.0 * expose_plane(path, model.sensor.kernel, model.sensor.columns, model.sensor.rows)
+    frame = 2.0 * expose_plane(path, 1.2, model.sensor.columns, model.sensor.rows)
     _, innovation = observer.step(model, state, frame)
     assert innovation.values == pytest.approx(np.zeros(5), abs=1e-4)
 
@@ -278,8 +296,8 @@ def test_bad_input_is_named():
         (lambda: TrackParams(RandomWalk(1.0), 1.0, basis="cosine"), "basis"),
         (lambda: TrackParams(RandomWalk(1.0), 1.0, exposure=0.51), "exposure"),
         (lambda: PlaneMomentFilter(order=0), "order"),
-        (lambda: PlaneSensor(gaussian_kernel([1.0, 1.0]), FIELD, FIELD, noise=0.0), "noise"),
-        (lambda: PlaneSensor(gaussian_kernel(1.0), FIELD, FIELD, noise=0.1), "kernel"),
+        (lambda: PlaneSensor(1.0, FIELD, FIELD, noise=0.0), "noise"),
+        (lambda: PlaneSensor(1.0, FIELD, FIELD, noise=0.1, total=0.0), "total"),
     ],
 )
 def test_settings_are_checked(make, named):

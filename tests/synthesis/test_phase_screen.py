@@ -7,15 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from atmosphere_theory import (
+    sample_path,
+    structure_function,
+    tilt_covariance,
+)
 
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.synthesis.atmosphere import PhaseScreenParams, structure_function, tilt_covariance
+from turbrestore.synthesis.atmosphere import PhaseScreenParams
 from turbrestore.synthesis.phase_screen import (
     Turbulence,
     draw_screen,
     draw_turbulence,
     sample_lattice,
-    sample_path,
     tilt_flow,
 )
 

@@ -79,6 +79,6 @@ def test_bad_parameters_are_refused():
     for none in ([], [" "]):
         with pytest.raises(ConfigurationError, match="^words: expected at least one"):
             printed_words(64, 64, none)
-    with pytest.raises(ConfigurationError, match="^words: expected what fits on 64×64 pixels, found 500"):
+    with pytest.raises(ConfigurationError, match="^words: expected words that fit on 64×64 pixels, found 500"):
         printed_words(64, 64, ["haze"] * 500)
     assert set(PICTURES) < set(SCENES)

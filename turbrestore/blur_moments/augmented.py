@@ -1,17 +1,17 @@
 """An oscillator whose gain, frequency and damping are estimated along with its state.
 
-Paper 2 finds that the error of the model dominates: its plant is known to ±7 dB only.  With the plant's numbers in the
-state, the same observers correct them as well, since they shape the blur.
+Paper 2 finds that the error of the model dominates: its plant is known to ±7 dB only.  With the parameters of the plant
+in the state, the same observers correct them as well, because they shape the blur.
 
 Symbols
 -------
 y, ẏ : output and its rate; the first two states.
-g, ω, ζ : gain at rest, natural frequency in rad/s, damping ratio of ``ÿ + 2ζω ẏ + ω² y = g ω² u``; the last three
-    states are the logarithms of their ratios to the nominal values, so that they stay positive.
-σ, v : decay ζω and squared turning rate ω² − σ², negative for strong damping.
-c, s : the two damped waves that all responses are made of, :func:`_damped_waves`.
+g, ω, ζ : gain at rest, natural frequency in rad/s and damping ratio of ``ÿ + 2ζω ẏ + ω² y = g ω² u``.  The last three
+    states are the logarithms of their ratios to the nominal values, which keeps the parameters positive.
+σ, v : decay rate ζω and ω² − σ², the squared frequency of the damped oscillation, negative for strong damping.
+c, s : the two damped waves of which all responses consist, :func:`_damped_waves`.
 
-With ``x₂ = y`` and ``x₁ = ẏ + 2ζω y`` this is the system that paper 2 prints (ω = 34 rad/s, ζ = 0.2, g = 1).
+With ``x₂ = y`` and ``x₁ = ẏ + 2ζω y`` this is the system printed in paper 2 (ω = 34 rad/s, ζ = 0.2, g = 1).
 """
 
 from __future__ import annotations
@@ -20,13 +20,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.fft import irfft, next_fast_len, rfft
 
 from ..core.errors import require
 from ..filtering.kalman import Gaussian
-from .kernels import Float64Array
-from .sensor import ExposureTiming
+from .sensor import ExposureTiming, Float64Array
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ class Oscillator:
 
 @dataclass(frozen=True, eq=False)
 class OscillatorMotion:
-    """Motion with the state (y, ẏ, ln g/g₀, ln ω/ω₀, ln ζ/ζ₀), for the observers of this package.
+    """Motion with the state (y, ẏ, ln g/g₀, ln ω/ω₀, ln ζ/ζ₀), a :class:`.lifting.Motion`.
 
     Parameters
     ----------
@@ -73,7 +71,7 @@ class OscillatorMotion:
         g₀, ω₀ and ζ₀.
     timing : ExposureTiming
     Q : ndarray, float64, shape (5, 5)
-        Covariance of the disturbance between two exposures; that of the last three says how fast the plant changes.
+        Covariance of the disturbance between two exposures; its last three variances allow the plant to change.
 
     Raises
     ------
@@ -100,20 +98,6 @@ class OscillatorMotion:
         """Number n of states."""
         return 5
 
-    def path(self, mean: Float64Array, inputs: Float64Array) -> Float64Array:
-        """Output at the fast steps of the exposure.
-
-        Parameters
-        ----------
-        mean : ndarray, float64, shape (..., 5)
-        inputs : ndarray, float64, shape (..., N)
-
-        Returns
-        -------
-        ndarray, float64, shape (..., N_e)
-        """
-        return self._outputs(mean, inputs, self.timing.exposure_steps)[0]
-
     def path_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Output at the fast steps of the exposure, and its derivative with respect to the state.
 
@@ -130,7 +114,7 @@ class OscillatorMotion:
         return self._outputs(mean, inputs, self.timing.exposure_steps)
 
     def advance(self, state: Gaussian, inputs: Float64Array) -> Gaussian:
-        """From the start of an exposure to the start of the next, linearised at the mean.
+        """Predict the state at the start of the next exposure, linearised at the mean.
 
         Parameters
         ----------
@@ -185,14 +169,14 @@ class OscillatorMotion:
 
     def _responses(self, mean: Float64Array, steps: int) -> _Responses:
         """Responses at the times 0, T_f, …, steps · T_f."""
-        # Factors beyond e⁴ are no plant any more but a search that has gone astray; they must not overflow.
+        # Factors beyond e⁴ occur only in a search that diverges; clipping keeps them from overflowing.
         ratios = np.exp(np.clip(mean[..., 2:, None], -4.0, 4.0))
         g = self.nominal.gain * ratios[..., 0, :]
         omega = self.nominal.frequency * ratios[..., 1, :]
         sigma = self.nominal.damping * ratios[..., 2, :] * omega
         t = self.timing.fast_period * np.arange(steps + 1, dtype=np.float64)
         v = omega**2 - sigma**2
-        # c and s have no pole at critical damping, their formulas have.
+        # The formulas of c and s are singular at critical damping, although c and s are not.
         v = np.where(np.abs(v) < 1e-6 * omega**2, 1e-6 * omega**2, v)
         c, s = _damped_waves(sigma, v, t)
         by_omega = -v * t * s - sigma * t * c, t * c - s - sigma * t * s
@@ -211,11 +195,11 @@ class OscillatorMotion:
 
 
 class _Responses(NamedTuple):
-    """What happens after the times 0 … steps · T_f, shapes (..., 5, steps + 1) and (..., 3, steps + 1).
+    """Responses at the times 0 … steps · T_f, shapes (..., 5, steps + 1) and (..., 3, steps + 1).
 
     ``y`` and ``rate`` hold the derivatives of the free output and of its rate with respect to the five states.
-    ``step`` and ``step_rate`` hold the output and its rate after a unit step of the input, which are their own
-    derivatives with respect to ln g, and their derivatives with respect to ln ω and ln ζ.
+    ``step`` and ``step_rate`` hold the output and its rate after a unit step of the input, which equal their own
+    derivatives with respect to ln g, followed by their derivatives with respect to ln ω and ln ζ.
     """
 
     y: Float64Array
@@ -225,7 +209,7 @@ class _Responses(NamedTuple):
 
 
 def _damped_waves(sigma: Float64Array, v: Float64Array, t: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """``e^(−σt) cos(√v t)`` and ``e^(−σt) sin(√v t) / √v``; for v < 0 the same with cosh and sinh."""
+    """``e^(−σt) cos(√v t)`` and ``e^(−σt) sin(√v t) / √v``; for v < 0 with cosh and sinh."""
     root = np.sqrt(np.abs(v))
     decay = np.exp(-sigma * t)
     c, s = decay * np.cos(root * t), decay * np.sin(root * t) / root
@@ -236,40 +220,8 @@ def _damped_waves(sigma: Float64Array, v: Float64Array, t: Float64Array) -> tupl
     return c, s
 
 
-def largest_deviation(plant: ArrayLike, frequencies: ArrayLike, nominal: Oscillator) -> Float64Array:
-    """How far the frequency response of plants is from the nominal one, in dB.
-
-    Parameters
-    ----------
-    plant : array_like, shape (..., 3)
-        ln g/g₀, ln ω/ω₀, ln ζ/ζ₀.
-    frequencies : array_like, shape (F,)
-        rad/s.
-    nominal : Oscillator
-
-    Returns
-    -------
-    ndarray, float64, shape (...)
-        Largest absolute value over the frequencies.
-
-    Examples
-    --------
-    >>> float(largest_deviation([np.log(2.0), 0.0, 0.0], [1.0, 34.0], Oscillator(1.0, 34.0, 0.2)).round(2))
-    6.02
-    """
-    logs = np.asarray(plant, np.float64)
-    w = np.asarray(frequencies, np.float64)
-
-    def gains(ratios: Float64Array) -> Float64Array:
-        g, omega, zeta = (np.exp(ratios[..., k, None]) for k in range(3))
-        omega, zeta = nominal.frequency * omega, nominal.damping * zeta
-        return nominal.gain * g * omega**2 / np.abs(omega**2 - w**2 + 2j * zeta * omega * w)
-
-    return np.abs(20 * np.log10(gains(logs) / gains(np.zeros(3)))).max(-1)
-
-
 def _convolve(pulse: Float64Array, inputs: Float64Array) -> Float64Array:
-    """Convolve the inputs, shape (..., steps), with three pulses, (..., 3, steps); an input acts a step later."""
+    """Convolve the inputs, shape (..., steps), with three pulses, (..., 3, steps); an input acts one step later."""
     steps = pulse.shape[-1]
     size = next_fast_len(2 * steps - 1, real=True)
     response = irfft(rfft(pulse, size) * rfft(inputs, size)[..., None, :], size)[..., : steps - 1]

@@ -1,8 +1,8 @@
-"""Cues from blur: how much wider one image is smeared than another, read from spectra without knowing the scene.
+"""Cues from blur: how much wider one image is blurred than another, read from spectra without knowing the scene.
 
 A temporal mean is one long exposure of an integrative sensor (papers 1 and 2), and second moments of blur add:
-``cov(blur of the mean) = cov(blur of a frame) + cov(displacement)``.  Two images of one scene differ at low frequency
-by ``−log(P₁ / P₂) = kᵀ(Σ₁ − Σ₂)k``, whatever the scene is and wherever it has moved to.
+``cov(blur of the mean) = cov(blur of a frame) + cov(displacement)``.  At low frequency the spectra of two images of one
+scene differ by ``−log(P₁ / P₂) = kᵀ(Σ₁ − Σ₂)k``, for any scene and any displacement between them.
 
 Symbols
 -------
@@ -11,7 +11,7 @@ k : frequency, radians per pixel.
 Σ : covariance of a blur (its central second moment), squared pixels.
 D : Σ₁ − Σ₂; q = kᵀDk, the exponent.
 
-The papers observe moments of a known point or edge; the scene here is unknown, and the equations are those of the
+The papers observe moments of a known point or edge.  Here the scene is unknown, and the equations are those of the
 logarithm of the transfer function, whose second derivatives at 0 are the second moments of the blur.
 """
 
@@ -25,13 +25,25 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.arrays import FloatArray, check_frames, check_image, luminance
 from ..core.errors import DataError
 from ..runtime.scratch import iter_frames
-from .exponent_fit import fit_difference
-from .tiles import CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
+from .tile_spectra import (
+    CORRELATED,
+    LARGEST_EXPONENT,
+    LARGEST_STEP,
+    NEWTON_STEPS,
+    CueParams,
+    Float64Array,
+    TileGrid,
+    TileSpectra,
+    fit_weights,
+    noise_floor,
+)
 
-# Directions that are told apart in the spectrum of a tile.
+# Directions that are distinguished in the spectrum of a tile.
 _SECTORS = 6
 # Tiles whose spectra are fitted together.
 _BATCH = 4096
+# An estimate of larger variance, pixels to the fourth, is reported as no estimate.
+_NO_ESTIMATE = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +53,16 @@ class RelativeBlur:
     Attributes
     ----------
     variance, deviation : float
-        Σ₁ − Σ₂ per axis if it is the same in all directions, and its standard deviation, squared pixels. Where it
-        is not, directions count by what is to be seen in them, and ``matrix`` is to be taken.
+        Σ₁ − Σ₂ per axis if it is the same in all directions, and its standard deviation, squared pixels.  If it is
+        not, directions with more structure count more, and ``matrix`` should be used.
     matrix, matrix_deviation : ndarray, float64, shape (2, 2)
         Σ₁ − Σ₂ with axes (x, y), and the standard deviation of each entry, squared pixels.
     tile_variance, tile_deviation : ndarray, float64, shape (m, n)
-        The same for every tile; 0 with an infinite deviation where nothing is to be seen.
+        The same for every tile; 0 with an infinite deviation where the tile has no structure.
     tile_matrix, tile_matrix_deviation : ndarray, float64, shape (m, n, 2, 2)
+        The same for every tile.
     grid : TileGrid
+        Positions of the tiles.
     """
 
     variance: float
@@ -67,13 +81,12 @@ def relative_blur(
 ) -> RelativeBlur:
     """Difference of the second moments of the blurs of two images of one scene.
 
-    ``−log(P₁ / P₂) = kᵀ(Σ₁ − Σ₂)k`` is fitted by weighted least squares to windowed tiles, each and all together.
-    Both sides are multiplied out, ``(P₁ − n₁) e^{q/2} = (P₂ − n₂) e^{−q/2}``, so that noise does not go through the
-    logarithm and the estimate has no bias at low signal. Weights follow from the noise floors, from
-    ``params.misfit`` and, where the exponent q is large, from ``params.departure``: only the low frequencies of a blur
-    are a matter of its second moment. The smear of a spectrum by the window, which makes differences look smaller
-    (5 % for σ = 1 and 1.5 in tiles of 48 pixels), is corrected to first order. The uncertainty comes from the
-    residuals themselves and holds for whatever causes them.
+    ``−log(P₁ / P₂) = kᵀ(Σ₁ − Σ₂)k`` is fitted by weighted least squares to windowed tiles, each tile alone and all
+    together.  The fit compares ``(P₁ − n₁) e^{q/2}`` with ``(P₂ − n₂) e^{−q/2}``, so no logarithm is taken of noise and
+    the estimate has no bias at low signal.  Weights follow from the noise floors, from ``params.misfit`` and, where the
+    exponent q is large, from ``params.departure``, because only the low frequencies of a blur depend on its second
+    moment alone.  The smear of a spectrum by the window, which makes differences look smaller (5 % for σ = 1 and 1.5 in
+    tiles of 48 pixels), is corrected to first order.  The deviations are estimated from the residuals.
 
     Parameters
     ----------
@@ -116,10 +129,10 @@ def displacement_variance(frames: ArrayLike, noise: float, params: CueParams | N
     """Covariance of the displacement over a sequence, from the blur of its temporal mean against its frames.
 
     ``cov(blur of the mean) = cov(blur of a frame) + cov(displacement)``: the spectrum of the mean, P₁, is compared
-    with the mean of the spectra, P₂. Of P₁ a share P₂/T is what independent frames leave however far they move, and
-    is taken off first; the result is the variance about the mean with divisor T − 1. Blur that changes from frame to
-    frame hardly matters; rotation and scaling within a tile do not count. The deviations say how well the spectra
-    fit, not how well T frames stand for others.
+    with the mean of the spectra, P₂.  The mean of T independent frames retains a share P₂/T of the power for any
+    displacement, which is subtracted from P₁; the result is the variance about the mean with divisor T − 1.  Changes of
+    blur from frame to frame have little effect; rotation and scaling within a tile are not measured.  The deviations
+    describe the fit of the spectra, not how well T frames represent others.
 
     Parameters
     ----------
@@ -127,8 +140,8 @@ def displacement_variance(frames: ArrayLike, noise: float, params: CueParams | N
     noise : float
         Standard deviation of the white noise of a frame, intensity.
     params : CueParams, optional
-        By default tiles of 64 pixels and a departure of 1: the displacements of few frames are far from Gaussian, and
-        those of 2 pixels are seen at the lowest frequencies only.
+        By default tiles of 64 pixels and a departure of 1, because the displacements of few frames are far from
+        Gaussian, and those of 2 pixels leave power at the lowest frequencies only.
 
     Returns
     -------
@@ -161,7 +174,7 @@ def displacement_variance(frames: ArrayLike, noise: float, params: CueParams | N
         grey = luminance(frame)
         mean += grey / np.float64(count)
         power = power + spectra.power(grey) / np.float64(count)
-    # This takes the noise of the mean, n²/T, off as well.
+    # This also subtracts the noise of the mean, n²/T.
     coherent = (spectra.power(mean.astype(np.float32)) - power / count) / (1 - 1 / count)
     return _compare(coherent, power, (0.0, noise), spectra, params)
 
@@ -173,7 +186,7 @@ def _compare(
     spectra: TileSpectra,
     params: CueParams,
 ) -> RelativeBlur:
-    """Fit spectra of tiles, shape (tiles, frequencies), one by one and pooled."""
+    """Fit the spectra of tiles, shape (tiles, frequencies), one by one and pooled."""
     floors = (noise_floor(noises[0]), noise_floor(noises[1]))
     averaging, k2, _ = spectra.cells()
     one, two = (power.mean(axis=0, keepdims=True) for power in (first, second))
@@ -181,13 +194,13 @@ def _compare(
     kx, ky = spectra.kx, spectra.ky
     spread = factor @ (averaging.T > 0)
     full = np.stack([kx**2, 2 * kx * ky, ky**2], axis=1) * spread[:, None]
-    round_ = ((kx**2 + ky**2) * spread)[:, None]
-    # Edges in one direction say nothing of blur along them: the signal is to be judged direction by direction.
+    isotropic = ((kx**2 + ky**2) * spread)[:, None]
+    # Edges carry no information about blur along them, so the signal is estimated in each direction separately.
     sectors = spectra.cells(_SECTORS)[0]
     shape = (len(spectra.grid.rows), len(spectra.grid.columns))
-    variance, deviation = fit_difference(one, two, floors, round_, averaging, len(first), params)
-    matrix, matrix_deviation = fit_difference(one, two, floors, full, sectors, len(first), params)
-    tiles, tile_deviation = _fit_tiles(first, second, floors, round_, averaging, params)
+    variance, deviation = _fit_difference(one, two, floors, isotropic, averaging, len(first), params)
+    matrix, matrix_deviation = _fit_difference(one, two, floors, full, sectors, len(first), params)
+    tiles, tile_deviation = _fit_tiles(first, second, floors, isotropic, averaging, params)
     matrices, matrix_deviations = _fit_tiles(first, second, floors, full, sectors, params)
     return RelativeBlur(
         variance=float(variance[0, 0]),
@@ -210,9 +223,9 @@ def _fit_tiles(
     averaging: FloatArray,
     params: CueParams,
 ) -> tuple[Float64Array, Float64Array]:
-    """Fit the spectra of each tile by itself, some thousands at a time: fits take many times what spectra do."""
+    """Fit the spectrum of each tile, some thousands at a time, because fits take many times the memory of spectra."""
     batches = [slice(start, start + _BATCH) for start in range(0, len(first), _BATCH)]
-    fits = [fit_difference(first[some], second[some], floors, design, averaging, 1, params) for some in batches]
+    fits = [_fit_difference(first[some], second[some], floors, design, averaging, 1, params) for some in batches]
     found, deviation = (np.concatenate(parts) for parts in zip(*fits, strict=True))
     return found, deviation
 
@@ -220,3 +233,40 @@ def _fit_tiles(
 def _symmetric(entries: Float64Array) -> Float64Array:
     """(…, 3) as xx, xy, yy to (…, 2, 2)."""
     return entries[..., [[0, 1], [1, 2]]]
+
+
+def _fit_difference(
+    first: NDArray[np.floating],
+    second: NDArray[np.floating],
+    floors: tuple[float, float],
+    design: Float64Array,
+    averaging: FloatArray,
+    tiles: int,
+    params: CueParams,
+) -> tuple[Float64Array, Float64Array]:
+    """Fit D, shape (..., p), to spectra P₁ and P₂, shape (..., f), that are means over ``tiles``; also its deviation.
+
+    ``design``, shape (f, p), holds the squared frequencies, q = design · D.  The signal is taken to be constant within
+    the cells of ``averaging``, shape (f, cells).
+    """
+    one, two = first.astype(np.float64) - floors[0], second.astype(np.float64) - floors[1]
+    D = np.zeros((*first.shape[:-1], design.shape[1]))
+    spread = (averaging.T > 0).astype(np.float64)
+    cell_size = np.maximum(spread.sum(axis=1) / CORRELATED**2, 1.0)
+    for _ in range(NEWTON_STEPS):
+        q = np.clip(D @ design.T, -LARGEST_EXPONENT, LARGEST_EXPONENT)
+        grown, shrunk = one * np.exp(q / 2), two * np.exp(-q / 2)
+        cells = (grown @ averaging, shrunk @ averaging, q @ averaging)
+        weight, signal = (part @ spread for part in fit_weights(cells, floors, tiles, cell_size, params))
+        information = np.einsum("...b,bi,bj->...ij", weight * signal, design, design)
+        information += 1e-9 * np.eye(design.shape[1])
+        pull = weight * (shrunk - grown)
+        step = np.linalg.solve(information, (pull @ design)[..., None])[..., 0]
+        D = D + np.clip(step, -LARGEST_STEP, LARGEST_STEP)
+    scatter = np.einsum("...b,bi,bj->...ij", pull**2, design, design)
+    inverse = np.linalg.inv(information)
+    # The scatter of few values is itself uncertain, and the expected one rests on assumptions: take half of each.
+    cov = CORRELATED**2 * (inverse @ scatter @ inverse + inverse) / 2
+    variances = np.diagonal(cov, axis1=-2, axis2=-1)
+    known = variances < _NO_ESTIMATE
+    return np.where(known, D, 0.0), np.where(known, np.sqrt(variances), np.inf)

@@ -1,8 +1,8 @@
-"""The exposure operator as a table, for estimators that evaluate it thousands of times.
+"""The exposure operator as a table, for observers that evaluate it thousands of times.
 
-The response of all pixels is tabulated over the position y of a still point, linearly interpolated.  A path then
-becomes a histogram over the positions of the table, and its image a few matrix products.  With positions h = σ / 6
-apart the error stays below h² / 8 · max|Ψ''| = 0.0035 of the peak of the kernel.
+The table holds the response of all pixels for closely spaced positions y of a point at rest, with linear interpolation
+between them.  A path becomes a histogram over these positions, and its image a few matrix products.  With positions
+h = σ / 6 apart the error is below h² / 8 · max|Ψ''| = 0.0035 of the peak of the kernel.
 """
 
 from __future__ import annotations
@@ -13,21 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import require
-from .kernels import Float64Array, line_response, line_slope
-from .sensor import LineSensor
+from .sensor import Float64Array, LineSensor
 
-_FINENESS = 6
+_POSITIONS_PER_SIGMA = 6
 # Tails of a Gaussian beyond six σ are below 2e-8 of its peak.
 _REACH = 6
-# Pixels in one matrix product; fewer waste less on positions out of reach, more use the processor better.
+# Pixels in one matrix product: fewer skip more positions out of reach, more use the CPU better.
 _BLOCK = 16
-# Entries beyond which a table takes more memory than it is worth: 160 MB.
+# A larger table would take more than 160 MB.
 _LARGEST = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class ExposureTable:
-    """Responses of the pixels to a point at the positions ``first + step · m``.
+    """Responses of the P pixels to a point at M positions ``first + step · m``, made by :func:`tabulate`.
 
     Parameters
     ----------
@@ -36,15 +35,9 @@ class ExposureTable:
     response : ndarray, float64, shape (M, P)
         Image of a point at each position; the first and last rows are zero.
     slope : ndarray, float64, shape (M, P)
-        Its derivative with respect to the position.
+        Derivative of ``response`` with respect to the position.
     blocks : tuple of (slice, slice)
         Runs of pixels, and the positions from which light reaches them.
-
-    Examples
-    --------
-    >>> from turbrestore.blur_moments.scenarios import mirror_model
-    >>> mirror_model().table.image(np.zeros((3, 100))).shape
-    (3, 80)
     """
 
     first: float
@@ -53,22 +46,8 @@ class ExposureTable:
     slope: Float64Array
     blocks: tuple[tuple[slice, slice], ...]
 
-    def image(self, path: Float64Array) -> Float64Array:
-        """Image that a path leaves.
-
-        Parameters
-        ----------
-        path : ndarray, float64, shape (..., N_e)
-
-        Returns
-        -------
-        ndarray, float64, shape (..., P)
-        """
-        index, share = self._locate(path)
-        return self._seen(self._histogram(index, share, np.ones_like(path)), self.response) / path.shape[-1]
-
     def image_and_jacobian(self, path: Float64Array, jacobian: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Image that a path leaves, and its derivative with respect to the state.
+        """Image of a path, and its derivative with respect to the state.
 
         Parameters
         ----------
@@ -81,35 +60,29 @@ class ExposureTable:
         image : ndarray, float64, shape (..., P)
         derivative : ndarray, float64, shape (..., n, P)
         """
-        index, share = self._locate(path)
-        columns = np.moveaxis(jacobian, -1, -2)
-        weights = np.concatenate([np.ones_like(path)[..., None, :], columns], -2)
-        spread = self._histogram(index[..., None, :], share[..., None, :], weights)
-        image, derivative = self._seen(spread[..., 0, :], self.response), self._seen(spread[..., 1:, :], self.slope)
-        return image / path.shape[-1], derivative / path.shape[-1]
-
-    def _seen(self, spread: Float64Array, responses: Float64Array) -> Float64Array:
-        """Sum of the responses to a histogram, without the pixels that a position does not reach."""
-        tall = spread.reshape(-1, spread.shape[-1])
-        seen = np.empty((len(tall), responses.shape[1]))
-        for pixels, positions in self.blocks:
-            seen[:, pixels] = tall[:, positions] @ responses[positions, pixels]
-        return seen.reshape(*spread.shape[:-1], -1)
-
-    def _locate(self, path: Float64Array) -> tuple[NDArray[np.intp], Float64Array]:
-        # A position beyond the table lands in its first or last row, which holds no light.
+        # A position beyond the table falls into its first or last row, which holds no light.
         place = np.clip((path - self.first) / self.step, 0.0, len(self.response) - 1.0)
         index = place.astype(np.intp)
-        return index, place - index
+        weights = np.concatenate([np.ones_like(path)[..., None, :], np.moveaxis(jacobian, -1, -2)], -2)
+        spread = self._histogram(index[..., None, :], (place - index)[..., None, :], weights) / path.shape[-1]
+        return self._sum(spread[..., 0, :], self.response), self._sum(spread[..., 1:, :], self.slope)
+
+    def _sum(self, spread: Float64Array, responses: Float64Array) -> Float64Array:
+        """Sum responses with the weights of a histogram, skipping positions whose light misses the pixels."""
+        rows = spread.reshape(-1, spread.shape[-1])
+        image = np.empty((len(rows), responses.shape[1]))
+        for pixels, positions in self.blocks:
+            image[:, pixels] = rows[:, positions] @ responses[positions, pixels]
+        return image.reshape(*spread.shape[:-1], -1)
 
     def _histogram(self, index: NDArray[np.intp], share: Float64Array, weight: Float64Array) -> Float64Array:
-        """Weights of a path spread over the two nearest positions of the table, shape (..., M)."""
+        """Distribute the weights of a path over the two nearest positions of the table, shape (..., M)."""
         rows, size = int(np.prod(weight.shape[:-1])), len(self.response)
         offset = size * np.arange(rows).reshape((*weight.shape[:-1], 1))
         flat, upper = (index + offset).ravel(), share * weight
         below = np.bincount(flat, (weight - upper).ravel(), rows * size)
         above = np.bincount(flat, upper.ravel(), rows * size)
-        # Nothing is left to spill from the last position into the next row: its share is zero.
+        # The last position of a row has the share zero, so nothing spills into the next row.
         below[1:] += above[:-1]
         return np.asarray(below, np.float64).reshape(*weight.shape[:-1], size)
 
@@ -120,7 +93,7 @@ def tabulate(sensor: LineSensor) -> ExposureTable:
     Parameters
     ----------
     sensor : LineSensor
-        Its kernel has a width; the image of a delta has no derivative.
+        With a kernel of positive width: the image of an ideal point has no derivative.
 
     Returns
     -------
@@ -129,29 +102,21 @@ def tabulate(sensor: LineSensor) -> ExposureTable:
     Raises
     ------
     ConfigurationError
-        Delta kernel, or one so narrow that its table would not fit in memory.
+        The kernel has no width, or one so small that its table would not fit into memory.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from turbrestore.blur_moments.kernels import PixelGrid, gaussian_kernel
-    >>> table = tabulate(LineSensor(gaussian_kernel(0.1), PixelGrid(-1.0, 1.0, 40), noise=0.1))
-    >>> float(round(table.image(np.zeros(3)).sum() * 0.05, 6))
+    >>> from turbrestore.blur_moments.sensor import GaussianKernel, PixelGrid
+    >>> table = tabulate(LineSensor(GaussianKernel(0.1), PixelGrid(-1.0, 1.0, 40), noise=0.1))
+    >>> image, _ = table.image_and_jacobian(np.zeros(3), np.ones((3, 1)))
+    >>> round(float(image.sum()) * 0.05, 6)
     1.0
     """
     kernel, pixels = sensor.kernel, sensor.pixels
-    if kernel.samples is not None and kernel.spacing is not None:
-        step = kernel.spacing[0] / 2
-        low, high = kernel.offset[0], kernel.offset[0] + kernel.spacing[0] * (len(kernel.samples) - 1)
-        low, high = low - 2 * kernel.spacing[0], high + 2 * kernel.spacing[0]
-    else:
-        sigma = float(np.sqrt(kernel.cov[0, 0]))
-        step = sigma / _FINENESS
-        low, high = kernel.offset[0] - _REACH * sigma, kernel.offset[0] + _REACH * sigma
+    require(kernel.sigma > 0, "kernel: expected one with a width, found a delta, whose image has no derivative")
+    step, reach = kernel.sigma / _POSITIONS_PER_SIGMA, _REACH * kernel.sigma
+    low, high = kernel.offset - reach, kernel.offset + reach
     first = pixels.start - high - pixels.width
-    if step == 0:
-        # The slope names the cause.
-        line_slope(kernel, np.zeros(1), pixels)
     span = (pixels.stop - low + pixels.width - first) / step
     require(
         span * pixels.count <= _LARGEST,
@@ -159,8 +124,8 @@ def tabulate(sensor: LineSensor) -> ExposureTable:
     )
     count = int(np.ceil(span)) + 2
     distance = pixels.centres - (first + step * np.arange(count))[:, None]
-    response = sensor.total * line_response(kernel, distance, pixels)
-    slope = -sensor.total * line_slope(kernel, distance, pixels)
+    response = sensor.total * kernel.response(distance, pixels)
+    slope = -sensor.total * kernel.slope(distance, pixels)
     response[[0, -1]] = slope[[0, -1]] = 0.0
     lit = (distance > low - pixels.width) & (distance < high + pixels.width)
     blocks = []

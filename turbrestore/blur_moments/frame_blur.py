@@ -1,8 +1,8 @@
-"""Blur of every frame of a sequence, tile by tile, relative to the other frames: which of them are lucky, and where.
+"""Blur of every frame of a sequence, tile by tile, relative to the other frames: which frames are sharp, and where.
 
 Symbols
 -------
-P_t, P̄ : power spectra of frame t and of what the frames have in common, squared intensity.
+P_t, P̄ : power spectra of frame t and of the reference, squared intensity.
 k : frequency, radians per pixel.
 s : relative blur variance of a frame, squared pixels: ``log(P_t / P̄) = −s k²``.
 """
@@ -17,18 +17,30 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, check_frames, luminance
 from ..core.errors import DataError
 from ..runtime.scratch import iter_frames
-from .exponent_fit import LARGEST_EXPONENT, PRIOR, fit_relative
-from .tiles import CORRELATED, CueParams, Float64Array, TileGrid, TileSpectra, noise_floor
+from .tile_spectra import (
+    CORRELATED,
+    LARGEST_EXPONENT,
+    LARGEST_STEP,
+    NEWTON_STEPS,
+    CueParams,
+    Float64Array,
+    TileGrid,
+    TileSpectra,
+    fit_weights,
+    noise_floor,
+)
 
 # Relative blur variance of frames in some tiles, its deviation, and its best estimate above the sharpest; (T, tiles).
-_Judged = tuple[Float64Array, Float64Array, Float64Array]
-# Rounds of frames against reference, reference from frames.
+_Estimate = tuple[Float64Array, Float64Array, Float64Array]
+# Prior standard deviation of the relative blur variance of a frame, squared pixels.
+_PRIOR = 2.0
+# Rounds that fit the frames to the reference and the reference to the frames.
 _ROUNDS = 3
-# Rings that fit worse than expected count less, within these limits.
+# Limits of the factor by which rings that fit worse than expected count less.
 _SMALLEST_MISFIT, _LARGEST_MISFIT = 0.3, 100.0
-# Spectra, of all frames in some tiles, that are fitted together; with 16 rings that takes 150 MB.
+# Number of spectra fitted together, all frames of some tiles; with 16 rings the fit takes 150 MB.
 _FITTED = 1 << 16
-# Share of s by which the correction for the window may be wrong.
+# Relative error of the correction for the window.
 _WINDOW_ERROR = 0.05
 
 
@@ -41,11 +53,12 @@ class FrameBlur:
     relative : ndarray, float32, shape (T, m, n)
         s, squared pixels; the mean over the frames is 0.
     deviation : ndarray, float32, shape (T, m, n)
-        Standard deviation of ``relative``; 2 squared pixels, what is assumed beforehand, where nothing is to be seen.
+        Standard deviation of ``relative``; 2 squared pixels, that of the prior, where a tile has no structure.
     extra : ndarray, float32, shape (T, m, n)
-        Best estimate of s above that of the sharpest frame, at least 0: ``relative`` drawn to 0 as far as noise
-        explains it, less its minimum over the frames.
+        Best estimate of s above that of the sharpest frame, at least 0: ``relative`` shrunk towards 0 as far as noise
+        explains it, minus its minimum over the frames.
     grid : TileGrid
+        Positions of the tiles.
     """
 
     relative: FloatArray
@@ -56,21 +69,21 @@ class FrameBlur:
 
 @dataclass(frozen=True, eq=False)
 class BlurReference:
-    """What the frames of a sequence have in common, so that other frames of it can be held against them.
+    """Common spectrum and statistics of the frames of a sequence, with which other frames can be compared.
 
     Attributes
     ----------
     spectrum : ndarray, float64, shape (tiles, rings)
         P̄ above the noise, squared intensity.
     misfit : ndarray, float64, shape (tiles, rings)
-        Factor on the expected squared error of each ring, by which the fit weighs it less.
-    size : ndarray, float64, shape (tiles, rings)
-        Mean squared residual of each ring, in units of what is expected.
+        Factor on the expected squared error of each ring; the fit divides its weight by this.
+    residual : ndarray, float64, shape (tiles, rings)
+        Mean squared residual of each ring, in units of the expected one.
     offset : ndarray, float64, shape (tiles,)
-        Mean of s before it is made 0, squared pixels.
+        Mean of s over the frames before centring, squared pixels.
     spread : ndarray, float64, shape (tiles,)
-        Variance of s over the frames that noise does not explain, pixels to the fourth.
-    least : ndarray, float64, shape (tiles,)
+        Variance of s over the frames beyond that of its error, pixels to the fourth.
+    sharpest : ndarray, float64, shape (tiles,)
         Best estimate of s of the sharpest frame, squared pixels.
     noise : float
         Standard deviation of the white noise of a frame, intensity.
@@ -81,10 +94,10 @@ class BlurReference:
 
     spectrum: Float64Array
     misfit: Float64Array
-    size: Float64Array
+    residual: Float64Array
     offset: Float64Array
     spread: Float64Array
-    least: Float64Array
+    sharpest: Float64Array
     noise: float
     shape: tuple[int, int]
     params: CueParams
@@ -93,16 +106,16 @@ class BlurReference:
 def frame_blur(frames: ArrayLike, noise: float, params: CueParams | None = None) -> FrameBlur:
     """Blur of every frame in every tile, relative to the other frames: ``log(P_t / P̄) = −s_t k²``.
 
-    Spectra are averaged over rings. The reference P̄ starts as the mean over the frames; as a mean of Gaussians of
-    different widths is none, it is then refitted as the spectrum of which the frames are blurred versions. Motion
-    does not change a spectrum, so the frames need not be registered, as long as what a tile shows stays in it; where
-    structure of another kind moves in and out, errors are up to three times the deviation.
+    Spectra are averaged over rings.  The reference P̄ starts as the mean over the frames.  A mean of Gaussians of
+    different widths is not a Gaussian, so P̄ is then refitted as the spectrum of which the frames are blurred versions.
+    A shift does not change a power spectrum, so the frames need not be registered as long as the content of a tile
+    stays in it.  Where other structure moves in and out, errors reach three times the deviation.
 
     Parameters
     ----------
     frames : array_like, shape (T, H, W) or (T, H, W, 3), at least two
     noise : float
-        Standard deviation of the white noise of a frame, intensity. Interpolation smooths noise: for registered
+        Standard deviation of the white noise of a frame, intensity.  Interpolation smooths noise, so for registered
         frames this is an upper bound at high frequency.
     params : CueParams, optional
 
@@ -125,11 +138,13 @@ def frame_blur(frames: ArrayLike, noise: float, params: CueParams | None = None)
     >>> frame_blur(frames, noise=1e-4).extra.ravel().astype(float).round(1).tolist()
     [0.0, 1.0, 0.0]
     """
-    return refer_blur(frames, noise, params)[1]
+    return prepare_blur_reference(frames, noise, params)[1]
 
 
-def refer_blur(frames: ArrayLike, noise: float, params: CueParams | None = None) -> tuple[BlurReference, FrameBlur]:
-    """Blur of every frame, as :func:`frame_blur` gives it, and the reference that other frames are held against.
+def prepare_blur_reference(
+    frames: ArrayLike, noise: float, params: CueParams | None = None
+) -> tuple[BlurReference, FrameBlur]:
+    """Measure the blur of every frame as :func:`frame_blur` does, and prepare a reference for other frames.
 
     Parameters
     ----------
@@ -152,7 +167,7 @@ def refer_blur(frames: ArrayLike, noise: float, params: CueParams | None = None)
 
     Examples
     --------
-    See :func:`blur_against`.
+    See :func:`relative_frame_blur`.
     """
     params = params or CueParams()
     stack = check_frames(frames, at_least=2)
@@ -162,23 +177,27 @@ def refer_blur(frames: ArrayLike, noise: float, params: CueParams | None = None)
     power = _ring_power(stack, spectra, averaging)
     spectrum, misfit = _common_spectrum(power, fit)
     design = fit.design(spectrum)
-    own = [_own_scores(power[:, some], spectrum[some], misfit[some], design, fit) for some in _batches(power)]
-    size, offset, spread, least = (np.concatenate(parts) for parts in zip(*(scores for scores, _ in own), strict=True))
-    reference = BlurReference(spectrum, misfit, size, offset, spread, least, noise, spectra.grid.shape, params)
-    return reference, _frame_blur([found for _, found in own], spectra.grid)
+    found = [
+        _reference_statistics(power[:, some], spectrum[some], misfit[some], design, fit) for some in _batches(power)
+    ]
+    residual, offset, spread, sharpest = (
+        np.concatenate(parts) for parts in zip(*(statistics for statistics, _ in found), strict=True)
+    )
+    reference = BlurReference(spectrum, misfit, residual, offset, spread, sharpest, noise, spectra.grid.shape, params)
+    return reference, _frame_blur([estimate for _, estimate in found], spectra.grid)
 
 
-def blur_against(frames: ArrayLike, reference: BlurReference, noise: float | None = None) -> FrameBlur:
+def relative_frame_blur(frames: ArrayLike, reference: BlurReference, noise: float | None = None) -> FrameBlur:
     """Blur of frames, or of an image fused from them, relative to the frames of a reference.
 
-    Each is judged by itself, so that frames can come one by one.
+    The result for a frame does not depend on the other frames given.
 
     Parameters
     ----------
     frames : array_like, shape (T, H, W) or (T, H, W, 3)
-        Of the same scene.
+        Frames of the same scene.
     reference : BlurReference
-        From :func:`refer_blur`.
+        From :func:`prepare_blur_reference`.
     noise : float, optional
         Standard deviation of the white noise of these frames, intensity; by default that of the reference.
 
@@ -199,9 +218,9 @@ def blur_against(frames: ArrayLike, reference: BlurReference, noise: float | Non
     >>> import cv2, numpy as np
     >>> scene = np.random.default_rng(0).normal(0.5, 0.1, (48, 48)).cumsum(0).cumsum(1).astype(np.float32) % 1
     >>> frames = np.stack([cv2.GaussianBlur(scene, (0, 0), sigma) for sigma in (1.0, 1.414, 1.0)])
-    >>> reference, _ = refer_blur(frames, noise=1e-4)
+    >>> reference, _ = prepare_blur_reference(frames, noise=1e-4)
     >>> soft = cv2.GaussianBlur(scene, (0, 0), 1.225)
-    >>> blur_against(soft[None], reference).extra.ravel().astype(float).round(1).tolist()
+    >>> relative_frame_blur(soft[None], reference).extra.ravel().astype(float).round(1).tolist()
     [0.5]
     """
     stack = check_frames(frames)
@@ -212,19 +231,19 @@ def blur_against(frames: ArrayLike, reference: BlurReference, noise: float | Non
     floor = noise_floor(reference.noise if noise is None else noise)
     fit = _Fit(spectra, k2, counts, floor, reference.params)
     power, design = _ring_power(stack, spectra, averaging), fit.design(reference.spectrum)
-    judged: list[_Judged] = []
+    estimates: list[_Estimate] = []
     for some in _batches(power):
-        s, gathered, _ = _score(power[:, some], reference.spectrum[some], reference.misfit[some], design, fit)
+        s, gathered, _ = _fit_frames(power[:, some], reference.spectrum[some], reference.misfit[some], design, fit)
         s = s - reference.offset[some]
-        deviation = _deviation(s, gathered, reference.size[some])
+        deviation = _deviation(s, gathered, reference.residual[some])
         estimate = _posterior(s, deviation, reference.spread[some])
-        judged.append((s, deviation, np.maximum(estimate - reference.least[some], 0.0)))
-    return _frame_blur(judged, spectra.grid)
+        estimates.append((s, deviation, np.maximum(estimate - reference.sharpest[some], 0.0)))
+    return _frame_blur(estimates, spectra.grid)
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """What spectra are fitted with: k² of the rings, how many independent values each holds, and n."""
+    """Constants of the fits: k² of the rings, the number of independent values in each, and n."""
 
     spectra: TileSpectra
     k2: Float64Array
@@ -233,7 +252,7 @@ class _Fit:
     params: CueParams
 
     def design(self, spectrum: Float64Array) -> Float64Array:
-        """k² as the window shows it in the mean of all tiles, shape (rings,)."""
+        """k² changed by the smear of the window, for the mean of all tiles, shape (rings,)."""
         return self.k2 * self.spectra.widening(2 * [spectrum.mean(axis=0)], self.k2)
 
 
@@ -247,13 +266,13 @@ def _ring_power(frames: FloatArray, spectra: TileSpectra, averaging: FloatArray)
 
 
 def _batches(power: FloatArray) -> list[slice]:
-    """Tiles that are fitted together, for a fit takes 36 times what their power in rings takes."""
+    """Tiles to fit together: a fit takes 36 times the memory of their power in rings."""
     tiles = max(_FITTED // len(power), 1)
     return [slice(start, start + tiles) for start in range(0, power.shape[1], tiles)]
 
 
 def _common_spectrum(power: FloatArray, fit: _Fit) -> tuple[Float64Array, Float64Array]:
-    """Spectrum that the frames are blurred versions of, and misfit of each ring, from power (T, tiles, rings)."""
+    """Spectrum of which the frames are blurred versions, and misfit of each ring, from power (T, tiles, rings)."""
     reference = np.maximum(power.mean(axis=0, dtype=np.float64) - fit.floor, 0.0)
     s, misfit = np.zeros(power.shape[:2]), np.ones(power.shape[1:])
     for _ in range(_ROUNDS - 1):
@@ -267,10 +286,10 @@ def _common_spectrum(power: FloatArray, fit: _Fit) -> tuple[Float64Array, Float6
 def _refit(
     power: FloatArray, reference: Float64Array, misfit: Float64Array, design: Float64Array, s: Float64Array, fit: _Fit
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """One round over some tiles: frames against reference, reference from frames; s, reference and misfit."""
+    """Fit the frames to the reference, then the reference to the frames, in some tiles: s, reference and misfit."""
     signal = power.astype(np.float64) - fit.floor
-    s, _, residual = fit_relative(signal, reference, fit.floor, design, fit.counts, s, misfit, fit.params)
-    # The slope of the logarithm of a spectrum, and with it the smear by the window, depends on s itself.
+    s, _, residual = _fit_relative(signal, reference, design, s, misfit, fit)
+    # The slope of the logarithm of a spectrum, and therefore the smear by the window, depends on s itself.
     s = s + 2 * fit.spectra.smear * s**2
     s -= s.mean(axis=0)
     decay = np.exp(-np.clip(s[..., None] * design, -LARGEST_EXPONENT, LARGEST_EXPONENT))
@@ -278,47 +297,71 @@ def _refit(
     return s, refitted, np.clip(misfit * residual.mean(axis=0), _SMALLEST_MISFIT, _LARGEST_MISFIT)
 
 
-def _own_scores(
+def _reference_statistics(
     power: FloatArray, spectrum: Float64Array, misfit: Float64Array, design: Float64Array, fit: _Fit
-) -> tuple[tuple[Float64Array, Float64Array, Float64Array, Float64Array], _Judged]:
-    """Judge the frames of the reference in some tiles: its size, offset, spread and least, and their blur."""
-    s, gathered, residual = _score(power, spectrum, misfit, design, fit)
-    size, offset = residual.mean(axis=0), s.mean(axis=0)
+) -> tuple[tuple[Float64Array, Float64Array, Float64Array, Float64Array], _Estimate]:
+    """Residual, offset, spread and sharpest of the frames of the reference in some tiles, and their blur."""
+    s, gathered, squared = _fit_frames(power, spectrum, misfit, design, fit)
+    residual, offset = squared.mean(axis=0), s.mean(axis=0)
     s = s - offset
-    deviation = _deviation(s, gathered, size)
+    deviation = _deviation(s, gathered, residual)
     spread = np.maximum((s**2 - deviation**2).mean(axis=0), 0.0)
     estimate = _posterior(s, deviation, spread)
-    least = estimate.min(axis=0)
-    return (size, offset, spread, least), (s, deviation, estimate - least)
+    sharpest = estimate.min(axis=0)
+    return (residual, offset, spread, sharpest), (s, deviation, estimate - sharpest)
 
 
-def _score(
+def _fit_frames(
     power: FloatArray, spectrum: Float64Array, misfit: Float64Array, design: Float64Array, fit: _Fit
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Fit s, shape (T, tiles), to a known spectrum; also information about s and squared residual of every ring."""
+    """Fit s, shape (T, tiles), with a known spectrum; also the information and squared residual of every ring."""
     s, signal = np.zeros(power.shape[:2]), power.astype(np.float64) - fit.floor
     for _ in range(2):
-        s, information, residual = fit_relative(signal, spectrum, fit.floor, design, fit.counts, s, misfit, fit.params)
+        s, information, residual = _fit_relative(signal, spectrum, design, s, misfit, fit)
     gathered = information * design**2
-    leverage = gathered / (gathered.sum(axis=-1, keepdims=True) + 1 / PRIOR**2)
+    leverage = gathered / (gathered.sum(axis=-1, keepdims=True) + 1 / _PRIOR**2)
     return s + 2 * fit.spectra.smear * s**2, gathered, residual / np.maximum(1 - leverage, 0.1)
 
 
-def _deviation(s: Float64Array, gathered: Float64Array, size: Float64Array) -> Float64Array:
-    """Combine what rings say of s, and the mean squared residual of each, to the standard deviation of s."""
-    total = gathered.sum(axis=-1) + 1 / PRIOR**2
-    variance = (CORRELATED * (gathered * np.maximum(size, 1.0)).sum(axis=-1) + 1 / PRIOR**2) / total**2
+def _fit_relative(
+    power: Float64Array,
+    reference: Float64Array,
+    design: Float64Array,
+    s: Float64Array,
+    misfit: Float64Array,
+    fit: _Fit,
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Fit s, shape (T, tiles), of frames to a reference with much less noise; q = s · design.
+
+    Returns s, shrunk towards 0 by the prior, the information about q, and the squared residual in units of the expected
+    one, both of shape (T, tiles, rings).
+    """
+    for _ in range(NEWTON_STEPS // 2):
+        q = np.clip(s[..., None] * design, -LARGEST_EXPONENT, LARGEST_EXPONENT)
+        grown, shrunk = power * np.exp(q / 2), reference * np.exp(-q / 2)
+        weight, signal = fit_weights((grown, shrunk, q), (fit.floor, 0.0), fit.counts, 1.0, fit.params)
+        weight = weight / misfit
+        difference, information = shrunk - grown, weight * signal
+        step = ((weight * difference) @ design - s / _PRIOR**2) / (information @ design**2 + 1 / _PRIOR**2)
+        s = s + np.clip(step, -LARGEST_STEP, LARGEST_STEP)
+    return s, information, difference**2 * weight / signal
+
+
+def _deviation(s: Float64Array, gathered: Float64Array, residual: Float64Array) -> Float64Array:
+    """Compute the deviation of s from the information in the rings and the mean squared residual of each."""
+    total = gathered.sum(axis=-1) + 1 / _PRIOR**2
+    variance = (CORRELATED * (gathered * np.maximum(residual, 1.0)).sum(axis=-1) + 1 / _PRIOR**2) / total**2
     return np.hypot(np.sqrt(variance), _WINDOW_ERROR * s)
 
 
 def _posterior(s: Float64Array, deviation: Float64Array, spread: Float64Array) -> Float64Array:
-    """Posterior mean of s, whose variance over the frames, ``spread``, is what noise does not explain."""
+    """Posterior mean of s, with the variance ``spread`` over the frames as that of the prior."""
     return s * spread / np.maximum(spread + deviation**2, 1e-30)
 
 
-def _frame_blur(judged: list[_Judged], grid: TileGrid) -> FrameBlur:
-    """Join what is said of tiles that were fitted together."""
+def _frame_blur(estimates: list[_Estimate], grid: TileGrid) -> FrameBlur:
+    """Join the estimates of batches of tiles."""
     shape = (-1, len(grid.rows), len(grid.columns))
-    joined = (np.concatenate(parts, axis=1) for parts in zip(*judged, strict=True))
+    joined = (np.concatenate(parts, axis=1) for parts in zip(*estimates, strict=True))
     relative, deviation, extra = (part.reshape(shape).astype(np.float32) for part in joined)
     return FrameBlur(relative, deviation, extra, grid)

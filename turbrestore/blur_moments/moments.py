@@ -1,13 +1,20 @@
-"""Moments that images measure, and the noise in them, in a basis of one's choice.
+"""Moments of images: what they measure, how noisy they are, and what a model of the motion predicts for them.
 
-Symbols (paper 1, eqs. 7 to 11)
--------------------------------
-y^(p) : raw moment ``∫ η^p Y dη / T_e`` of the image, :func:`image_moments`; what it says about the motion is in
-    :mod:`.moment_algebra`.
-V : density of the white pixel noise, whose effect is :func:`moment_noise`.
+Symbols (paper 1, eqs. 7 to 11; paper 2, eqs. 2 to 4)
+-----------------------------------------------------
+y^(p) : raw moment ``∫ η^p Y dη / T_e`` of the image, :func:`image_moments`.
+y_δ^(p), y_Ψ^(p) : time average of y^p over the exposure; raw moment of the kernel.
+x̂ : state at the start of an exposure.
+h, H : predicted moments and their derivative with respect to the state, :func:`predicted_moments`.
+V, R : density of the pixel noise; covariance of the noise of the moments, :func:`moment_noise`.
 
-The denominator is the known total intensity, not the measured one of paper 1, eq. 7: under strong noise the
-measured total can be near zero or negative and the ratio has no useful variance.
+Departures from the papers
+--------------------------
+The denominator of a moment is the known total intensity, not the measured one of paper 1, eq. 7: under strong noise the
+measured total can be near zero or negative, and the ratio has no useful variance.
+
+The binomial relation ``y^(p) = Σ_i binom(p, i) y_Ψ^(p−i) y_δ^(i)`` (paper 2, eq. 3) holds for *raw* moments on both
+sides.  Equation 4 of paper 2 centres the kernel at η₀ but not the image, which loses the offset; it is not used.
 
 The Legendre basis is monic and belongs to the interval of the pixels; on [−1, 1] its second moment is
 ``y^(2) − y^(0) / 3``.  Under white noise its moments are uncorrelated and have the least variance of all bases of
@@ -16,23 +23,124 @@ that order: 8V/45 for the second, against 2V/5 for y^(2).
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import comb
 
 from ..core.errors import ConfigurationError, DataError, require
-from .kernels import Float64Array, PixelGrid
-from .moment_algebra import check_light, check_order
+from .exposure_table import ExposureTable, tabulate
+from .lifting import Motion
+from .sensor import Float64Array, GaussianKernel, LineSensor, PixelGrid
 
 BASES = ("monomial", "legendre")
 
 
-def image_moments(
-    image: ArrayLike,
-    pixels: PixelGrid,
-    order: int,
+@dataclass(frozen=True, eq=False)
+class BlurModel:
+    """A motion and the sensor that records it.
+
+    Parameters
+    ----------
+    motion : Motion
+    sensor : LineSensor
+    """
+
+    motion: Motion
+    sensor: LineSensor
+
+    @functools.cached_property
+    def table(self) -> ExposureTable:
+        """Exposure operator of the sensor as a table."""
+        return tabulate(self.sensor)
+
+    def image_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Predict the image from a state.
+
+        Parameters
+        ----------
+        mean : ndarray, float64, shape (..., n)
+            State at the start of the exposure.
+        inputs : ndarray, float64, shape (..., N)
+
+        Returns
+        -------
+        image : ndarray, float64, shape (..., count)
+        derivative : ndarray, float64, shape (..., n, count)
+            With respect to the state.
+        """
+        return self.table.image_and_jacobian(*self.motion.path_and_jacobian(mean, inputs))
+
+
+def predicted_moments(
+    model: BlurModel,
+    mean: Float64Array,
+    inputs: Float64Array,
+    orders: tuple[int, ...],
     basis: str = "monomial",
-    total: float | None = 1.0,
-    background: float = 0.0,
+    border: bool = False,
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Predict the moments h(x̂) from a state, with their derivative and the covariance of their noise.
+
+    Parameters
+    ----------
+    model : BlurModel
+    mean : ndarray, float64, shape (..., n)
+        State at the start of the exposure.
+    inputs : ndarray, float64, shape (..., N)
+    orders : tuple of int
+        Orders of the moments.
+    basis : {"monomial", "legendre"}
+    border : bool
+        Compute the moments from the predicted image, without the light that misses the pixels.  Otherwise they
+        follow from the moments of path and kernel by the binomial relation.
+
+    Returns
+    -------
+    moments : ndarray, float64, shape (..., m)
+    H : ndarray, float64, shape (..., m, n)
+    R : ndarray, float64, shape (m, m)
+
+    Raises
+    ------
+    ConfigurationError
+        As many moments as pixels: R would be singular.
+
+    Examples
+    --------
+    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
+    >>> from turbrestore.blur_moments.sensor import ExposureTiming
+    >>> timing = ExposureTiming(fast_period=1.0, exposure=2.0, readout=0.0, frame_period=2.0)
+    >>> motion = lift(FastSystem([[0.5]], [1.0], [1.0]), timing, [[0.1]])
+    >>> sensor = LineSensor(GaussianKernel(0.1), PixelGrid(-1.0, 1.0, 20, integrating=False), noise=0.1)
+    >>> h, H, _ = predicted_moments(BlurModel(motion, sensor), np.array([0.4]), np.zeros(2), (1, 2))
+    >>> h.round(3), H.round(3)
+    (array([0.3 , 0.11]), array([[0.75],
+           [0.5 ]]))
+    """
+    sensor, order, chosen = model.sensor, max(orders), list(orders)
+    pixels = sensor.pixels
+    require(
+        order < pixels.count, f"orders: expected below the number of pixels, {pixels.count}, found {order} (singular R)"
+    )
+    if border:
+        image, derivative = model.image_and_jacobian(mean, inputs)
+        weights = basis_functions(pixels, order, basis) * pixels.width / sensor.total
+        moments, H = image @ weights, np.swapaxes(derivative @ weights, -1, -2)
+    else:
+        path, slopes = model.motion.path_and_jacobian(mean, inputs)
+        powers = _powers(path, order)
+        change = basis_change(pixels, order, basis) @ kernel_relation(sensor.kernel, pixels, order)
+        moments = powers.mean(-1) @ change.T
+        H = change[:, 1:] @ (np.arange(1, order + 1)[:, None] * (powers[..., :-1, :] @ slopes) / path.shape[-1])
+    R = moment_noise(pixels, order, sensor.noise, basis) / sensor.total**2
+    return moments[..., chosen], H[..., chosen, :], R[chosen][:, chosen]
+
+
+def image_moments(
+    image: ArrayLike, pixels: PixelGrid, order: int, basis: str = "monomial", total: float = 1.0
 ) -> Float64Array:
     """Moments of images of a line.
 
@@ -44,11 +152,8 @@ def image_moments(
     order : int
         Highest order p.
     basis : {"monomial", "legendre"}
-        What the image is projected on.
-    total : float, optional
-        Known total intensity of the exposure, the denominator. None divides by the measured total.
-    background : float
-        Intensity without light, taken off.
+    total : float
+        Known total intensity of the exposure, the denominator.
 
     Returns
     -------
@@ -58,84 +163,27 @@ def image_moments(
     Raises
     ------
     DataError
-        Shapes do not agree, values are not finite, or a frame holds no light to divide by.
+        Shapes do not agree, or values are not finite.
     ConfigurationError
-        Unknown basis, or an order or a total that makes no sense.
+        Unknown basis, negative order, or a total that is not above 0.
 
     Examples
     --------
     >>> image_moments([0.25, 0.75], PixelGrid(-1.0, 1.0, 2), order=2)
     array([1.  , 0.25, 0.25])
     """
-    values = _check_image(image, (pixels.count,)) - background
-    measured = values @ basis_functions(pixels, order, basis) * pixels.width
-    return measured / _denominator(values.sum(-1) * pixels.width, total)[..., None]
+    values = np.asarray(image, np.float64)
+    if values.ndim < 1 or values.shape[-1] != pixels.count or not np.isfinite(values).all():
+        raise DataError(f"image: expected finite values of shape (..., {pixels.count}), found shape {values.shape}")
+    require(0 < total < np.inf, f"total: expected an intensity above 0, found {total:g}")
+    return values @ basis_functions(pixels, order, basis) * pixels.width / total
 
 
-def plane_moments(
-    image: ArrayLike,
-    columns: PixelGrid,
-    rows: PixelGrid,
-    order: int,
-    basis: str = "monomial",
-    total: float | None = 1.0,
-    background: float = 0.0,
-) -> Float64Array:
-    """Moments of images of the plane.
-
-    Parameters
-    ----------
-    image : array_like, shape (..., rows, columns)
-        Intensity per unit of area.
-    columns, rows : PixelGrid
-        Pixels along x and along y.
-    order : int
-        Highest order in x and in y.
-    basis : {"monomial", "legendre"}
-        What the image is projected on; products of the functions of x and of y.
-    total : float, optional
-        Known total intensity of the exposure, the denominator. None divides by the measured total.
-    background : float
-        Intensity without light, taken off.
-
-    Returns
-    -------
-    ndarray, float64, shape (..., order + 1, order + 1)
-        ``[..., p, q]`` goes with x^p y^q.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, values are not finite, or a frame holds no light to divide by.
-    ConfigurationError
-        Unknown basis, or an order or a total that makes no sense.
-
-    Examples
-    --------
-    >>> pixels = PixelGrid(-1.0, 1.0, 2)
-    >>> plane_moments([[0.0, 0.0], [0.0, 1.0]], pixels, pixels, order=1)
-    array([[1.  , 0.5 ],
-           [0.5 , 0.25]])
-    """
-    values = _check_image(image, (rows.count, columns.count)) - background
-    cell = columns.width * rows.width
-    along_x, along_y = basis_functions(columns, order, basis), basis_functions(rows, order, basis)
-    measured = np.swapaxes(along_x, 0, 1) @ np.swapaxes(values, -1, -2) @ along_y * cell
-    return measured / _denominator(values.sum((-1, -2)) * cell, total)[..., None, None]
-
-
-def moment_noise(
-    pixels: PixelGrid,
-    order: int,
-    density: float,
-    basis: str = "monomial",
-    image: ArrayLike | None = None,
-    photons: float | None = None,
-) -> Float64Array:
-    """Covariance of the noise of the moments: ``V ∫ b_p b_q dη``, plus shot noise.
+def moment_noise(pixels: PixelGrid, order: int, density: float, basis: str = "monomial") -> Float64Array:
+    """Covariance of the noise of the moments, ``V ∫ b_p b_q dη``.
 
     On [−1, 1] with fine pixels: 2V, 2V/3 and 2V/5 for orders 0, 1, 2; 2V/3 between 0 and 2; 0 between 1 and 2.
-    Paper 1, eq. 11, as it survives, has 3V for the second.
+    Paper 1, eq. 11, in the text available, has 3V for the second.
 
     Parameters
     ----------
@@ -145,19 +193,15 @@ def moment_noise(
     density : float
         V of the white noise.
     basis : {"monomial", "legendre"}
-    image : array_like, shape (..., count), optional
-        Noise-free image, for shot noise.
-    photons : float, optional
-        Photons that a total intensity of 1 stands for.
 
     Returns
     -------
-    ndarray, float64, shape (..., order + 1, order + 1)
+    ndarray, float64, shape (order + 1, order + 1)
 
     Raises
     ------
     ConfigurationError
-        Unknown basis, negative density, or photons without an image.
+        Unknown basis, negative order or negative density.
 
     Examples
     --------
@@ -166,16 +210,50 @@ def moment_noise(
     """
     require(0 <= density < np.inf, f"density: expected noise of at least 0, found {density:g}")
     functions = basis_functions(pixels, order, basis)
-    cov = density * pixels.width * functions.T @ functions
-    if photons is None:
-        return cov
-    require(image is not None and photons > 0, "photons: expected a number above 0 and the image they form")
-    values = np.maximum(np.asarray(image, np.float64), 0.0)
-    return cov + (functions.T * values[..., None, :]) @ functions * pixels.width / photons
+    return density * pixels.width * functions.T @ functions
+
+
+def kernel_relation(kernel: GaussianKernel, pixels: PixelGrid, order: int) -> Float64Array:
+    """Matrix from the moments of a path to those of its image: the binomial relation (paper 2, eq. 3).
+
+    The moments of kernel and pixel are those of offset, Gaussian and pixel one after the other; an integrating pixel
+    of width Δ adds Δ²/12 to the variance.
+
+    Parameters
+    ----------
+    kernel : GaussianKernel
+    pixels : PixelGrid
+    order : int
+        Highest order.
+
+    Returns
+    -------
+    ndarray, float64, shape (order + 1, order + 1)
+        Entry (p, i) is ``binom(p, i) y_Ψ^(p−i)``; the first column holds the raw moments of the kernel.
+
+    Raises
+    ------
+    ConfigurationError
+        The order is negative.
+
+    Examples
+    --------
+    >>> kernel_relation(GaussianKernel(0.5, offset=1.0), PixelGrid(0.0, 1.0, 1, integrating=False), 2)
+    array([[1.  , 0.  , 0.  ],
+           [1.  , 1.  , 0.  ],
+           [1.25, 2.  , 1.  ]])
+    """
+    p = _orders(order)
+    odd_product = np.array([np.prod(np.arange(k - 1, 0, -2, dtype=np.float64)) for k in p])
+    gaussian = np.where(p % 2 == 0, kernel.sigma**p * odd_product, 0.0)
+    relation = _binomial_matrix(kernel.offset**p) @ _binomial_matrix(gaussian)
+    if pixels.integrating:
+        relation = relation @ _binomial_matrix(np.where(p % 2 == 0, (pixels.width / 2) ** p / (p + 1), 0.0))
+    return relation
 
 
 def basis_functions(pixels: PixelGrid, order: int, basis: str = "monomial") -> Float64Array:
-    """Functions that images are projected on, at the pixels.
+    """Functions on which images are projected, at the centres of the pixels.
 
     Parameters
     ----------
@@ -198,8 +276,7 @@ def basis_functions(pixels: PixelGrid, order: int, basis: str = "monomial") -> F
     >>> basis_functions(PixelGrid(-1.0, 1.0, 2), order=2, basis="legendre")[:, 2].round(4)
     array([-0.0833, -0.0833])
     """
-    powers = pixels.centres[:, None] ** np.arange(check_order(order) + 1)
-    return powers @ basis_change(pixels, order, basis).T
+    return pixels.centres[:, None] ** _orders(order) @ basis_change(pixels, order, basis).T
 
 
 def basis_change(pixels: PixelGrid, order: int, basis: str) -> Float64Array:
@@ -232,7 +309,7 @@ def basis_change(pixels: PixelGrid, order: int, basis: str) -> Float64Array:
     """
     if basis not in BASES:
         raise ConfigurationError(f"basis: expected one of {', '.join(BASES)}, found {basis!r}")
-    size = check_order(order) + 1
+    size = len(_orders(order))
     if basis == "monomial":
         return np.eye(size)
     middle, half = (pixels.start + pixels.stop) / 2, (pixels.stop - pixels.start) / 2
@@ -245,59 +322,21 @@ def basis_change(pixels: PixelGrid, order: int, basis: str) -> Float64Array:
     return matrix
 
 
-def total_intensity(frames: ArrayLike, cell: float, background: float = 0.0) -> tuple[float, float]:
-    """Total intensity of an exposure from several frames, robustly, with its standard error.
-
-    Parameters
-    ----------
-    frames : array_like, shape (T, n) or (T, h, w)
-        Frames of equal exposure.
-    cell : float
-        Width or area of a pixel.
-    background : float
-        Intensity without light, taken off.
-
-    Returns
-    -------
-    total : float
-        Median over the frames, so that a few outliers do not matter.
-    standard_error : float
-        Of the median, from the median absolute deviation; NaN for a single frame.
-
-    Raises
-    ------
-    DataError
-        No frames, or no light.
-
-    Examples
-    --------
-    >>> total_intensity([[1.0, 1.0], [1.0, 1.0], [9.0, 9.0]], cell=0.5)
-    (1.0, 0.0)
-    """
-    values = np.asarray(frames, np.float64)
-    if values.ndim < 2 or values.size == 0 or not np.isfinite(values).all():
-        raise DataError(f"frames: expected finite frames of shape (T, n) or (T, h, w), found shape {values.shape}")
-    totals = (values - background).sum(tuple(range(1, values.ndim))) * cell
-    total = float(np.median(totals))
-    check_light(np.asarray(total))
-    if len(totals) == 1:
-        return total, float("nan")
-    deviation = 1.4826 * float(np.median(np.abs(totals - total)))
-    return total, float(np.sqrt(np.pi / 2) * deviation / np.sqrt(len(totals)))
+def _orders(order: int) -> np.ndarray:
+    require(order >= 0, f"order: expected at least 0, found {order}")
+    return np.arange(order + 1)
 
 
-def _denominator(measured: Float64Array, total: float | None) -> Float64Array:
-    if total is None:
-        check_light(measured)
-        return measured
-    require(0 < total < np.inf, f"total: expected an intensity above 0, found {total:g}")
-    return np.asarray(total, np.float64)
+def _powers(values: Float64Array, order: int) -> Float64Array:
+    """Powers 0 … order, shape (..., order + 1, N_e); repeated products are many times faster than ``**``."""
+    result = np.ones((*values.shape[:-1], order + 1, values.shape[-1]))
+    for p in range(order):
+        result[..., p + 1, :] = result[..., p, :] * values
+    return result
 
 
-def _check_image(image: ArrayLike, shape: tuple[int, ...]) -> Float64Array:
-    values = np.asarray(image, np.float64)
-    if values.ndim < len(shape) or values.shape[-len(shape) :] != shape:
-        raise DataError(f"image: expected shape (..., {', '.join(map(str, shape))}), found {values.shape}")
-    if not np.isfinite(values).all():
-        raise DataError("image: expected finite values, found NaN or infinite ones")
-    return values
+def _binomial_matrix(moments: Float64Array) -> Float64Array:
+    """Matrix that adds an independent position with these raw moments: entry (p, i) is binom(p, i) m_(p−i)."""
+    p = np.arange(len(moments))
+    lag = np.subtract.outer(p, p)
+    return comb(p[:, None], p) * np.where(lag >= 0, moments[np.maximum(lag, 0)], 0.0)

@@ -1,10 +1,9 @@
 """Tip-tilt and tracking: the motion of a point or a small target in a video, also within the exposures.
 
-A moving target leaves a streak.  Its centroid says where it was on average, its second moments how far it moved
-during the exposure, and a model of the motion joins the two from frame to frame.
+A moving target leaves a streak.  Its centroid is its mean position, its second moments show how far it moved during the
+exposure, and a model of the motion (:mod:`.targets`) connects the frames.
 
-The motions are in :mod:`.target_motion`, the filter on the moments of the plane in :mod:`.plane_filter`.  x counts
-columns and y rows, both in pixels, with pixel centres at whole numbers.
+x counts columns and y rows, both in pixels, with pixel centres at whole numbers.
 """
 
 from __future__ import annotations
@@ -19,19 +18,17 @@ from scipy.optimize import minimize_scalar
 from ..core.arrays import check_frames, luminance
 from ..core.errors import ConfigurationError, DataError, require, require_between
 from ..filtering.kalman import Gaussian, Innovation
-from .kernels import Float64Array, PixelGrid, gaussian_kernel
-from .moments import plane_moments, total_intensity
-from .plane_filter import PlaneModel, PlaneMomentFilter, PlaneSensor
-from .sensor import ExposureTiming
-from .target_motion import Oscillation, RandomWalk, TargetMotion, lift_motion
+from .moments import basis_functions
+from .sensor import ExposureTiming, Float64Array, PixelGrid
+from .targets import Oscillation, PlaneModel, PlaneMomentFilter, PlaneSensor, RandomWalk, TargetMotion, lift_motion
 
-# Pixels along the border of the window that are taken to be background.
+# Width of the rim of the window that is taken to be background, pixels.
 _RIM = 2
-# Times the noise above which a pixel counts as light when the window is placed.
+# A pixel counts as light of the target above this many standard deviations of the noise.
 _LIT = 3.0
 # Frequencies tried per resolvable step of 1 / duration.
 _FINENESS, _MOST_TRIED = 2.0, 400
-# How well the first window is placed, pixels; how often a window is moved; smallest window.
+# Accuracy of the first window, pixels; most shifts of a window; smallest window.
 _PLACED, _PLACINGS, _SMALLEST = 1.0, 8, 2 * _RIM + 3
 # Smallest noise as a share of the brightest pixel.
 _LEAST_NOISE = 1e-5
@@ -39,16 +36,15 @@ _LEAST_NOISE = 1e-5
 
 @dataclass(frozen=True)
 class TrackParams:
-    """How a target is tracked.
+    """Settings of the tracking of a target.
 
     Parameters
     ----------
     motion : RandomWalk, ConstantVelocity or Oscillation
     sigma : float
-        Standard deviation of the still target, blur of the optics included, pixels; see
-        :func:`~turbrestore.blur_moments.kernels.kernel_from_still` for how to measure it.
+        Standard deviation of the image of the still target, including the blur of the optics, pixels.
     exposure : float
-        Share of the frame period that the shutter is open, a whole number of 1 / ``steps``.
+        Share of the frame period during which the shutter is open, a whole multiple of 1 / ``steps``.
     frame_period : float
         Seconds.
     steps : int
@@ -56,16 +52,16 @@ class TrackParams:
     order : {1, 2}
         Centroids only, or second moments as well; for a random walk always centroids.
     basis : {"legendre", "monomial"}
-        Of the moments; Legendre ones carry less noise.
+        Basis of the moments; Legendre moments carry less noise.
 
     Raises
     ------
     ConfigurationError
-        A setting out of range, or an exposure that is no whole number of steps.
+        A setting is out of range, or the exposure is not a whole number of steps.
 
     Examples
     --------
-    >>> from turbrestore.blur_moments.target_motion import ConstantVelocity
+    >>> from turbrestore.blur_moments.targets import ConstantVelocity
     >>> TrackParams(ConstantVelocity(0.1), sigma=1.2).timing().exposure_steps
     16
     """
@@ -98,25 +94,26 @@ class Track:
     Attributes
     ----------
     positions : ndarray, float64, shape (T, 2)
-        (x, y) in the middle of the exposures, from this frame and those before it, pixels.
+        (x, y) in the middle of the exposures, estimated from this and all earlier frames, pixels.
     position_cov : ndarray, float64, shape (T, 2, 2)
+        Covariance of ``positions``, squared pixels.
     velocities : ndarray, float64, shape (T, 2)
-        There too, pixels per second; NaN for a random walk.
+        Velocity in the middle of the exposures, pixels per second; NaN for a random walk.
     paths : ndarray, float64, shape (T, steps, 2)
-        (x, y) in the middle of the fast steps, until the next exposure.
+        (x, y) in the middle of the fast steps of each frame period, pixels.
     states : tuple of Gaussian
-        At the start of every exposure, after its frame.
+        State at the start of every exposure, after its frame.
     innovations : tuple of Innovation
     log_likelihood : float
-        Of all frames.
+        Log-likelihood of all frames.
     frequency : float or None
-        Of an oscillation, Hz; the most likely one if it was searched for.
+        Frequency of an oscillation, Hz; the most likely one if a range was searched.
     centroids : ndarray, float64, shape (T, 2)
         First moments of the frames alone, pixels.
     spreads : ndarray, float64, shape (T, 2, 2)
-        Central second moments of the frames alone, squared pixels: still target and motion.
+        Central second moments of the frames alone, which contain still target and motion, squared pixels.
     background, noise, total : float
-        What was measured of the frames: intensity beside the target, deviation of a pixel, light of the target.
+        Measured intensity beside the target, standard deviation of a pixel, and total light of the target.
     """
 
     positions: Float64Array
@@ -136,7 +133,7 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """The target cut out of every frame, and what surrounds it."""
+    """The target cut out of every frame, with the positions and statistics of the windows."""
 
     images: Float64Array
     centres: Float64Array
@@ -149,7 +146,9 @@ class _Windows:
     spreads: Float64Array = field(init=False)
 
     def __post_init__(self) -> None:
-        moments = plane_moments(self.images, self.columns, self.rows, 2, total=self.total)
+        x, y = basis_functions(self.columns, 2), basis_functions(self.rows, 2)
+        # Entry (p, q) is the moment of x^p y^q.
+        moments = x.T @ np.swapaxes(self.images, -1, -2) @ y / self.total
         first = np.stack([moments[:, 1, 0], moments[:, 0, 1]], axis=-1)
         second = np.stack([moments[:, [2, 1], [0, 1]], moments[:, [1, 0], [1, 2]]], axis=-2)
         object.__setattr__(self, "centroids", first + self.centres)
@@ -159,9 +158,9 @@ class _Windows:
 def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackParams) -> Track:
     """Track a point or a small target by centroid and second moments, also within the exposures.
 
-    A window of the size of ``roi`` follows the target. Background, noise and light of the target are taken from the
-    windows: their rim is background, the light the same in all frames. One target on an even background is assumed,
-    and a window that holds it with its streak.
+    A window of the size of ``roi`` follows the target.  Background and noise are measured on the rim of the windows,
+    and the light of the target is assumed to be the same in all frames.  There must be one target on an even
+    background, and the window must contain its whole streak.
 
     Parameters
     ----------
@@ -180,17 +179,16 @@ def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackP
     DataError
         Fewer than two frames, a frame without light, or a target that leaves the frame.
     ConfigurationError
-        The window lies outside the frame or is too small, or the motion cannot be seen at this frame rate.
+        The window lies outside the frame or is too small, or the frame rate does not determine the motion.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from turbrestore.blur_moments.sensor import expose_plane
-    >>> from turbrestore.blur_moments.target_motion import ConstantVelocity
-    >>> pixels = PixelGrid(-0.5, 47.5, 48)
-    >>> path = 10 + 2.0 * (np.arange(160) + 0.5).reshape(10, 16, 1) / 16 * np.ones(2)
+    >>> from turbrestore.blur_moments.targets import ConstantVelocity
+    >>> path = 10 + 2.0 * (np.arange(160) + 0.5).reshape(10, 16, 1) / 16
+    >>> profile = np.exp(-((np.arange(48) - path) ** 2) / 2) / np.sqrt(2 * np.pi)
     >>> rng = np.random.default_rng(0)
-    >>> frames = 20 * expose_plane(path, gaussian_kernel([1.0, 1.0]), pixels, pixels)
+    >>> frames = 20 * np.swapaxes(profile, 1, 2) @ profile / 16
     >>> frames += rng.normal(0, 0.01, frames.shape)
     >>> track = track_blur(frames, (3, 3, 16, 16), TrackParams(ConstantVelocity(1e-3), sigma=1.0))
     >>> track.velocities[-1].round(1), track.paths[-1, 0].round(0)
@@ -202,7 +200,7 @@ def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackP
         params = replace(params, motion=_most_likely(windows, params, params.motion))
     states, innovations = _run(windows, params)
     model = _model(windows, params)
-    steps = model.timing.exposure_steps
+    steps = model.axis.timing.exposure_steps
     outputs = model.outputs(params.steps)
     middle = outputs[:steps].mean(axis=0)
     means, covs = np.stack([state.mean for state in states]), np.stack([state.cov for state in states])
@@ -225,12 +223,12 @@ def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackP
 
 def _run(windows: _Windows, params: TrackParams) -> tuple[tuple[Gaussian, ...], tuple[Innovation, ...]]:
     """States at the start of the exposures, after their frames."""
-    # Where a random walk went within an exposure says nothing of where it was.
+    # The spread of a random walk within an exposure carries no information about its position.
     order = 1 if isinstance(params.motion, RandomWalk) else params.order
     model, observer = _model(windows, params), PlaneMomentFilter(order, params.basis)
     state = _start(windows, params)
     states, innovations = [], []
-    # The window moves with the target, so that every frame has a model of its own.
+    # The window moves with the target, so every frame has its own model.
     for image, centre in zip(windows.images, windows.centres, strict=True):
         state, innovation = observer.step(replace(model, centre=tuple(centre)), state, image)
         states.append(state)
@@ -242,27 +240,25 @@ def _run(windows: _Windows, params: TrackParams) -> tuple[tuple[Gaussian, ...], 
 def _model(windows: _Windows, params: TrackParams) -> PlaneModel:
     motion = lift_motion(params.motion, params.timing())
     sigma = np.sqrt(params.sigma**2 + params.motion.smear(motion.timing.exposure))
-    sensor = PlaneSensor(
-        gaussian_kernel([sigma, sigma]), windows.columns, windows.rows, windows.noise**2, windows.total
-    )
-    return PlaneModel(motion, motion, sensor)
+    sensor = PlaneSensor(float(sigma), windows.columns, windows.rows, windows.noise**2, windows.total)
+    return PlaneModel(motion, sensor)
 
 
 def _start(windows: _Windows, params: TrackParams) -> Gaussian:
-    """Rough state before the first frame: at rest in the first window, with the spread that the frames suggest."""
+    """Rough state before the first frame: at rest in the first window, with a spread estimated from the frames."""
     moved = np.mean(np.diff(windows.centroids, axis=0) ** 2)
     streak = np.mean(windows.spreads[:, [0, 1], [0, 1]]) - params.sigma**2 - 1 / 12
     step = float(np.sqrt(moved + np.maximum(streak, 0.0) + _PLACED**2))
     prior = params.motion.prior(step, params.frame_period)
     means = np.zeros((2, len(prior)))
     means[:, 0] = windows.centres[0]
-    # A third state is the centre of an oscillation.
+    # The third state, if any, is the centre of an oscillation.
     means[:, 2:] = windows.centroids.mean(axis=0)[:, None]
     return Gaussian(means.ravel(), block_diag(prior, prior))
 
 
 def _most_likely(windows: _Windows, params: TrackParams, motion: Oscillation) -> Oscillation:
-    """Oscillation with the frequency under which the frames are most likely."""
+    """Oscillation with the frequency of the largest likelihood."""
     assert motion.highest is not None
 
     def cost(frequency: float) -> float:
@@ -270,7 +266,7 @@ def _most_likely(windows: _Windows, params: TrackParams, motion: Oscillation) ->
         try:
             _, innovations = _run(windows, replace(params, motion=candidate))
         except ConfigurationError:
-            # A frequency that the frames cannot show, such as half the frame rate.
+            # The frames do not determine the state, for example at half the frame rate.
             return np.inf
         return -float(sum(innovation.log_likelihood for innovation in innovations))
 
@@ -305,21 +301,23 @@ def _cut_windows(stack: Float64Array, roi: tuple[int, int, int, int]) -> _Window
     rim = cut[:, _rim(height, width)]
     background = float(np.median(rim))
     noise = 1.4826 * float(np.median(np.abs(rim - background)))
-    total, _ = total_intensity(cut, 1.0, background)
+    total = float(np.median((cut - background).sum((1, 2))))
+    if total <= 0:
+        raise DataError(f"roi: expected a target brighter than its background, found a total of {total:g}; check roi")
     return _Windows(
         images=cut - background,
         centres=np.stack(corners) + np.array([(width - 1) / 2, (height - 1) / 2]),
         columns=PixelGrid(-width / 2, width / 2, width),
         rows=PixelGrid(-height / 2, height / 2, height),
         background=background,
-        # Noise-free synthetic frames keep a filter defined.
+        # The lower limit keeps the filter defined for noise-free synthetic frames.
         noise=max(noise, _LEAST_NOISE * float(cut.max() - background)),
         total=total,
     )
 
 
 def _place(frame: Float64Array, guess: NDArray[np.intp], size: tuple[int, int]) -> tuple[float, NDArray[np.intp]]:
-    """Centre a window on the light in it: how much light, and the corner (left, top)."""
+    """Centre a window on the light in it; return the amount of light and the corner (left, top)."""
     width, height = size
     limit = np.array([frame.shape[1] - width, frame.shape[0] - height])
     corner, light = np.clip(guess, 0, limit), 0.0

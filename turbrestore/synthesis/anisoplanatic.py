@@ -11,20 +11,21 @@ How a frame is made
 1. Tilt at every pixel (:func:`turbrestore.synthesis.phase_screen.tilt_flow`).  Light of θ arrives from θ + tilt, so
    ``frame(x + tilt) = truth(x)``.
 2. Point spread functions of the tilt-free phase at field points ``field_spacing`` apart, by matrix Fourier transform
-   at the pixels of the camera.  In colour the path differences are shared and the phase goes with 1/λ of a channel.
-3. Displacement first, blur second, as light has it (Chan, *Tilt-then-blur or blur-then-tilt?*, 2022).  The blur varies
-   over the image: ``frame(y) = Σ_k c_k(y) (h_k ∗ displaced)(y)`` with c_0 = 1, h_0 the mean and the other h_k the
-   principal components of point spread functions seen elsewhere in the same screens; c_k is linear between field
-   points.  The h_k with k > 0 sum to 0: no light is lost or gained.
+   at the pixels of the camera.  Colour channels share the path differences; the phase is proportional to 1/λ.
+3. Displacement before blur (Chan, *Tilt-then-blur or blur-then-tilt?*, 2022).  The blur varies over the image:
+   ``frame(y) = Σ_k c_k(y) (h_k ∗ displaced)(y)`` with c_0 = 1, h_0 the mean and the other h_k the principal components
+   of point spread functions at other places of the same screens.  c_k is linear between field points.  The h_k with
+   k > 0 sum to 0, so light is neither lost nor gained.
 4. The mean over the sub-frames of the exposure, then shot noise, read noise and quantisation.
 
-Beyond the edge the scene is continued by reflection.  Left out: scintillation, absorption, changing wind.  In strong
-turbulence point spread functions vary faster over the field than ``field_spacing``; mixtures stand for those between.
+The scene is continued by reflection beyond its edge.  Scintillation, absorption and changing wind are left out.  In
+strong turbulence point spread functions vary faster over the field than ``field_spacing``; between the field points
+they are mixtures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -35,9 +36,9 @@ from scipy import fft
 
 from ..core.arrays import FloatArray
 from ..core.errors import require
+from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_ahead, one_thread_each
 from .atmosphere import PhaseScreenParams
-from .exposure import exposed_frame
 from .phase_screen import Turbulence, draw_turbulence, tilt_flow
 from .pupil import (
     ComplexArray,
@@ -50,9 +51,9 @@ from .pupil import (
     sample_pupil,
     tilt_free_path,
 )
-from .sequence import CameraParams, SyntheticFrame, check_scene, record
+from .sequence import CameraParams, SyntheticFrame, check_scene, exposed_frame, record
 
-# Displacements beyond this many standard deviations see the edge of the reflected scene repeated.
+# The reflected margin covers displacements up to this many standard deviations.
 _WIDEST_TILT = 4
 
 
@@ -62,9 +63,9 @@ def phase_screen_frames(
     rng: np.random.Generator,
     params: PhaseScreenParams | None = None,
     camera: CameraParams | None = None,
-    progress: Callable[[int], None] | None = None,
+    runtime: Runtime = DEFAULT,
 ) -> Iterator[SyntheticFrame]:
-    """Frames of a scene seen through turbulence, one after the other.
+    """Generate frames of a scene seen through turbulence.
 
     Parameters
     ----------
@@ -73,18 +74,18 @@ def phase_screen_frames(
     count : int
         Number of frames.
     rng : numpy.random.Generator
-        Source of randomness, drawn from when the first frame is asked for; the same state of it gives the same bytes.
+        Source of randomness, used when the first frame is requested; the same state gives the same bytes.
     params : PhaseScreenParams, optional
         Path and optics.
     camera : CameraParams, optional
         Timing and noise.
-    progress : callable, optional
-        Called with 1 after each frame.
+    runtime : Runtime, optional
+        ``threads`` frames are computed side by side; their number does not change the frames.
 
     Returns
     -------
     iterator of SyntheticFrame
-        Memory does not grow with ``count``.
+        The memory used does not depend on ``count``.
 
     Raises
     ------
@@ -104,11 +105,11 @@ def phase_screen_frames(
     params, camera = params or PhaseScreenParams(), camera or CameraParams()
     truth = check_scene(scene)
     require(count >= 1, f"count: expected at least 1 frame, found {count}")
-    return _frames(truth, count, rng, params, camera, progress)
+    return _frames(truth, count, rng, params, camera, runtime)
 
 
 def diffraction_limited(scene: ArrayLike, params: PhaseScreenParams | None = None) -> FloatArray:
-    """Show a scene as the optics alone would, without turbulence and noise.
+    """Image a scene through the optics alone, without turbulence and noise.
 
     Parameters
     ----------
@@ -144,7 +145,7 @@ def diffraction_limited(scene: ArrayLike, params: PhaseScreenParams | None = Non
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """All that stays the same from frame to frame."""
+    """Quantities that all frames share."""
 
     turbulence: Turbulence
     pupil: Pupil
@@ -167,15 +168,13 @@ def _frames(
     rng: np.random.Generator,
     params: PhaseScreenParams,
     camera: CameraParams,
-    progress: Callable[[int], None] | None,
+    runtime: Runtime,
 ) -> Iterator[SyntheticFrame]:
     with one_thread_each():
         view = _prepare(truth, rng, params, camera)
-    # Each frame has noise of its own, so that threads cannot change it.
+    # Each frame has a generator of its own, so its noise does not depend on the threads.
     seeds = rng.integers(2**63, size=(count, 2))
-    for _, frame in map_ahead(partial(_frame, view, seeds), range(count)):
-        if progress is not None:
-            progress(1)
+    for _, frame in map_ahead(partial(_frame, view, seeds), range(count), runtime.threads):
         yield frame
 
 

@@ -1,26 +1,26 @@
 """Dynamic-texture synthesis: new turbulence that moves like a given clip (paper 3, section 3.2 and Figure 6).
 
 The flows of the clip are measured from its centroid, a linear system is identified from them, and the system is run
-with fresh noise.  The new flows distort the centroid, or any other scene.
+with new noise.  The new flows distort the centroid, or any other scene.
 
 Symbols
 -------
 W : flow; C, ξ, A, Q, Ξ, R : modes, state, transition, process noise, training states and residual variance of
 :mod:`turbrestore.dynamics.dynamic_texture`, for n states and τ training flows.
-r : what the n modes leave out of a flow; D, η : its own modes and their states, ``r = D η``.
+r : residual of a flow outside the n modes; D, η : its modes and their states, ``r = D η``.
 φ : correlation of a residual state with itself one frame later.
 
 Departures from the paper
 -------------------------
-- ``W = C ξ + r``, where the paper simulates ``C ξ`` alone (``residual="drop"``).  On real clips the n modes hold 70 to
-  98 % of the variance and r is mostly motion, so without it the new flows are too short.  r is drawn from the
-  covariance of the training residuals: the modes after the n-th of the same singular value decomposition, each driven
-  by an autoregression of order one with the variance and φ that it has in training.  The expected variance of the
-  displacement at every pixel is then that of the training flows, and the modes of r are orthogonal to C, so the
-  system identified from a synthetic sequence is the one it was made with.
-- A and Q are those of :func:`turbrestore.dynamics.dynamic_texture.stable_system`: the sequence neither grows nor fades.
-- The mean flow W̄, which vanishes at the centroid but for the bias of the flow method, is left out, so the scene lies
-  at the mean geometry of the synthetic sequence.
+- ``W = C ξ + r``, where the paper simulates ``C ξ`` alone (``residual="drop"``).  On real clips the n modes contain 70
+  to 98 % of the variance, and r is mostly motion, so without it the new flows are too short.  r is drawn from the
+  covariance of the training residuals: its modes are those after the n-th of the same singular value decomposition,
+  each driven by an autoregression of order one with the variance and φ of the training.  The expected variance of the
+  displacement at every pixel is then that of the training flows.  The modes of r are orthogonal to C, so identification
+  from a synthetic sequence returns the original system.
+- A and Q are those of :func:`turbrestore.dynamics.simulate.stable_system`: the sequence neither grows nor fades.
+- The mean flow W̄, which vanishes at the centroid except for the bias of the flow method, is left out, so the scene has
+  the mean geometry of the synthetic sequence.
 """
 
 from __future__ import annotations
@@ -46,24 +46,24 @@ Float64Array = NDArray[np.float64]
 
 RESIDUALS = ("keep", "drop")
 FITS = ("mirror", "stretch")
-# As many modes as identify() may be asked for.
+# Largest number of modes that identify() accepts.
 _MOST_MODES = 10_000
 
 
 @dataclass(frozen=True)
 class DynamicTextureParams:
-    """How the flows of a clip are learned and continued.
+    """Settings of the identification and continuation of the flows of a clip.
 
     Parameters
     ----------
     residual : {"keep", "drop"}
-        Whether motion outside the modes of the dynamics is drawn as well; ``"drop"`` is the paper's ``W = C ξ``.
+        Whether motion outside the modes of the dynamics is added; ``"drop"`` is the paper's ``W = C ξ``.
     fit : {"mirror", "stretch"}
-        How flows reach the size of another scene.  ``"mirror"`` keeps pixels: the flow is cut to its centre along a
-        shorter side, and continued by reflection, the displacement unchanged, along a longer one.  ``"stretch"``
-        keeps the view: the flow is interpolated over the scene, and displacements grow with it.
+        How flows are fitted to the size of another scene.  ``"mirror"`` keeps the pixel scale: the flow is cropped to
+        its centre along a shorter side, and continued by reflection along a longer one.  ``"stretch"`` keeps the field
+        of view: the flow is interpolated over the scene, and displacements scale with it.
     largest_modulus : float
-        Eigenvalues of A of larger modulus are shortened to this, and φ is limited to it, above 0 and below 1.
+        Limit of the moduli of the eigenvalues of A and of φ, above 0 and below 1.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -92,20 +92,20 @@ class DynamicTextureParams:
 
 @dataclass(frozen=True, eq=False)
 class TextureFlows:
-    """Sequence of synthetic flows; each is computed when it is asked for.
+    """Sequence of synthetic flows, each computed when it is requested.
 
     Parameters
     ----------
     modes : ndarray, float32, shape (2 h w, m)
-        C and D: orthonormal columns, one a state, on the grid of the training flows.
+        C and D: orthonormal columns, one for each state, on the grid of the training flows.
     states : ndarray, float64, shape (m, count)
-        ξ and η, one column a flow.
+        ξ and η, one column for each flow.
     grid : (int, int)
         Height h and width w of the training flows.
     size : (int, int)
-        Height H and width W of the flows handed out.
+        Height H and width W of the resulting flows.
     fit : {"mirror", "stretch"}
-        How a flow on the grid reaches that size.
+        How a flow is fitted from the grid to that size.
     """
 
     modes: FloatArray
@@ -132,14 +132,13 @@ class DynamicTexture:
     Attributes
     ----------
     scene : ndarray, float32, shape (H, W) or (H, W, 3)
-        Truth of the synthetic sequence, at its mean geometry: the centroid of the clip, or the scene that was given.
+        Truth of the synthetic sequence, at its mean geometry: the centroid of the clip, or the scene given.
     flows : TextureFlows
-        From the scene to each frame, each of shape (H, W, 2), pixels; for example for
-        :func:`turbrestore.synthesis.smooth_flow.distort`.
+        From the scene to each frame, each of shape (H, W, 2), pixels.
     dynamics : FlowDynamics
-        System identified from the clip, as fitted.
+        System identified from the clip, before its stabilisation.
     eigenvalues : ndarray, complex128, shape (n,)
-        Of the A that made the flows, largest modulus first.
+        Eigenvalues of the stabilised A, largest modulus first.
     """
 
     scene: FloatArray
@@ -156,27 +155,27 @@ def synthesize_like(
     scene: ArrayLike | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> DynamicTexture:
-    """Learn the motion of a clip and make up more of it.
+    """Learn the motion of a clip and continue it.
 
     Parameters
     ----------
     frames : array_like, shape (T, h, w) or (T, h, w, 3)
-        Training clip of a static scene, at least three frames; some hundred describe the motion well.
+        Training clip of a static scene, at least three frames; some hundred are needed to describe the motion well.
     count : int
-        Flows to make.
+        Number of new flows.
     rng : numpy.random.Generator
-        Source of randomness; the same state of it gives the same bytes.
+        Source of randomness; the same state gives the same bytes.
     params : DynamicTextureParams, optional
         Settings.
     scene : array_like, shape (H, W) or (H, W, 3), optional
-        What to distort, of any size; by default the centroid of the clip.
+        Scene to distort, of any size; by default the centroid of the clip.
     progress : callable, optional
         Called with 1 after each flow that is measured.
 
     Returns
     -------
     DynamicTexture
-        Its flows take as much memory as those of the clip, however many they are.
+        The memory of its flows is that of the flows of the clip, for any ``count``.
 
     Raises
     ------
@@ -215,18 +214,18 @@ def continue_flows(
     params: DynamicTextureParams | None = None,
     size: tuple[int, ...] | None = None,
 ) -> tuple[TextureFlows, FlowDynamics]:
-    """Make up flows that move like given ones.
+    """Synthesise flows that move like given ones.
 
     Parameters
     ----------
     flows : array_like, shape (τ, h, w, 2)
         Training flows, pixels; at least three.
     count : int
-        Flows to make.
+        Number of new flows.
     rng : numpy.random.Generator
         Source of randomness.
     params : DynamicTextureParams, optional
-        Settings; ``flow`` and ``centroid`` are not used.
+        Settings; ``flow`` and ``centroid`` have no effect.
     size : (int, int), optional
         Height and width of the new flows; by default (h, w).
 
@@ -234,7 +233,7 @@ def continue_flows(
     -------
     flows : TextureFlows
     dynamics : FlowDynamics
-        System identified from the training flows, as fitted.
+        System identified from the training flows, before its stabilisation.
 
     Raises
     ------
@@ -285,7 +284,7 @@ def _autoregressions(training: Float64Array, count: int, rng: np.random.Generato
 
 
 def _mirrored(flow: FloatArray, height: int, width: int) -> FloatArray:
-    """Cut to the centre, or continue by reflection, to the size."""
+    """Crop to the centre, or continue by reflection, to the given size."""
     edges = []
     for have, want in zip(flow.shape[:2], (height, width), strict=True):
         before = (want - have) // 2
@@ -298,7 +297,7 @@ def _mirrored(flow: FloatArray, height: int, width: int) -> FloatArray:
 
 
 def _stretched(flow: FloatArray, height: int, width: int) -> FloatArray:
-    """Interpolate over the size; displacements grow with it."""
+    """Interpolate to the given size; displacements scale with it."""
     scale = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
     return cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR) * scale
 

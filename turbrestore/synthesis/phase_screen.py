@@ -5,20 +5,16 @@ Symbols
 Φ : power spectrum of :func:`turbrestore.synthesis.atmosphere.phase_spectrum`; f : frequency, cycles/m.
 P : period of the lattice, m.  w(f) = 1 − exp(−(f P/2)⁴) : share of Φ that the lattice carries.
 
-A Fourier lattice of period P has no frequencies below 1/P, and around 1/P the spectrum falls so steeply that a value
-at the middle of a cell does not stand for the cell.  The spectrum is therefore divided: w Φ, which is smooth on the
-scale 1/P, goes to a lattice (filtered white noise), and the rest, (1 − w) Φ, to plane waves.  Every wave stands for one
-stratum of the plane (ring × sector), has the power of its stratum and a frequency drawn inside it with density Φ, so
-that the expected structure function is exact and not only close, as it is for the customary sub-harmonics at fixed
-frequencies (Lane, Glindemann and Dainty 1992).  The waves repeat nowhere; the lattice repeats after P, and its axes are
-turned against the wind so that what comes back, comes back elsewhere.
+A Fourier lattice of period P has no frequencies below 1/P, and around 1/P the spectrum is so steep that the value in
+the middle of a cell does not represent the cell.  The spectrum is therefore divided.  w Φ, which is smooth on the scale
+1/P, is assigned to a lattice (filtered white noise), and the rest, (1 − w) Φ, to plane waves.  Every wave represents
+one stratum of the plane (ring × sector): it has the power of the stratum and a frequency drawn inside it with density
+Φ.  The expected structure function is therefore exact, unlike that of the usual sub-harmonics at fixed frequencies
+(Lane, Glindemann and Dainty 1992).  The waves never repeat.  The lattice repeats after P, and its axes are rotated
+against the wind so that the same points are not seen again.
 
-The lattice is looked up bilinearly.  At the default path, whose lattice points lie γD/32 apart, this takes 14 % of the
-structure function over one such step, 3 % over four, and nothing over sixteen.
-
-The widely used ``ft_sh_phase_screen`` of aotools (1.0.8) seeds two generators with the same number, one for the
-lattice and one for the sub-harmonics, whenever a seed is given; the two parts then share their draws.  Here they follow
-each other in one generator.
+The lattice is interpolated bilinearly.  On the default path, whose lattice points are γD/32 apart, this removes 14 % of
+the structure function over one such step, 3 % over four, and nothing over sixteen.
 """
 
 from __future__ import annotations
@@ -28,24 +24,22 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import fft, special
 from scipy.interpolate import make_interp_spline
 
 from ..core.arrays import FloatArray
 from ..core.errors import require
-from .atmosphere import Layer, PhaseScreenParams, phase_spectrum
+from .atmosphere import Float64Array, Layer, PhaseScreenParams, phase_spectrum
 
-Float64Array = NDArray[np.float64]
-
-# The share passes from waves to lattice about two cells off the origin.
+# The lattice takes over from the waves about two cells from the origin.
 _CROSSOVER = 2.0
 _STEEPNESS = 4
 _RINGS_PER_DECADE = 7
 _SECTORS = 12
 _SMALLEST_SCREEN, _LARGEST_SCREEN = 512, 2048
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
-# Waves vary so slowly over the field of view that a spline through every 8th pixel follows them to 1e-3.
+# Waves vary so slowly over the field of view that a spline through every 8th pixel is accurate to 1e-3.
 _WAVE_SPACING = 8
 
 
@@ -68,7 +62,7 @@ class PhaseScreen:
     waves : ndarray, complex128, shape (m,)
         Amplitudes, m: the wave is ``Re(a exp(−2πi f·x))``, that is Re a cos + Im a sin.
     wave_slopes : ndarray, complex128, shape (2, m)
-        Amplitudes of the tilts of the waves over the aperture, rad, in the same sense.
+        Amplitudes of the tilts of the waves over the aperture, in the same form, rad.
     """
 
     path: FloatArray
@@ -96,7 +90,7 @@ class Turbulence:
     screens: tuple[PhaseScreen, ...]
 
     def drift(self, time: float) -> Float64Array:
-        """How far the wind has carried each layer.
+        """Displacement of each layer by the wind.
 
         Parameters
         ----------
@@ -136,7 +130,7 @@ def draw_screen(
     rng : numpy.random.Generator
         Source of randomness.
     wavelength : float
-        At which r0 holds, m.
+        Wavelength of r0, m.
     aperture : float
         Diameter over which the slopes are averaged, m.
     turn : float
@@ -155,8 +149,8 @@ def draw_screen(
     --------
     >>> import numpy as np
     >>> screen = draw_screen(64, 0.01, 0.05, 5.0, 0.0, np.random.default_rng(0), wavelength=5e-7, aperture=0.1)
-    >>> sample_path(screen, [0.0, 100.0], [0.0, 0.0]).shape
-    (2,)
+    >>> screen.path.shape, screen.frequencies.shape == (len(screen.waves), 2)
+    ((64, 64), True)
     """
     require(size >= 8, f"size: expected at least 8 points, found {size}")
     period = size * spacing
@@ -167,20 +161,20 @@ def draw_screen(
     amplitude = (np.sqrt(power) * (size / period * wavelength / (2 * np.pi))).astype(np.float32)
     spectrum = fft.rfft2(rng.standard_normal((size, size), dtype=np.float32)) * amplitude
     path = fft.irfft2(spectrum, s=(size, size))
-    spectrum *= (2j * np.pi * tilt_response(f * aperture)).astype(np.complex64)
+    spectrum *= (2j * np.pi * _tilt_response(f * aperture)).astype(np.complex64)
     slopes = np.empty((2, size, size), np.float32)
     for axis in range(2):
         component = (axes[0, axis] * along + axes[1, axis] * across).astype(np.float32)
         slopes[axis] = fft.irfft2(spectrum * component, s=(size, size))
     frequencies, waves = _draw_waves(period, r0, outer_scale, inner_scale, rng)
     waves *= wavelength / (2 * np.pi)
-    response = tilt_response(np.hypot(*frequencies.T) * aperture)
+    response = _tilt_response(np.hypot(*frequencies.T) * aperture)
     wave_slopes = -2j * np.pi * frequencies.T * response * waves
     return PhaseScreen(path, slopes, spacing, axes, frequencies, waves, wave_slopes)
 
 
 def draw_turbulence(params: PhaseScreenParams, shape: tuple[int, ...], rng: np.random.Generator) -> Turbulence:
-    """Draw a phase screen for every layer, wide enough that nothing repeats within the field of view.
+    """Draw a phase screen for every layer, larger than the field of view, so that nothing repeats within it.
 
     Parameters
     ----------
@@ -201,30 +195,23 @@ def draw_turbulence(params: PhaseScreenParams, shape: tuple[int, ...], rng: np.r
     >>> [screen.path.shape for screen in turbulence.screens]
     [(512, 512), (512, 512)]
     """
-    layers, screens = params.path(), []
+    layers, scales, screens = params.path(), (params.outer_scale, params.inner_scale), []
     for number, layer in enumerate(layers):
         diameter = layer.shrink * params.aperture
         width = float(np.hypot(shape[0], shape[1])) * params.pixel_angle * layer.distance + diameter
         finest = max(diameter / params.pupil_samples, params.inner_scale / 4, width / _LARGEST_SCREEN)
         size = max(_SMALLEST_SCREEN, fft.next_fast_len(int(width / finest), real=True))
-        along = np.arctan2(layer.velocity[1], layer.velocity[0])
-        screen = draw_screen(
-            size,
-            finest,
-            layer.r0,
-            params.outer_scale,
-            params.inner_scale,
-            rng,
-            wavelength=params.wavelength,
-            aperture=diameter,
-            turn=along + (number + 1) * _GOLDEN_ANGLE,
+        turn = np.arctan2(layer.velocity[1], layer.velocity[0]) + (number + 1) * _GOLDEN_ANGLE
+        screens.append(
+            draw_screen(
+                size, finest, layer.r0, *scales, rng, wavelength=params.wavelength, aperture=diameter, turn=turn
+            )
         )
-        screens.append(screen)
     return Turbulence(params, layers, tuple(screens))
 
 
 def tilt_flow(turbulence: Turbulence, x: Float64Array, y: Float64Array, drift: Float64Array) -> FloatArray:
-    """Displacement by tilt on a grid of pixels.
+    """Compute the displacement by tilt on a grid of pixels.
 
     Parameters
     ----------
@@ -264,38 +251,10 @@ def tilt_flow(turbulence: Turbulence, x: Float64Array, y: Float64Array, drift: F
     return flow / np.float32(angle)
 
 
-def sample_path(screen: PhaseScreen, x: ArrayLike, y: ArrayLike) -> FloatArray:
-    """Difference of optical path at any points.
-
-    Parameters
-    ----------
-    screen : PhaseScreen
-    x, y : array_like, one shape
-        Positions, m.
-
-    Returns
-    -------
-    ndarray, float32, shape of ``x``
-        m.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> screen = draw_screen(64, 0.01, 0.05, 5.0, 0.0, np.random.default_rng(0), wavelength=5e-7, aperture=0.1)
-    >>> bool(sample_path(screen, 0.02, 0.03) == sample_path(screen, 0.02, 0.03))
-    True
-    """
-    u, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
-    phases = np.multiply.outer(u, screen.frequencies[:, 0]) + np.multiply.outer(v, screen.frequencies[:, 1])
-    smooth = (np.exp(-2j * np.pi * phases) @ screen.waves).real
-    (flat,) = sample_lattice(screen, [screen.path], u.reshape(1, -1), v.reshape(1, -1))
-    return np.asarray(smooth + flat.reshape(u.shape), np.float32)
-
-
 def sample_lattice(
     screen: PhaseScreen, planes: Iterable[FloatArray], x: Float64Array, y: Float64Array
 ) -> list[FloatArray]:
-    """Look up planes on the lattice between their points, bilinear and periodic.
+    """Interpolate planes on the lattice, bilinear and periodic.
 
     Parameters
     ----------
@@ -303,12 +262,12 @@ def sample_lattice(
     planes : iterable of ndarray, float32, shape (n, n)
         ``screen.path`` or ``screen.slopes``.
     x, y : ndarray, float64, shape (a, b)
-        Positions, m, no more than some periods apart.
+        Positions, at most some periods apart, m.
 
     Returns
     -------
     list of ndarray, float32, shape (a, b)
-        One a plane.
+        One for each plane.
 
     Examples
     --------
@@ -322,33 +281,16 @@ def sample_lattice(
     maps = []
     for axis in screen.axes / screen.spacing:
         position = axis[0] * x + axis[1] * y
-        # Whole periods are taken off in double precision; single precision is enough for what remains.
+        # Whole periods are subtracted in double precision; single precision is enough for the remainder.
         position -= size * np.floor(position.flat[0] / size)
         maps.append(position.astype(np.float32))
     return [cv2.remap(plane, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for plane in planes]
 
 
-def tilt_response(cycles: ArrayLike) -> Float64Array:
-    """Share of a wave's slope that the plane fitted over a circular aperture keeps: ``8 J2(πfD)/(πfD)²``.
-
-    Noll (1976), from the transform of Zernike tilt.
-
-    Parameters
-    ----------
-    cycles : array_like
-        f D, cycles across the aperture.
-
-    Returns
-    -------
-    ndarray, float64, shape of ``cycles``
-
-    Examples
-    --------
-    >>> tilt_response([0.0, 1.0]).round(3)
-    array([1.   , 0.393])
-    """
-    x = np.maximum(np.pi * np.abs(np.asarray(cycles, np.float64)), 1e-2)
-    # J2 by recurrence: SciPy has fast routines for J0 and J1 only.
+def _tilt_response(cycles: Float64Array) -> Float64Array:
+    """Share of a wave's slope in the plane fitted over an aperture, ``8 J2(πfD)/(πfD)²`` (Noll 1976), from f D."""
+    x = np.maximum(np.pi * cycles, 1e-2)
+    # J2 by recurrence, because SciPy has fast routines for J0 and J1 only.
     return 8 * (2 * special.j1(x) / x - special.j0(x)) / x**2
 
 
@@ -359,8 +301,8 @@ def _lattice_share(f: Float64Array, period: float) -> Float64Array:
 def _draw_waves(
     period: float, r0: float, outer_scale: float, inner_scale: float, rng: np.random.Generator
 ) -> tuple[Float64Array, NDArray[np.complex128]]:
-    """Frequencies and amplitudes (rad), one wave a stratum; half the plane is enough for real waves."""
-    # Beyond the last ring waves carry less than 1e-7 of Φ; within the first Φ is flat and tilts nothing.
+    """Frequencies and amplitudes (rad), one wave for each stratum of half the plane, which suffices for real waves."""
+    # Beyond the last ring the waves have less than 1e-7 of Φ; within the first Φ is flat and causes no tilt.
     last = 2 * _CROSSOVER / period
     first = min(0.05 / outer_scale, last / 10)
     count = int(np.ceil(_RINGS_PER_DECADE * np.log10(last / first)))
@@ -379,7 +321,7 @@ def _draw_waves(
 
 
 def _spline(pixels: Float64Array) -> tuple[Float64Array, FloatArray]:
-    """Nodes that span the pixels, and the matrix that takes values at the nodes to the pixels by a cubic spline."""
+    """Nodes that span the pixels, and the matrix of cubic spline interpolation from the nodes to the pixels."""
     count = max(4, int(np.ceil(np.ptp(pixels) / _WAVE_SPACING)) + 1)
     nodes = np.linspace(pixels[0], max(pixels[-1], pixels[0] + 1), count)
     return nodes, make_interp_spline(nodes, np.eye(count))(pixels).astype(np.float32)

@@ -1,6 +1,6 @@
-"""Scenes to look at through turbulence, at any size: a resolution chart, a page of words, and pictures.
+"""Scenes for synthetic turbulence, at any size: a resolution chart, a page of words, and pictures.
 
-The pictures are those of scikit-image that its wheel brings along; nothing is downloaded.
+The pictures are those contained in the wheel of scikit-image; nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -23,31 +23,20 @@ if TYPE_CHECKING:
 
 SMALLEST = 64
 # Grey pictures, then those in colour.
-PICTURES = {
-    "camera": "camera.png",
-    "brick": "brick.png",
-    "grass": "grass.png",
-    "gravel": "gravel.png",
-    "coins": "coins.png",
-    "moon": "moon.png",
-    "page": "page.png",
-    "astronaut": "astronaut.png",
-    "cat": "chelsea.png",
-    "coffee": "coffee.png",
-    "rocket": "rocket.jpg",
-}
-# Common words of five to eight letters, which a text recogniser has in its dictionary.
+PICTURES = ("camera", "brick", "grass", "gravel", "coins", "moon", "page", "astronaut", "cat", "coffee", "rocket")
+_FILES = {"cat": "chelsea.png", "rocket": "rocket.jpg"}
+# Common words of five to eight letters, which are in the dictionary of a text recogniser.
 WORDS = ("harbour", "window", "engine", "seventh", "market", "glacier", "copper", "journey", "planet", "bridge")
 _DARK, _BRIGHT = 0.12, 0.88
-# Drawn this many times larger and averaged down: no jagged edges.
+# Scenes are drawn this many times larger and averaged down, which avoids jagged edges.
 _OVERSAMPLING = 4
 _LINE_SPACING = 1.2
-# Letters are about half as high as the size of their font.
+# Letters are about half as high as the font size.
 _SMALLEST_FONT = 6
 
 
 def resolution_chart(height: int = 256, width: int = 256) -> FloatArray:
-    """Bars, letters, a Siemens star, a checkerboard and thin lines, one kind in each part of the image.
+    """Draw a chart of bars, letters, a Siemens star, a checkerboard and thin lines.
 
     Parameters
     ----------
@@ -89,15 +78,14 @@ def resolution_chart(height: int = 256, width: int = 256) -> FloatArray:
 
 
 def picture(name: str, height: int, width: int) -> FloatArray:
-    """Photograph or texture of scikit-image: its largest central part of the right proportions, resized.
+    """Load a photograph or texture of scikit-image, crop it centrally to the proportions asked for, and resize it.
 
     Parameters
     ----------
     name : str
         One of ``PICTURES``.
     height, width : int
-        Size in pixels.  Pixels are averaged by area where the picture shrinks and interpolated where it grows; most
-        have 512 pixels a side, beyond which they look soft.
+        Size in pixels.  Most pictures have 512 pixels a side and look soft beyond that size.
 
     Returns
     -------
@@ -115,8 +103,8 @@ def picture(name: str, height: int, width: int) -> FloatArray:
     """
     require(name in PICTURES, f"picture: expected one of {', '.join(PICTURES)}, found {name!r}")
     require(min(height, width) >= 1, f"size: expected at least 1 pixel a side, found {width}×{height}")
-    # Read from its folder: the functions of skimage.data may start a download.
-    with as_file(files("skimage.data") / PICTURES[name]) as path:
+    # The functions of skimage.data could start a download, so the file is read directly.
+    with as_file(files("skimage.data") / _FILES.get(name, f"{name}.png")) as path:
         whole = read_image(path).image
     scale = min(whole.shape[0] / height, whole.shape[1] / width)
     rows, columns = (max(1, round(scale * side)) for side in (height, width))
@@ -127,14 +115,14 @@ def picture(name: str, height: int, width: int) -> FloatArray:
 
 
 def printed_words(height: int, width: int, words: Sequence[str] = WORDS) -> FloatArray:
-    """Page of printed words, as large as they fit, for measuring how much of a text can be read.
+    """Print words on a page, as large as they fit, to measure how much of a text can be read.
 
     Parameters
     ----------
     height, width : int
         Size in pixels, at least 64.
     words : sequence of str
-        What is printed, line by line from the upper left.
+        Printed line by line from the upper left.
 
     Returns
     -------
@@ -143,7 +131,7 @@ def printed_words(height: int, width: int, words: Sequence[str] = WORDS) -> Floa
     Raises
     ------
     ConfigurationError
-        The size is too small, or there are no words, or they do not fit at three pixels of letter height.
+        The size is too small, there are no words, or they do not fit at three pixels of letter height.
 
     Examples
     --------
@@ -158,7 +146,7 @@ def printed_words(height: int, width: int, words: Sequence[str] = WORDS) -> Floa
     margin = max(4, min(height, width) // 20) * _OVERSAMPLING
     room = (width * _OVERSAMPLING - 2 * margin, height * _OVERSAMPLING - 2 * margin)
     font, lines = _largest_print(words, *room)
-    require(bool(lines), f"words: expected what fits on {width}×{height} pixels, found {len(words)}; print fewer")
+    require(bool(lines), f"words: expected words that fit on {width}×{height} pixels, found {len(words)}; print fewer")
     ink = Image.new("L", (width * _OVERSAMPLING, height * _OVERSAMPLING))
     drawing = ImageDraw.Draw(ink)
     pitch = room[1] / len(lines)
@@ -169,22 +157,22 @@ def printed_words(height: int, width: int, words: Sequence[str] = WORDS) -> Floa
 
 
 def _largest_print(words: Sequence[str], width: int, height: int) -> tuple[FreeTypeFont | ImageFont, list[str]]:
-    """Largest font with which the words fit, and the lines they make; no lines if there is none."""
+    """Largest font with which the words fit, and their lines; no lines if there is none."""
     from PIL import ImageFont
 
     size = float(height)
-    while True:
+    while size >= _SMALLEST_FONT * _OVERSAMPLING:
         font = ImageFont.load_default(size)
         lines = _broken_lines(words, font, width)
-        fits = bool(lines) and len(lines) * _LINE_SPACING * size <= height
-        # A twelfth of an octave less each time.
+        if lines and len(lines) * _LINE_SPACING * size <= height:
+            return font, lines
+        # Each step is a twelfth of an octave.
         size *= 2 ** (-1 / 12)
-        if fits or size < _SMALLEST_FONT * _OVERSAMPLING:
-            return font, lines if fits else []
+    return ImageFont.load_default(), []
 
 
 def _broken_lines(words: Sequence[str], font: FreeTypeFont | ImageFont, width: int) -> list[str]:
-    """Words in lines no longer than ``width`` pixels; no lines if a word is."""
+    """Break words into lines of at most ``width`` pixels; no lines if a word is longer."""
     lines: list[str] = []
     for word in words:
         if font.getlength(word) > width:
@@ -198,7 +186,7 @@ def _broken_lines(words: Sequence[str], font: FreeTypeFont | ImageFont, width: i
 
 
 def _bars(height: int, width: int) -> FloatArray:
-    """Bars that get finer from left to right, upright in the upper half and level in the lower."""
+    """Bars of increasing frequency, vertical in the upper half and horizontal in the lower."""
     x = np.linspace(0, 1, width, endpoint=False, dtype=np.float32)
     finest = width / _OVERSAMPLING / 5
     phase = finest * (0.25 * x + 0.375 * x**2)
@@ -247,7 +235,7 @@ def _printed(ink: NDArray[np.uint8]) -> FloatArray:
 
 
 def _checkerboard(height: int, width: int) -> FloatArray:
-    """Squares that shrink from quarter to quarter."""
+    """Squares of four sizes, one in each quarter."""
     y, x = np.mgrid[:height, :width]
     side = np.where(y < height // 2, np.where(x < width // 2, 12, 8), np.where(x < width // 2, 6, 4)) * _OVERSAMPLING
     return np.where((x // side + y // side) % 2 == 0, _DARK, _BRIGHT).astype(np.float32)

@@ -1,7 +1,14 @@
-"""What synthetic sequences have in common: scenes that show motion, frames with their true flow, and the camera."""
+"""The camera of synthetic sequences: exposures with their true flow, noise, and the scenes that it can record.
+
+Symbols
+-------
+Y : image of an integrative sensor, ``Y = (1/T_e) ∫ ρ ∘ w_t⁻¹ dt`` over the exposure T_e (papers 1 and 2), here the mean
+over sub-frames in the middle of equal parts of it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,15 +16,16 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image, from_unit
 from ..core.errors import DataError, require, require_between
+from ..registration.warp import invert_flow, warp
 
-# Below this no stage can tell motion.
+# No stage can measure motion in a smaller scene.
 SMALLEST_SCENE = 16
 _LEAST_CONTRAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticFrame:
-    """One frame and the motion it was made with.
+    """One frame and its true motion.
 
     Attributes
     ----------
@@ -34,20 +42,20 @@ class SyntheticFrame:
 
 @dataclass(frozen=True)
 class CameraParams:
-    """When the camera looks, and what it adds.
+    """Timing and noise of the camera.
 
     Parameters
     ----------
     frame_rate : float
         Frames per second.
     exposure : float
-        Time over which a frame gathers light, s, from the start of the frame on; 0 is an instant.
+        Exposure time from the start of the frame on, s; 0 is an instant.
     sub_frames : int
-        Instants that an exposure is summed from.
+        Number of instants over which an exposure is averaged.
     photons : float
-        Photons per pixel at white, which give shot noise; inf for none.
+        Photons per pixel at white, which determine the shot noise; inf for none.
     read_noise : float
-        Standard deviation of the noise of reading, intensity.
+        Standard deviation of the read noise, intensity.
     bit_depth : int
         1 to 16.
     """
@@ -66,14 +74,14 @@ class CameraParams:
             f"exposure: expected 0 to the frame time of {1 / self.frame_rate:.6g} s, found {self.exposure:g}",
         )
         require_between("sub_frames", self.sub_frames, 1, 1000)
-        # Beyond 10¹² shot noise is less than a millionth; NumPy cannot draw it beyond 10¹⁸.
+        # Above 10¹² photons shot noise is less than a millionth; NumPy cannot draw it above 10¹⁸.
         if self.photons != np.inf:
             require_between("photons", self.photons, 1, 1e12, "per pixel at white, or inf")
         require_between("read_noise", self.read_noise, 0, 1)
         require_between("bit_depth", self.bit_depth, 1, 16)
 
     def sub_frame_shares(self) -> tuple[float, ...]:
-        """Instants of an exposure as shares of the frame time, each in the middle of its part.
+        """Instants of an exposure as shares of the frame time, in the middle of equal parts.
 
         Returns
         -------
@@ -92,7 +100,7 @@ class CameraParams:
 
 
 def check_scene(scene: ArrayLike) -> FloatArray:
-    """Return a scene that can show turbulence, as float32.
+    """Check that a scene can show turbulence, and return it as float32.
 
     Parameters
     ----------
@@ -129,7 +137,7 @@ def check_scene(scene: ArrayLike) -> FloatArray:
 
 
 def record(image: FloatArray, camera: CameraParams, rng: np.random.Generator) -> FloatArray:
-    """Give what the camera makes of an image: shot noise, read noise, quantisation.
+    """Add shot noise and read noise to an image, and quantise it.
 
     Parameters
     ----------
@@ -156,3 +164,91 @@ def record(image: FloatArray, camera: CameraParams, rng: np.random.Generator) ->
     if camera.read_noise > 0:
         exposed = exposed + np.float32(camera.read_noise) * rng.standard_normal(image.shape, dtype=np.float32)
     return np.divide(from_unit(exposed, camera.bit_depth), np.float32(2**camera.bit_depth - 1), dtype=np.float32)
+
+
+def exposed_frame(
+    scene: ArrayLike,
+    sub_flows: Iterable[FloatArray],
+    blur: Callable[[FloatArray, int], FloatArray] | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Average a scene displaced by the flow of each sub-frame.
+
+    Parameters
+    ----------
+    scene : array_like, shape (H, W) or (H, W, 3)
+        ρ.
+    sub_flows : iterable of ndarray, float32, shape (H, W, 2)
+        From the scene to each sub-frame, pixels; at least one.
+    blur : callable, optional
+        ``blur(image, index)`` is applied to each displaced sub-frame; it may crop.
+
+    Returns
+    -------
+    image : ndarray, float32
+        Y, before noise.
+    flow : ndarray, float32, shape (H, W, 2)
+        Mean of the flows, pixels.
+
+    Raises
+    ------
+    DataError
+        No flow, or shapes do not agree.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> dot = np.zeros((16, 16), np.float32); dot[8, 8] = 1
+    >>> flows = np.zeros((2, 16, 16, 2), np.float32); flows[1, ..., 0] = 2
+    >>> image, flow = exposed_frame(dot, flows)
+    >>> image[8, 8:11:2].round(3), flow[8, 8]
+    (array([0.5, 0.5], dtype=float32), array([1., 0.], dtype=float32))
+    """
+    truth = check_image(scene, "scene")
+    total, displacement, count = None, None, 0
+    for index, flow in enumerate(sub_flows):
+        seen = warp(truth, invert_flow(flow))
+        seen = seen if blur is None else blur(seen, index)
+        total = seen if total is None else total + seen
+        displacement = flow if displacement is None else displacement + flow
+        count += 1
+    if total is None or displacement is None:
+        raise DataError("sub_flows: expected at least one flow, found none")
+    return total / np.float32(count), displacement / np.float32(count)
+
+
+def flows_between(flows: Iterable[FloatArray], shares: Sequence[float]) -> Iterator[list[FloatArray]]:
+    """Interpolate the flows of the sub-frames of each frame linearly in time, between its flow and the next one.
+
+    Parameters
+    ----------
+    flows : iterable of ndarray, float32, shape (H, W, 2)
+        At the start of each frame, one at a time; the last flow only ends the frame before it.
+    shares : sequence of float
+        Instants as shares of the frame time, 0 to 1.
+
+    Yields
+    ------
+    list of ndarray, float32, shape (H, W, 2)
+        One flow for each share; one list fewer than flows.
+
+    Raises
+    ------
+    ConfigurationError
+        No share, or one outside 0 to 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> flows = (np.full((1, 1, 2), k, np.float32) for k in range(3))
+    >>> [[float(flow[0, 0, 0]) for flow in frame] for frame in flows_between(flows, (0.0, 0.5))]
+    [[0.0, 0.5], [1.0, 1.5]]
+    """
+    require(
+        len(shares) > 0 and all(0 <= share <= 1 for share in shares),
+        f"shares: expected at least one, all of 0 to 1, found {tuple(shares)}",
+    )
+    previous: FloatArray | None = None
+    for flow in flows:
+        if previous is not None:
+            yield [previous + np.float32(share) * (flow - previous) for share in shares]
+        previous = flow

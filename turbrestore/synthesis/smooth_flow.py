@@ -1,8 +1,8 @@
 """Sequences with known motion: smooth random flows that change steadily, and frames distorted by them.
 
-The simplest turbulence there is: each component of the flow is a stationary Gaussian field in space (Gaussian
-correlation) and an autoregression of order one in time.  It has no physics in it; it serves where the true flow must
-be known, in tests, examples and benchmarks.
+Each component of a flow is a stationary Gaussian field in space (Gaussian correlation) and an autoregression of order
+one in time.  This is not a model of the atmosphere; it is used where the true flow must be known, in tests, examples
+and benchmarks.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def smooth_flows(
 def distort(
     scene: ArrayLike, flows: ArrayLike, rng: np.random.Generator, blur: float = 0.0, noise: float = 0.0
 ) -> FloatArray:
-    """Frames of a scene seen through flows: ``I_k = (Kρ) ∘ w_k⁻¹`` plus noise (paper 3, eq. 6).
+    """Distort a scene by flows: ``I_k = (Kρ) ∘ w_k⁻¹`` plus noise (paper 3, eq. 6).
 
     Parameters
     ----------

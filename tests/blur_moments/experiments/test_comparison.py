@@ -1,29 +1,20 @@
-"""What both experiments must show, with few seeds, and the bookkeeping of scores and bounds."""
-
-from itertools import pairwise
+"""What both experiments must show, with few seeds, and the arithmetic of the scores."""
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from turbrestore.blur_moments.augmented import largest_deviation
-from turbrestore.blur_moments.blur_model import predicted_moments
-from turbrestore.blur_moments.bounds import image_information, moment_information, posterior_bound
-from turbrestore.blur_moments.experiments import mirror, wavefront
-from turbrestore.blur_moments.image_prediction import ImageFilter
-from turbrestore.blur_moments.observers import steady_kalman
-from turbrestore.blur_moments.scenarios import (
+from turbrestore.blur_moments.experiments.comparison import Contestant, Track, follow, mirror, score, wavefront
+from turbrestore.blur_moments.experiments.scenarios import (
     MirrorParams,
     WavefrontParams,
     mirror_model,
     mirror_oscillator,
     record_mirror,
-    record_wavefront,
-    wavefront_model,
 )
-from turbrestore.blur_moments.sensor import expose
-from turbrestore.blur_moments.trials import Contestant, Track, follow, join_tracks, score
-from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.blur_moments.image_observer import ImageFilter
+from turbrestore.blur_moments.observers import steady_kalman
+from turbrestore.core.errors import ConfigurationError
 from turbrestore.filtering.kalman import Gaussian
 
 SEEDS = 40
@@ -116,62 +107,20 @@ class TestMirror:
         assert augmented.between < 0.35 * O1.between
         assert np.isnan(augmented.bound)
 
-    def test_plants_stay_within_their_bounds(self):
-        params = MirrorParams(frames=1, burn_in=0, deviation=5.0)
-        plants = record_mirror(range(40), params).states[0, :, 2:]
-        found = largest_deviation(plants, 2 * np.pi * np.linspace(0.2, 10.0, 50), mirror_oscillator().nominal)
-        assert found.max() <= 5.0
-        assert found.max() > 4.0
+
+def test_results_do_not_depend_on_how_seeds_are_grouped(monkeypatch):
+    params = WavefrontParams(frames=3, burn_in=1)
+    whole = wavefront(range(5), params)
+    monkeypatch.setattr("turbrestore.blur_moments.experiments.comparison._CHUNK", 2)
+    parts = wavefront(range(5), params)
+    for name, result in whole.scores.items():
+        assert parts.scores[name].error == pytest.approx(result.error, rel=1e-9)
+        assert parts.scores[name].bound == pytest.approx(result.bound, rel=1e-9)
 
 
-class TestRecordings:
-    def test_runs_are_functions_of_their_seed(self):
-        params = WavefrontParams(frames=3, burn_in=0)
-        alone, among = record_wavefront([5], params), record_wavefront([1, 5, 9], params)
-        # Products of matrices may round differently in a batch of another size.
-        np.testing.assert_allclose(alone.frames[:, 0], among.frames[:, 1], atol=1e-12)
-        assert not np.allclose(among.frames[:, 0], among.frames[:, 1])
-        again = record_mirror([5], MirrorParams(frames=2, burn_in=0))
-        np.testing.assert_array_equal(again.frames, record_mirror([5], MirrorParams(frames=2, burn_in=0)).frames)
-
-    def test_frames_are_exposures_of_the_outputs(self):
-        quiet = WavefrontParams(frames=2, burn_in=0, noise=1e-12)
-        recording, model = record_wavefront([3], quiet), wavefront_model(quiet)
-        image = expose(recording.outputs[1, 0], model.sensor.kernel, model.sensor.pixels)
-        np.testing.assert_allclose(recording.frames[1, 0], image, atol=1e-3)
-
-    def test_results_do_not_depend_on_how_seeds_are_grouped(self, monkeypatch):
-        params = WavefrontParams(frames=3, burn_in=1)
-        whole = wavefront(range(5), params)
-        monkeypatch.setattr("turbrestore.blur_moments.experiments._CHUNK", 2)
-        parts = wavefront(range(5), params)
-        for name, result in whole.scores.items():
-            assert parts.scores[name].error == pytest.approx(result.error, rel=1e-9)
-            assert parts.scores[name].bound == pytest.approx(result.bound, rel=1e-9)
-
-
-class TestBounds:
-    def test_of_a_linear_measurement_is_the_kalman_covariance(self):
-        model = wavefront_model()
-        _, settled = steady_kalman(model)
-        _, H, R = predicted_moments(model, np.zeros(2), np.zeros(200), (1,))
-        information = moment_information(model, np.zeros(2), np.zeros(200), (1,))
-        np.testing.assert_allclose(information, H.T @ H / R[0, 0])
-        bounds = posterior_bound(model.motion.A, model.motion.Q, settled, [information] * 4)
-        gain = settled @ H.T / (H @ settled @ H.T + R)
-        np.testing.assert_allclose(bounds[-1], settled - gain @ H @ settled, rtol=1e-8)
-
-    def test_more_moments_never_hold_less_and_the_image_most(self):
-        model, rng = wavefront_model(), np.random.default_rng(0)
-        states, inputs = rng.normal(0, 0.2, (5, 2)), rng.normal(size=(5, 200))
-        whole = image_information(model, states, inputs)
-        found = [moment_information(model, states, inputs, tuple(range(1, p + 1))) for p in (1, 2, 4)] + [whole]
-        for less, more in pairwise(found):
-            assert (np.linalg.eigvalsh(more - less) > -0.01 * np.trace(whole, axis1=1, axis2=2)[:, None]).all()
-
-    def test_singular_start(self):
-        with pytest.raises(DataError, match="singular"):
-            posterior_bound(np.eye(2), np.eye(2), np.diag([1.0, 0.0]), [np.eye(2)])
+def test_seeds_are_needed():
+    with pytest.raises(ConfigurationError, match="^seeds: expected"):
+        wavefront([])
 
 
 class TestScores:
@@ -203,12 +152,6 @@ class TestScores:
         spread = np.std([result.ratio for result in found])
         assert np.mean([result.ratio_error for result in found]) == pytest.approx(spread, rel=0.15)
 
-    def test_joined_tracks(self):
-        track = Track(np.ones((3, 2)), np.ones((3, 2)), np.ones((3, 2)), 4, np.zeros((3, 7)))
-        joined = join_tracks([track, track])
-        assert joined.errors.shape == (3, 4)
-        assert joined.example.shape == (3, 7)
-
     def test_error_of_the_output_is_that_within_the_exposure(self):
         params = MirrorParams(frames=2, burn_in=0)
         recording, model = record_mirror([0, 1], params), mirror_oscillator(params)
@@ -220,23 +163,3 @@ class TestScores:
         steps = model.timing.exposure_steps
         assert track.errors[0, 0] == pytest.approx(np.sqrt(np.mean(away[:steps] ** 2)))
         assert track.between[0, 0] == pytest.approx(np.sqrt(np.mean(away**2)))
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: wavefront([]),
-        lambda: WavefrontParams(frames=10, burn_in=10),
-        lambda: WavefrontParams(slope_disturbance=0.0),
-        lambda: WavefrontParams(pixels=4),
-        lambda: WavefrontParams(noise=0.0),
-        lambda: WavefrontParams(kernel_width=1e-6),
-        lambda: WavefrontParams(low_tone=float("nan")),
-        lambda: MirrorParams(amplitude=float("inf")),
-        lambda: MirrorParams(deviation=8.0),
-        lambda: MirrorParams(rate_disturbance=float("nan")),
-    ],
-)
-def test_settings_that_make_no_sense(make):
-    with pytest.raises(ConfigurationError, match="^[a-z_]+: expected [^\n]*$"):
-        make()

@@ -1,13 +1,16 @@
-"""Power spectra of windowed tiles: where the tiles lie, what noise adds to the spectra, how the window smears them.
+"""Power spectra of windowed tiles: their places, noise floor and window smear, and the weights of fits to them.
 
 Symbols
 -------
 P, n : power spectrum of a tile and its noise floor, squared intensity.
 k : frequency, radians per pixel; δ² : variance per axis by which the window smears a spectrum.
-D : difference of two blurs, squared pixels.
-β, v : what a smooth spectrum is taken to be, ``log P = a − β log k − v k²``.
+D : difference of the covariances of two blurs, squared pixels; q = kᵀDk, the exponent by which two spectra differ.
+β, v : parameters of a smooth model spectrum, ``log P = a − β log k − v k²``.
 
-A ring holds the frequencies of about one length |k|, a cell is a ring or the part of it in a range of directions.
+A ring holds the frequencies of about one length |k|; a cell is a ring, or its part in a range of directions.
+
+Fits compare ``(P₁ − n₁) e^{q/2}`` with ``(P₂ − n₂) e^{−q/2}``, so no logarithm is taken of noise.  The code calls these
+two sides ``grown`` and ``shrunk``.
 """
 
 from __future__ import annotations
@@ -24,29 +27,34 @@ from ..core.errors import DataError, require, require_between
 
 Float64Array = NDArray[np.float64]
 
-# Neighbouring values of the spectrum of a tile under a Hann window are correlated: power by 4/9 and 1/36 per axis.
+# Values of the spectrum that count as one independent value: under a Hann window the power of neighbours is correlated
+# by 4/9 and 1/36 per axis.
 CORRELATED = 1 + 2 * (4 / 9 + 1 / 36)
-# Noise below this drowns in the rounding of float32, intensity.
+# Larger exponents only say that nothing of a frequency is left.
+LARGEST_EXPONENT = 8.0
+# Newton steps of a fit, and their largest size, squared pixels.
+NEWTON_STEPS, LARGEST_STEP = 12, 4.0
+# Smaller noise is hidden by the rounding of float32, intensity.
 _LEAST_NOISE = 1e-6
 
 
 @dataclass(frozen=True)
 class CueParams:
-    """How spectra are compared.
+    """Settings of the comparison of spectra.
 
     Parameters
     ----------
     tile : int
-        Side of the square tiles, pixels; half of it is the distance between them.  Images smaller than a tile are
-        one tile.
+        Side of the square tiles, pixels; neighbouring tiles overlap by half.  An image smaller than a tile is one
+        tile.
     lowest : float
-        Lowest frequency that is used, periods in a tile; below 1.5 the brightness of the tile leaks in.
+        Lowest frequency used, periods in a tile; below 1.5 the mean brightness of the tile leaks in.
     highest : float
-        Highest frequency that is used, cycles per pixel.
+        Highest frequency used, cycles per pixel.
     misfit : float
-        Relative error of the spectrum of a tile besides noise: what a blur carries over its border.
+        Relative error of the spectrum of a tile besides noise, from structure blurred across its border.
     departure : float
-        Error of an exponent as a share of its square: blur is a Gaussian at low frequency only.
+        Error of an exponent as a share of its square, because a blur is Gaussian at low frequency only.
     """
 
     tile: int = 48
@@ -66,7 +74,7 @@ class CueParams:
 
 @dataclass(frozen=True, eq=False)
 class TileGrid:
-    """Where the tiles of an image lie.
+    """Positions of the tiles of an image.
 
     Attributes
     ----------
@@ -86,7 +94,7 @@ class TileGrid:
 
 @dataclass(frozen=True, eq=False)
 class TileSpectra:
-    """Power spectra of the windowed tiles of images of one size, at the frequencies that are used.
+    """Power spectra of the windowed tiles of images of one size, at the frequencies used.
 
     Attributes
     ----------
@@ -141,14 +149,14 @@ class TileSpectra:
         window /= np.sqrt(np.sum(window**2))
         ky, kx = np.meshgrid(fft.fftfreq(height), fft.rfftfreq(width), indexing="ij")
         radius = np.hypot(kx, ky)
-        # Half of the plane says it all: the spectrum of an image is symmetric.
+        # Half of the plane suffices, because the power spectrum of an image is symmetric.
         half = (kx > 0) | (ky > 0)
         inside = half & (radius * min(height, width) >= params.lowest) & (radius <= params.highest)
         used = np.flatnonzero(inside)
         return cls(grid, window.astype(np.float32), used, 2 * np.pi * kx.flat[used], 2 * np.pi * ky.flat[used])
 
     def power(self, image: FloatArray) -> FloatArray:
-        """Spectra of the tiles; white noise of variance 1 gives 1.
+        """Compute the power spectra of the tiles; white noise of variance 1 gives 1.
 
         Parameters
         ----------
@@ -159,31 +167,31 @@ class TileSpectra:
         ndarray, float32, shape (tiles, f)
             P, squared intensity.
         """
-        # The brightness is taken out first: float32 keeps seven digits of it.
+        # The mean brightness is subtracted first, because float32 has seven digits only.
         tiles = np.lib.stride_tricks.sliding_window_view(image - image.mean(), self.grid.size)
         power = np.empty((len(self.grid.rows), len(self.grid.columns), len(self.used)), image.dtype)
-        # A row of tiles at a time: windowed and transformed, all of them take fifteen times what the image takes.
+        # One row of tiles at a time: all windowed and transformed tiles take fifteen times the memory of the image.
         for row, found in zip(self.grid.rows, power, strict=True):
             spectrum = fft.rfft2(tiles[row, self.grid.columns] * self.window).reshape(len(found), -1)[:, self.used]
             np.add(spectrum.real**2, spectrum.imag**2, out=found)
         return power.reshape(-1, len(self.used))
 
     def cells(self, sectors: int = 1) -> tuple[FloatArray, Float64Array, Float64Array]:
-        """Rings of the spectrum, cut into sectors.
+        """Divide the spectrum into rings and sectors.
 
         Parameters
         ----------
         sectors : int
-            How many directions are told apart.
+            Number of directions that are distinguished.
 
         Returns
         -------
         averaging : ndarray, float32, shape (f, cells)
-            Times a spectrum, the mean of every cell.
+            A spectrum times this matrix is the mean of every cell.
         k2 : ndarray, float64, shape (cells,)
             Mean of k².
         counts : ndarray, float64, shape (cells,)
-            How many independent values each holds, at least 1.
+            Number of independent values in each cell, at least 1.
         """
         k = np.hypot(self.kx, self.ky)
         ring = np.rint(k / (2 * np.pi) * min(self.grid.size))
@@ -200,7 +208,7 @@ class TileSpectra:
         return float(4 / 3 * np.pi**2 / (self.grid.size[0] * self.grid.size[1]))
 
     def widening(self, powers: list[Float64Array], k2: Float64Array) -> Float64Array:
-        """Factor by which k² of an exponent is seen through the window.
+        """Factor by which the smear of the window changes k² in an exponent.
 
         A smear by a variance δ² per axis turns P into P + δ²/2 ΔP, and the logarithm of a ratio −D k² into
         −D (k² + δ²/2 (4 + 2 k d/dk log P₁P₂)).
@@ -221,7 +229,7 @@ class TileSpectra:
 
 
 def tile_map(values: ArrayLike, grid: TileGrid) -> FloatArray:
-    """Values of the tiles at every pixel: bilinear between the centres of the tiles, constant beyond.
+    """Interpolate values of the tiles to every pixel: bilinear between the centres of the tiles, constant beyond.
 
     Parameters
     ----------
@@ -259,7 +267,7 @@ def noise_floor(noise: float) -> float:
     Returns
     -------
     float
-        n, squared intensity; above 0 also where there is no noise.
+        n, squared intensity; above 0 even without noise.
 
     Raises
     ------
@@ -271,40 +279,57 @@ def noise_floor(noise: float) -> float:
     >>> noise_floor(0.5)
     0.25
     """
-    check_noise(noise)
+    require(np.isfinite(noise) and noise >= 0, f"noise: expected a finite number of 0 or more, found {noise}")
     return max(noise, _LEAST_NOISE) ** 2
 
 
-def check_noise(noise: float) -> None:
-    """Refuse a noise that is none.
+def fit_weights(
+    cells: tuple[Float64Array, Float64Array, Float64Array],
+    floors: tuple[float, float],
+    repeats: float | Float64Array,
+    cell_size: float | Float64Array,
+    params: CueParams,
+) -> tuple[Float64Array, Float64Array]:
+    """Weights of ``shrunk − grown`` in a fit of the exponent q, and the signal that both sides have in common.
+
+    The weight is the inverse variance of ``log grown − log shrunk`` divided by the signal.
 
     Parameters
     ----------
-    noise : float
-        Standard deviation, intensity.
+    cells : tuple of three ndarrays, float64, shape (..., cells)
+        ``grown``, ``shrunk`` and q.
+    floors : tuple of two floats
+        n₁ and n₂.
+    repeats : float or ndarray
+        Number of independent values of which each entry is a mean.
+    cell_size : float or ndarray
+        Number of such entries in a cell.
+    params : CueParams
 
-    Raises
-    ------
-    ConfigurationError
-        The noise is negative or not finite.
-
-    Examples
-    --------
-    >>> check_noise(-1.0)
-    Traceback (most recent call last):
-    turbrestore.core.errors.ConfigurationError: noise: expected a finite number of 0 or more, found -1.0
+    Returns
+    -------
+    weight, signal : ndarray, float64, shape (..., cells)
     """
-    require(np.isfinite(noise) and noise >= 0, f"noise: expected a finite number of 0 or more, found {noise}")
+    grown, shrunk, q = cells
+    noise_one, noise_two = floors[0] * np.exp(q / 2), floors[1] * np.exp(-q / 2)
+    # The image with less noise shows the signal better.
+    share = (noise_two + 1e-30) / (noise_one + noise_two + 2e-30)
+    error = np.hypot(share * noise_one, (1 - share) * noise_two) / np.sqrt(repeats * cell_size)
+    # A cell of pure noise seems to contain some signal by chance.
+    signal = np.maximum(share * grown + (1 - share) * shrunk - 2 * error, 1e-15)
+    noise = 2 * signal * (noise_one + noise_two) + noise_one**2 + noise_two**2
+    variance = (params.misfit**2 * signal**2 + noise) / repeats + (params.departure * q**2 * signal) ** 2
+    return signal / variance, signal
 
 
 def _log_slope(power: Float64Array, k2: Float64Array) -> Float64Array:
-    """Logarithmic slope k d/dk of ``log P = a − β log k − v k²``, fitted up to where the signal ends; 0 if nowhere."""
+    """Logarithmic slope k d/dk of ``log P = a − β log k − v k²``, fitted where there is signal; 0 if there is none."""
     weak = np.flatnonzero(power <= 1e-4 * power.max(initial=0.0))
     end = weak[0] if len(weak) else len(power)
     if end < 4:
         return np.zeros_like(k2)
     terms = np.stack([np.ones_like(k2), -0.5 * np.log(k2), -k2], axis=1)[:end]
-    # Rings hold values in proportion to k.
+    # The number of values in a ring is proportional to k.
     weights = k2[:end] ** 0.25
     solution = np.linalg.lstsq(terms * weights[:, None], np.log(power[:end]) * weights, rcond=None)[0]
     return -solution[1] - 2 * solution[2] * k2

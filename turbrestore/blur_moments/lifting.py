@@ -1,26 +1,27 @@
-"""Lift a fast system to the rate of the frames: what happens from one exposure to the next, and within one.
+"""Lift a fast system to the rate of the frames: the step from one exposure to the next, and the output within one.
 
 Symbols (paper 1, section V; paper 2, section IV)
 -------------------------------------------------
 A_f, B_f, C_f, D_f : fast system with the step T_f, :class:`FastSystem`.
 A_s, B_s, C_s, D_s : the same at the rate of the frames, :class:`LiftedSystem`, made by :func:`lift`.
-u_s(j) : inputs of a slow step, ``[u(jN), …, u(jN + N − 1)]``.
-Q : covariance of the disturbance that enters between two exposures.
+u_s(j) : inputs of frame period j, ``[u(jN), …, u(jN + N − 1)]``.
+Q : covariance of the disturbance that is added between two exposures.
 ŷ(i) : output at the fast steps i = 0 … N_e − 1 of the exposure, given the state at its start.
 
 Departures from the papers
 --------------------------
-The matrices A_f, B_f that paper 2 prints are continuous (poles −6.8 ± 33.3i, gain 1 at rest); :func:`discretise`
-makes them discrete.  C_s carries the factor 1 / N_e that the paper leaves out, for a moment is an average; it
-averages the steps 0 … N_e − 1, so that entry n of D_s is ``C_f Σ_{i ≤ N_e − 2 − n} A_f^i B_f / N_e`` (the printed
-sum up to N_e − 1 − n goes with the steps 1 … N_e).  Input enters as ``Σ_i A_f^i B_f u(jN − 1 − i)``, where paper 1 has
-u(jN − i).  Both papers say that (A_s, C_s) is observable whenever (A_f, C_f) is; this fails where a slow step is
-half a period of an oscillation, or an exposure a whole one, so it is checked.
+The matrices A_f, B_f printed in paper 2 are continuous (poles −6.8 ± 33.3i, gain 1 at rest); :func:`discretise`
+makes them discrete.  C_s carries the factor 1 / N_e that the paper omits, because a moment is an average; it averages
+the steps 0 … N_e − 1, so entry n of D_s is ``C_f Σ_{i ≤ N_e − 2 − n} A_f^i B_f / N_e`` (the printed sum up to
+N_e − 1 − n belongs to the steps 1 … N_e).  The input enters as ``Σ_i A_f^i B_f u(jN − 1 − i)``, where paper 1 prints
+u(jN − i).  Both papers state that (A_s, C_s) is observable whenever (A_f, C_f) is.  This fails if a frame period is
+half a period of an oscillation, or an exposure a whole one, so :func:`lift` checks it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,13 +29,41 @@ from scipy.linalg import expm
 
 from ..core.errors import ConfigurationError, DataError, require
 from ..filtering.kalman import Gaussian, predict
-from .kernels import Float64Array
-from .sensor import ExposureTiming
+from .sensor import ExposureTiming, Float64Array
 
-# Directions of the state that reach the output 1e-9 times as strongly as the best one cannot be estimated in float64.
+# A direction of the state counts as unobservable below this share of the strongest effect on the output (float64).
 _OBSERVABLE = 1e-9
-# Eigenvalues of a double root come out of float64 about 1e-8 apart.
+# In float64 the two eigenvalues of a double root come out about 1e-8 apart.
 _APART = 1e-6
+
+
+class Motion(Protocol):
+    """The methods of a system that the observers call: :class:`LiftedSystem` and :class:`.augmented.OscillatorMotion`.
+
+    The state is that at the start of an exposure, shape (..., n); inputs are u_s, shape (..., N).
+    """
+
+    @property
+    def order(self) -> int:
+        """Number n of states."""
+        ...
+
+    @property
+    def timing(self) -> ExposureTiming:
+        """When the sensor is exposed."""
+        ...
+
+    def path_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Output ŷ in the exposure, shape (..., N_e), and its derivative, shape (..., N_e, n)."""
+        ...
+
+    def advance(self, state: Gaussian, inputs: Float64Array) -> Gaussian:
+        """Predict the state at the start of the next exposure."""
+        ...
+
+    def fast_output(self, state: Gaussian, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Mean and variance of the output at every fast step of the frame period, shape (..., N)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +74,8 @@ class FastSystem:
     ----------
     A : ndarray, float64, shape (n, n)
         A_f, discrete.
-    B : ndarray, float64, shape (n,)
-        B_f.
-    C : ndarray, float64, shape (n,)
-        C_f.
+    B, C : ndarray, float64, shape (n,)
+        B_f and C_f.
     D : float
         D_f.
 
@@ -59,8 +86,8 @@ class FastSystem:
 
     Examples
     --------
-    >>> FastSystem([[0.5]], [1.0], [1.0]).order
-    1
+    >>> FastSystem([[0.5]], [1.0], [1.0]).B
+    array([1.])
     """
 
     A: Float64Array
@@ -87,19 +114,13 @@ class FastSystem:
         for name, matrix in (("A", A), ("B", B), ("C", C)):
             object.__setattr__(self, name, matrix)
 
-    @property
-    def order(self) -> int:
-        """Number n of states."""
-        return len(self.B)
-
 
 @dataclass(frozen=True, eq=False)
 class LiftedSystem:
-    """A fast system seen once per frame, made by :func:`lift`.
+    """A fast system observed once per frame, made by :func:`lift`.
 
     Parameters
     ----------
-    fast : FastSystem
     timing : ExposureTiming
     A : ndarray, float64, shape (n, n)
         A_s, from the start of an exposure to the start of the next.
@@ -110,9 +131,9 @@ class LiftedSystem:
     D : ndarray, float64, shape (N,)
         D_s.
     free : ndarray, float64, shape (N, n)
-        Output at every fast step of the slow step for a state at its start.
+        Output at every fast step as a function of the state at the start of the exposure.
     forced : ndarray, float64, shape (N, N)
-        Output at every fast step for the inputs.
+        Output at every fast step as a function of the inputs.
     Q : ndarray, float64, shape (n, n)
         Covariance of the disturbance between two exposures.
 
@@ -120,13 +141,12 @@ class LiftedSystem:
     --------
     >>> timing = ExposureTiming(fast_period=1.0, exposure=2.0, readout=1.0, frame_period=3.0)
     >>> lifted = lift(FastSystem([[0.5]], [1.0], [1.0]), timing, [[0.1]])
-    >>> lifted.path(np.array([1.0]), np.array([1.0, 0.0, 0.0]))
+    >>> lifted.path_and_jacobian(np.array([1.0]), np.array([1.0, 0.0, 0.0]))[0]
     array([1. , 1.5])
     >>> lifted.fast_output(Gaussian(np.ones(1), np.eye(1)), np.zeros(3))
     (array([1.  , 0.5 , 0.25]), array([1.    , 0.25  , 0.0625]))
     """
 
-    fast: FastSystem
     timing: ExposureTiming
     A: Float64Array
     B: Float64Array
@@ -140,23 +160,6 @@ class LiftedSystem:
     def order(self) -> int:
         """Number n of states."""
         return len(self.C)
-
-    def path(self, mean: Float64Array, inputs: Float64Array) -> Float64Array:
-        """Output ŷ at the fast steps of the exposure.
-
-        Parameters
-        ----------
-        mean : ndarray, float64, shape (..., n)
-            State at the start of the exposure.
-        inputs : ndarray, float64, shape (..., N)
-            u_s.
-
-        Returns
-        -------
-        ndarray, float64, shape (..., N_e)
-        """
-        steps = self.timing.exposure_steps
-        return mean @ self.free[:steps].T + inputs[..., :steps] @ self.forced[:steps, :steps].T
 
     def path_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Output ŷ at the fast steps of the exposure, and its derivative with respect to the state.
@@ -173,11 +176,12 @@ class LiftedSystem:
         path : ndarray, float64, shape (..., N_e)
         jacobian : ndarray, float64, shape (..., N_e, n)
         """
-        path, steps = self.path(mean, inputs), self.timing.exposure_steps
+        steps = self.timing.exposure_steps
+        path = mean @ self.free[:steps].T + inputs[..., :steps] @ self.forced[:steps, :steps].T
         return path, np.broadcast_to(self.free[:steps], (*path.shape, self.order))
 
     def advance(self, state: Gaussian, inputs: Float64Array) -> Gaussian:
-        """From the start of an exposure to the start of the next.
+        """Predict the state at the start of the next exposure.
 
         Parameters
         ----------
@@ -194,7 +198,7 @@ class LiftedSystem:
         return Gaussian(ahead.mean + inputs @ self.B.T, ahead.cov)
 
     def fast_output(self, state: Gaussian, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Output at every fast step of the slow step: within the exposure and until the next one.
+        """Output at every fast step of the frame period, within the exposure and until the next one.
 
         Parameters
         ----------
@@ -206,14 +210,14 @@ class LiftedSystem:
         Returns
         -------
         mean, variance : ndarray, float64, shape (..., N)
-            The disturbance enters at the end of the step, so the variance is that of the state.
+            The disturbance is added at the end of the frame period, so the variance is that of the state.
         """
         mean = state.mean @ self.free.T + inputs @ self.forced.T
         return mean, np.einsum("in,...nm,im->...i", self.free, state.cov, self.free)
 
 
 def discretise(A: ArrayLike, B: ArrayLike, period: float) -> tuple[Float64Array, Float64Array]:
-    """Discrete form of ``ẋ = A x + B u`` with the input held over each step (zero-order hold).
+    """Discretise ``ẋ = A x + B u`` with an input that is constant over each step (zero-order hold).
 
     Parameters
     ----------
@@ -258,7 +262,7 @@ def lift(fast: FastSystem, timing: ExposureTiming, Q: ArrayLike) -> LiftedSystem
     fast : FastSystem
     timing : ExposureTiming
     Q : array_like, shape (n, n)
-        Covariance of the disturbance that enters between two exposures.
+        Covariance of the disturbance that is added between two exposures.
 
     Returns
     -------
@@ -267,7 +271,7 @@ def lift(fast: FastSystem, timing: ExposureTiming, Q: ArrayLike) -> LiftedSystem
     Raises
     ------
     ConfigurationError
-        Q has the wrong shape, or the state cannot be seen in the average output of the exposures.
+        Q has the wrong shape, or the average outputs of the exposures do not determine the state.
 
     Examples
     --------
@@ -276,7 +280,7 @@ def lift(fast: FastSystem, timing: ExposureTiming, Q: ArrayLike) -> LiftedSystem
     >>> lifted.A, lifted.B, lifted.C, lifted.D
     (array([[0.125]]), array([[0.25, 0.5 , 1.  ]]), array([0.75]), array([0.5, 0. , 0. ]))
     """
-    steps, n = timing.frame_steps, fast.order
+    steps, n = timing.frame_steps, len(fast.B)
     noise = np.asarray(Q, np.float64)
     require(noise.shape == (n, n), f"Q: expected shape {(n, n)}, found {noise.shape}")
     reached = np.empty((steps, n))
@@ -288,31 +292,21 @@ def lift(fast: FastSystem, timing: ExposureTiming, Q: ArrayLike) -> LiftedSystem
     pulse = np.concatenate([[fast.D], reached[:-1] @ fast.C])
     lag = np.subtract.outer(np.arange(steps), np.arange(steps))
     forced = np.where(lag >= 0, pulse[np.maximum(lag, 0)], 0.0)
-    lifted = LiftedSystem(
-        fast=fast,
-        timing=timing,
-        A=np.linalg.matrix_power(fast.A, steps),
-        B=reached[::-1].T,
-        C=free[: timing.exposure_steps].mean(0),
-        D=forced[: timing.exposure_steps].mean(0),
-        free=free,
-        forced=forced,
-        Q=noise,
-    )
-    if not is_observable(lifted.A, lifted.C):
+    A, C = np.linalg.matrix_power(fast.A, steps), free[: timing.exposure_steps].mean(0)
+    if not is_observable(A, C):
         raise ConfigurationError(
-            "system: expected a state that the mean outputs of the exposures show, found one they do not show "
-            "(A_s, C_s not observable); change exposure or frame period"
+            "system: expected a state that the mean outputs of the exposures determine, found one that they do not "
+            "((A_s, C_s) is not observable); change exposure or frame period"
         )
-    return lifted
+    return LiftedSystem(timing, A, reached[::-1].T, C, forced[: timing.exposure_steps].mean(0), free, forced, noise)
 
 
 def is_observable(A: ArrayLike, C: ArrayLike) -> bool:
-    """Whether the outputs C x, C A x, … tell the state (Popov, Belevitch & Hautus).
+    """Whether the outputs C x, C A x, … determine the state (test of Popov, Belevitch and Hautus).
 
-    An eigenvalue that is apart from the others needs an eigenvector that C shows; apart is meant relative to its
-    size, so that modes which die out within a step are not confused with each other.  For the rest the rank of
-    ``[λ I − A; C]`` decides.
+    A simple eigenvalue needs an eigenvector v with C v ≠ 0.  Eigenvalues count as distinct relative to their size,
+    so that modes that die out within a step are kept apart.  For multiple eigenvalues λ the rank of ``[λ I − A; C]``
+    decides.
 
     Parameters
     ----------
@@ -336,25 +330,26 @@ def is_observable(A: ArrayLike, C: ArrayLike) -> bool:
     for i, value in enumerate(values):
         others = np.delete(values, i)
         if (np.abs(others - value) > _APART * np.maximum(np.abs(others), abs(value))).all():
-            shown = np.linalg.norm(C @ vectors[:, i])
+            visible = np.linalg.norm(C @ vectors[:, i])
         else:
             scale = max(float(np.abs(values).max()), 1e-300) / max(float(strength), 1e-300)
             stacked = np.concatenate([value * np.eye(len(A)) - A, scale * C]) / scale
-            shown = np.linalg.svd(stacked, compute_uv=False)[-1]
-        if shown <= _OBSERVABLE * strength:
+            visible = np.linalg.svd(stacked, compute_uv=False)[-1]
+        if visible <= _OBSERVABLE * strength:
             return False
     return True
 
 
-def check_inputs(inputs: ArrayLike, steps: int) -> Float64Array:
-    """Return the inputs of a slow step as a float64 array.
+def check_inputs(motion: Motion, state: Gaussian, inputs: ArrayLike) -> Float64Array:
+    """Return the inputs of a frame period as float64, after checking that state and inputs belong to a motion.
 
     Parameters
     ----------
+    motion : Motion
+    state : Gaussian
+        Shape (..., n).
     inputs : array_like, shape (..., N)
         u_s.
-    steps : int
-        N.
 
     Returns
     -------
@@ -363,37 +358,11 @@ def check_inputs(inputs: ArrayLike, steps: int) -> Float64Array:
     Raises
     ------
     DataError
-        Wrong number of inputs, or values that are not finite.
-
-    Examples
-    --------
-    >>> check_inputs([0, 1], 2)
-    array([0., 1.])
+        Wrong number of states or inputs, or inputs that are not finite.
     """
-    values = np.asarray(inputs, np.float64)
+    if state.mean.shape[-1] != motion.order:
+        raise DataError(f"state: expected a mean of shape (..., {motion.order}), found {state.mean.shape}")
+    values, steps = np.asarray(inputs, np.float64), motion.timing.frame_steps
     if values.ndim < 1 or values.shape[-1] != steps or not np.isfinite(values).all():
         raise DataError(f"input: expected finite values of shape (..., {steps}), found shape {values.shape}")
     return values
-
-
-def check_state(state: Gaussian, order: int) -> None:
-    """Raise unless a state has as many components as the motion.
-
-    Parameters
-    ----------
-    state : Gaussian
-        Shape (..., n).
-    order : int
-        n.
-
-    Raises
-    ------
-    DataError
-        Another number of components.
-
-    Examples
-    --------
-    >>> check_state(Gaussian(np.zeros(2), np.eye(2)), 2)
-    """
-    if state.mean.shape[-1] != order:
-        raise DataError(f"state: expected a mean of shape (..., {order}), found {state.mean.shape}")

@@ -1,22 +1,21 @@
-"""Observers on the whole image: the state whose predicted frame fits the measured one (paper 2, O3).
+"""Observers on the whole image: the state whose predicted frame fits the measured one best (paper 2, O3).
 
-The search is a damped Gauss–Newton method (Levenberg–Marquardt) from several starts.  Blur does not show the
-direction of time or the sign of a symmetric motion, so the misfit has several minima; the starts are the
-prediction, its negative, and the prediction moved both ways along the axes of its covariance.
+The search is a damped Gauss–Newton method (Levenberg–Marquardt) from several starts.  Blur shows neither the direction
+of time nor the sign of a symmetric motion, so the misfit has several minima.  The search starts from the prediction,
+from its negative, and from the prediction shifted both ways along the axes of its covariance.
 
 Symbols (paper 2, section IV)
 -----------------------------
-Y, C_Ψ(ŷ) : measured frame, frame predicted from the path ŷ of a state.
+Y, C_Ψ(ŷ) : measured frame; frame predicted from the path ŷ of a state.
 x̂, P : prediction of the state and its covariance.
 V / Δ : variance of a pixel.
 
 Departures from the paper
 -------------------------
-Paper 2 minimises a squared 2-norm in the formula and an ∞-norm in the text; both are here.  The ∞-norm is approached by
-p-norms with p = 2, 8, 32, which have derivatives.  Neither uses what is known of the state before the frame; they
-only refuse states that would leave the pixels dark, for which the ∞-norm can be small.
-``norm="map"`` adds it, ``(x − x̂)ᵀ P⁻¹ (x − x̂)``, which is what makes the whole image useful where one frame does
-not determine the state.
+Paper 2 minimises a squared 2-norm in the formula and an ∞-norm in the text; both are available.  The ∞-norm is
+approached by p-norms with p = 2, 8, 32, which are differentiable.  Neither norm uses the prediction; they only reject
+states that would leave the pixels dark, for which the ∞-norm can be small.  ``norm="map"`` adds the prior term
+``(x − x̂)ᵀ P⁻¹ (x − x̂)``, which makes the whole image useful where one frame does not determine the state.
 """
 
 from __future__ import annotations
@@ -28,24 +27,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import ConfigurationError, DataError, require
 from ..filtering.kalman import Gaussian, Innovation, update_information
-from .blur_model import BlurModel
-from .exposure_table import ExposureTable
-from .kernels import Float64Array
-from .lifted import check_inputs, check_state
-from .sensor import noise_variance
+from .lifting import check_inputs
+from .moments import BlurModel
+from .sensor import Float64Array
 
 NORMS = ("map", "two", "infinity")
 _POWERS = {"map": (2,), "two": (2,), "infinity": (2, 8, 32)}
-# How far starts lie from the prediction, in standard deviations.
+# Distance of the shifted starts from the prediction, in standard deviations.
 _PERTURBED = 2.0
-# Iterations that every start gets before only the best go on.
+# Iterations from every start before only the best ones continue.
 _TRIAL = 2
-# Squared distances in units of the curvature: a last step that the frame cannot tell, two starts of one minimum.
+# Squared distances in units of the curvature: a step that the frame cannot resolve; two starts at the same minimum.
 _SETTLED = 1e-3
 _SAME = 0.1
 # Share of the light that must fall on the pixels where no prior keeps the search from leaving them.
 _LIT = 0.5
-# Share of the prior information that keeps the covariance of a search without prior finite.
+# Share of the prior information that keeps the covariance finite in a search without a prior.
 _WEAK = 1e-6
 
 
@@ -56,13 +53,13 @@ class ImageFilter:
     Parameters
     ----------
     norm : {"map", "two", "infinity"}
-        Image misfit with the prior; without it; largest misfit of a pixel.
+        Misfit of the image with the prior; without it; largest misfit of a pixel.
     iterations : int
         Of the search; 1 from a single start with ``norm="map"`` is the extended Kalman filter on the image.
     multistart : bool
-        Whether to start from the negative and from perturbed states as well.
+        Whether to start from the negative and from shifted states as well.
     kept : int
-        Starts that go on after a few iterations.
+        Number of starts that continue after a few iterations.
 
     Raises
     ------
@@ -89,20 +86,12 @@ class ImageFilter:
     def step(
         self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
     ) -> tuple[Gaussian, Innovation]:
-        """Correct the state at the start of an exposure by its frame.
-
-        Parameters
-        ----------
-        model : BlurModel
-        state : Gaussian
-            Prediction, shape (n,) or (B, n).
-        frame : array_like, shape (count,) or (B, count)
-        inputs : array_like, shape (N,) or (B, N)
+        """Correct the predicted state by its frame; see :meth:`.observers.Observer.step`.
 
         Returns
         -------
         state : Gaussian
-            The covariance is that of the linearised problem at the result.
+            Its covariance is that of the problem linearised at the estimate.
         innovation : Innovation
             In information form; ``normalised_squared`` is the smallest misfit, chi-squared with as many degrees of
             freedom as pixels if the model fits.
@@ -112,62 +101,46 @@ class ImageFilter:
         DataError
             Shapes do not agree, values are not finite, or the covariance of the state is singular.
         """
-        task = _Task(model, state, frame, inputs, self.norm)
-        best = task.start[:, None, :]
+        problem = _Problem(model, state, frame, inputs, self.norm)
+        best = problem.start[:, None, :]
         if self.iterations > 1 or self.norm != "map":
-            starts = _starts(task.start, task.cov) if self.multistart else best
-            best = _search(task, starts, self)
-        return task.posterior(best[:, 0], state.mean.shape)
+            starts = _starts(problem.start, problem.cov) if self.multistart else best
+            best = _search(problem, starts, self)
+        return problem.posterior(best[:, 0], state.mean.shape)
 
 
-class _Task:
+class _Problem:
     """One frame of every batch as a least-squares problem; rows of the batch are addressed by number."""
 
     def __init__(self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike, norm: str) -> None:
-        sensor = model.sensor
-        n, pixels = model.motion.order, sensor.pixels.count
-        check_state(state, n)
-        self.start = state.mean.reshape(-1, n)
-        batch = len(self.start)
-        self.cov = np.broadcast_to(state.cov, (*state.mean.shape, n)).reshape(-1, n, n)
+        sensor, n, batch = model.sensor, model.motion.order, state.mean.shape[:-1]
+        values = check_inputs(model.motion, state, inputs)
         image = np.asarray(frame, np.float64)
-        if image.shape != (*state.mean.shape[:-1], pixels) or not np.isfinite(image).all():
-            raise DataError(f"frame: expected finite {(*state.mean.shape[:-1], pixels)}, found shape {image.shape}")
-        self.image = image.reshape(batch, pixels)
-        held = check_inputs(inputs, model.motion.timing.frame_steps)
-        self.inputs = np.broadcast_to(held, (*state.mean.shape[:-1], held.shape[-1])).reshape(batch, -1)
-        self.motion, self.table = model.motion, model.table
+        if image.shape != (*batch, sensor.pixels.count) or not np.isfinite(image).all():
+            raise DataError(f"frame: expected finite {(*batch, sensor.pixels.count)}, found shape {image.shape}")
+        self.model = model
+        self.start = state.mean.reshape(-1, n)
+        self.cov = np.broadcast_to(state.cov, (*state.mean.shape, n)).reshape(-1, n, n)
+        self.image = image.reshape(-1, sensor.pixels.count)
+        self.inputs = np.broadcast_to(values, (*batch, values.shape[-1])).reshape(len(self.start), -1)
         try:
             self.information = np.linalg.inv(self.cov)
         except np.linalg.LinAlgError as error:
             raise DataError("cov: expected a covariance that can be inverted, found a singular one") from error
-        if norm != "map":
-            self.information = _WEAK * self.information
-        self.prior_weight = 1.0 if norm == "map" else 0.0
+        self.has_prior = norm == "map"
         self.least_light = _LIT * sensor.total / sensor.pixels.width
-        self.variance = self._pixel_variance(sensor.pixels.width, sensor.noise, sensor.photons, self.table)
-
-    def _pixel_variance(self, width: float, noise: float, photons: float | None, table: ExposureTable) -> Float64Array:
-        expected = 0.0 if photons is None else table.image(self.motion.path(self.start, self.inputs))
-        return noise_variance(expected, width, noise, photons)
 
     def residual(self, rows: NDArray[np.intp], x: Float64Array) -> tuple[Float64Array, Float64Array, NDArray[np.bool_]]:
         """Misfit in units of the noise, (F, P), derivative of the predicted frame, (F, n, P), and whether it is lit."""
-        path, slopes = self.motion.path_and_jacobian(x, self.inputs[rows])
-        image, derivative = self.table.image_and_jacobian(path, slopes)
-        deviation = np.sqrt(self.variance if self.variance.ndim == 0 else self.variance[rows])
-        scale = deviation[:, None, :] if deviation.ndim else deviation
-        lit = image.sum(-1) > self.least_light
-        return (self.image[rows] - image) / deviation, derivative / scale, lit
+        image, derivative = self.model.image_and_jacobian(x, self.inputs[rows])
+        deviation = self.model.sensor.deviation
+        return (self.image[rows] - image) / deviation, derivative / deviation, image.sum(-1) > self.least_light
 
     def evaluate(
         self, rows: NDArray[np.intp], x: Float64Array, power: int
     ) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Cost, gradient step's right side and curvature at x of the rows."""
+        """Cost, right-hand side of the Gauss–Newton step, and curvature at x."""
         residual, derivative, lit = self.residual(rows, x)
-        away = self.start[rows] - x
-        information = self.prior_weight * self.information[rows]
-        pull = np.einsum("fab,fb->fa", information, away)
         weighted = derivative
         if power == 2:
             cost = (residual**2).sum(-1)
@@ -177,53 +150,54 @@ class _Task:
             cost = ((np.abs(residual) / top) ** power).sum(-1) ** (2 / power) * top[:, 0] ** 2
             ratio = (np.abs(residual) / np.sqrt(cost)[:, None]) ** (power - 2)
             weighted = derivative * ratio[:, None, :]
-        if not self.prior_weight:
-            cost = np.where(lit, cost, np.inf)
-        right = np.einsum("fap,fp->fa", weighted, residual) + pull
-        curvature = (power - 1) * weighted @ np.swapaxes(derivative, -1, -2) + information
-        return cost + (away * pull).sum(-1), right, curvature
+        right = np.einsum("fap,fp->fa", weighted, residual)
+        curvature = (power - 1) * weighted @ np.swapaxes(derivative, -1, -2)
+        if not self.has_prior:
+            return np.where(lit, cost, np.inf), right, curvature
+        away, information = self.start[rows] - x, self.information[rows]
+        pull = np.einsum("fab,fb->fa", information, away)
+        return cost + (away * pull).sum(-1), right + pull, curvature + information
 
     def posterior(self, x: Float64Array, shape: tuple[int, ...]) -> tuple[Gaussian, Innovation]:
         """Gaussian at the minimum: one linear update with the derivative taken there."""
         residual, derivative, _ = self.residual(np.arange(len(x)), x)
         H = np.swapaxes(derivative, -1, -2)
         linear = residual + np.einsum("fpn,fn->fp", H, x)
-        prior = Gaussian(self.start, self.cov) if self.prior_weight else Gaussian(x, self.cov / _WEAK)
+        prior = Gaussian(self.start, self.cov) if self.has_prior else Gaussian(x, self.cov / _WEAK)
         after, innovation = update_information(prior, linear, H, 1.0)
-        mean = after.mean if self.prior_weight else x
-        batch = shape[:-1]
+        mean, batch = after.mean if self.has_prior else x, shape[:-1]
         fields = (innovation.values, innovation.cov, innovation.normalised_squared, innovation.log_likelihood)
-        reshaped = [np.asarray(field).reshape((*batch, *field.shape[1:])) for field in fields]
+        values, cov, squared, likelihood = (np.asarray(part).reshape((*batch, *part.shape[1:])) for part in fields)
         observed = np.broadcast_to(innovation.observed, (len(x),)).reshape(batch)
         return (
             Gaussian(mean.reshape(shape), after.cov.reshape((*shape, shape[-1]))),
-            Innovation(reshaped[0], reshaped[1], reshaped[2], reshaped[3], observed),
+            Innovation(values, cov, squared, likelihood, observed),
         )
 
 
 def _starts(mean: Float64Array, cov: Float64Array) -> Float64Array:
-    """Prediction, its negative, and both ways along the axes of the covariance, shape (B, K, n)."""
+    """Prediction, its negative, and shifts both ways along the axes of the covariance, shape (B, K, n)."""
     values, vectors = np.linalg.eigh(cov)
     axes = _PERTURBED * np.swapaxes(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :], -1, -2)
     here = mean[:, None, :]
     return np.concatenate([here, -here, here + axes, here - axes], 1)
 
 
-def _search(task: _Task, starts: Float64Array, settings: ImageFilter) -> Float64Array:
+def _search(problem: _Problem, starts: Float64Array, settings: ImageFilter) -> Float64Array:
     """Best minimum of every row, shape (B, 1, n)."""
     powers = _POWERS[settings.norm]
-    x, cost, curvature = _descend(task, starts, powers[0], min(_TRIAL, settings.iterations))
+    x, cost, curvature = _descend(problem, starts, powers[0], min(_TRIAL, settings.iterations))
     order = np.argsort(cost, 1)[:, : settings.kept]
     x, cost = np.take_along_axis(x, order[..., None], 1), np.take_along_axis(cost, order, 1)
     distinct = _distinct(x, np.take_along_axis(curvature, order[..., None, None], 1))
     for power in powers:
-        x, cost, _ = _descend(task, x, power, settings.iterations, distinct)
+        x, cost, _ = _descend(problem, x, power, settings.iterations, distinct)
     best = np.argmin(np.where(distinct, cost, np.inf), 1)
     return np.take_along_axis(x, best[:, None, None], 1)
 
 
 def _distinct(x: Float64Array, curvature: Float64Array) -> NDArray[np.bool_]:
-    """Which of the starts, best first, are not on their way to the minimum of a better one, shape (B, K)."""
+    """Mask of the starts, best first, that are not at the minimum of a better one, shape (B, K)."""
     distinct = np.ones(x.shape[:2], np.bool_)
     for k in range(1, x.shape[1]):
         away = x[:, k, None] - x[:, :k]
@@ -233,22 +207,22 @@ def _distinct(x: Float64Array, curvature: Float64Array) -> NDArray[np.bool_]:
 
 
 def _descend(
-    task: _Task, starts: Float64Array, power: int, iterations: int, chosen: NDArray[np.bool_] | None = None
+    problem: _Problem, starts: Float64Array, power: int, iterations: int, chosen: NDArray[np.bool_] | None = None
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Levenberg–Marquardt from every start on its own; those that have converged drop out."""
+    """Levenberg–Marquardt from every start separately; converged ones drop out of the batch."""
     batch, count, n = starts.shape
     rows = np.repeat(np.arange(batch), count)
     x = starts.reshape(-1, n).copy()
     active = np.arange(len(x)) if chosen is None else np.flatnonzero(chosen)
     cost, right, curvature = np.full(len(x), np.inf), np.zeros_like(x), np.zeros((len(x), n, n))
-    cost[active], right[active], curvature[active] = task.evaluate(rows[active], x[active], power)
+    cost[active], right[active], curvature[active] = problem.evaluate(rows[active], x[active], power)
     damping = np.full(len(x), 1e-3)
     for _ in range(iterations):
         a = active
         diagonal = np.einsum("fii->fi", curvature[a]) + 1e-12
         system = curvature[a] + (damping[a, None] * diagonal)[:, :, None] * np.eye(n)
         move = np.linalg.solve(system, right[a, :, None])[..., 0]
-        new_cost, new_right, new_curvature = task.evaluate(rows[a], x[a] + move, power)
+        new_cost, new_right, new_curvature = problem.evaluate(rows[a], x[a] + move, power)
         better = new_cost < cost[a]
         gained = a[better]
         x[gained] += move[better]

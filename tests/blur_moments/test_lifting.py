@@ -1,21 +1,22 @@
-"""Lifting and the oscillator with its plant among the states; errata 7 and 8 of the blur-moments papers."""
+"""Lifting and the Jacobians of the moments; errata 7 and 8 of the blur-moments papers."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blur_moments.augmented import Oscillator, OscillatorMotion, largest_deviation
-from turbrestore.blur_moments.blur_model import BlurModel, predicted_moments
-from turbrestore.blur_moments.kernels import PixelGrid, gaussian_kernel
-from turbrestore.blur_moments.lifted import FastSystem, check_inputs, discretise, is_observable, lift
-from turbrestore.blur_moments.moments import image_moments
-from turbrestore.blur_moments.sensor import ExposureTiming, LineSensor, expose
+from turbrestore.blur_moments.lifting import FastSystem, check_inputs, discretise, is_observable, lift
+from turbrestore.blur_moments.moments import BlurModel, image_moments, predicted_moments
+from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid, expose
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.filtering.kalman import Gaussian
 
 TIMING = ExposureTiming(1e-3, 0.1, 0.35, 0.45, 0.09)
 PAPER_2 = np.array([[0.0, -1156.0], [1.0, -13.6]]), np.array([1156.0, 0.0]), np.array([0.0, 1.0])
+
+
+def path_of(motion, state, inputs):
+    return motion.path_and_jacobian(state, inputs)[0]
 
 
 def simulate(system, state, inputs):
@@ -43,7 +44,7 @@ class TestLift:
         lifted = lift(system, timing, np.eye(3))
         state, inputs = rng.normal(size=3), rng.normal(size=9)
         outputs, end = simulate(system, state, inputs)
-        np.testing.assert_allclose(lifted.path(state, inputs), outputs[:5], atol=1e-9)
+        np.testing.assert_allclose(path_of(lifted, state, inputs), outputs[:5], atol=1e-9)
         np.testing.assert_allclose(lifted.A @ state + lifted.B @ inputs, end, atol=1e-9)
         np.testing.assert_allclose(lifted.C @ state + lifted.D @ inputs, outputs[:5].mean(), atol=1e-9)
         ahead = lifted.advance(Gaussian(state, np.eye(3)), inputs)
@@ -81,7 +82,8 @@ class TestLift:
     def test_erratum_8_printed_output_matrices(self):
         A, B = discretise(PAPER_2[0], PAPER_2[1], 1e-3)
         C, N_e = PAPER_2[2], 100
-        lifted = lift(FastSystem(A, B, C), TIMING, np.eye(2))
+        system = FastSystem(A, B, C)
+        lifted = lift(system, TIMING, np.eye(2))
         powers = [C @ np.linalg.matrix_power(A, i) for i in range(N_e + 1)]
         printed_C = sum(powers[:N_e])
         np.testing.assert_allclose(printed_C / N_e, lifted.C, atol=1e-12)
@@ -92,7 +94,7 @@ class TestLift:
         np.testing.assert_allclose(lifted.D[:N_e], corrected_D, atol=1e-12)
         assert not lifted.D[N_e:].any()
         inputs = np.random.default_rng(1).normal(size=450) + 1.0
-        outputs, _ = simulate(lifted.fast, np.zeros(2), inputs)
+        outputs, _ = simulate(system, np.zeros(2), inputs)
         assert lifted.D @ inputs == pytest.approx(outputs[:N_e].mean())
         assert printed_D @ inputs[:N_e] == pytest.approx(outputs[1 : N_e + 1].mean())
         assert abs(printed_D @ inputs[:N_e] - outputs[:N_e].mean()) > 1e-3
@@ -113,27 +115,32 @@ class TestLift:
         assert np.abs(np.linalg.eigvals(lifted.A)).max() < 0.05
 
     @pytest.mark.parametrize(
-        ("make", "error", "named"),
+        ("make", "named"),
         [
-            (lambda: FastSystem([[1.01]], [1.0], [1.0]), ConfigurationError, "A"),
-            (lambda: FastSystem([[0.5, 0.0]], [1.0], [1.0]), ConfigurationError, "system"),
-            (lambda: FastSystem([[np.nan]], [1.0], [1.0]), ConfigurationError, "system"),
-            (lambda: FastSystem([[0.5]], [1.0], [1.0], np.nan), ConfigurationError, "system"),
-            (lambda: FastSystem(np.zeros((0, 0)), [], []), ConfigurationError, "system"),
-            (lambda: discretise([[np.nan]], [1.0], 1e-3), ConfigurationError, "system"),
-            (lambda: discretise([1.0], 1.0, 1e-3), ConfigurationError, "system"),
-            (lambda: lift(FastSystem([[0.5]], [1.0], [0.0]), TIMING, [[1.0]]), ConfigurationError, "system"),
-            (lambda: lift(FastSystem([[0.5]], [1.0], [1.0]), TIMING, [1.0]), ConfigurationError, "Q"),
-            (lambda: discretise([[1.0]], [1.0], 0.0), ConfigurationError, "period"),
-            (lambda: check_inputs([1.0, 2.0], 3), DataError, "input"),
-            (lambda: check_inputs([1.0, np.nan], 2), DataError, "input"),
-            (lambda: Oscillator(1.0, 34.0, 0.0), ConfigurationError, "damping"),
-            (lambda: OscillatorMotion(Oscillator(1.0, 34.0, 0.2), TIMING, np.eye(2)), ConfigurationError, "Q"),
+            (lambda: FastSystem([[1.01]], [1.0], [1.0]), "A"),
+            (lambda: FastSystem([[0.5, 0.0]], [1.0], [1.0]), "system"),
+            (lambda: FastSystem([[np.nan]], [1.0], [1.0]), "system"),
+            (lambda: FastSystem([[0.5]], [1.0], [1.0], np.nan), "system"),
+            (lambda: FastSystem(np.zeros((0, 0)), [], []), "system"),
+            (lambda: discretise([[np.nan]], [1.0], 1e-3), "system"),
+            (lambda: discretise([1.0], 1.0, 1e-3), "system"),
+            (lambda: lift(FastSystem([[0.5]], [1.0], [0.0]), TIMING, [[1.0]]), "system"),
+            (lambda: lift(FastSystem([[0.5]], [1.0], [1.0]), TIMING, [1.0]), "Q"),
+            (lambda: discretise([[1.0]], [1.0], 0.0), "period"),
         ],
     )
-    def test_bad_input_is_named_in_one_line(self, make, error, named):
-        with pytest.raises(error, match=f"^{named}: expected [^\n]*$"):
+    def test_bad_input_is_named_in_one_line(self, make, named):
+        with pytest.raises(ConfigurationError, match=f"^{named}: expected [^\n]*$"):
             make()
+
+    @pytest.mark.parametrize(
+        ("order", "inputs", "named"),
+        [(2, [1.0, 2.0], "input"), (2, [1.0, np.nan, 1.0], "input"), (3, [0] * 3, "state")],
+    )
+    def test_inputs_and_states_of_another_system(self, order, inputs, named):
+        motion = lift(random_system(0, n=2)[0], ExposureTiming(1.0, 2.0, 1.0, 3.0), np.eye(2))
+        with pytest.raises(DataError, match=f"^{named}: expected [^\n]*$"):
+            check_inputs(motion, Gaussian(np.zeros(order), np.eye(order)), inputs)
 
 
 class TestJacobians:
@@ -143,17 +150,17 @@ class TestJacobians:
         system, rng = random_system(3)
         lifted = lift(system, ExposureTiming(1.0, 6.0, 1.0, 7.0), np.eye(3))
         pixels = PixelGrid(-2.0, 2.5, 90)
-        model = BlurModel(lifted, LineSensor(gaussian_kernel(0.4, 0.1), pixels, noise=0.1))
-        state, inputs, table = 0.3 * rng.normal(size=3), 0.1 * rng.normal(size=7), model.table if border else None
+        model = BlurModel(lifted, LineSensor(GaussianKernel(0.4, 0.1), pixels, noise=0.1))
+        state, inputs = 0.3 * rng.normal(size=3), 0.1 * rng.normal(size=7)
         orders = (1, 2, 3, 4)
 
         def moments(mean):
             if border:
-                image = expose(lifted.path(mean, inputs), model.sensor.kernel, pixels)
+                image = expose(path_of(lifted, mean, inputs), model.sensor.kernel, pixels)
                 return image_moments(image, pixels, 4, basis)[1:]
             return predicted_moments(model, mean, inputs, orders, basis)[0]
 
-        h, H, _ = predicted_moments(model, state, inputs, orders, basis, table)
+        h, H, _ = predicted_moments(model, state, inputs, orders, basis, border)
         # A table in steps of σ / 6 is right to half a percent.
         tolerance = 0.005 if border else 1e-7
         np.testing.assert_allclose(h, moments(state), atol=tolerance)
@@ -165,65 +172,7 @@ class TestJacobians:
     def test_border_or_not_makes_no_difference_far_from_it(self):
         system, rng = random_system(4)
         lifted = lift(system, ExposureTiming(1.0, 6.0, 1.0, 7.0), np.eye(3))
-        model = BlurModel(lifted, LineSensor(gaussian_kernel(0.2), PixelGrid(-3.0, 3.0, 240), noise=0.1))
+        model = BlurModel(lifted, LineSensor(GaussianKernel(0.2), PixelGrid(-3.0, 3.0, 240), noise=0.1))
         state, inputs = 0.1 * rng.normal(size=3), 0.1 * rng.normal(size=7)
-        near, far = (predicted_moments(model, state, inputs, (1, 2), "monomial", t)[0] for t in (None, model.table))
+        near, far = (predicted_moments(model, state, inputs, (1, 2), "monomial", border)[0] for border in (False, True))
         np.testing.assert_allclose(near, far, atol=1e-3)
-
-
-class TestOscillator:
-    @pytest.mark.parametrize("damping", [0.2, 0.999, 1.0, 3.0])
-    def test_equals_the_lifted_system(self, damping):
-        gain, omega = 1.2, 30.0
-        motion = OscillatorMotion(Oscillator(1.0, 34.0, 0.2), TIMING, np.zeros((5, 5)))
-        logs = np.log([gain, omega / 34.0, damping / 0.2])
-        A, B = discretise([[0, 1], [-(omega**2), -2 * damping * omega]], [0, gain * omega**2], 1e-3)
-        lifted = lift(FastSystem(A, B, [1.0, 0.0]), TIMING, np.eye(2))
-        state, inputs = np.array([0.3, 4.0]), np.random.default_rng(0).normal(size=450)
-        whole = np.concatenate([state, logs])
-        # Critical damping is replaced by one that differs by 1e-6 of ω².
-        np.testing.assert_allclose(motion.path(whole, inputs), lifted.path(state, inputs), atol=1e-5)
-        still = Gaussian(whole, np.zeros((5, 5)))
-        end = motion.advance(still, inputs).mean
-        np.testing.assert_allclose(end[:2], lifted.A @ state + lifted.B @ inputs, atol=1e-4)
-        np.testing.assert_allclose(end[2:], logs)
-        fast, _ = motion.fast_output(still, inputs)
-        np.testing.assert_allclose(fast, lifted.fast_output(Gaussian(state, np.eye(2)), inputs)[0], atol=1e-5)
-
-    @given(st.integers(0, 1000))
-    @settings(max_examples=20, deadline=None)
-    def test_jacobians(self, seed):
-        rng = np.random.default_rng(seed)
-        motion = OscillatorMotion(Oscillator(1.0, 34.0, 0.2), TIMING, np.zeros((5, 5)))
-        state = np.array([0.5, 8.0, 0.5, 0.3, 1.5]) * rng.uniform(-1, 1, 5)
-        inputs = rng.normal(size=450)
-        path, slopes = motion.path_and_jacobian(state, inputs)
-        np.testing.assert_allclose(path, motion.path(state, inputs))
-        numeric, ends = [], []
-        for shift in 1e-5 * np.eye(5):
-            sides = [state + shift, state - shift]
-            numeric.append((motion.path(sides[0], inputs) - motion.path(sides[1], inputs)) / 2e-5)
-            moved = [motion.advance(Gaussian(side, np.eye(5)), inputs).mean for side in sides]
-            ends.append((moved[0] - moved[1]) / 2e-5)
-        scale = np.abs(slopes).max()
-        np.testing.assert_allclose(slopes, np.stack(numeric, -1), atol=1e-6 * scale)
-        F = np.stack(ends, -1)
-        cov = motion.advance(Gaussian(state, np.eye(5)), inputs).cov
-        np.testing.assert_allclose(cov, F @ F.T, atol=1e-6 * np.abs(cov).max())
-
-    def test_batches(self):
-        rng = np.random.default_rng(1)
-        motion = OscillatorMotion(Oscillator(1.0, 34.0, 0.2), TIMING, 1e-3 * np.eye(5))
-        states, inputs = 0.1 * rng.normal(size=(4, 5)), rng.normal(size=(4, 450))
-        paths = motion.path(states, inputs)
-        np.testing.assert_allclose(paths[2], motion.path(states[2], inputs[2]), atol=1e-12)
-        one = motion.advance(Gaussian(states[2], np.eye(5)), inputs[2])
-        all_of_them = motion.advance(Gaussian(states, np.eye(5)), inputs)
-        np.testing.assert_allclose(all_of_them.cov[2], one.cov, atol=1e-9)
-
-    def test_deviation_of_a_plant(self):
-        nominal = Oscillator(1.0, 34.0, 0.2)
-        at_rest, at_resonance = [0.01], [34.0]
-        assert largest_deviation(np.log([2.0, 1.0, 1.0]), at_rest, nominal) == pytest.approx(6.02, abs=0.01)
-        assert largest_deviation(np.log([1.0, 1.0, 2.0]), at_resonance, nominal) == pytest.approx(6.02, abs=0.01)
-        assert largest_deviation(np.log([1.0, 1.0, 2.0]), at_rest, nominal) < 1e-4

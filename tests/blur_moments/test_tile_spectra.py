@@ -1,9 +1,9 @@
-"""Tiles of an image, and the settings by which their spectra are compared."""
+"""Tiles of an image, and the settings of the comparison of their spectra."""
 
 import numpy as np
 import pytest
 
-from turbrestore.blur_moments.tiles import CueParams, TileGrid, tile_map
+from turbrestore.blur_moments.tile_spectra import CueParams, TileGrid, tile_map
 from turbrestore.core.errors import ConfigurationError
 
 

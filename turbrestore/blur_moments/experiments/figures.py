@@ -1,7 +1,4 @@
-"""Figures 4 to 7 of both papers, from the experiments: four panels in one picture.
-
-Needs matplotlib, which nothing else does.
-"""
+"""Figures 4 to 7 of both papers, from the experiments: four panels in one picture, drawn with matplotlib."""
 
 from __future__ import annotations
 
@@ -11,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import ConfigurationError
-from .experiments import Experiment
+from ...core.errors import ConfigurationError
+from .comparison import Experiment
 
 # Colour and dash of every observer, the same in all panels.
 _STYLES = {"O1": ("tab:blue", "--"), "O2": ("tab:orange", ":"), "O3": ("tab:red", "-"), "image_map": ("tab:green", "-")}
-# Seconds of a run that the overview shows.
+# Duration of the overview, seconds.
 _OVERVIEW = 5.0
 
 
 def new_figure() -> Any:
-    """Empty figure; asked for before a long computation, it tells whether there can be one.
+    """Create an empty figure; called before a long computation, it shows whether matplotlib is installed.
 
     Returns
     -------
@@ -33,7 +30,7 @@ def new_figure() -> Any:
         Matplotlib is not installed.
     """
     try:
-        # Optional packages are loaded by name, so that type checkers do without them as well.
+        # Loading the optional package by name lets type checkers run without it.
         return importlib.import_module("matplotlib.figure").Figure(figsize=(12, 8), layout="constrained")
     except ImportError as error:
         raise ConfigurationError(
@@ -91,9 +88,9 @@ def draw_mirror(experiment: Experiment) -> bytes:
     Returns
     -------
     bytes
-        PNG: overview with the exposures shaded; the slow step in which the error of O1 is the median; error at the
-        start of the exposures; error over the slow steps. Estimates are those that know the frame of their own slow
-        step, which is there only after the readout.
+        PNG: overview with the exposures shaded; the frame period in which the error of O1 is the median; error at the
+        start of the exposures; error over the frame periods.  Estimates use the frame of their own period, which
+        is available only after the readout.
 
     Raises
     ------
@@ -112,13 +109,13 @@ def draw_mirror(experiment: Experiment) -> bytes:
         for start in range(part.start, part.stop, steps):
             panel.axvspan(t[start], t[min(start + exposed, t.size - 1)], color="0.9", zorder=0)
     _label(panels[0], "Figure 4: overview, exposures shaded", "time, s", "y")
-    _label(panels[1], f"Figure 5: slow step {typical}", "time, s", "y")
+    _label(panels[1], f"Figure 5: frame period {typical}", "time, s", "y")
     for name in ("O1", "O2", "O3"):
         away = np.abs(experiment.estimates[name] - experiment.truth)
         panels[2].plot(away[:, 0], **_style(name))
         panels[3].plot(np.sqrt((away**2).sum(1)), **_style(name))
     _label(panels[2], "Figure 6: error at the start of the exposures", "frame", "|ŷ − y|")
-    _label(panels[3], "Figure 7: error over the slow step", "frame", "‖ŷ − y‖₂")
+    _label(panels[3], "Figure 7: error over the frame period", "frame", "‖ŷ − y‖₂")
     return _png(figure)
 
 
@@ -142,7 +139,7 @@ def _label(panel: Any, title: str, x: str, y: str) -> None:
     panel.set_title(title, fontsize=10, loc="left")
     panel.set_xlabel(x)
     panel.set_ylabel(y)
-    # Beside the title nothing is covered.
+    # Above the panel, beside the title, the legend covers nothing.
     panel.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False, handlelength=1.5)
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.synthesis.exposure import exposed_frame, flows_between
 from turbrestore.synthesis.scenes import resolution_chart
-from turbrestore.synthesis.sequence import CameraParams
+from turbrestore.synthesis.sequence import CameraParams, exposed_frame, flows_between
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
 
 

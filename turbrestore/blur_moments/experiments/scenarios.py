@@ -1,16 +1,16 @@
 """The two simulated set-ups: a wavefront sensor (paper 1, section VI) and a steered mirror (paper 2, section V).
 
-Settings that the papers give are kept; what they leave open is chosen so that the observers on moments reach the errors
-that the papers report.
+The settings given in the papers are kept.  The others are chosen so that the observers on moments reach the errors that
+the papers report.
 
 Departures from the papers
 --------------------------
 Paper 1: white noise of density V = .1 and the exposure of 200 ms are as printed.  The input (two tones), the
 disturbance between exposures (standard deviation .038 of the slope, .025 of its rate per second) and the pixels (100
-on [−1, 1]) are not; with these the Kalman filter on the first moment errs by .07, as printed.
-The error .05 that the paper reports for both moments is below what any observer of two moments can reach here.
+on [−1, 1]) are not; with these the Kalman filter on the first moment has the error .07, as printed.
+The error .05 that the paper reports for both moments is below the bound for any observer of two moments here.
 
-Paper 2: the mirror is simulated, not measured.  Its disturbance (.3 and 10 per second, on y and ẏ) enters between
+Paper 2: the mirror is simulated, not measured.  Its disturbance (.3 and 10 per second, on y and ẏ) is added between
 exposures.  Kernel (σ = .1), pixels (80 on [−4, 4]), noise density (.002) and input (three tones of .5) are chosen.  The
 plant is known, or drawn for every seed within ±7 dB of the nominal one at all frequencies from .2 to 10 Hz.
 """
@@ -22,20 +22,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.errors import require, require_between
-from .augmented import Oscillator, OscillatorMotion, largest_deviation
-from .blur_model import BlurModel
-from .kernels import Float64Array, PixelGrid, gaussian_kernel
-from .lifted import FastSystem, discretise, lift
-from .observers import steady_kalman
-from .sensor import ExposureTiming, LineSensor
-from .trials import Recording, simulate
+from ...core.errors import require, require_between
+from ...filtering.kalman import Gaussian
+from ..augmented import Oscillator, OscillatorMotion
+from ..lifting import FastSystem, LiftedSystem, discretise, lift
+from ..moments import BlurModel
+from ..observers import steady_kalman
+from ..sensor import ExposureTiming, Float64Array, GaussianKernel, LineSensor, PixelGrid, expose
+
+# Frequencies in rad/s at which the plant of a seed is compared with the nominal one.
+_COMPARED = 2 * np.pi * np.linspace(0.2, 10.0, 50)
 
 
 def _check_common(params: WavefrontParams | MirrorParams) -> None:
     burn_in = params.burn_in
     require(params.frames > burn_in >= 0, f"frames: expected more than the burn-in of {burn_in}, found {params.frames}")
-    # The covariance of the noise of orders 0 to 4 is singular with fewer.
+    # With fewer pixels the covariance of the noise of orders 0 to 4 is singular.
     require(params.pixels >= 5, f"pixels: expected at least 5, found {params.pixels}")
     require_between("noise", params.noise, 1e-15, 1e6)
     require_between("kernel_width", params.kernel_width, 1e-3, 1e3)
@@ -68,7 +70,7 @@ class WavefrontParams:
     Raises
     ------
     ConfigurationError
-        Nothing is left after the burn-in, or a number makes no sense.
+        No frame is left after the burn-in, or a number is out of range.
 
     Examples
     --------
@@ -121,7 +123,7 @@ class MirrorParams:
     Raises
     ------
     ConfigurationError
-        Nothing is left after the burn-in, or a number makes no sense.
+        No frame is left after the burn-in, or a number is out of range.
 
     Examples
     --------
@@ -146,7 +148,30 @@ class MirrorParams:
             require_between(name, getattr(self, name), 1e-9, 1e6)
 
 
-def wavefront_model(params: WavefrontParams | None = None) -> BlurModel:
+WAVEFRONT, MIRROR = WavefrontParams(), MirrorParams()
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Simulated truth and the frames that the sensor recorded; T frames, S seeds.
+
+    Parameters
+    ----------
+    inputs : ndarray, float64, shape (T, S, N)
+    states : ndarray, float64, shape (T, S, n)
+        At the start of every exposure.
+    outputs : ndarray, float64, shape (T, S, N)
+        At every fast step.
+    frames : ndarray, float64, shape (T, S, count)
+    """
+
+    inputs: Float64Array
+    states: Float64Array
+    outputs: Float64Array
+    frames: Float64Array
+
+
+def wavefront_model(params: WavefrontParams = WAVEFRONT) -> BlurModel:
     """System and sensor of paper 1, section VI: ``ẍ = −20 x − 30 ẋ + 20 u``, exposed all the time.
 
     Parameters
@@ -162,19 +187,17 @@ def wavefront_model(params: WavefrontParams | None = None) -> BlurModel:
     >>> wavefront_model().motion.timing.frame_steps
     200
     """
-    params = params or WavefrontParams()
     timing = ExposureTiming(fast_period=1e-3, exposure=0.2, readout=0.0, frame_period=0.2)
-    A, B = discretise([[0.0, 1.0], [-20.0, -30.0]], [0.0, 20.0], timing.fast_period)
-    Q = np.diag([params.slope_disturbance**2, params.rate_disturbance**2])
+    disturbance = (params.slope_disturbance, params.rate_disturbance)
+    motion = _two_states([[0.0, 1.0], [-20.0, -30.0]], [0.0, 20.0], timing, disturbance)
     pixels = PixelGrid(-1.0, 1.0, params.pixels, integrating=False)
-    sensor = LineSensor(gaussian_kernel(params.kernel_width), pixels, params.noise)
-    return BlurModel(lift(FastSystem(A, B, np.array([1.0, 0.0])), timing, Q), sensor)
+    return BlurModel(motion, LineSensor(GaussianKernel(params.kernel_width), pixels, params.noise))
 
 
-def mirror_model(params: MirrorParams | None = None) -> BlurModel:
+def mirror_model(params: MirrorParams = MIRROR) -> BlurModel:
     """Nominal mirror and camera of paper 2, section V, with the states y and ẏ.
 
-    The paper's states are ``x₂ = y`` and ``x₁ = ẏ + 13.6 y``.
+    The states of the paper are ``x₂ = y`` and ``x₁ = ẏ + 13.6 y``.
 
     Parameters
     ----------
@@ -189,18 +212,17 @@ def mirror_model(params: MirrorParams | None = None) -> BlurModel:
     >>> mirror_model().motion.timing.exposure_steps
     100
     """
-    params = params or MirrorParams()
-    nominal, timing = mirror_oscillator(params).nominal, mirror_oscillator(params).timing
-    omega = nominal.frequency
+    motion = mirror_oscillator(params)
+    nominal, omega = motion.nominal, motion.nominal.frequency
     continuous = [[0.0, 1.0], [-(omega**2), -2 * nominal.damping * omega]]
-    A, B = discretise(continuous, [0.0, nominal.gain * omega**2], timing.fast_period)
-    Q = np.diag([params.output_disturbance**2, params.rate_disturbance**2])
-    sensor = LineSensor(gaussian_kernel(params.kernel_width), PixelGrid(-4.0, 4.0, params.pixels), params.noise)
-    return BlurModel(lift(FastSystem(A, B, np.array([1.0, 0.0])), timing, Q), sensor)
+    disturbance = (params.output_disturbance, params.rate_disturbance)
+    lifted = _two_states(continuous, [0.0, nominal.gain * omega**2], motion.timing, disturbance)
+    sensor = LineSensor(GaussianKernel(params.kernel_width), PixelGrid(-4.0, 4.0, params.pixels), params.noise)
+    return BlurModel(lifted, sensor)
 
 
-def mirror_oscillator(params: MirrorParams | None = None) -> OscillatorMotion:
-    """Mirror of paper 2, ω = 34 rad/s and ζ = .2, with its plant among the states.
+def mirror_oscillator(params: MirrorParams = MIRROR) -> OscillatorMotion:
+    """Mirror of paper 2, ω = 34 rad/s and ζ = .2, with the parameters of its plant among the states.
 
     Parameters
     ----------
@@ -215,20 +237,19 @@ def mirror_oscillator(params: MirrorParams | None = None) -> OscillatorMotion:
     >>> mirror_oscillator().order
     5
     """
-    params = params or MirrorParams()
     timing = ExposureTiming(fast_period=1e-3, exposure=0.1, readout=0.35, frame_period=0.45, trigger=0.09)
-    # A little movement keeps the filter from trusting its first linearisation for ever.
+    # Small variances of the parameters keep the filter from relying on its first linearisation for ever.
     spread = [params.output_disturbance**2, params.rate_disturbance**2, 1e-6, 1e-6, 1e-6]
     return OscillatorMotion(Oscillator(1.0, 34.0, 0.2), timing, np.diag(spread))
 
 
-def record_wavefront(seeds: Sequence[int], params: WavefrontParams | None = None) -> Recording:
+def record_wavefront(seeds: Sequence[int], params: WavefrontParams = WAVEFRONT) -> Recording:
     """Simulate the wavefront and its frames.
 
     Parameters
     ----------
     seeds : sequence of int
-        Each gives phases, start, disturbance and noise of one run.
+        Each determines the phases, start, disturbance and noise of one run.
     params : WavefrontParams
 
     Returns
@@ -240,28 +261,26 @@ def record_wavefront(seeds: Sequence[int], params: WavefrontParams | None = None
     >>> record_wavefront([7], WavefrontParams(frames=3, burn_in=1)).frames.shape
     (3, 1, 100)
     """
-    params = params or WavefrontParams()
-    model = wavefront_model(params)
+    model, count = wavefront_model(params), params.frames
     _, cov = steady_kalman(model)
     scale = np.array([params.slope_disturbance, params.rate_disturbance])
-    steps, count = model.motion.timing.frame_steps, params.frames
     tones = np.array([params.low_tone, params.high_tone])
 
-    def one(rng: np.random.Generator) -> tuple[Float64Array, ...]:
-        inputs = _tones(tones, rng, params.amplitude, count, steps)
+    def draw(rng: np.random.Generator) -> tuple[Float64Array, ...]:
+        inputs = _tones(tones, rng, params.amplitude, count, model.motion.timing.frame_steps)
         start = np.linalg.cholesky(cov) @ rng.standard_normal(2)
         return start, inputs, scale * rng.standard_normal((count, 2)), rng.standard_normal((count, params.pixels))
 
-    return _record(model, one, seeds)
+    return _record(model, draw, seeds)
 
 
-def record_mirror(seeds: Sequence[int], params: MirrorParams | None = None) -> Recording:
+def record_mirror(seeds: Sequence[int], params: MirrorParams = MIRROR) -> Recording:
     """Simulate the mirror and its frames; the states are (y, ẏ, ln g/g₀, ln ω/ω₀, ln ζ/ζ₀).
 
     Parameters
     ----------
     seeds : sequence of int
-        Each gives plant, tones, start, disturbance and noise of one run.
+        Each determines the plant, tones, start, disturbance and noise of one run.
     params : MirrorParams
 
     Returns
@@ -273,29 +292,73 @@ def record_mirror(seeds: Sequence[int], params: MirrorParams | None = None) -> R
     >>> record_mirror([7], MirrorParams(frames=3, burn_in=1)).states.shape
     (3, 1, 5)
     """
-    params = params or MirrorParams()
-    model, truth = mirror_model(params), mirror_oscillator(params)
+    model, truth, count = mirror_model(params), mirror_oscillator(params), params.frames
     _, cov = steady_kalman(model)
     scale = np.array([params.output_disturbance, params.rate_disturbance, 0.0, 0.0, 0.0])
-    steps, count = truth.timing.frame_steps, params.frames
 
-    def one(rng: np.random.Generator) -> tuple[Float64Array, ...]:
+    def draw(rng: np.random.Generator) -> tuple[Float64Array, ...]:
         tones = rng.uniform([0.5, 2.0, 4.0], [1.5, 3.5, 6.0])
-        inputs = _tones(tones, rng, params.amplitude, count, steps)
+        inputs = _tones(tones, rng, params.amplitude, count, truth.timing.frame_steps)
         plant = _draw_plant(rng, params.deviation, truth.nominal)
         start = np.concatenate([np.linalg.cholesky(cov) @ rng.standard_normal(2), plant])
         return start, inputs, scale * rng.standard_normal((count, 5)), rng.standard_normal((count, params.pixels))
 
-    return _record(BlurModel(truth, model.sensor), one, seeds)
+    return _record(BlurModel(truth, model.sensor), draw, seeds)
+
+
+def largest_deviation(plant: Float64Array, nominal: Oscillator) -> float:
+    """Largest deviation of the frequency response of a plant from the nominal one, in dB, from .2 to 10 Hz.
+
+    Parameters
+    ----------
+    plant : ndarray, float64, shape (3,)
+        ln g/g₀, ln ω/ω₀, ln ζ/ζ₀.
+    nominal : Oscillator
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> round(largest_deviation(np.array([np.log(2.0), 0.0, 0.0]), Oscillator(1.0, 34.0, 0.2)), 2)
+    6.02
+    """
+
+    def gains(g: float, omega: float, zeta: float) -> Float64Array:
+        return g * omega**2 / np.abs(omega**2 - _COMPARED**2 + 2j * zeta * omega * _COMPARED)
+
+    reference = np.array([nominal.gain, nominal.frequency, nominal.damping])
+    return float(np.abs(20 * np.log10(gains(*(reference * np.exp(plant))) / gains(*reference))).max())
+
+
+def _two_states(
+    A: list[list[float]], B: list[float], timing: ExposureTiming, disturbance: tuple[float, float]
+) -> LiftedSystem:
+    """Lift a continuous system whose output is its first state."""
+    held_A, held_B = discretise(A, B, timing.fast_period)
+    return lift(FastSystem(held_A, held_B, np.array([1.0, 0.0])), timing, np.diag(np.square(disturbance)))
 
 
 def _record(
-    model: BlurModel, one: Callable[[np.random.Generator], tuple[Float64Array, ...]], seeds: Sequence[int]
+    model: BlurModel, draw: Callable[[np.random.Generator], tuple[Float64Array, ...]], seeds: Sequence[int]
 ) -> Recording:
-    draws = [one(np.random.default_rng(seed)) for seed in seeds]
-    start = np.stack([draw[0] for draw in draws])
-    inputs, disturbances, noise = (np.stack([draw[k] for draw in draws], 1) for k in (1, 2, 3))
-    return simulate(model.motion, model.sensor, start, inputs, disturbances, noise)
+    """Simulate all seeds; ``draw`` gives start, inputs, disturbances and standard normal noise of one."""
+    motion, sensor = model.motion, model.sensor
+    draws = [draw(np.random.default_rng(seed)) for seed in seeds]
+    state = np.stack([drawn[0] for drawn in draws])
+    inputs, disturbances, noise = (np.stack([drawn[k] for drawn in draws], 1) for k in (1, 2, 3))
+    certain = np.zeros((motion.order, motion.order))
+    states, outputs, frames = [], [], []
+    for held, disturbance, standard in zip(inputs, disturbances, noise, strict=True):
+        now = Gaussian(state, certain)
+        output, _ = motion.fast_output(now, held)
+        image = expose(output[:, : motion.timing.exposure_steps], sensor.kernel, sensor.pixels, sensor.total)
+        states.append(state)
+        outputs.append(output)
+        frames.append(image + sensor.deviation * standard)
+        state = motion.advance(now, held).mean + disturbance
+    return Recording(inputs, np.array(states), np.array(outputs), np.array(frames))
 
 
 def _tones(
@@ -309,9 +372,8 @@ def _tones(
 
 
 def _draw_plant(rng: np.random.Generator, deviation: float, nominal: Oscillator) -> Float64Array:
-    """Plant within ``deviation`` dB of the nominal one at every frequency of interest, as logarithms of ratios."""
-    frequencies = 2 * np.pi * np.linspace(0.2, 10.0, 50)
+    """Plant within ``deviation`` dB of the nominal one at every compared frequency, as logarithms of ratios."""
     while True:
         plant = rng.uniform(-1.0, 1.0, 3) * deviation / 7.0 * np.array([0.8, 0.3, 0.7])
-        if largest_deviation(plant, frequencies, nominal) <= deviation:
+        if largest_deviation(plant, nominal) <= deviation:
             return plant

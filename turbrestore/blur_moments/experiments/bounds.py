@@ -1,0 +1,148 @@
+"""Posterior Cramér–Rao bounds: limits for every observer of moments, or of the whole image.
+
+Symbols (Tichavský, Muravchik & Nehorai, 1998)
+----------------------------------------------
+J : Bayesian information about the state; J⁻¹ bounds the mean squared error of any estimate.
+A_s, Q : motion from one exposure to the next, and covariance of its disturbance.
+
+For a linear motion with Gaussian disturbance ``J⁺ = (Q + A_s J⁻¹ A_sᵀ)⁻¹ + E[Hᵀ R⁻¹ H]``, where the expectation is over
+the states that occur, and H is the derivative of the measurement at the true state.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.errors import DataError
+from ..lifting import LiftedSystem
+from ..moments import BlurModel, predicted_moments
+from ..sensor import Float64Array
+from .scenarios import Recording
+
+
+def moment_information(
+    model: BlurModel, states: Float64Array, inputs: Float64Array, orders: tuple[int, ...]
+) -> Float64Array:
+    """Information that Legendre moments of a frame carry about the state, ``Hᵀ R⁻¹ H``.
+
+    Parameters
+    ----------
+    model : BlurModel
+    states : ndarray, float64, shape (..., n)
+        At the start of the exposure.
+    inputs : ndarray, float64, shape (..., N)
+    orders : tuple of int
+        Orders of the moments.
+
+    Returns
+    -------
+    ndarray, float64, shape (..., n, n)
+    """
+    _, H, R = predicted_moments(model, states, inputs, orders, "legendre")
+    return np.swapaxes(H, -1, -2) @ np.linalg.solve(R, H)
+
+
+def image_information(model: BlurModel, states: Float64Array, inputs: Float64Array) -> Float64Array:
+    """Information that the whole frame carries about the state.
+
+    Parameters
+    ----------
+    model : BlurModel
+    states : ndarray, float64, shape (..., n)
+        At the start of the exposure.
+    inputs : ndarray, float64, shape (..., N)
+
+    Returns
+    -------
+    ndarray, float64, shape (..., n, n)
+    """
+    _, derivative = model.image_and_jacobian(states, inputs)
+    scaled = derivative / model.sensor.deviation
+    return scaled @ np.swapaxes(scaled, -1, -2)
+
+
+def posterior_bound(A: Float64Array, Q: Float64Array, start: Float64Array, information: ArrayLike) -> Float64Array:
+    """Bound on the covariance of the estimation error after every frame.
+
+    Parameters
+    ----------
+    A, Q : ndarray, float64, shape (n, n)
+        Motion from one exposure to the next, covariance of its disturbance.
+    start : ndarray, float64, shape (n, n)
+        Covariance of the state before the first frame.
+    information : array_like, shape (T, n, n)
+        Mean information of every frame.
+
+    Returns
+    -------
+    ndarray, float64, shape (T, n, n)
+
+    Raises
+    ------
+    DataError
+        The prediction has a singular covariance.
+
+    Examples
+    --------
+    >>> one = np.eye(1)
+    >>> posterior_bound(one, 0.5 * one, one, [one, one]).ravel()
+    array([0.5, 0.5])
+    """
+    before, bounds = start, []
+    for gained in np.asarray(information, np.float64):
+        try:
+            after = np.linalg.inv(np.linalg.inv(before) + gained)
+        except np.linalg.LinAlgError as error:
+            raise DataError("start: expected covariances that can be inverted, found a singular one") from error
+        bounds.append(after)
+        before = A @ after @ A.T + Q
+    return np.array(bounds)
+
+
+def recorded_information(model: BlurModel, recording: Recording) -> dict[str, Float64Array]:
+    """Information of every frame by what is measured, mean over the seeds.
+
+    Parameters
+    ----------
+    model : BlurModel
+        With a known motion, whose states are the first ones recorded.
+    recording : Recording
+
+    Returns
+    -------
+    dict of str to ndarray, float64, shape (T, n, n)
+    """
+    states, inputs = recording.states[..., : model.motion.order], recording.inputs
+    return {
+        "moments": moment_information(model, states, inputs, (1, 2)).mean(1),
+        "moments_1_to_4": moment_information(model, states, inputs, (1, 2, 3, 4)).mean(1),
+        "image": image_information(model, states, inputs).mean(1),
+    }
+
+
+def error_bound(model: BlurModel, cov: Float64Array, information: ArrayLike, burn_in: int, of_state: bool) -> float:
+    """Bound on the root mean square error of the state, or of the output within the exposure.
+
+    Parameters
+    ----------
+    model : BlurModel
+        With a linear motion.
+    cov : ndarray, float64, shape (n, n)
+        Covariance of the state before the first frame.
+    information : array_like, shape (T, n, n)
+        Mean information of every frame.
+    burn_in : int
+        Frames left out at the start.
+    of_state : bool
+
+    Returns
+    -------
+    float
+    """
+    motion = model.motion
+    assert isinstance(motion, LiftedSystem)
+    covariances = posterior_bound(motion.A, motion.Q, cov, information)[burn_in:]
+    free = motion.free[: motion.timing.exposure_steps]
+    weight = np.eye(motion.order) if of_state else free.T @ free / len(free)
+    return float(np.sqrt(np.einsum("ab,tba->t", weight, covariances).mean()))
