@@ -17,7 +17,8 @@ from scipy.special import ndtr
 from turbrestore.blur_moments.cues import displacement_variance, relative_blur
 from turbrestore.blur_moments.frame_blur import frame_blur
 from turbrestore.core.arrays import FloatArray
-from turbrestore.registration.warp import invert_flow, warp
+from turbrestore.registration.flow_algebra import invert_flow
+from turbrestore.registration.warp import warp
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 

@@ -259,7 +259,7 @@ def deconvolve(
     image = read_input_image(input, limits)
     guide_image = image if guide is None else read_input_image(guide, limits)
     with progress_bars(quiet) as progress:
-        steps = remove_blur_steps(image, guide_image, deconvolution, guards, runtime=machine.runtime())
+        steps = remove_blur_steps(image, guide_image, deconvolution, guards, machine.runtime())
         deblurred = finish(steps, step_counter(progress, "deconvolve", deconvolution.iterations))
     if bit_depth is None:
         bit_depth = 16 if input.suffix.lower() in ARTIFACT else read_image(input, limits).bit_depth

@@ -22,7 +22,7 @@ from turbrestore.io.images import check_output, check_space, read_image, write_i
 from turbrestore.io.limits import Limits
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video
 from turbrestore.memory_plan import training_share
-from turbrestore.pipeline import Progress, stage_counter
+from turbrestore.pipeline import Progress, step_counter
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import DynamicTextureParams, synthesize_like
@@ -141,7 +141,7 @@ def synthesize(
                 _training_frames(like, train, limits), truth, frames, rng, dynamic_texture, camera, progress
             )
         request = {"scene": scene, "model": model, "like": None if like is None else str(like), "seed": seed}
-        facts = _write(outputs, made, camera, request, stage_counter(progress, "synthesize", frames))
+        facts = _write(outputs, made, camera, request, step_counter(progress, "synthesize", frames))
     if overwrite and DIFFRACTION not in outputs:
         # The file of an earlier run would not belong to this one.
         output.with_name(output.stem + DIFFRACTION).unlink(missing_ok=True)
@@ -215,7 +215,7 @@ def _like_a_clip(
     camera: CameraParams,
     progress: Progress | None,
 ) -> Synthesis:
-    measured = stage_counter(progress, "centroid", len(training) * params.centroid.iterations)
+    measured = step_counter(progress, "centroid", len(training) * params.centroid.iterations)
     # One flow more than frames: the last exposure ends on it.
     texture = synthesize_like(training, count + 1, rng, params, scene, measured)
     seeds = rng.integers(2**63, size=(count, 2))
@@ -236,14 +236,14 @@ def _write(
     made: Synthesis,
     camera: CameraParams,
     request: dict[str, Any],
-    counter: Callable[[int], None] | None,
+    count: Callable[[object], None],
 ) -> dict[str, Any]:
     """Write everything into a hidden folder first, so that a failure leaves nothing; return the facts."""
     # Size of the flows; that of the encoded frames is not known beforehand.
     check_space(outputs[VIDEO], 8 * made.count * made.truth.shape[0] * made.truth.shape[1])
     with _hidden_folder(outputs[VIDEO]) as folder:
         staged = {ending: folder / path.name for ending, path in outputs.items()}
-        flow_rms = _write_frames(staged[VIDEO], staged[FLOW], made, camera, counter)
+        flow_rms = _write_frames(staged[VIDEO], staged[FLOW], made, camera, count)
         write_image(staged[TRUTH], made.truth, bit_depth=16)
         if made.diffraction is not None:
             write_image(staged[DIFFRACTION], made.diffraction, bit_depth=16)
@@ -275,7 +275,7 @@ def _hidden_folder(output: Path) -> Iterator[Path]:
 
 
 def _write_frames(
-    video: Path, flow_file: Path, made: Synthesis, camera: CameraParams, counter: Callable[[int], None] | None
+    video: Path, flow_file: Path, made: Synthesis, camera: CameraParams, count: Callable[[object], None]
 ) -> list[float]:
     """Write frames and flows as they are generated; return the root mean square of the flow along x and y."""
     squares = np.zeros(2)
@@ -289,8 +289,7 @@ def _write_frames(
                 file.write(frame.flow.astype("<f4").tobytes())
                 squares[:] += np.mean(np.square(frame.flow, dtype=np.float64), axis=(0, 1))
                 yield frame.image
-                if counter is not None:
-                    counter(1)
+                count(frame)
 
         write_video(video, images(), camera.frame_rate, camera.bit_depth)
     return [float(value) for value in np.sqrt(squares / made.count)]

@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
+from .blind.remove_blur import remove_blur_memory
 from .core.decision import Decision
 from .core.errors import ConfigurationError, DataError, require
-from .deconvolution.memory import deconvolution_memory
 from .dynamics.dynamic_texture import identify_memory, modes_memory
-from .filtering.alternating import filter_memory
+from .filtering.filter_records import filter_memory
 from .registration.flow import MIN_SIDE, flow_memory
 from .runtime.device import TORCH_BYTES, find_device, needs_torch
 from .runtime.jit import COMPILER_BYTES
@@ -225,10 +225,10 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice) -> flo
     flow = flow_memory(part, threads)
     stages = {
         "centroid": frames + flows + flow,
-        "identify": frames + flows + modes + identify_memory(part, train, params.dynamics),
+        "identify": frames + flows + modes + identify_memory(part, train),
         "filter": frames + flows + modes + flow + filter_memory(part, train, params.filter, threads),
         "deconvolve": _held_by_deconvolution(shape, params, choice)
-        + deconvolution_memory(_smallest_tile(shape), params.deconvolution),
+        + remove_blur_memory(shape[1:], params.deconvolution, 4 * HALO),
     }
     after = _held_by_deconvolution(shape, params, choice) + _report(shape)
     # While tiles are processed the images of the whole lie in files, but for a frame that is being read.
@@ -256,10 +256,6 @@ def _scratch_bytes(shape: tuple[int, ...], params: RestoreParams, choice: _Choic
         # A tile has copies of its frames and flows and a model of its own; tiles of the images overlap up to fourfold.
         size += sum(_stack(part, params, choice.train)) + 4.0 * _pixels(shape) * (6 + 14 * _channels(shape))
     return int(size)
-
-
-def _smallest_tile(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return *largest_tile((shape[1], shape[2]), 4 * HALO), *shape[3:]
 
 
 def _report(shape: tuple[int, ...]) -> float:

@@ -306,7 +306,7 @@ def _temporal_mean(source: FrameSource) -> FloatArray:
 def _deblur(run: _Run, image: FloatArray, guide: FloatArray) -> Deblurred:
     params = run.params
     runtime = replace(run.plan.runtime, memory_limit=run.plan.deconvolution)
-    steps = remove_blur_steps(image, guide, params.deconvolution, params.guards, runtime=runtime)
+    steps = remove_blur_steps(image, guide, params.deconvolution, params.guards, runtime)
     return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 
 

@@ -298,16 +298,6 @@ def test_frames_whose_flow_folds_count_for_little(sequence):
     assert np.median(filtered.variance[region]) > 1.7 * np.median(filtered.variance[70:, 70:])
 
 
-def test_no_more_of_the_residual_is_kept_than_the_model_says_is_motion(sequence):
-    centroid, dynamics = start(sequence)
-    plain, capped = (
-        filter_frames(sequence.frames, centroid.image, replace(dynamics, motion_factor=f), known_flows=centroid.flows)
-        for f in (dynamics.motion_factor, np.full((96, 96), 0.25, np.float32))
-    )
-    assert plain.motion_share > 0.5
-    assert capped.motion_share == pytest.approx(0.25, abs=0.01)
-
-
 def spoil(frames):
     """A bird that crosses, two flashes, a glint and a frame that slipped."""
     spoilt = frames.copy()

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blur.blur_cues import BlurBounds
 from turbrestore.blur.estimation import BlurEstimate
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams, deconvolve
@@ -53,7 +52,6 @@ def make_results():
         "filtered": filter_frames(CLIP, CLIP[0], dynamics, FAST),
         "deconvolution": deconvolve(CLIP[0], 1.0, DeconvolutionParams(method="tv", iterations=5)),
         "blur": BlurEstimate(1.0, 0.1, 5 / 3, 0.01, 1, 9.0, np.arange(3.0), np.ones(3)),
-        "blur_bounds": BlurBounds(0.5, 2.0),
     }
 
 

@@ -148,7 +148,7 @@ def _fields(kind, height, width, count):
     dims = {
         "image": (height, width), "variance": (height, width), "flows": (count, height, width, 2),
         "C": (height * width * 2, count), "A": (count, count), "mean_flow": (height, width, 2),
-        "residual_variance": (height, width), "motion_factor": (height, width), "states": (count, count + 1),
+        "residual_variance": (height, width), "states": (count, count + 1),
         "singular_values": (count + 1,), "flow_states": (count, 2),
     }  # fmt: skip
     scalars = {"float": st.floats(0, 1), "int": st.integers(1, 10**9), "bool": st.booleans()}
@@ -177,9 +177,7 @@ def chosen_settings(draw):
     params = RestoreParams(
         train=draw(st.integers(2, 1000)),
         keep_best=Share(draw(share)),
-        memory_limit=draw(st.none() | st.integers(10**9, 10**12)),
         border=draw(st.sampled_from(["keep", "crop"])),
-        displacement_cue=draw(st.booleans()),
         flow=FlowParams(method=draw(st.sampled_from(["dis", "tvl1", "farneback"])), global_shift=draw(st.booleans())),
         centroid=CentroidParams(iterations=draw(few), tolerance=draw(st.floats(0.01, 1.0))),
         dynamics=DynamicsParams(rank=draw(st.none() | few), energy=draw(share)),
@@ -213,7 +211,6 @@ def kept_runs(draw):
         dynamics=None,
         filtered=filtered,
         blur=None,
-        blur_bounds=None,
         deconvolution=None,
         guard_readings=tuple(draw(st.lists(READINGS, max_size=2))),
         decisions=tuple(draw(st.lists(st.builds(Decision, TEXT, TEXT, TEXT), max_size=2))),

@@ -18,7 +18,6 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore.blind.guards import GuardReading
-from turbrestore.blur.blur_cues import BlurBounds
 from turbrestore.core.arrays import from_unit
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, OutputError
@@ -29,12 +28,13 @@ from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.report import check_report, facts, pictures, render_report, write_report
 from turbrestore.report.vector import inline_svg
-from turbrestore.runs.run_files import RUN_FILES, load_run, save_run
+from turbrestore.runs.run_files import MEAN, RUN_FILES, load_run, save_run
 from turbrestore.runs.run_record import RunRecord, describe_run
 from turbrestore.runtime.scratch import new_stack
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.application import build
-from turbrestore_cli.options import Selection
+from turbrestore.runtime.memory_size import MemorySize
+from turbrestore_cli.options import Machine, Selection
 from turbrestore_cli.output import repeating_command, settings_record
 
 EVIL = "<script>alert(1)</script>\"'&.mkv"
@@ -296,7 +296,7 @@ class TestFiles:
 
     def test_a_run_comes_back(self, whole, run, tmp_path):
         save_run(tmp_path / "kept", whole, run)
-        assert {path.name for path in (tmp_path / "kept").iterdir()} == set(RUN_FILES) - {"blur_bounds.npz"}
+        assert {path.name for path in (tmp_path / "kept").iterdir()} == set(RUN_FILES) - {MEAN}
         restoration, record = load_run(tmp_path / "kept")
         same(restoration, whole)
         same(record, run)
@@ -308,11 +308,10 @@ class TestFiles:
         same(load_run(tmp_path)[0], part)
         assert not (tmp_path / "filtered.npz").exists()
 
-    def test_infinite_uncertainty_bounds_and_gaps_come_back(self, whole, run, tmp_path):
+    def test_infinite_uncertainty_and_gaps_come_back(self, whole, run, tmp_path):
         blur = dataclasses.replace(whole.blur, uncertainty=math.inf)
         filtered = dataclasses.replace(whole.filtered, innovations=np.full(6, np.nan))
-        bounds = BlurBounds(0.0, math.inf)
-        found = dataclasses.replace(whole, blur=blur, blur_bounds=bounds, filtered=filtered)
+        found = dataclasses.replace(whole, blur=blur, filtered=filtered)
         save_run(tmp_path, found, run)
         same(load_run(tmp_path)[0], found)
 
@@ -454,17 +453,20 @@ class TestCommand:
     def test_the_command_says_what_differs(self, tmp_path):
         params = RestoreParams(
             train=7,
-            displacement_cue=True,
+            keep_best=0.5,
             centroid=CentroidParams(mode="single", tolerance=0.1 + 0.2),
             deconvolution=dataclasses.replace(QUICK.deconvolution, sharpen_guide=False, sigma=1e-7),
         )
         selection = Selection(frames=":30:2", roi="0,0,64,48")
-        record = settings_record(params, selection, 16)
+        machine = Machine(threads=3)
+        record = settings_record(params, selection, 16, machine, MemorySize("2GB"))
         words = repeating_command(tmp_path / "-in put.mkv", tmp_path / "o.png", record)
-        assert len(words) == 4 + 9
+        assert len(words) == 4 + 11
         _, bound, _ = build().parse_args(words[1:], exit_on_error=False, print_error=False)
         assert bound.arguments["params"] == params
         assert bound.arguments["selection"] == selection
+        assert bound.arguments["machine"] == machine
+        assert bound.arguments["memory_limit"] == 2e9
         assert bound.arguments["bit_depth"] == 16
         assert bound.arguments["input"] == tmp_path / "-in put.mkv"
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore.blur.blur_cues import BlurBounds
+from turbrestore.blur.estimation import BlurEstimate
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, OutputError
 from turbrestore.deconvolution.deconvolve import Deconvolution
 from turbrestore.dynamics.flow_model import FlowDynamics
@@ -43,7 +43,7 @@ def test_an_image_is_read_from_artifacts_and_files(restoration, tmp_path):
     write_image(tmp_path / "a.tif", restoration.centroid.image, 32)
     assert np.allclose(load_stage_image(tmp_path / "a.tif"), np.clip(restoration.centroid.image, 0, 1))
     save_artifact(tmp_path / "d.npz", restoration.dynamics)
-    with pytest.raises(DataError, match="expected an artifact with an image, found a dynamics"):
+    with pytest.raises(DataError, match="expected a stage file with an image, found a dynamics"):
         load_stage_image(tmp_path / "d.npz")
 
 
@@ -69,15 +69,15 @@ def test_existing_files_and_other_suffixes_are_refused(restoration, tmp_path):
 def test_damage_and_other_kinds_are_told_apart(restoration, tmp_path):
     path = tmp_path / "c.npz"
     save_artifact(path, restoration.centroid)
-    with pytest.raises(DataError, match="expected a dynamics artifact, found a centroid"):
+    with pytest.raises(DataError, match="expected a dynamics stage file, found a centroid"):
         load_artifact(path, FlowDynamics)
     data = path.read_bytes()
     (tmp_path / "cut.npz").write_bytes(data[: len(data) // 2])
-    (tmp_path / "text.npz").write_text("not an artifact")
+    (tmp_path / "text.npz").write_text("not a stage file")
     np.savez(tmp_path / "plain.npz", a=np.zeros(3))
     np.savez(tmp_path / "pickled.npz", header=np.array({"kind": "centroid"}, dtype=object))
     for name in ("cut", "text", "plain", "pickled"):
-        with pytest.raises(DataError, match="expected an artifact of turbrestore"):
+        with pytest.raises(DataError, match="expected a stage file of turbrestore"):
             load_artifact(tmp_path / f"{name}.npz", Centroid)
     with pytest.raises(InputNotFoundError):
         load_artifact(tmp_path / "none.npz", Centroid)
@@ -130,9 +130,9 @@ DOCTORED = [
     *[("centroid", "flows", change) for change in (np.sum, short, text_of, spoilt(np.nan), np.float64)],
     *[("centroid", "image", change) for change in (np.ravel, spoilt(np.inf), text_of, lambda image: image[..., None])],
     ("centroid", "mean_flow_sizes", lambda sizes: sizes[:0]),
-    *[("dynamics", field, text_of) for field in ("A", "C", "Q", "mean_flow", "motion_factor", "states")],
+    *[("dynamics", field, text_of) for field in ("A", "C", "Q", "mean_flow", "states")],
     *[("dynamics", field, text_of) for field in ("residual_variance", "singular_values")],
-    *[("dynamics", field, short) for field in ("A", "C", "motion_factor", "residual_variance", "singular_values")],
+    *[("dynamics", field, short) for field in ("A", "C", "residual_variance", "singular_values")],
     *[("dynamics", "mean_flow", spoilt(value)) for value in (np.nan, 1e30)],
     *[("dynamics", "states", change) for change in (spoilt(np.nan), lambda states: states[:, :1])],
     *[("dynamics", "Q", change) for change in (np.negative, spoilt(1e6, 1), spoilt(np.nan))],
@@ -186,21 +186,16 @@ def test_figures_that_no_stage_makes_are_refused_by_name(restoration, tmp_path, 
     [
         "[" * 100_000,
         "9" * 6000,
-        '{"kind": "blur_bounds", "schema": true, "fields": {"low": 1, "high": 2}}',
-        '{"kind": "blur_bounds", "schema": 1.0, "fields": {"low": 1, "high": 2}}',
-        '{"kind": ["blur_bounds"], "schema": 1, "fields": {"low": 1, "high": 2}}',
-        '{"kind": "blur_bounds", "schema": 1, "fields": [1]}',
+        '{"kind": "blur", "schema": true, "fields": {"sigma": 1}}',
+        '{"kind": "blur", "schema": 1.0, "fields": {"sigma": 1}}',
+        '{"kind": ["blur"], "schema": 1, "fields": {"sigma": 1}}',
+        '{"kind": "blur", "schema": 1, "fields": [1]}',
     ],
 )
 def test_odd_headers_are_refused(tmp_path, header):
     np.savez(tmp_path / "a.npz", header=np.array(header))
-    with pytest.raises(DataError, match=r"a\.npz: expected an artifact of"):
-        load_artifact(tmp_path / "a.npz", BlurBounds)
-
-
-def test_bounds_may_be_open(tmp_path):
-    save_artifact(tmp_path / "a.npz", BlurBounds(0.0, float("inf")))
-    assert load_artifact(tmp_path / "a.npz", BlurBounds) == BlurBounds(0.0, float("inf"))
+    with pytest.raises(DataError, match=r"a\.npz: expected a stage file of"):
+        load_artifact(tmp_path / "a.npz", BlurEstimate)
 
 
 @pytest.mark.parametrize(

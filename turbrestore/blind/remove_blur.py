@@ -15,7 +15,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from ..blur.blur_cues import BlurBounds
 from ..blur.estimation import BlurEstimate, estimate_blur
 from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray
@@ -70,7 +69,7 @@ class Deblurred:
     blur : BlurEstimate or None
         None if the width was given.
     tiles : BlurMap or None
-        Widths of tiles; None if the width or bounds on it were given, or the image is not blurred or small.
+        Widths of tiles; None if the width was given, or the image is not blurred or small.
     readings : tuple of GuardReading
         One for each width that was removed; empty if no blur was removed.
     decisions : tuple of Decision
@@ -92,9 +91,7 @@ def remove_blur(
     guide: FloatArray,
     deconvolution: DeconvolutionParams | None = None,
     guards: GuardParams | None = None,
-    bounds: BlurBounds | None = None,
     runtime: Runtime = DEFAULT,
-    *,
     held: float = 0.0,
 ) -> Deblurred:
     """Remove a blur of given or of estimated width.
@@ -109,8 +106,6 @@ def remove_blur(
         Method, and the width if it is known.
     guards : GuardParams, optional
         Bounds that the result must keep.
-    bounds : BlurBounds, optional
-        Bounds on an estimated width; the width is then the same for the whole image.
     runtime : Runtime
         Threads, device, memory limit, and the folder of files that hold images; without one they stay in memory.  If
         the memory limit is too small for the whole image, it is deconvolved in tiles.
@@ -139,7 +134,7 @@ def remove_blur(
     >>> result.decisions
     (Decision(subject='blur', choice='none removed', reason='asked for'),)
     """
-    return finish(remove_blur_steps(image, guide, deconvolution, guards, bounds, runtime, held=held))
+    return finish(remove_blur_steps(image, guide, deconvolution, guards, runtime, held))
 
 
 def remove_blur_steps(
@@ -147,16 +142,14 @@ def remove_blur_steps(
     guide: FloatArray,
     deconvolution: DeconvolutionParams | None = None,
     guards: GuardParams | None = None,
-    bounds: BlurBounds | None = None,
     runtime: Runtime = DEFAULT,
-    *,
     held: float = 0.0,
 ) -> Steps[Deblurred]:
     """Remove a blur step by step; see :func:`remove_blur`.
 
     Parameters
     ----------
-    image, guide, deconvolution, guards, bounds, runtime, held
+    image, guide, deconvolution, guards, runtime, held
         See :func:`remove_blur`.
 
     Yields
@@ -183,7 +176,7 @@ def remove_blur_steps(
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
     exponent = params.exponent or KOLMOGOROV
     blur = estimate_blur(image, exponent=exponent, runtime=runtime) if params.sigma is None else None
-    sigma, params = blur_to_remove(blur, params, bounds)
+    sigma, params = blur_to_remove(blur, params)
     memory = None
     if runtime.memory_limit is not None:
         memory = runtime.memory_limit - held - _image_bytes(image.shape, runtime.scratch is not None)
@@ -194,7 +187,7 @@ def remove_blur_steps(
         return tiled_deconvolution_steps(image, width, params, guide, runtime, tiles)
 
     tiles, first, widths = None, None, None
-    if blur is not None and blur.blurred and bounds is None:
+    if blur is not None and blur.blurred:
         if memory is None:
             tiles, first = yield from _map_meanwhile(image, blur, _label(remove(sigma), sigma, next(numbers)))
         else:
@@ -248,9 +241,7 @@ def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side
     return _image_bytes(shape, in_file=False) + max(beside, deconvolution_memory(part, params, MOST_THREADS))
 
 
-def blur_to_remove(
-    estimate: BlurEstimate | None, deconvolution: DeconvolutionParams, bounds: BlurBounds | None = None
-) -> tuple[float, DeconvolutionParams]:
+def blur_to_remove(estimate: BlurEstimate | None, deconvolution: DeconvolutionParams) -> tuple[float, DeconvolutionParams]:
     """Decide on the width to remove, and complete the settings by the shape of the blur.
 
     Parameters
@@ -259,13 +250,11 @@ def blur_to_remove(
         Needed if ``deconvolution.sigma`` is None.
     deconvolution : DeconvolutionParams
         Settings.
-    bounds : BlurBounds, optional
-        Bounds on an estimated width.
 
     Returns
     -------
     sigma : float
-        The given width, otherwise the one that is safe to remove within the bounds; pixels.
+        The given width, otherwise the one that is safe to remove; pixels.
     deconvolution : DeconvolutionParams
 
     Examples
@@ -276,10 +265,7 @@ def blur_to_remove(
     """
     if deconvolution.sigma is not None or estimate is None:
         return deconvolution.sigma or 0.0, deconvolution
-    sigma = estimate.removable
-    if bounds is not None and sigma > 0:
-        sigma = min(max(sigma, bounds.low), bounds.high)
-    return sigma, replace(deconvolution, exponent=estimate.exponent)
+    return estimate.removable, replace(deconvolution, exponent=estimate.exponent)
 
 
 def guarded_steps(

@@ -159,7 +159,6 @@ def identify(
         energy_share=float(np.sum(singular_values[:n] ** 2)) / energy if energy else 1.0,
         overfitted=overfitted,
         notes=_notes(A, strips.count, n, present, overfitted, params),
-        motion_factor=to_scratch(np.ones(mean.shape[:2], np.float32), runtime.scratch),
     )
 
 

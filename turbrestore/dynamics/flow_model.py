@@ -70,10 +70,6 @@ class FlowDynamics:
         meaningless.
     notes : tuple of str
         Warnings about this fit, one line each.
-    motion_factor : ndarray, float32, shape (H, W)
-        Variance of the motion divided by that of the measured flows; 1 unless
-        :func:`turbrestore.dynamics.displacement.with_displacement` has changed it. Q and ``state_covariance`` are
-        scaled by its mean; states, singular values and R are those of the flows as measured.
     """
 
     A: Float64Array
@@ -87,7 +83,6 @@ class FlowDynamics:
     energy_share: float
     overfitted: bool
     notes: tuple[str, ...]
-    motion_factor: FloatArray
 
     def plot(self) -> Figure:
         """Draw the singular values of the flows and the eigenvalues of A.
@@ -157,9 +152,8 @@ class FlowDynamics:
 
     @property
     def state_covariance(self) -> Float64Array:
-        """Covariance of the states over the training flows, times the mean motion factor; shape (n, n), diagonal."""
-        measured = self.singular_values[: self.rank] ** 2 / (self.frame_count - 1)
-        return np.diag(float(self.motion_factor.mean()) * measured)
+        """Covariance of the states over the training flows; shape (n, n), diagonal."""
+        return np.diag(self.singular_values[: self.rank] ** 2 / (self.frame_count - 1))
 
 
 def project(dynamics: FlowDynamics, flow: ArrayLike) -> Float64Array:

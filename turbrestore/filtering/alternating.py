@@ -304,8 +304,8 @@ def _settings(
         params.image_noise,
         runtime.threads,
     )
-    largest = np.float32(0) if params.residual == "drop" else dynamics.motion_factor
-    share = np.minimum(statistics.motion_share, largest)
+    share = np.zeros_like(statistics.motion_share) if params.residual == "drop" else statistics.motion_share
+    statistics = replace(statistics, motion_share=share)
     backend = array_backend(runtime.device)
     with memory_of(backend.device, "take a smaller --roi"):
         statistics = backend.load_statistics(statistics)

@@ -217,14 +217,12 @@ def _filter_facts(restoration: Restoration) -> Iterator[Fact]:
 
 
 def _blur_facts(restoration: Restoration) -> Iterator[Fact]:
-    blur, bounds, done = restoration.blur, restoration.blur_bounds, restoration.deconvolution
+    blur, done = restoration.blur, restoration.deconvolution
     if blur is not None:
         known = math.isfinite(blur.uncertainty)
         value = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} px" if known else f"{blur.sigma:.2f} px"
         note = f"evidence {blur.evidence:.2f}, image reduced {blur.reduction}×" if known else "cannot be measured"
         yield Fact("Estimated blur", value, note, not known)
-    if bounds is not None:
-        yield Fact("Bounds of the blur", f"{bounds.low:.2f} to {bounds.high:.2f} px", "from the frames and their mean")
     if done is not None:
         yield Fact("Noise before deblurring", f"{100 * done.noise:.2f} %", "of full scale")
         if done.sigma > 0:

@@ -105,7 +105,6 @@ FIELDS: dict[str, dict[str, Field]] = {
         "energy_share": Number(high=1 + _ROUNDING),
         "overfitted": Flag(),
         "notes": Lines(),
-        "motion_factor": Array("f4", "H W", low=0),
     },
     "filtered": {
         "image": _IMAGE,
@@ -161,10 +160,10 @@ def check_fields(kind: str, fields: Mapping[str, Any], name: str) -> None:
 
     Examples
     --------
-    >>> check_fields("blur_bounds", {"low": 0.5, "high": -1.0}, "a.npz")
+    >>> check_fields("centroid", {"image": 0}, "a.npz")
     Traceback (most recent call last):
     ...
-    turbrestore.core.errors.DataError: a.npz: expected high from 0 to inf, found -1.0; the file is damaged
+    turbrestore.core.errors.DataError: a.npz: expected the fields ['converged', 'flows', ...], found ['image']
     """
     layout = FIELDS[kind]
     if set(fields) != set(layout):

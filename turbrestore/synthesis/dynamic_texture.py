@@ -38,8 +38,9 @@ from ..core.errors import DataError, require
 from ..dynamics.dynamic_texture import DynamicsParams, identify
 from ..dynamics.flow_model import FlowDynamics
 from ..dynamics.simulate import simulate, stable_system
-from ..registration.centroid import CentroidParams, find_centroid
+from ..registration.centroid import CentroidParams, CentroidState, centroid_steps
 from ..registration.flow import FlowParams
+from ..runtime.steps import finish
 from .sequence import check_scene
 
 Float64Array = NDArray[np.float64]
@@ -153,7 +154,7 @@ def synthesize_like(
     rng: np.random.Generator,
     params: DynamicTextureParams | None = None,
     scene: ArrayLike | None = None,
-    progress: Callable[[int], None] | None = None,
+    observe: Callable[[CentroidState], None] | None = None,
 ) -> DynamicTexture:
     """Learn the motion of a clip and continue it.
 
@@ -169,8 +170,8 @@ def synthesize_like(
         Settings.
     scene : array_like, shape (H, W) or (H, W, 3), optional
         Scene to distort, of any size; by default the centroid of the clip.
-    progress : callable, optional
-        Called with 1 after each flow that is measured.
+    observe : callable, optional
+        Called with the state of the centroid after each flow that is measured.
 
     Returns
     -------
@@ -199,7 +200,7 @@ def synthesize_like(
     params = params or DynamicTextureParams()
     _check_count(count)
     given = None if scene is None else check_scene(scene)
-    centroid = find_centroid(frames, params.centroid, params.flow, progress)
+    centroid = finish(centroid_steps(frames, params.centroid, params.flow), observe)
     image = centroid.image if given is None else given
     flows, dynamics = continue_flows(centroid.flows, count, rng, params, image.shape[:2])
     A, _ = stable_system(dynamics, params.largest_modulus)

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image, from_unit
 from ..core.errors import DataError, require, require_between
-from ..registration.warp import invert_flow, warp
+from ..registration.flow_algebra import invert_flow
+from ..registration.warp import warp
 
 # No stage can measure motion in a smaller scene.
 SMALLEST_SCENE = 16
