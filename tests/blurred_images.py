@@ -1,4 +1,4 @@
-"""What deconvolution is tested on: a blurred photograph; and small images worked on in strips, as large ones are."""
+"""A blurred photograph, which deconvolution is tested on."""
 
 import cv2
 import numpy as np
@@ -16,9 +16,3 @@ def camera(size: int, sigma: float, noise: float, seed: int = 0) -> tuple[np.nda
 
 def psnr(image: np.ndarray, truth: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean((image - truth) ** 2)))
-
-
-def in_strips(monkeypatch):
-    monkeypatch.setattr("turbrestore.deconvolution.strip_grid._ONE_STRIP", 1)
-    monkeypatch.setattr("turbrestore.deconvolution.strip_grid._STRIP", 700)
-    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_tv.STRIP_PIXELS", 700)

@@ -4,16 +4,17 @@ import numpy as np
 from scipy import fft
 
 from turbrestore.blur.psf import gaussian_otf
+from turbrestore.deconvolution.array_ops import numpy_ops
 from turbrestore.deconvolution.problem import Problem
-from turbrestore.deconvolution.strip_grid import StripGrid
+
+OPS = numpy_ops()
 
 
 def small_problem(seed: int, fidelity: float, shape: tuple[int, int] = (8, 8), margin: int = 2) -> Problem:
     rng = np.random.default_rng(seed)
     seen = np.zeros(shape, np.float32)
     seen[margin : shape[0] - margin, margin : shape[1] - margin] = 1
-    grid = StripGrid(shape)
-    return Problem(rng.random(shape).astype(np.float32), seen, grid.in_blocks(gaussian_otf(shape, 0.7)), fidelity, grid)
+    return Problem(rng.random(shape).astype(np.float32), seen, gaussian_otf(shape, 0.7), fidelity, OPS)
 
 
 def dense(operator, shape: tuple[int, int]) -> np.ndarray:
@@ -22,5 +23,4 @@ def dense(operator, shape: tuple[int, int]) -> np.ndarray:
 
 
 def dense_blur(problem: Problem) -> np.ndarray:
-    shape = problem.seen.shape
-    return dense(lambda u: fft.irfft2(problem.transfer[0] * fft.rfft2(u), s=shape), shape)
+    return dense(lambda u: problem.blur(fft.rfft2(u)), problem.shape)

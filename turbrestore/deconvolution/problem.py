@@ -1,109 +1,279 @@
-"""The data term of deconvolution, ``λ/2 ‖M(k∗u − f)‖²``, and its gradient.
+"""The deconvolution problem: data term, boundary, and the planes of a colour image.
 
-Symbols as in :mod:`turbrestore.deconvolution.deconvolve`.
+Symbols
+-------
+f : observed image; u : image that is sought.
+k : point spread function; B : convolution with k; H : its transfer function; Bᵀ : adjoint of B.
+M : 1 where a pixel was observed, 0 in the margin around the image.
+λ : fidelity, the weight of the data.  The paper's μ is 1 here.
+
+The data term is ``λ/2 ‖M(Bu − f)‖²`` (paper 3, eqs. 21 and 22, with the mask M).
+
+Boundary
+--------
+Pixels near the border of f received light from beyond it.  The unknown u therefore has a margin of at least 4σ on each
+side, in which M is 0, and the convolution is periodic on that larger domain: its two sides meet where nothing was
+observed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from ..blur.psf import Spectrum
-from ..core.arrays import FloatArray
-from .strip_grid import Found, StripGrid
+from ..blur.psf import check_psf, wiener_fidelity
+from ..core.arrays import FloatArray, luminance
+from ..core.errors import require
+from .array_ops import Array, ArrayOps
+
+# Smallest margin, in widths of the blur.
+MARGIN_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Data term ``λ/2 ‖M(k∗u − f)‖²`` on the padded domain.
+    """Data term ``λ/2 ‖M(Bu − f)‖²`` on the padded domain.
 
     Attributes
     ----------
-    observed : ndarray, float32, shape (P, Q)
-        f, continued by reflection where nothing was seen.
-    seen : ndarray, float32, shape (P, Q)
+    observed : array, float32, shape (P, Q)
+        f, continued by reflection into the margin.
+    seen : array, float32, shape (P, Q)
         M.
-    transfer : ndarray, shape (B, P, C)
-        Transfer function of k, in blocks.
+    otf : array, float32 or complex64, shape (P, Q // 2 + 1)
+        H.
     fidelity : float
         λ.
-    grid : StripGrid
-        Of these.
-    judged : tuple of two ndarrays, float32, shapes (P,) and (Q,), optional
-        1 for the rows and columns that changes are judged in; by default all are.
+    ops : ArrayOps
+        Library that the arrays belong to.
     """
 
-    observed: FloatArray
-    seen: FloatArray
-    transfer: Spectrum
+    observed: Array
+    seen: Array
+    otf: Array
     fidelity: float
-    grid: StripGrid
-    judged: tuple[FloatArray, FloatArray] | None = None
+    ops: ArrayOps
 
-    def weight(self, rows: slice) -> FloatArray:
-        """Weigh squares of changes in some rows: 1 where they are judged."""
-        if self.judged is None:
-            return np.ones_like(self.observed[rows])
-        down, across = self.judged
-        return np.outer(down[rows], across)
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns, P and Q."""
+        return self.observed.shape[0], self.observed.shape[1]
 
-    def blurred(self, u: FloatArray) -> FloatArray:
-        """Bu, a new image."""
-        blurred = self.grid.image()
+    @cached_property
+    def power(self) -> Array:
+        """|H|², the transfer function of BᵀB."""
+        return self.ops.arrays.abs(self.otf) ** 2
 
-        def put(rows: slice, strip: FloatArray) -> None:
-            blurred[rows] = strip
+    @cached_property
+    def mean(self) -> float:
+        """Mean of the observed pixels."""
+        return self.ops.total(self.seen * self.observed) / self.ops.total(self.seen)
 
-        self._blur(u, put, blurred)
-        return blurred
+    def blur(self, spectrum: Array) -> Array:
+        """Image Bu from the transform of u."""
+        return self.ops.back(self.otf * spectrum, self.shape)
 
-    def misfit(self, u: FloatArray) -> float:
+    def misfit(self, u: Array) -> float:
         """``λ/2 ‖M(Bu − f)‖²``."""
-
-        def squares(rows: slice, strip: FloatArray) -> float:
-            strip -= self.observed[rows]
-            strip *= self.seen[rows]
-            return float(np.square(strip, out=strip).sum(dtype=np.float64))
-
-        return self.fidelity / 2 * sum(self._blur(u, squares, self.observed, self.seen))
-
-    def power(self, block: int) -> FloatArray:
-        """|k̂|², which BᵀB multiplies by, of a block."""
-        return np.square(np.abs(self.transfer[block]))
-
-    def _blur(self, u: FloatArray, work: Callable[[slice, FloatArray], Found], *touched: object) -> list[Found]:
-        """Do something to every strip of Bu."""
-        grid, (spectrum, _), transfer = self.grid, self.grid.spectra, self.transfer
-
-        def multiply(block: int) -> None:
-            found = fft.fft(spectrum[block], axis=0)
-            found *= transfer[block]
-            spectrum[block] = fft.ifft(found, axis=0, overwrite_x=True)
-
-        grid.over_rows(lambda rows: grid.transform_strip(u[rows], spectrum, rows), spectrum, u)
-        grid.over_blocks(multiply, spectrum, transfer)
-        return grid.over_rows(lambda rows: work(rows, grid.strip_of(spectrum, rows)), spectrum, *touched)
+        residual = self.seen * (self.blur(self.ops.forward(u)) - self.observed)
+        return self.fidelity / 2 * self.ops.total(residual**2)
 
 
-def seen_mean(problem: Problem) -> np.float32:
-    """Mean of the pixels that were seen.
+@dataclass(frozen=True)
+class Margin:
+    """Pixels added around an image, for which nothing was observed.
+
+    Attributes
+    ----------
+    size : (int, int)
+        H and W of the image.
+    widths : tuple of (int, int)
+        Pixels before and after each axis.
+    """
+
+    size: tuple[int, int]
+    widths: tuple[tuple[int, int], tuple[int, int]]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns with the margin."""
+        (top, bottom), (left, right) = self.widths
+        return self.size[0] + top + bottom, self.size[1] + left + right
+
+    def inside(self, rim: int = 0) -> tuple[slice, slice]:
+        """Part of the padded domain that the image covers, without its outermost ``rim`` pixels."""
+        (top, _), (left, _) = self.widths
+        return slice(top + rim, top + self.size[0] - rim), slice(left + rim, left + self.size[1] - rim)
+
+    def mask(self, rim: int = 0) -> FloatArray:
+        """1 in :meth:`inside`, 0 elsewhere; with ``rim`` 0 it is M."""
+        mask = np.zeros(self.shape, np.float32)
+        mask[self.inside(rim)] = 1
+        return mask
+
+    def pad(self, image: FloatArray) -> FloatArray:
+        """Continue an image by reflection."""
+        return np.pad(image, self.widths, mode="symmetric")
+
+
+def margin_around(size: tuple[int, int], least: int | None) -> Margin:
+    """Margin of at least ``least`` pixels on each side, up to a size with a fast transform.
 
     Parameters
     ----------
-    problem : Problem
+    size : (int, int)
+        H and W of the image.
+    least : int or None
+        Smallest width, pixels; None adds no margin.
 
     Returns
     -------
-    numpy.float32
+    Margin
 
     Examples
     --------
-    >>> grid = StripGrid((1, 3))
-    >>> float(seen_mean(Problem(np.float32([[1, 2, 9]]), np.float32([[1, 1, 0]]), np.ones((1, 1, 2)), 1.0, grid)))
-    1.5
+    >>> margin_around((64, 62), 4).widths
+    ((4, 4), (5, 5))
     """
-    inner = problem.grid.inner
-    return np.float32(inner(problem.seen, problem.observed) / inner(problem.seen, problem.seen))
+    if least is None:
+        return Margin(size, ((0, 0), (0, 0)))
+    extra = [fft.next_fast_len(length + 2 * least, real=True) - length for length in size]
+    top, left = (total // 2 for total in extra)
+    return Margin(size, ((top, extra[0] - top), (left, extra[1] - left)))
+
+
+def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:
+    """Split an image into the planes that are deblurred.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+    channels : {"luminance", "each"}
+        Of a colour image, luminance alone or every channel.
+
+    Returns
+    -------
+    list of ndarray, float32, shape (H, W)
+
+    Examples
+    --------
+    >>> len(split_planes(np.zeros((2, 2, 3), np.float32), "each"))
+    3
+    """
+    if image.ndim == 3 and channels == "each":
+        return [np.ascontiguousarray(image[..., index]) for index in range(image.shape[2])]
+    return [luminance(image)]
+
+
+def join_planes(image: FloatArray, planes: list[FloatArray], channels: str) -> FloatArray:
+    """Join deblurred planes into an image; the reverse of :func:`split_planes`.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        Blurred image; chroma is taken from it.
+    planes : list of ndarray, float32, shape (H, W)
+    channels : {"luminance", "each"}
+
+    Returns
+    -------
+    ndarray, float32, shape of ``image``
+
+    Examples
+    --------
+    >>> grey = np.full((2, 2), 0.5, np.float32)
+    >>> join_planes(np.zeros((2, 2, 3), np.float32), [grey], "luminance")[0, 0]
+    array([0.5, 0.5, 0.5], dtype=float32)
+    """
+    if image.ndim == 2:
+        return planes[0]
+    if channels == "each":
+        return np.stack(planes, axis=-1)
+    return image + (planes[0] - luminance(image))[..., None]
+
+
+def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
+    """Weight λ of the data from the noise of the blurred image.
+
+    Parameters
+    ----------
+    method : {"nltv", "tv", "wiener", "tikhonov"}
+        Penalty.
+    image : ndarray, float32, shape (H, W)
+        Blurred image.
+    noise : float
+        Standard deviation n of its noise, intensity.
+
+    Returns
+    -------
+    float
+        nltv ``20/√(n² + .004²)``, tv ``12/√(n² + .003²)``; wiener as :func:`turbrestore.blur.psf.wiener_fidelity`,
+        tikhonov half of that.
+
+    Notes
+    -----
+    Total variation has the unit of intensity and the data term its square, hence 1/n. For nltv and tv on
+    photographs, brick and text blurred with σ 1–3 the result is within 0.4 dB of the best λ for n = .01–.02. Below,
+    a perfectly known blur allows 3 to 10 times more (0.1–3 dB, 5 dB on thin text). The floors keep λ so small
+    that a slightly wrong σ does little harm: a registered average is less sharp than its noise suggests. On
+    registered averages of simulated turbulence, with σ within 0.2 px, 3λ gains 0.3 dB at most and loses up to 1.7.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> round(automatic_fidelity("nltv", np.zeros((2, 2), np.float32), 0.003))
+    4000
+    """
+    if method == "nltv":
+        return 20.0 / float(np.hypot(noise, 0.004))
+    if method == "tv":
+        return 12.0 / float(np.hypot(noise, 0.003))
+    fidelity = wiener_fidelity(image, noise)
+    return fidelity if method == "wiener" else fidelity / 2
+
+
+def read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:
+    """Read a blur that is given by its width or by its PSF.
+
+    Parameters
+    ----------
+    sigma_or_psf : float, or array_like of shape (h, w) with odd sizes
+        As of :func:`turbrestore.deconvolution.deconvolve.deconvolve`.
+
+    Returns
+    -------
+    psf : ndarray, float64, or None
+        None where only the width is known.
+    sigma : float
+        Standard deviation, pixels.
+    reach : int
+        Pixels that light is moved by at most.
+
+    Raises
+    ------
+    DataError
+        An unusable PSF.
+    ConfigurationError
+        A width that is negative or not finite.
+
+    Examples
+    --------
+    >>> read_blur(1.5)
+    (None, 1.5, 6)
+    """
+    if np.ndim(sigma_or_psf) == 0:
+        sigma: Any = sigma_or_psf
+        require(
+            np.isfinite(sigma) and sigma >= 0,
+            f"sigma_or_psf: expected a finite number of 0 or more pixels, found {sigma}",
+        )
+        return None, float(sigma), int(np.ceil(MARGIN_SIGMAS * sigma))
+    psf = check_psf(sigma_or_psf)
+    y, x = (np.arange(size) - size // 2 for size in psf.shape)
+    squares = psf.sum(axis=1) @ y**2 + psf.sum(axis=0) @ x**2
+    return psf, float(np.sqrt(squares / 2)), max(psf.shape) // 2

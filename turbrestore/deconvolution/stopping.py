@@ -1,62 +1,173 @@
-"""When an iteration has come near enough to where it goes.
+"""The loop of the iterative solvers, and when it stops.
 
-A photograph is deblurred after some fifty iterations, the finest bars of a chart after hundreds.  A bound for the last
-change of the whole tells them apart badly: what changes slowly may have far to go, and a few letters on a large page
-change little of it.  So changes are looked at where they are largest, and what follows them is foreseen.
+A photograph is deblurred after some fifty iterations, the finest bars of a chart after hundreds.  The last change of
+the whole image tells the two apart badly: an image that changes slowly may have far to go, and a few letters on a large
+page change little of it.  So changes are measured in the tile that changes most, and further changes are predicted.
 
-Where the image goes on beyond its border, primal-dual splitting is not judged in the outermost pixels, as many as the
-blur is wide.  Up to half of their light comes from pixels that nobody saw.  These and those swing for hundreds of
-iterations, by less than can be seen, and the more tiles there are, the more likely one still swings.  Conjugate
-gradients do not swing; what they change last lies there, so they are judged everywhere.
+Where the image continues beyond its border, changes of nltv and tv are not measured in the outermost pixels, as many as
+the blur is wide.  Up to half of their light comes from pixels that were not observed.  These oscillate for hundreds of
+iterations, by less than can be seen, and the more tiles there are, the more likely one of them still oscillates.
+Conjugate gradients do not oscillate; their last changes are at the border, so they are measured everywhere.
 
 Symbols
 -------
-d : change of the image in a window of iterations, relative.
+d : change of the image over a window of iterations, relative to the brightest tile.
 q : ratio of the changes of two windows in succession, the mean of the last ones.
 
-The changes to come are continued as a geometric series, ``d (q + q² + …) = d q / (1 − q)``.  A q near 1 is known too
-badly for that: no more is foreseen than ``MOST`` times the last change, and that much as long as q is not known.
+The predicted changes are a geometric series, ``d (q + q² + …) = d q / (1 − q)``.  A q near 1 is too uncertain for that:
+the prediction is at most ``MOST`` times the last change, and that much as long as q is not known.
 
-That is too much where an image swings: it goes as far back as it went.  So primal-dual splitting also ends where the
-image rests, that is, where all images of the last windows (``turbrestore.deconvolution.primal_dual.REST``) differ from
-it by no more than the tolerance.  Neither rule is a bound: that what is left can hardly be seen is measured
-(``benchmarks/stopping.py``), and what drifts very slowly may rest.
+That is too much for an image that oscillates.  So primal-dual splitting also stops when the image is at rest: when it
+differs from the images after each of the last windows (``turbrestore.deconvolution.primal_dual.REST``) by no more than
+the tolerance.  Neither rule is a bound: ``benchmarks/stopping.py`` measures that the remaining change is hardly
+visible, and an image that drifts very slowly may be taken to be at rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from .array_ops import Array, ArrayOps
+from .problem import Problem
 
-# Pixels a side of the tiles that changes are compared in.
+# Pixels a side of the tiles that changes are measured in.
 TILE = 64
-# Steps from window to window that q is taken from, of which there must be FEWEST; and how many times the last change is
-# foreseen at most.
+# q is the mean over this many steps from window to window, of which there must be at least FEWEST; the prediction is at
+# most MOST times the last change.
 SPAN, FEWEST, MOST = 5, 4, 6.0
+# The energy is recorded every so many iterations, a multiple of the windows of all solvers.
+_RECORD_EVERY = 10
 
 
-def still_to_come(changes: Sequence[float]) -> float:
-    """Sum of the changes that follow.
+@dataclass(frozen=True)
+class DeconvolutionState:
+    """Progress of a deconvolution.
+
+    Attributes
+    ----------
+    iteration : int
+        Iterations done.
+    change : float
+        Latest change for each iteration, of the tile that changes most and relative to the brightest tile; infinite
+        until the first is known.
+    """
+
+    iteration: int
+    change: float
+
+
+class Solution(NamedTuple):
+    """Images, iterations, whether they converged, and records (iteration, energy, change for each iteration)."""
+
+    images: list[Array]
+    iterations: int
+    converged: bool
+    records: list[tuple[int, float, float]]
+
+
+class _SolverState(Protocol):
+    @property
+    def image(self) -> Array: ...
+
+
+State = TypeVar("State", bound=_SolverState)
+
+
+class Solver(Protocol[State]):
+    """An iterative solver; see :mod:`turbrestore.deconvolution.primal_dual` for the constants."""
+
+    window: ClassVar[int]
+    rest: ClassVar[int]
+
+    def step(self, problem: Problem, state: State) -> State:
+        """One iteration."""
+        ...
+
+    def penalty(self, problem: Problem, u: Array) -> float:
+        """Value of the penalty."""
+        ...
+
+
+def iterate(
+    solver: Solver[State],
+    problems: list[Problem],
+    states: list[State],
+    measured: Array,
+    iterations: int,
+    tolerance: float,
+) -> Generator[DeconvolutionState, None, Solution]:
+    """Step the problems of all channels until no image changes any more.
+
+    Parameters
+    ----------
+    solver : Solver
+    problems : list of Problem
+        One for each channel.
+    states : list
+        State of the solver for each problem.
+    measured : array, float32, shape of the images
+        1 where changes count, else 0.
+    iterations : int
+        Largest number of iterations.
+    tolerance : float
+        Change that is small enough.
+
+    Yields
+    ------
+    DeconvolutionState
+
+    Returns
+    -------
+    Solution
+    """
+    ops, images = problems[0].ops, [state.image for state in states]
+    earlier = deque([images], max(solver.rest, 1))
+    changes, records, begun, converged = list[float](), list[tuple[int, float, float]](), 0, False
+    for iteration in range(1, iterations + 1):
+        states = [solver.step(problem, state) for problem, state in zip(problems, states, strict=True)]
+        last, full = iteration == iterations, iteration % solver.window == 0
+        if last or full:
+            images = [state.image for state in states]
+            changes.append(change_of(earlier[-1], images, measured, ops) * solver.window / (iteration - begun))
+            converged = predicted_change(changes) <= tolerance
+            if not converged and full and len(earlier) == solver.rest:
+                converged = all(change_of(old, images, measured, ops) <= tolerance for old in earlier)
+            begun, last = iteration, last or converged
+            earlier.append(images)
+        change = changes[-1] / solver.window if changes else np.inf
+        if last or iteration % _RECORD_EVERY == 0:
+            energies = (p.misfit(u) + solver.penalty(p, u) for p, u in zip(problems, images, strict=True))
+            records.append((iteration, sum(energies), change))
+        yield DeconvolutionState(iteration, change)
+        if last:
+            break
+    return Solution(images, iteration, converged, records)
+
+
+def predicted_change(changes: Sequence[float]) -> float:
+    """Predict the sum of the changes that follow.
 
     Parameters
     ----------
     changes : sequence of float
-        Of all windows until now.
+        Changes over all windows until now.
 
     Returns
     -------
     float
-        In the unit of the changes; the most that is foreseen as long as there are too few to tell.
+        In the unit of the changes; the largest prediction as long as there are too few of them.
 
     Examples
     --------
-    >>> still_to_come([0.8, 0.4, 0.2, 0.1, 0.05])
+    >>> predicted_change([0.8, 0.4, 0.2, 0.1, 0.05])
     0.05
-    >>> still_to_come([0.8, 0.5])
+    >>> predicted_change([0.8, 0.5])
     3.0
     """
     last, span = changes[-1], min(SPAN, len(changes) - 1)
@@ -66,49 +177,60 @@ def still_to_come(changes: Sequence[float]) -> float:
     return last * ratio / (1 - ratio)
 
 
-def tile_sums(strip: FloatArray, first: int) -> NDArray[np.float64]:
-    """Sum some rows of an image over tiles.
+def change_of(before: list[Array], after: list[Array], measured: Array, ops: ArrayOps) -> float:
+    """Change of images as they are shown: clipped to [0, 1], and where changes are measured.
 
     Parameters
     ----------
-    strip : ndarray, float32, shape (h, W)
-        Rows, at least one.
-    first : int
-        Number of the first of them in the image.
-
-    Returns
-    -------
-    ndarray, float64, shape (n, ceil(W / TILE))
-        Of the n rows of tiles that they belong to, from row ``first // TILE`` of tiles on.
-
-    Examples
-    --------
-    >>> tile_sums(np.ones((2, 65), np.float32), 63)
-    array([[64.,  1.],
-           [64.,  1.]])
-    """
-    across = np.add.reduceat(strip, np.arange(0, strip.shape[1], TILE), axis=1, dtype=np.float64)
-    begins = np.arange(-(-(first + 1) // TILE) * TILE, first + len(strip), TILE) - first
-    return np.add.reduceat(across, np.concatenate([[0], begins]))
-
-
-def relative_change(moved: NDArray[np.float64], size: NDArray[np.float64]) -> float:
-    """Change of the tile that changed most, relative to the brightest.
-
-    Parameters
-    ----------
-    moved, size : ndarray, float64, equal shapes
-        Squares of the change and of the image, summed over tiles.
+    before, after : list of array, float32, shape (P, Q)
+        Channels of two images.
+    measured : array, float32, shape (P, Q)
+        1 where changes count, else 0.
+    ops : ArrayOps
+        Library that the arrays belong to.
 
     Returns
     -------
     float
-        Of their roots.
+        Root of the sum of squares over the tile that changed most, relative to that of the brightest tile.
 
     Examples
     --------
-    >>> relative_change(np.array([0.0, 4.0]), np.array([100.0, 1.0]))
+    >>> from turbrestore.deconvolution.array_ops import numpy_ops
+    >>> grey = np.full((4, 4), 0.5, np.float32)
+    >>> change_of([grey], [1.25 * grey], np.ones_like(grey), numpy_ops())
     0.2
     """
+    moved, size = np.zeros((2, 1, 1))
+    for old, new in zip(before, after, strict=True):
+        shown = measured * new.clip(0, 1)
+        moved = moved + tile_sums((shown - measured * old.clip(0, 1)) ** 2, ops)
+        size = size + tile_sums(shown**2, ops)
     most, brightest = float(moved.max()), float(size.max())
     return float(most > 0) if brightest == 0 else float(np.sqrt(most / brightest))
+
+
+def tile_sums(image: Array, ops: ArrayOps) -> NDArray[np.float64]:
+    """Sum an image over tiles.
+
+    Parameters
+    ----------
+    image : array, float32, shape (P, Q)
+    ops : ArrayOps
+        Library that the image belongs to.
+
+    Returns
+    -------
+    ndarray, float64, shape (ceil(P / TILE), ceil(Q / TILE))
+
+    Examples
+    --------
+    >>> from turbrestore.deconvolution.array_ops import numpy_ops
+    >>> tile_sums(np.ones((2, 65), np.float32), numpy_ops())
+    array([[128.,   2.]])
+    """
+    rows, columns = (-(-length // TILE) for length in image.shape)
+    padded = ops.load(np.zeros((rows * TILE, columns * TILE), np.float32))
+    padded[: image.shape[0], : image.shape[1]] = image
+    tiles = padded.reshape(rows, TILE, columns, TILE)
+    return ops.store(tiles.sum((1, 3), dtype=ops.arrays.float64))

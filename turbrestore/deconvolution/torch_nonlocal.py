@@ -1,17 +1,18 @@
-"""Nonlocal weights and the operators on their edges, in torch.
+"""Nonlocal weights and nonlocal TV in torch.
 
-Symbols, definitions and defaults as in :mod:`turbrestore.deconvolution.nonlocal_tv`, which finds the same graph on the
-processor.
+Symbols and definitions as in :mod:`turbrestore.deconvolution.nonlocal_weights`, which finds the same graph on the CPU,
+and :mod:`turbrestore.deconvolution.nonlocal_tv`.
 
 All patches of a strip of rows are compared with all of their neighbours at once, and the best are found by one partial
-sort of integers that hold distance and offset.  Sums over the edges of a pixel are gathers: pixels of like degree stand
-in one table of edge numbers, whose rows are summed.  Adding edges to pixels would be shorter, but on a GPU the order of
-such additions, and with it the last digits, changes from run to run.
+sort of integers that hold distance and offset.  Sums over the pairs of a pixel are gathers: the numbers of the pairs of
+pixels of similar degree form a table, whose rows are summed.  Adding pairs to pixels would be shorter, but on a GPU the
+order of such additions, and with it the last digits, changes from run to run.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import cv2
@@ -19,20 +20,20 @@ import numpy as np
 
 from ..core.arrays import FloatArray
 from ..runtime.image_stacks import torch_ops
-from .nonlocal_tv import SMALLEST_WEIGHT, NonlocalParams, automatic_h, search_offsets
+from .nonlocal_weights import SMALLEST_WEIGHT, NonlocalParams, automatic_h
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-# Bytes of the distances of a strip: little on a processor, and what keeps a GPU busy.
+# Bytes of the distances of a strip: little on a CPU, and what keeps a GPU busy.
 _STRIP_BYTES_CPU, _STRIP_BYTES_GPU = 1.6e7, 2.5e8
 # Sorts last: the pixel itself, which is no neighbour.
 _LAST = np.iinfo(np.int32).max
 
 
 @dataclass(frozen=True, eq=False)
-class DeviceGraph:
-    """Symmetric weighted graph over the pixels of an image, on a device.
+class TorchNonlocalPenalty:
+    """J(u) with the weights of a graph whose arrays are on a device.
 
     Attributes
     ----------
@@ -43,8 +44,8 @@ class DeviceGraph:
     root : tensor, float32, shape (E,)
         √w.
     tables : tuple of tensors, int32, shape (n, degree)
-        Which of the 2E values on edges leave each pixel, for pixels of like degree; 2E where there is none.
-    places : tensor, int32, shape (H·W,)
+        Which of the 2E values on pairs leave each pixel, for pixels of similar degree; 2E where there is none.
+    places : tensor, int32, shape (H · W,)
         Row of each pixel in the tables, one below the other.
     """
 
@@ -55,9 +56,70 @@ class DeviceGraph:
     tables: tuple[Tensor, ...]
     places: Tensor
 
+    def gradient(self, u: Tensor) -> Tensor:
+        """``(∇_w u)(x, y) = [u(y) − u(x)] √w(x, y)``, shape (2, E)."""
+        import torch
 
-def weights_on_device(guide: FloatArray, params: NonlocalParams, device: str) -> DeviceGraph:
-    """Weights between similar patches.
+        flat = u.reshape(-1)
+        along = (flat.index_select(0, self.heads) - flat.index_select(0, self.tails)) * self.root
+        return torch.stack([along, -along])
+
+    def adjoint(self, p: Tensor) -> Tensor:
+        """``−div_w p``, the adjoint of the gradient, shape (H, W)."""
+        import torch
+
+        along = (p[1] - p[0]) * self.root
+        return self._sum_of_pairs(torch.cat([along, -along]))
+
+    def magnitude(self, p: Tensor) -> Tensor:
+        """``|p|(x) = √Σ_y p(x, y)²``, shape (H, W)."""
+        return self._sum_of_pairs((p * p).reshape(-1)).sqrt()
+
+    def project(self, p: Tensor) -> Tensor:
+        """Nearest function on pairs with ``|p|(x) ≤ 1``."""
+        import torch
+
+        factor = 1 / self.magnitude(p).clamp(min=1).reshape(-1)
+        return p * torch.stack([factor.index_select(0, self.tails), factor.index_select(0, self.heads)])
+
+    def zero_dual(self, u: Tensor) -> Tensor:
+        """P = 0."""
+        return u.new_zeros((2, len(self.root)))
+
+    def ascend(self, p: Tensor, u: Tensor, step: float, relaxation: float) -> tuple[Tensor, Tensor]:
+        """``p + ρ(p' − p)`` with p' the projection of ``p + s∇_w u`` on |p|(x) ≤ 1, and −div_w of it."""
+        p = p + relaxation * (self.project(self.gradient(u).mul_(step).add_(p)) - p)
+        return p, self.adjoint(p)
+
+    def value(self, u: Tensor) -> float:
+        """J(u)."""
+        import torch
+
+        return float(self.magnitude(self.gradient(u)).sum(dtype=torch.float64))
+
+    @cached_property
+    def norm_squared(self) -> float:
+        """Upper bound of ‖∇_w‖², as of :class:`turbrestore.deconvolution.nonlocal_weights.NonlocalGraph`."""
+        x, bound = self.root.new_ones(self.shape[0] * self.shape[1]), np.inf
+        for _ in range(10):
+            x = (x / x.max()).clamp(min=1e-6)
+            along = (x.index_select(0, self.tails) + x.index_select(0, self.heads)) * self.root**2
+            product = self._sum_of_pairs(along.repeat(2)).reshape(-1)
+            bound = min(bound, float((product / x).max()))
+            x = product
+        return 2 * bound
+
+    def _sum_of_pairs(self, values: Tensor) -> Tensor:
+        """Sum of 2E values over those that leave each pixel."""
+        import torch
+
+        padded = torch.cat([values, values.new_zeros(1)])
+        parts = [padded.index_select(0, table.reshape(-1)).reshape(table.shape).sum(1) for table in self.tables]
+        return torch.cat(parts).index_select(0, self.places).reshape(self.shape)
+
+
+def torch_nonlocal_penalty(guide: FloatArray, params: NonlocalParams, device: str) -> TorchNonlocalPenalty:
+    """Nonlocal TV with weights between the similar patches of a guide.
 
     Parameters
     ----------
@@ -70,14 +132,14 @@ def weights_on_device(guide: FloatArray, params: NonlocalParams, device: str) ->
 
     Returns
     -------
-    DeviceGraph
+    TorchNonlocalPenalty
 
     Examples
     --------
     >>> import numpy as np
     >>> params = NonlocalParams(patch=1, search=3, best=1, h=1.0)
-    >>> graph = weights_on_device(np.float32([[0, 0, 1]]), params, "cpu")
-    >>> graph.tails.tolist(), graph.heads.tolist(), (graph.root**2).numpy().round(3)
+    >>> penalty = torch_nonlocal_penalty(np.float32([[0, 0, 1]]), params, "cpu")
+    >>> penalty.tails.tolist(), penalty.heads.tolist(), (penalty.root**2).numpy().round(3)
     ([0, 1], [1, 2], array([1.   , 0.368], dtype=float32))
     """
     import torch
@@ -85,7 +147,7 @@ def weights_on_device(guide: FloatArray, params: NonlocalParams, device: str) ->
     h = params.h if params.h is not None else automatic_h(guide)
     pixels, neighbours, distances = _neighbours(guide, params, device)
     weights = torch.exp(-distances / float(np.float32(h**2))).clamp(min=SMALLEST_WEIGHT)
-    # Sorted by pair, the two directions of an edge stand side by side, and the larger weight counts.
+    # Sorted by pair, the two directions of a pair are adjacent, and the larger weight counts.
     pairs, order = torch.sort(torch.minimum(pixels, neighbours) * guide.size + torch.maximum(pixels, neighbours))
     weights = weights[order]
     again = pairs[1:] == pairs[:-1]
@@ -93,148 +155,13 @@ def weights_on_device(guide: FloatArray, params: NonlocalParams, device: str) ->
     first = torch.ones_like(pairs, dtype=torch.bool)
     first[1:] = ~again
     tails, heads = (pairs[first] // guide.size).int(), (pairs[first] % guide.size).int()
-    tables, places = _edge_tables(torch.cat([tails, heads]), guide.size)
-    return DeviceGraph((guide.shape[0], guide.shape[1]), tails, heads, torch.sqrt(weights[first]), tables, places)
+    tables, places = _pair_tables(torch.cat([tails, heads]), guide.size)
+    return TorchNonlocalPenalty(
+        (guide.shape[0], guide.shape[1]), tails, heads, torch.sqrt(weights[first]), tables, places
+    )
 
 
-def device_gradient(graph: DeviceGraph, u: Tensor) -> Tensor:
-    """Nonlocal gradient ``[u(y) − u(x)] √w(x, y)`` on the edges.
-
-    Parameters
-    ----------
-    graph : DeviceGraph
-    u : tensor, float32, shape (H, W)
-
-    Returns
-    -------
-    tensor, float32, shape (2, E)
-
-    Examples
-    --------
-    >>> import torch
-    >>> graph = weights_on_device(np.float32([[0, 0]]), NonlocalParams(search=3, best=1), "cpu")
-    >>> device_gradient(graph, torch.tensor([[1.0, 3.0]])).tolist()
-    [[2.0], [-2.0]]
-    """
-    import torch
-
-    flat = u.reshape(-1)
-    along = (flat.index_select(0, graph.heads) - flat.index_select(0, graph.tails)) * graph.root
-    return torch.stack([along, -along])
-
-
-def device_divergence(graph: DeviceGraph, v: Tensor) -> Tensor:
-    """Nonlocal divergence, the negative adjoint of the gradient.
-
-    Parameters
-    ----------
-    graph : DeviceGraph
-    v : tensor, float32, shape (2, E)
-
-    Returns
-    -------
-    tensor, float32, shape (H, W)
-
-    Examples
-    --------
-    >>> import torch
-    >>> graph = weights_on_device(np.float32([[0, 0]]), NonlocalParams(search=3, best=1), "cpu")
-    >>> device_divergence(graph, torch.tensor([[2.0], [0.0]])).tolist()
-    [[2.0, -2.0]]
-    """
-    import torch
-
-    along = (v[0] - v[1]) * graph.root
-    return _sum_of_edges(graph, torch.cat([along, -along]))
-
-
-def device_magnitude(graph: DeviceGraph, v: Tensor) -> Tensor:
-    """Magnitude ``|v|(x) = √Σ_y v(x, y)²`` at every pixel.
-
-    Parameters
-    ----------
-    graph : DeviceGraph
-    v : tensor, float32, shape (2, E)
-
-    Returns
-    -------
-    tensor, float32, shape (H, W)
-
-    Examples
-    --------
-    >>> import torch
-    >>> graph = weights_on_device(np.float32([[0, 0]]), NonlocalParams(search=3, best=1), "cpu")
-    >>> device_magnitude(graph, torch.tensor([[2.0], [-3.0]])).tolist()
-    [[2.0, 3.0]]
-    """
-    return _sum_of_edges(graph, (v * v).reshape(-1)).sqrt()
-
-
-def device_projection(graph: DeviceGraph, v: Tensor) -> Tensor:
-    """Nearest function on edges with ``|v|(x) ≤ 1`` at every pixel.
-
-    Parameters
-    ----------
-    graph : DeviceGraph
-    v : tensor, float32, shape (2, E)
-
-    Returns
-    -------
-    tensor, float32, shape (2, E)
-
-    Examples
-    --------
-    >>> import torch
-    >>> graph = weights_on_device(np.float32([[0, 0]]), NonlocalParams(search=3, best=1), "cpu")
-    >>> device_projection(graph, torch.tensor([[2.0], [-0.5]])).tolist()
-    [[1.0], [-0.5]]
-    """
-    import torch
-
-    factor = 1 / device_magnitude(graph, v).clamp(min=1).reshape(-1)
-    return v * torch.stack([factor.index_select(0, graph.tails), factor.index_select(0, graph.heads)])
-
-
-def device_norm_squared(graph: DeviceGraph, iterations: int = 10) -> float:
-    """Upper bound of ‖∇_w‖², found as that of :class:`turbrestore.deconvolution.nonlocal_tv.NonlocalGraph` is.
-
-    Parameters
-    ----------
-    graph : DeviceGraph
-    iterations : int
-        Powers that sharpen it.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> graph = weights_on_device(np.float32([[0, 0]]), NonlocalParams(search=3, best=1), "cpu")
-    >>> device_norm_squared(graph)
-    4.0
-    """
-    x = graph.root.new_ones(graph.shape[0] * graph.shape[1])
-    bound = np.inf
-    for _ in range(iterations):
-        x = (x / x.max()).clamp(min=1e-6)
-        along = (x.index_select(0, graph.tails) + x.index_select(0, graph.heads)) * graph.root**2
-        image = _sum_of_edges(graph, along.repeat(2)).reshape(-1)
-        bound = min(bound, float((image / x).max()))
-        x = image
-    return 2 * bound
-
-
-def _sum_of_edges(graph: DeviceGraph, values: Tensor) -> Tensor:
-    """Sum of 2E values over those that leave each pixel."""
-    import torch
-
-    padded = torch.cat([values, values.new_zeros(1)])
-    parts = [padded.index_select(0, table.reshape(-1)).reshape(table.shape).sum(1) for table in graph.tables]
-    return torch.cat(parts).index_select(0, graph.places).reshape(graph.shape)
-
-
-def _edge_tables(owners: Tensor, pixels: int) -> tuple[tuple[Tensor, ...], Tensor]:
+def _pair_tables(owners: Tensor, pixels: int) -> tuple[tuple[Tensor, ...], Tensor]:
     """Tables of which values belong to which pixel, each for degrees that differ by an eighth at most."""
     import torch
 
@@ -257,11 +184,11 @@ def _edge_tables(owners: Tensor, pixels: int) -> tuple[tuple[Tensor, ...], Tenso
 
 
 def _neighbours(guide: FloatArray, params: NonlocalParams, device: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Directed edges: pixel, neighbour and patch distance, each of shape (edges,)."""
+    """Neighbours that pixels choose: pixel, neighbour and patch distance, each of shape (n,)."""
     import torch
 
     height, width = guide.shape
-    offsets = search_offsets(params.search)
+    offsets = params.offsets
     bits = len(offsets).bit_length()
     margin = params.search // 2 + params.patch // 2
     around = cv2.copyMakeBorder(guide, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
@@ -285,7 +212,7 @@ def _neighbours(guide: FloatArray, params: NonlocalParams, device: str) -> tuple
 def _best_keys(padded: Tensor, top: int, rows: int, height: int, params: NonlocalParams) -> Tensor:
     """Distance and rank of offset in one integer, for the nearest and the best offsets of the pixels of a strip.
 
-    Integers as in :mod:`turbrestore.deconvolution.patch_search`: of like distances the nearer offset comes first.
+    Integers as in :mod:`turbrestore.deconvolution.nonlocal_weights`: of like distances the nearer offset comes first.
     """
     import torch
 
@@ -296,7 +223,7 @@ def _best_keys(padded: Tensor, top: int, rows: int, height: int, params: Nonloca
     x = torch.arange(width, device=padded.device) + axis[:, None]
     outside_y, outside_x = (y < 0) | (y >= height), (x < 0) | (x >= width)
     distances.masked_fill_(outside_y[:, None, :, None], np.inf).masked_fill_(outside_x[None, :, None, :], np.inf)
-    offsets = search_offsets(params.search)
+    offsets = params.offsets
     bits = len(offsets).bit_length()
     # Where each offset, nearest first, stands among the rows and columns of the window.
     stands = torch.from_numpy((offsets[:, 0] + reach) * params.search + offsets[:, 1] + reach).long()

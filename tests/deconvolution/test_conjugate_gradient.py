@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 from scipy import fft
-from small_problems import dense, dense_blur, small_problem
+from small_problems import OPS, dense, dense_blur, small_problem
 
 from turbrestore.blur.psf import gaussian_otf, laplacian_symbol, psf_to_otf
-from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients
+from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients, quadratic_solver
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.deconvolution.tv import local_gradient
 
@@ -19,13 +19,13 @@ from turbrestore.deconvolution.tv import local_gradient
 def test_the_residual_is_the_slope_of_the_energy(method, steps):
     # An asymmetric kernel, for which a convolution and its adjoint differ.
     psf = np.random.default_rng(1).random((3, 3))
-    problem = dataclasses.replace(small_problem(1, 7.0), transfer=psf_to_otf(psf, (8, 8))[None])
-    solver = ConjugateGradients(laplacian_symbol(8, 8)[None] if method == "wiener" else np.ones((1, 8, 5), np.float32))
+    problem = dataclasses.replace(small_problem(1, 7.0), otf=psf_to_otf(psf, (8, 8)))
+    solver = quadratic_solver(problem, method)
     state = solver.start(problem)
     for _ in range(steps):
         state = solver.step(problem, state)
     u, direction = state.image, np.random.default_rng(2).random((8, 8)).astype(np.float32)
-    down = fft.irfft2(state.residual[0], s=u.shape)
+    down = fft.irfft2(state.residual, s=u.shape)
 
     def energy(image):
         return problem.misfit(image) + solver.penalty(problem, image)
@@ -63,7 +63,7 @@ def test_masked_solution_is_that_of_dense_least_squares(method):
     seen[top : top + 9, left : left + 7] = True
     otf = gaussian_otf(shape, sigma)
     blur = dense(lambda u: fft.irfft2(otf * fft.rfft2(u), s=shape), shape)[seen.ravel()]
-    penalty = dense(local_gradient, shape) if method == "wiener" else np.eye(seen.size)
+    penalty = dense(lambda u: local_gradient(u, OPS), shape) if method == "wiener" else np.eye(seen.size)
     system = np.concatenate([np.sqrt(fidelity) * blur, penalty])
     right = np.concatenate([np.sqrt(fidelity) * (image.ravel() - mean), np.zeros(len(penalty))])
     solution = np.linalg.lstsq(system, right, rcond=None)[0]
@@ -75,20 +75,20 @@ def test_masked_solution_is_that_of_dense_least_squares(method):
 
 
 def test_directions_are_conjugate():
-    problem, solver = small_problem(10, 10.0), ConjugateGradients(laplacian_symbol(8, 8)[None] + np.float32(0.1))
+    problem, solver = small_problem(10, 10.0), ConjugateGradients(laplacian_symbol(8, 8) + np.float32(0.1))
     blur, state, found = dense_blur(problem), solver.start(problem), []
     system = 10.0 * blur.T @ np.diag(problem.seen.ravel()) @ blur
-    system += dense(lambda u: fft.irfft2(solver.symbol[0] * fft.rfft2(u), s=(8, 8)), (8, 8))
+    system += dense(lambda u: fft.irfft2(solver.symbol * fft.rfft2(u), s=(8, 8)), (8, 8))
     for _ in range(3):
         state = solver.step(problem, state)
-        found.append(fft.irfft2(state.direction[0], s=(8, 8)).ravel().astype(np.float64))
+        found.append(fft.irfft2(state.direction, s=(8, 8)).ravel().astype(np.float64))
     products = np.array(found) @ system @ np.array(found).T
     assert np.abs(products - np.diag(np.diag(products))).max() < 1e-3 * np.diag(products).min()
 
 
 def test_conjugate_gradients_stay_where_they_are_when_solved():
     problem = dataclasses.replace(small_problem(10, 10.0), observed=np.full((8, 8), 0.5, np.float32))
-    solver = ConjugateGradients(laplacian_symbol(8, 8)[None])
+    solver = ConjugateGradients(laplacian_symbol(8, 8))
     state = solver.start(problem)
     for _ in range(20):
         state = solver.step(problem, state)

@@ -1,0 +1,110 @@
+"""The operations that the solvers need of NumPy or torch, so that every solver is written once.
+
+Arithmetic, ``sum``, ``clip``, ``abs``, ``roll``, ``stack`` and ``sqrt`` are spelled alike in both libraries.  Loading
+arrays and Fourier transforms are not, and are here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import fft
+
+from ..core.arrays import FloatArray
+
+# ndarray or torch tensor.
+Array = Any
+# Transforms of smaller images are faster on one thread than on several.
+_PARALLEL_PIXELS = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayOps:
+    """Operations of one library.
+
+    Attributes
+    ----------
+    arrays : module
+        ``numpy`` or ``torch``.
+    load, store : callable
+        Convert from a NumPy array, and back to one.
+    forward : callable
+        Half-spectrum of a real image, as :func:`scipy.fft.rfft2`.
+    back : callable
+        ``back(spectrum, shape)`` is the image of a half-spectrum.
+    """
+
+    arrays: Any
+    load: Callable[[FloatArray], Array]
+    store: Callable[[Array], FloatArray]
+    forward: Callable[[Array], Array]
+    back: Callable[[Array, tuple[int, int]], Array]
+
+    def total(self, values: Array) -> float:
+        """Sum all values in double precision."""
+        return float(values.sum(dtype=self.arrays.float64))
+
+
+def numpy_ops(threads: int = 1) -> ArrayOps:
+    """Operations of NumPy and SciPy.
+
+    Parameters
+    ----------
+    threads : int
+        Threads that share the transform of a large image.
+
+    Returns
+    -------
+    ArrayOps
+
+    Examples
+    --------
+    >>> ops = numpy_ops()
+    >>> image = np.eye(4, dtype=np.float32)
+    >>> bool(np.allclose(ops.back(ops.forward(image), image.shape), image))
+    True
+    """
+
+    def workers(shape: tuple[int, ...]) -> int:
+        return threads if shape[0] * shape[1] >= _PARALLEL_PIXELS else 1
+
+    return ArrayOps(
+        arrays=np,
+        load=lambda array: array,
+        store=lambda array: array,
+        forward=lambda image: fft.rfft2(image, workers=workers(image.shape)),
+        back=lambda spectrum, shape: fft.irfft2(spectrum, s=shape, workers=workers(shape)),
+    )
+
+
+def torch_ops(device: str) -> ArrayOps:
+    """Operations of torch on a device.
+
+    Parameters
+    ----------
+    device : str
+        Name that torch gives it.
+
+    Returns
+    -------
+    ArrayOps
+
+    Examples
+    --------
+    >>> ops = torch_ops("cpu")
+    >>> ops.total(ops.load(np.ones((2, 3), np.float32)))
+    6.0
+    """
+    import torch
+
+    return ArrayOps(
+        arrays=torch,
+        # torch shares no memory that is read-only.
+        load=lambda array: torch.from_numpy(np.require(array, requirements=["C", "W"])).to(device),
+        store=lambda tensor: tensor.cpu().numpy(),
+        forward=torch.fft.rfft2,
+        back=lambda spectrum, shape: torch.fft.irfft2(spectrum, s=shape),
+    )

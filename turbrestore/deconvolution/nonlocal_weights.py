@@ -1,0 +1,344 @@
+"""Weights between pixels with similar patches: the graph of nonlocal TV (paper 3, section 5).
+
+Symbols
+-------
+g : guide; G_a : Gaussian window of standard deviation a over a patch; sums to 1.
+d(x, y) : distance of two patches, ``Σ_z G_a(z) [g(x + z) − g(y + z)]²``.
+h : filtering parameter, intensity.
+w(x, y) : weight of the pair of pixels x, y, ``exp(−d(x, y)/h²)``; 0 for pairs outside the graph (eq. 23).
+tail, head : the pixels x < y of a pair, in the order of the image.
+
+Neighbours are integers (keys) that hold a distance and an offset, see :mod:`turbrestore.deconvolution.patch_search`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+
+from ..core.arrays import FloatArray, check_image, luminance
+from ..core.errors import DataError, require
+from ..core.noise import estimate_noise
+from ..runtime.jit import jit
+from ..runtime.threads import map_ahead
+from .patch_search import NO_KEY, PLACES, Keys, search_tile
+
+# A weight must be positive for its pair to stay in the graph.
+SMALLEST_WEIGHT = 1e-6
+# Rows and columns of a tile of the search.
+_TILE_ROWS, _TILE_COLUMNS = 64, 192
+# Bits of an infinite distance: that of a pixel outside the image.
+_OUTSIDE = int(np.float32(np.inf).view(np.int32))
+
+
+@dataclass(frozen=True)
+class NonlocalParams:
+    """Which pixels are joined to a pixel, and how strongly.
+
+    Parameters
+    ----------
+    patch : int
+        Width of the compared patches, pixels, odd.
+    patch_sigma : float
+        Standard deviation a of their Gaussian window, pixels.
+    search : int
+        Width of the window around a pixel in which its neighbours lie, pixels, odd.
+    best : int
+        Number of neighbours with the most similar patches.
+    nearest : {0, 4, 8}
+        Number of adjacent pixels that are neighbours whatever their patches.
+    h : float, optional
+        Filtering parameter, intensity; by default from the contrast and the noise of the guide, see
+        :func:`automatic_h`.
+    """
+
+    patch: int = 5
+    patch_sigma: float = 1.2
+    search: int = 21
+    best: int = 10
+    nearest: int = 4
+    h: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, size in (("patch", self.patch), ("search", self.search)):
+            require(size >= 1 and size % 2 == 1, f"{name}: expected an odd number of pixels, found {size}")
+        require(self.search <= 101, f"search: expected at most 101 pixels, found {self.search}")
+        require(self.patch_sigma > 0, f"patch_sigma: expected a positive number of pixels, found {self.patch_sigma}")
+        require(self.nearest in (0, 4, 8), f"nearest: expected 0, 4 or 8, found {self.nearest}")
+        there = self.search**2 - 1
+        require(self.nearest <= there, f"search: expected 3 or more pixels for {self.nearest} nearest neighbours")
+        require(
+            0 <= self.best <= there and self.best + self.nearest > 0,
+            f"best: expected 1 to {there} neighbours in a search window of {self.search} pixels, found {self.best}",
+        )
+        require(self.h is None or self.h > 0, f"h: expected a positive intensity, found {self.h}")
+
+    @property
+    def offsets(self) -> NDArray[np.int32]:
+        """All (dy, dx) of the search window but (0, 0), nearest first; shape (search² − 1, 2)."""
+        axis = np.arange(-(self.search // 2), self.search // 2 + 1, dtype=np.int32)
+        grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+        order = np.argsort((grid**2).sum(axis=1), kind="stable")
+        return grid[order[1:]]
+
+    @property
+    def rank_mask(self) -> int:
+        """Bits of a key that hold the rank of its offset."""
+        return (1 << (self.search**2 - 1).bit_length()) - 1
+
+    @property
+    def window(self) -> FloatArray:
+        """G_a along one axis; shape (patch,)."""
+        return cv2.getGaussianKernel(self.patch, self.patch_sigma, cv2.CV_32F).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class NonlocalGraph:
+    """Symmetric weighted graph over the pixels of an image; each pair is stored once, by its tail.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Rows and columns of the image.
+    starts : ndarray, int32, shape (H · W + 1,)
+        Where the pairs of each tail start, and where the last end.
+    heads : ndarray, int32, shape (E,)
+        Pixel (row · W + column) at which each pair ends.
+    roots : ndarray, float32, shape (E,)
+        √w of each pair.
+    reach : int
+        Largest number of rows from a tail to its heads.
+    h : float
+        Filtering parameter that was used, intensity.
+    """
+
+    shape: tuple[int, int]
+    starts: NDArray[np.int32]
+    heads: NDArray[np.int32]
+    roots: FloatArray
+    reach: int
+    h: float
+
+    def norm_squared(self, iterations: int = 10) -> float:
+        """Upper bound of ‖∇_w‖² = 2‖D‖², with D the differences of pairs.
+
+        ``‖D‖² = ρ(DᵀD) ≤ ρ(|D|ᵀ|D|)``, and for a non-negative matrix A and any positive x, ``ρ(A) ≤ max_i (Ax)_i/x_i``
+        (Collatz–Wielandt).  The bound falls with each power of A that is applied to x.
+        """
+        size = self.shape[0] * self.shape[1]
+        weights = sparse.csr_array((self.roots**2, self.heads, self.starts), shape=(size, size))
+        x, bound = np.ones(size, np.float32), np.inf
+        degrees = weights @ x + weights.T @ x
+        for _ in range(iterations):
+            # Pixels without pairs do not take part.
+            x = np.maximum(x / x.max(), np.float32(1e-6))
+            product = weights @ x + weights.T @ x + degrees * x
+            bound = min(bound, float((product / x).max()))
+            x = product
+        return 2 * bound
+
+
+def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None, threads: int = 0) -> NonlocalGraph:
+    """Weights ``w(x, y) = exp(−d(x, y)/h²)``, ``d = Σ_z G_a(z) [g(x + z) − g(y + z)]²`` (paper 3, eq. 23).
+
+    The printed equation has the absolute difference instead of its square, which does not fit the unit of h²; the
+    square is that of the nonlocal means that the paper cites.  Beyond the border the guide is reflected.
+
+    A pixel is joined to the ``best`` most similar pixels of its search window and to its ``nearest`` ones, and they
+    to it.
+
+    Parameters
+    ----------
+    guide : array_like, shape (H, W) or (H, W, 3)
+        g; colour is reduced to luminance.
+    params : NonlocalParams, optional
+        Size of patches, search and neighbourhood.
+    threads : int
+        Tiles searched side by side; 0 means one per available core.
+
+    Returns
+    -------
+    NonlocalGraph
+
+    Raises
+    ------
+    DataError
+        Wrong shape, values that are not finite, or fewer than two pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> graph = nonlocal_weights(np.array([[0.0, 0.0, 1.0]]), NonlocalParams(patch=1, search=3, best=1, h=1.0))
+    >>> graph.starts, graph.heads, (graph.roots**2).round(3)
+    (array([0, 1, 2, 2], dtype=int32), array([1, 2], dtype=int32), array([1.   , 0.368], dtype=float32))
+    """
+    params = params or NonlocalParams()
+    grey = luminance(check_image(guide, "guide"))
+    if grey.size < 2:
+        raise DataError(f"guide: expected two pixels or more, found shape {grey.shape}")
+    h = params.h if params.h is not None else automatic_h(grey)
+    starts, heads, keys = join_pairs(search_patches(grey, params, threads), grey.shape[1], params)
+    keys &= ~np.int32(params.rank_mask)
+    roots = keys.view(np.float32)
+    np.exp(np.divide(roots, -np.float32(h**2), out=roots), out=roots)
+    np.sqrt(np.maximum(roots, np.float32(SMALLEST_WEIGHT), out=roots), out=roots)
+    return NonlocalGraph((grey.shape[0], grey.shape[1]), starts, heads, roots, params.search // 2, h)
+
+
+def automatic_h(grey: FloatArray) -> float:
+    """Choose the filtering parameter h: an eighth of the contrast of the guide, or 4 times its noise if that is more.
+
+    Contrast is the range from the 1st to the 99th percentile.  The paper takes h equal to the noise: a fused image has
+    so little that almost every weight would vanish, and with them the regularisation.  At 4 times the noise n, patches
+    that differ by noise alone (d = 2 n²) keep the weight .88, so that flat regions hold together.
+
+    Parameters
+    ----------
+    grey : ndarray, float32, shape (H, W)
+        g.
+
+    Returns
+    -------
+    float
+        Intensity.
+
+    Examples
+    --------
+    >>> round(automatic_h(np.tile(np.linspace(0, 1, 101, dtype=np.float32), (9, 1))), 3)
+    0.123
+    """
+    low, high = np.percentile(grey, (1, 99))
+    # The last term only keeps h positive for an image of one colour, where all distances are 0.
+    return float(max((high - low) / 8, 4 * estimate_noise(grey), 1e-3))
+
+
+def search_patches(grey: FloatArray, params: NonlocalParams, threads: int = 0) -> Keys:
+    """Keys of the neighbours that every pixel chooses.
+
+    Parameters
+    ----------
+    grey : ndarray, float32, shape (H, W)
+        g; reflected beyond the border.
+    params : NonlocalParams
+    threads : int
+        Tiles searched side by side; 0 means one per available core.
+
+    Returns
+    -------
+    ndarray, int32, shape (H · W, nearest + best)
+        The nearest offsets in their order, then the best, which may be among the nearest too.
+
+    Examples
+    --------
+    >>> params = NonlocalParams(patch=1, search=3, best=1, nearest=0)
+    >>> keys = search_patches(np.float32([[0, 0, 1]]), params)
+    >>> params.offsets[keys[:, 0] & params.rank_mask, 1]
+    array([ 1, -1, -1], dtype=int32)
+    """
+    (height, width), offsets, window = grey.shape, params.offsets, params.window
+    margin = params.search // 2 + params.patch // 2
+    padded = cv2.copyMakeBorder(grey, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
+    keys = np.empty((height, width, params.nearest + params.best), np.int32)
+    places = params.nearest + -(-params.best // PLACES) * PLACES
+
+    def search(corner: tuple[int, int]) -> None:
+        top, left = corner
+        rows, columns = min(_TILE_ROWS, height - top), min(_TILE_COLUMNS, width - left)
+        block = np.ascontiguousarray(padded[top : top + rows + 2 * margin, left : left + columns + 2 * margin])
+        found = np.full((rows, places, columns), NO_KEY, np.int32)
+        edges = np.array([-top, height - top, -left, width - left])
+        search_tile(block, window, offsets, edges, params.nearest, params.rank_mask, found)
+        keys[top : top + rows, left : left + columns] = found[:, : keys.shape[2]].transpose(0, 2, 1)
+
+    corners = ((top, left) for top in range(0, height, _TILE_ROWS) for left in range(0, width, _TILE_COLUMNS))
+    for _ in map_ahead(search, corners, threads):
+        pass
+    return keys.reshape(-1, keys.shape[2])
+
+
+def join_pairs(keys: Keys, width: int, params: NonlocalParams) -> tuple[NDArray[np.int32], NDArray[np.int32], Keys]:
+    """Pairs of pixels from the neighbours that they choose; a pair that both choose counts once.
+
+    Parameters
+    ----------
+    keys : ndarray, int32, shape (H · W, nearest + best)
+        From :func:`search_patches`; overwritten.
+    width : int
+        Columns of the image.
+    params : NonlocalParams
+
+    Returns
+    -------
+    starts, heads : ndarray, int32
+        As in :class:`NonlocalGraph`.
+    keys : ndarray, int32, shape (E,)
+        Key of each pair.
+
+    Examples
+    --------
+    >>> params = NonlocalParams(patch=1, search=3, best=1, nearest=0)
+    >>> join_pairs(search_patches(np.float32([[0, 0, 1]]), params), 3, params)[:2]
+    (array([0, 1, 2, 2], dtype=int32), array([1, 2], dtype=int32))
+    """
+    offsets, radius = params.offsets, params.search // 2
+    steps = offsets @ np.array([width, 1])
+    rank_of = np.zeros((params.search, params.search), np.int64)
+    rank_of[tuple((offsets + radius).T)] = np.arange(len(offsets))
+    opposite = rank_of[tuple((radius - offsets).T)]
+    starts = np.zeros(len(keys) + 1, np.int32)
+    mark_pairs(keys, steps, opposite, params.nearest, params.rank_mask, starts)
+    np.cumsum(starts, out=starts)
+    heads, of_pairs = np.empty((2, starts[-1]), np.int32)
+    place_pairs(keys, steps, params.rank_mask, starts[:-1].copy(), heads, of_pairs)
+    return starts, heads, of_pairs
+
+
+@jit
+def mark_pairs(
+    keys: Keys,
+    steps: NDArray[np.int64],
+    opposite: NDArray[np.int64],
+    nearest: int,
+    rank_mask: int,
+    starts: NDArray[np.int32],
+) -> None:
+    """Overwrite keys that make no new pair by −1, and count the pairs of tail x in ``starts[x + 1]``.
+
+    ``steps`` are the offsets on the flattened image, and ``opposite`` the rank of the opposite of each offset.
+    """
+    for pixel in range(keys.shape[0]):
+        for place in range(keys.shape[1]):
+            rank = keys[pixel, place] & rank_mask
+            other = pixel + steps[rank]
+            new = keys[pixel, place] < _OUTSIDE and (place < nearest or rank >= nearest)
+            if new and other < pixel:
+                for key in keys[other]:
+                    if key >= 0 and key & rank_mask == opposite[rank]:
+                        new = False
+            if new:
+                starts[min(pixel, other) + 1] += 1
+            else:
+                keys[pixel, place] = -1
+
+
+@jit
+def place_pairs(
+    keys: Keys,
+    steps: NDArray[np.int64],
+    rank_mask: int,
+    ends: NDArray[np.int32],
+    heads: NDArray[np.int32],
+    of_pairs: Keys,
+) -> None:
+    """Write the pairs that :func:`mark_pairs` left to where those of their tail end."""
+    for pixel in range(keys.shape[0]):
+        for key in keys[pixel]:
+            if key >= 0:
+                other = pixel + steps[key & rank_mask]
+                tail = min(pixel, other)
+                heads[ends[tail]], of_pairs[ends[tail]] = max(pixel, other), key
+                ends[tail] += 1
