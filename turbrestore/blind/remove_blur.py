@@ -186,24 +186,28 @@ def remove_blur_steps(
         tiles = deconvolution_tiles(image.shape, replace(params, sigma=width), memory)
         return tiled_deconvolution_steps(image, width, params, guide, runtime, tiles)
 
-    tiles, first, widths = None, None, None
+    tiles, first = None, None
     if blur is not None and blur.blurred:
         if memory is None:
             tiles, first = yield from _map_meanwhile(image, blur, _label(remove(sigma), sigma, next(numbers)))
         else:
             tiles = estimate_blur_map(image, blur, runtime)
-    if tiles is not None and tiles.varies:
-        widths, first = sigma_map(tiles.removable, image.shape[:2]), None
-        sigma = float(widths.max())
+    widths = sigma_map(tiles.removable, image.shape[:2]) if tiles is not None and tiles.varies else None
+    if widths is not None:
+        sigma, first = float(widths.max()), None
 
     def attempt(width: float) -> Steps[Deconvolution]:
-        one = widths is None or width == 0
-        steps = remove(width) if one else varying_deconvolution_steps(remove, widths * (width / sigma), runtime)
+        if widths is None or width == 0:
+            steps = remove(width)
+        else:
+            steps = varying_deconvolution_steps(remove, widths * (width / sigma), runtime)
         return _label(steps, width, next(numbers))
 
     if blur is None:
         result = yield from attempt(sigma)
-        readings = (evaluate_guards(result.image, image, sigma, guards),) if sigma > 0 else ()
+        readings: tuple[GuardReading, ...] = ()
+        if sigma > 0:
+            readings = (evaluate_guards(result.image, image, sigma, guards),)
     else:
         result, readings = yield from guarded_steps(attempt, image, sigma, guards, first)
     on_guards = explain_guards(result.sigma, readings, guards)

@@ -67,7 +67,7 @@ def deconvolution_tiles(
     >>> len(deconvolution_tiles((1080, 1920), params)), len(deconvolution_tiles((1080, 1920), params, memory=300e6)) > 1
     (1, True)
     """
-    size, longest = shape[:2], max(*shape[:2], SMALLEST_SIDE)
+    size, longest = (shape[0], shape[1]), max(*shape[:2], SMALLEST_SIDE)
     if memory is None or params.sigma == 0:
         return halo_tiles(size, longest)
     for side in (longest, *range(longest - _SIDE_STEP, SMALLEST_SIDE, -_SIDE_STEP), SMALLEST_SIDE):
