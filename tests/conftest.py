@@ -98,10 +98,3 @@ def varied() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A scene, frames of it whose blur varies in time and space, and the variance of that blur."""
     scene = SCENES["camera"](144)
     return scene, *moving_blur(scene, 40, np.random.default_rng(0))
-
-
-@pytest.fixture
-def no_compiler(monkeypatch):
-    """What a plan chooses at a limit depends on what Numba takes, and so on whether it is installed."""
-    for module in ("memory_plan", "deconvolution.deconvolution_memory"):
-        monkeypatch.setattr(f"turbrestore.{module}.can_compile", lambda: False)

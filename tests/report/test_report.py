@@ -30,10 +30,10 @@ from turbrestore.report import check_report, facts, pictures, render_report, wri
 from turbrestore.report.vector import inline_svg
 from turbrestore.runs.run_files import MEAN, RUN_FILES, load_run, save_run
 from turbrestore.runs.run_record import RunRecord, describe_run
+from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.scratch import new_stack
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.application import build
-from turbrestore.runtime.memory_size import MemorySize
 from turbrestore_cli.options import Machine, Selection
 from turbrestore_cli.output import repeating_command, settings_record
 

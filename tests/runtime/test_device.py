@@ -1,89 +1,25 @@
-"""Every stage on a device finds what it finds on the processor; torch on the processor stands in for a GPU."""
+"""How a device is chosen, and what is said where it is not there or has too little memory."""
 
 import subprocess
 import sys
 import textwrap
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
-import numpy as np
 import pytest
 
-from turbrestore import settings as restoration_module
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients
-from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
-from turbrestore.deconvolution.nonlocal_tv import (
-    NonlocalParams,
-    nonlocal_divergence,
-    nonlocal_gradient,
-    nonlocal_magnitude,
-    nonlocal_weights,
-    project_to_unit,
-)
-from turbrestore.deconvolution.primal_dual import WINDOW
-from turbrestore.deconvolution.torch_weights import (
-    device_divergence,
-    device_gradient,
-    device_magnitude,
-    device_norm_squared,
-    device_projection,
-    weights_on_device,
-)
-from turbrestore.filtering.filter_records import FilterParams
-from turbrestore.footage.frame_selection import Share
-from turbrestore.io.source import FrameSource
-from turbrestore.pipeline import restore
-from turbrestore.registration.centroid import CentroidParams
-from turbrestore.registration.flow import FlowParams, estimate_flow
-from turbrestore.registration.tvl1 import refer_tvl1, tvl1_flows
-from turbrestore.registration.warp import warp
-from turbrestore.runs.resumption import stage_facts
 from turbrestore.runtime import device as device_module
 from turbrestore.runtime.device import TORCH_BYTES, check_device, explain_device, find_device, memory_of, needs_torch
-from turbrestore.settings import RestoreParams, explain_devices, place_stages
-from turbrestore.synthesis.scenes import SCENES, resolution_chart
-from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
-from turbrestore_cli.__main__ import main
+from turbrestore.runtime.runtime import Runtime
 
-SIZE = 72
 NO_TORCH = pytest.mark.skipif(find_spec("torch") is None, reason="torch is not installed")
 
 
-def devices():
-    """Names to test: torch on the processor, and a GPU where there is one."""
-    if find_spec("torch") is None:
-        return [pytest.param("cpu:0", marks=NO_TORCH)]
-    import torch
-
-    return ["cpu:0", *(["cuda"] if torch.cuda.is_available() else [])]
-
-
-on_devices = pytest.mark.parametrize("device", devices())
-
-
-def psnr(image, truth):
-    return -10 * np.log10(np.mean(np.square(image - truth)))
-
-
-def frames_of(scene, count, rms=1.5, seed=0, length=8.0):
-    """Frames of a scene in turbulent motion, and the flows."""
-    rng = np.random.default_rng(seed)
-    params = SmoothFlowParams(rms=rms, correlation_length=length, persistence=0.5)
-    flows = smooth_flows(count, *scene.shape[:2], rng, params)
-    return distort(scene, flows, rng, blur=0.8, noise=0.01), flows
-
-
-def coloured(scene):
-    return np.stack([scene, scene**2, 1 - scene], axis=-1).astype(np.float32)
-
-
 class TestChoice:
-    def test_the_processor_needs_no_torch(self, monkeypatch):
+    def test_the_cpu_needs_no_torch(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "torch", None)
         assert find_device("cpu") == find_device("auto") == "cpu"
 
@@ -122,12 +58,8 @@ class TestChoice:
         monkeypatch.setitem(sys.modules, "torch", None)
         with pytest.raises(ConfigurationError, match="^device: expected auto, cpu, cuda"):
             check_device(name)
-        for settings in (FlowParams, FilterParams, DeconvolutionParams):
-            if name is None:
-                assert settings(device=name).device is None
-            else:
-                with pytest.raises(ConfigurationError, match="^device: expected auto, cpu, cuda"):
-                    settings(device=name)
+        with pytest.raises(ConfigurationError, match="^device: expected auto, cpu, cuda"):
+            Runtime(device=name)
 
     @pytest.mark.parametrize(
         ("system", "nodes", "library", "asked"),
@@ -182,19 +114,12 @@ class TestChoice:
         assert build or int(taken) < 1.2 * TORCH_BYTES
 
     def test_what_is_said(self):
-        def told(wanted, found, method, **own):
-            return explain_device(wanted, found, {"optical flow": found, "filter": found, **own}, method)
-
-        assert told("cpu", "cpu", "tvl1") == ()
-        assert told("auto", "cpu", "dis") == (Decision("device", "processor", "no GPU that torch sees"),)
-        assert told("cuda", "cuda", "tvl1") == (Decision("device", "cuda", "asked for"),)
-        first, second = told("auto", "cuda", "farneback")
-        assert (first.choice, second.choice) == ("cuda", "on the processor")
+        assert explain_device("cpu", "cpu", "tvl1") == ()
+        assert explain_device("auto", "cpu", "dis") == (Decision("device", "CPU", "torch sees no GPU"),)
+        assert explain_device("cuda", "cuda", "tvl1") == (Decision("device", "cuda", "asked for"),)
+        first, second = explain_device("auto", "cuda", "farneback")
+        assert (first.choice, second.choice) == ("cuda", "on the CPU")
         assert "farneback" in second.reason
-        assert told("cpu", "cpu", "dis", filter="cuda") == (Decision("filter", "on cuda", "a setting of its own"),)
-        own = told("cuda", "cuda", "tvl1", **{"optical flow": "cpu"})
-        assert own[1:] == (Decision("optical flow", "on the processor", "a setting of its own"),)
-        assert [item.subject for item in told("cpu", "cpu", "dis", **{"optical flow": "cuda"})] == ["optical flow"]
 
     def test_lack_of_memory_is_one_line_and_other_errors_are_not(self):
         line = r"^device: the memory of 'cuda:1' is not enough; lower --flow.tvl1.batch or use 'cpu'$"
@@ -235,213 +160,3 @@ class TestFlow:
         frames, _ = frames_of(SCENES["camera"](48, 48), 2, seed=3)
         here, there = (estimate_flow(frames[0], frames, FlowParams(device=d)) for d in ("cpu", device))
         assert here.tobytes() == there.tobytes()
-
-
-@on_devices
-class TestMemory:
-    @pytest.mark.parametrize(
-        ("place", "advice", "settings"),
-        [
-            ("registration.flow.tvl1_flows", "lower --flow.tvl1.batch", {"flow": FlowParams(method="tvl1")}),
-            ("registration.warp.warp_stack", "take a smaller --roi", {}),
-            ("filtering.array_backend.warp_stack", "take a smaller --roi", {}),
-            ("deconvolution.torch_deconvolution.weights_on_device", "take a smaller --roi", {}),
-        ],
-    )
-    def test_what_to_do_is_said_where_it_is_not_enough(self, device, place, advice, settings, monkeypatch):
-        def fail(*_):
-            raise RuntimeError("CUDA out of memory.")
-
-        monkeypatch.setattr(f"turbrestore.{place}", fail)
-        frames, _ = frames_of(SCENES["camera"](48, 48), 3, seed=17)
-        line = f"^device: the memory of '{device[:3]}.* is not enough; {advice} or use 'cpu'$"
-        with pytest.raises(ConfigurationError, match=line):
-            restore(frames, RestoreParams(device=device, **settings))
-
-
-@on_devices
-class TestWarp:
-    def test_warp(self, device):
-        scene = SCENES["camera"](50, 64)
-        flow = smooth_flows(1, 50, 64, np.random.default_rng(6), SmoothFlowParams(rms=6.0, correlation_length=5.0))[0]
-        for image in (scene, coloured(scene)):
-            assert np.abs(warp(image, flow) - warp(image, flow, device=device)).max() < 1e-5
-
-
-GUIDES = {
-    "chart": (resolution_chart(64, 70), NonlocalParams()),
-    "noise": (np.random.default_rng(7).random((40, 33)).astype(np.float32), NonlocalParams(3, 1.0, 7, 4, 8)),
-    "nearest": (np.random.default_rng(8).random((9, 14)).astype(np.float32), NonlocalParams(best=0)),
-    "best": (np.random.default_rng(9).random((12, 13)).astype(np.float32), NonlocalParams(best=10, nearest=0)),
-    "flat": (np.zeros((20, 20), np.float32), NonlocalParams(search=5)),
-    "line": (np.linspace(0, 1, 8, dtype=np.float32)[None], NonlocalParams(patch=1, search=5, best=2, nearest=0)),
-}
-
-
-@on_devices
-@pytest.mark.parametrize("name", GUIDES)
-class TestWeights:
-    def test_graph_is_that_of_the_processor(self, device, name):
-        here, there = nonlocal_weights(*GUIDES[name]), weights_on_device(*GUIDES[name], device)
-        assert (here.tails == there.tails.cpu().numpy()).all()
-        assert (here.heads == there.heads.cpu().numpy()).all()
-        assert there.root.cpu().numpy() ** 2 == pytest.approx(here.weights, rel=1e-3, abs=1e-6)
-        assert device_norm_squared(there) == pytest.approx(here.norm_squared, rel=1e-5)
-
-    def test_operators_are_those_of_the_processor(self, device, name):
-        import torch
-
-        guide, params = GUIDES[name]
-        here, there = nonlocal_weights(guide, params), weights_on_device(guide, params, device)
-        rng = np.random.default_rng(10)
-        u = rng.random(guide.shape).astype(np.float32)
-        v = rng.normal(size=(2, len(here.weights))).astype(np.float32)
-        a, b = torch.from_numpy(u).to(device), torch.from_numpy(v).to(device)
-        for expected, found in (
-            (nonlocal_gradient(here, u), device_gradient(there, a)),
-            (nonlocal_divergence(here, v), device_divergence(there, b)),
-            (nonlocal_magnitude(here, v), device_magnitude(there, b)),
-            (project_to_unit(here, v), device_projection(there, b)),
-        ):
-            assert found.cpu().numpy() == pytest.approx(expected, abs=2e-4)
-
-
-def blurred(scene, sigma=1.5, seed=11):
-    noise = np.random.default_rng(seed).normal(0, 0.005, scene.shape)
-    return np.clip(cv2.GaussianBlur(scene, (0, 0), sigma) + noise, 0, 1).astype(np.float32)
-
-
-@on_devices
-class TestDeconvolution:
-    @pytest.mark.parametrize(
-        "settings",
-        [
-            {"method": "nltv"},
-            {"method": "nltv", "sharpen_guide": False, "boundary": "periodic"},
-            {"method": "tv"},
-            {"method": "wiener"},
-            {"method": "tikhonov", "boundary": "periodic"},
-        ],
-        ids=lambda settings: "-".join(map(str, settings.values())),
-    )
-    def test_image_and_record_are_those_of_the_processor(self, device, settings):
-        scene = SCENES["camera"](SIZE, SIZE + 3)
-        image = blurred(scene)
-        params = DeconvolutionParams(**settings)
-        steps = []
-        here = deconvolve(image, 1.5, params)
-        there = deconvolve(image, 1.5, replace(params, device=device), progress=steps.append)
-        assert abs(psnr(here.image, scene) - psnr(there.image, scene)) < 0.002
-        assert np.abs(here.image - there.image).max() < 5e-3
-        # So many are judged together.
-        window = WINDOW if params.method in ("nltv", "tv") else ConjugateGradients.window
-        assert abs(here.iterations - there.iterations) <= window
-        assert sum(steps) == there.iterations
-        assert there.converged == here.converged
-        assert there.objective[-1] == pytest.approx(here.objective[-1], rel=1e-4)
-        assert there.recorded[0] == here.recorded[0]
-        assert there.changes[0] == pytest.approx(here.changes[0], rel=1e-2, abs=1e-6)
-
-    @pytest.mark.parametrize("channels", ["luminance", "each"])
-    def test_colour_and_a_guide(self, device, channels):
-        scene = coloured(SCENES["camera"](SIZE, SIZE))
-        image, guide = blurred(scene), blurred(scene, seed=12)
-        params = DeconvolutionParams(channels=channels, iterations=30)
-        here, there = (deconvolve(image, 1.5, replace(params, device=d), guide) for d in ("cpu", device))
-        assert abs(psnr(here.image, scene) - psnr(there.image, scene)) < 0.002
-
-    @pytest.mark.parametrize("iterations", [1, 3])
-    def test_the_first_iterations_are_those_of_the_processor(self, device, iterations):
-        image = blurred(SCENES["camera"](SIZE, SIZE))
-        params = DeconvolutionParams(method="tv", iterations=iterations)
-        here, there = (deconvolve(image, 1.5, replace(params, device=d)) for d in ("cpu", device))
-        assert np.abs(here.image - there.image).max() < 2e-4
-
-    def test_a_sampled_blur(self, device):
-        scene = SCENES["camera"](SIZE, SIZE)
-        psf = np.zeros((5, 7))
-        psf[2, 1:6] = 0.2
-        image = np.clip(cv2.filter2D(scene, -1, psf), 0, 1)
-        params = DeconvolutionParams(method="tv", iterations=40)
-        here, there = (deconvolve(image, psf, replace(params, device=d)) for d in ("cpu", device))
-        assert np.abs(here.image - there.image).max() < 1e-3
-
-
-@on_devices
-class TestRestoration:
-    FLOW = FlowParams(method="tvl1")
-
-    def test_image_is_that_of_the_processor(self, device):
-        scene = SCENES["camera"](SIZE, SIZE + 8)
-        frames, _ = frames_of(scene, 12, seed=13)
-        here = restore(frames, RestoreParams(flow=self.FLOW))
-        there, again = (restore(frames, RestoreParams(flow=self.FLOW, device=device)) for _ in range(2))
-        for a, b in ((here.centroid, there.centroid), (here.filtered, there.filtered), (here, there)):
-            assert abs(psnr(a.image, scene) - psnr(b.image, scene)) < 0.02
-        assert np.linalg.norm(here.centroid.flows - there.centroid.flows, axis=-1).mean() < 0.02
-        assert there.filtered.shares == pytest.approx(here.filtered.shares, rel=1e-2)
-        assert there.image.tobytes() == again.image.tobytes()
-        assert Decision("device", device, "asked for") in there.decisions
-        assert not any(decision.subject == "device" for decision in here.decisions)
-
-    def test_arrays_that_cannot_be_written(self, device):
-        frames, _ = frames_of(SCENES["camera"](64, 64), 3, seed=16)
-        frames.flags.writeable = False
-        before = frames.copy()
-        restore(frames, RestoreParams(flow=self.FLOW, device=device))
-        assert frames.tobytes() == before.tobytes()
-
-    def test_frames_that_do_not_count(self, device):
-        scene = coloured(SCENES["camera"](64, 64))
-        frames, _ = frames_of(scene, 8, seed=14)
-        params = RestoreParams(until="filter", keep_best=Share(0.5))
-        here, there = (restore(frames, replace(params, device=d)) for d in ("cpu", device))
-        assert abs(psnr(here.image, scene) - psnr(there.image, scene)) < 0.02
-        assert (np.isnan(here.filtered.sharpness) == np.isnan(there.filtered.sharpness)).all()
-
-
-class TestPlacing:
-    def test_a_stage_keeps_a_device_of_its_own(self, monkeypatch):
-        monkeypatch.setattr(restoration_module, "find_device", lambda wanted: wanted)
-        own = {"flow": FlowParams(device="cpu"), "filter": FilterParams(device="cuda:1")}
-        placed = place_stages(RestoreParams(device="cuda", **own))
-        assert (placed.flow.device, placed.filter.device, placed.deconvolution.device) == ("cpu", "cuda:1", "cuda")
-        assert place_stages(placed) == placed
-        assert [(item.subject, item.choice) for item in explain_devices(placed)] == [
-            ("device", "cuda"),
-            ("optical flow", "on the processor"),
-            ("filter", "on cuda:1"),
-        ]
-
-    @pytest.mark.parametrize("stage", ["flow", "filter", "deconvolution"])
-    def test_the_device_of_a_stage_is_looked_for_before_the_first(self, stage, tmp_path, capsys, monkeypatch):
-        monkeypatch.setitem(sys.modules, "torch", None)
-        np.save(tmp_path / "in.npy", np.random.default_rng(0).random((3, 32, 32)).astype(np.float32))
-        words = ["restore", str(tmp_path / "in.npy"), str(tmp_path / "out.png"), f"--{stage}.device", "cuda"]
-        assert main([*words, "--keep", str(tmp_path / "kept")]) == 2
-        assert "device: torch is not installed, found 'cuda'" in capsys.readouterr().err
-        assert not list(tmp_path.glob("**/*.npz"))
-
-    def test_auto_of_a_stage_is_settled_in_what_is_kept(self, monkeypatch):
-        monkeypatch.setattr(device_module, "_cuda_is_there", lambda: False)
-        source = FrameSource.from_array(np.zeros((5, 16, 16)))
-        auto = RestoreParams(filter=FilterParams(device="auto"), deconvolution=DeconvolutionParams(device="auto"))
-        assert stage_facts(source, auto) == stage_facts(source, RestoreParams())
-
-    def test_auto_is_settled_before_the_stages(self, monkeypatch):
-        monkeypatch.setattr(device_module, "_cuda_is_there", lambda: False)
-        frames, _ = frames_of(SCENES["camera"](64, 64), 3, seed=15)
-        params = RestoreParams(until="centroid", centroid=CentroidParams(iterations=1))
-        here, there = (restore(frames, replace(params, device=d)) for d in ("cpu", "auto"))
-        assert here.image.tobytes() == there.image.tobytes()
-        assert there.decisions[0] == Decision("device", "processor", "no GPU that torch sees")
-
-    @NO_TORCH
-    def test_a_device_that_is_not_there_ends_the_command_before_it_reads(self, tmp_path, capsys, monkeypatch):
-        import torch
-
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-        np.save(tmp_path / "in.npy", np.random.default_rng(0).random((3, 32, 32)).astype(np.float32))
-        assert main(["restore", str(tmp_path / "in.npy"), str(tmp_path / "out.png"), "--device", "cuda"]) == 2
-        assert capsys.readouterr().err.strip().endswith("found 'cuda'; use 'cpu' or 'auto'")
-        assert not (tmp_path / "out.png").exists()

@@ -245,7 +245,9 @@ def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side
     return _image_bytes(shape, in_file=False) + max(beside, deconvolution_memory(part, params, MOST_THREADS))
 
 
-def blur_to_remove(estimate: BlurEstimate | None, deconvolution: DeconvolutionParams) -> tuple[float, DeconvolutionParams]:
+def blur_to_remove(
+    estimate: BlurEstimate | None, deconvolution: DeconvolutionParams
+) -> tuple[float, DeconvolutionParams]:
     """Decide on the width to remove, and complete the settings by the shape of the blur.
 
     Parameters

@@ -1,0 +1,130 @@
+"""A whole restoration on a device is that of the CPU; torch on the CPU stands in for a GPU."""
+
+import sys
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from turbrestore.core.decision import Decision
+from turbrestore.core.errors import ConfigurationError
+from turbrestore.filtering.filter_records import FilterParams
+from turbrestore.footage.frame_selection import Share
+from turbrestore.pipeline import restore
+from turbrestore.registration.centroid import CentroidParams
+from turbrestore.registration.flow import FlowParams
+from turbrestore.runtime import device as device_module
+from turbrestore.runtime.runtime import Runtime
+from turbrestore.settings import RestoreParams
+from turbrestore.synthesis.scenes import SCENES
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
+from turbrestore_cli.__main__ import main
+
+NO_TORCH = pytest.mark.skipif(find_spec("torch") is None, reason="torch is not installed")
+TVL1 = FlowParams(method="tvl1")
+
+
+def devices():
+    """Names to test: torch on the CPU, and a GPU where there is one."""
+    if find_spec("torch") is None:
+        return [pytest.param("cpu:0", marks=NO_TORCH)]
+    import torch
+
+    return ["cpu:0", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+on_devices = pytest.mark.parametrize("device", devices())
+
+
+def psnr(image, truth):
+    return -10 * np.log10(np.mean(np.square(image - truth)))
+
+
+def frames_of(scene, count, seed):
+    rng = np.random.default_rng(seed)
+    params = SmoothFlowParams(rms=1.5, correlation_length=8.0, persistence=0.5)
+    return distort(scene, smooth_flows(count, *scene.shape[:2], rng, params), rng, blur=0.8, noise=0.01)
+
+
+@on_devices
+def test_the_image_is_that_of_the_cpu(device):
+    scene = SCENES["camera"](72, 80)
+    frames = frames_of(scene, 12, seed=13)
+    here = restore(frames, RestoreParams(flow=TVL1))
+    there, again = (restore(frames, RestoreParams(flow=TVL1), Runtime(device=device)) for _ in range(2))
+    for a, b in ((here.centroid, there.centroid), (here.filtered, there.filtered), (here, there)):
+        assert abs(psnr(a.image, scene) - psnr(b.image, scene)) < 0.02
+    assert np.linalg.norm(here.centroid.flows - there.centroid.flows, axis=-1).mean() < 0.02
+    assert there.filtered.shares == pytest.approx(here.filtered.shares, rel=1e-2)
+    assert there.image.tobytes() == again.image.tobytes()
+    assert Decision("device", device, "asked for") in there.decisions
+    assert not any(decision.subject == "device" for decision in here.decisions)
+
+
+@on_devices
+def test_arrays_that_cannot_be_written(device):
+    frames = frames_of(SCENES["camera"](64, 64), 3, seed=16)
+    frames.flags.writeable = False
+    before = frames.copy()
+    restore(frames, RestoreParams(flow=TVL1), Runtime(device=device))
+    assert frames.tobytes() == before.tobytes()
+
+
+@on_devices
+def test_frames_that_do_not_count(device):
+    scene = SCENES["camera"](64, 64)
+    coloured = np.stack([scene, scene**2, 1 - scene], axis=-1).astype(np.float32)
+    frames = frames_of(coloured, 8, seed=14)
+    params = RestoreParams(until="filter", keep_best=Share(0.5))
+    here, there = (restore(frames, params, Runtime(device=name)) for name in ("cpu", device))
+    assert abs(psnr(here.image, coloured) - psnr(there.image, coloured)) < 0.02
+    assert (np.isnan(here.filtered.sharpness) == np.isnan(there.filtered.sharpness)).all()
+
+
+@on_devices
+@pytest.mark.parametrize(
+    ("place", "advice", "params"),
+    [
+        ("registration.tvl1.tvl1_flows", "lower --flow.tvl1.batch", RestoreParams(flow=TVL1)),
+        ("registration.warp.warp_stack", "take a smaller --roi", RestoreParams()),
+        ("filtering.array_backend.warp_stack", "take a smaller --roi", RestoreParams(filter=FilterParams())),
+    ],
+)
+def test_what_to_do_is_said_where_the_memory_of_the_device_is_too_small(device, place, advice, params, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("CUDA out of memory.")
+
+    monkeypatch.setattr(f"turbrestore.{place}", fail)
+    frames = frames_of(SCENES["camera"](48, 48), 3, seed=17)
+    line = f"^device: the memory of '{device[:3]}.* is not enough; {advice} or use 'cpu'$"
+    with pytest.raises(ConfigurationError, match=line):
+        restore(frames, params, Runtime(device=device))
+
+
+def test_auto_is_settled_before_the_stages(monkeypatch):
+    monkeypatch.setattr(device_module, "_cuda_is_there", lambda: False)
+    frames = frames_of(SCENES["camera"](64, 64), 3, seed=15)
+    params = RestoreParams(until="centroid", centroid=CentroidParams(iterations=1))
+    here, there = (restore(frames, params, Runtime(device=name)) for name in ("cpu", "auto"))
+    assert here.image.tobytes() == there.image.tobytes()
+    assert there.decisions[0] == Decision("device", "CPU", "torch sees no GPU")
+
+
+def test_without_torch_a_device_ends_the_command_before_it_keeps_anything(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    np.save(tmp_path / "in.npy", np.random.default_rng(0).random((3, 32, 32)).astype(np.float32))
+    words = ["restore", str(tmp_path / "in.npy"), str(tmp_path / "out.png"), "--device", "cuda"]
+    assert main([*words, "--keep", str(tmp_path / "kept")]) == 2
+    assert "device: torch is not installed, found 'cuda'" in capsys.readouterr().err
+    assert not list(tmp_path.glob("**/*.npz"))
+
+
+@NO_TORCH
+def test_a_device_that_is_not_there_ends_the_command(tmp_path, capsys, monkeypatch):
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    np.save(tmp_path / "in.npy", np.random.default_rng(0).random((3, 32, 32)).astype(np.float32))
+    assert main(["restore", str(tmp_path / "in.npy"), str(tmp_path / "out.png"), "--device", "cuda"]) == 2
+    assert capsys.readouterr().err.strip().endswith("found 'cuda'; use 'cpu' or 'auto'")
+    assert not (tmp_path / "out.png").exists()
