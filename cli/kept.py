@@ -10,7 +10,7 @@ from turbrestore.io.images import check_space
 from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import plan_memory
 from turbrestore.runs.folder_lock import lock_folder
-from turbrestore.runs.run_files import read_stages
+from turbrestore.runs.run_files import RECORD, read_stages
 from turbrestore.runs.run_folder import RunFolder
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.settings import RestoreParams
@@ -57,7 +57,8 @@ def kept_stages(
 
 def own_outputs(folder: Path) -> set[Path]:
     """List the outputs that an earlier run was writing when it died; it may replace them."""
-    record = read_stages(folder)
+    # A link is refused later on.
+    record = None if (folder / RECORD).is_symlink() else read_stages(folder)
     return set() if record is None else {Path(name) for name in record["outputs"]}
 
 

@@ -118,6 +118,12 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: 
         return
     if not folder.is_dir():
         raise OutputError(f"{folder}: is a file; name a folder to keep the stages in")
+    for name in (LOCK, *RUN_FILES, CHECKPOINT, *(f"{image}.png" for image in _IMAGES)):
+        if (folder / name).is_symlink():
+            raise OutputError(f"{folder / name}: is a link to a file elsewhere; remove it or name another folder")
+        if (folder / name).resolve() in {path.resolve() for path in taken}:
+            raise OutputError(f"{folder / name}: is an input or output already; name another folder")
+        check_output(folder / name, taken, overwrite=True, suffixes=None)
     known = resume and read_stages(folder) is not None
     # What a run leaves that is killed while it starts.
     rest = [path for path in folder.iterdir() if path.name != LOCK and not is_part(path)]
@@ -125,12 +131,6 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: 
         if resume:
             raise OutputError(f"{folder}: holds no run to go on with; choose another folder or allow overwriting")
         raise OutputError(f"{folder}: is not empty; choose another folder, allow overwriting, or resume the run in it")
-    for name in (LOCK, *RUN_FILES, CHECKPOINT, *(f"{image}.png" for image in _IMAGES)):
-        if (folder / name).is_symlink():
-            raise OutputError(f"{folder / name}: is a link to a file elsewhere; remove it or name another folder")
-        if (folder / name).resolve() in {path.resolve() for path in taken}:
-            raise OutputError(f"{folder / name}: is an input or output already; name another folder")
-        check_output(folder / name, taken, overwrite=True, suffixes=None)
 
 
 def save_stages(stages: RunFolder, restoration: Restoration, run: RunRecord, bit_depth: int) -> None:

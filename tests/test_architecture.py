@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "turbrestore"
 # A folder imports only from itself and from those before it; the modules on the last line but one are one room too.
 ORDER = [
     "core", "runtime", "display", "io", "footage", "registration", "dynamics", "filtering", "blur_moments", "blur",
-    "deconvolution", "blind", "synthesis", "metrics", "wording", "tiled_stages", "memory_plan", "settings",
+    "deconvolution", "blind", "synthesis", "metrics", "wording", "tiled_stages", "results", "settings", "memory_plan",
     "pipeline", "runs", "report",
 ]  # fmt: skip
 HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}

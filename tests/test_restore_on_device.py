@@ -94,8 +94,8 @@ def test_what_to_do_is_said_where_the_memory_of_the_device_is_too_small(device, 
     def fail(*_):
         raise RuntimeError("CUDA out of memory.")
 
-    monkeypatch.setattr(f"turbrestore.{place}", fail)
     frames = frames_of(SCENES["camera"](48, 48), 3, seed=17)
+    monkeypatch.setattr(f"turbrestore.{place}", fail)
     line = f"^device: the memory of '{device[:3]}.* is not enough; {advice} or use 'cpu'$"
     with pytest.raises(ConfigurationError, match=line):
         restore(frames, params, Runtime(device=device))

@@ -42,8 +42,10 @@ _FEWEST_IN_NEED = 10
 _TRAINING_BYTES = 1.5e9
 # Interpreter, libraries and readers, bytes.
 _BASE = 1.6e8
-# Images and maps that the stages leave, bytes a pixel and bytes a pixel and channel.
+# Images and maps that the stages leave, bytes a pixel and bytes a pixel and channel; with tiles most of them lie in
+# scratch files.
 _RESULTS, _RESULTS_COLOUR = 60, 40
+_RESULTS_OF_TILES, _RESULTS_OF_TILES_COLOUR = 3, 15
 # A report with its pictures, which are at most 2048 pixels wide: bytes, bytes a pixel and a pixel that is shown.
 _REPORT, _REPORT_PIXEL, _REPORT_SHOWN, _SHOWN_SIDE = 6e7, 40, 50, 2048
 # Numbers of the modes that a thread has in hand while they lie in a file.
@@ -245,6 +247,8 @@ def _stack(shape: tuple[int, ...], params: RestoreParams, train: int) -> tuple[f
 
 def _held_by_deconvolution(shape: tuple[int, ...], params: RestoreParams, choice: _Choice) -> float:
     """Bytes of the results of the stages before the deconvolution."""
+    if choice.tile is not None:
+        return _pixels(shape) * float(_RESULTS_OF_TILES + _RESULTS_OF_TILES_COLOUR * _channels(shape))
     held = _pixels(shape) * float(_RESULTS + _RESULTS_COLOUR * _channels(shape))
     return held if choice.in_scratch else held + sum(_stack(shape, params, choice.train)[1:])
 

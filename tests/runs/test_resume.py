@@ -106,8 +106,8 @@ def spy(monkeypatch):
 PLACES = {
     "centroid": ("turbrestore.pipeline.centroid_steps", 1),
     "flow model": ("turbrestore.pipeline.identify", 1),
-    "first block": ("turbrestore.filtering.alternating._filter_window", 1),
-    "third block": ("turbrestore.filtering.alternating._filter_window", 4),
+    "first block": ("turbrestore.filtering.alternating.pass_over", 1),
+    "third block": ("turbrestore.filtering.alternating.pass_over", 4),
     "deconvolution": ("turbrestore.pipeline.remove_blur_steps", 1),
     "kept images": ("turbrestore_cli.output.write_image", 2),
     "output": ("turbrestore_cli.restore.write_image", 1),
@@ -129,15 +129,15 @@ def test_an_interrupted_run_ends_as_if_nothing_had_happened(whole, place, capsys
 
 def test_what_is_done_is_not_done_again(place, monkeypatch):
     with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, "turbrestore.filtering.alternating._filter_window", 4)
+        interrupt(patch, "turbrestore.filtering.alternating.pass_over", 4)
         main(WORDS)
     # Eight training frames, then blocks of eight: two are done and kept.
     kept = RunFolder("kept", open_frames("clip.mkv"), params_of(WORDS), resume=True)
     assert len(kept.filter_start().records) == 16
     called, blocks = spy(monkeypatch), []
-    real = sys.modules["turbrestore.filtering.alternating"]._filter_window
+    real = sys.modules["turbrestore.filtering.alternating"].pass_over
     monkeypatch.setattr(
-        "turbrestore.filtering.alternating._filter_window", lambda *words: blocks.append(words[2]) or real(*words)
+        "turbrestore.filtering.alternating.pass_over", lambda *words: blocks.append(words[4]) or real(*words)
     )
     assert main([*WORDS, "--resume"]) == 0
     assert called == ["filter_steps", "remove_blur_steps"]
@@ -255,7 +255,7 @@ def test_files_that_are_not_what_was_written_are_made_again(whole, ended, capsys
 
 def test_a_damaged_checkpoint_costs_the_filter_only(whole, place, monkeypatch, capsys):
     with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, "turbrestore.filtering.alternating._filter_window", 4)
+        interrupt(patch, "turbrestore.filtering.alternating.pass_over", 4)
         main(WORDS)
     path = place / "kept" / "checkpoint.npz"
     path.write_bytes(path.read_bytes()[:-40])

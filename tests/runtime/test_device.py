@@ -128,35 +128,3 @@ class TestChoice:
                 raise RuntimeError(said)
         with pytest.raises(RuntimeError, match="^a bug$"), memory_of("cuda", "lower the batch"):
             raise RuntimeError("a bug")
-
-
-@on_devices
-class TestFlow:
-    def test_flows_are_those_of_the_processor(self, device):
-        frames, _ = frames_of(SCENES["camera"](SIZE, SIZE + 9), 3)
-        mean = frames.mean(axis=0)
-        here, there = (estimate_flow(mean, frames, FlowParams(method="tvl1", device=d)) for d in ("cpu", device))
-        apart = np.linalg.norm(here - there, axis=-1)
-        assert apart.mean() < 1e-3
-        assert apart.max() < 0.02
-
-    def test_large_motion_and_a_start(self, device):
-        frames, flows = frames_of(SCENES["brick"](SIZE, SIZE), 2, rms=3.0, seed=1)
-        grey = 255 * frames
-        here, there = (tvl1_flows(grey, refer_tvl1(grey.mean(axis=0), device=d), flows) for d in ("cpu", device))
-        assert np.linalg.norm(here.flows - there.flows, axis=-1).mean() < 1e-3
-        assert (here.warps == there.warps).all()
-        assert (here.settled == there.settled).all()
-
-    @pytest.mark.parametrize("batch", [1, 2, 5])
-    def test_batches_do_not_matter(self, device, batch):
-        frames, _ = frames_of(SCENES["camera"](48, 48), 5, seed=2)
-        params = FlowParams(method="tvl1", device=device)
-        small = replace(params, tvl1=replace(params.tvl1, batch=batch))
-        apart = estimate_flow(frames[0], frames, params) - estimate_flow(frames[0], frames, small)
-        assert np.abs(apart).max() < 1e-3
-
-    def test_methods_of_opencv_stay_where_they_are(self, device):
-        frames, _ = frames_of(SCENES["camera"](48, 48), 2, seed=3)
-        here, there = (estimate_flow(frames[0], frames, FlowParams(device=d)) for d in ("cpu", device))
-        assert here.tobytes() == there.tobytes()

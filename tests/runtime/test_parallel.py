@@ -12,6 +12,7 @@ import pytest
 from conftest import make_sequence
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.flow import FlowParams
+from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.threads import ThreadTeam, map_ahead, map_in_turns, sum_in_threads
 
 
@@ -227,9 +228,7 @@ def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypa
     frames = make_sequence(seed=3, count=28).frames[:, :64, :80]
 
     def run(threads):
-        for module in ("runtime.threads", "memory_plan"):
-            monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: threads)
-        return restore(frames, RestoreParams(train=12, flow=FlowParams(method, threads=threads)))
+        return restore(frames, RestoreParams(train=12, flow=FlowParams(method)), Runtime(threads=threads))
 
     one, *others = map(run, (1, 2, 4))
     for other in others:

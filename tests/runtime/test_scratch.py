@@ -1,9 +1,7 @@
 """Arrays in a file without a name: what they hold, what they take, and what is left of them."""
 
 import itertools
-import mmap
 import os
-import platform
 import shutil
 import signal
 import subprocess
@@ -11,7 +9,6 @@ import sys
 import textwrap
 from collections import namedtuple
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,10 +20,8 @@ from turbrestore.runtime.scratch import (
     drop_pages,
     iter_frames,
     iter_parts,
-    keeping_freed,
     mean_of,
     new_stack,
-    returning_freed,
     to_scratch,
     variance_of,
 )
@@ -140,69 +135,6 @@ def test_a_full_disk_is_a_clear_error(tmp_path, monkeypatch):
     with pytest.raises(StorageError, match="nowhere: cannot hold"):
         monkeypatch.undo()
         new_stack((2, 2), tmp_path / "nowhere")
-
-
-def test_the_allocator_gets_back_what_it_had(monkeypatch):
-    calls = []
-    library = SimpleNamespace(mallopt=lambda *setting: calls.append(setting), malloc_trim=calls.append)
-    monkeypatch.setattr("ctypes.CDLL", lambda name: library)
-    monkeypatch.setattr("platform.libc_ver", lambda: ("glibc", "2.36"))
-    with returning_freed(False):
-        pass
-    assert calls == []
-    with pytest.raises(KeyError), returning_freed():
-        assert calls == [(-3, 1 << 20), (-1, 2 << 20)]
-        raise KeyError
-    as_it_was = [(-3, 32 << 20), (-1, 64 << 20), (-2, 128 << 10), 0]
-    assert calls[2:] == as_it_was
-    calls.clear()
-    with keeping_freed(False):
-        pass
-    assert calls == []
-    with pytest.raises(KeyError), keeping_freed():
-        assert calls == [(-3, 32 << 20), (-1, -1), (-2, 128 << 20)]
-        raise KeyError
-    assert calls[3:] == as_it_was
-    calls.clear()
-    monkeypatch.setattr("platform.libc_ver", lambda: ("", ""))
-    with returning_freed(), keeping_freed():
-        pass
-    assert calls == []
-
-
-# Heaps that threads have of their own are those of glibc, and faults count pages only where these are small.
-@pytest.mark.skipif(
-    platform.libc_ver()[0] != "glibc"
-    or mmap.PAGESIZE != 4096
-    or (HUGE_PAGES.is_file() and "[always]" in HUGE_PAGES.read_text()),
-    reason="the allocator is another, or its pages are",
-)
-def test_a_thread_that_frees_all_keeps_its_pages():
-    """In a process of its own, whose thread takes 18,000 pages in arrays of 3 MB, and frees them, again and again."""
-    code = textwrap.dedent(
-        """
-        import resource, sys
-        import numpy as np
-        from turbrestore.runtime.threads import map_ahead
-        from turbrestore.runtime.scratch import keeping_freed
-
-        def work(_):
-            for _ in range(2):
-                arrays = [np.ones(3 << 17) for _ in range(24)]
-                del arrays
-                faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
-
-        faults = []
-        with keeping_freed(sys.argv[1] == "kept"):
-            list(map_ahead(work, range(5), threads=1))
-        print(faults[-1] - faults[0])
-        """
-    )
-    faults = [
-        int(subprocess.run([sys.executable, "-c", code, how], capture_output=True, text=True, check=True).stdout)
-        for how in ("kept", "given back")
-    ]
-    assert faults[1] > max(10 * faults[0], 10_000)
 
 
 def test_an_array_is_moved_to_a_file_once(tmp_path):

@@ -35,6 +35,7 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
 
     Examples
     --------
+    >>> import numpy as np
     >>> source, params = FrameSource.from_array(np.zeros((5, 16, 16))), RestoreParams()
     >>> facts = stage_dependencies(source, params, plan_memory(source.shape, params, DEFAULT))
     >>> list(facts), facts["filtered"]["frames"]
