@@ -40,9 +40,8 @@ from ..dynamics.flow_model import FlowDynamics
 from ..dynamics.simulate import simulate, stable_system
 from ..registration.centroid import CentroidParams, find_centroid
 from ..registration.flow import FlowParams
+from .atmosphere import Float64Array
 from .sequence import check_scene
-
-Float64Array = NDArray[np.float64]
 
 RESIDUALS = ("keep", "drop")
 FITS = ("mirror", "stretch")
@@ -197,7 +196,7 @@ def synthesize_like(
     (300, (80, 96, 2))
     """
     params = params or DynamicTextureParams()
-    _check_count(count)
+    require(count >= 1, f"count: expected at least 1 frame, found {count}")
     given = None if scene is None else check_scene(scene)
     centroid = find_centroid(frames, params.centroid, params.flow, progress)
     image = centroid.image if given is None else given
@@ -251,7 +250,7 @@ def continue_flows(
     True
     """
     params = params or DynamicTextureParams()
-    _check_count(count)
+    require(count >= 1, f"count: expected at least 1 frame, found {count}")
     training = check_flow(flows, "flows")
     if training.ndim != 4 or len(training) < 3:
         raise DataError(f"flows: expected shape (τ, H, W, 2) with at least 3 flows, found {training.shape}")
@@ -266,10 +265,6 @@ def continue_flows(
     grid = dynamics.shape
     height, width = grid if size is None else size[:2]
     return TextureFlows(modes, states, grid, (height, width), params.fit), dynamics
-
-
-def _check_count(count: int) -> None:
-    require(count >= 1, f"count: expected at least 1 frame, found {count}")
 
 
 def _autoregressions(training: Float64Array, count: int, rng: np.random.Generator, largest: float) -> Float64Array:
