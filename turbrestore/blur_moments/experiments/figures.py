@@ -54,7 +54,7 @@ def draw_wavefront(experiment: Experiment) -> bytes:
     for name in ("O1", "O3", "image_map"):
         panels[1].plot(experiment.errors[name], **_style(name))
         panels[2].plot(t, experiment.estimates[name].ravel() - truth, **_style(name))
-    _label(panels[1], f"Figure 5: error of the state, mean of {experiment.seeds} seeds", "frame", "‖x̂ − x‖")
+    _label(panels[1], f"Figure 5: mean error, {experiment.seeds} seeds", "frame", "‖x̂ − x‖")
     _label(panels[2], "Figure 6: error at the fast rate", "time, s", "θ̂ − θ")
     last = slice(truth.size - steps, truth.size)
     panels[3].plot(t[last], truth[last], "k", label="truth")
