@@ -135,7 +135,10 @@ def synthesize(
             made = _through_screens(_scene(scene, size, limits), frames, rng, _with_strength(path, strength), camera)
         else:
             require(strength is None, "--strength: has no effect with --model dynamic-texture; leave it out")
-            require(path == PhaseScreenParams(), "--model dynamic-texture: knows no path and no optics; leave them out")
+            require(
+                path == PhaseScreenParams(),
+                "--model dynamic-texture: has no path and no optics; leave their options out",
+            )
             truth = None if scene == CENTROID and size is None else _scene(scene, size, limits)
             made = _like_a_clip(
                 _training_frames(like, train, limits), truth, frames, rng, dynamic_texture, camera, progress

@@ -96,8 +96,8 @@ _ = right.legend()
 
 # %% [markdown]
 # The phase varies by many radians over two metres, on all scales. Its structure function lies on von Kármán's from four
-# centimetres to ten metres, and levels off beyond the outer scale of 5 m. Kolmogorov's law, which knows no outer scale,
-# is above it even at the shortest distances.
+# centimetres to ten metres, and levels off beyond the outer scale of 5 m. Kolmogorov's law, which has no outer
+# scale, is above it even at the shortest distances.
 
 # %% [markdown]
 # ## Weak, medium, strong
@@ -117,25 +117,25 @@ for name, ratio in strengths.items():
 show(panels)
 
 # %% [markdown]
-# Edges wave and details go, more so the stronger the air. The displacements are as large as theory expects.
+# Edges wave and details vanish, more so in stronger turbulence. The displacements are as large as theory expects.
 
 # %% [markdown]
-# Every frame comes with its flow. Bending the frame back by it takes out the motion and leaves the blur. What the
-# optics alone make of the scene is the best that a restoration can be asked for.
+# Every frame comes with its flow. Warping the frame back by it removes the motion and leaves the blur. The image
+# of the scene through the optics alone is the best possible restoration.
 
 # %%
 frame = clip[-1]
 show(
     {
         "strong, last frame": frame.image,
-        "bent back by its flow": warp(frame.image, frame.flow),
+        "warped back by its flow": warp(frame.image, frame.flow),
         "optics alone": tr.diffraction_limited(scene),
         "truth": scene,
     }
 )
 
 # %% [markdown]
-# The man stands straight again, and is as soft as before.
+# The man is straight again, and as soft as before.
 
 # %% [markdown]
 # ## Exposure
@@ -159,9 +159,9 @@ show(panels)
 
 # %% [markdown]
 # ## Dynamic texture: the motion of a clip on another scene
-# The flows of a clip are measured and a linear system identified; run with fresh noise it makes flows of any length,
-# which here bend another picture. The clip is a brick wall seen through medium turbulence. It should have detail
-# everywhere, for where a flow cannot be measured it cannot be learned. The frames shown are six apart.
+# The flows of a clip are measured and a linear system identified; run with new noise it makes sequences of flows of
+# any length, which here distort another picture. The clip is a brick wall seen through medium turbulence. It should
+# have detail everywhere, because a flow that cannot be measured cannot be learned. The frames shown are six apart.
 
 # %%
 wall = picture("brick", SIZE, SIZE)

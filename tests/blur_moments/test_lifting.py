@@ -23,16 +23,16 @@ def simulate(system, state, inputs):
     """Outputs and final state, one fast step after the other."""
     outputs = []
     for u in inputs:
-        outputs.append(system.C @ state + system.D * u)
+        outputs.append(system.C @ state)
         state = system.A @ state + system.B * u
     return np.array(outputs), state
 
 
-def random_system(seed, n=3, direct=0.3):
+def random_system(seed, n=3):
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(n, n))
     A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
-    return FastSystem(A, rng.normal(size=n), rng.normal(size=n), direct), rng
+    return FastSystem(A, rng.normal(size=n), rng.normal(size=n)), rng
 
 
 class TestLift:
@@ -120,7 +120,6 @@ class TestLift:
             (lambda: FastSystem([[1.01]], [1.0], [1.0]), "A"),
             (lambda: FastSystem([[0.5, 0.0]], [1.0], [1.0]), "system"),
             (lambda: FastSystem([[np.nan]], [1.0], [1.0]), "system"),
-            (lambda: FastSystem([[0.5]], [1.0], [1.0], np.nan), "system"),
             (lambda: FastSystem(np.zeros((0, 0)), [], []), "system"),
             (lambda: discretise([[np.nan]], [1.0], 1e-3), "system"),
             (lambda: discretise([1.0], 1.0, 1e-3), "system"),
@@ -144,9 +143,8 @@ class TestLift:
 
 
 class TestJacobians:
-    @pytest.mark.parametrize("border", [False, True])
     @pytest.mark.parametrize("basis", ["monomial", "legendre"])
-    def test_of_the_moments(self, basis, border):
+    def test_of_the_moments(self, basis):
         system, rng = random_system(3)
         lifted = lift(system, ExposureTiming(1.0, 6.0, 1.0, 7.0), np.eye(3))
         pixels = PixelGrid(-2.0, 2.5, 90)
@@ -155,24 +153,12 @@ class TestJacobians:
         orders = (1, 2, 3, 4)
 
         def moments(mean):
-            if border:
-                image = expose(path_of(lifted, mean, inputs), model.sensor.kernel, pixels)
-                return image_moments(image, pixels, 4, basis)[1:]
             return predicted_moments(model, mean, inputs, orders, basis)[0]
 
-        h, H, _ = predicted_moments(model, state, inputs, orders, basis, border)
-        # A table in steps of σ / 6 is right to half a percent.
-        tolerance = 0.005 if border else 1e-7
-        np.testing.assert_allclose(h, moments(state), atol=tolerance)
+        h, H, _ = predicted_moments(model, state, inputs, orders, basis)
+        image = expose(path_of(lifted, state, inputs), model.sensor.kernel, pixels)
+        np.testing.assert_allclose(h, image_moments(image, pixels, 4, basis)[1:], atol=0.005)
         for k in range(3):
             shift = 1e-5 * np.eye(3)[k]
             slope = (moments(state + shift) - moments(state - shift)) / 2e-5
-            np.testing.assert_allclose(H[:, k], slope, atol=tolerance * np.abs(slope).max())
-
-    def test_border_or_not_makes_no_difference_far_from_it(self):
-        system, rng = random_system(4)
-        lifted = lift(system, ExposureTiming(1.0, 6.0, 1.0, 7.0), np.eye(3))
-        model = BlurModel(lifted, LineSensor(GaussianKernel(0.2), PixelGrid(-3.0, 3.0, 240), noise=0.1))
-        state, inputs = 0.1 * rng.normal(size=3), 0.1 * rng.normal(size=7)
-        near, far = (predicted_moments(model, state, inputs, (1, 2), "monomial", border)[0] for border in (False, True))
-        np.testing.assert_allclose(near, far, atol=1e-3)
+            np.testing.assert_allclose(H[:, k], slope, atol=1e-7 * np.abs(slope).max())

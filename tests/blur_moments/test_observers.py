@@ -31,7 +31,6 @@ OBSERVERS = {
     "poles": luenberger(MODEL.motion, [0.5, 0.6]),
     "second": MomentFilter((2,)),
     "both": MomentFilter((1, 2)),
-    "border": MomentFilter((1, 2), border=True),
     "legendre": MomentFilter((1, 2, 3, 4), "legendre"),
     "unscented": MomentFilter((1, 2), method="unscented"),
     "iterated": MomentFilter((1, 2), method="iterated"),
@@ -136,20 +135,6 @@ class TestLaws:
         gain = luenberger(MIRROR.motion, [0.3, 0.35]).gain
         A, C = MIRROR.motion.A, MIRROR.motion.C
         np.testing.assert_allclose(np.sort(np.linalg.eigvals(A - np.outer(gain, C @ A))), [0.3, 0.35], atol=1e-8)
-
-    def test_border_matters_at_the_border(self):
-        motion = lift(FastSystem([[1.0]], [0.0], [1.0]), ExposureTiming(1.0, 2.0, 0.0, 2.0), [[0.01]])
-        sensor = LineSensor(GaussianKernel(0.05), PixelGrid(-1.0, 1.0, 200), noise=1e-7)
-        # Closer to the border the first moment shrinks again and would not tell the position.
-        model, truth = BlurModel(motion, sensor), 0.87
-        frame = expose([truth, truth], sensor.kernel, sensor.pixels)
-        prior = Gaussian(np.array([0.85]), np.array([[0.01]]))
-        errors = []
-        for border in (False, True):
-            after, _ = MomentFilter((1,), method="iterated", border=border).step(model, prior, frame, np.zeros(2))
-            errors.append(abs(after.mean[0] - truth))
-        assert errors[0] > 0.004
-        assert errors[1] < 0.0005
 
 
 @dataclass(frozen=True)

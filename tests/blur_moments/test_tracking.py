@@ -13,7 +13,6 @@ from turbrestore.blur_moments.targets import (
     Oscillation,
     PlaneModel,
     PlaneMomentFilter,
-    PlaneSensor,
     RandomWalk,
     lift_motion,
 )
@@ -57,14 +56,13 @@ def plane_model(noise=0.01, size=(24, 20)):
     fast = FastSystem([[1.0, h], [0.0, 0.98]], [0.0, 0.0], [1.0, h / 2])
     motion = lift(fast, TIMING, np.diag([1e-4, 1e-3]))
     columns, rows = (PixelGrid(-n / 2, n / 2, n) for n in size)
-    return PlaneModel(motion, PlaneSensor(1.2, columns, rows, noise, total=2.0))
+    return PlaneModel(motion, 1.2, columns, rows, noise, total=2.0)
 
 
 def line_models(model):
     """What the sums over rows and over columns show: the noise of a sum over n pixels has n times the density."""
-    sensor = model.sensor
-    for grid, other in ((sensor.columns, sensor.rows), (sensor.rows, sensor.columns)):
-        line = LineSensor(GaussianKernel(sensor.sigma), grid, sensor.noise * other.count * other.width, sensor.total)
+    for grid, other in ((model.columns, model.rows), (model.rows, model.columns)):
+        line = LineSensor(GaussianKernel(model.sigma), grid, model.noise * other.count * other.width, model.total)
         yield BlurModel(model.axis, line)
 
 
@@ -120,7 +118,7 @@ def test_moments_of_a_rendered_frame_are_predicted():
     model, observer = plane_model(noise=1e-6), PlaneMomentFilter()
     state = Gaussian(np.array([0.5, 2.0, -1.0, 1.0]), np.zeros((4, 4)))
     path = np.einsum("san,n->sa", model.outputs(TIMING.exposure_steps), state.mean)
-    frame = 2.0 * expose_plane(path, 1.2, model.sensor.columns, model.sensor.rows)
+    frame = 2.0 * expose_plane(path, 1.2, model.columns, model.rows)
     _, innovation = observer.step(model, state, frame)
     assert innovation.values == pytest.approx(np.zeros(5), abs=1e-4)
 
@@ -296,8 +294,7 @@ def test_bad_input_is_named():
         (lambda: TrackParams(RandomWalk(1.0), 1.0, basis="cosine"), "basis"),
         (lambda: TrackParams(RandomWalk(1.0), 1.0, exposure=0.51), "exposure"),
         (lambda: PlaneMomentFilter(order=0), "order"),
-        (lambda: PlaneSensor(1.0, FIELD, FIELD, noise=0.0), "noise"),
-        (lambda: PlaneSensor(1.0, FIELD, FIELD, noise=0.1, total=0.0), "total"),
+        (lambda: plane_model(noise=0.0), "noise"),
     ],
 )
 def test_settings_are_checked(make, named):

@@ -99,33 +99,11 @@ class OscillatorMotion:
         return 5
 
     def path_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Output at the fast steps of the exposure, and its derivative with respect to the state.
-
-        Parameters
-        ----------
-        mean : ndarray, float64, shape (..., 5)
-        inputs : ndarray, float64, shape (..., N)
-
-        Returns
-        -------
-        path : ndarray, float64, shape (..., N_e)
-        jacobian : ndarray, float64, shape (..., N_e, 5)
-        """
+        """Output in the exposure and its derivative; see :meth:`.lifting.Motion.path_and_jacobian`."""
         return self._outputs(mean, inputs, self.timing.exposure_steps)
 
     def advance(self, state: Gaussian, inputs: Float64Array) -> Gaussian:
-        """Predict the state at the start of the next exposure, linearised at the mean.
-
-        Parameters
-        ----------
-        state : Gaussian
-            Shape (..., 5).
-        inputs : ndarray, float64, shape (..., N)
-
-        Returns
-        -------
-        Gaussian
-        """
+        """Predict the state at the start of the next exposure, linearised at the mean."""
         steps = self.timing.frame_steps
         response = self._responses(state.mean, steps)
         backwards = inputs[..., None, steps - 1 :: -1]
@@ -144,18 +122,7 @@ class OscillatorMotion:
         return Gaussian(moved, 0.5 * (cov + np.swapaxes(cov, -1, -2)))
 
     def fast_output(self, state: Gaussian, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Mean and variance of the output at every fast step until the next exposure.
-
-        Parameters
-        ----------
-        state : Gaussian
-            At the start of the exposure, after its frame; shape (..., 5).
-        inputs : ndarray, float64, shape (..., N)
-
-        Returns
-        -------
-        mean, variance : ndarray, float64, shape (..., N)
-        """
+        """Mean and variance of the output at every fast step; see :meth:`.lifting.Motion.fast_output`."""
         path, slopes = self._outputs(state.mean, inputs, self.timing.frame_steps)
         return path, np.einsum("...in,...nm,...im->...i", slopes, state.cov, slopes)
 

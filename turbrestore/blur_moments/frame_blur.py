@@ -148,26 +148,19 @@ def prepare_blur_reference(
 
     Parameters
     ----------
-    frames : array_like, shape (T, H, W) or (T, H, W, 3), at least two
-    noise : float
-        Standard deviation of the white noise of a frame, intensity.
-    params : CueParams, optional
+    frames, noise, params
+        As of :func:`frame_blur`.
 
     Returns
     -------
     reference : BlurReference
+        For :func:`relative_frame_blur`.
     blur : FrameBlur
 
     Raises
     ------
-    DataError
-        Fewer than two frames, or frames smaller than 16 pixels.
-    ConfigurationError
-        The noise is negative.
-
-    Examples
-    --------
-    See :func:`relative_frame_blur`.
+    DataError, ConfigurationError
+        As :func:`frame_blur`.
     """
     params = params or CueParams()
     stack = check_frames(frames, at_least=2)

@@ -2,7 +2,7 @@
 
 Symbols (paper 1, section V; paper 2, section IV)
 -------------------------------------------------
-A_f, B_f, C_f, D_f : fast system with the step T_f, :class:`FastSystem`.
+A_f, B_f, C_f : fast system with the step T_f, :class:`FastSystem`.
 A_s, B_s, C_s, D_s : the same at the rate of the frames, :class:`LiftedSystem`, made by :func:`lift`.
 u_s(j) : inputs of frame period j, ``[u(jN), …, u(jN + N − 1)]``.
 Q : covariance of the disturbance that is added between two exposures.
@@ -38,10 +38,7 @@ _APART = 1e-6
 
 
 class Motion(Protocol):
-    """The methods of a system that the observers call: :class:`LiftedSystem` and :class:`.augmented.OscillatorMotion`.
-
-    The state is that at the start of an exposure, shape (..., n); inputs are u_s, shape (..., N).
-    """
+    """Interface between systems and observers: :class:`LiftedSystem`, :class:`.augmented.OscillatorMotion`."""
 
     @property
     def order(self) -> int:
@@ -54,7 +51,20 @@ class Motion(Protocol):
         ...
 
     def path_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Output ŷ in the exposure, shape (..., N_e), and its derivative, shape (..., N_e, n)."""
+        """Output ŷ at the fast steps of the exposure, and its derivative with respect to the state.
+
+        Parameters
+        ----------
+        mean : ndarray, float64, shape (..., n)
+            State at the start of the exposure.
+        inputs : ndarray, float64, shape (..., N)
+            u_s.
+
+        Returns
+        -------
+        path : ndarray, float64, shape (..., N_e)
+        jacobian : ndarray, float64, shape (..., N_e, n)
+        """
         ...
 
     def advance(self, state: Gaussian, inputs: Float64Array) -> Gaussian:
@@ -62,7 +72,19 @@ class Motion(Protocol):
         ...
 
     def fast_output(self, state: Gaussian, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Mean and variance of the output at every fast step of the frame period, shape (..., N)."""
+        """Output at every fast step of the frame period, within the exposure and until the next one.
+
+        Parameters
+        ----------
+        state : Gaussian
+            At the start of the exposure, after its frame; shape (..., n).
+        inputs : ndarray, float64, shape (..., N)
+            u_s.
+
+        Returns
+        -------
+        mean, variance : ndarray, float64, shape (..., N)
+        """
         ...
 
 
@@ -76,8 +98,6 @@ class FastSystem:
         A_f, discrete.
     B, C : ndarray, float64, shape (n,)
         B_f and C_f.
-    D : float
-        D_f.
 
     Raises
     ------
@@ -93,7 +113,6 @@ class FastSystem:
     A: Float64Array
     B: Float64Array
     C: Float64Array
-    D: float = 0.0
 
     def __post_init__(self) -> None:
         A, B, C = (np.asarray(matrix, np.float64) for matrix in (self.A, self.B, self.C))
@@ -104,7 +123,7 @@ class FastSystem:
             f"system: expected shapes (n, n), (n,) and (n,), n of at least 1, found {A.shape}, {B.shape} and {C.shape}",
         )
         require(
-            all(bool(np.isfinite(matrix).all()) for matrix in (A, B, C, self.D)),
+            all(bool(np.isfinite(matrix).all()) for matrix in (A, B, C)),
             "system: expected finite matrices, found NaN or infinite values",
         )
         radius = float(np.abs(np.linalg.eigvals(A)).max())
@@ -162,55 +181,20 @@ class LiftedSystem:
         return len(self.C)
 
     def path_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Output ŷ at the fast steps of the exposure, and its derivative with respect to the state.
-
-        Parameters
-        ----------
-        mean : ndarray, float64, shape (..., n)
-            State at the start of the exposure.
-        inputs : ndarray, float64, shape (..., N)
-            u_s.
-
-        Returns
-        -------
-        path : ndarray, float64, shape (..., N_e)
-        jacobian : ndarray, float64, shape (..., N_e, n)
-        """
+        """Output ŷ in the exposure and its derivative; see :meth:`Motion.path_and_jacobian`."""
         steps = self.timing.exposure_steps
         path = mean @ self.free[:steps].T + inputs[..., :steps] @ self.forced[:steps, :steps].T
         return path, np.broadcast_to(self.free[:steps], (*path.shape, self.order))
 
     def advance(self, state: Gaussian, inputs: Float64Array) -> Gaussian:
-        """Predict the state at the start of the next exposure.
-
-        Parameters
-        ----------
-        state : Gaussian
-            At the start of the exposure, shape (..., n).
-        inputs : ndarray, float64, shape (..., N)
-            u_s.
-
-        Returns
-        -------
-        Gaussian
-        """
+        """Predict the state at the start of the next exposure."""
         ahead = predict(state, self.A, self.Q)
         return Gaussian(ahead.mean + inputs @ self.B.T, ahead.cov)
 
     def fast_output(self, state: Gaussian, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Output at every fast step of the frame period, within the exposure and until the next one.
+        """Mean and variance of the output at every fast step; see :meth:`Motion.fast_output`.
 
-        Parameters
-        ----------
-        state : Gaussian
-            At the start of the exposure, after its frame; shape (..., n).
-        inputs : ndarray, float64, shape (..., N)
-            u_s.
-
-        Returns
-        -------
-        mean, variance : ndarray, float64, shape (..., N)
-            The disturbance is added at the end of the frame period, so the variance is that of the state.
+        The disturbance is added at the end of the frame period, so the variance is that of the state.
         """
         mean = state.mean @ self.free.T + inputs @ self.forced.T
         return mean, np.einsum("in,...nm,im->...i", self.free, state.cov, self.free)
@@ -289,7 +273,7 @@ def lift(fast: FastSystem, timing: ExposureTiming, Q: ArrayLike) -> LiftedSystem
     for i in range(steps):
         free[i], reached[i] = row, column
         row, column = row @ fast.A, fast.A @ column
-    pulse = np.concatenate([[fast.D], reached[:-1] @ fast.C])
+    pulse = np.concatenate([[0.0], reached[:-1] @ fast.C])
     lag = np.subtract.outer(np.arange(steps), np.arange(steps))
     forced = np.where(lag >= 0, pulse[np.maximum(lag, 0)], 0.0)
     A, C = np.linalg.matrix_power(fast.A, steps), free[: timing.exposure_steps].mean(0)
@@ -342,18 +326,6 @@ def is_observable(A: ArrayLike, C: ArrayLike) -> bool:
 
 def check_inputs(motion: Motion, state: Gaussian, inputs: ArrayLike) -> Float64Array:
     """Return the inputs of a frame period as float64, after checking that state and inputs belong to a motion.
-
-    Parameters
-    ----------
-    motion : Motion
-    state : Gaussian
-        Shape (..., n).
-    inputs : array_like, shape (..., N)
-        u_s.
-
-    Returns
-    -------
-    ndarray, float64, shape (..., N)
 
     Raises
     ------

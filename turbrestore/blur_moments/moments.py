@@ -80,9 +80,10 @@ def predicted_moments(
     inputs: Float64Array,
     orders: tuple[int, ...],
     basis: str = "monomial",
-    border: bool = False,
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Predict the moments h(x̂) from a state, with their derivative and the covariance of their noise.
+
+    They follow from the moments of path and kernel by the binomial relation, as if all light fell on the pixels.
 
     Parameters
     ----------
@@ -93,9 +94,6 @@ def predicted_moments(
     orders : tuple of int
         Orders of the moments.
     basis : {"monomial", "legendre"}
-    border : bool
-        Compute the moments from the predicted image, without the light that misses the pixels.  Otherwise they
-        follow from the moments of path and kernel by the binomial relation.
 
     Returns
     -------
@@ -125,16 +123,11 @@ def predicted_moments(
     require(
         order < pixels.count, f"orders: expected below the number of pixels, {pixels.count}, found {order} (singular R)"
     )
-    if border:
-        image, derivative = model.image_and_jacobian(mean, inputs)
-        weights = basis_functions(pixels, order, basis) * pixels.width / sensor.total
-        moments, H = image @ weights, np.swapaxes(derivative @ weights, -1, -2)
-    else:
-        path, slopes = model.motion.path_and_jacobian(mean, inputs)
-        powers = _powers(path, order)
-        change = basis_change(pixels, order, basis) @ kernel_relation(sensor.kernel, pixels, order)
-        moments = powers.mean(-1) @ change.T
-        H = change[:, 1:] @ (np.arange(1, order + 1)[:, None] * (powers[..., :-1, :] @ slopes) / path.shape[-1])
+    path, slopes = model.motion.path_and_jacobian(mean, inputs)
+    powers = _powers(path, order)
+    change = basis_change(pixels, order, basis) @ kernel_relation(sensor.kernel, pixels, order)
+    moments = powers.mean(-1) @ change.T
+    H = change[:, 1:] @ (np.arange(1, order + 1)[:, None] * (powers[..., :-1, :] @ slopes) / path.shape[-1])
     R = moment_noise(pixels, order, sensor.noise, basis) / sensor.total**2
     return moments[..., chosen], H[..., chosen, :], R[chosen][:, chosen]
 

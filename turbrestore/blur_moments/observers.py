@@ -116,8 +116,6 @@ class MomentFilter:
         Legendre moments have less noise, see :mod:`.moments`.
     method : {"extended", "iterated", "unscented"}
         Linearisation at the prediction, repeated linearisation at the estimate, or sigma points.
-    border : bool
-        Account for light that misses the pixels, by the image of the predicted path.
     iterations : int
         Of the iterated method.
 
@@ -135,7 +133,6 @@ class MomentFilter:
     orders: tuple[int, ...] = (1, 2)
     basis: str = "monomial"
     method: str = "extended"
-    border: bool = False
     iterations: int = 5
 
     def __post_init__(self) -> None:
@@ -161,8 +158,8 @@ class MomentFilter:
     def predicted(
         self, model: BlurModel, mean: Float64Array, inputs: Float64Array
     ) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Moments of this filter, H and R; see :func:`.moments.predicted_moments`."""
-        return predicted_moments(model, mean, inputs, self.orders, self.basis, self.border)
+        """Predict the moments of this filter, with H and R; see :func:`.moments.predicted_moments`."""
+        return predicted_moments(model, mean, inputs, self.orders, self.basis)
 
 
 def run_observer(

@@ -212,19 +212,23 @@ def lift_motion(motion: TargetMotion, timing: ExposureTiming) -> LiftedSystem:
     return lift(fast, timing, 0.5 * (Q + Q.T))
 
 
-@dataclass(frozen=True)
-class PlaneSensor:
-    """Pixels of the plane that record one target.
+@dataclass(frozen=True, eq=False)
+class PlaneModel:
+    """A motion that both axes follow independently, and the pixels that record it.
 
     Parameters
     ----------
+    axis : LiftedSystem
+        Motion of one axis.
     sigma : float
         σ of the round Gaussian image of the still target, pixels.
     columns, rows : PixelGrid
     noise : float
         V, density of the white noise, above 0.
     total : float
-        Known total intensity of an exposure.
+        Known total intensity of an exposure, above 0.
+    centre : tuple of two floats
+        Position of the origin of the pixels.
 
     Raises
     ------
@@ -233,46 +237,24 @@ class PlaneSensor:
 
     Examples
     --------
-    >>> PlaneSensor(1.0, PixelGrid(-8, 8, 16), PixelGrid(-8, 8, 16), noise=0.01).total
-    1.0
-    """
-
-    sigma: float
-    columns: PixelGrid
-    rows: PixelGrid
-    noise: float
-    total: float = 1.0
-
-    def __post_init__(self) -> None:
-        require(0 < self.noise < np.inf, f"noise: expected a density above 0, found {self.noise:g} (singular R)")
-        require(0 < self.total < np.inf, f"total: expected an intensity above 0, found {self.total:g}")
-
-
-@dataclass(frozen=True, eq=False)
-class PlaneModel:
-    """A motion that both axes follow independently, and the sensor that records it.
-
-    Parameters
-    ----------
-    axis : LiftedSystem
-        Motion of one axis.
-    sensor : PlaneSensor
-    centre : tuple of two floats
-        Position of the origin of the sensor.
-
-    Examples
-    --------
     >>> timing = ExposureTiming(fast_period=0.25, exposure=0.5, readout=0.0, frame_period=1.0)
     >>> pixels = PixelGrid(-8, 8, 16)
-    >>> model = PlaneModel(lift_motion(RandomWalk(0.1), timing), PlaneSensor(1.0, pixels, pixels, noise=0.01))
+    >>> model = PlaneModel(lift_motion(RandomWalk(0.1), timing), 1.0, pixels, pixels, noise=0.01)
     >>> model.advance(Gaussian(np.zeros(2), np.eye(2))).cov
     array([[1.1, 0. ],
            [0. , 1.1]])
     """
 
     axis: LiftedSystem
-    sensor: PlaneSensor
+    sigma: float
+    columns: PixelGrid
+    rows: PixelGrid
+    noise: float
+    total: float = 1.0
     centre: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        _check_positive(noise=self.noise, total=self.total)
 
     def advance(self, state: Gaussian) -> Gaussian:
         """Predict the state, shape (n,), at the start of the next exposure."""
@@ -333,9 +315,9 @@ class PlaneMomentFilter:
         DataError
             Shapes do not agree or values are not finite.
         """
-        measure, _, R = _moment_tables(model.sensor, self.order, self.basis)
+        measure, _, R = self._tables(model)
         image = np.asarray(frame, np.float64)
-        shape = (model.sensor.rows.count, model.sensor.columns.count)
+        shape = (model.rows.count, model.columns.count)
         if image.shape != shape or not np.isfinite(image).all():
             raise DataError(f"frame: expected finite values of shape {shape}, found shape {image.shape}")
         expected, H, spread = self.predicted(model, state)
@@ -356,7 +338,7 @@ class PlaneMomentFilter:
         H : ndarray, float64, shape (m, n)
         spread : ndarray, float64, shape (m, m)
         """
-        _, of_path, _ = _moment_tables(model.sensor, self.order, self.basis)
+        _, of_path, _ = self._tables(model)
         f = model.outputs(model.axis.timing.exposure_steps)
         x, y = (f @ state.mean - np.asarray(model.centre)).T
         fx, fy = f[:, 0], f[:, 1]
@@ -370,20 +352,24 @@ class PlaneMomentFilter:
         curved = of_path[:, 3:]
         return of_path @ raw, of_path @ slope, curved @ (np.einsum("iab,jba->ij", MP, MP) / 2) @ curved.T
 
+    def _tables(self, model: PlaneModel) -> tuple[Float64Array, Float64Array, Float64Array]:
+        return _moment_tables(model.sigma, model.columns, model.rows, model.noise, model.total, self.order, self.basis)
+
 
 @functools.lru_cache(maxsize=8)
-def _moment_tables(sensor: PlaneSensor, order: int, basis: str) -> tuple[Float64Array, Float64Array, Float64Array]:
+def _moment_tables(
+    sigma: float, columns: PixelGrid, rows: PixelGrid, noise: float, total: float, order: int, basis: str
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Matrices from pixels to moments, from raw moments of the path to moments, and covariance R of their noise."""
-    grids = (sensor.columns, sensor.rows)
     p, q = np.transpose(_ORDERS[order])
-    along_x, along_y = (basis_functions(grid, order, basis) for grid in grids)
-    cell = sensor.columns.width * sensor.rows.width
-    measure = (along_y.T[q][:, :, None] * along_x.T[p][:, None, :]).reshape(len(p), -1) * cell / sensor.total
-    kernel = GaussianKernel(sensor.sigma)
-    of_x, of_y = (basis_change(grid, 2, basis) @ kernel_relation(kernel, grid, 2) for grid in grids)
+    along_x, along_y = basis_functions(columns, order, basis), basis_functions(rows, order, basis)
+    cell = columns.width * rows.width
+    measure = (along_y.T[q][:, :, None] * along_x.T[p][:, None, :]).reshape(len(p), -1) * cell / total
+    kernel = GaussianKernel(sigma)
+    of_x, of_y = (basis_change(grid, 2, basis) @ kernel_relation(kernel, grid, 2) for grid in (columns, rows))
     i, j = np.transpose(((0, 0), *_ORDERS[2]))
     of_path = of_x[p[:, None], i] * of_y[q[:, None], j]
-    return measure, of_path, sensor.noise / cell * measure @ measure.T
+    return measure, of_path, noise / cell * measure @ measure.T
 
 
 def _check_positive(**values: float) -> None:

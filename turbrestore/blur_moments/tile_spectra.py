@@ -292,23 +292,8 @@ def fit_weights(
 ) -> tuple[Float64Array, Float64Array]:
     """Weights of ``shrunk − grown`` in a fit of the exponent q, and the signal that both sides have in common.
 
-    The weight is the inverse variance of ``log grown − log shrunk`` divided by the signal.
-
-    Parameters
-    ----------
-    cells : tuple of three ndarrays, float64, shape (..., cells)
-        ``grown``, ``shrunk`` and q.
-    floors : tuple of two floats
-        n₁ and n₂.
-    repeats : float or ndarray
-        Number of independent values of which each entry is a mean.
-    cell_size : float or ndarray
-        Number of such entries in a cell.
-    params : CueParams
-
-    Returns
-    -------
-    weight, signal : ndarray, float64, shape (..., cells)
+    The weight is the inverse variance of ``log grown − log shrunk`` divided by the signal.  ``cells`` are ``grown``,
+    ``shrunk`` and q, shape (..., cells), means of ``cell_size`` values, each a mean of ``repeats`` independent ones.
     """
     grown, shrunk, q = cells
     noise_one, noise_two = floors[0] * np.exp(q / 2), floors[1] * np.exp(-q / 2)

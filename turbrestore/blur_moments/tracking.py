@@ -20,7 +20,7 @@ from ..core.errors import ConfigurationError, DataError, require, require_betwee
 from ..filtering.kalman import Gaussian, Innovation
 from .moments import basis_functions
 from .sensor import ExposureTiming, Float64Array, PixelGrid
-from .targets import Oscillation, PlaneModel, PlaneMomentFilter, PlaneSensor, RandomWalk, TargetMotion, lift_motion
+from .targets import Oscillation, PlaneModel, PlaneMomentFilter, RandomWalk, TargetMotion, lift_motion
 
 # Width of the rim of the window that is taken to be background, pixels.
 _RIM = 2
@@ -240,8 +240,7 @@ def _run(windows: _Windows, params: TrackParams) -> tuple[tuple[Gaussian, ...], 
 def _model(windows: _Windows, params: TrackParams) -> PlaneModel:
     motion = lift_motion(params.motion, params.timing())
     sigma = np.sqrt(params.sigma**2 + params.motion.smear(motion.timing.exposure))
-    sensor = PlaneSensor(float(sigma), windows.columns, windows.rows, windows.noise**2, windows.total)
-    return PlaneModel(motion, sensor)
+    return PlaneModel(motion, float(sigma), windows.columns, windows.rows, windows.noise**2, windows.total)
 
 
 def _start(windows: _Windows, params: TrackParams) -> Gaussian:

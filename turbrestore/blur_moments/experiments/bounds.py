@@ -24,39 +24,13 @@ from .scenarios import Recording
 def moment_information(
     model: BlurModel, states: Float64Array, inputs: Float64Array, orders: tuple[int, ...]
 ) -> Float64Array:
-    """Information that Legendre moments of a frame carry about the state, ``Hᵀ R⁻¹ H``.
-
-    Parameters
-    ----------
-    model : BlurModel
-    states : ndarray, float64, shape (..., n)
-        At the start of the exposure.
-    inputs : ndarray, float64, shape (..., N)
-    orders : tuple of int
-        Orders of the moments.
-
-    Returns
-    -------
-    ndarray, float64, shape (..., n, n)
-    """
+    """Information that Legendre moments of a frame carry about the state, ``Hᵀ R⁻¹ H``."""
     _, H, R = predicted_moments(model, states, inputs, orders, "legendre")
     return np.swapaxes(H, -1, -2) @ np.linalg.solve(R, H)
 
 
 def image_information(model: BlurModel, states: Float64Array, inputs: Float64Array) -> Float64Array:
-    """Information that the whole frame carries about the state.
-
-    Parameters
-    ----------
-    model : BlurModel
-    states : ndarray, float64, shape (..., n)
-        At the start of the exposure.
-    inputs : ndarray, float64, shape (..., N)
-
-    Returns
-    -------
-    ndarray, float64, shape (..., n, n)
-    """
+    """Information that the whole frame carries about the state."""
     _, derivative = model.image_and_jacobian(states, inputs)
     scaled = derivative / model.sensor.deviation
     return scaled @ np.swapaxes(scaled, -1, -2)
@@ -101,18 +75,7 @@ def posterior_bound(A: Float64Array, Q: Float64Array, start: Float64Array, infor
 
 
 def recorded_information(model: BlurModel, recording: Recording) -> dict[str, Float64Array]:
-    """Information of every frame by what is measured, mean over the seeds.
-
-    Parameters
-    ----------
-    model : BlurModel
-        With a known motion, whose states are the first ones recorded.
-    recording : Recording
-
-    Returns
-    -------
-    dict of str to ndarray, float64, shape (T, n, n)
-    """
+    """Information of every frame about the states of a known motion, mean over the seeds, by what is measured."""
     states, inputs = recording.states[..., : model.motion.order], recording.inputs
     return {
         "moments": moment_information(model, states, inputs, (1, 2)).mean(1),
@@ -122,24 +85,7 @@ def recorded_information(model: BlurModel, recording: Recording) -> dict[str, Fl
 
 
 def error_bound(model: BlurModel, cov: Float64Array, information: ArrayLike, burn_in: int, of_state: bool) -> float:
-    """Bound on the root mean square error of the state, or of the output within the exposure.
-
-    Parameters
-    ----------
-    model : BlurModel
-        With a linear motion.
-    cov : ndarray, float64, shape (n, n)
-        Covariance of the state before the first frame.
-    information : array_like, shape (T, n, n)
-        Mean information of every frame.
-    burn_in : int
-        Frames left out at the start.
-    of_state : bool
-
-    Returns
-    -------
-    float
-    """
+    """Bound on the root mean square error of the state, or of the output within the exposure, after the burn-in."""
     motion = model.motion
     assert isinstance(motion, LiftedSystem)
     covariances = posterior_bound(motion.A, motion.Q, cov, information)[burn_in:]

@@ -265,20 +265,7 @@ def mirror(seeds: Sequence[int], params: MirrorParams = MIRROR) -> Experiment:
 
 
 def follow(contestant: Contestant, recording: Recording, of_state: bool) -> Track:
-    """Run an observer over a recording and measure its errors.
-
-    Parameters
-    ----------
-    contestant : Contestant
-    recording : Recording
-    of_state : bool
-        Whether the error is the norm of the error of the state, or the root mean square error of the output within
-        the exposure.
-
-    Returns
-    -------
-    Track
-    """
+    """Run an observer over a recording; measure the norm of the error of the state, or the error of the output."""
     motion, start = contestant.model.motion, contestant.start
     seeds = recording.states.shape[1]
     prior = Gaussian(np.broadcast_to(start.mean, (seeds, start.mean.size)), start.cov)
@@ -301,21 +288,7 @@ def follow(contestant: Contestant, recording: Recording, of_state: bool) -> Trac
 
 
 def score(tracks: Mapping[str, Track], bounds: Mapping[str, float], burn_in: int) -> dict[str, Score]:
-    """Compare observers with the first of them and with the bounds.
-
-    Parameters
-    ----------
-    tracks : mapping of str to Track
-        All over the same recordings.
-    bounds : mapping of str to float
-        Cramér–Rao bound for some of the observers.
-    burn_in : int
-        Frames left out at the start.
-
-    Returns
-    -------
-    dict of str to Score
-    """
+    """Compare observers on the same recordings with the first of them and with the bounds known for some of them."""
     reference = next(iter(tracks.values())).errors[burn_in:].mean(0)
     return {
         name: _score_one(track, reference, bounds.get(name, float("nan")), burn_in) for name, track in tracks.items()

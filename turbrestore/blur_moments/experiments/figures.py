@@ -39,23 +39,10 @@ def new_figure() -> Any:
 
 
 def draw_wavefront(experiment: Experiment) -> bytes:
-    """Figures 4 to 7 of paper 1.
+    """Draw figures 4 to 7 of paper 1 as PNG.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        Of :func:`~.experiments.wavefront`.
-
-    Returns
-    -------
-    bytes
-        PNG: estimates by the first and by the second moment; error after every frame; error at the fast rate;
-        estimates within one exposure.
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
+    They show the estimates by the first and by the second moment, the error after every frame, the error at the fast
+    rate, and the estimates within one exposure.
     """
     figure, panels = _four_panels("Wavefront sensor: slope θ, first seed")
     t, steps = _times(experiment), experiment.timing.frame_steps
@@ -67,7 +54,7 @@ def draw_wavefront(experiment: Experiment) -> bytes:
     for name in ("O1", "O3", "image_map"):
         panels[1].plot(experiment.errors[name], **_style(name))
         panels[2].plot(t, experiment.estimates[name].ravel() - truth, **_style(name))
-    _label(panels[1], f"Figure 5: error of the state, mean of {experiment.seeds} seeds", "frame", "‖x̂ − x‖")
+    _label(panels[1], f"Figure 5: mean error, {experiment.seeds} seeds", "frame", "‖x̂ − x‖")
     _label(panels[2], "Figure 6: error at the fast rate", "time, s", "θ̂ − θ")
     last = slice(truth.size - steps, truth.size)
     panels[3].plot(t[last], truth[last], "k", label="truth")
@@ -78,24 +65,11 @@ def draw_wavefront(experiment: Experiment) -> bytes:
 
 
 def draw_mirror(experiment: Experiment) -> bytes:
-    """Figures 4 to 7 of paper 2.
+    """Draw figures 4 to 7 of paper 2 as PNG.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        Of :func:`~.experiments.mirror`.
-
-    Returns
-    -------
-    bytes
-        PNG: overview with the exposures shaded; the frame period in which the error of O1 is the median; error at the
-        start of the exposures; error over the frame periods.  Estimates use the frame of their own period, which
-        is available only after the readout.
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
+    They show an overview with the exposures shaded, the frame period in which the error of O1 is the median, the error
+    at the start of the exposures, and the error over the frame periods.  Estimates use the frame of their own period,
+    which is available only after the readout.
     """
     figure, panels = _four_panels("Steered mirror: output y, first seed")
     t, steps, exposed = _times(experiment), experiment.timing.frame_steps, experiment.timing.exposure_steps

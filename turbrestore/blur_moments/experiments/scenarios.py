@@ -172,21 +172,7 @@ class Recording:
 
 
 def wavefront_model(params: WavefrontParams = WAVEFRONT) -> BlurModel:
-    """System and sensor of paper 1, section VI: ``ẍ = −20 x − 30 ẋ + 20 u``, exposed all the time.
-
-    Parameters
-    ----------
-    params : WavefrontParams
-
-    Returns
-    -------
-    BlurModel
-
-    Examples
-    --------
-    >>> wavefront_model().motion.timing.frame_steps
-    200
-    """
+    """System and sensor of paper 1, section VI: ``ẍ = −20 x − 30 ẋ + 20 u``, exposed all the time."""
     timing = ExposureTiming(fast_period=1e-3, exposure=0.2, readout=0.0, frame_period=0.2)
     disturbance = (params.slope_disturbance, params.rate_disturbance)
     motion = _two_states([[0.0, 1.0], [-20.0, -30.0]], [0.0, 20.0], timing, disturbance)
@@ -198,19 +184,6 @@ def mirror_model(params: MirrorParams = MIRROR) -> BlurModel:
     """Nominal mirror and camera of paper 2, section V, with the states y and ẏ.
 
     The states of the paper are ``x₂ = y`` and ``x₁ = ẏ + 13.6 y``.
-
-    Parameters
-    ----------
-    params : MirrorParams
-
-    Returns
-    -------
-    BlurModel
-
-    Examples
-    --------
-    >>> mirror_model().motion.timing.exposure_steps
-    100
     """
     motion = mirror_oscillator(params)
     nominal, omega = motion.nominal, motion.nominal.frequency
@@ -222,21 +195,7 @@ def mirror_model(params: MirrorParams = MIRROR) -> BlurModel:
 
 
 def mirror_oscillator(params: MirrorParams = MIRROR) -> OscillatorMotion:
-    """Mirror of paper 2, ω = 34 rad/s and ζ = .2, with the parameters of its plant among the states.
-
-    Parameters
-    ----------
-    params : MirrorParams
-
-    Returns
-    -------
-    OscillatorMotion
-
-    Examples
-    --------
-    >>> mirror_oscillator().order
-    5
-    """
+    """Mirror of paper 2, ω = 34 rad/s and ζ = .2, with the parameters of its plant among the states."""
     timing = ExposureTiming(fast_period=1e-3, exposure=0.1, readout=0.35, frame_period=0.45, trigger=0.09)
     # Small variances of the parameters keep the filter from relying on its first linearisation for ever.
     spread = [params.output_disturbance**2, params.rate_disturbance**2, 1e-6, 1e-6, 1e-6]
@@ -244,23 +203,7 @@ def mirror_oscillator(params: MirrorParams = MIRROR) -> OscillatorMotion:
 
 
 def record_wavefront(seeds: Sequence[int], params: WavefrontParams = WAVEFRONT) -> Recording:
-    """Simulate the wavefront and its frames.
-
-    Parameters
-    ----------
-    seeds : sequence of int
-        Each determines the phases, start, disturbance and noise of one run.
-    params : WavefrontParams
-
-    Returns
-    -------
-    Recording
-
-    Examples
-    --------
-    >>> record_wavefront([7], WavefrontParams(frames=3, burn_in=1)).frames.shape
-    (3, 1, 100)
-    """
+    """Simulate the wavefront and its frames; a seed determines phases, start, disturbance and noise of one run."""
     model, count = wavefront_model(params), params.frames
     _, cov = steady_kalman(model)
     scale = np.array([params.slope_disturbance, params.rate_disturbance])
@@ -277,20 +220,7 @@ def record_wavefront(seeds: Sequence[int], params: WavefrontParams = WAVEFRONT) 
 def record_mirror(seeds: Sequence[int], params: MirrorParams = MIRROR) -> Recording:
     """Simulate the mirror and its frames; the states are (y, ẏ, ln g/g₀, ln ω/ω₀, ln ζ/ζ₀).
 
-    Parameters
-    ----------
-    seeds : sequence of int
-        Each determines the plant, tones, start, disturbance and noise of one run.
-    params : MirrorParams
-
-    Returns
-    -------
-    Recording
-
-    Examples
-    --------
-    >>> record_mirror([7], MirrorParams(frames=3, burn_in=1)).states.shape
-    (3, 1, 5)
+    A seed determines plant, tones, start, disturbance and noise of one run.
     """
     model, truth, count = mirror_model(params), mirror_oscillator(params), params.frames
     _, cov = steady_kalman(model)
@@ -309,18 +239,8 @@ def record_mirror(seeds: Sequence[int], params: MirrorParams = MIRROR) -> Record
 def largest_deviation(plant: Float64Array, nominal: Oscillator) -> float:
     """Largest deviation of the frequency response of a plant from the nominal one, in dB, from .2 to 10 Hz.
 
-    Parameters
-    ----------
-    plant : ndarray, float64, shape (3,)
-        ln g/g₀, ln ω/ω₀, ln ζ/ζ₀.
-    nominal : Oscillator
+    The plant is given as ln g/g₀, ln ω/ω₀ and ln ζ/ζ₀.
 
-    Returns
-    -------
-    float
-
-    Examples
-    --------
     >>> round(largest_deviation(np.array([np.log(2.0), 0.0, 0.0]), Oscillator(1.0, 34.0, 0.2)), 2)
     6.02
     """
