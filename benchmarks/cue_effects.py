@@ -23,13 +23,13 @@ from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.dynamics.displacement import with_displacement
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.dynamics.flow_model import FlowDynamics
-from turbrestore.filtering.alternating import FilterParams, filter_frames
+from turbrestore.filtering.alternating import filter_frames
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import compare
 from turbrestore.registration.centroid import find_centroid
 
 SETTINGS = DeconvolutionParams()
-VARIANTS = ("default", "frame noise by blur", "displacement cue", "blur bounds")
+VARIANTS = ("default", "displacement cue", "blur bounds")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +74,11 @@ def measure(clip: Clip) -> Effects:
     cue = displacement_variance(training, typical_noise(training))
     motion = with_displacement(flows, *displacement_maps(training))
 
-    def fuse(dynamics: FlowDynamics, params: FilterParams) -> FloatArray:
-        return filter_frames(frames, centroid.image, dynamics, params, known_flows=centroid.flows).image
+    def fuse(dynamics: FlowDynamics) -> FloatArray:
+        return filter_frames(frames, centroid.image, dynamics, known_flows=centroid.flows).image
 
-    plain = fuse(flows, FilterParams())
-    by_blur, moved = fuse(flows, FilterParams(frame_noise="blur")), fuse(motion, FilterParams())
-    images = dict(zip(VARIANTS, (plain, by_blur, moved, plain), strict=True))
+    plain, moved = fuse(flows), fuse(motion)
+    images = dict(zip(VARIANTS, (plain, moved, plain), strict=True))
     estimate = estimate_blur(plain, exponent=KOLMOGOROV)
     bounds = bound_blur(plain, frames.mean(axis=0), training, len(frames), KOLMOGOROV)
     after, widths = {}, {}
