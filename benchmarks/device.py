@@ -34,6 +34,7 @@ from turbrestore.registration.flow import FlowParams, estimate_flow
 from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.device import PROCESSOR, find_device
+from turbrestore.runtime.runtime import Runtime
 from turbrestore.settings import RestoreParams
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
@@ -86,8 +87,8 @@ def stages(clip: Clip, device: str) -> list[Stage]:
         return weights_on_device(image, NonlocalParams(h=0.1), name).root.cpu()
 
     def fuse(name: str) -> object:
-        settings = FilterParams(inner_iterations=1, device=name)
-        return filter_frames(clip.frames, image, dynamics, settings, known_flows=clip.flows)
+        settings, runtime = FilterParams(inner_iterations=1), Runtime(device=name)
+        return filter_frames(clip.frames, image, dynamics, settings, known_flows=clip.flows, runtime=runtime)
 
     return [
         Stage("flow (tvl1)", lambda name: tvl1_flows(grey, referred[name]), flow, FRAMES),

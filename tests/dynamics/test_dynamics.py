@@ -13,7 +13,7 @@ from flow_systems import (
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.dynamics import dynamic_texture as module
-from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
+from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify, identify_memory, modes_memory
 from turbrestore.dynamics.flow_model import flow_of, predict_flow, project
 from turbrestore.dynamics.simulate import simulate
 
@@ -240,3 +240,10 @@ def test_unusable_flows_are_a_clear_error(flows, words):
 def test_unusable_settings_are_a_clear_error(settings, words):
     with pytest.raises(ConfigurationError, match=words):
         DynamicsParams(**settings)
+
+
+def test_memory_follows_the_number_of_flows_and_states():
+    assert identify_memory((9, 10, 10), 6) == 70 * 100 * 6
+    assert identify_memory((9, 1000, 1000, 3), 6) == 140e6
+    assert modes_memory((90, 10, 10), 60) == 8 * 100 * 20
+    assert modes_memory((90, 10, 10), 60, DynamicsParams(rank=70)) == 8 * 100 * 59

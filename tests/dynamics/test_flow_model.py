@@ -13,7 +13,14 @@ from flow_systems import (
 
 from turbrestore.core.errors import DataError
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
-from turbrestore.dynamics.flow_model import flow_of, predict_flow, project, project_deviation
+from turbrestore.dynamics.flow_model import (
+    SUMMED,
+    add_products,
+    flow_of,
+    predict_flow,
+    project,
+    project_deviation,
+)
 from turbrestore.dynamics.simulate import simulate, stable_system
 from turbrestore.runtime.scratch import drop_pages, new_stack
 
@@ -92,6 +99,22 @@ def test_a_state_is_the_same_from_a_file_and_piece_by_piece(rng, tmp_path, monke
     kept, filed = project(whole, flows[3]), project(replace(whole, C=mapped), flows[3])
     np.testing.assert_array_equal(kept, filed)
     np.testing.assert_allclose(kept, at_once, atol=1e-5)
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("shape", [(2, 3), (16, SUMMED // 32), (31, 45)])
+@pytest.mark.parametrize("rank", [0, 1, 7])
+def test_a_flow_is_projected_as_the_plain_loop_does(rng, shape, rank, order):
+    """On fewer products than are summed at once, on as many, and on more; modes in rows and in columns."""
+    size = 2 * shape[0] * shape[1]
+    modes = np.asarray(rng.normal(0, size**-0.5, (size, rank)), np.float32, order)
+    dynamics = replace(identify(np.zeros((3, *shape, 2))), C=modes)
+    flow, plain = rng.normal(0, 2, (*shape, 2)).astype(np.float32), np.zeros(rank)
+    add_products.py_func(modes.T, flow.reshape(-1), 0, size, plain)
+    found = project_deviation(dynamics, flow)
+    assert found.dtype == np.float64
+    assert found == pytest.approx(plain, abs=1e-4)
+    assert found == pytest.approx(flow.reshape(-1).astype(np.float64) @ modes.astype(np.float64), abs=1e-4)
 
 
 # Pages of a mapped file that are resident are counted by the system alone, and only Linux tells them.

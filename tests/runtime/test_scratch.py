@@ -20,6 +20,7 @@ from turbrestore.runtime.scratch import (
     drop_pages,
     iter_frames,
     iter_parts,
+    iter_slices,
     mean_of,
     new_stack,
     to_scratch,
@@ -147,3 +148,18 @@ def test_an_array_is_moved_to_a_file_once(tmp_path):
     copy = kept.copy()
     assert to_scratch(copy, tmp_path) is not copy
     assert to_scratch(array) is array
+
+
+@needs_proc
+def test_work_in_slices_takes_a_slice_of_each_array_at_a_time(tmp_path):
+    read, written = (new_stack((40, 250_000), tmp_path) for _ in range(2))
+    read[:] = 1
+    drop_pages(read)
+    before, most = resident(), 0
+    for rows in iter_slices(40, 4, read, written):
+        written[rows] = 2 * read[rows]
+        most = max(most, resident() - before)
+    # Each array takes 40 MB.
+    assert most < 24e6
+    assert resident() - before < 4e6
+    assert (written == 2).all()

@@ -52,7 +52,6 @@ from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import DataError
 from ..dynamics.flow_model import FlowDynamics
 from ..registration.flow import FlowParams, iterate_flows
-from ..runtime.device import memory_of
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from .array_backend import array_backend
@@ -72,7 +71,7 @@ Flows = FloatArray | Sequence[FloatArray | None]
 class _Position:
     """State after the blocks that are done, and the block that has begun.
 
-    ``image`` is where flows are measured from next: it contains the block that has begun too.
+    ``image`` is the reference of the flows that are measured next; it contains the block that has begun too.
     """
 
     state: FilterState
@@ -212,27 +211,27 @@ def _filter_blocks(
     settings: PassSettings,
 ) -> Generator[FilterStep, None, _Position]:
     """Do steps 1 to 4 of the module docstring for one block after the other."""
-    iterations, size, last = params.inner_iterations, params.block, params.inner_iterations == 1
+    once, size = params.inner_iterations == 1, params.block
     if at.block:
         # The flows of the first block are known in its first iteration.
-        at = yield from _iterate(at, settings, known, settle=last, from_known=True)
-        if last:
-            yield FilterStep(at.flows_measured, _checkpoint(at, at.image))
+        at = yield from _iterate(at, settings, known, settle=once, from_known=True)
+        if once:
+            yield FilterStep(at.flows_measured, FilterCheckpoint(at.state, at.records, at.image))
     while True:
         if not at.block:
-            at = replace(at, block=deque(islice(stream, size)))
+            known, at = (), replace(at, block=deque(islice(stream, size)))
             if not at.block:
                 return at
-            known = ()
-            if not last:
+            if not once:
                 at = yield from _iterate(at, settings)
-        for _ in range(iterations - 2):
+        for _ in range(params.inner_iterations - 2):
             at = yield from _iterate(at, settings, known)
-        seen_from = at.image
-        # The last iteration of this block, together with the first of the next: threads wait at the end of a pass.
-        at = yield from _iterate(at, settings, known, settle=True, following=islice(stream, 0 if last else size))
+        # The last iteration of this block and the first of the next are one pass, as threads idle at the end of each.
+        reference = at.image
+        at = yield from _iterate(at, settings, known, settle=True, following=islice(stream, 0 if once else size))
         known = ()
-        yield FilterStep(at.flows_measured, _checkpoint(at, at.image if last else seen_from))
+        reference = at.image if once else reference
+        yield FilterStep(at.flows_measured, FilterCheckpoint(at.state, at.records, reference))
 
 
 def _iterate(
@@ -243,34 +242,34 @@ def _iterate(
     following: Iterable[FloatArray | None] = (),
     from_known: bool = False,
 ) -> Generator[FilterStep, None, _Position]:
-    """One iteration over the block that has begun, the last if ``settle``, and over the frames that follow it."""
-    settled = len(at.block) if settle else 0
+    """Run one iteration over the block that has begun, its last if ``settle``, and over the frames that follow it."""
+    settled, backend = len(at.block) if settle else 0, settings.backend
     frames, starts = chain(_drain(at.block), following), chain(known, repeat(None))
-    image = done = settings.backend.load_pixels(at.state.image)
+    reference = None if from_known else at.image
+    image = settled_image = backend.load_pixels(at.state.image)
     flow, records, block, flows_measured = at.state.flow, list(at.records), deque[Frame](), at.flows_measured
-    measure_from = None if from_known else at.image
-    for number, tracked in enumerate(pass_over(frames, starts, measure_from, at.state.flow, settled, settings)):
+    for number, tracked in enumerate(pass_over(frames, starts, reference, at.state.flow, settled, settings)):
         image, record = _fuse(image, tracked, settings)
         if number < settled:
-            done, flow = image, tracked.state
+            settled_image, flow = image, tracked.state
             records.append(record)
         else:
             block.append(tracked.frame)
         if not from_known:
             flows_measured += 1
             yield FilterStep(flows_measured)
-    state = FilterState(settings.backend.store_pixels(done), flow)
-    return _Position(state, tuple(records), settings.backend.store_image(image), block, flows_measured)
+    state = FilterState(backend.store_pixels(settled_image), flow)
+    return _Position(state, tuple(records), backend.store_image(image), block, flows_measured)
 
 
 def _fuse(image: PixelStacks, tracked: TrackedFrame, settings: PassSettings) -> tuple[PixelStacks, FrameRecord]:
     """Update the image by a frame (eqs. 14a, 14c, 15 and 16)."""
     if tracked.registered is None:
         return image, FrameRecord(tracked.state.mean, 0.0, tracked.innovation, np.nan, 0.0)
-    with memory_of(settings.backend.device, "take a smaller --roi"):
+    with settings.backend.memory():
         frame = tracked.registered()
-        image, gain = update_pixels(image, frame.channels, frame.noise, settings.drift)
-        gain, information = float(gain.mean()), float((1 / frame.noise).mean())
+        image, gains = update_pixels(image, frame.channels, frame.noise, settings.drift)
+        gain, information = float(gains.mean()), float((1 / frame.noise).mean())
     return image, FrameRecord(tracked.state.mean, gain, tracked.innovation, frame.sharpness, information)
 
 
@@ -278,10 +277,6 @@ def _drain(block: deque[Frame]) -> Iterator[Frame]:
     """Hand over the frames of a block, so that no two blocks are in memory."""
     while block:
         yield block.popleft()
-
-
-def _checkpoint(at: _Position, reference: FloatArray) -> FilterCheckpoint:
-    return FilterCheckpoint(at.state, at.records, reference)
 
 
 def _settings(
@@ -307,11 +302,16 @@ def _settings(
     share = np.zeros_like(statistics.motion_share) if params.residual == "drop" else statistics.motion_share
     statistics = replace(statistics, motion_share=share)
     backend = array_backend(runtime.device)
-    with memory_of(backend.device, "take a smaller --roi"):
-        statistics = backend.load_statistics(statistics)
-        both = backend.ops.load(np.stack([share, share], axis=-1))
-    sharpness, drift = params.sharpness, params.image_drift
-    return PassSettings(dynamics, statistics, both, sharpness, drift, flow_params, runtime, backend)
+    return PassSettings(
+        dynamics=dynamics,
+        statistics=backend.load_statistics(statistics),
+        motion_share=backend.load(np.stack([share, share], axis=-1)),
+        sharpness=params.sharpness,
+        drift=params.image_drift,
+        flow=flow_params,
+        runtime=runtime,
+        backend=backend,
+    )
 
 
 def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params: FilterParams) -> FilterState:

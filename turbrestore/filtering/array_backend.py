@@ -7,13 +7,15 @@ how a frame is warped by the estimated flow, ``I ∘ ŵ`` (paper 3, eq. 15).
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..registration.warp import inside, warp
-from ..runtime.device import PROCESSOR, find_device
+from ..runtime.device import PROCESSOR, find_device, memory_of
 from ..runtime.image_stacks import Stack, StackOps, numpy_ops, torch_ops, warp_stack
 from .frame_noise import FrameStatistics
 from .image_state import PixelGaussian, PixelStacks
@@ -42,13 +44,21 @@ class ArrayBackend:
 
     @property
     def is_cpu(self) -> bool:
-        """Whether it is NumPy, whose operations run side by side in threads."""
+        """Whether the arrays are NumPy's, whose operations run side by side in threads."""
         return self.device == PROCESSOR
+
+    def memory(self) -> AbstractContextManager[None]:
+        """Context in which a lack of memory on the device is a ConfigurationError."""
+        return memory_of(self.device, "take a smaller --roi")
+
+    def load(self, array: NDArray[np.floating]) -> Stack:
+        """Bring an array to the device, float32."""
+        with self.memory():
+            return self.ops.load(np.asarray(array, np.float32))
 
     def load_pixels(self, pixels: PixelGaussian) -> PixelStacks:
         """Bring ρ̂ and Σ to the device."""
-        mean, variance = np.asarray(pixels.mean, np.float32), np.asarray(pixels.variance, np.float32)
-        return PixelStacks(self.ops.load(_channels_first(mean)), self.ops.load(variance))
+        return PixelStacks(self.load(_channels_first(pixels.mean)), self.load(pixels.variance))
 
     def store_pixels(self, pixels: PixelStacks) -> PixelGaussian:
         """Bring ρ̂ and Σ back to NumPy arrays."""
@@ -62,13 +72,13 @@ class ArrayBackend:
     def load_statistics(self, statistics: FrameStatistics) -> FrameStatistics:
         """Bring the maps that Z follows from to the device."""
         names = ("mean_sharpness", "score_scale", "score_variance", "mean_frame", "deviation")
-        maps = {name: self.ops.load(getattr(statistics, name)) for name in names}
+        maps = {name: self.load(getattr(statistics, name)) for name in names}
         along, across = statistics.template
-        return replace(statistics, template=(self.ops.load(along), self.ops.load(across)), **maps)
+        return replace(statistics, template=(self.load(along), self.load(across)), **maps)
 
 
 def array_backend(device: str) -> ArrayBackend:
-    """Backend of a device.
+    """Return the backend of a device.
 
     Parameters
     ----------
@@ -119,5 +129,5 @@ def _within(position: Stack, length: int) -> Stack:
     return (1 - (-position).maximum(position - (length - 1))).clamp(0, 1)
 
 
-def _channels_first(image: FloatArray) -> FloatArray:
+def _channels_first(image: NDArray[np.floating]) -> NDArray[np.floating]:
     return image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)

@@ -143,5 +143,10 @@ def estimate_flow(modelled: Stack, measured: Stack, motion_share: Stack) -> Stac
     Returns
     -------
     array, float32, shape (H, W, 2)
+
+    Examples
+    --------
+    >>> float(estimate_flow(np.float32(1), np.float32(2), np.float32(0.75)))
+    1.75
     """
     return modelled + motion_share * (measured - modelled)

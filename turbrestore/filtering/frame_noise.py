@@ -132,8 +132,8 @@ def frame_noise_variance(
     squared = excess * excess
     score = (smooth(projection, statistics.window, ops) - statistics.mean_sharpness) * statistics.score_scale
     score = arrays.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)
-    # Something other than the scene may have more contrast than the scene.
-    score = arrays.where(score > 0, score / squared, score)
+    # z / e² where z > 0: something other than the scene may have more contrast than the scene.
+    score = arrays.minimum(score, score / squared)
     # For a normal score of variance v the mean of exp(β z − β² v / 2) is one: the information per frame stays 1 / Z₀.
     exponent = statistics.score_variance * (beta**2 / 2) - score * beta
     exponent = arrays.clip(exponent + invalid_mask(flow, seen, ops) * _LOG_INVALID, None, _LARGEST_EXPONENT)
