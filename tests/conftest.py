@@ -103,5 +103,5 @@ def varied() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @pytest.fixture
 def no_compiler(monkeypatch):
     """What a plan chooses at a limit depends on what Numba takes, and so on whether it is installed."""
-    for module in ("memory_plan", "deconvolution.deconvolution_memory"):
+    for module in ("memory_plan",):
         monkeypatch.setattr(f"turbrestore.{module}.can_compile", lambda: False)

@@ -8,32 +8,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 
 from turbrestore import settings as restoration_module
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients
-from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
-from turbrestore.deconvolution.nonlocal_tv import (
-    NonlocalParams,
-    nonlocal_divergence,
-    nonlocal_gradient,
-    nonlocal_magnitude,
-    nonlocal_weights,
-    project_to_unit,
-)
-from turbrestore.deconvolution.primal_dual import WINDOW
-from turbrestore.deconvolution.torch_weights import (
-    device_divergence,
-    device_gradient,
-    device_magnitude,
-    device_norm_squared,
-    device_projection,
-    weights_on_device,
-)
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import FilterParams, filter_frames
 from turbrestore.footage.frame_selection import Share
@@ -47,7 +28,7 @@ from turbrestore.runs.resumption import stage_facts
 from turbrestore.runtime import device as device_module
 from turbrestore.runtime.device import TORCH_BYTES, check_device, explain_device, find_device, memory_of, needs_torch
 from turbrestore.settings import RestoreParams, explain_devices, place_stages
-from turbrestore.synthesis.scenes import SCENES, resolution_chart
+from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 from turbrestore_cli.__main__ import main
 
@@ -246,7 +227,6 @@ class TestMemory:
             ("registration.flow.tvl1_flows", "lower --flow.tvl1.batch", {"flow": FlowParams(method="tvl1")}),
             ("registration.warp.warp_stack", "take a smaller --roi", {}),
             ("filtering.torch_fusion.warp_stack", "take a smaller --roi", {}),
-            ("deconvolution.torch_deconvolution.weights_on_device", "take a smaller --roi", {}),
         ],
     )
     def test_what_to_do_is_said_where_it_is_not_enough(self, device, place, advice, settings, monkeypatch):
@@ -317,105 +297,6 @@ class TestFusion:
         flow = smooth_flows(1, 50, 64, np.random.default_rng(6), SmoothFlowParams(rms=6.0, correlation_length=5.0))[0]
         for image in (scene, coloured(scene)):
             assert np.abs(warp(image, flow) - warp(image, flow, device=device)).max() < 1e-5
-
-
-GUIDES = {
-    "chart": (resolution_chart(64, 70), NonlocalParams()),
-    "noise": (np.random.default_rng(7).random((40, 33)).astype(np.float32), NonlocalParams(3, 1.0, 7, 4, 8)),
-    "nearest": (np.random.default_rng(8).random((9, 14)).astype(np.float32), NonlocalParams(best=0)),
-    "best": (np.random.default_rng(9).random((12, 13)).astype(np.float32), NonlocalParams(best=10, nearest=0)),
-    "flat": (np.zeros((20, 20), np.float32), NonlocalParams(search=5)),
-    "line": (np.linspace(0, 1, 8, dtype=np.float32)[None], NonlocalParams(patch=1, search=5, best=2, nearest=0)),
-}
-
-
-@on_devices
-@pytest.mark.parametrize("name", GUIDES)
-class TestWeights:
-    def test_graph_is_that_of_the_processor(self, device, name):
-        here, there = nonlocal_weights(*GUIDES[name]), weights_on_device(*GUIDES[name], device)
-        assert (here.tails == there.tails.cpu().numpy()).all()
-        assert (here.heads == there.heads.cpu().numpy()).all()
-        assert there.root.cpu().numpy() ** 2 == pytest.approx(here.weights, rel=1e-3, abs=1e-6)
-        assert device_norm_squared(there) == pytest.approx(here.norm_squared, rel=1e-5)
-
-    def test_operators_are_those_of_the_processor(self, device, name):
-        import torch
-
-        guide, params = GUIDES[name]
-        here, there = nonlocal_weights(guide, params), weights_on_device(guide, params, device)
-        rng = np.random.default_rng(10)
-        u = rng.random(guide.shape).astype(np.float32)
-        v = rng.normal(size=(2, len(here.weights))).astype(np.float32)
-        a, b = torch.from_numpy(u).to(device), torch.from_numpy(v).to(device)
-        for expected, found in (
-            (nonlocal_gradient(here, u), device_gradient(there, a)),
-            (nonlocal_divergence(here, v), device_divergence(there, b)),
-            (nonlocal_magnitude(here, v), device_magnitude(there, b)),
-            (project_to_unit(here, v), device_projection(there, b)),
-        ):
-            assert found.cpu().numpy() == pytest.approx(expected, abs=2e-4)
-
-
-def blurred(scene, sigma=1.5, seed=11):
-    noise = np.random.default_rng(seed).normal(0, 0.005, scene.shape)
-    return np.clip(cv2.GaussianBlur(scene, (0, 0), sigma) + noise, 0, 1).astype(np.float32)
-
-
-@on_devices
-class TestDeconvolution:
-    @pytest.mark.parametrize(
-        "settings",
-        [
-            {"method": "nltv"},
-            {"method": "nltv", "sharpen_guide": False, "boundary": "periodic"},
-            {"method": "tv"},
-            {"method": "wiener"},
-            {"method": "tikhonov", "boundary": "periodic"},
-        ],
-        ids=lambda settings: "-".join(map(str, settings.values())),
-    )
-    def test_image_and_record_are_those_of_the_processor(self, device, settings):
-        scene = SCENES["camera"](SIZE, SIZE + 3)
-        image = blurred(scene)
-        params = DeconvolutionParams(**settings)
-        steps = []
-        here = deconvolve(image, 1.5, params)
-        there = deconvolve(image, 1.5, replace(params, device=device), progress=steps.append)
-        assert abs(psnr(here.image, scene) - psnr(there.image, scene)) < 0.002
-        assert np.abs(here.image - there.image).max() < 5e-3
-        # So many are judged together.
-        window = WINDOW if params.method in ("nltv", "tv") else ConjugateGradients.window
-        assert abs(here.iterations - there.iterations) <= window
-        assert sum(steps) == there.iterations
-        assert there.converged == here.converged
-        assert there.objective[-1] == pytest.approx(here.objective[-1], rel=1e-4)
-        assert there.recorded[0] == here.recorded[0]
-        assert there.changes[0] == pytest.approx(here.changes[0], rel=1e-2, abs=1e-6)
-
-    @pytest.mark.parametrize("channels", ["luminance", "each"])
-    def test_colour_and_a_guide(self, device, channels):
-        scene = coloured(SCENES["camera"](SIZE, SIZE))
-        image, guide = blurred(scene), blurred(scene, seed=12)
-        params = DeconvolutionParams(channels=channels, iterations=30)
-        here, there = (deconvolve(image, 1.5, replace(params, device=d), guide) for d in ("cpu", device))
-        assert abs(psnr(here.image, scene) - psnr(there.image, scene)) < 0.002
-
-    @pytest.mark.parametrize("iterations", [1, 3])
-    def test_the_first_iterations_are_those_of_the_processor(self, device, iterations):
-        image = blurred(SCENES["camera"](SIZE, SIZE))
-        params = DeconvolutionParams(method="tv", iterations=iterations)
-        here, there = (deconvolve(image, 1.5, replace(params, device=d)) for d in ("cpu", device))
-        assert np.abs(here.image - there.image).max() < 2e-4
-
-    def test_a_sampled_blur(self, device):
-        scene = SCENES["camera"](SIZE, SIZE)
-        psf = np.zeros((5, 7))
-        psf[2, 1:6] = 0.2
-        image = np.clip(cv2.filter2D(scene, -1, psf), 0, 1)
-        params = DeconvolutionParams(method="tv", iterations=40)
-        here, there = (deconvolve(image, psf, replace(params, device=d)) for d in ("cpu", device))
-        assert np.abs(here.image - there.image).max() < 1e-3
 
 
 @on_devices

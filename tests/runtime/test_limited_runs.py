@@ -15,9 +15,7 @@ from memory_limits import least_limit
 from conftest import make_sequence
 from turbrestore import pipeline
 from turbrestore.core.errors import StorageError
-from turbrestore.deconvolution.deconvolution_memory import DeconvolutionWork, Room
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
-from turbrestore.deconvolution.nonlocal_tv import NonlocalParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import plan_memory
@@ -119,28 +117,6 @@ def test_a_limit_for_a_run_that_does_not_deconvolve(frames):
     limit = limit_that(frames.shape, lambda plan: plan.in_file, wanted=24, flow=QUICK.flow, until="centroid")
     settings = replace(QUICK, train=24, until="centroid", deconvolution=DeconvolutionParams(), memory_limit=limit)
     assert pipeline.restore(frames, settings).train == 24
-
-
-def test_room_is_asked_for_all_files(frames, tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(pipeline, "check_space", lambda path, size: asked.append((path.parent, size)))
-    settings = replace(QUICK, deconvolution=DeconvolutionParams(sigma=1.0, iterations=2, memory="1MB"))
-    pipeline.restore(frames, settings, scratch=tmp_path)
-    # The margin of four widths is part of it.
-    work = DeconvolutionWork((104, 104), 1, "nltv", NonlocalParams())
-    assert asked == [(tmp_path, int(work.files(Room(1, True, True))))]
-
-
-def test_pairs_lie_in_the_folder_that_is_named(frames, tmp_path, monkeypatch):
-    def full(shape, folder):
-        raise StorageError(f"{folder} has no room")
-
-    for module in ("deconvolution.nonlocal_tv", "deconvolution.nonlocal_penalty"):
-        with monkeypatch.context() as patch:
-            patch.setattr(f"turbrestore.{module}.new_stack", full)
-            settings = replace(QUICK, deconvolution=DeconvolutionParams(sigma=1.0, memory="1MB"))
-            with pytest.raises(StorageError, match=rf"^{tmp_path} has no room"):
-                pipeline.restore(frames, settings, scratch=tmp_path)
 
 
 @pytest.mark.parametrize(("limit", "kept", "tight"), [(None, 1, 0), ("20GB", 0, 0), ("400MB", 0, 1)])

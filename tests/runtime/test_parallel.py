@@ -221,15 +221,13 @@ def test_a_crew_may_be_called_within_itself():
 def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypatch, method):
     # Several strips and several sums of everything.
     monkeypatch.setattr("turbrestore.registration.warp._STRIP", 1000)
-    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_tv.STRIP_PIXELS", 700)
     monkeypatch.setattr("turbrestore.dynamics.flow_subspace._STRIP_BYTES", 1 << 16)
-    monkeypatch.setattr("turbrestore.deconvolution.strip_grid._ONE_STRIP", 1)
-    monkeypatch.setattr("turbrestore.deconvolution.strip_grid._STRIP", 700)
-    monkeypatch.setattr("turbrestore.deconvolution.deconvolve._SIDE_BY_SIDE", 0)
+    monkeypatch.setattr("turbrestore.deconvolution.deconvolve._PARALLEL_PIXELS", 0)
+    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_tv._PARALLEL_PIXELS", 0)
     frames = make_sequence(seed=3, count=28).frames[:, :64, :80]
 
     def run(threads):
-        for module in ("runtime.threads", "deconvolution.deconvolve", "deconvolution.nonlocal_tv", "memory_plan"):
+        for module in ("runtime.threads", "memory_plan"):
             monkeypatch.setattr(f"turbrestore.{module}.available_cores", lambda: threads)
         return restore(frames, RestoreParams(train=12, flow=FlowParams(method, threads=threads)))
 
