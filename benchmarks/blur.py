@@ -49,9 +49,7 @@ def main() -> int:
             found[estimator].append((sigma, width))
             cells.append(f"{width:.2f}")
         print(f"| {name} | {sigma} | {noise} | " + " | ".join(cells) + " |", flush=True)
-    print(
-        "\n| estimator | median error | 90th percentile | largest overestimate | widest if sharp | s per image |"
-    )
+    print("\n| estimator | median error | 90th percentile | largest overestimate | widest if sharp | s per image |")
     print("|---|---|---|---|---|---|")
     broken = False
     for estimator, pairs in found.items():
