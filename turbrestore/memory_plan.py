@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from .blind.remove_blur import remove_blur_memory
+from .blind.tiled_deconvolution import SMALLEST_SIDE
 from .core.decision import Decision
 from .core.errors import ConfigurationError, DataError, require
 from .dynamics.dynamic_texture import identify_memory, modes_memory
@@ -30,7 +31,7 @@ from .filtering.filter_records import filter_memory
 from .registration.flow import MIN_SIDE, flow_memory
 from .runtime.device import TORCH_BYTES, find_device, needs_torch
 from .runtime.jit import COMPILER_BYTES
-from .runtime.memory_size import MemorySize, size_text
+from .runtime.memory_size import size_text
 from .runtime.runtime import Runtime
 from .runtime.tiling import HALO, halo_tiles, largest_tile
 from .settings import RestoreParams
@@ -70,8 +71,8 @@ class MemoryPlan:
         Longest side of the tiles in which frames are processed, pixels; None for whole frames.
     scratch_bytes : int
         Size of all scratch files.
-    deconvolution : MemorySize or None
-        Bytes that are left for the deconvolution; None where there is no limit.
+    held : float
+        Bytes that the process takes before the deconvolution; 0 where there is no limit.
     decisions : tuple of Decision
         What the limit has caused, in words.
     """
@@ -80,7 +81,7 @@ class MemoryPlan:
     runtime: Runtime
     tile: int | None = None
     scratch_bytes: int = 0
-    deconvolution: MemorySize | None = None
+    held: float = 0.0
     decisions: tuple[Decision, ...] = ()
 
 
@@ -145,7 +146,7 @@ def plan_memory(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime)
         chosen,
         choice.tile,
         _scratch_bytes(shape, params, choice) if choice.in_scratch else 0,
-        MemorySize(limit - base - _held_by_deconvolution(shape, params, choice)),
+        base + _held_by_deconvolution(shape, params, choice),
         tuple(_decisions(shape, params, choice, _Choice(train, most), base, limit)),
     )
 
@@ -230,7 +231,7 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice) -> flo
         "identify": frames + flows + modes + identify_memory(part, train),
         "filter": frames + flows + modes + flow + filter_memory(part, train, params.filter, threads),
         "deconvolve": _held_by_deconvolution(shape, params, choice)
-        + remove_blur_memory(shape[1:], params.deconvolution, 4 * HALO),
+        + remove_blur_memory(shape[1:], params.deconvolution, SMALLEST_SIDE),
     }
     after = _held_by_deconvolution(shape, params, choice) + _report(shape)
     # While tiles are processed the images of the whole lie in files, but for a frame that is being read.

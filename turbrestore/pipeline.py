@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
 from typing import TypeVar
@@ -305,8 +305,8 @@ def _temporal_mean(source: FrameSource) -> FloatArray:
 
 def _deblur(run: _Run, image: FloatArray, guide: FloatArray) -> Deblurred:
     params = run.params
-    runtime = replace(run.plan.runtime, memory_limit=run.plan.deconvolution)
-    steps = remove_blur_steps(image, guide, params.deconvolution, params.guards, runtime)
+    plan = run.plan
+    steps = remove_blur_steps(image, guide, params.deconvolution, params.guards, plan.runtime, plan.held)
     return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 
 

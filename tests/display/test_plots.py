@@ -225,7 +225,7 @@ class TestResults:
 
     def test_unknown_blur(self):
         blur = estimate_blur(np.full((32, 32), 0.5, np.float32))
-        assert "not told" in blur._repr_html_()
+        assert "not determined" in blur._repr_html_()
         assert blur.plot().axes[0].texts
 
     def test_thumbnails_are_reduced(self):

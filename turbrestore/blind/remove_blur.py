@@ -21,6 +21,7 @@ from ..core.arrays import FloatArray
 from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, DeconvolutionState
 from ..deconvolution.memory import deconvolution_memory
+from ..runtime.device import PROCESSOR, find_device
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.tiling import largest_tile
@@ -108,7 +109,7 @@ def remove_blur(
         Bounds that the result must keep.
     runtime : Runtime
         Threads, device, memory limit, and the folder of files that hold images; without one they stay in memory.  If
-        the memory limit is too small for the whole image, it is deconvolved in tiles.
+        the memory limit is too small for the whole image, the CPU deconvolves it in tiles.
     held : float
         Bytes that the process already takes, the images included; they count towards the memory limit.
 
@@ -178,7 +179,7 @@ def remove_blur_steps(
     blur = estimate_blur(image, exponent=exponent, runtime=runtime) if params.sigma is None else None
     sigma, params = blur_to_remove(blur, params)
     memory = None
-    if runtime.memory_limit is not None:
+    if runtime.memory_limit is not None and find_device(runtime.device) == PROCESSOR:
         memory = runtime.memory_limit - held - _image_bytes(image.shape, runtime.scratch is not None)
     numbers = itertools.count(1)
 
@@ -188,7 +189,7 @@ def remove_blur_steps(
 
     tiles, first = None, None
     if blur is not None and blur.blurred:
-        if memory is None:
+        if runtime.memory_limit is None:
             tiles, first = yield from _map_meanwhile(image, blur, _label(remove(sigma), sigma, next(numbers)))
         else:
             tiles = estimate_blur_map(image, blur, runtime)
