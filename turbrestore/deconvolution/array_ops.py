@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
-
-from ..core.arrays import FloatArray
 
 # ndarray or torch tensor.
 Array = Any
@@ -30,7 +29,7 @@ class ArrayOps:
     arrays : module
         ``numpy`` or ``torch``.
     load, store : callable
-        Convert from a NumPy array, and back to one.
+        Convert from a NumPy array of real or complex numbers, and back to one.
     forward : callable
         Half-spectrum of a real image, as :func:`scipy.fft.rfft2`.
     back : callable
@@ -38,8 +37,8 @@ class ArrayOps:
     """
 
     arrays: Any
-    load: Callable[[FloatArray], Array]
-    store: Callable[[Array], FloatArray]
+    load: Callable[[NDArray[Any]], Array]
+    store: Callable[[Array], NDArray[Any]]
     forward: Callable[[Array], Array]
     back: Callable[[Array, tuple[int, int]], Array]
 

@@ -14,9 +14,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Generator
-from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -271,17 +270,16 @@ def deconvolve_steps(
     rim = min(int(np.ceil(sigma)), min(height, width) // 4) if oscillates else 0
     device = find_device(runtime.device)
     ops = numpy_ops(runtime.workers) if device == PROCESSOR else torch_ops(device)
-    with _on(device), one_thread_each(), ThreadTeam(runtime.workers) as team:
-        seen, otf = ops.load(margin.mask()), ops.load(otf)
-        problems = [Problem(ops.load(margin.pad(plane)), seen, otf, fidelity, ops) for plane in planes]
+    with memory_of(device, "take a smaller --roi"), one_thread_each(), ThreadTeam(runtime.workers) as team:
+        seen, transfer = ops.load(margin.mask()), ops.load(otf)
+        problems = [Problem(ops.load(margin.pad(plane)), seen, transfer, fidelity, ops) for plane in planes]
         measured = ops.load(margin.mask(rim))
         around = _padded_guide(guide, margin)
         solution = yield from _solve(problems, around, measured, params, _Resources(team, runtime.workers, device))
     restored = join_planes(pixels, [ops.store(u)[margin.inside()] for u in solution.images], params.channels)
-    recorded, objective, changes = (np.array(column) for column in zip(*solution.records, strict=True))
-    restored = np.clip(restored, 0, 1)
+    records = (np.array(column) for column in zip(*solution.records, strict=True))
     return Deconvolution(
-        restored, sigma, fidelity, noise, solution.iterations, solution.converged, recorded, objective, changes
+        np.clip(restored, 0, 1), sigma, fidelity, noise, solution.iterations, solution.converged, *records
     )
 
 
@@ -304,6 +302,13 @@ def whole_image_params(
         With ``fidelity`` from the noise of the whole image, and ``weights.h`` from the contrast and the noise of the
         whole guide, unless they are given.
 
+    Notes
+    -----
+    Deconvolved with these, a tile agrees with the whole at 99 % of its pixels within .01, away from a halo of 96
+    pixels.  The others have neighbours of similar patches that differ, because each tile sharpens its part of the guide
+    by itself.  With a guide that is sharpened before (``method="wiener"``) and ``sharpen_guide=False`` all pixels
+    agree.
+
     Examples
     --------
     >>> import numpy as np
@@ -323,10 +328,6 @@ class _Resources(NamedTuple):
     device: str
 
 
-def _on(device: str) -> Any:
-    return nullcontext() if device == PROCESSOR else memory_of(device, "take a smaller --roi")
-
-
 def _solve(
     problems: list[Problem],
     guide: FloatArray | None,
@@ -338,13 +339,13 @@ def _solve(
     if params.method in ("wiener", "tikhonov"):
         quadratic = quadratic_solver(problems[0], params.method)
         return (yield from iterate(quadratic, problems, [quadratic.start(p) for p in problems], *stop))
-    starts, guide = _sharpened(problems, guide, params, resources)
+    starts, compared = _sharpened(problems, guide, params, resources)
     penalty: Penalty = LocalPenalty(problems[0].ops)
     if params.method == "nltv":
-        penalty = _nonlocal_penalty(guide, params.weights, resources)
+        penalty = _nonlocal_penalty(compared, params.weights, resources)
     solver = PrimalDual(penalty)
     states = [solver.start(problem, u) for problem, u in zip(problems, starts, strict=True)]
-    del starts
+    del starts, compared
     return (yield from iterate(solver, problems, states, *stop))
 
 
@@ -357,20 +358,19 @@ def _nonlocal_penalty(guide: FloatArray, weights: NonlocalParams, resources: _Re
 def _sharpened(
     problems: list[Problem], guide: FloatArray | None, params: DeconvolutionParams, resources: _Resources
 ) -> tuple[list[Array], FloatArray]:
-    """Wiener solutions to start from, and the guide of the weights: by default the mean of what is deblurred."""
+    """Wiener solutions to start from, and the image whose patches are compared: by default the mean of the channels."""
     ops, blurred = problems[0].ops, list(problems)
-    separate = guide is not None and params.sharpen_guide and params.method == "nltv"
-    if separate:
+    if guide is not None and params.sharpen_guide and params.method == "nltv":
         blurred.append(dataclasses.replace(problems[0], observed=ops.load(guide)))
     side_by_side = resources.device == PROCESSOR and np.prod(problems[0].shape) >= _PARALLEL_PIXELS
     sharp = list(resources.team.map(wiener_image, blurred) if side_by_side else map(wiener_image, blurred))
-    starts = sharp[: len(problems)]
-    if separate:
-        guide = ops.store(sharp[-1])
-    elif guide is None:
-        own = starts if params.sharpen_guide else [p.observed for p in problems]
-        guide = np.mean([ops.store(u) for u in own], axis=0, dtype=np.float32)
-    return starts, guide
+    starts, further = sharp[: len(problems)], sharp[len(problems) :]
+    if further:
+        return starts, ops.store(further[0])
+    if guide is not None:
+        return starts, guide
+    own = starts if params.sharpen_guide else [problem.observed for problem in problems]
+    return starts, np.mean([ops.store(u) for u in own], axis=0, dtype=np.float32)
 
 
 def _padded_guide(guide: ArrayLike | None, margin: Margin) -> FloatArray | None:

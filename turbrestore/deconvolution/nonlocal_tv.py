@@ -69,7 +69,8 @@ class NonlocalPenalty:
 
     def zero_dual(self, u: FloatArray) -> PairDual:
         """P = 0."""
-        return PairDual(np.zeros((2, len(self.graph.heads)), np.float32), *np.zeros((2, u.size), np.float32))
+        values, (factor, lag) = np.zeros((2, len(self.graph.heads)), np.float32), np.zeros((2, u.size), np.float32)
+        return PairDual(values, factor, lag)
 
     def ascend(self, p: PairDual, u: FloatArray, step: float, relaxation: float) -> tuple[PairDual, FloatArray]:
         """``p + ρ(p' − p)`` with p' the projection of ``p + s∇_w u`` on |p|(x) ≤ 1, and −div_w of it."""
@@ -77,7 +78,7 @@ class NonlocalPenalty:
         pairs, (squares, pull) = (graph.starts, graph.heads, graph.roots), np.zeros((2, u.size), np.float32)
         change = p.lag + scaled
         self._over_bands(lambda band: add_gradient(p.factor, change, *pairs, band, p.values, squares))
-        factor = relaxation / np.sqrt(squares).clip(1) + (1 - relaxation)
+        factor: FloatArray = relaxation / np.sqrt(squares).clip(1) + (1 - relaxation)
         p = PairDual(p.values, factor, (relaxation - 1) * scaled)
         self._over_bands(lambda band: add_adjoint(p.factor, p.lag, *pairs, band, p.values, pull))
         return p, pull.reshape(u.shape)
