@@ -9,7 +9,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from turbrestore.core.errors import require
-from turbrestore.io.images import check_output, write_image
+from turbrestore.io.images import write_image
+from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.memory_plan import check_comparison
 from turbrestore.metrics import comparable

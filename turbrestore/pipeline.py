@@ -32,7 +32,7 @@ from .explanation import (
 )
 from .filtering.alternating import Filtered, filter_frames
 from .footage.frame_selection import best_frames, frame_quality
-from .io.images import check_space
+from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan, plan_memory
 from .registration.centroid import Centroid, find_centroid

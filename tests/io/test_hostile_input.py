@@ -15,12 +15,11 @@ import pytest
 import tifffile
 
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError
-from turbrestore.io import tiff_pages
 from turbrestore.io.images import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.npy import map_npy, read_npz
 from turbrestore.io.source import FrameSource
-from turbrestore.io.tiff import open_tiff
+from turbrestore.io.tiff import _unlzw, open_tiff
 from turbrestore.io.video import open_frames, write_video
 from turbrestore_cli.__main__ import main
 
@@ -157,7 +156,7 @@ class TestArrayFiles:
         with pytest.warns(UserWarning, match="Duplicate"), zipfile.ZipFile(tmp_path / "b.npz", "w") as archive:
             archive.writestr("a.npy", b"")
             archive.writestr("a.npy", b"")
-        with pytest.raises(DataError, match="twice"):
+        with pytest.raises(DataError, match="same name"):
             read_npz(tmp_path / "b.npz")
 
     def test_too_many_bytes(self, tmp_path):
@@ -286,7 +285,7 @@ class TestInflation:
             found = 0
             for start, size in zip(page.dataoffsets, page.databytecounts, strict=True):
                 data = (tmp_path / "a.tif").read_bytes()[start : start + size]
-                found += tiff_pages._lzw_size(tmp_path, data, 10**9)
+                found += len(_unlzw(tmp_path, data, 10**6))
         assert found == pixels.size
         np.testing.assert_array_equal(read_image(tmp_path / "a.tif").image, pixels / np.float32(255))
         assert capfd.readouterr().err == ""
@@ -333,7 +332,7 @@ class TestInflation:
 
         data = data[:16] + header + struct.pack(">I", zlib.crc32(b"IHDR" + header)) + data[33:]
         (tmp_path / "a.png").write_bytes(data)
-        with pytest.raises(DataError, match="bytes of pixels"):
+        with pytest.raises(DataError, match="truncated"):
             read_image(tmp_path / "a.png")
         assert capfd.readouterr() == ("", "")
 

@@ -1,4 +1,4 @@
-"""Writing video files through PyAV: FFV1 in Matroska without loss, H.264 in MP4 for viewing."""
+"""Writing of video files through PyAV: lossless FFV1 in Matroska, H.264 in MP4 for viewing."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, cast
 
 from ..core.arrays import FloatArray, from_unit
-from ..core.errors import DataError, StorageError, require
+from ..core.errors import StorageError, require
 from .container import convert
-from .images import atomic_output
+from .output import atomic_output, frames_of_one_size
 from .pixels import check_depth
-from .source import size_text
 
 if TYPE_CHECKING:
     import av
 
-# The same frames give the same bytes: without this, Matroska numbers its segment and tracks at random.
+# Without this option Matroska numbers its segment and tracks at random; with it the same frames give the same bytes.
 _WRITE_OPTIONS = {"fflags": "+bitexact"}
 _GREY_DEPTHS = {8: "gray", 10: "gray10le", 12: "gray12le", 14: "gray14le", 16: "gray16le"}
 _RGB_DEPTHS = {8: "bgr0", 10: "gbrp10le", 12: "gbrp12le", 14: "gbrp14le", 16: "gbrp16le"}
 
 
 @dataclass(frozen=True)
-class _Recipe:
-    """How to encode a video; ``settings`` gives the pixel format and the codec's options for a frame's shape."""
+class _Format:
+    """How to encode a video; ``settings`` returns pixel format and codec options for the shape of a frame."""
 
     container: str
     codec: str
@@ -42,12 +41,12 @@ def write_mkv(
     bit_depth: int = 8,
     overwrite: bool = False,
 ) -> None:
-    """Write frames without loss: FFV1 version 3 with checksums, in Matroska; the same frames give the same bytes.
+    """Write frames losslessly: FFV1 version 3 with checksums, in Matroska; the same frames give the same bytes.
 
     Parameters
     ----------
     path : path-like
-        The file to be written.
+        The file that is written.
     frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
         Intensities; values outside [0, 1] are clipped.
     fps : float
@@ -79,22 +78,22 @@ def write_mkv(
     depth = min(step for step in _GREY_DEPTHS if step >= min(check_depth(bit_depth), 16))
 
     def settings(shape: tuple[int, ...]) -> tuple[str, dict[str, str]]:
-        # Keyframes only: a frame is decoded without its neighbours, and damage stays in one frame. A fixed number of
-        # slices gives the same file on every machine; four need two rows and two columns.
+        # With keyframes only, every frame is decoded without its neighbours and damage stays in one frame. A fixed
+        # number of slices gives the same file on every machine; four slices need two rows and two columns.
         slices = "4" if min(shape[:2]) > 1 else "1"
         kind = (_GREY_DEPTHS if len(shape) == 2 else _RGB_DEPTHS)[depth]
         return kind, {"level": "3", "slicecrc": "1", "g": "1", "slices": slices}
 
-    _encode(path, frames, _check_rate(fps, 1000), depth, _Recipe("matroska", "ffv1", settings), overwrite)
+    _encode(path, frames, _check_rate(fps, 1000), depth, _Format("matroska", "ffv1", settings), overwrite)
 
 
 def write_mp4(path: str | os.PathLike[str], frames: Iterable[FloatArray], fps: float, overwrite: bool = False) -> None:
-    """Write frames for viewing: H.264 of 8 bits in MP4, with loss.
+    """Write frames for viewing: lossy H.264 of 8 bits in MP4.
 
     Parameters
     ----------
     path : path-like
-        The file to be written.
+        The file that is written.
     frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
         Intensities; values outside [0, 1] are clipped. Grey becomes RGB.
     fps : float
@@ -126,10 +125,10 @@ def write_mp4(path: str | os.PathLike[str], frames: Iterable[FloatArray], fps: f
     require("libx264" in av.codecs_available, f"{path}: no H.264 encoder is available; write .mkv")
 
     def settings(shape: tuple[int, ...]) -> tuple[str, dict[str, str]]:
-        # Halved colour resolution, which every player knows, needs even sizes.
+        # Every player supports halved colour resolution, which needs even sizes.
         return "yuv444p" if shape[0] % 2 or shape[1] % 2 else "yuv420p", {"crf": "14"}
 
-    _encode(path, frames, _check_rate(fps, 10000), 8, _Recipe("mp4", "libx264", settings), overwrite)
+    _encode(path, frames, _check_rate(fps, 10000), 8, _Format("mp4", "libx264", settings), overwrite)
 
 
 def _encode(
@@ -137,26 +136,21 @@ def _encode(
     frames: Iterable[FloatArray],
     rate: Fraction,
     depth: int,
-    recipe: _Recipe,
+    video_format: _Format,
     overwrite: bool,
 ) -> None:
     import av
 
     with atomic_output(path, overwrite) as temporary, _encoding(path):
-        iterator = iter(frames)
-        first = next(iterator, None)
-        if first is None:
-            raise DataError(f"{path}: expected at least one frame, found none")
+        iterator = frames_of_one_size(frames, path)
+        first = next(iterator)
         name = f"file:{temporary}"
-        with av.open(name, "w", format=recipe.container, container_options=dict(_WRITE_OPTIONS)) as output:
-            pixel_format, options = recipe.settings(first.shape)
-            stream = cast("av.VideoStream", output.add_stream(recipe.codec, rate=rate, options=options))
+        with av.open(name, "w", format=video_format.container, container_options=dict(_WRITE_OPTIONS)) as output:
+            pixel_format, options = video_format.settings(first.shape)
+            stream = cast("av.VideoStream", output.add_stream(video_format.codec, rate=rate, options=options))
             stream.height, stream.width = first.shape[:2]
             stream.pix_fmt = pixel_format
             for number, frame in enumerate(itertools.chain([first], iterator)):
-                if frame.shape != first.shape:
-                    expected, found = size_text(first.shape), size_text(frame.shape)
-                    raise DataError(f"{path}: frame {number}: expected {expected}, found {found}")
                 picture = convert(_picture(frame, depth), pixel_format)
                 picture.pts, picture.time_base = number, 1 / rate
                 output.mux(stream.encode(picture))
@@ -172,7 +166,7 @@ def _picture(frame: FloatArray, depth: int) -> av.VideoFrame:
 
 def _check_rate(fps: float, limit: int) -> Fraction:
     require(0 < fps <= limit, f"fps: expected more than 0 and at most {limit} frames per second, found {fps}")
-    # Keeps 30000/1001 and its like exact.
+    # Rates such as 30000/1001 stay exact.
     return Fraction(fps).limit_denominator(1001)
 
 

@@ -1,34 +1,38 @@
-"""Arrays from ``.npy`` and ``.npz`` files: headers are held against the size of the file first, nothing is unpickled.
+"""Arrays in ``.npy`` and ``.npz`` files, and videos in ``.npy`` files; nothing is unpickled.
 
-NumPy believes a header and asks for the memory that it names; an archive of a few kilobytes inflates to gigabytes.  The
-archives that this package writes are not compressed, so a compressed one is refused, and no more memory is asked for
-than the file is large.
+NumPy allocates the memory that a header asks for, and a compressed archive of a few kilobytes can hold gigabytes.
+Headers are therefore compared with the size of the file first, and compressed archives, which this package never
+writes, are refused, so no more memory is allocated than the file is large.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import FloatArray, from_unit
 from ..core.errors import DataError, TurbrestoreError
 from ..runtime.scratch import iter_parts, new_stack
-from .files import check_input, first_line, input_errors
-from .limits import DEFAULT_LIMITS, Limits
+from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
+from .output import atomic_output, frames_of_one_size
+from .pixels import PixelArray
+from .source import FrameSource
 
-# Arrays of more bytes may be put in a file.
+# Arrays of more bytes may be moved to a scratch file.
 _LARGE = 1 << 22
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
-    """Map the array of a ``.npy`` file into memory, to be read on demand.
+    """Map the array of a ``.npy`` file into memory; it is read on demand.
 
     Parameters
     ----------
@@ -43,7 +47,7 @@ def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
     Raises
     ------
     InputNotFoundError, StorageError
-        No such file, or it cannot be read.
+        The file does not exist, or cannot be read.
     DataError
         Not a ``.npy`` file, shorter than its header says, or not of numbers.
 
@@ -86,19 +90,19 @@ def read_npz(
     limits : Limits
         Most bytes that are read.
     scratch : Path, optional
-        Folder of a file for large arrays; by default they are in memory.
+        Folder for scratch files, which then hold large arrays of float32; by default all are in memory.
     large : int, optional
-        Bytes from which an array is large; by default 4 MiB.
+        Bytes above which an array is large; by default 4 MiB.
 
     Returns
     -------
     dict of str to ndarray
-        By their names, without the suffix ``.npy``.
+        Arrays by their names in the archive, without the suffix ``.npy``.
 
     Raises
     ------
     InputNotFoundError, StorageError
-        No such file, or it cannot be read.
+        The file does not exist, or cannot be read.
     DataError
         Not an archive of arrays, damaged, compressed, or too large.
 
@@ -118,8 +122,8 @@ def read_npz(
             members = archive.infolist()
             names = [member.filename.removesuffix(".npy") for member in members]
             if len(set(names)) < len(names):
-                raise ValueError("one name stands twice in it")
-            # Members are not compressed; they hold more than the file only where they lie within each other.
+                raise ValueError("two members have the same name")
+            # Uncompressed members hold more than the file only if they overlap.
             if sum(member.file_size for member in members) > size:
                 raise ValueError(f"its members hold more than its {size} bytes")
             least = _LARGE if large is None else large
@@ -131,12 +135,7 @@ def read_npz(
 
 
 def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays as :func:`numpy.savez` does, those of a mapped file without taking them into memory.
-
-    Parameters
-    ----------
-    stream : binary file
-    arrays : mapping of str to ndarray
+    """Write arrays as :func:`numpy.savez` does, but memory-mapped arrays part by part.
 
     Examples
     --------
@@ -159,6 +158,58 @@ def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
                     np.lib.format.write_array(member, array, allow_pickle=False)
 
 
+def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
+    """Open a ``.npy`` array of shape (T, H, W) or (T, H, W, 3) as a video; the errors are those of :func:`map_npy`."""
+    array = map_npy(path)
+    source = FrameSource.from_array(array, path.name)
+    limits.check_size(source.shape[2], source.shape[1], str(path))
+    limits.check_count(len(source), str(path))
+    return dataclasses.replace(source, format=f"npy/{array.dtype}", path=path)
+
+
+def write_npy(
+    path: str | os.PathLike[str], frames: Iterable[FloatArray], bit_depth: int = 32, overwrite: bool = False
+) -> None:
+    """Write frames as one ``.npy`` array.
+
+    Parameters
+    ----------
+    path : path-like
+        The file that is written.
+    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
+        Intensities; values outside [0, 1] are clipped. Taken one at a time.
+    bit_depth : int
+        1 to 8 gives uint8, 9 to 16 gives uint16 (scaled to its full range), 32 float32.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    DataError
+        No frames, or frames of two sizes.
+    OutputError, StorageError
+        The file cannot be created or completed.
+    """
+    count = 0
+    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+        for frame in frames_of_one_size(frames, path):
+            pixels: PixelArray = (
+                np.clip(frame, 0, 1) if bit_depth == 32 else from_unit(frame, 8 if bit_depth <= 8 else 16)
+            )
+            if count == 0:
+                _write_header(file, (0, *pixels.shape), pixels.dtype)
+            file.write(pixels.tobytes())
+            count += 1
+        # NumPy pads the header so that the number of frames fits in afterwards.
+        file.seek(0)
+        _write_header(file, (count, *pixels.shape), pixels.dtype)
+
+
+def _write_header(file: IO[bytes], shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    description = np.lib.format.dtype_to_descr(dtype)
+    np.lib.format.write_array_header_1_0(file, {"descr": description, "fortran_order": False, "shape": shape})
+
+
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | None, large: int) -> NDArray[Any]:
     if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
         raise ValueError(f"{member.filename} is compressed; expected it as numpy.savez writes it")
@@ -167,17 +218,17 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | N
         if scratch is not None and member.file_size > large and dtype == np.float32:
             stack = _stack_of(stream, shape[::-1] if is_fortran else shape, member, scratch)
             return stack.T if is_fortran else stack
-        # Reading to the end lets zipfile compare the checksum.
+        # zipfile compares the checksum at the end of the member.
         data = stream.read()
     if math.prod(shape) * dtype.itemsize != len(data):
-        raise ValueError(f"{member.filename} has {len(data)} bytes, which do not fill shape {shape}")
+        raise ValueError(f"{member.filename} has {len(data)} bytes, which do not fit shape {shape}")
     return np.frombuffer(bytearray(data), dtype).reshape(shape, order="F" if is_fortran else "C")
 
 
 def _stack_of(stream: IO[bytes], shape: tuple[int, ...], member: zipfile.ZipInfo, scratch: Path) -> NDArray[np.float32]:
-    """Copy a stack to a file of its own, one part after the other."""
+    """Copy a stack to a scratch file, part by part."""
     if not 0 < 4 * math.prod(shape) <= member.file_size:
-        raise ValueError(f"{member.filename} has {member.file_size} bytes, which do not fill shape {shape}")
+        raise ValueError(f"{member.filename} has {member.file_size} bytes, which do not fit shape {shape}")
     stack = new_stack(shape, scratch)
     for part in iter_parts(stack):
         part[...] = np.frombuffer(stream.read(part.nbytes), np.float32).reshape(part.shape)
@@ -187,7 +238,7 @@ def _stack_of(stream: IO[bytes], shape: tuple[int, ...], member: zipfile.ZipInfo
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether in the order of Fortran, and type; the stream is at the data then."""
+    """Read shape, whether the order is that of Fortran, and type; the stream is at the data afterwards."""
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:
         raise ValueError(f"version {version} of the format is not supported")

@@ -1,7 +1,7 @@
-"""From the pixel values of files to intensities in [0, 1], by one rule for all formats.
+"""Conversion of the pixel values of files to intensities in [0, 1], by one rule for all formats.
 
-Integers are divided by the value that means white in their file; floating point values have to lie in [0, 1]
-already, because nothing says what else they mean.
+Integers are divided by the value that means white in their file. Floating point values must lie in [0, 1] already,
+because nothing in the file says what else they mean.
 """
 
 from __future__ import annotations
@@ -16,25 +16,24 @@ from ..core.errors import DataError, require
 
 PixelArray = NDArray[Any]
 
-# 67 million, twice an 8K frame; a frame of this size takes 800 MB as RGB in float32.
+# 67 million pixels are two 8K frames; a frame of this size takes 800 MB as float32 RGB.
 MAX_PIXELS = 2**26
-# Rounding and resampling overshoot a little; values further out mean that another scale was used.
+# Rounding and resampling overshoot a little; values further outside indicate another scale.
 FLOAT_MARGIN = 0.01
 
 
 def to_unit(pixels: PixelArray, full_scale: float, name: str) -> FloatArray:
-    """Turn the pixel values of a file into intensities in [0, 1].
+    """Convert the pixel values of a file to intensities in [0, 1].
 
     Parameters
     ----------
     pixels : ndarray
-        Unsigned integers, or floating point values in [0, 1]. Floating point values up to 0.01 outside are
-        clipped: rounding and resampling leave such values, while another scale (0 to 255, 0 to 4095) goes far
-        beyond.
+        Unsigned integers, or floating point values in [0, 1]. Floating point values up to 0.01 outside are clipped:
+        rounding and resampling produce such values, while another scale (0 to 255, 0 to 4095) goes far beyond.
     full_scale : float
         The integer that means 1; ignored for floating point values.
     name : str
-        How error messages call the array.
+        Name of the array in error messages.
 
     Returns
     -------
@@ -75,24 +74,23 @@ def to_unit(pixels: PixelArray, full_scale: float, name: str) -> FloatArray:
 
 
 def full_scale_of(dtype: np.dtype[Any], name: str) -> int:
-    """Value that means intensity 1 in an array of this type.
+    """Value that means intensity 1: the maximum of an unsigned integer type, 1 for floating point.
 
     Parameters
     ----------
     dtype : dtype
-        Of the array.
+        Type of the array.
     name : str
-        How error messages call the array.
+        Name of the array in error messages.
 
     Returns
     -------
     int
-        The largest value of an unsigned integer type, 1 for floating point.
 
     Raises
     ------
     DataError
-        Signed integers, booleans and other types: nothing says where their white lies.
+        Signed integers, booleans and other types, for which white is not defined.
 
     Examples
     --------
@@ -108,16 +106,7 @@ def full_scale_of(dtype: np.dtype[Any], name: str) -> int:
 
 
 def depth_of(dtype: np.dtype[Any]) -> int:
-    """Bit depth of an array: its unsigned integers' bits, at most 32; 32 for floating point.
-
-    Parameters
-    ----------
-    dtype : dtype
-        Of the array.
-
-    Returns
-    -------
-    int
+    """Bit depth of an array: the bits of unsigned integers, at most 32; 32 for floating point.
 
     Examples
     --------
@@ -129,21 +118,7 @@ def depth_of(dtype: np.dtype[Any]) -> int:
 
 
 def check_depth(bit_depth: int) -> int:
-    """Return ``bit_depth`` if an output can have it.
-
-    Parameters
-    ----------
-    bit_depth : int
-        Bits per channel.
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    ConfigurationError
-        Neither 1 to 16 nor 32.
+    """Return ``bit_depth``, or raise ConfigurationError unless it is 1 to 16 or 32.
 
     Examples
     --------
@@ -153,3 +128,38 @@ def check_depth(bit_depth: int) -> int:
     known = not isinstance(bit_depth, bool) and bit_depth in {*range(1, 17), 32}
     require(known, f"bit_depth: expected 1 to 16, or 32 for floating point, found {bit_depth}")
     return bit_depth
+
+
+def without_alpha(pixels: PixelArray) -> tuple[PixelArray, tuple[str, ...]]:
+    """Drop the last channel of two or four; return the pixels and a warning where there was one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> pixels, warnings = without_alpha(np.zeros((2, 3, 4), np.uint8))
+    >>> pixels.shape, warnings
+    ((2, 3, 3), ('alpha channel ignored',))
+    """
+    if pixels.ndim == 2 or pixels.shape[2] not in (2, 4):
+        return pixels, ()
+    colours = pixels[..., 0] if pixels.shape[2] == 2 else pixels[..., :3]
+    return np.ascontiguousarray(colours), ("alpha channel ignored",)
+
+
+def upright(pixels: PixelArray, orientation: object) -> PixelArray:
+    """Turn and mirror an image as its EXIF or TIFF orientation tag, 1 to 8, demands; other values do nothing.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> upright(np.array([[1, 2], [3, 4], [5, 6]]), 6)
+    array([[5, 3, 1],
+           [6, 4, 2]])
+    """
+    if orientation not in range(2, 9):
+        return pixels
+    place = int(orientation) - 1  # type: ignore[call-overload]
+    if place >= 4:
+        pixels = np.swapaxes(pixels, 0, 1)
+    horizontal, vertical = [(1, 1), (-1, 1), (-1, -1), (1, -1)][place % 4]
+    return np.ascontiguousarray(pixels[::vertical, ::horizontal])

@@ -8,11 +8,11 @@ bytes   content
 42–161  observer, instrument, telescope
 162     two int64: date, date in UTC
 178     frames, rows from the top
-then    optionally an int64 a frame: time in units of 100 ns
+then    optionally one int64 per frame: time in units of 100 ns
 ======  ====================================================================================
 
-The description says that a flag of 1 means little endian. The programs that came first wrote 0 with little-endian
-pixels, all later ones followed them, and so does this module: 0 is little endian, everything else is big endian.
+The description says that an endianness flag of 1 means little endian. The first programs wrote 0 with little-endian
+pixels and all later ones followed them, so 0 is read as little endian and every other value as big endian.
 """
 
 from __future__ import annotations
@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, from_unit
 from ..core.errors import DataError
-from .files import input_errors
-from .images import atomic_output
-from .limits import DEFAULT_LIMITS, Limits
+from .limits import DEFAULT_LIMITS, Limits, input_errors
+from .output import atomic_output, frames_of_one_size
 from .pixels import PixelArray, check_depth
 from .source import FrameSource, cut_short_text, skipped_end_text
 
@@ -49,16 +48,16 @@ _NAMES = {_MONO: "mono", _RGB: "rgb", _BGR: "bgr", 8: "rggb", 9: "grbg", 10: "gb
 
 @dataclass(frozen=True)
 class SerHeader:
-    """What the header of a SER file says.
+    """Header of a SER file.
 
     Attributes
     ----------
     colour : int
         0 mono; 8 to 11 Bayer RGGB, GRBG, GBRG, BGGR; 100 RGB; 101 BGR.
     little_endian : bool
-        Byte order of pixels of two bytes, as written in practice.
+        Byte order of two-byte pixels, as written in practice.
     width, height, frames : int
-        Size in pixels, and how many frames.
+        Size in pixels, and number of frames.
     bit_depth : int
         Bits per plane, 1 to 16.
     """
@@ -79,7 +78,7 @@ class SerHeader:
 
     @property
     def planes(self) -> int:
-        """Values a pixel."""
+        """Values per pixel."""
         return 3 if self.colour in (_RGB, _BGR) else 1
 
     @property
@@ -96,7 +95,7 @@ def read_ser_header(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMIT
     path : path-like
         The file.
     limits : Limits
-        Largest size of a frame that is read.
+        Largest frame that is read.
 
     Returns
     -------
@@ -105,9 +104,9 @@ def read_ser_header(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMIT
     Raises
     ------
     InputNotFoundError, StorageError
-        No such file, or it cannot be read.
+        The file does not exist, or cannot be read.
     DataError
-        Not a SER file, or of a kind that is not supported.
+        Not a SER file, or of an unsupported kind.
 
     Examples
     --------
@@ -148,7 +147,7 @@ def open_ser(
     limits : Limits
         Largest video that is read.
     skip_damaged : bool
-        Read what is whole of a file that is cut short.
+        Read the whole frames of a file that is cut short.
 
     Returns
     -------
@@ -157,9 +156,9 @@ def open_ser(
     Raises
     ------
     InputNotFoundError, StorageError
-        No such file, or it cannot be read.
+        The file does not exist, or cannot be read.
     DataError
-        Not a SER file, of a kind that is not supported, or cut short.
+        Not a SER file, of an unsupported kind, or cut short.
 
     Examples
     --------
@@ -208,13 +207,13 @@ def write_ser(
     Parameters
     ----------
     path : path-like
-        The file to be written.
+        The file that is written.
     frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
         Intensities; values outside [0, 1] are clipped.
     bit_depth : int
         1 to 16 bits per plane; 32 is written as 16.
     fps : float, optional
-        Frames per second; adds a time to each frame, from 1 January 2000 on.
+        Frames per second; stores the time of every frame, beginning on 1 January 2000.
     overwrite : bool
         Replace an existing file.
 
@@ -237,24 +236,19 @@ def write_ser(
     """
     depth = min(check_depth(bit_depth), 16)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
-        count, shape = 0, None
+        count = 0
         file.write(bytes(HEADER_SIZE))
-        for frame in frames:
-            if shape is not None and frame.shape != shape:
-                raise DataError(f"{path}: frame {count}: expected shape {shape}, found {frame.shape}")
-            shape = frame.shape
+        for frame in frames_of_one_size(frames, path):
             pixels = from_unit(frame, depth)
             file.write(pixels.astype(pixels.dtype.newbyteorder("<")).tobytes())
             count += 1
-        if shape is None:
-            raise DataError(f"{path}: expected at least one frame, found none")
         if fps is not None:
             start = (np.datetime64("2000-01-01") - np.datetime64("0001-01-01")) // np.timedelta64(1, "s")
             ticks = start * TICKS_PER_SECOND + np.rint(np.arange(count) * (TICKS_PER_SECOND / fps)).astype("<i8")
             file.write(ticks.astype("<i8").tobytes())
         file.seek(0)
-        colour = _MONO if len(shape) == 2 else _RGB
-        fields = np.array([0, colour, 0, shape[1], shape[0], depth, count], "<i4")
+        colour = _MONO if pixels.ndim == 2 else _RGB
+        fields = np.array([0, colour, 0, pixels.shape[1], pixels.shape[0], depth, count], "<i4")
         file.write(SIGNATURE + fields.tobytes())
 
 
@@ -262,7 +256,7 @@ def _frames(path: Path, header: SerHeader, chosen: Sequence[int]) -> Iterator[Pi
     shape = (header.height, header.width) if header.planes == 1 else (header.height, header.width, 3)
     for number in chosen:
         with input_errors(path):
-            # Mapped one by one: pages of frames already seen do not count as this process's memory.
+            # Frames are mapped one by one, so the pages of earlier frames are no memory of this process.
             offset = HEADER_SIZE + number * header.frame_bytes
             frame = np.memmap(path, header.dtype, "r", offset, shape)
         if header.colour in _BAYER:
@@ -277,11 +271,11 @@ def _timestamps(path: Path, header: SerHeader, size: int) -> NDArray[np.float64]
         return None
     with input_errors(path):
         ticks = np.fromfile(path, "<i8", header.frames, offset=start)
-    # Recorders without a clock leave zeros; a clock that was set back during the recording tells no frame rate.
+    # Recorders without a clock write zeros; a clock that was set back during the recording gives no frame rate.
     return (ticks - ticks[0]) / TICKS_PER_SECOND if np.all(np.diff(ticks) >= 0) and ticks[-1] > ticks[0] else None
 
 
 def _has_gaps(times: NDArray[np.float64]) -> bool:
-    """Whether frames are missing in time; cameras that time their frames themselves scatter by much less."""
+    """Whether frames are missing in time; the jitter of cameras is much smaller."""
     intervals = np.diff(times)
     return len(times) > 2 and bool(intervals.max() > 1.5 * np.median(intervals))

@@ -1,15 +1,13 @@
-"""A video as the stages see it: frames on demand, as often as wanted, one at a time in memory.
+"""A video as the stages use it: frames are decoded on demand, one at a time, as often as wanted.
 
-A reader of one format (``container``, ``ser``, ``tiff``, …) hands over a function that yields the native pixels of
-given frames, and what it knows from the headers. Range, crop, scaling to [0, 1] and the checks are done here, once
-for all formats.
+The reader of a format (``container``, ``ser``, ``tiff`` and others) provides a function that yields the native pixels
+of given frames, and what the headers say. Range, crop, scaling to [0, 1] and checks are done here for all formats.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import operator
-import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -20,24 +18,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import CHANNELS, FloatArray
 from ..core.errors import ConfigurationError, DataError, require
-from ..runtime.scratch import drop_pages
-from .images import IMAGE_SUFFIXES
+from ..runtime.scratch import iter_frames
+from .output import size_text
 from .pixels import PixelArray, depth_of, full_scale_of, to_unit
 
 FrameRange = tuple[int | None, int | None] | tuple[int | None, int | None, int | None]
 Roi = tuple[int, int, int, int]
-# Frames that a message names before it only counts them.
+# Number of frames that a message lists before it only counts the others.
 _NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
 class FrameSource:
-    """Frames of a video, decoded while iterating; every iteration starts anew.
+    """Frames of a video that are decoded while iterating; every iteration starts from the first frame.
 
     Attributes
     ----------
     name : str
-        How messages call the video.
+        Name of the video in messages.
     format : str
         Container or codec and pixel format, such as ``ffv1/gray16le``.
     file_shape : tuple of int
@@ -47,23 +45,23 @@ class FrameSource:
     bit_depth : int
         Bits per channel of the file; 32 for floating point.
     pixels : callable
-        Given ascending frame numbers of the file, yields their native pixels in that order.
+        Takes ascending frame numbers of the file, and yields the native pixels of these frames.
     path : Path or None
-        The file or folder; None for an array.
+        File or folder; None for an array.
     fps : float or None
         Frames per second, after the selection.
     timestamps : ndarray, float64, shape (T,), or None
         Seconds since the first frame of the file, after the selection.
     warnings : tuple of str
-        What was left out or looks odd.
+        What was left out, or is unusual.
     damaged : tuple of int
         Numbers, in the file, of frames that are known to be damaged.
     repair : callable or None
-        Applied to the native pixels of every frame of the file before anything looks at them.
+        Applied to the native pixels of every frame first.
     numbers : range or tuple of int
-        Numbers, in the file, of the frames selected, ascending; by default all.
+        Ascending numbers, in the file, of the selected frames; by default all.
     window : tuple of slice
-        Rows and columns selected; by default all.
+        Selected rows and columns; by default all.
 
     Examples
     --------
@@ -105,7 +103,7 @@ class FrameSource:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(T, H, W) or (T, H, W, 3) of the frames selected."""
+        """(T, H, W) or (T, H, W, 3) of the selected frames."""
         rows, columns = self.window
         return (len(self.numbers), rows.stop - rows.start, columns.stop - columns.start, *self.file_shape[3:])
 
@@ -121,7 +119,7 @@ class FrameSource:
         Parameters
         ----------
         start, stop : int
-            As in a slice, counted in the selection.
+            Positions in the selection, as in a slice.
 
         Returns
         -------
@@ -132,7 +130,7 @@ class FrameSource:
         DataError
             Frames are damaged or missing.
         ConfigurationError
-            No frame lies in the range.
+            The range is empty.
 
         Examples
         --------
@@ -148,12 +146,11 @@ class FrameSource:
         return stack
 
     def native(self) -> Iterator[PixelArray]:
-        """Frames of the selection as the file has them: cropped, but neither scaled nor checked.
+        """Iterate over the selected frames in the type of the file: cropped, but neither scaled nor checked.
 
         Yields
         ------
         ndarray, shape (H, W) or (H, W, 3)
-            In the type of the file.
 
         Raises
         ------
@@ -175,9 +172,9 @@ class FrameSource:
         Parameters
         ----------
         numbers : collection of int
-            Numbers, in the file, of the frames to leave out; those that are not selected do not count.
+            Numbers, in the file, of the frames to leave out; numbers that are not selected have no effect.
         warning : str
-            Added to the warnings where a frame is left out.
+            Added to the warnings if a frame is left out.
 
         Returns
         -------
@@ -208,13 +205,13 @@ class FrameSource:
         )
 
     def select(self, frames: FrameRange | None = None, roi: Roi | None = None) -> FrameSource:
-        """Part of the frames, cropped.
+        """Select a range of frames and a rectangle.
 
         Parameters
         ----------
         frames : tuple, optional
-            (start, stop) or (start, stop, step), as in a slice; None stands for the end of the video. Nothing
-            counts from the end, and nothing may lie outside.
+            (start, stop) or (start, stop, step), as in a slice, but without negative numbers and within the video;
+            None as the stop is the end of the video.
         roi : tuple of int, optional
             (x, y, width, height) in pixels.
 
@@ -251,14 +248,14 @@ class FrameSource:
 
     @staticmethod
     def from_array(array: ArrayLike, name: str = "array", fps: float | None = None) -> FrameSource:
-        """Frames that lie in memory, or in a memory-mapped file.
+        """Use an array in memory, or a memory-mapped file, as a video.
 
         Parameters
         ----------
         array : array_like, shape (T, H, W) or (T, H, W, 3)
             Unsigned integers, scaled by the range of their type, or floating point in [0, 1].
         name : str
-            How messages call the video.
+            Name of the video in messages.
         fps : float, optional
             Frames per second.
 
@@ -311,13 +308,12 @@ class FrameSource:
 
     def _native(self, chosen: range | tuple[int, ...]) -> Iterator[tuple[int, PixelArray]]:
         done = 0
-        for number, pixels in zip(chosen, self.pixels(chosen), strict=False):
+        # Without iter_frames a memory-mapped video would be in memory as a whole at the end.
+        for number, pixels in zip(chosen, iter_frames(self.pixels(chosen)), strict=False):
             if pixels.shape != self.file_shape[1:]:
                 expected, found = size_text(self.file_shape[1:]), size_text(pixels.shape)
                 raise DataError(f"{self.name}: frame {number}: expected {expected} as the first frame, found {found}")
             yield number, (pixels if self.repair is None else self.repair(pixels))[self.window]
-            # A mapped video would be in memory as a whole at the end.
-            drop_pages(pixels)
             done += 1
         if done < len(chosen):
             raise DataError(
@@ -326,21 +322,7 @@ class FrameSource:
 
 
 def check_frame_range(frames: FrameRange | None) -> slice:
-    """Return (start, stop[, step]) as a slice of non-negative integers.
-
-    Parameters
-    ----------
-    frames : tuple, optional
-        See :meth:`FrameSource.select`.
-
-    Returns
-    -------
-    slice
-
-    Raises
-    ------
-    ConfigurationError
-        Not two or three non-negative integers or None, or a step below 1.
+    """Return (start, stop[, step]) as a slice, or raise ConfigurationError for anything but integers from 0 or None.
 
     Examples
     --------
@@ -362,80 +344,13 @@ def check_frame_range(frames: FrameRange | None) -> slice:
     return slice(*values)
 
 
-def frame_files(folder: Path) -> list[Path]:
-    """Images of a folder that are the frames of a video: no hidden files, no folders, no links that lead nowhere.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    list of Path
-        In the order of their names, with the digits counting as numbers.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be read.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     for name in ("a10.png", "a9.png", ".a1.png", "notes.txt"):
-    ...         Path(folder, name).touch()
-    ...     [path.name for path in frame_files(Path(folder))]
-    ['a9.png', 'a10.png']
-    """
-
-    def natural(file: Path) -> tuple[list[tuple[int, str]], str]:
-        parts = re.findall(r"\d+|\D+", file.name)
-        return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts], file.name
-
-    named = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != ".")
-    return sorted((path for path in named if path.is_file()), key=natural)
-
-
-def size_text(shape: tuple[int, ...]) -> str:
-    """Size and kind of a frame in words.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        (H, W) or (H, W, C).
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> size_text((480, 640, 3))
-    '640×480 RGB'
-    """
-    kind = "grey" if len(shape) == 2 else "RGB" if shape[2] == 3 else f"{shape[2]} channels"
-    return f"{shape[1]}×{shape[0]} {kind}"
-
-
 def cut_short_text(intact: int) -> str:
-    """Say what is wrong with, and what to do about, a video of which only the first ``intact`` frames are there.
-
-    Parameters
-    ----------
-    intact : int
-        Frames that can be read.
-
-    Returns
-    -------
-    str
+    """Error message, after the name of the file, for a video of which only the first ``intact`` frames are there.
 
     Examples
     --------
     >>> cut_short_text(59)
     'cut short after 59 whole frames; copy the file again or select frames up to 59'
-    >>> cut_short_text(0)
-    'cut short before the end of the first frame; copy the file again'
     """
     if intact < 1:
         return "cut short before the end of the first frame; copy the file again"
@@ -443,36 +358,12 @@ def cut_short_text(intact: int) -> str:
 
 
 def skipped_end_text(intact: int) -> str:
-    """Say that only the whole frames of a video that is cut short are used.
-
-    Parameters
-    ----------
-    intact : int
-        Frames that can be read.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> skipped_end_text(59)
-    'cut short; only its first 59 frames are used'
-    """
+    """Warning for a video that is cut short and of which the first ``intact`` frames are used."""
     return f"cut short; only its first {intact} frames are used"
 
 
 def numbers_text(numbers: Collection[int]) -> str:
-    """Name frames: how many, and the first few.
-
-    Parameters
-    ----------
-    numbers : collection of int
-        Ascending.
-
-    Returns
-    -------
-    str
+    """List the first few of ascending frame numbers, and count the others.
 
     Examples
     --------

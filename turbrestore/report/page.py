@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigurationError
-from ..io.images import atomic_write, check_output
+from ..io.output import atomic_write, check_output
 from ..runs.run_record import RunRecord
 from ..runtime.scratch import returning_freed
 from ..settings import Restoration

@@ -11,8 +11,8 @@ import numpy as np
 from ..core.errors import DataError, InputNotFoundError
 from ..filtering.alternating import FilterCheckpoint, Filtered, FilterState, FrameRecord
 from ..filtering.kalman import Gaussian, PixelGaussian
-from ..io.images import atomic_output
 from ..io.npy import read_npz, write_npz
+from ..io.output import atomic_output
 from ..tiled_stages import FilteredTiles
 
 _FIGURES = ("gain", "innovation", "sharpness", "information")

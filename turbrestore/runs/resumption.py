@@ -45,8 +45,8 @@ from ..core.errors import DataError, OutputError, require
 from ..deconvolution.deconvolve import Deconvolution
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
-from ..io.images import atomic_output, atomic_write
 from ..io.npy import map_npy
+from ..io.output import atomic_output, atomic_write
 from ..io.source import FrameSource
 from ..pipeline import memory_plan
 from ..registration.centroid import Centroid
