@@ -6,11 +6,11 @@ Pillow reduces 16-bit colour to 8 bits, so OpenCV decodes those images once Pill
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,10 +21,9 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image, from_unit
 from ..core.errors import DataError, StorageError, TurbrestoreError
-from ..runtime.scratch import iter_parts
 from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
 from .output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
-from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit, upright, without_alpha
+from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, to_unit, upright, without_alpha
 from .source import FrameSource, cut_short_text, skipped_end_text
 from .tiff import TIFF_SUFFIXES, read_tiff
 
@@ -154,17 +153,16 @@ def write_image(
     path = Path(path)
     check_output(path, overwrite=overwrite)
     depth = check_depth(32 if bit_depth is None else bit_depth)
-    image = check_image(image, "image")
-    if path.suffix.lower() == ".png":
-        levels = from_unit(image, 8 if depth <= 8 else 16)
-        done, data = cv2.imencode(".png", levels if levels.ndim == 2 else levels[..., ::-1])
+    is_png = path.suffix.lower() == ".png"
+    pixels = from_unit_to_type(check_image(image, "image"), min(depth, 16) if is_png else depth)
+    if is_png:
+        done, data = cv2.imencode(".png", pixels if pixels.ndim == 2 else pixels[..., ::-1])
         if not done:
-            raise StorageError(f"{path}: the PNG encoder failed on an image of shape {levels.shape}")
+            raise StorageError(f"{path}: the PNG encoder failed on an image of shape {pixels.shape}")
         atomic_write(path, data.data, overwrite)
         return
     import tifffile
 
-    pixels = _clipped(image) if depth == 32 else from_unit(image, 8 if depth <= 8 else 16)
     check_space(path, pixels.nbytes)
     with atomic_output(path, overwrite) as temporary:
         tifffile.imwrite(temporary, pixels, photometric="minisblack" if pixels.ndim == 2 else "rgb", metadata=None)
@@ -217,7 +215,7 @@ def open_animation(
     if count < 2:
         raise DataError(f"{path}: a single image; name the folder that holds the frames")
     limits.check_count(count, str(path))
-    shape, durations, fault = _scan(path, animation)
+    shape, durations, fault = _scan(path, animation, count)
     if kind == "png" and not fault:
         with _header(path, data, limits, ("PNG",)) as header:
             # Decoding does not compare the checksums.
@@ -309,7 +307,8 @@ def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
         orientation = file.metadata(index=0, exclude_applied=False).get("Orientation")
     if kind == "PPM" or (kind == "PNG" and data[24] == 16):
         pixels = _opencv_pixels(path, data)
-        pixels = pixels[..., [0, 3]] if mode == "LA" else pixels
+        # OpenCV returns grey with alpha (type 4) as RGBA.
+        pixels = pixels[..., [0, 3]] if kind == "PNG" and data[25] == 4 else pixels
     if pixels.dtype == bool:
         pixels = np.uint8(255) * pixels
     return upright(pixels, orientation)
@@ -346,18 +345,16 @@ class _Animation:
                     yield upright(pixels, facts.get("Orientation")), float(facts.get("duration", 0))
 
 
-def _scan(path: Path, animation: _Animation) -> tuple[tuple[int, ...], list[float], str]:
-    """Shape of the frames, duration of every whole frame, and what is wrong with the file."""
+def _scan(path: Path, animation: _Animation, count: int) -> tuple[tuple[int, ...], list[float], str]:
+    """Shape of the frames, duration of every whole frame, and what is wrong with a file of ``count`` frames."""
     shape: tuple[int, ...] = ()
     durations: list[float] = []
-    try:
-        with _image_errors(path):
-            for pixels, duration in animation.frames():
-                shape = pixels.shape
-                durations.append(duration)
-    except DataError:
-        return shape, durations, f"damaged or {cut_short_text(len(durations))}"
-    return shape, durations, ""
+    with contextlib.suppress(DataError), _image_errors(path):
+        for pixels, duration in animation.frames():
+            shape = pixels.shape
+            durations.append(duration)
+    present = len(durations)
+    return shape, durations, f"damaged or {cut_short_text(present)}" if present < count else ""
 
 
 def _chosen_frames(path: Path, animation: _Animation, chosen: Sequence[int]) -> Iterator[PixelArray]:
@@ -369,7 +366,7 @@ def _chosen_frames(path: Path, animation: _Animation, chosen: Sequence[int]) -> 
             yield pixels
 
 
-@contextmanager
+@contextlib.contextmanager
 def _header(path: Path, data: bytes, limits: Limits, formats: Sequence[str]) -> Iterator[PIL.Image.Image]:
     """Image of Pillow that is not decoded yet and has no more pixels than allowed."""
     import PIL.Image
@@ -379,7 +376,7 @@ def _header(path: Path, data: bytes, limits: Limits, formats: Sequence[str]) -> 
         yield header
 
 
-@contextmanager
+@contextlib.contextmanager
 def _image_errors(path: Path) -> Iterator[None]:
     """Turn the exceptions of Pillow into DataError, and silence its warnings."""
     import PIL.Image
@@ -396,11 +393,3 @@ def _image_errors(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: not an image of a known format") from error
     except Exception as error:  # Pillow raises SyntaxError, ValueError, struct.error and others, by the format
         raise DataError(f"{path}: not an image, or damaged ({first_line(error)})") from error
-
-
-def _clipped(image: FloatArray) -> FloatArray:
-    pixels, done = np.empty(image.shape, np.float32), 0
-    for part in iter_parts(image):
-        np.clip(part, 0, 1, out=pixels[done : done + len(part)])
-        done += len(part)
-    return pixels

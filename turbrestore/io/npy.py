@@ -18,12 +18,12 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, from_unit
+from ..core.arrays import FloatArray
 from ..core.errors import DataError, TurbrestoreError
 from ..runtime.scratch import iter_parts, new_stack
 from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
 from .output import atomic_output, frames_of_one_size
-from .pixels import PixelArray
+from .pixels import from_unit_to_type
 from .source import FrameSource
 
 # Arrays of more bytes may be moved to a scratch file.
@@ -193,9 +193,7 @@ def write_npy(
     count = 0
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         for frame in frames_of_one_size(frames, path):
-            pixels: PixelArray = (
-                np.clip(frame, 0, 1) if bit_depth == 32 else from_unit(frame, 8 if bit_depth <= 8 else 16)
-            )
+            pixels = from_unit_to_type(frame, bit_depth)
             if count == 0:
                 _write_header(file, (0, *pixels.shape), pixels.dtype)
             file.write(pixels.tobytes())

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, from_unit
 from ..core.errors import DataError, require
+from ..runtime.scratch import iter_parts
 
 PixelArray = NDArray[Any]
 
@@ -128,6 +129,24 @@ def check_depth(bit_depth: int) -> int:
     known = not isinstance(bit_depth, bool) and bit_depth in {*range(1, 17), 32}
     require(known, f"bit_depth: expected 1 to 16, or 32 for floating point, found {bit_depth}")
     return bit_depth
+
+
+def from_unit_to_type(image: FloatArray, bit_depth: int) -> PixelArray:
+    """Convert intensities to the type of a file: uint8 up to 8 bits, uint16 up to 16, clipped float32 for 32.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from_unit_to_type(np.array([0.5, 1.2], np.float32), 12)
+    array([32768, 65535], dtype=uint16)
+    """
+    if bit_depth != 32:
+        return from_unit(image, 8 if bit_depth <= 8 else 16)
+    pixels, done = np.empty(image.shape, np.float32), 0
+    for part in iter_parts(image):
+        np.clip(part, 0, 1, out=pixels[done : done + len(part)])
+        done += len(part)
+    return pixels
 
 
 def without_alpha(pixels: PixelArray) -> tuple[PixelArray, tuple[str, ...]]:

@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, from_unit
+from ..core.arrays import FloatArray
 from ..core.errors import DataError, TurbrestoreError
 from ..runtime.jit import jit
 from .limits import DEFAULT_LIMITS, Limits, first_line, input_errors
 from .output import atomic_output, frames_of_one_size
-from .pixels import PixelArray, check_depth, depth_of, full_scale_of, upright
+from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, upright
 from .source import FrameSource
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ def write_tiff(
     depth = check_depth(bit_depth)
     with atomic_output(path, overwrite) as temporary, tifffile.TiffWriter(temporary, bigtiff=True) as tiff:
         for frame in frames_of_one_size(frames, path):
-            pixels: PixelArray = np.clip(frame, 0, 1) if depth == 32 else from_unit(frame, 8 if depth <= 8 else 16)
+            pixels = from_unit_to_type(frame, depth)
             # Without metadata and contiguity every page is complete in itself, so any reader finds a stack.
             tiff.write(pixels, photometric="minisblack" if frame.ndim == 2 else "rgb", contiguous=False, metadata=None)
 
