@@ -25,13 +25,7 @@ from ..core.errors import DataError
 from .integrity import ffv1_slices_intact, is_cut_short
 from .limits import DEFAULT_LIMITS, Limits, input_errors
 from .pixels import PixelArray
-from .source import (
-    FrameRange,
-    FrameSource,
-    check_frame_range,
-    cut_short_text,
-    skipped_end_text,
-)
+from .source import FrameRange, FrameSource, check_cut_short, check_frame_range
 
 if TYPE_CHECKING:
     import av
@@ -74,37 +68,17 @@ def open_container(
     limits: Limits = DEFAULT_LIMITS,
     skip_damaged: bool = False,
 ) -> FrameSource:
-    """Open a video file.
+    """Open a video file; the errors are those of :func:`turbrestore.io.video.open_frames`.
 
-    Parameters
-    ----------
-    path : path-like
-        MP4, MOV, Matroska, WebM, AVI or GIF file.
-    frames : tuple, optional
-        The frames that will be selected. Damage elsewhere is no error, but the source has all frames.
-    limits : Limits
-        Largest video that is read.
-    skip_damaged : bool
-        Read the whole frames of a file that is cut short, and list damaged frames on which no others depend in
-        ``FrameSource.damaged``, instead of raising DataError.
-
-    Returns
-    -------
-    FrameSource
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The file does not exist, or cannot be read.
-    DataError
-        Not a video, damaged or cut short, or too large.
+    ``frames`` is the range that will be selected: damage elsewhere is no error, but the source has all frames. With
+    ``skip_damaged`` damaged frames on which no others depend are listed in ``FrameSource.damaged``.
 
     Examples
     --------
     >>> import tempfile
-    >>> from turbrestore.io.encoding import write_mkv
+    >>> from turbrestore.io.encoding import write_container
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_mkv(folder + "/a.mkv", [np.zeros((4, 6), np.float32)] * 3, fps=25, bit_depth=12)
+    ...     write_container(folder + "/a.mkv", [np.zeros((4, 6), np.float32)] * 3, fps=25, bit_depth=12)
     ...     source = open_container(folder + "/a.mkv")
     >>> source.shape, source.bit_depth, source.fps, source.format
     ((3, 4, 6), 12, 25.0, 'ffv1/gray12le')
@@ -125,13 +99,12 @@ def open_container(
         scan = _scan(path, cut, limits)
     cut = cut or scan.intact < scan.count or (duration is not None and _ends_early(scan, duration))
     intra = codec in _INTRA_CODECS and scan.keyframes == scan.count
-    damaged = _check_damage(path, scan, cut, frames, intra, skip_damaged)
+    notes += check_cut_short(path, scan.intact, check_frame_range(frames).stop, skip_damaged) if cut else ()
+    damaged = _check_damage(path, scan, frames, intra, skip_damaged)
     varies = scan.times is not None and _varies(scan.times, scan.tick)
     fps = float(rate) if rate else None
     if varies and scan.times is not None:
         fps, notes = (len(scan.times) - 1) / float(scan.times[-1]), (*notes, "variable frame rate")
-    if cut and skip_damaged:
-        notes = (*notes, skipped_end_text(scan.intact))
     return FrameSource(
         name=path.name,
         format=f"{codec}/{layout.name}",
@@ -239,14 +212,9 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
     return _Scan(count, intact, keyframes, tuple(damaged), None if times is None else times[:intact], tick, last)
 
 
-def _check_damage(
-    path: Path, scan: _Scan, cut: bool, frames: FrameRange | None, intra: bool, skip: bool
-) -> tuple[int, ...]:
+def _check_damage(path: Path, scan: _Scan, frames: FrameRange | None, intra: bool, skip: bool) -> tuple[int, ...]:
     """Refuse damage in the selected frames; return the numbers of damaged frames that can be skipped."""
-    wanted = check_frame_range(frames)
-    if cut and not (skip and scan.intact) and (wanted.stop is None or wanted.stop > scan.intact):
-        raise DataError(f"{path}: {cut_short_text(scan.intact)}")
-    needed = range(scan.intact)[wanted]
+    needed = range(scan.intact)[check_frame_range(frames)]
     if needed and not intra:
         needed = range(needed[-1] + 1)
     bad = [number for number in scan.damaged if number in needed]
@@ -318,14 +286,7 @@ def _pixels(path: Path, frame: av.VideoFrame, layout: _PixelFormat, number: int)
 
 
 def convert(frame: av.VideoFrame, target: str) -> av.VideoFrame:
-    """Convert a frame to the pixel format that FFmpeg calls ``target``, rounding to nearest.
-
-    Examples
-    --------
-    >>> import av
-    >>> convert(av.VideoFrame(4, 4, "gray"), "rgb24").format.name
-    'rgb24'
-    """
+    """Convert a frame to the pixel format that FFmpeg calls ``target``, rounding to nearest."""
     from av.video.reformatter import Interpolation
 
     # By default FFmpeg rounds YUV down, by half a grey level on average.

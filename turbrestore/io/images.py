@@ -24,7 +24,7 @@ from ..core.errors import DataError, StorageError, TurbrestoreError
 from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
 from .output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
 from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, to_unit, upright, without_alpha
-from .source import FrameSource, cut_short_text, skipped_end_text
+from .source import FrameSource, check_cut_short
 from .tiff import TIFF_SUFFIXES, read_tiff
 
 if TYPE_CHECKING:
@@ -41,17 +41,7 @@ _OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV", "RGBX", "RGBa")
 
 @dataclass(frozen=True, eq=False)
 class ImageFile:
-    """A still image and what its file said about it.
-
-    Attributes
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Intensities in [0, 1], RGB.
-    bit_depth : int
-        8, 16, or 32 for floating point files.
-    warnings : tuple of str
-        What was left out, such as an alpha channel.
-    """
+    """A still image, float32 in [0, 1], the bit depth of its file, and what was left out, such as an alpha channel."""
 
     image: FloatArray
     bit_depth: int
@@ -96,13 +86,7 @@ def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) ->
 
 
 def read_pixels(path: Path, limits: Limits = DEFAULT_LIMITS) -> tuple[PixelArray, tuple[str, ...]]:
-    """Read a still image as :func:`read_image` does, but in the type of its file and with values that are not scaled.
-
-    Returns
-    -------
-    pixels : ndarray, shape (H, W) or (H, W, 3)
-    warnings : tuple of str
-    """
+    """Read a still image as :func:`read_image` does, but in the type of its file; return warnings too."""
     suffix = path.suffix.lower()
     if suffix not in IMAGE_SUFFIXES:
         raise DataError(f"{path}: expected an image ({', '.join(IMAGE_SUFFIXES)}), found {suffix or 'no suffix'}")
@@ -169,34 +153,13 @@ def write_image(
 
 
 def open_animation(
-    path: str | os.PathLike[str],
-    stop: int | None = None,
-    limits: Limits = DEFAULT_LIMITS,
-    skip_damaged: bool = False,
+    path: str | os.PathLike[str], stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
 ) -> FrameSource:
     """Open an animated PNG or WebP file; all frames are decoded once to find out whether they are whole.
 
-    Parameters
-    ----------
-    path : path-like
-        Animated PNG or WebP file. 16-bit colour is read as 8 bits.
-    stop : int, optional
-        Frames from this one on are not needed, so they may be missing.
-    limits : Limits
-        Largest animation that is read.
-    skip_damaged : bool
-        Read the whole frames of a PNG file that is cut short.
-
-    Returns
-    -------
-    FrameSource
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The file does not exist, or cannot be read.
-    DataError
-        Not an animation, damaged or cut short, or too large.
+    Frames from ``stop`` on are not needed, so they may be missing. With ``skip_damaged`` the whole frames of a PNG file
+    that is cut short are read. 16-bit colour is read as 8 bits. The errors are those of
+    :func:`turbrestore.io.video.open_frames`.
 
     Examples
     --------
@@ -215,19 +178,17 @@ def open_animation(
     if count < 2:
         raise DataError(f"{path}: a single image; name the folder that holds the frames")
     limits.check_count(count, str(path))
-    shape, durations, fault = _scan(path, animation, count)
-    if kind == "png" and not fault:
+    shape, durations = _scan(path, animation)
+    present = len(durations)
+    if kind == "png" and present == count:
         with _header(path, data, limits, ("PNG",)) as header:
             # Decoding does not compare the checksums.
             header.verify()
-    present = len(durations)
-    if fault and not (skip_damaged and present) and (stop is None or stop > present):
-        raise DataError(f"{path}: {fault}")
     deep = animation.mode == "I;16"
     notes = ("alpha channel ignored",) if animation.mode in ("LA", "RGBA") else ()
     notes += ("16-bit values read as 8 bits",) if kind == "png" and data[24] == 16 and not deep else ()
     notes += ("variable frame rate",) if len(set(durations[:-1])) > 1 else ()
-    notes += (skipped_end_text(present),) if fault and skip_damaged else ()
+    notes += check_cut_short(path, present, stop, skip_damaged, "damaged or cut short") if present < count else ()
     times = np.cumsum([0.0, *durations[:-1]]) / 1000
     return FrameSource(
         name=path.name,
@@ -246,33 +207,9 @@ def open_animation(
 def write_animation(
     path: str | os.PathLike[str], frames: Iterable[FloatArray], fps: float, overwrite: bool = False
 ) -> None:
-    """Write frames as an animated image for viewing, GIF or WebP of 8 bits, repeated without end.
+    """Write frames for viewing as GIF of 256 colours or lossless WebP of 8 bits, repeated without end.
 
-    Parameters
-    ----------
-    path : path-like
-        Ends in ``.gif`` (256 colours) or ``.webp`` (lossless).
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-        Intensities; values outside [0, 1] are clipped. All frames are in memory at 8 bits until the end.
-    fps : float
-        Frames per second; GIF counts hundredths of a second, WebP thousandths.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    DataError
-        No frames, or frames of two sizes.
-    OutputError, StorageError
-        The file cannot be created or completed.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_animation(folder + "/a.gif", [np.zeros((2, 3), np.float32)], fps=25)
-    ...     Path(folder, "a.gif").read_bytes()[:6]
-    b'GIF89a'
+    All frames are in memory at 8 bits until the end. GIF counts hundredths of a second, WebP thousandths.
     """
     import imageio.v3 as iio
 
@@ -345,16 +282,15 @@ class _Animation:
                     yield upright(pixels, facts.get("Orientation")), float(facts.get("duration", 0))
 
 
-def _scan(path: Path, animation: _Animation, count: int) -> tuple[tuple[int, ...], list[float], str]:
-    """Shape of the frames, duration of every whole frame, and what is wrong with a file of ``count`` frames."""
+def _scan(path: Path, animation: _Animation) -> tuple[tuple[int, ...], list[float]]:
+    """Shape of the frames, and duration of every frame up to the first that is damaged or missing."""
     shape: tuple[int, ...] = ()
     durations: list[float] = []
     with contextlib.suppress(DataError), _image_errors(path):
         for pixels, duration in animation.frames():
             shape = pixels.shape
             durations.append(duration)
-    present = len(durations)
-    return shape, durations, f"damaged or {cut_short_text(present)}" if present < count else ""
+    return shape, durations
 
 
 def _chosen_frames(path: Path, animation: _Animation, chosen: Sequence[int]) -> Iterator[PixelArray]:

@@ -25,15 +25,6 @@ def is_cut_short(path: Path) -> bool:
     """Whether a Matroska, WebM, MP4, MOV, AVI or GIF file ends before its outermost structure does.
 
     Other formats, and live recordings that state no size, are never reported.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = Path(folder, "a.avi")
-    ...     _ = path.write_bytes(b"RIFF" + (1000).to_bytes(4, "little") + b"AVI " + bytes(500))
-    ...     is_cut_short(path)
-    True
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -51,13 +42,7 @@ def is_cut_short(path: Path) -> bool:
 
 
 def ffv1_slices_intact(packet: bytes) -> bool | None:
-    """Whether all slices of an FFV1 frame (version 3) pass their checksums; None where there are no checksums.
-
-    Examples
-    --------
-    >>> ffv1_slices_intact(b"no slices in here") is None
-    True
-    """
+    """Whether all slices of an FFV1 frame (version 3) pass their checksums; None where there are no checksums."""
     end, intact = len(packet), True
     while end > 0:
         # Every slice ends with its size without this footer (3 bytes), an error status (1) and the checksum (4).

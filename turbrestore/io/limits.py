@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.errors import DataError, InputNotFoundError, StorageError, require
+from ..core.errors import DataError, InputNotFoundError, StorageError, TurbrestoreError, require
 from .pixels import MAX_PIXELS
 
 _NOT_FILES = {
@@ -84,16 +84,7 @@ DEFAULT_LIMITS = Limits()
 
 @contextmanager
 def input_errors(path: Path) -> Iterator[None]:
-    """Turn system errors while reading ``path`` into InputNotFoundError or StorageError.
-
-    Examples
-    --------
-    >>> with input_errors(Path("missing.mkv")):
-    ...     Path("missing.mkv").read_bytes()
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.InputNotFoundError: missing.mkv: no such file or folder
-    """
+    """Turn system errors while reading ``path`` into InputNotFoundError or StorageError."""
     try:
         yield
     except FileNotFoundError as error:
@@ -102,25 +93,22 @@ def input_errors(path: Path) -> Iterator[None]:
         raise StorageError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
+@contextmanager
+def format_errors(path: Path, problem: str) -> Iterator[None]:
+    """Turn the exceptions of a library about the content of ``path`` into DataError; system errors pass."""
+    try:
+        yield
+    except (TurbrestoreError, OSError):
+        raise
+    except Exception as error:  # NumPy, zipfile and tifffile document no closed list of exceptions for damaged files
+        raise DataError(f"{path}: {problem} ({first_line(error)})") from error
+
+
 def check_input(path: Path) -> os.stat_result:
-    """Refuse a pipe, a socket or a device: a pipe waits for a writer, and a device may have no end.
+    """Return the status of a file or folder, and raise DataError for a pipe, a socket or a device.
 
-    Parameters
-    ----------
-    path : Path
-        The file or folder that will be read; a symbolic link is followed.
-
-    Returns
-    -------
-    os.stat_result
-        Its status, such as the size in bytes.
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The path does not exist, or cannot be accessed.
-    DataError
-        It is neither a file nor a folder.
+    A pipe would wait for a writer, and a device may have no end. A symbolic link is followed; a path that does not
+    exist or cannot be accessed raises InputNotFoundError or StorageError.
 
     Examples
     --------
@@ -138,13 +126,7 @@ def check_input(path: Path) -> os.stat_result:
 
 
 def first_line(error: BaseException) -> str:
-    r"""First line of an error's message, because messages of turbrestore have one line.
-
-    Examples
-    --------
-    >>> first_line(ValueError("too short\nmore"))
-    'too short'
-    """
+    """First line of an error's message, because messages of turbrestore have one line."""
     # The message of a LookupError is only the key.
     lines = [] if isinstance(error, LookupError) else str(error).splitlines()
     return (lines or [type(error).__name__])[0]

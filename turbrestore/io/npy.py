@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
-from ..core.errors import DataError, TurbrestoreError
 from ..runtime.scratch import iter_parts, new_stack
-from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
+from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
 from .output import atomic_output, frames_of_one_size
 from .pixels import from_unit_to_type
 from .source import FrameSource
@@ -32,17 +31,7 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
-    """Map the array of a ``.npy`` file into memory; it is read on demand.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-
-    Returns
-    -------
-    ndarray
-        Read-only.
+    """Map the array of a ``.npy`` file into memory, read-only; it is read on demand.
 
     Raises
     ------
@@ -61,91 +50,48 @@ def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
     """
     path = Path(path)
     size = check_input(path).st_size
-    try:
-        with input_errors(path), path.open("rb") as file:
-            shape, is_fortran, dtype = _header(file)
-            offset = file.tell()
-            needed = math.prod(shape) * dtype.itemsize
-            if not 0 < needed <= size - offset:
-                raise ValueError(f"its header asks for {needed} bytes, {size - offset} are there")
-            return np.memmap(path, dtype, "r", offset, shape, "F" if is_fortran else "C")
-    except TurbrestoreError:
-        raise
-    except Exception as error:  # NumPy documents no closed list of exceptions for damaged headers
-        raise DataError(f"{path}: not a whole .npy array of numbers ({first_line(error)})") from error
+    with input_errors(path), format_errors(path, "not a whole .npy array of numbers"), path.open("rb") as file:
+        shape, is_fortran, dtype = _header(file)
+        offset = file.tell()
+        needed = math.prod(shape) * dtype.itemsize
+        if not 0 < needed <= size - offset:
+            raise ValueError(f"its header asks for {needed} bytes, {size - offset} are there")
+        return np.memmap(path, dtype, "r", offset, shape, "F" if is_fortran else "C")
 
 
 def read_npz(
-    path: str | os.PathLike[str],
-    limits: Limits = DEFAULT_LIMITS,
-    scratch: Path | None = None,
-    large: int | None = None,
+    path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, scratch: Path | None = None, large: int | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an uncompressed ``.npz`` file.
+    """Read all arrays of an uncompressed ``.npz`` file, as :func:`numpy.savez` writes it.
 
-    Parameters
-    ----------
-    path : path-like
-        The file, as :func:`numpy.savez` writes it.
-    limits : Limits
-        Most bytes that are read.
-    scratch : Path, optional
-        Folder for scratch files, which then hold large arrays of float32; by default all are in memory.
-    large : int, optional
-        Bytes above which an array is large; by default 4 MiB.
-
-    Returns
-    -------
-    dict of str to ndarray
-        Arrays by their names in the archive, without the suffix ``.npy``.
+    Where ``scratch`` is a folder, arrays of float32 of more than ``large`` bytes (by default 4 MiB) go to scratch files
+    there.
 
     Raises
     ------
     InputNotFoundError, StorageError
         The file does not exist, or cannot be read.
     DataError
-        Not an archive of arrays, damaged, compressed, or too large.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     np.savez(folder + "/a.npz", x=np.arange(3))
-    ...     read_npz(folder + "/a.npz")
-    {'x': array([0, 1, 2])}
+        Not an archive of arrays, damaged, compressed, or larger than the limits.
     """
     path = Path(path)
     size = check_input(path).st_size
     limits.check_bytes(size, str(path))
-    try:
-        with input_errors(path), path.open("rb") as file, zipfile.ZipFile(file) as archive:
-            members = archive.infolist()
-            names = [member.filename.removesuffix(".npy") for member in members]
-            if len(set(names)) < len(names):
-                raise ValueError("two members have the same name")
-            # Uncompressed members hold more than the file only if they overlap.
-            if sum(member.file_size for member in members) > size:
-                raise ValueError(f"its members hold more than its {size} bytes")
-            least = _LARGE if large is None else large
-            return {name: _member(archive, member, scratch, least) for name, member in zip(names, members, strict=True)}
-    except TurbrestoreError:
-        raise
-    except Exception as error:  # neither NumPy nor zipfile documents a closed list of exceptions for damaged files
-        raise DataError(f"{path}: not a whole archive of arrays ({first_line(error)})") from error
+    errors = input_errors(path), format_errors(path, "not a whole archive of arrays")
+    with errors[0], errors[1], path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        names = [member.filename.removesuffix(".npy") for member in members]
+        if len(set(names)) < len(names):
+            raise ValueError("two members have the same name")
+        # Uncompressed members hold more than the file only if they overlap.
+        if sum(member.file_size for member in members) > size:
+            raise ValueError(f"its members hold more than its {size} bytes")
+        least = _LARGE if large is None else large
+        return {name: _member(archive, member, scratch, least) for name, member in zip(names, members, strict=True)}
 
 
 def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays as :func:`numpy.savez` does, but memory-mapped arrays part by part.
-
-    Examples
-    --------
-    >>> import io
-    >>> stream = io.BytesIO()
-    >>> write_npz(stream, {"x": np.arange(3)})
-    >>> _ = stream.seek(0)
-    >>> np.load(stream)["x"]
-    array([0, 1, 2])
-    """
+    """Write arrays as :func:`numpy.savez` does, but memory-mapped arrays part by part."""
     with zipfile.ZipFile(stream, "w", allowZip64=True) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -159,7 +105,7 @@ def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
-    """Open a ``.npy`` array of shape (T, H, W) or (T, H, W, 3) as a video; the errors are those of :func:`map_npy`."""
+    """Open an array of shape (T, H, W) or (T, H, W, 3) as a video; the errors are those of :func:`map_npy`."""
     array = map_npy(path)
     source = FrameSource.from_array(array, path.name)
     limits.check_size(source.shape[2], source.shape[1], str(path))
@@ -170,26 +116,7 @@ def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
 def write_npy(
     path: str | os.PathLike[str], frames: Iterable[FloatArray], bit_depth: int = 32, overwrite: bool = False
 ) -> None:
-    """Write frames as one ``.npy`` array.
-
-    Parameters
-    ----------
-    path : path-like
-        The file that is written.
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-        Intensities; values outside [0, 1] are clipped. Taken one at a time.
-    bit_depth : int
-        1 to 8 gives uint8, 9 to 16 gives uint16 (scaled to its full range), 32 float32.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    DataError
-        No frames, or frames of two sizes.
-    OutputError, StorageError
-        The file cannot be created or completed.
-    """
+    """Write frames, one at a time, as one array of uint8, uint16 or float32."""
     count = 0
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         for frame in frames_of_one_size(frames, path):

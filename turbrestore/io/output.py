@@ -29,16 +29,8 @@ def check_output(
 ) -> None:
     """Refuse an output that cannot be created, before any work begins.
 
-    Parameters
-    ----------
-    path : path-like
-        The file that will be written.
-    inputs : iterable of path-like
-        Files and folders that are read. The output must be none of them, under any name, and in none of the folders.
-    overwrite : bool
-        Whether an existing file may be replaced.
-    suffixes : collection of str, optional
-        Suffixes that the writer supports, in lower case with the dot; None allows any.
+    The output must be none of the ``inputs``, files or folders, under any name, and in none of the folders. Its suffix
+    must be one of ``suffixes``, in lower case with the dot; None allows any.
 
     Raises
     ------
@@ -46,13 +38,6 @@ def check_output(
         Unsupported suffix.
     OutputError
         The path is a folder, a device or an input, it exists already, or its folder is missing or not writable.
-
-    Examples
-    --------
-    >>> check_output("result.xyz")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.ConfigurationError: result.xyz: expected a name that ends in .png, .tif or .tiff, found .xyz
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -79,19 +64,7 @@ def check_output(
 
 
 def check_space(path: str | os.PathLike[str], size: int) -> None:
-    """Refuse work whose result does not fit on the disk.
-
-    Parameters
-    ----------
-    path : path-like
-        The file or folder that will be written; its parent folder exists.
-    size : int
-        Expected bytes; a tenth and a megabyte more must be free.
-
-    Raises
-    ------
-    StorageError
-        Less is free.
+    """Raise StorageError unless ``size`` bytes, a tenth and a megabyte more are free in the folder of ``path``.
 
     Examples
     --------
@@ -115,26 +88,8 @@ def check_space(path: str | os.PathLike[str], size: int) -> None:
 def atomic_output(path: str | os.PathLike[str], overwrite: bool = False) -> Iterator[Path]:
     """Provide a temporary file in the folder of ``path``, and rename it to ``path`` when the block has succeeded.
 
-    Any exception in the block, Ctrl-C included, removes the temporary file and leaves ``path`` as it was.
-
-    Parameters
-    ----------
-    path : path-like
-        The file that is written; a symbolic link is followed.
-    overwrite : bool
-        Replace an existing file.
-
-    Yields
-    ------
-    Path
-        An empty file to write to.
-
-    Raises
-    ------
-    OutputError
-        The file exists, or no file can be created in its folder.
-    StorageError
-        Writing failed.
+    Any exception in the block, Ctrl-C included, removes the temporary file and leaves ``path`` as it was. A symbolic
+    link is followed. OutputError is raised where no file can be created, StorageError where writing fails.
 
     Examples
     --------
@@ -165,43 +120,20 @@ def atomic_output(path: str | os.PathLike[str], overwrite: bool = False) -> Iter
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes | memoryview, overwrite: bool = False) -> None:
-    """Write ``data`` to a file completely or not at all; the errors are those of :func:`atomic_output`.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     atomic_write(folder + "/a.json", b"{}")
-    ...     Path(folder, "a.json").read_bytes()
-    b'{}'
-    """
+    """Write ``data`` to a file completely or not at all; the errors are those of :func:`atomic_output`."""
     check_space(path, len(data))
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(data)
 
 
 def size_text(shape: tuple[int, ...]) -> str:
-    """Size and kind of a frame of shape (H, W) or (H, W, C), for messages.
-
-    Examples
-    --------
-    >>> size_text((480, 640, 3))
-    '640×480 RGB'
-    """
+    """Size and kind of a frame of shape (H, W) or (H, W, C), for messages, such as 640×480 RGB."""
     kind = "grey" if len(shape) == 2 else "RGB" if shape[2] == 3 else f"{shape[2]} channels"
     return f"{shape[1]}×{shape[0]} {kind}"
 
 
 def frames_of_one_size(frames: Iterable[FloatArray], path: str | os.PathLike[str]) -> Iterator[FloatArray]:
-    """Yield the frames of a video that is written to ``path``, and raise DataError for none or for two sizes.
-
-    Examples
-    --------
-    >>> list(frames_of_one_size([], "a.mkv"))
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.DataError: a.mkv: expected at least one frame, found none
-    """
+    """Yield the frames of a video that is written to ``path``; raise DataError for none or for two sizes."""
     shape = None
     for number, frame in enumerate(frames):
         shape = shape or frame.shape

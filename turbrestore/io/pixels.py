@@ -24,22 +24,11 @@ FLOAT_MARGIN = 0.01
 
 
 def to_unit(pixels: PixelArray, full_scale: float, name: str) -> FloatArray:
-    """Convert the pixel values of a file to intensities in [0, 1].
+    """Convert the pixel values of a file to a new array of float32 intensities in [0, 1].
 
-    Parameters
-    ----------
-    pixels : ndarray
-        Unsigned integers, or floating point values in [0, 1]. Floating point values up to 0.01 outside are clipped:
-        rounding and resampling produce such values, while another scale (0 to 255, 0 to 4095) goes far beyond.
-    full_scale : float
-        The integer that means 1; ignored for floating point values.
-    name : str
-        Name of the array in error messages.
-
-    Returns
-    -------
-    ndarray, float32, shape of ``pixels``
-        A new array.
+    Unsigned integers are divided by ``full_scale``. Floating point values up to 0.01 outside [0, 1] are clipped:
+    rounding and resampling produce such values, while another scale (0 to 255, 0 to 4095) goes far beyond. ``name`` is
+    the array in messages.
 
     Raises
     ------
@@ -77,27 +66,7 @@ def to_unit(pixels: PixelArray, full_scale: float, name: str) -> FloatArray:
 def full_scale_of(dtype: np.dtype[Any], name: str) -> int:
     """Value that means intensity 1: the maximum of an unsigned integer type, 1 for floating point.
 
-    Parameters
-    ----------
-    dtype : dtype
-        Type of the array.
-    name : str
-        Name of the array in error messages.
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    DataError
-        Signed integers, booleans and other types, for which white is not defined.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> full_scale_of(np.dtype(np.uint8), "a.tif")
-    255
+    Other types raise DataError, because their white is not defined; ``name`` is the array in the message.
     """
     if np.issubdtype(dtype, np.unsignedinteger):
         return int(np.iinfo(dtype).max)
@@ -107,39 +76,19 @@ def full_scale_of(dtype: np.dtype[Any], name: str) -> int:
 
 
 def depth_of(dtype: np.dtype[Any]) -> int:
-    """Bit depth of an array: the bits of unsigned integers, at most 32; 32 for floating point.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> depth_of(np.dtype(np.uint16)), depth_of(np.dtype(np.float64))
-    (16, 32)
-    """
+    """Bit depth of an array: the bits of unsigned integers, at most 32; 32 for floating point."""
     return min(8 * dtype.itemsize, 32) if np.issubdtype(dtype, np.unsignedinteger) else 32
 
 
 def check_depth(bit_depth: int) -> int:
-    """Return ``bit_depth``, or raise ConfigurationError unless it is 1 to 16 or 32.
-
-    Examples
-    --------
-    >>> check_depth(12)
-    12
-    """
+    """Return ``bit_depth``, or raise ConfigurationError unless it is 1 to 16 or 32."""
     known = not isinstance(bit_depth, bool) and bit_depth in {*range(1, 17), 32}
     require(known, f"bit_depth: expected 1 to 16, or 32 for floating point, found {bit_depth}")
     return bit_depth
 
 
 def from_unit_to_type(image: FloatArray, bit_depth: int) -> PixelArray:
-    """Convert intensities to the type of a file: uint8 up to 8 bits, uint16 up to 16, clipped float32 for 32.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from_unit_to_type(np.array([0.5, 1.2], np.float32), 12)
-    array([32768, 65535], dtype=uint16)
-    """
+    """Convert intensities to the type of a file: uint8 up to 8 bits, uint16 up to 16, clipped float32 for 32."""
     if bit_depth != 32:
         return from_unit(image, 8 if bit_depth <= 8 else 16)
     pixels, done = np.empty(image.shape, np.float32), 0
@@ -150,15 +99,7 @@ def from_unit_to_type(image: FloatArray, bit_depth: int) -> PixelArray:
 
 
 def without_alpha(pixels: PixelArray) -> tuple[PixelArray, tuple[str, ...]]:
-    """Drop the last channel of two or four; return the pixels and a warning where there was one.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> pixels, warnings = without_alpha(np.zeros((2, 3, 4), np.uint8))
-    >>> pixels.shape, warnings
-    ((2, 3, 3), ('alpha channel ignored',))
-    """
+    """Drop the last channel of two or four; return the pixels, and a warning where there was one."""
     if pixels.ndim == 2 or pixels.shape[2] not in (2, 4):
         return pixels, ()
     colours = pixels[..., 0] if pixels.shape[2] == 2 else pixels[..., :3]
@@ -166,15 +107,7 @@ def without_alpha(pixels: PixelArray) -> tuple[PixelArray, tuple[str, ...]]:
 
 
 def upright(pixels: PixelArray, orientation: object) -> PixelArray:
-    """Turn and mirror an image as its EXIF or TIFF orientation tag, 1 to 8, demands; other values do nothing.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> upright(np.array([[1, 2], [3, 4], [5, 6]]), 6)
-    array([[5, 3, 1],
-           [6, 4, 2]])
-    """
+    """Turn and mirror an image as its EXIF or TIFF orientation tag, 1 to 8, demands; other values do nothing."""
     if orientation not in range(2, 9):
         return pixels
     place = int(orientation) - 1  # type: ignore[call-overload]

@@ -31,7 +31,7 @@ from ..core.errors import DataError
 from .limits import DEFAULT_LIMITS, Limits, input_errors
 from .output import atomic_output, frames_of_one_size
 from .pixels import PixelArray, check_depth
-from .source import FrameSource, cut_short_text, skipped_end_text
+from .source import FrameSource, check_cut_short
 
 SIGNATURE = b"LUCAM-RECORDER"
 HEADER_SIZE = 178
@@ -48,18 +48,10 @@ _NAMES = {_MONO: "mono", _RGB: "rgb", _BGR: "bgr", 8: "rggb", 9: "grbg", 10: "gb
 
 @dataclass(frozen=True)
 class SerHeader:
-    """Header of a SER file.
+    """Header of a SER file: size in pixels, number of frames, bits per plane and colour code.
 
-    Attributes
-    ----------
-    colour : int
-        0 mono; 8 to 11 Bayer RGGB, GRBG, GBRG, BGGR; 100 RGB; 101 BGR.
-    little_endian : bool
-        Byte order of two-byte pixels, as written in practice.
-    width, height, frames : int
-        Size in pixels, and number of frames.
-    bit_depth : int
-        Bits per plane, 1 to 16.
+    The colour code is 0 for mono; 8 to 11 for Bayer RGGB, GRBG, GBRG, BGGR; 100 for RGB and 101 for BGR.
+    ``little_endian`` is the byte order of two-byte pixels as written in practice.
     """
 
     colour: int
@@ -88,35 +80,7 @@ class SerHeader:
 
 
 def read_ser_header(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> SerHeader:
-    """Read and check the header of a SER file.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    limits : Limits
-        Largest frame that is read.
-
-    Returns
-    -------
-    SerHeader
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The file does not exist, or cannot be read.
-    DataError
-        Not a SER file, or of an unsupported kind.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_ser(folder + "/a.ser", [np.zeros((2, 3), np.float32)], bit_depth=12)
-    ...     header = read_ser_header(folder + "/a.ser")
-    >>> header.width, header.height, header.bit_depth, header.frames
-    (3, 2, 12, 1)
-    """
+    """Read and check the header of a SER file."""
     path = Path(path)
     with input_errors(path), path.open("rb") as file:
         data = file.read(HEADER_SIZE)
@@ -138,27 +102,8 @@ def open_ser(
 ) -> FrameSource:
     """Open a SER file; Bayer patterns become RGB by bilinear interpolation.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    stop : int, optional
-        Frames from this one on are not needed, so they may be missing.
-    limits : Limits
-        Largest video that is read.
-    skip_damaged : bool
-        Read the whole frames of a file that is cut short.
-
-    Returns
-    -------
-    FrameSource
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The file does not exist, or cannot be read.
-    DataError
-        Not a SER file, of an unsupported kind, or cut short.
+    Frames from ``stop`` on are not needed, so they may be missing. With ``skip_damaged`` the whole frames of a file
+    that is cut short are read. The errors are those of :func:`turbrestore.io.video.open_frames`.
 
     Examples
     --------
@@ -174,12 +119,10 @@ def open_ser(
     with input_errors(path):
         size = path.stat().st_size
     present = (size - HEADER_SIZE) // header.frame_bytes
-    cut = present < header.frames
-    if cut and not (skip_damaged and present) and (stop is None or stop > present):
-        raise DataError(f"{path}: {cut_short_text(present)}")
+    notes = check_cut_short(path, present, stop, skip_damaged) if present < header.frames else ()
     limits.check_count(min(header.frames, present), str(path))
     times = _timestamps(path, header, size)
-    notes = ("variable frame rate",) if times is not None and _has_gaps(times) else ()
+    notes = (*(["variable frame rate"] if times is not None and _has_gaps(times) else []), *notes)
     channels = () if header.colour == _MONO else (3,)
     return FrameSource(
         name=path.name,
@@ -191,7 +134,7 @@ def open_ser(
         path=path,
         fps=None if times is None else (len(times) - 1) / float(times[-1]),
         timestamps=times,
-        warnings=(*notes, skipped_end_text(present)) if cut and skip_damaged else notes,
+        warnings=notes,
     )
 
 
@@ -202,37 +145,9 @@ def write_ser(
     fps: float | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write frames as a SER file, mono or RGB, little endian.
+    """Write frames as a SER file, mono or RGB, little endian; a depth of 32 is written as 16 bits.
 
-    Parameters
-    ----------
-    path : path-like
-        The file that is written.
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-        Intensities; values outside [0, 1] are clipped.
-    bit_depth : int
-        1 to 16 bits per plane; 32 is written as 16.
-    fps : float, optional
-        Frames per second; stores the time of every frame, beginning on 1 January 2000.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    ConfigurationError
-        Unsupported bit depth.
-    DataError
-        No frames, or frames of two sizes.
-    OutputError, StorageError
-        The file cannot be created or completed.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_ser(folder + "/a.ser", [np.full((2, 2), 0.4, np.float32)], bit_depth=4)
-    ...     open_ser(folder + "/a.ser").read()[0, 0]
-    array([0.4, 0.4], dtype=float32)
+    With ``fps`` the time of every frame is stored, beginning on 1 January 2000.
     """
     depth = min(check_depth(bit_depth), 16)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:

@@ -114,16 +114,7 @@ class FrameSource:
         return self._frames(self.numbers)
 
     def read(self, start: int = 0, stop: int | None = None) -> FloatArray:
-        """Frames ``start`` to ``stop`` (exclusive) as one array.
-
-        Parameters
-        ----------
-        start, stop : int
-            Positions in the selection, as in a slice.
-
-        Returns
-        -------
-        ndarray, float32, shape (T, H, W) or (T, H, W, 3)
+        """Read frames ``start`` to ``stop`` (exclusive), counted in the selection, as one float32 array.
 
         Raises
         ------
@@ -148,15 +139,6 @@ class FrameSource:
     def native(self) -> Iterator[PixelArray]:
         """Iterate over the selected frames in the type of the file: cropped, but neither scaled nor checked.
 
-        Yields
-        ------
-        ndarray, shape (H, W) or (H, W, 3)
-
-        Raises
-        ------
-        DataError
-            Frames are damaged or missing.
-
         Examples
         --------
         >>> import numpy as np
@@ -167,18 +149,7 @@ class FrameSource:
             yield pixels
 
     def without(self, numbers: Collection[int], warning: str) -> FrameSource:
-        """Leave frames out.
-
-        Parameters
-        ----------
-        numbers : collection of int
-            Numbers, in the file, of the frames to leave out; numbers that are not selected have no effect.
-        warning : str
-            Added to the warnings if a frame is left out.
-
-        Returns
-        -------
-        FrameSource
+        """Leave out the frames with these numbers in the file; where any is selected, ``warning`` is added.
 
         Raises
         ------
@@ -210,14 +181,10 @@ class FrameSource:
         Parameters
         ----------
         frames : tuple, optional
-            (start, stop) or (start, stop, step), as in a slice, but without negative numbers and within the video;
-            None as the stop is the end of the video.
+            (start, stop) or (start, stop, step), as in a slice, but without negative numbers and within the video; None
+            as the stop is the end of the video.
         roi : tuple of int, optional
             (x, y, width, height) in pixels.
-
-        Returns
-        -------
-        FrameSource
 
         Raises
         ------
@@ -253,28 +220,17 @@ class FrameSource:
         Parameters
         ----------
         array : array_like, shape (T, H, W) or (T, H, W, 3)
-            Unsigned integers, scaled by the range of their type, or floating point in [0, 1].
+            Unsigned integers, scaled by the range of their type, or floating point in [0, 1]; others raise DataError.
         name : str
             Name of the video in messages.
         fps : float, optional
             Frames per second.
 
-        Returns
-        -------
-        FrameSource
-
-        Raises
-        ------
-        DataError
-            Wrong shape or type.
-
         Examples
         --------
         >>> import numpy as np
-        >>> FrameSource.from_array(np.full((2, 1, 1), 255, np.uint8)).read()
-        array([[[1.]],
-        <BLANKLINE>
-               [[1.]]], dtype=float32)
+        >>> FrameSource.from_array(np.full((2, 1, 1), 255, np.uint8)).read().ravel()
+        array([1., 1.], dtype=float32)
         """
         values = np.asanyarray(array)
         return FrameSource(
@@ -322,13 +278,7 @@ class FrameSource:
 
 
 def check_frame_range(frames: FrameRange | None) -> slice:
-    """Return (start, stop[, step]) as a slice, or raise ConfigurationError for anything but integers from 0 or None.
-
-    Examples
-    --------
-    >>> check_frame_range((10, None, 2))
-    slice(10, None, 2)
-    """
+    """Return (start, stop[, step]) as a slice; raise ConfigurationError unless they are integers from 0 or None."""
     wrong = ConfigurationError(
         f"frames: expected (start, stop) or (start, stop, step) of integers from 0 or None, found {frames}"
     )
@@ -344,22 +294,28 @@ def check_frame_range(frames: FrameRange | None) -> slice:
     return slice(*values)
 
 
-def cut_short_text(intact: int) -> str:
-    """Error message, after the name of the file, for a video of which only the first ``intact`` frames are there.
+def check_cut_short(
+    path: Path, intact: int, stop: int | None, skip_damaged: bool, problem: str = "cut short"
+) -> tuple[str, ...]:
+    """Raise DataError for a video of which only the first ``intact`` frames are there, or return a warning.
+
+    The other frames may be missing if ``skip_damaged`` is true, or if frames from ``stop`` on are not needed.
 
     Examples
     --------
-    >>> cut_short_text(59)
-    'cut short after 59 whole frames; copy the file again or select frames up to 59'
+    >>> check_cut_short(Path("a.ser"), 59, None, False)
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.DataError: a.ser: cut short after 59 whole frames; copy the file again or select frames up to 59
     """
+    if skip_damaged and intact:
+        return (f"cut short; only its first {intact} frames are used",)
+    if stop is not None and stop <= intact:
+        return ()
     if intact < 1:
-        return "cut short before the end of the first frame; copy the file again"
-    return f"cut short after {intact} whole frames; copy the file again or select frames up to {intact}"
-
-
-def skipped_end_text(intact: int) -> str:
-    """Warning for a video that is cut short and of which the first ``intact`` frames are used."""
-    return f"cut short; only its first {intact} frames are used"
+        raise DataError(f"{path}: {problem} before the end of the first frame; copy the file again")
+    remedy = f"copy the file again or select frames up to {intact}"
+    raise DataError(f"{path}: {problem} after {intact} whole frames; {remedy}")
 
 
 def numbers_text(numbers: Collection[int]) -> str:
@@ -367,8 +323,6 @@ def numbers_text(numbers: Collection[int]) -> str:
 
     Examples
     --------
-    >>> numbers_text([4])
-    'frame 4'
     >>> numbers_text(range(10, 30))
     'frames 10, 11, 12, 13, 14 and 15 more'
     """

@@ -14,7 +14,6 @@ import os
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -22,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
-from ..core.errors import DataError, TurbrestoreError
+from ..core.errors import DataError
 from ..runtime.jit import jit
-from .limits import DEFAULT_LIMITS, Limits, first_line, input_errors
+from .limits import DEFAULT_LIMITS, Limits, first_line, format_errors, input_errors
 from .output import atomic_output, frames_of_one_size
 from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, upright
 from .source import FrameSource
@@ -37,6 +36,7 @@ _NONE, _LZW, _PACKBITS, _LZMA = 1, 5, 32773, 34925
 # Compressions that are undone here: LZW, two codes of deflate, PackBits and LZMA.
 _DECOMPRESSED = (_LZW, 8, 32946, _PACKBITS, _LZMA)
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
+_NOT_TIFF = "not a TIFF file, or damaged"
 _MOST_SAMPLES = 16
 _ORIENTATION = 274
 # LZW codes that start a new table and that end the data, and the size of the largest table.
@@ -44,26 +44,10 @@ _CLEAR, _END, _TABLE = 256, 257, 4096
 
 
 def open_tiff(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> FrameSource:
-    """Open a TIFF stack, grey or RGB, with 8 or 16 bits or floating point.
+    """Open a TIFF, BigTIFF or ImageJ stack, grey or RGB, with 8 or 16 bits or floating point.
 
-    Parameters
-    ----------
-    path : path-like
-        TIFF, BigTIFF or ImageJ stack, uncompressed or compressed by deflate, LZMA, LZW or PackBits. Packed bits and
-        other compressions need the package ``imagecodecs``.
-    limits : Limits
-        Largest stack that is read.
-
-    Returns
-    -------
-    FrameSource
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The file does not exist, or cannot be read.
-    DataError
-        Not a TIFF file, damaged, cut short, or of an unsupported kind.
+    Packed bits, and compressions other than deflate, LZMA, LZW and PackBits, need the package ``imagecodecs``. The
+    errors are those of :func:`turbrestore.io.video.open_frames`.
 
     Examples
     --------
@@ -79,7 +63,7 @@ def open_tiff(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> 
     path = Path(path)
     with input_errors(path), path.open("rb") as file:
         pages = count_pages(path, file, limits)
-    with input_errors(path), _tiff_errors(path), tifffile.TiffFile(path) as tiff:
+    with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
         page = tiff.pages.first
         _check_page(path, page, limits)
         packed = _packed_stack(path, tiff) if pages == 1 else None
@@ -104,35 +88,17 @@ def open_tiff(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> 
 
 
 def read_tiff(path: Path, data: bytes, limits: Limits) -> tuple[PixelArray | None, tuple[str, ...]]:
-    """Read a TIFF file of one image.
+    """Read a TIFF file of one image whose content is ``data``: upright pixels in its type, and warnings.
 
-    Parameters
-    ----------
-    path : Path
-        Name of the file in messages.
-    data : bytes
-        Its content.
-    limits : Limits
-        Largest image that is read.
-
-    Returns
-    -------
-    pixels : ndarray, shape (H, W) or (H, W, 3), or None
-        Upright pixels in the type of the file; None for a file that has to be decoded by OpenCV, such as one with a
-        palette, one bit, JPEG or fax compression.
-    warnings : tuple of str
-
-    Raises
-    ------
-    DataError
-        Not a TIFF file, damaged, too large, or of several pages.
+    The pixels are None for a file that OpenCV has to decode, such as one with a palette, one bit, JPEG or fax
+    compression.
     """
     import tifffile
 
     pages = count_pages(path, io.BytesIO(data), limits)
     if pages != 1:
         raise DataError(f"{path}: expected one image, found {pages} pages; read it as a video")
-    with _tiff_errors(path), tifffile.TiffFile(io.BytesIO(data)) as tiff:
+    with format_errors(path, _NOT_TIFF), tifffile.TiffFile(io.BytesIO(data)) as tiff:
         page = tiff.pages.first
         _check_page(path, page, limits)
         if _is_decodable(page):
@@ -148,36 +114,7 @@ def read_tiff(path: Path, data: bytes, limits: Limits) -> tuple[PixelArray | Non
 def write_tiff(
     path: str | os.PathLike[str], frames: Iterable[FloatArray], bit_depth: int = 16, overwrite: bool = False
 ) -> None:
-    """Write frames as a TIFF stack, uncompressed, one page a frame.
-
-    Parameters
-    ----------
-    path : path-like
-        The file that is written.
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-        Intensities; values outside [0, 1] are clipped.
-    bit_depth : int
-        1 to 8 gives 8 bits, 9 to 16 gives 16 bits (scaled to the full range of the file), 32 floating point.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    ConfigurationError
-        Unsupported bit depth.
-    DataError
-        No frames, or frames of two sizes.
-    OutputError, StorageError
-        The file cannot be created or completed.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_tiff(folder + "/a.tif", [np.zeros((2, 3), np.float32)] * 4, bit_depth=12)
-    ...     open_tiff(folder + "/a.tif").format
-    'tiff/uint16'
-    """
+    """Write frames as an uncompressed TIFF stack of 8 bits, 16 bits or floating point, one page a frame."""
     import tifffile
 
     depth = check_depth(bit_depth)
@@ -222,17 +159,6 @@ def count_pages(path: Path, file: BinaryIO, limits: Limits) -> int:
     if not seen:
         raise DataError(f"{path}: expected at least one page, found none")
     return len(seen)
-
-
-@contextmanager
-def _tiff_errors(path: Path) -> Iterator[None]:
-    """Turn the exceptions of tifffile into DataError."""
-    try:
-        yield
-    except (TurbrestoreError, OSError):
-        raise
-    except Exception as error:  # tifffile documents no closed list of exceptions for damaged files
-        raise DataError(f"{path}: not a TIFF file, or damaged ({first_line(error)})") from error
 
 
 def _check_page(path: Path, page: tifffile.TiffPage, limits: Limits) -> None:
@@ -280,7 +206,7 @@ def _is_decodable(page: tifffile.TiffPage) -> bool:
 def _frames(path: Path, chosen: Sequence[int], limits: Limits) -> Iterator[PixelArray]:
     import tifffile
 
-    with input_errors(path), _tiff_errors(path), tifffile.TiffFile(path) as tiff:
+    with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
         for number in chosen:
             page = tiff.pages[number].aspage()
             _check_page(path, page, limits)

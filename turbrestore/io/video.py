@@ -25,7 +25,7 @@ import numpy as np
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, require
 from .container import CONTAINER_SUFFIXES, open_container
-from .encoding import write_mkv, write_mp4
+from .encoding import write_container
 from .images import (
     ANIMATION_OUTPUT_SUFFIXES,
     ANIMATION_SUFFIXES,
@@ -128,11 +128,7 @@ def open_frames(
 
 
 def write_video(
-    path: str | os.PathLike[str],
-    frames: Iterable[FloatArray],
-    fps: float,
-    bit_depth: int = 8,
-    overwrite: bool = False,
+    path: str | os.PathLike[str], frames: Iterable[FloatArray], fps: float, bit_depth: int = 8, overwrite: bool = False
 ) -> None:
     """Write frames as a video, in the format given by the suffix.
 
@@ -173,10 +169,8 @@ def write_video(
     require(0 < fps < np.inf, f"fps: expected a positive number of frames per second, found {fps}")
     suffix = Path(path).suffix.lower()
     checked = (check_image(frame, f"frame {number}") for number, frame in enumerate(frames))
-    if suffix == ".mkv":
-        write_mkv(path, checked, fps, bit_depth, overwrite)
-    elif suffix == ".mp4":
-        write_mp4(path, checked, fps, overwrite)
+    if suffix in (".mkv", ".mp4"):
+        write_container(path, checked, fps, bit_depth, overwrite)
     elif suffix == ".ser":
         write_ser(path, checked, bit_depth, fps, overwrite)
     elif suffix == ".npy":
@@ -190,19 +184,7 @@ def write_video(
 def frame_files(folder: Path) -> list[Path]:
     """Images of a folder that are the frames of a video, without hidden files, folders and broken links.
 
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    list of Path
-        Sorted by name, with digits compared as numbers.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be read.
+    They are sorted by name, with digits compared as numbers.
 
     Examples
     --------
