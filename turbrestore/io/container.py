@@ -11,7 +11,6 @@ Losses within a packet of a lossy codec that its decoder conceals are not found.
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -63,10 +62,7 @@ class _Scan:
 
 
 def open_container(
-    path: str | os.PathLike[str],
-    frames: FrameRange | None = None,
-    limits: Limits = DEFAULT_LIMITS,
-    skip_damaged: bool = False,
+    path: Path, frames: FrameRange | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
 ) -> FrameSource:
     """Open a video file; the errors are those of :func:`turbrestore.io.video.open_frames`.
 
@@ -78,12 +74,11 @@ def open_container(
     >>> import tempfile
     >>> from turbrestore.io.encoding import write_container
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_container(folder + "/a.mkv", [np.zeros((4, 6), np.float32)] * 3, fps=25, bit_depth=12)
-    ...     source = open_container(folder + "/a.mkv")
+    ...     write_container(Path(folder, "a.mkv"), [np.zeros((4, 6), np.float32)] * 3, fps=25, bit_depth=12)
+    ...     source = open_container(Path(folder, "a.mkv"))
     >>> source.shape, source.bit_depth, source.fps, source.format
     ((3, 4, 6), 12, 25.0, 'ffv1/gray12le')
     """
-    path = Path(path)
     with input_errors(path):
         cut = is_cut_short(path)
     with input_errors(path), _decoding(path, "it is cut short" if cut else "not a video, or damaged"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -28,7 +27,7 @@ _MOST_FRAMES_PER_SECOND = {".mkv": 1000, ".mp4": 10000}
 
 
 def write_container(
-    path: str | os.PathLike[str], frames: Iterable[FloatArray], fps: float, bit_depth: int = 8, overwrite: bool = False
+    path: Path, frames: Iterable[FloatArray], fps: float, bit_depth: int = 8, overwrite: bool = False
 ) -> None:
     """Write frames as ``.mkv`` (lossless FFV1 version 3 with checksums) or ``.mp4`` (lossy H.264, RGB of 8 bits).
 
@@ -41,13 +40,13 @@ def write_container(
     >>> import numpy as np
     >>> from turbrestore.io.container import open_container
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_container(folder + "/a.mkv", [np.full((1, 2), 0.2, np.float32)], fps=25)
-    ...     open_container(folder + "/a.mkv").read()
+    ...     write_container(Path(folder, "a.mkv"), [np.full((1, 2), 0.2, np.float32)], fps=25)
+    ...     open_container(Path(folder, "a.mkv")).read()
     array([[[0.2, 0.2]]], dtype=float32)
     """
     import av
 
-    suffix = Path(path).suffix.lower()
+    suffix = path.suffix.lower()
     limit = _MOST_FRAMES_PER_SECOND[suffix]
     require(0 < fps <= limit, f"fps: expected more than 0 and at most {limit} frames per second, found {fps}")
     # Rates such as 30000/1001 stay exact.
@@ -89,7 +88,7 @@ def _picture(frame: FloatArray, depth: int) -> av.VideoFrame:
 
 
 @contextmanager
-def _encoding(path: str | os.PathLike[str]) -> Iterator[None]:
+def _encoding(path: Path) -> Iterator[None]:
     import av
 
     try:

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -153,7 +153,7 @@ def write_image(
 
 
 def open_animation(
-    path: str | os.PathLike[str], stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
+    path: Path, stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
 ) -> FrameSource:
     """Open an animated PNG or WebP file; all frames are decoded once to find out whether they are whole.
 
@@ -165,12 +165,11 @@ def open_animation(
     --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_animation(folder + "/a.webp", [np.full((2, 3), k / 4, np.float32) for k in range(4)], fps=25)
-    ...     source = open_animation(folder + "/a.webp")
+    ...     write_animation(Path(folder, "a.webp"), [np.full((2, 3), k / 4, np.float32) for k in range(4)], fps=25)
+    ...     source = open_animation(Path(folder, "a.webp"))
     >>> source.shape, source.fps, source.format
     ((4, 2, 3, 3), 25.0, 'webp/RGB')
     """
-    path = Path(path)
     data = _read_file(path, limits)
     with _header(path, data, limits, ("PNG", "WEBP")) as header:
         animation = _Animation(data, header.mode, bool(header.info.get("default_image")))
@@ -185,7 +184,7 @@ def open_animation(
             # Decoding does not compare the checksums.
             header.verify()
     deep = animation.mode == "I;16"
-    notes = ("alpha channel ignored",) if animation.mode in ("LA", "RGBA") else ()
+    notes: tuple[str, ...] = ("alpha channel ignored",) if animation.mode in ("LA", "RGBA") else ()
     notes += ("16-bit values read as 8 bits",) if kind == "png" and data[24] == 16 and not deep else ()
     notes += ("variable frame rate",) if len(set(durations[:-1])) > 1 else ()
     notes += check_cut_short(path, present, stop, skip_damaged, "damaged or cut short") if present < count else ()
@@ -204,18 +203,17 @@ def open_animation(
     )
 
 
-def write_animation(
-    path: str | os.PathLike[str], frames: Iterable[FloatArray], fps: float, overwrite: bool = False
-) -> None:
+def write_animation(path: Path, frames: Iterable[FloatArray], fps: float, overwrite: bool = False) -> None:
     """Write frames for viewing as GIF of 256 colours or lossless WebP of 8 bits, repeated without end.
 
     All frames are in memory at 8 bits until the end. GIF counts hundredths of a second, WebP thousandths.
     """
     import imageio.v3 as iio
 
-    suffix = Path(path).suffix.lower()
+    suffix = path.suffix.lower()
     buffer = io.BytesIO()
-    with iio.imopen(buffer, "w", plugin="pillow", extension=suffix) as output:
+    writer: Any = iio.imopen(buffer, "w", plugin="pillow", extension=suffix)
+    with writer as output:
         for frame in frames_of_one_size(frames, path):
             output.write(from_unit(frame, 8), is_batch=False, duration=1000 / fps, loop=0, lossless=True)
     atomic_write(path, buffer.getbuffer(), overwrite)
@@ -232,14 +230,12 @@ def _read_file(path: Path, limits: Limits) -> bytes:
 
 def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
     """Upright pixels of the only or first image, with all channels."""
-    import imageio.v3 as iio
-
     with _header(path, data, limits, _FORMATS) as header:
         mode, kind = header.mode, header.format
         if kind == "PNG":
             # Decoding does not compare the checksums.
             header.verify()
-    with _image_errors(path), iio.imopen(data, "r", plugin="pillow") as file:
+    with _image_errors(path), _opened(data) as file:
         pixels = file.read(index=0, mode="RGB" if mode in _OTHER_COLOURS else None)
         orientation = file.metadata(index=0, exclude_applied=False).get("Orientation")
     if kind == "PPM" or (kind == "PNG" and data[24] == 16):
@@ -249,6 +245,13 @@ def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
     if pixels.dtype == bool:
         pixels = np.uint8(255) * pixels
     return upright(pixels, orientation)
+
+
+def _opened(data: bytes) -> Any:
+    """Reader of imageio for all images in a file."""
+    import imageio.v3 as iio
+
+    return iio.imopen(data, "r", plugin="pillow")
 
 
 def _opencv_pixels(path: Path, data: bytes) -> PixelArray:
@@ -272,10 +275,8 @@ class _Animation:
 
     def frames(self) -> Iterator[tuple[PixelArray, float]]:
         """Decode all frames: pixels, grey or RGB, and duration in milliseconds."""
-        import imageio.v3 as iio
-
         target = None if self.mode == "I;16" else "L" if self.mode in ("1", "L", "LA") else "RGB"
-        with iio.imopen(self.data, "r", plugin="pillow") as file:
+        with _opened(self.data) as file:
             for index, pixels in enumerate(file.iter(mode=target)):
                 if index >= self.skips_first:
                     facts = file.metadata(index=index, exclude_applied=False)
@@ -303,7 +304,7 @@ def _chosen_frames(path: Path, animation: _Animation, chosen: Sequence[int]) -> 
 
 
 @contextlib.contextmanager
-def _header(path: Path, data: bytes, limits: Limits, formats: Sequence[str]) -> Iterator[PIL.Image.Image]:
+def _header(path: Path, data: bytes, limits: Limits, formats: tuple[str, ...]) -> Iterator[PIL.Image.Image]:
     """Image of Pillow that is not decoded yet and has no more pixels than allowed."""
     import PIL.Image
 

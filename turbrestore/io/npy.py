@@ -113,9 +113,7 @@ def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     return dataclasses.replace(source, format=f"npy/{array.dtype}", path=path)
 
 
-def write_npy(
-    path: str | os.PathLike[str], frames: Iterable[FloatArray], bit_depth: int = 32, overwrite: bool = False
-) -> None:
+def write_npy(path: Path, frames: Iterable[FloatArray], bit_depth: int = 32, overwrite: bool = False) -> None:
     """Write frames, one at a time, as one array of uint8, uint16 or float32."""
     count = 0
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:

@@ -17,7 +17,6 @@ pixels and all later ones followed them, so 0 is read as little endian and every
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,9 +78,8 @@ class SerHeader:
         return self.width * self.height * self.planes * self.dtype.itemsize
 
 
-def read_ser_header(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> SerHeader:
+def read_ser_header(path: Path, limits: Limits = DEFAULT_LIMITS) -> SerHeader:
     """Read and check the header of a SER file."""
-    path = Path(path)
     with input_errors(path), path.open("rb") as file:
         data = file.read(HEADER_SIZE)
     if len(data) < HEADER_SIZE or not data.startswith(SIGNATURE):
@@ -98,7 +96,7 @@ def read_ser_header(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMIT
 
 
 def open_ser(
-    path: str | os.PathLike[str], stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
+    path: Path, stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
 ) -> FrameSource:
     """Open a SER file; Bayer patterns become RGB by bilinear interpolation.
 
@@ -109,12 +107,11 @@ def open_ser(
     --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_ser(folder + "/a.ser", [np.zeros((2, 3), np.float32)] * 4, bit_depth=12, fps=50)
-    ...     source = open_ser(folder + "/a.ser")
+    ...     write_ser(Path(folder, "a.ser"), [np.zeros((2, 3), np.float32)] * 4, bit_depth=12, fps=50)
+    ...     source = open_ser(Path(folder, "a.ser"))
     >>> source.shape, source.format, source.fps
     ((4, 2, 3), 'ser/mono12', 50.0)
     """
-    path = Path(path)
     header = read_ser_header(path, limits)
     with input_errors(path):
         size = path.stat().st_size
@@ -139,11 +136,7 @@ def open_ser(
 
 
 def write_ser(
-    path: str | os.PathLike[str],
-    frames: Iterable[FloatArray],
-    bit_depth: int = 16,
-    fps: float | None = None,
-    overwrite: bool = False,
+    path: Path, frames: Iterable[FloatArray], bit_depth: int = 16, fps: float | None = None, overwrite: bool = False
 ) -> None:
     """Write frames as a SER file, mono or RGB, little endian; a depth of 32 is written as 16 bits.
 

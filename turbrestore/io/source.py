@@ -303,10 +303,8 @@ def check_cut_short(
 
     Examples
     --------
-    >>> check_cut_short(Path("a.ser"), 59, None, False)
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.DataError: a.ser: cut short after 59 whole frames; copy the file again or select frames up to 59
+    >>> check_cut_short(Path("a.ser"), 59, None, skip_damaged=True)
+    ('cut short; only its first 59 frames are used',)
     """
     if skip_damaged and intact:
         return (f"cut short; only its first {intact} frames are used",)

@@ -10,7 +10,6 @@ import dataclasses
 import io
 import lzma
 import math
-import os
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -43,7 +42,7 @@ _ORIENTATION = 274
 _CLEAR, _END, _TABLE = 256, 257, 4096
 
 
-def open_tiff(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> FrameSource:
+def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     """Open a TIFF, BigTIFF or ImageJ stack, grey or RGB, with 8 or 16 bits or floating point.
 
     Packed bits, and compressions other than deflate, LZMA, LZW and PackBits, need the package ``imagecodecs``. The
@@ -53,14 +52,13 @@ def open_tiff(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> 
     --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_tiff(folder + "/a.tif", [np.full((2, 3), 0.25, np.float32)] * 4, bit_depth=32)
-    ...     source = open_tiff(folder + "/a.tif")
+    ...     write_tiff(Path(folder, "a.tif"), [np.full((2, 3), 0.25, np.float32)] * 4, bit_depth=32)
+    ...     source = open_tiff(Path(folder, "a.tif"))
     ...     source.shape, source.format, float(source.read().max())
     ((4, 2, 3), 'tiff/float32', 0.25)
     """
     import tifffile
 
-    path = Path(path)
     with input_errors(path), path.open("rb") as file:
         pages = count_pages(path, file, limits)
     with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
@@ -111,9 +109,7 @@ def read_tiff(path: Path, data: bytes, limits: Limits) -> tuple[PixelArray | Non
         return None, ()
 
 
-def write_tiff(
-    path: str | os.PathLike[str], frames: Iterable[FloatArray], bit_depth: int = 16, overwrite: bool = False
-) -> None:
+def write_tiff(path: Path, frames: Iterable[FloatArray], bit_depth: int = 16, overwrite: bool = False) -> None:
     """Write frames as an uncompressed TIFF stack of 8 bits, 16 bits or floating point, one page a frame."""
     import tifffile
 
@@ -223,7 +219,8 @@ def _page_pixels(path: Path, page: tifffile.TiffPage) -> PixelArray:
         page.compression = _NONE
         pixels = np.zeros(page.shaped, page.dtype)
         for index, part in enumerate(parts):
-            segment, (plane, depth, top, left, _), shape = page.decode(part, index)
+            decoded: Any = page.decode(part, index)
+            segment, (plane, depth, top, left, _), shape = decoded
             rows, columns = slice(top, top + shape[1]), slice(left, left + shape[2])
             pixels[plane, depth : depth + shape[0], rows, columns] = segment[
                 : page.imagedepth - depth, : page.imagelength - top, : page.imagewidth - left

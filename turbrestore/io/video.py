@@ -164,10 +164,11 @@ def write_video(
     ...     open_frames(folder + "/a.npy").format
     'npy/float32'
     """
+    path = Path(path)
     check_output(path, overwrite=overwrite, suffixes=VIDEO_OUTPUT_SUFFIXES)
     check_depth(bit_depth)
     require(0 < fps < np.inf, f"fps: expected a positive number of frames per second, found {fps}")
-    suffix = Path(path).suffix.lower()
+    suffix = path.suffix.lower()
     checked = (check_image(frame, f"frame {number}") for number, frame in enumerate(frames))
     if suffix in (".mkv", ".mp4"):
         write_container(path, checked, fps, bit_depth, overwrite)
