@@ -117,17 +117,6 @@ class ContentReport:
 def check_content(source: FrameSource, params: ContentParams | None = None) -> ContentReport:
     """Examine every frame once; memory does not grow with the video, except for 20 bytes per frame.
 
-    Parameters
-    ----------
-    source : FrameSource
-        The video.
-    params : ContentParams, optional
-        Thresholds.
-
-    Returns
-    -------
-    ContentReport
-
     Raises
     ------
     DataError
@@ -156,17 +145,12 @@ def check_content(source: FrameSource, params: ContentParams | None = None) -> C
 def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
     """Repair the defects that :func:`check_content` has found, or leave their frames out.
 
-    Parameters
-    ----------
-    source : FrameSource
-        The video.
-    report : ContentReport
-        The defects of exactly these frames; a report on others raises ConfigurationError.
+    The returned source repairs frames while they are read, and its ``warnings`` list what is done.
 
-    Returns
-    -------
-    FrameSource
-        Repairs frames while they are read; ``warnings`` lists what is done.
+    Raises
+    ------
+    ConfigurationError
+        The report is about other frames.
 
     Examples
     --------

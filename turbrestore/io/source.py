@@ -34,16 +34,12 @@ class FrameSource:
 
     Attributes
     ----------
-    name : str
-        Name of the video in messages.
-    format : str
-        Container or codec and pixel format, such as ``ffv1/gray16le``.
+    name, format : str
+        Name of the video in messages; container or codec and pixel format, such as ``ffv1/gray16le``.
     file_shape : tuple of int
         (T, H, W) or (T, H, W, 3) of the whole file.
-    full_scale : int
-        Native value that means intensity 1.
-    bit_depth : int
-        Bits per channel of the file; 32 for floating point.
+    full_scale, bit_depth : int
+        Native value that means intensity 1; bits per channel of the file, 32 for floating point.
     pixels : callable
         Takes ascending frame numbers of the file, and yields the native pixels of these frames.
     path : Path or None
@@ -58,20 +54,16 @@ class FrameSource:
         Numbers, in the file, of frames that are known to be damaged.
     repair : callable or None
         Applied to the native pixels of every frame first.
-    numbers : range or tuple of int
-        Ascending numbers, in the file, of the selected frames; by default all.
-    window : tuple of slice
-        Selected rows and columns; by default all.
+    numbers, window : range or tuple of int, tuple of slice
+        Ascending numbers, in the file, of the selected frames; selected rows and columns. By default all.
 
     Examples
     --------
     >>> import numpy as np
     >>> source = FrameSource.from_array(np.zeros((5, 4, 6), np.uint8))
-    >>> source.shape, source.bit_depth
-    ((5, 4, 6), 8)
     >>> part = source.select(frames=(1, None, 2), roi=(0, 1, 3, 2))
-    >>> len(part), [frame.shape for frame in part]
-    (2, [(2, 3), (2, 3)])
+    >>> source.shape, len(part), [frame.shape for frame in part]
+    ((5, 4, 6), 2, [(2, 3), (2, 3)])
     """
 
     name: str
