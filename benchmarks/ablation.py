@@ -24,7 +24,7 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.filtering.alternating import FilterParams
-from turbrestore.io.images import atomic_write
+from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import Restoration, RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams

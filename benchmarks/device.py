@@ -27,7 +27,7 @@ from turbrestore.deconvolution.nonlocal_tv import NonlocalParams, nonlocal_weigh
 from turbrestore.deconvolution.torch_weights import weights_on_device
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import FilterParams, filter_frames
-from turbrestore.io.images import atomic_write
+from turbrestore.io.output import atomic_write
 from turbrestore.metrics import psnr
 from turbrestore.pipeline import restore
 from turbrestore.registration.flow import FlowParams, estimate_flow

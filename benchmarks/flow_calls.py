@@ -23,7 +23,7 @@ from clips import find_clips
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.filtering.alternating import FilterParams
-from turbrestore.io.images import atomic_write
+from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams

@@ -1,4 +1,4 @@
-"""Files that are malformed, damaged, lying or of odd content, from scratch and the same in every run."""
+"""Files that are malformed or damaged, have forged headers or odd content; the same in every run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
 
-FORMATS = (".mkv", ".mp4", ".avi", ".mov", ".gif", ".ser", ".tif", ".npy")
+FORMATS = (".mkv", ".mp4", ".avi", ".mov", ".gif", ".png", ".webp", ".ser", ".tif", ".npy")
 FLIPPED = {"FFV1 with checksums": ".mkv", "H.264": ".mp4", "SER": ".ser", "TIFF": ".tif", "npy": ".npy"}
 # Still images, and whether every flip within the compressed pixels has to be found.
 STILLS = {"deflate": True, "LZW": False, "PackBits": False}
@@ -27,7 +27,7 @@ _HUGE = 60_000
 
 @dataclass(frozen=True)
 class Bomb:
-    """A file that must not be believed, and the command that meets it."""
+    """A file with a forged header, and the command that reads it."""
 
     write: Callable[[Path], object]
     command: tuple[str, ...] = ("restore", "{input}", "{output}")
@@ -35,7 +35,7 @@ class Bomb:
 
 @dataclass(frozen=True)
 class Content:
-    """A video of odd content, and what the command line has to say about it."""
+    """A video of odd content, and the words that the command line must write about it."""
 
     name: str
     write: Callable[[Path], object]
@@ -64,7 +64,7 @@ def write_clip(path: Path, kind: str = "") -> None:
     """Write a whole video in the format of the suffix."""
     if path.suffix in (".mkv", ".ser", ".tif", ".npy", ".mp4") and kind != "H.264":
         write_video(path, clip(), 25, 8)
-    elif path.suffix == ".gif":
+    elif path.suffix in (".gif", ".png", ".webp"):
         import PIL.Image
 
         images = [PIL.Image.fromarray(np.uint8(255 * frame)) for frame in clip()]
@@ -273,6 +273,7 @@ BOMBS = {
     "short.png": Bomb(lambda path: _png(path, 8000, 16, 6), _EVALUATE),
     "comment.png": Bomb(lambda path: _png(path, 32, extra=zlib.compress(bytes(5 * 10**8), 1)), _DEBLUR),
     "frames of png": Bomb(_folder_of_png),
+    "animation.png": Bomb(lambda path: _png(path, _HUGE)),
     "huge.jpg": Bomb(_jpeg, _EVALUATE),
     "huge.tif": Bomb(lambda path: _tiff(path, {256: _HUGE, 257: _HUGE, 278: _HUGE}), _EVALUATE),
     "stack.tif": Bomb(lambda path: _tiff(path, {256: _HUGE, 257: _HUGE, 278: _HUGE})),

@@ -1,4 +1,4 @@
-"""Feed the command line files that are malformed, damaged, lying or of odd content, and count what is handled.
+"""Run the command line on files that are malformed or damaged, have forged headers or odd content, and count passes.
 
 Run ``python benchmarks/hostile_input.py``; it prints a Markdown table and exits with 1 when a row fails.
 ``--sample`` runs a few cases of every group; ``--only`` one group.
@@ -51,6 +51,7 @@ IMPORTED = (
     "av",
     "tifffile",
     "PIL.Image",
+    "imageio.v3",
     "turbrestore_cli.restore",
     "turbrestore_cli.stages",
     "turbrestore_cli.inspection",
@@ -118,7 +119,7 @@ def table(rows: Iterable[Row]) -> str:
 
 def malformed_files(folder: Path, sample: bool) -> list[Row]:
     """Empty, text, wrong magic, random, and truncated at ten points."""
-    row = Row("malformed: empty, text, wrong first bytes, random, cut at ten points; eight formats", _REFUSED)
+    row = Row("malformed: empty, text, wrong first bytes, random, cut at ten points; ten formats", _REFUSED)
     _apart(lambda: [write_clip(folder / f"whole{suffix}") for suffix in FORMATS])
     for suffix in FORMATS:
         cases = malformed((folder / f"whole{suffix}").read_bytes(), suffix)

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from turbrestore.io.images import atomic_write
+from turbrestore.io.output import atomic_write
 
 HERE = Path(__file__).parent
 TESTS = HERE.parent / "tests"

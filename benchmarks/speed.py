@@ -32,7 +32,7 @@ from revisions import Figures, child, revision, take_two_cores
 
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.deconvolution.nonlocal_tv import nonlocal_weights
-from turbrestore.io.images import atomic_write
+from turbrestore.io.output import atomic_write
 from turbrestore.io.source import FrameSource
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams

@@ -12,7 +12,7 @@ import tomli_w
 
 from turbrestore import __version__
 from turbrestore.core.errors import require
-from turbrestore.io.images import atomic_write, check_output
+from turbrestore.io.output import atomic_write, check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.settings import RestoreParams
 

@@ -13,9 +13,8 @@ from cyclopts import Parameter
 from turbrestore.core.arrays import FloatArray, check_flow
 from turbrestore.core.errors import DataError, require
 from turbrestore.footage.content import clean_source
-from turbrestore.io.files import check_input, input_errors
 from turbrestore.io.images import read_image
-from turbrestore.io.limits import DEFAULT_LIMITS
+from turbrestore.io.limits import DEFAULT_LIMITS, check_input, input_errors
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import appearance, compare, compare_flows
 from turbrestore.runs.stage_files import load_flows
@@ -42,7 +41,7 @@ def info(
     Parameters
     ----------
     input : Path
-        Video (mp4, mkv, avi, mov, webm, gif), TIFF stack, SER, .npy, or folder of images.
+        Video (mp4, mkv, avi, mov, webm, gif), animated PNG or WebP, TIFF stack, SER, .npy, or folder of images.
     json : bool
         Print JSON.
     """

@@ -13,7 +13,7 @@ from turbrestore.blur_moments.experiments.comparison import wavefront as run_wav
 from turbrestore.blur_moments.experiments.figures import draw_mirror, draw_wavefront, new_figure
 from turbrestore.blur_moments.experiments.scenarios import MirrorParams, WavefrontParams
 from turbrestore.core.errors import require_between
-from turbrestore.io.images import atomic_write, check_output
+from turbrestore.io.output import atomic_write, check_output
 
 from .options import Flag
 from .output import print_json

@@ -15,7 +15,8 @@ import tomli_w
 from turbrestore import __version__
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import OutputError
-from turbrestore.io.images import atomic_write, check_output, write_image
+from turbrestore.io.images import write_image
+from turbrestore.io.output import atomic_write, check_output
 from turbrestore.metrics import compare
 from turbrestore.results import Restoration
 from turbrestore.runs.folder_lock import LOCK

@@ -9,7 +9,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from turbrestore.core.errors import require
-from turbrestore.io.images import check_output, write_image
+from turbrestore.io.images import write_image
+from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.metrics import comparable
 from turbrestore.pipeline import restore as run_pipeline
@@ -61,7 +62,7 @@ def restore(
     Parameters
     ----------
     input : Path
-        Video (mp4, mkv, avi, mov, webm, gif), TIFF stack, SER, .npy, or folder of images.
+        Video (mp4, mkv, avi, mov, webm, gif), animated PNG or WebP, TIFF stack, SER, .npy, or folder of images.
     output : Path
         Image to write: .png (8 or 16 bit) or .tif (8, 16 bit or float).
     sigma : float

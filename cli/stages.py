@@ -16,7 +16,8 @@ from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.dynamics.dynamic_texture import identify as identify_flows
 from turbrestore.dynamics.flow_model import FlowDynamics
 from turbrestore.filtering.alternating import Filtered, FilterParams, FilterStep, filter_steps
-from turbrestore.io.images import IMAGE_OUTPUT_SUFFIXES, check_output, check_space, read_image, write_image
+from turbrestore.io.images import read_image, write_image
+from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, check_output, check_space
 from turbrestore.io.pixels import check_depth
 from turbrestore.memory_plan import training_share
 from turbrestore.pipeline import step_counter

@@ -18,8 +18,9 @@ from cyclopts import Parameter
 from turbrestore import __version__
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import ConfigurationError, OutputError, require, require_between
-from turbrestore.io.images import check_output, check_space, read_image, write_image
+from turbrestore.io.images import read_image, write_image
 from turbrestore.io.limits import Limits
+from turbrestore.io.output import check_output, check_space
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video
 from turbrestore.memory_plan import training_share
 from turbrestore.pipeline import Progress, step_counter

@@ -20,7 +20,7 @@ from .dynamics.dynamic_texture import identify
 from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import Filtered, FilterStep, filter_steps
 from .footage.frame_selection import best_frames, frame_quality
-from .io.images import check_space
+from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan, plan_memory
 from .registration.centroid import Centroid, centroid_steps

@@ -23,13 +23,8 @@ from turbrestore.core.errors import (
     StorageError,
     TurbrestoreError,
 )
-from turbrestore.io.images import (
-    atomic_output,
-    atomic_write,
-    check_output,
-    read_image,
-    write_image,
-)
+from turbrestore.io.images import read_image, write_image
+from turbrestore.io.output import atomic_output, atomic_write, check_output
 from turbrestore.io.pixels import to_unit
 
 SHAPES = st.tuples(st.integers(1, 5), st.integers(1, 5)).flatmap(lambda s: st.sampled_from([s, (*s, 3)]))

@@ -17,7 +17,8 @@ from turbrestore.core.errors import OutputError, StorageError
 from turbrestore.filtering.filter_records import FilterCheckpoint, FilterState
 from turbrestore.filtering.image_state import PixelGaussian
 from turbrestore.filtering.kalman import Gaussian
-from turbrestore.io.images import atomic_write, check_space, write_image
+from turbrestore.io.images import write_image
+from turbrestore.io.output import atomic_write, check_space
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, write_video
 from turbrestore.registration.centroid import Centroid
 from turbrestore.runs.checkpoint import save_checkpoint
@@ -72,7 +73,7 @@ class TestWriters:
         def interrupt(_):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("turbrestore.io.images.os.fsync", interrupt)
+        monkeypatch.setattr("turbrestore.io.output.os.fsync", interrupt)
         with pytest.raises(KeyboardInterrupt):
             WRITERS[name](tmp_path / name)
         assert list(tmp_path.iterdir()) == []
@@ -85,7 +86,7 @@ class TestWriters:
             seen.append((part.suffix, os.fstat(descriptor).st_size))
             fsync(descriptor)
 
-        monkeypatch.setattr("turbrestore.io.images.os.fsync", flush)
+        monkeypatch.setattr("turbrestore.io.output.os.fsync", flush)
         WRITERS[name](tmp_path / name)
         [written] = tmp_path.iterdir()
         assert written.name == name
@@ -120,7 +121,7 @@ def fails(capsys, words, code, part):
 @pytest.mark.parametrize(("more", "free"), [([], 500_000), (["--keep=kept"], 1_100_000)], ids=["image", "stages"])
 def test_a_disk_that_is_too_full_is_told_before_the_work(place, monkeypatch, capsys, more, free):
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr("turbrestore.io.images.shutil.disk_usage", lambda _: usage(1 << 30, 0, free))
+    monkeypatch.setattr("turbrestore.io.output.shutil.disk_usage", lambda _: usage(1 << 30, 0, free))
     monkeypatch.setattr("turbrestore.pipeline.find_centroid", None)
     fails(capsys, ["restore", "clip.npy", "o.png", *more, *QUICK], StorageError.exit_code, "make room on the disk")
     assert [path.name for path in place.iterdir()] == ["clip.npy"]
@@ -141,7 +142,7 @@ def test_every_stage_asks_for_room_before_the_work(place, monkeypatch, capsys, w
     for name in ("centroid.npz", "dynamics.npz"):
         (place / "kept" / name).rename(place / name)
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr("turbrestore.io.images.shutil.disk_usage", lambda _: usage(1 << 30, 0, 1 << 20))
+    monkeypatch.setattr("turbrestore.io.output.shutil.disk_usage", lambda _: usage(1 << 30, 0, 1 << 20))
     monkeypatch.setattr(f"turbrestore_cli.{stage}", None)
     before = sorted(place.iterdir())
     fails(capsys, [*words, "--quiet"], StorageError.exit_code, "make room on the disk")

@@ -45,7 +45,7 @@ class TestRefusals:
         (tmp_path / f"a{suffix}").write_bytes(content)
         assert refused(tmp_path / f"a{suffix}", DataError, f"a{suffix}") == 65
 
-    @pytest.mark.parametrize(("name", "word"), [("a.xyz", ".mkv"), ("a", "no suffix"), ("a.png", "folder")])
+    @pytest.mark.parametrize(("name", "word"), [("a.xyz", ".mkv"), ("a", "no suffix"), ("a.jpg", "folder")])
     def test_unknown_suffix(self, tmp_path, name, word):
         (tmp_path / name).write_bytes(b"x")
         refused(tmp_path / name, DataError, word)

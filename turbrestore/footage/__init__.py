@@ -1,1 +1,1 @@
-"""What a clip shows: cuts, stuck pixels, repeated or damaged frames, and which frames are sharpest."""
+"""Analysis of clips: cuts, stuck pixels, repeated and blank frames, and the sharpness of frames."""

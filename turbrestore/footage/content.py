@@ -1,18 +1,17 @@
-"""What frames show that no image should be made of: found in one pass, then repaired or left out.
+"""Defects of the content of a video: they are found in one pass, then repaired or left out.
 
 ====================  =================================================================  =============================
-found                 how                                                                what :func:`clean_source` does
+defect                criterion                                                          :func:`clean_source`
 ====================  =================================================================  =============================
-NaN, infinite values  in up to 1 % of a frame; more is refused                           fills them from around
-stuck pixels          apart from all eight neighbours, the same way in every frame       median of the neighbours
-duplicated frames     every value as in the frame before                                 leaves them out
+NaN, infinite values  in up to 1 % of a frame; more raises DataError                     fills them from around
+stuck pixels          outside the range of their neighbours in every frame               median of the neighbours
+duplicated frames     every value equals that of the frame before                        leaves them out
 blank frames          a tenth of the usual contrast or less: lens cap, flash, dropout    leaves them out
-cuts                  two frames look alike under no shift                               keeps the longest scene
-saturation            half of the values or more at white                                only says so
+cuts                  two frames are not similar under any shift                         keeps the longest scene
+saturation            half of the values or more are white                               only warns
 ====================  =================================================================  =============================
 
-How cuts and stuck pixels are told from the scene: :mod:`turbrestore.footage.scene_cuts`,
-:mod:`turbrestore.footage.stuck_pixels`.
+:mod:`turbrestore.footage.scene_cuts` detects cuts, :mod:`turbrestore.footage.stuck_pixels` stuck pixels.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ from numpy.typing import NDArray
 from ..core.errors import ConfigurationError, DataError, require_between
 from ..io.pixels import PixelArray, to_unit
 from ..io.source import FrameSource, numbers_text
-from .scene_cuts import Scene, SceneWatch, divide, thumbnail
-from .stuck_pixels import StuckPixels, without_stuck
+from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
+from .stuck_pixels import StuckPixelDetector, repair_stuck
 
-# More values than this share are no isolated defects.
+# A frame with more missing values than this share is refused.
 _MOST_MISSING = 0.01
-# Rings of values that are filled around what is known.
+# Number of rings of values that are filled from the edge of a hole inwards.
 _WIDEST_HOLE = 32
 _LEAST_CONTRAST = 1 / 510
 _SATURATED = 0.5
@@ -41,18 +40,18 @@ _SATURATED = 0.5
 
 @dataclass(frozen=True)
 class ContentParams:
-    """What counts as a defect of the content, and what is done about it.
+    """Thresholds for defects of the content, and whether they are errors.
 
     Parameters
     ----------
     strict : bool
-        Refuse what would otherwise be repaired or left out.
+        Raise DataError instead of repairing defects or leaving frames out.
     blank_contrast : float
         Frames of at most this share of the median contrast are blank.
     cut_similarity : float
         Similarity, 0 to 1, below which two frames show different scenes.
     stuck_excess : float
-        Distance, as a share of full scale, by which a stuck pixel lies outside of the range of its neighbours.
+        Distance, as a share of full scale, by which a stuck pixel lies outside the range of its neighbours.
 
     Examples
     --------
@@ -74,16 +73,16 @@ class ContentParams:
 
 @dataclass(frozen=True, eq=False)
 class ContentReport:
-    """What was found in the frames of a video.
+    """Defects of the content of a video.
 
     Attributes
     ----------
     numbers : range or tuple of int
-        Numbers, in the file, of the frames that were looked at.
+        Numbers, in the file, of the examined frames.
     filled : tuple of int
         Frames with NaN or infinite values.
     filled_values : int
-        How many such values there are.
+        Number of these values.
     stuck : ndarray, int, shape (N, 2) or (N, 3)
         Row, column, and channel of colour frames, in the file, of every stuck pixel.
     duplicated : tuple of int
@@ -93,13 +92,13 @@ class ContentReport:
     scenes : tuple of Scene
         In the order of their first frames; one where there is no cut.
     saturated : float
-        Mean share of values at white.
+        Mean share of white values.
     contrast : float
-        Largest standard deviation within a frame, seen as a thumbnail; 0 where no frame shows anything.
+        Largest standard deviation within the thumbnail of a frame; 0 where no frame shows anything.
     left_out : frozenset of int
         Frames that :func:`clean_source` leaves out.
     warnings : tuple of str
-        All of this in words, and what is done about it; empty for a clean video.
+        The defects and what is done about them; empty for a clean video.
     """
 
     numbers: range | tuple[int, ...]
@@ -116,23 +115,12 @@ class ContentReport:
 
 
 def check_content(source: FrameSource, params: ContentParams | None = None) -> ContentReport:
-    """Look at every frame once; memory does not grow with the video, but for 20 bytes a frame.
-
-    Parameters
-    ----------
-    source : FrameSource
-        The video.
-    params : ContentParams, optional
-        What counts as a defect.
-
-    Returns
-    -------
-    ContentReport
+    """Examine every frame once; memory does not grow with the video, except for 20 bytes per frame.
 
     Raises
     ------
     DataError
-        Damaged frames, too many values that are not finite, or, where ``params.strict``, any defect.
+        Damaged frames, too many values that are not finite, or, with ``params.strict``, any defect.
 
     Examples
     --------
@@ -145,29 +133,19 @@ def check_content(source: FrameSource, params: ContentParams | None = None) -> C
     ((5,), [[8, 9]])
     """
     params = params or ContentParams()
-    watch = _Watch(source, params)
+    scan = _ContentScan(source, params)
     for number, pixels in zip(source.numbers, source.native(), strict=True):
-        watch.look(number, pixels)
-    report = watch.report()
+        scan.update(number, pixels)
+    report = scan.report()
     if params.strict and (report.left_out or report.filled or len(report.stuck)):
         raise DataError(f"{source.name}: {report.warnings[0]}; refused by strict, leave it out to go on")
     return report
 
 
 def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
-    """Repair or leave out what :func:`check_content` has found; a clean video comes back as it is.
+    """Repair the defects that :func:`check_content` has found, or leave their frames out.
 
-    Parameters
-    ----------
-    source : FrameSource
-        The video.
-    report : ContentReport
-        What was found in these very frames.
-
-    Returns
-    -------
-    FrameSource
-        Reads the frames anew and repairs them on the way; ``warnings`` says what was done.
+    The returned source repairs frames while they are read, and its ``warnings`` list what is done.
 
     Raises
     ------
@@ -190,17 +168,15 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
 
     def repaired(pixels: PixelArray) -> PixelArray:
         pixels = _filled(pixels) if fill else pixels
-        return without_stuck(pixels, stuck) if len(stuck) else pixels
+        return repair_stuck(pixels, stuck) if len(stuck) else pixels
 
     return dataclasses.replace(
-        cleaned,
-        warnings=(*source.warnings, *report.warnings),
-        repair=repaired if fill or len(stuck) else source.repair,
+        cleaned, warnings=(*source.warnings, *report.warnings), repair=repaired if fill or len(stuck) else source.repair
     )
 
 
-class _Watch:
-    """What has been seen so far."""
+class _ContentScan:
+    """State of the pass over the frames."""
 
     def __init__(self, source: FrameSource, params: ContentParams) -> None:
         self._source, self._params = source, params
@@ -211,11 +187,11 @@ class _Watch:
         self._filled: list[int] = []
         self._filled_values = 0
         self._duplicated: list[int] = []
-        self._stuck = StuckPixels(params.stuck_excess)
-        self._scenes = SceneWatch(params.cut_similarity)
+        self._stuck = StuckPixelDetector(params.stuck_excess)
+        self._scenes = SceneDetector(params.cut_similarity)
 
-    def look(self, number: int, pixels: PixelArray) -> None:
-        pixels = self._complete(number, pixels)
+    def update(self, number: int, pixels: PixelArray) -> None:
+        pixels = self._with_holes_filled(number, pixels)
         values = to_unit(pixels, self._source.full_scale, f"{self._source.name}: frame {number}")
         self._saturated += np.count_nonzero(values >= 1) / values.size
         if self._previous is not None and np.array_equal(pixels, self._previous):
@@ -224,11 +200,11 @@ class _Watch:
         thumb = thumbnail(values)
         contrast = float(thumb.std())
         self._contrasts.append(contrast)
-        # A slowly updated median: blank frames must not count as scenes, nor end the watch on stuck pixels.
+        # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
         self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
         if contrast > max(_LEAST_CONTRAST, self._params.blank_contrast * self._usual):
-            self._stuck.look(values)
-            self._scenes.look(thumb)
+            self._stuck.update(values)
+            self._scenes.update(thumb)
         else:
             self._scenes.skip()
 
@@ -239,9 +215,9 @@ class _Watch:
         blank &= ~blank.all()
         duplicated = np.isin(numbers, self._duplicated)
         labels = np.where(blank, -1, self._scenes.labels())
-        scenes, used = divide(numbers, labels)
+        scenes, used = group_scenes(numbers, labels)
         left_out = blank | ~used
-        # A video of one repeated frame is a still image; there is nothing else to take.
+        # In a video of one repeated frame there are no others to use.
         repeated = (~(left_out | duplicated)).sum() < 2
         left_out |= duplicated & ~repeated
         stuck = self._stuck.found()
@@ -263,8 +239,8 @@ class _Watch:
         )
         return dataclasses.replace(report, warnings=tuple(_in_words(report, bool(repeated))))
 
-    def _complete(self, number: int, pixels: PixelArray) -> PixelArray:
-        """Pixels whose values are finite; isolated holes are filled."""
+    def _with_holes_filled(self, number: int, pixels: PixelArray) -> PixelArray:
+        """Fill isolated values that are not finite; raise DataError where there are too many."""
         if not np.issubdtype(pixels.dtype, np.floating):
             return pixels
         missing = int(pixels.size - np.count_nonzero(np.isfinite(pixels)))
@@ -312,7 +288,7 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
 
 
 def _filled(pixels: PixelArray) -> PixelArray:
-    """Fill holes, ring by ring, with the mean of the known among the eight neighbours."""
+    """Fill holes ring by ring with the mean of the known values among the eight neighbours."""
     missing = ~np.isfinite(pixels)
     if not missing.any():
         return pixels

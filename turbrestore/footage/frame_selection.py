@@ -1,7 +1,7 @@
 """Lucky imaging: rank the frames of a clip by sharpness and keep the best (Fried 1978).
 
-The quality of a frame is the energy of its Laplacian of Gaussian over its mean intensity squared: what stacking
-programs for planets use, insensitive to brightness, and to noise as far as the Gaussian goes.
+The quality of a frame is the energy of its Laplacian of Gaussian divided by its squared mean intensity, as in programs
+that stack images of planets. Division makes it independent of brightness, and the Gaussian suppresses noise.
 """
 
 from __future__ import annotations
@@ -15,23 +15,13 @@ from numpy.typing import ArrayLike
 from ..core.arrays import check_image, luminance
 from ..core.errors import ConfigurationError, DataError, require
 
-# Fine enough for the detail that turbulence takes away, coarse enough to leave pixel noise out.
+# Small enough for the detail that turbulence blurs, large enough to suppress pixel noise.
 _SIGMA = 1.5
 _DARK = 1e-3
 
 
 class Share(float):
-    """A part of a whole from 0 to 1; text such as ``"30%"`` is understood.
-
-    Parameters
-    ----------
-    value : float or str
-        A number, or text of a number with or without a percent sign.
-
-    Raises
-    ------
-    ConfigurationError
-        Neither.
+    """A fraction; text of a number, with or without a percent sign, is understood.
 
     Examples
     --------
@@ -40,7 +30,7 @@ class Share(float):
     """
 
     def __new__(cls, value: float | str) -> Share:
-        """Read the number."""
+        """Read the number; raise ConfigurationError where there is none."""
         text = str(value).strip()
         try:
             number = float(text[:-1]) / 100 if text.endswith("%") else float(text)
@@ -50,26 +40,15 @@ class Share(float):
 
 
 def frame_quality(frames: Iterable[ArrayLike]) -> np.ndarray:
-    """Sharpness of every frame, for ranking frames of one clip.
-
-    Parameters
-    ----------
-    frames : iterable of array_like, shape (H, W) or (H, W, 3)
-        Consumed lazily.
-
-    Returns
-    -------
-    ndarray, float64, shape (T,)
-        Energy of the Laplacian of Gaussian (σ = 1.5 pixels) over the squared mean intensity.
+    """Sharpness of the frames of one clip, which are taken one at a time: float64 of shape (T,).
 
     Raises
     ------
     DataError
-        No frames, or values that are not finite.
+        There are no frames, or one is not a finite image.
 
     Examples
     --------
-    >>> import numpy as np
     >>> sharp = np.zeros((32, 32), np.float32); sharp[:, 16:] = 1
     >>> soft = np.repeat([np.clip((np.arange(32) - 8) / 16, 0, 1)], 32, axis=0)
     >>> bool(np.diff(frame_quality([soft, sharp]))[0] > 0)
@@ -86,24 +65,7 @@ def frame_quality(frames: Iterable[ArrayLike]) -> np.ndarray:
 
 
 def best_frames(quality: ArrayLike, share: float) -> np.ndarray:
-    """Mark the sharpest frames.
-
-    Parameters
-    ----------
-    quality : array_like, shape (T,)
-        From :func:`frame_quality`.
-    share : float
-        Part of the frames to keep, above 0, up to 1.
-
-    Returns
-    -------
-    ndarray, bool, shape (T,)
-        True for the ⌈share · T⌉ frames of highest quality; of equals the earlier.
-
-    Raises
-    ------
-    ConfigurationError
-        The share is not between 0 and 1.
+    """Mark the ⌈share · T⌉ frames of highest quality; of equal frames the earlier ones.
 
     Examples
     --------
@@ -118,20 +80,5 @@ def best_frames(quality: ArrayLike, share: float) -> np.ndarray:
 
 
 def check_share(share: float) -> None:
-    """Refuse what is no share of frames.
-
-    Parameters
-    ----------
-    share : float
-        Above 0, up to 1.
-
-    Raises
-    ------
-    ConfigurationError
-        It is not.
-
-    Examples
-    --------
-    >>> check_share(0.3)
-    """
+    """Raise ConfigurationError unless the fraction of frames to keep is above 0 and at most 1."""
     require(0 < share <= 1, f"keep_best: expected a share above 0 and up to 1, or 1% to 100%, found {share}")

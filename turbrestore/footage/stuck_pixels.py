@@ -1,9 +1,8 @@
-"""Hot and dead pixels, told from details of the scene.
+"""Detection and repair of hot and dead pixels.
 
-A stuck pixel differs from a small detail of the scene in two ways, one of which has to hold: it stands alone, its
-neighbours show nothing of it although any lens and any motion would spread it; or it never changes while its
-neighbours do.  Pairs and clusters are not found, nor pixels at the border, nor what a lossy codec or a Bayer pattern
-has spread.
+A stuck pixel differs from a small detail of the scene in one of two ways: its neighbours show nothing of it, although a
+lens and motion would spread a detail; or it never changes while its neighbours do. Pairs, clusters, pixels at the
+border, and pixels that a lossy codec or a Bayer pattern has spread are not found.
 """
 
 from __future__ import annotations
@@ -17,17 +16,17 @@ from ..io.pixels import PixelArray
 
 _MOST_STUCK = 0.005
 _FEWEST_FRAMES = 10
-# Frames in which pixels are compared everywhere before only few candidates are left to follow.
+# Most frames in which all pixels are compared; afterwards only the remaining candidates are followed.
 _DENSE_FRAMES = 8
-# Share of its height over the median of the neighbours by which a lone pixel stands over the highest of them.
+# A lone pixel exceeds its highest neighbour by this share of its distance from the median of all neighbours.
 _ALONE = 0.8
 _STILL, _MOVING = 1.5 / 255, 8 / 255
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _AROUND = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
 
 
-class StuckPixels:
-    """Pixels that have stood out of all their neighbours in every frame so far."""
+class StuckPixelDetector:
+    """Finds pixels that lie outside the range of all their neighbours in every frame."""
 
     def __init__(self, excess: float) -> None:
         self._excess = excess
@@ -37,24 +36,18 @@ class StuckPixels:
         self._searching = True
         self._places = np.empty((0, 2), np.int64)
 
-    def look(self, values: FloatArray) -> None:
-        """Compare the next frame.
-
-        Parameters
-        ----------
-        values : (H, W) or (H, W, 3) float32 array
-            Frame on the scale of 0 to 1; below 3 pixels a side it is passed over.
-        """
+    def update(self, values: FloatArray) -> None:
+        """Compare the next frame, shape (H, W) or (H, W, 3) in [0, 1]; frames below 3×3 pixels are ignored."""
         if min(values.shape[:2]) < 3:
             return
         self._frames += 1
         if self._searching:
-            self._look_everywhere(values)
+            self._compare_all(values)
         elif len(self._places):
             self._follow(values)
 
     def found(self) -> NDArray[np.int64]:
-        """Row, column, and channel of colour frames."""
+        """Row, column, and channel of colour frames, of every stuck pixel: int64 of shape (N, 2) or (N, 3)."""
         none = np.empty((0, 2), np.int64)
         if self._searching or not len(self._places) or self._frames < _FEWEST_FRAMES:
             return none
@@ -62,7 +55,7 @@ class StuckPixels:
         stuck = self._places[still | (self._alone >= _ALONE)]
         return none if len(stuck) > _MOST_STUCK * self._size else stuck
 
-    def _look_everywhere(self, values: FloatArray) -> None:
+    def _compare_all(self, values: FloatArray) -> None:
         around = cv2.dilate(values, _RING)
         high = np.subtract(values, around, out=around) > self._excess
         around = cv2.erode(values, _RING, dst=around)
@@ -73,7 +66,7 @@ class StuckPixels:
         if count > _MOST_STUCK * values.size and self._frames < _DENSE_FRAMES:
             return
         self._size = values.size
-        # At the border half of the neighbours are missing, and codecs and scalers leave marks.
+        # At the border half of the neighbours are missing, and codecs and scalers leave artefacts.
         for marks in (self._high, self._low):
             marks[[0, -1]] = marks[:, [0, -1]] = False
         self._places = np.argwhere(self._high | self._low)
@@ -102,32 +95,20 @@ class StuckPixels:
 
 
 def _with_neighbours(values: PixelArray, places: NDArray[np.int64]) -> tuple[PixelArray, PixelArray]:
-    """Values at places off the border, shape (N,), and those of their eight neighbours, shape (N, 8)."""
+    """Values at places off the border, shape (N,), and at their eight neighbours, shape (N, 8)."""
     rows, columns = places[:, :1] + _AROUND[:, 0], places[:, 1:2] + _AROUND[:, 1]
     channels = [places[:, 2:3]] if places.shape[1] == 3 else []
     return values[tuple(places.T)], values[(rows, columns, *channels)]
 
 
-def without_stuck(pixels: PixelArray, stuck: NDArray[np.int64]) -> PixelArray:
-    """Replace stuck pixels by the median of their eight neighbours.
-
-    Parameters
-    ----------
-    pixels : (H, W) or (H, W, 3) array
-        Frame of any dtype of pixels.
-    stuck : (N, 2) or (N, 3) int64 array
-        Row and column, and channel of colour frames, as :meth:`StuckPixels.found` gives them; none at the border.
-
-    Returns
-    -------
-    array like pixels
-        A copy.
+def repair_stuck(pixels: PixelArray, stuck: NDArray[np.int64]) -> PixelArray:
+    """Return a copy of a frame in which stuck pixels are the median of their eight neighbours.
 
     Examples
     --------
     >>> frame = np.zeros((3, 3), np.uint8)
     >>> frame[1, 1] = 255
-    >>> int(without_stuck(frame, np.array([[1, 1]])).max())
+    >>> int(repair_stuck(frame, np.array([[1, 1]])).max())
     0
     """
     _, around = _with_neighbours(pixels, stuck)

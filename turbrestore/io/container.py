@@ -1,18 +1,16 @@
 """Video files (MP4, MOV, Matroska, WebM, AVI, GIF) through PyAV, in their native pixel format.
 
-Grey formats stay grey at their depth, 8-bit colour becomes RGB, deeper colour 16-bit RGB. Opening reads all packets
-once without decoding them: that gives the number of frames, their times, and the damage that decoders keep quiet
-about (see :mod:`turbrestore.io.integrity`). Losses in the middle of a lossy codec's packet, which its decoder conceals,
-are not found.
+Grey formats stay grey at their depth, 8-bit colour becomes RGB, and deeper colour 16-bit RGB. Opening a file reads all
+packets once without decoding them, which gives the number of frames, their times, and damage that decoders do not
+report (:mod:`turbrestore.io.integrity`).
 
-Colour of more than 8 bits in YUV comes out up to 0.4 % darker than exact arithmetic has it: that is how FFmpeg
-converts it. Grey video is taken as full range, as its decoder delivers it.
+Losses within a packet of a lossy codec that its decoder conceals are not found. FFmpeg converts YUV colour of more than
+8 bits to values up to 0.4 % darker than exact. Grey video is taken as full range, as its decoder returns it.
 """
 
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,31 +21,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import DataError
-from .files import input_errors
 from .integrity import ffv1_slices_intact, is_cut_short
-from .limits import DEFAULT_LIMITS, Limits
+from .limits import DEFAULT_LIMITS, Limits, input_errors
 from .pixels import PixelArray
-from .source import (
-    FrameRange,
-    FrameSource,
-    check_frame_range,
-    cut_short_text,
-    skipped_end_text,
-)
+from .source import FrameRange, FrameSource, check_cut_short, check_frame_range
 
 if TYPE_CHECKING:
     import av
 
 CONTAINER_SUFFIXES = (".mkv", ".mp4", ".m4v", ".mov", ".webm", ".avi", ".gif")
-# By content FFmpeg would also open playlists, which lead to other files.
+# Without this list FFmpeg would also open playlists, which refer to other files.
 _OPEN_OPTIONS = {"format_whitelist": "matroska,webm,mov,mp4,avi,gif"}
-# Every packet of these codecs decodes without the others.
+# Codecs whose packets are decoded independently of each other.
 _INTRA_CODECS = {"ffv1", "mjpeg", "rawvideo", "png", "huffyuv", "ffvhuff", "utvideo", "prores", "dnxhd"}
 
 
 @dataclass(frozen=True)
 class _PixelFormat:
-    """How frames of one pixel format become arrays."""
+    """Native pixel format, and the format to which its frames are converted."""
 
     name: str
     target: str
@@ -59,7 +50,7 @@ class _PixelFormat:
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
-    """What all packets together tell."""
+    """What reading all packets has shown."""
 
     count: int
     intact: int
@@ -71,47 +62,23 @@ class _Scan:
 
 
 def open_container(
-    path: str | os.PathLike[str],
-    frames: FrameRange | None = None,
-    limits: Limits = DEFAULT_LIMITS,
-    skip_damaged: bool = False,
+    path: Path, frames: FrameRange | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
 ) -> FrameSource:
-    """Open a video file.
+    """Open a video file; the errors are those of :func:`turbrestore.io.video.open_frames`.
 
-    Parameters
-    ----------
-    path : path-like
-        MP4, MOV, Matroska, WebM, AVI or GIF file.
-    frames : tuple, optional
-        The frames that will be selected; damage elsewhere is no error then. The source has all frames all the same.
-    limits : Limits
-        Largest video that is read.
-    skip_damaged : bool
-        Read what is whole of a file that is cut short, and only name frames that are damaged and that no others
-        depend on (``FrameSource.damaged``).
-
-    Returns
-    -------
-    FrameSource
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        No such file, or it cannot be read.
-    DataError
-        Not a video, damaged or cut short, or too large.
+    ``frames`` is the range that will be selected: damage elsewhere is no error, but the source has all frames. With
+    ``skip_damaged`` damaged frames on which no others depend are listed in ``FrameSource.damaged``.
 
     Examples
     --------
     >>> import tempfile
-    >>> from turbrestore.io.encoding import write_mkv
+    >>> from turbrestore.io.encoding import write_container
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_mkv(folder + "/a.mkv", [np.zeros((4, 6), np.float32)] * 3, fps=25, bit_depth=12)
-    ...     source = open_container(folder + "/a.mkv")
+    ...     write_container(Path(folder, "a.mkv"), [np.zeros((4, 6), np.float32)] * 3, fps=25, bit_depth=12)
+    ...     source = open_container(Path(folder, "a.mkv"))
     >>> source.shape, source.bit_depth, source.fps, source.format
     ((3, 4, 6), 12, 25.0, 'ffv1/gray12le')
     """
-    path = Path(path)
     with input_errors(path):
         cut = is_cut_short(path)
     with input_errors(path), _decoding(path, "it is cut short" if cut else "not a video, or damaged"):
@@ -127,13 +94,12 @@ def open_container(
         scan = _scan(path, cut, limits)
     cut = cut or scan.intact < scan.count or (duration is not None and _ends_early(scan, duration))
     intra = codec in _INTRA_CODECS and scan.keyframes == scan.count
-    damaged = _check_damage(path, scan, cut, frames, intra, skip_damaged)
+    notes += check_cut_short(path, scan.intact, check_frame_range(frames).stop, skip_damaged) if cut else ()
+    damaged = _check_damage(path, scan, frames, intra, skip_damaged)
     varies = scan.times is not None and _varies(scan.times, scan.tick)
     fps = float(rate) if rate else None
     if varies and scan.times is not None:
         fps, notes = (len(scan.times) - 1) / float(scan.times[-1]), (*notes, "variable frame rate")
-    if cut and skip_damaged:
-        notes = (*notes, skipped_end_text(scan.intact))
     return FrameSource(
         name=path.name,
         format=f"{codec}/{layout.name}",
@@ -152,7 +118,7 @@ def open_container(
 def _open(path: Path) -> av.container.InputContainer:
     import av
 
-    # The prefix keeps a colon in the name from being read as a protocol.
+    # Without the prefix FFmpeg would take a name with a colon for a URL.
     return av.open(f"file:{path}", options=dict(_OPEN_OPTIONS), metadata_errors="replace")
 
 
@@ -163,7 +129,7 @@ def _video_stream(path: Path, container: av.container.InputContainer, limits: Li
     if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
         raise DataError(f"{path}: holds no video stream that can be decoded")
     limits.check_size(stream.width, stream.height, str(path))
-    # The stream can state another size than the container.
+    # The size in the stream can differ from that in the container.
     stream.codec_context.options = {"max_pixels": str(min(limits.max_pixels, 2**31 - 1))}
     return stream
 
@@ -190,7 +156,7 @@ def _pixel_format(path: Path, native: av.VideoFormat) -> _PixelFormat:
 
 def _notes(frame: av.VideoFrame, layout: _PixelFormat, codec: str) -> tuple[str, ...]:
     notes = []
-    # GIF frames always come with alpha, though few images use it.
+    # GIF frames are always decoded with alpha, which few images use.
     if layout.alpha and codec != "gif":
         notes.append("alpha channel ignored")
     if frame.interlaced_frame:
@@ -201,7 +167,7 @@ def _notes(frame: av.VideoFrame, layout: _PixelFormat, codec: str) -> tuple[str,
 
 
 def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
-    """Read all packets once, decoding none."""
+    """Read all packets without decoding them."""
     stamps: list[int | None] = []
     damaged: list[int] = []
     unchecked: list[int] = []
@@ -211,8 +177,8 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
         codec = stream.codec_context.name
         tick = float(stream.time_base or 0)
         for packet in container.demux(stream):
-            # Empty packets end the stream or stand for frames that the camera dropped; discarded ones are cut off
-            # by the edit list of an MP4 file.
+            # Empty packets end the stream or mark frames that the camera dropped; the edit list of an MP4 file discards
+            # packets.
             if packet.size == 0 or packet.is_discard:
                 continue
             if packet.is_corrupt and intact is None:
@@ -231,24 +197,19 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
     if None not in stamps:
         ticks = np.sort(np.array(stamps, np.int64))
         times = (ticks - ticks[0]) * tick
-    # A damaged slice size makes one packet look as if it had no checksums; in a stream without them, all do.
+    # A packet with a damaged slice size seems to have no checksums; in a stream without checksums all packets do.
     if len(unchecked) < len(stamps):
         damaged = sorted(damaged + unchecked)
     count = len(stamps)
     if intact is None:
-        # The last frame of a GIF file decodes as far as it goes, without complaint.
+        # A truncated last frame of a GIF file is decoded without complaint.
         intact = count - 1 if cut and codec == "gif" else count
     return _Scan(count, intact, keyframes, tuple(damaged), None if times is None else times[:intact], tick, last)
 
 
-def _check_damage(
-    path: Path, scan: _Scan, cut: bool, frames: FrameRange | None, intra: bool, skip: bool
-) -> tuple[int, ...]:
-    """Refuse damage in what was asked for; return the numbers of damaged frames that can be skipped."""
-    wanted = check_frame_range(frames)
-    if cut and not (skip and scan.intact) and (wanted.stop is None or wanted.stop > scan.intact):
-        raise DataError(f"{path}: {cut_short_text(scan.intact)}")
-    needed = range(scan.intact)[wanted]
+def _check_damage(path: Path, scan: _Scan, frames: FrameRange | None, intra: bool, skip: bool) -> tuple[int, ...]:
+    """Refuse damage in the selected frames; return the numbers of damaged frames that can be skipped."""
+    needed = range(scan.intact)[check_frame_range(frames)]
     if needed and not intra:
         needed = range(needed[-1] + 1)
     bad = [number for number in scan.damaged if number in needed]
@@ -259,7 +220,7 @@ def _check_damage(
 
 
 def _declared_duration(stream: av.VideoStream) -> float | None:
-    """End of the last frame in seconds, as the header of an AVI file or Matroska's statistics have it."""
+    """End of the last frame in seconds, from the header of an AVI file or the statistics of Matroska."""
     if stream.container.format.name == "avi":
         return float(stream.frames / stream.average_rate) if stream.frames and stream.average_rate else None
     try:
@@ -270,14 +231,14 @@ def _declared_duration(stream: av.VideoStream) -> float | None:
 
 
 def _ends_early(scan: _Scan, duration: float) -> bool:
-    """Whether a frame should follow the last one; where intervals vary, the longest counts."""
+    """Whether another frame should follow the last one, judged by the longest interval."""
     if scan.times is None or len(scan.times) < 2:
         return False
     return scan.last < duration - 1.5 * float(np.diff(scan.times).max())
 
 
 def _varies(times: NDArray[np.float64], tick: float) -> bool:
-    """Whether the frame intervals differ by more than the rounding to the file's clock."""
+    """Whether frame intervals differ by more than the rounding to the clock of the file."""
     if len(times) < 3:
         return False
     intervals = np.diff(times)
@@ -297,7 +258,7 @@ def _frames(
             packets = (packet for packet in container.demux(stream) if packet.size > 0 or packet.dts is None)
             numbers: Iterator[int] = itertools.count()
             if intra:
-                # Without this a range or a step would pay for the frames that it leaves out.
+                # Frames outside the range or between the steps are not decoded.
                 numbers = iter(chosen)
                 packets = (packet for index, packet in enumerate(packets) if packet.size == 0 or index in wanted)
             for packet in packets:
@@ -320,28 +281,10 @@ def _pixels(path: Path, frame: av.VideoFrame, layout: _PixelFormat, number: int)
 
 
 def convert(frame: av.VideoFrame, target: str) -> av.VideoFrame:
-    """Convert a frame to another pixel format, rounding to nearest.
-
-    Parameters
-    ----------
-    frame : av.VideoFrame
-    target : str
-        FFmpeg's name of the pixel format.
-
-    Returns
-    -------
-    av.VideoFrame
-        The frame itself where it has that format.
-
-    Examples
-    --------
-    >>> import av
-    >>> convert(av.VideoFrame(4, 4, "gray"), "rgb24").format.name
-    'rgb24'
-    """
+    """Convert a frame to the pixel format that FFmpeg calls ``target``, rounding to nearest."""
     from av.video.reformatter import Interpolation
 
-    # FFmpeg's default rounds YUV down, half a grey level on average.
+    # By default FFmpeg rounds YUV down, by half a grey level on average.
     exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
     return frame if frame.format.name == target else frame.reformat(format=target, interpolation=exact)
 

@@ -1,53 +1,47 @@
-"""Still images in and out, and how any file is written.
+"""Still images and animated images, read and written by imageio through Pillow.
 
-Every file is written under a temporary name in its folder and takes its real name only when it is complete
-(:func:`atomic_output`), so a failure leaves nothing behind.
-
-OpenCV decodes the images, because imageio and Pillow cut 16-bit RGB down to 8 bits. What must not be decoded is refused
-before (:mod:`turbrestore.io.image_headers`).
+Pillow reduces 16-bit colour to 8 bits, so OpenCV decodes those images once Pillow has found them whole; TIFF is read by
+:mod:`turbrestore.io.tiff`. The size in the header is checked before anything is decoded.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
-import secrets
-import shutil
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image, from_unit
-from ..core.errors import ConfigurationError, DataError, OutputError, StorageError
-from ..runtime.scratch import iter_parts
-from .files import check_input, input_errors
-from .image_headers import check_still
-from .limits import DEFAULT_LIMITS, Limits
-from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit
+from ..core.errors import DataError, StorageError, TurbrestoreError
+from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
+from .output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
+from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, to_unit, upright, without_alpha
+from .source import FrameSource, check_cut_short
+from .tiff import TIFF_SUFFIXES, read_tiff
+
+if TYPE_CHECKING:
+    import PIL.Image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
-IMAGE_OUTPUT_SUFFIXES = (".png", ".tif", ".tiff")
-# Bytes that must stay free beside what is written.
-_SPARE = 1 << 20
+ANIMATION_SUFFIXES = (".png", ".apng", ".webp")
+ANIMATION_OUTPUT_SUFFIXES = (".gif", ".webp")
+# Pillow knows many more formats, some of which run other programs.
+_FORMATS = ("PNG", "JPEG", "BMP", "PPM", "WEBP")
+# Modes of Pillow that are converted to RGB.
+_OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV", "RGBX", "RGBa")
 
 
 @dataclass(frozen=True, eq=False)
 class ImageFile:
-    """A still image and what its file said about it.
-
-    Attributes
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Intensities in [0, 1], RGB.
-    bit_depth : int
-        8, 16, or 32 for floating point files.
-    warnings : tuple of str
-        What was left out, such as an alpha channel.
-    """
+    """A still image, float32 in [0, 1], the bit depth of its file, and what was left out, such as an alpha channel."""
 
     image: FloatArray
     bit_depth: int
@@ -55,12 +49,12 @@ class ImageFile:
 
 
 def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> ImageFile:
-    """Read a still image.
+    """Read a still image, turned upright as its orientation tag demands.
 
     Parameters
     ----------
     path : path-like
-        PNG, JPEG, TIFF (one page), BMP, PGM, PPM or WebP file.
+        PNG, JPEG, TIFF (one page), BMP, PGM, PPM or WebP file. Of an animation the first frame is read.
     limits : Limits
         Largest image that is read.
 
@@ -71,9 +65,9 @@ def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) ->
     Raises
     ------
     InputNotFoundError
-        No such file.
+        The file does not exist.
     DataError
-        Not an image, damaged, too large, more than one page, or values that are no intensities.
+        Not an image, damaged, too large, a TIFF file of several pages, or values outside [0, 1].
     StorageError
         The file cannot be read.
 
@@ -92,45 +86,15 @@ def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) ->
 
 
 def read_pixels(path: Path, limits: Limits = DEFAULT_LIMITS) -> tuple[PixelArray, tuple[str, ...]]:
-    """Read a still image as its file has it: grey or RGB, alpha dropped, values not scaled.
-
-    Parameters
-    ----------
-    path : Path
-        See :func:`read_image`.
-    limits : Limits
-        Largest image that is read.
-
-    Returns
-    -------
-    pixels : ndarray, shape (H, W) or (H, W, 3)
-        In the type of the file.
-    warnings : tuple of str
-        What was left out.
-
-    Raises
-    ------
-    InputNotFoundError, DataError, StorageError
-        As :func:`read_image`.
-    """
-    if path.suffix.lower() not in IMAGE_SUFFIXES:
-        raise DataError(f"{path}: expected an image ({', '.join(IMAGE_SUFFIXES)}), found {path.suffix or 'no suffix'}")
-    limits.check_bytes(check_input(path).st_size, str(path))
-    with input_errors(path):
-        data = path.read_bytes()
-    if not data:
-        raise DataError(f"{path}: the file is empty")
-    check_still(path, data, limits)
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        pixels = None
-    if pixels is None:
-        raise DataError(f"{path}: cannot be decoded as an image; the file is damaged or of an unsupported kind")
-    if pixels.ndim == 2:
-        return pixels, ()
-    notes = ("alpha channel ignored",) if pixels.shape[2] == 4 else ()
-    return np.ascontiguousarray(pixels[..., 2::-1]), notes
+    """Read a still image as :func:`read_image` does, but in the type of its file; return warnings too."""
+    suffix = path.suffix.lower()
+    if suffix not in IMAGE_SUFFIXES:
+        raise DataError(f"{path}: expected an image ({', '.join(IMAGE_SUFFIXES)}), found {suffix or 'no suffix'}")
+    data = _read_file(path, limits)
+    if suffix in TIFF_SUFFIXES:
+        pixels, notes = read_tiff(path, data, limits)
+        return (pixels, notes) if pixels is not None else without_alpha(_opencv_pixels(path, data))
+    return without_alpha(_decoded(path, data, limits))
 
 
 def write_image(
@@ -159,7 +123,7 @@ def write_image(
     OutputError
         The file exists, or its folder is missing or not writable.
     StorageError
-        Writing failed half-way; nothing is left behind.
+        Writing failed; nothing is left behind.
 
     Examples
     --------
@@ -173,10 +137,13 @@ def write_image(
     path = Path(path)
     check_output(path, overwrite=overwrite)
     depth = check_depth(32 if bit_depth is None else bit_depth)
-    is_tiff = path.suffix.lower() != ".png"
-    pixels = _stored(check_image(image, "image"), depth, is_tiff)
-    if not is_tiff:
-        atomic_write(path, _encode_png(path, pixels), overwrite)
+    is_png = path.suffix.lower() == ".png"
+    pixels = from_unit_to_type(check_image(image, "image"), min(depth, 16) if is_png else depth)
+    if is_png:
+        done, data = cv2.imencode(".png", pixels if pixels.ndim == 2 else pixels[..., ::-1])
+        if not done:
+            raise StorageError(f"{path}: the PNG encoder failed on an image of shape {pixels.shape}")
+        atomic_write(path, data.data, overwrite)
         return
     import tifffile
 
@@ -185,199 +152,181 @@ def write_image(
         tifffile.imwrite(temporary, pixels, photometric="minisblack" if pixels.ndim == 2 else "rgb", metadata=None)
 
 
-def check_output(
-    path: str | os.PathLike[str],
-    inputs: Iterable[str | os.PathLike[str]] = (),
-    overwrite: bool = False,
-    suffixes: Collection[str] | None = IMAGE_OUTPUT_SUFFIXES,
-) -> None:
-    """Refuse an output that cannot be created, before any work begins.
+def open_animation(
+    path: Path, stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
+) -> FrameSource:
+    """Open an animated PNG or WebP file; all frames are decoded once to find out whether they are whole.
 
-    Parameters
-    ----------
-    path : path-like
-        The file to be written.
-    inputs : iterable of path-like
-        Files and folders that are read; the output is none of them, under any name, nor inside such a folder.
-    overwrite : bool
-        Whether an existing file may be replaced.
-    suffixes : collection of str, optional
-        Suffixes that the writer supports, lower case with the dot; None allows any.
-
-    Raises
-    ------
-    ConfigurationError
-        Unsupported suffix.
-    OutputError
-        The path is a folder, an input, exists already, or its folder is missing or not writable.
+    Frames from ``stop`` on are not needed, so they may be missing. With ``skip_damaged`` the whole frames of a PNG file
+    that is cut short are read. 16-bit colour is read as 8 bits. The errors are those of
+    :func:`turbrestore.io.video.open_frames`.
 
     Examples
     --------
-    >>> check_output("result.xyz")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.ConfigurationError: result.xyz: expected a name that ends in .png, .tif or .tiff, found .xyz
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_animation(Path(folder, "a.webp"), [np.full((2, 3), k / 4, np.float32) for k in range(4)], fps=25)
+    ...     source = open_animation(Path(folder, "a.webp"))
+    >>> source.shape, source.fps, source.format
+    ((4, 2, 3, 3), 25.0, 'webp/RGB')
     """
-    path = Path(path)
+    data = _read_file(path, limits)
+    with _header(path, data, limits, ("PNG", "WEBP")) as header:
+        animation = _Animation(data, header.mode, bool(header.info.get("default_image")))
+        count, kind = getattr(header, "n_frames", 1) - animation.skips_first, str(header.format).lower()
+    if count < 2:
+        raise DataError(f"{path}: a single image; name the folder that holds the frames")
+    limits.check_count(count, str(path))
+    shape, durations = _scan(path, animation)
+    present = len(durations)
+    if kind == "png" and present == count:
+        with _header(path, data, limits, ("PNG",)) as header:
+            # Decoding does not compare the checksums.
+            header.verify()
+    deep = animation.mode == "I;16"
+    notes: tuple[str, ...] = ("alpha channel ignored",) if animation.mode in ("LA", "RGBA") else ()
+    notes += ("16-bit values read as 8 bits",) if kind == "png" and data[24] == 16 and not deep else ()
+    notes += ("variable frame rate",) if len(set(durations[:-1])) > 1 else ()
+    notes += check_cut_short(path, present, stop, skip_damaged, "damaged or cut short") if present < count else ()
+    times = np.cumsum([0.0, *durations[:-1]]) / 1000
+    return FrameSource(
+        name=path.name,
+        format=f"{kind}/{animation.mode}",
+        file_shape=(present, *shape),
+        full_scale=65535 if deep else 255,
+        bit_depth=16 if deep else 8,
+        pixels=lambda chosen: _chosen_frames(path, animation, chosen),
+        path=path,
+        fps=(present - 1) / float(times[-1]) if times[-1] > 0 else None,
+        timestamps=times if times[-1] > 0 else None,
+        warnings=notes,
+    )
+
+
+def write_animation(path: Path, frames: Iterable[FloatArray], fps: float, overwrite: bool = False) -> None:
+    """Write frames for viewing as GIF of 256 colours or lossless WebP of 8 bits, repeated without end.
+
+    All frames are in memory at 8 bits until the end. GIF counts hundredths of a second, WebP thousandths.
+    """
+    import imageio.v3 as iio
+
     suffix = path.suffix.lower()
-    if suffixes is not None and suffix not in suffixes:
-        *others, last = suffixes
-        names = f"{', '.join(others)} or {last}" if others else last
-        raise ConfigurationError(f"{path}: expected a name that ends in {names}, found {suffix or 'no suffix'}")
+    buffer = io.BytesIO()
+    writer: Any = iio.imopen(buffer, "w", plugin="pillow", extension=suffix)
+    with writer as output:
+        for frame in frames_of_one_size(frames, path):
+            output.write(from_unit(frame, 8), is_batch=False, duration=1000 / fps, loop=0, lossless=True)
+    atomic_write(path, buffer.getbuffer(), overwrite)
+
+
+def _read_file(path: Path, limits: Limits) -> bytes:
+    limits.check_bytes(check_input(path).st_size, str(path))
+    with input_errors(path):
+        data = path.read_bytes()
+    if not data:
+        raise DataError(f"{path}: the file is empty")
+    return data
+
+
+def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
+    """Upright pixels of the only or first image, with all channels."""
+    with _header(path, data, limits, _FORMATS) as header:
+        mode, kind = header.mode, header.format
+        if kind == "PNG":
+            # Decoding does not compare the checksums.
+            header.verify()
+    with _image_errors(path), _opened(data) as file:
+        pixels = file.read(index=0, mode="RGB" if mode in _OTHER_COLOURS else None)
+        orientation = file.metadata(index=0, exclude_applied=False).get("Orientation")
+    if kind == "PPM" or (kind == "PNG" and data[24] == 16):
+        pixels = _opencv_pixels(path, data)
+        # OpenCV returns grey with alpha (type 4) as RGBA.
+        pixels = pixels[..., [0, 3]] if kind == "PNG" and data[25] == 4 else pixels
+    if pixels.dtype == bool:
+        pixels = np.uint8(255) * pixels
+    return upright(pixels, orientation)
+
+
+def _opened(data: bytes) -> Any:
+    """Reader of imageio for all images in a file."""
+    import imageio.v3 as iio
+
+    return iio.imopen(data, "r", plugin="pillow")
+
+
+def _opencv_pixels(path: Path, data: bytes) -> PixelArray:
+    """Grey, RGB or RGBA pixels; imageio would pass the bytes to OpenCV through a temporary file."""
     try:
-        folder = Path(os.path.realpath(path)).parent
-        if path.is_dir():
-            raise OutputError(f"{path}: is a folder; name a file in it")
-        if path.exists() and not path.is_file():
-            raise OutputError(f"{path}: is a device or a pipe, which is not written to; name a file")
-        if not folder.is_dir():
-            raise OutputError(f"{path}: the folder {folder} does not exist; create it first")
-        for source in map(Path, inputs):
-            _check_not_input(path, folder, source)
-        if path.exists() and not overwrite:
-            raise OutputError(f"{path}: exists already; choose another name or allow overwriting")
-        if not os.access(folder, os.W_OK):
-            raise OutputError(f"{path}: the folder {folder} is not writable")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be created ({error.strerror or error})") from error
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise DataError(f"{path}: cannot be decoded as an image; the file is damaged or of an unsupported kind")
+    return pixels if pixels.ndim == 2 else pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
 
 
-def check_space(path: str | os.PathLike[str], size: int) -> None:
-    """Refuse to begin what does not fit on the disk.
+@dataclass(frozen=True, eq=False)
+class _Animation:
+    """Content of an animated file, its mode, and whether a still image that is no frame comes first."""
 
-    Parameters
-    ----------
-    path : path-like
-        A file or folder to be written; its folder exists.
-    size : int
-        Bytes that are expected; a tenth and a megabyte more must be free.
+    data: bytes
+    mode: str
+    skips_first: bool
 
-    Raises
-    ------
-    StorageError
-        There is less.
+    def frames(self) -> Iterator[tuple[PixelArray, float]]:
+        """Decode all frames: pixels, grey or RGB, and duration in milliseconds."""
+        target = None if self.mode == "I;16" else "L" if self.mode in ("1", "L", "LA") else "RGB"
+        with _opened(self.data) as file:
+            for index, pixels in enumerate(file.iter(mode=target)):
+                if index >= self.skips_first:
+                    facts = file.metadata(index=index, exclude_applied=False)
+                    yield upright(pixels, facts.get("Orientation")), float(facts.get("duration", 0))
 
-    Examples
-    --------
-    >>> check_space("result.png", 10**30)  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.StorageError: result.png: needs ... MiB, found ... MiB free; make room on the disk
-    """
-    folder = Path(os.path.realpath(path)).parent
-    needed = size + size // 10 + _SPARE
+
+def _scan(path: Path, animation: _Animation) -> tuple[tuple[int, ...], list[float]]:
+    """Shape of the frames, and duration of every frame up to the first that is damaged or missing."""
+    shape: tuple[int, ...] = ()
+    durations: list[float] = []
+    with contextlib.suppress(DataError), _image_errors(path):
+        for pixels, duration in animation.frames():
+            shape = pixels.shape
+            durations.append(duration)
+    return shape, durations
+
+
+def _chosen_frames(path: Path, animation: _Animation, chosen: Sequence[int]) -> Iterator[PixelArray]:
+    wanted, frames = frozenset(chosen), animation.frames()
+    for number in range(chosen[-1] + 1):
+        with _image_errors(path):
+            pixels, _ = next(frames)
+        if number in wanted:
+            yield pixels
+
+
+@contextlib.contextmanager
+def _header(path: Path, data: bytes, limits: Limits, formats: tuple[str, ...]) -> Iterator[PIL.Image.Image]:
+    """Image of Pillow that is not decoded yet and has no more pixels than allowed."""
+    import PIL.Image
+
+    with _image_errors(path), PIL.Image.open(io.BytesIO(data), formats=formats) as header:
+        limits.check_size(*header.size, str(path))
+        yield header
+
+
+@contextlib.contextmanager
+def _image_errors(path: Path) -> Iterator[None]:
+    """Turn the exceptions of Pillow into DataError, and silence its warnings."""
+    import PIL.Image
+
     try:
-        total, _, free = shutil.disk_usage(folder)
-    except OSError:
-        return
-    # Not every file system tells; those of the kernel have no size.
-    if total > 0 and free < needed:
-        raise StorageError(f"{path}: needs {needed >> 20} MiB, found {free >> 20} MiB free; make room on the disk")
-
-
-@contextmanager
-def atomic_output(path: str | os.PathLike[str], overwrite: bool = False) -> Iterator[Path]:
-    """Give a temporary file in the folder of ``path``, and rename it to ``path`` when the block has succeeded.
-
-    Whatever ends the block early, Ctrl-C included, removes the temporary file and leaves ``path`` as it was.
-
-    Parameters
-    ----------
-    path : path-like
-        The file to be written; a symbolic link is followed.
-    overwrite : bool
-        Replace an existing file.
-
-    Yields
-    ------
-    Path
-        An empty file to write to.
-
-    Raises
-    ------
-    OutputError
-        The file exists, or no file can be created in its folder.
-    StorageError
-        Writing failed half-way.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     with atomic_output(folder + "/a.txt") as temporary:
-    ...         _ = temporary.write_text("complete")
-    ...     Path(folder, "a.txt").read_text()
-    'complete'
-    """
-    check_output(path, overwrite=overwrite, suffixes=None)
-    target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{secrets.token_hex(8)}.part")
-    try:
-        temporary.open("xb").close()
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be created ({error.strerror or error})") from error
-    try:
-        yield temporary
-        # A new descriptor flushes what the writer left to the system, whoever wrote it.
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        temporary.replace(target)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror or error}); nothing was saved") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def atomic_write(path: str | os.PathLike[str], data: bytes | memoryview, overwrite: bool = False) -> None:
-    """Write a whole file or nothing.
-
-    Parameters
-    ----------
-    path : path-like
-        The file to be written.
-    data : bytes or memoryview of bytes
-        Its content.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    OutputError, StorageError
-        As :func:`atomic_output`.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     atomic_write(folder + "/a.json", b"{}")
-    ...     Path(folder, "a.json").read_bytes()
-    b'{}'
-    """
-    check_space(path, len(data))
-    with atomic_output(path, overwrite) as temporary:
-        temporary.write_bytes(data)
-
-
-def _stored(image: FloatArray, depth: int, is_tiff: bool) -> PixelArray:
-    """Pixels as they lie in the file."""
-    if depth != 32 or not is_tiff:
-        return from_unit(image, 8 if depth <= 8 else 16)
-    pixels, done = np.empty(image.shape, np.float32), 0
-    for part in iter_parts(image):
-        np.clip(part, 0, 1, out=pixels[done : done + len(part)])
-        done += len(part)
-    return pixels
-
-
-def _encode_png(path: Path, pixels: PixelArray) -> memoryview:
-    done, data = cv2.imencode(".png", pixels if pixels.ndim == 2 else pixels[..., ::-1])
-    if not done:
-        raise StorageError(f"{path}: the PNG encoder failed on an image of shape {pixels.shape}")
-    return data.data
-
-
-def _check_not_input(path: Path, folder: Path, source: Path) -> None:
-    if source.is_dir() and source.samefile(folder):
-        raise OutputError(f"{path}: lies in the input folder {source}; choose another folder")
-    if path.exists() and source.exists() and path.samefile(source):
-        raise OutputError(f"{path}: is the input {source}; choose another name")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except TurbrestoreError:
+        raise
+    except PIL.Image.DecompressionBombError as error:
+        raise DataError(f"{path}: has far more pixels than can be read") from error
+    except PIL.UnidentifiedImageError as error:
+        raise DataError(f"{path}: not an image of a known format") from error
+    except Exception as error:  # Pillow raises SyntaxError, ValueError, struct.error and others, by the format
+        raise DataError(f"{path}: not an image, or damaged ({first_line(error)})") from error

@@ -1,11 +1,11 @@
-"""Damage that decoders do not report: files that were cut short, and FFV1 slices whose checksum fails.
+"""Damage that decoders do not report: files that are cut short, and FFV1 slices whose checksum fails.
 
-A truncated Matroska file decodes without complaint to fewer frames. The outermost element of each container states
-its own size, so comparing it with the size of the file finds every cut, whatever the codec and frame rate.
+A truncated Matroska file decodes without complaint to fewer frames. The outermost element of every container states its
+own size, which is compared with the size of the file.
 
-An FFV1 encoder can add a checksum to each slice (CRC-32, polynomial 0x04C11DB7, most significant bit first, start
-0; RFC 9043, sections 4.3 and 4.9). The decoder only logs a mismatch, and logs are global to the process. The bits
-of zlib's CRC-32 run the other way round, so it computes the same checksum on bit-reversed bytes.
+FFV1 can store a checksum for each slice (CRC-32, polynomial 0x04C11DB7, most significant bit first, start 0; RFC 9043,
+sections 4.3 and 4.9), and the decoder only logs a mismatch. zlib computes the same CRC-32 in the opposite bit order, so
+it is applied to bit-reversed bytes.
 """
 
 from __future__ import annotations
@@ -17,36 +17,14 @@ from typing import BinaryIO
 _REVERSED_BITS = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
 _EBML_HEADER, _MATROSKA_SEGMENT = b"\x1aE\xdf\xa3", b"\x18S\x80g"
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"moof", b"mfra", b"wide", b"free", b"skip", b"pnot", b"styp", b"sidx")
-# Some writers count the RIFF header into the size that excludes it.
+# Some writers include the RIFF header in a size that should exclude it.
 _RIFF_SLACK = 16
 
 
 def is_cut_short(path: Path) -> bool:
-    """Whether a video file ends before its outermost structure does.
+    """Whether a Matroska, WebM, MP4, MOV, AVI or GIF file ends before its outermost structure does.
 
-    Parameters
-    ----------
-    path : Path
-        Matroska or WebM, MP4 or MOV, AVI or GIF, told by content. Others are never called cut short, nor are live
-        recordings that do not state their size.
-
-    Returns
-    -------
-    bool
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = Path(folder, "a.avi")
-    ...     _ = path.write_bytes(b"RIFF" + (1000).to_bytes(4, "little") + b"AVI " + bytes(500))
-    ...     is_cut_short(path)
-    True
+    Other formats, and live recordings that state no size, are never reported.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -64,30 +42,14 @@ def is_cut_short(path: Path) -> bool:
 
 
 def ffv1_slices_intact(packet: bytes) -> bool | None:
-    """Whether all slices of an FFV1 frame pass their checksums.
-
-    Parameters
-    ----------
-    packet : bytes
-        One coded frame, FFV1 version 3.
-
-    Returns
-    -------
-    bool or None
-        None if the bytes are not divided into slices with checksums.
-
-    Examples
-    --------
-    >>> ffv1_slices_intact(b"no slices in here") is None
-    True
-    """
+    """Whether all slices of an FFV1 frame (version 3) pass their checksums; None where there are no checksums."""
     end, intact = len(packet), True
     while end > 0:
-        # Footer of a slice: size of what precedes it (3 bytes), error status (1), checksum (4).
+        # Every slice ends with its size without this footer (3 bytes), an error status (1) and the checksum (4).
         start = end - 8 - int.from_bytes(packet[max(0, end - 8) : max(0, end - 5)], "big")
         if end < 8 or start < 0:
             return None
-        # Over data and checksum together the remainder is 0; zlib inverts before and after.
+        # The CRC of data and checksum together is 0; zlib inverts it before and after.
         intact = intact and zlib.crc32(packet[start:end].translate(_REVERSED_BITS), 0xFFFFFFFF) == 0xFFFFFFFF
         end = start
     return intact
@@ -98,7 +60,7 @@ def _matroska_end(file: BinaryIO, size: int) -> int:
     while position < size:
         file.seek(position)
         head = file.read(12)
-        # What other programs append belongs to no Matroska structure.
+        # Other programs may append data after the Matroska structure.
         if not head.startswith((_EBML_HEADER, _MATROSKA_SEGMENT)) or len(head) < 5:
             break
         length = 9 - head[4].bit_length()
@@ -107,7 +69,7 @@ def _matroska_end(file: BinaryIO, size: int) -> int:
             break
         content = int.from_bytes(field, "big") & ((1 << 7 * length) - 1)
         if content == (1 << 7 * length) - 1:
-            break  # all ones: size unknown, a live recording
+            break  # all ones: a live recording of unknown size
         position += 4 + length + content
     return position
 

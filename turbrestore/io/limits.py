@@ -1,25 +1,42 @@
-"""How large an input may be; headers are checked against it before anything is decoded."""
+"""What is checked before an input is read: its kind and size, and how the errors of reading it are reported."""
 
 from __future__ import annotations
 
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
-from ..core.errors import DataError, require
+from ..core.errors import DataError, InputNotFoundError, StorageError, TurbrestoreError, require
 from .pixels import MAX_PIXELS
+
+_NOT_FILES = {
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest input that is read.
+    """Largest input that is read; headers are checked against it before anything is decoded.
 
     Parameters
     ----------
     max_pixels : int
-        Pixels a frame or image.
+        Pixels of a frame or image.
     max_frames : int
         Frames of a video.
     max_bytes : int
-        Bytes of what is loaded whole: files of still images, flows and artifacts.
+        Bytes of files that are loaded as a whole: still images, animations, flows and stage files.
+
+    Raises
+    ------
+    ConfigurationError
+        A limit is not a whole number of at least 1.
 
     Examples
     --------
@@ -40,20 +57,7 @@ class Limits:
             require(whole and value >= 1, f"{name}: expected a whole number from 1, found {value}")
 
     def check_size(self, width: int, height: int, name: str) -> None:
-        """Refuse a frame size that is empty or too large.
-
-        Parameters
-        ----------
-        width, height : int
-            As the header has them, pixels.
-        name : str
-            How error messages call the file.
-
-        Raises
-        ------
-        DataError
-            No pixel, or too many.
-        """
+        """Raise DataError where the frame size in a header is empty or too large; ``name`` is the file."""
         if width < 1 or height < 1:
             raise DataError(
                 f"{name}: expected a width and height in pixels, found {width}×{height}; the file is damaged"
@@ -65,40 +69,64 @@ class Limits:
             )
 
     def check_count(self, frames: int, name: str) -> None:
-        """Refuse more frames than the limit.
-
-        Parameters
-        ----------
-        frames : int
-            As the header has them, or counted so far.
-        name : str
-            How error messages call the file.
-
-        Raises
-        ------
-        DataError
-            Too many.
-        """
+        """Raise DataError where a header states, or a reader has counted, too many frames."""
         if frames > self.max_frames:
             raise DataError(f"{name}: expected up to {self.max_frames} frames, found {frames} or more; cut the video")
 
     def check_bytes(self, size: int, name: str) -> None:
-        """Refuse to load more bytes than the limit.
-
-        Parameters
-        ----------
-        size : int
-            Bytes.
-        name : str
-            How error messages call the file.
-
-        Raises
-        ------
-        DataError
-            Too many.
-        """
+        """Raise DataError where a file is too large to be loaded as a whole."""
         if size > self.max_bytes:
             raise DataError(f"{name}: expected up to {self.max_bytes} bytes to load at once, found {size}")
 
 
 DEFAULT_LIMITS = Limits()
+
+
+@contextmanager
+def input_errors(path: Path) -> Iterator[None]:
+    """Turn system errors while reading ``path`` into InputNotFoundError or StorageError."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise InputNotFoundError(f"{path}: no such file or folder") from error
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+@contextmanager
+def format_errors(path: Path, problem: str) -> Iterator[None]:
+    """Turn the exceptions of a library about the content of ``path`` into DataError; system errors pass."""
+    try:
+        yield
+    except (TurbrestoreError, OSError):
+        raise
+    except Exception as error:  # NumPy, zipfile and tifffile document no closed list of exceptions for damaged files
+        raise DataError(f"{path}: {problem} ({first_line(error)})") from error
+
+
+def check_input(path: Path) -> os.stat_result:
+    """Return the status of a file or folder, and raise DataError for a pipe, a socket or a device.
+
+    A pipe would wait for a writer, and a device may have no end. A symbolic link is followed; a path that does not
+    exist or cannot be accessed raises InputNotFoundError or StorageError.
+
+    Examples
+    --------
+    >>> check_input(Path("/dev/null"))
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.DataError: /dev/null: expected a file, found a device; copy its content to a file
+    """
+    with input_errors(path):
+        status = path.stat()
+    kind = _NOT_FILES.get(stat.S_IFMT(status.st_mode))
+    if kind is not None:
+        raise DataError(f"{path}: expected a file, found {kind}; copy its content to a file")
+    return status
+
+
+def first_line(error: BaseException) -> str:
+    """First line of an error's message, because messages of turbrestore have one line."""
+    # The message of a LookupError is only the key.
+    lines = [] if isinstance(error, LookupError) else str(error).splitlines()
+    return (lines or [type(error).__name__])[0]

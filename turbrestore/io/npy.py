@@ -1,49 +1,42 @@
-"""Arrays from ``.npy`` and ``.npz`` files: headers are held against the size of the file first, nothing is unpickled.
+"""Arrays in ``.npy`` and ``.npz`` files, and videos in ``.npy`` files; nothing is unpickled.
 
-NumPy believes a header and asks for the memory that it names; an archive of a few kilobytes inflates to gigabytes.  The
-archives that this package writes are not compressed, so a compressed one is refused, and no more memory is asked for
-than the file is large.
+NumPy allocates the memory that a header asks for, and a compressed archive of a few kilobytes can hold gigabytes.
+Headers are therefore compared with the size of the file first, and compressed archives, which this package never
+writes, are refused, so no more memory is allocated than the file is large.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import DataError, TurbrestoreError
+from ..core.arrays import FloatArray
 from ..runtime.scratch import iter_parts, new_stack
-from .files import check_input, first_line, input_errors
-from .limits import DEFAULT_LIMITS, Limits
+from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
+from .output import atomic_output, frames_of_one_size
+from .pixels import from_unit_to_type
+from .source import FrameSource
 
-# Arrays of more bytes may be put in a file.
+# Arrays of more bytes may be moved to a scratch file.
 _LARGE = 1 << 22
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
-    """Map the array of a ``.npy`` file into memory, to be read on demand.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-
-    Returns
-    -------
-    ndarray
-        Read-only.
+    """Map the array of a ``.npy`` file into memory, read-only; it is read on demand.
 
     Raises
     ------
     InputNotFoundError, StorageError
-        No such file, or it cannot be read.
+        The file does not exist, or cannot be read.
     DataError
         Not a ``.npy`` file, shorter than its header says, or not of numbers.
 
@@ -57,96 +50,48 @@ def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
     """
     path = Path(path)
     size = check_input(path).st_size
-    try:
-        with input_errors(path), path.open("rb") as file:
-            shape, is_fortran, dtype = _header(file)
-            offset = file.tell()
-            needed = math.prod(shape) * dtype.itemsize
-            if not 0 < needed <= size - offset:
-                raise ValueError(f"its header asks for {needed} bytes, {size - offset} are there")
-            return np.memmap(path, dtype, "r", offset, shape, "F" if is_fortran else "C")
-    except TurbrestoreError:
-        raise
-    except Exception as error:  # NumPy documents no closed list of exceptions for damaged headers
-        raise DataError(f"{path}: not a whole .npy array of numbers ({first_line(error)})") from error
+    with input_errors(path), format_errors(path, "not a whole .npy array of numbers"), path.open("rb") as file:
+        shape, is_fortran, dtype = _header(file)
+        offset = file.tell()
+        needed = math.prod(shape) * dtype.itemsize
+        if not 0 < needed <= size - offset:
+            raise ValueError(f"its header asks for {needed} bytes, {size - offset} are there")
+        return np.memmap(path, dtype, "r", offset, shape, "F" if is_fortran else "C")
 
 
 def read_npz(
-    path: str | os.PathLike[str],
-    limits: Limits = DEFAULT_LIMITS,
-    scratch: Path | None = None,
-    large: int | None = None,
+    path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, scratch: Path | None = None, large: int | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an uncompressed ``.npz`` file.
+    """Read all arrays of an uncompressed ``.npz`` file, as :func:`numpy.savez` writes it.
 
-    Parameters
-    ----------
-    path : path-like
-        The file, as :func:`numpy.savez` writes it.
-    limits : Limits
-        Most bytes that are read.
-    scratch : Path, optional
-        Folder of a file for large arrays; by default they are in memory.
-    large : int, optional
-        Bytes from which an array is large; by default 4 MiB.
-
-    Returns
-    -------
-    dict of str to ndarray
-        By their names, without the suffix ``.npy``.
+    Where ``scratch`` is a folder, arrays of float32 of more than ``large`` bytes (by default 4 MiB) go to scratch files
+    there.
 
     Raises
     ------
     InputNotFoundError, StorageError
-        No such file, or it cannot be read.
+        The file does not exist, or cannot be read.
     DataError
-        Not an archive of arrays, damaged, compressed, or too large.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     np.savez(folder + "/a.npz", x=np.arange(3))
-    ...     read_npz(folder + "/a.npz")
-    {'x': array([0, 1, 2])}
+        Not an archive of arrays, damaged, compressed, or larger than the limits.
     """
     path = Path(path)
     size = check_input(path).st_size
     limits.check_bytes(size, str(path))
-    try:
-        with input_errors(path), path.open("rb") as file, zipfile.ZipFile(file) as archive:
-            members = archive.infolist()
-            names = [member.filename.removesuffix(".npy") for member in members]
-            if len(set(names)) < len(names):
-                raise ValueError("one name stands twice in it")
-            # Members are not compressed; they hold more than the file only where they lie within each other.
-            if sum(member.file_size for member in members) > size:
-                raise ValueError(f"its members hold more than its {size} bytes")
-            least = _LARGE if large is None else large
-            return {name: _member(archive, member, scratch, least) for name, member in zip(names, members, strict=True)}
-    except TurbrestoreError:
-        raise
-    except Exception as error:  # neither NumPy nor zipfile documents a closed list of exceptions for damaged files
-        raise DataError(f"{path}: not a whole archive of arrays ({first_line(error)})") from error
+    errors = input_errors(path), format_errors(path, "not a whole archive of arrays")
+    with errors[0], errors[1], path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        names = [member.filename.removesuffix(".npy") for member in members]
+        if len(set(names)) < len(names):
+            raise ValueError("two members have the same name")
+        # Uncompressed members hold more than the file only if they overlap.
+        if sum(member.file_size for member in members) > size:
+            raise ValueError(f"its members hold more than its {size} bytes")
+        least = _LARGE if large is None else large
+        return {name: _member(archive, member, scratch, least) for name, member in zip(names, members, strict=True)}
 
 
 def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays as :func:`numpy.savez` does, those of a mapped file without taking them into memory.
-
-    Parameters
-    ----------
-    stream : binary file
-    arrays : mapping of str to ndarray
-
-    Examples
-    --------
-    >>> import io
-    >>> stream = io.BytesIO()
-    >>> write_npz(stream, {"x": np.arange(3)})
-    >>> _ = stream.seek(0)
-    >>> np.load(stream)["x"]
-    array([0, 1, 2])
-    """
+    """Write arrays as :func:`numpy.savez` does, but memory-mapped arrays part by part."""
     with zipfile.ZipFile(stream, "w", allowZip64=True) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -159,6 +104,35 @@ def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
                     np.lib.format.write_array(member, array, allow_pickle=False)
 
 
+def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
+    """Open an array of shape (T, H, W) or (T, H, W, 3) as a video; the errors are those of :func:`map_npy`."""
+    array = map_npy(path)
+    source = FrameSource.from_array(array, path.name)
+    limits.check_size(source.shape[2], source.shape[1], str(path))
+    limits.check_count(len(source), str(path))
+    return dataclasses.replace(source, format=f"npy/{array.dtype}", path=path)
+
+
+def write_npy(path: Path, frames: Iterable[FloatArray], bit_depth: int = 32, overwrite: bool = False) -> None:
+    """Write frames, one at a time, as one array of uint8, uint16 or float32."""
+    count = 0
+    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+        for frame in frames_of_one_size(frames, path):
+            pixels = from_unit_to_type(frame, bit_depth)
+            if count == 0:
+                _write_header(file, (0, *pixels.shape), pixels.dtype)
+            file.write(pixels.tobytes())
+            count += 1
+        # NumPy pads the header so that the number of frames fits in afterwards.
+        file.seek(0)
+        _write_header(file, (count, *pixels.shape), pixels.dtype)
+
+
+def _write_header(file: IO[bytes], shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    description = np.lib.format.dtype_to_descr(dtype)
+    np.lib.format.write_array_header_1_0(file, {"descr": description, "fortran_order": False, "shape": shape})
+
+
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | None, large: int) -> NDArray[Any]:
     if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
         raise ValueError(f"{member.filename} is compressed; expected it as numpy.savez writes it")
@@ -167,17 +141,17 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | N
         if scratch is not None and member.file_size > large and dtype == np.float32:
             stack = _stack_of(stream, shape[::-1] if is_fortran else shape, member, scratch)
             return stack.T if is_fortran else stack
-        # Reading to the end lets zipfile compare the checksum.
+        # zipfile compares the checksum at the end of the member.
         data = stream.read()
     if math.prod(shape) * dtype.itemsize != len(data):
-        raise ValueError(f"{member.filename} has {len(data)} bytes, which do not fill shape {shape}")
+        raise ValueError(f"{member.filename} has {len(data)} bytes, which do not fit shape {shape}")
     return np.frombuffer(bytearray(data), dtype).reshape(shape, order="F" if is_fortran else "C")
 
 
 def _stack_of(stream: IO[bytes], shape: tuple[int, ...], member: zipfile.ZipInfo, scratch: Path) -> NDArray[np.float32]:
-    """Copy a stack to a file of its own, one part after the other."""
+    """Copy a stack to a scratch file, part by part."""
     if not 0 < 4 * math.prod(shape) <= member.file_size:
-        raise ValueError(f"{member.filename} has {member.file_size} bytes, which do not fill shape {shape}")
+        raise ValueError(f"{member.filename} has {member.file_size} bytes, which do not fit shape {shape}")
     stack = new_stack(shape, scratch)
     for part in iter_parts(stack):
         part[...] = np.frombuffer(stream.read(part.nbytes), np.float32).reshape(part.shape)
@@ -187,7 +161,7 @@ def _stack_of(stream: IO[bytes], shape: tuple[int, ...], member: zipfile.ZipInfo
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether in the order of Fortran, and type; the stream is at the data then."""
+    """Read shape, whether the order is that of Fortran, and type; the stream is at the data afterwards."""
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:
         raise ValueError(f"version {version} of the format is not supported")

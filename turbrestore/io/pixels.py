@@ -1,7 +1,7 @@
-"""From the pixel values of files to intensities in [0, 1], by one rule for all formats.
+"""Conversion of the pixel values of files to intensities in [0, 1], by one rule for all formats.
 
-Integers are divided by the value that means white in their file; floating point values have to lie in [0, 1]
-already, because nothing says what else they mean.
+Integers are divided by the value that means white in their file. Floating point values must lie in [0, 1] already,
+because nothing in the file says what else they mean.
 """
 
 from __future__ import annotations
@@ -11,35 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, from_unit
 from ..core.errors import DataError, require
+from ..runtime.scratch import iter_parts
 
 PixelArray = NDArray[Any]
 
-# 67 million, twice an 8K frame; a frame of this size takes 800 MB as RGB in float32.
+# 67 million pixels are two 8K frames; a frame of this size takes 800 MB as float32 RGB.
 MAX_PIXELS = 2**26
-# Rounding and resampling overshoot a little; values further out mean that another scale was used.
+# Rounding and resampling overshoot a little; values further outside indicate another scale.
 FLOAT_MARGIN = 0.01
 
 
 def to_unit(pixels: PixelArray, full_scale: float, name: str) -> FloatArray:
-    """Turn the pixel values of a file into intensities in [0, 1].
+    """Convert the pixel values of a file to a new array of float32 intensities in [0, 1].
 
-    Parameters
-    ----------
-    pixels : ndarray
-        Unsigned integers, or floating point values in [0, 1]. Floating point values up to 0.01 outside are
-        clipped: rounding and resampling leave such values, while another scale (0 to 255, 0 to 4095) goes far
-        beyond.
-    full_scale : float
-        The integer that means 1; ignored for floating point values.
-    name : str
-        How error messages call the array.
-
-    Returns
-    -------
-    ndarray, float32, shape of ``pixels``
-        A new array.
+    Unsigned integers are divided by ``full_scale``. Floating point values up to 0.01 outside [0, 1] are clipped:
+    rounding and resampling produce such values, while another scale (0 to 255, 0 to 4095) goes far beyond. ``name`` is
+    the array in messages.
 
     Raises
     ------
@@ -75,30 +64,9 @@ def to_unit(pixels: PixelArray, full_scale: float, name: str) -> FloatArray:
 
 
 def full_scale_of(dtype: np.dtype[Any], name: str) -> int:
-    """Value that means intensity 1 in an array of this type.
+    """Value that means intensity 1: the maximum of an unsigned integer type, 1 for floating point.
 
-    Parameters
-    ----------
-    dtype : dtype
-        Of the array.
-    name : str
-        How error messages call the array.
-
-    Returns
-    -------
-    int
-        The largest value of an unsigned integer type, 1 for floating point.
-
-    Raises
-    ------
-    DataError
-        Signed integers, booleans and other types: nothing says where their white lies.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> full_scale_of(np.dtype(np.uint8), "a.tif")
-    255
+    Other types raise DataError, because their white is not defined; ``name`` is the array in the message.
     """
     if np.issubdtype(dtype, np.unsignedinteger):
         return int(np.iinfo(dtype).max)
@@ -108,48 +76,42 @@ def full_scale_of(dtype: np.dtype[Any], name: str) -> int:
 
 
 def depth_of(dtype: np.dtype[Any]) -> int:
-    """Bit depth of an array: its unsigned integers' bits, at most 32; 32 for floating point.
-
-    Parameters
-    ----------
-    dtype : dtype
-        Of the array.
-
-    Returns
-    -------
-    int
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> depth_of(np.dtype(np.uint16)), depth_of(np.dtype(np.float64))
-    (16, 32)
-    """
+    """Bit depth of an array: the bits of unsigned integers, at most 32; 32 for floating point."""
     return min(8 * dtype.itemsize, 32) if np.issubdtype(dtype, np.unsignedinteger) else 32
 
 
 def check_depth(bit_depth: int) -> int:
-    """Return ``bit_depth`` if an output can have it.
-
-    Parameters
-    ----------
-    bit_depth : int
-        Bits per channel.
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    ConfigurationError
-        Neither 1 to 16 nor 32.
-
-    Examples
-    --------
-    >>> check_depth(12)
-    12
-    """
+    """Return ``bit_depth``, or raise ConfigurationError unless it is 1 to 16 or 32."""
     known = not isinstance(bit_depth, bool) and bit_depth in {*range(1, 17), 32}
     require(known, f"bit_depth: expected 1 to 16, or 32 for floating point, found {bit_depth}")
     return bit_depth
+
+
+def from_unit_to_type(image: FloatArray, bit_depth: int) -> PixelArray:
+    """Convert intensities to the type of a file: uint8 up to 8 bits, uint16 up to 16, clipped float32 for 32."""
+    if bit_depth != 32:
+        return from_unit(image, 8 if bit_depth <= 8 else 16)
+    pixels, done = np.empty(image.shape, np.float32), 0
+    for part in iter_parts(image):
+        np.clip(part, 0, 1, out=pixels[done : done + len(part)])
+        done += len(part)
+    return pixels
+
+
+def without_alpha(pixels: PixelArray) -> tuple[PixelArray, tuple[str, ...]]:
+    """Drop the last channel of two or four; return the pixels, and a warning where there was one."""
+    if pixels.ndim == 2 or pixels.shape[2] not in (2, 4):
+        return pixels, ()
+    colours = pixels[..., 0] if pixels.shape[2] == 2 else pixels[..., :3]
+    return np.ascontiguousarray(colours), ("alpha channel ignored",)
+
+
+def upright(pixels: PixelArray, orientation: object) -> PixelArray:
+    """Turn and mirror an image as its EXIF or TIFF orientation tag, 1 to 8, demands; other values do nothing."""
+    if orientation not in range(2, 9):
+        return pixels
+    place = int(orientation) - 1  # type: ignore[call-overload]
+    if place >= 4:
+        pixels = np.swapaxes(pixels, 0, 1)
+    horizontal, vertical = [(1, 1), (-1, 1), (-1, -1), (1, -1)][place % 4]
+    return np.ascontiguousarray(pixels[::vertical, ::horizontal])

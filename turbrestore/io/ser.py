@@ -8,16 +8,15 @@ bytes   content
 42–161  observer, instrument, telescope
 162     two int64: date, date in UTC
 178     frames, rows from the top
-then    optionally an int64 a frame: time in units of 100 ns
+then    optionally one int64 per frame: time in units of 100 ns
 ======  ====================================================================================
 
-The description says that a flag of 1 means little endian. The programs that came first wrote 0 with little-endian
-pixels, all later ones followed them, and so does this module: 0 is little endian, everything else is big endian.
+The description says that an endianness flag of 1 means little endian. The first programs wrote 0 with little-endian
+pixels and all later ones followed them, so 0 is read as little endian and every other value as big endian.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,11 +27,10 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, from_unit
 from ..core.errors import DataError
-from .files import input_errors
-from .images import atomic_output
-from .limits import DEFAULT_LIMITS, Limits
+from .limits import DEFAULT_LIMITS, Limits, input_errors
+from .output import atomic_output, frames_of_one_size
 from .pixels import PixelArray, check_depth
-from .source import FrameSource, cut_short_text, skipped_end_text
+from .source import FrameSource, check_cut_short
 
 SIGNATURE = b"LUCAM-RECORDER"
 HEADER_SIZE = 178
@@ -49,18 +47,10 @@ _NAMES = {_MONO: "mono", _RGB: "rgb", _BGR: "bgr", 8: "rggb", 9: "grbg", 10: "gb
 
 @dataclass(frozen=True)
 class SerHeader:
-    """What the header of a SER file says.
+    """Header of a SER file: size in pixels, number of frames, bits per plane and colour code.
 
-    Attributes
-    ----------
-    colour : int
-        0 mono; 8 to 11 Bayer RGGB, GRBG, GBRG, BGGR; 100 RGB; 101 BGR.
-    little_endian : bool
-        Byte order of pixels of two bytes, as written in practice.
-    width, height, frames : int
-        Size in pixels, and how many frames.
-    bit_depth : int
-        Bits per plane, 1 to 16.
+    The colour code is 0 for mono; 8 to 11 for Bayer RGGB, GRBG, GBRG, BGGR; 100 for RGB and 101 for BGR.
+    ``little_endian`` is the byte order of two-byte pixels as written in practice.
     """
 
     colour: int
@@ -79,7 +69,7 @@ class SerHeader:
 
     @property
     def planes(self) -> int:
-        """Values a pixel."""
+        """Values per pixel."""
         return 3 if self.colour in (_RGB, _BGR) else 1
 
     @property
@@ -88,37 +78,8 @@ class SerHeader:
         return self.width * self.height * self.planes * self.dtype.itemsize
 
 
-def read_ser_header(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> SerHeader:
-    """Read and check the header of a SER file.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    limits : Limits
-        Largest size of a frame that is read.
-
-    Returns
-    -------
-    SerHeader
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        No such file, or it cannot be read.
-    DataError
-        Not a SER file, or of a kind that is not supported.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_ser(folder + "/a.ser", [np.zeros((2, 3), np.float32)], bit_depth=12)
-    ...     header = read_ser_header(folder + "/a.ser")
-    >>> header.width, header.height, header.bit_depth, header.frames
-    (3, 2, 12, 1)
-    """
-    path = Path(path)
+def read_ser_header(path: Path, limits: Limits = DEFAULT_LIMITS) -> SerHeader:
+    """Read and check the header of a SER file."""
     with input_errors(path), path.open("rb") as file:
         data = file.read(HEADER_SIZE)
     if len(data) < HEADER_SIZE or not data.startswith(SIGNATURE):
@@ -135,52 +96,30 @@ def read_ser_header(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMIT
 
 
 def open_ser(
-    path: str | os.PathLike[str], stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
+    path: Path, stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
 ) -> FrameSource:
     """Open a SER file; Bayer patterns become RGB by bilinear interpolation.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    stop : int, optional
-        Frames from this one on are not needed, so they may be missing.
-    limits : Limits
-        Largest video that is read.
-    skip_damaged : bool
-        Read what is whole of a file that is cut short.
-
-    Returns
-    -------
-    FrameSource
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        No such file, or it cannot be read.
-    DataError
-        Not a SER file, of a kind that is not supported, or cut short.
+    Frames from ``stop`` on are not needed, so they may be missing. With ``skip_damaged`` the whole frames of a file
+    that is cut short are read. The errors are those of :func:`turbrestore.io.video.open_frames`.
 
     Examples
     --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_ser(folder + "/a.ser", [np.zeros((2, 3), np.float32)] * 4, bit_depth=12, fps=50)
-    ...     source = open_ser(folder + "/a.ser")
+    ...     write_ser(Path(folder, "a.ser"), [np.zeros((2, 3), np.float32)] * 4, bit_depth=12, fps=50)
+    ...     source = open_ser(Path(folder, "a.ser"))
     >>> source.shape, source.format, source.fps
     ((4, 2, 3), 'ser/mono12', 50.0)
     """
-    path = Path(path)
     header = read_ser_header(path, limits)
     with input_errors(path):
         size = path.stat().st_size
     present = (size - HEADER_SIZE) // header.frame_bytes
-    cut = present < header.frames
-    if cut and not (skip_damaged and present) and (stop is None or stop > present):
-        raise DataError(f"{path}: {cut_short_text(present)}")
+    notes = check_cut_short(path, present, stop, skip_damaged) if present < header.frames else ()
     limits.check_count(min(header.frames, present), str(path))
     times = _timestamps(path, header, size)
-    notes = ("variable frame rate",) if times is not None and _has_gaps(times) else ()
+    notes = (*(["variable frame rate"] if times is not None and _has_gaps(times) else []), *notes)
     channels = () if header.colour == _MONO else (3,)
     return FrameSource(
         name=path.name,
@@ -192,69 +131,32 @@ def open_ser(
         path=path,
         fps=None if times is None else (len(times) - 1) / float(times[-1]),
         timestamps=times,
-        warnings=(*notes, skipped_end_text(present)) if cut and skip_damaged else notes,
+        warnings=notes,
     )
 
 
 def write_ser(
-    path: str | os.PathLike[str],
-    frames: Iterable[FloatArray],
-    bit_depth: int = 16,
-    fps: float | None = None,
-    overwrite: bool = False,
+    path: Path, frames: Iterable[FloatArray], bit_depth: int = 16, fps: float | None = None, overwrite: bool = False
 ) -> None:
-    """Write frames as a SER file, mono or RGB, little endian.
+    """Write frames as a SER file, mono or RGB, little endian; a depth of 32 is written as 16 bits.
 
-    Parameters
-    ----------
-    path : path-like
-        The file to be written.
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-        Intensities; values outside [0, 1] are clipped.
-    bit_depth : int
-        1 to 16 bits per plane; 32 is written as 16.
-    fps : float, optional
-        Frames per second; adds a time to each frame, from 1 January 2000 on.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    ConfigurationError
-        Unsupported bit depth.
-    DataError
-        No frames, or frames of two sizes.
-    OutputError, StorageError
-        The file cannot be created or completed.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_ser(folder + "/a.ser", [np.full((2, 2), 0.4, np.float32)], bit_depth=4)
-    ...     open_ser(folder + "/a.ser").read()[0, 0]
-    array([0.4, 0.4], dtype=float32)
+    With ``fps`` the time of every frame is stored, beginning on 1 January 2000.
     """
     depth = min(check_depth(bit_depth), 16)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
-        count, shape = 0, None
+        count = 0
         file.write(bytes(HEADER_SIZE))
-        for frame in frames:
-            if shape is not None and frame.shape != shape:
-                raise DataError(f"{path}: frame {count}: expected shape {shape}, found {frame.shape}")
-            shape = frame.shape
+        for frame in frames_of_one_size(frames, path):
             pixels = from_unit(frame, depth)
             file.write(pixels.astype(pixels.dtype.newbyteorder("<")).tobytes())
             count += 1
-        if shape is None:
-            raise DataError(f"{path}: expected at least one frame, found none")
         if fps is not None:
             start = (np.datetime64("2000-01-01") - np.datetime64("0001-01-01")) // np.timedelta64(1, "s")
             ticks = start * TICKS_PER_SECOND + np.rint(np.arange(count) * (TICKS_PER_SECOND / fps)).astype("<i8")
             file.write(ticks.astype("<i8").tobytes())
         file.seek(0)
-        colour = _MONO if len(shape) == 2 else _RGB
-        fields = np.array([0, colour, 0, shape[1], shape[0], depth, count], "<i4")
+        colour = _MONO if pixels.ndim == 2 else _RGB
+        fields = np.array([0, colour, 0, pixels.shape[1], pixels.shape[0], depth, count], "<i4")
         file.write(SIGNATURE + fields.tobytes())
 
 
@@ -262,7 +164,7 @@ def _frames(path: Path, header: SerHeader, chosen: Sequence[int]) -> Iterator[Pi
     shape = (header.height, header.width) if header.planes == 1 else (header.height, header.width, 3)
     for number in chosen:
         with input_errors(path):
-            # Mapped one by one: pages of frames already seen do not count as this process's memory.
+            # Frames are mapped one by one, so the pages of earlier frames are no memory of this process.
             offset = HEADER_SIZE + number * header.frame_bytes
             frame = np.memmap(path, header.dtype, "r", offset, shape)
         if header.colour in _BAYER:
@@ -277,11 +179,11 @@ def _timestamps(path: Path, header: SerHeader, size: int) -> NDArray[np.float64]
         return None
     with input_errors(path):
         ticks = np.fromfile(path, "<i8", header.frames, offset=start)
-    # Recorders without a clock leave zeros; a clock that was set back during the recording tells no frame rate.
+    # Recorders without a clock write zeros; a clock that was set back during the recording gives no frame rate.
     return (ticks - ticks[0]) / TICKS_PER_SECOND if np.all(np.diff(ticks) >= 0) and ticks[-1] > ticks[0] else None
 
 
 def _has_gaps(times: NDArray[np.float64]) -> bool:
-    """Whether frames are missing in time; cameras that time their frames themselves scatter by much less."""
+    """Whether frames are missing in time; the jitter of cameras is much smaller."""
     intervals = np.diff(times)
     return len(times) > 2 and bool(intervals.max() > 1.5 * np.median(intervals))

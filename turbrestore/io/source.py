@@ -1,15 +1,13 @@
-"""A video as the stages see it: frames on demand, as often as wanted, one at a time in memory.
+"""A video as the stages use it: frames are decoded on demand, one at a time, as often as wanted.
 
-A reader of one format (``container``, ``ser``, ``tiff``, …) hands over a function that yields the native pixels of
-given frames, and what it knows from the headers. Range, crop, scaling to [0, 1] and the checks are done here, once
-for all formats.
+The reader of a format (``container``, ``ser``, ``tiff`` and others) provides a function that yields the native pixels
+of given frames, and what the headers say. Range, crop, scaling to [0, 1] and checks are done here for all formats.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import operator
-import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -20,60 +18,52 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import CHANNELS, FloatArray
 from ..core.errors import ConfigurationError, DataError, require
-from ..runtime.scratch import drop_pages
-from .images import IMAGE_SUFFIXES
+from ..runtime.scratch import iter_frames
+from .output import size_text
 from .pixels import PixelArray, depth_of, full_scale_of, to_unit
 
 FrameRange = tuple[int | None, int | None] | tuple[int | None, int | None, int | None]
 Roi = tuple[int, int, int, int]
-# Frames that a message names before it only counts them.
+# Number of frames that a message lists before it only counts the others.
 _NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
 class FrameSource:
-    """Frames of a video, decoded while iterating; every iteration starts anew.
+    """Frames of a video that are decoded while iterating; every iteration starts from the first frame.
 
     Attributes
     ----------
-    name : str
-        How messages call the video.
-    format : str
-        Container or codec and pixel format, such as ``ffv1/gray16le``.
+    name, format : str
+        Name of the video in messages; container or codec and pixel format, such as ``ffv1/gray16le``.
     file_shape : tuple of int
         (T, H, W) or (T, H, W, 3) of the whole file.
-    full_scale : int
-        Native value that means intensity 1.
-    bit_depth : int
-        Bits per channel of the file; 32 for floating point.
+    full_scale, bit_depth : int
+        Native value that means intensity 1; bits per channel of the file, 32 for floating point.
     pixels : callable
-        Given ascending frame numbers of the file, yields their native pixels in that order.
+        Takes ascending frame numbers of the file, and yields the native pixels of these frames.
     path : Path or None
-        The file or folder; None for an array.
+        File or folder; None for an array.
     fps : float or None
         Frames per second, after the selection.
     timestamps : ndarray, float64, shape (T,), or None
         Seconds since the first frame of the file, after the selection.
     warnings : tuple of str
-        What was left out or looks odd.
+        What was left out, or is unusual.
     damaged : tuple of int
         Numbers, in the file, of frames that are known to be damaged.
     repair : callable or None
-        Applied to the native pixels of every frame of the file before anything looks at them.
-    numbers : range or tuple of int
-        Numbers, in the file, of the frames selected, ascending; by default all.
-    window : tuple of slice
-        Rows and columns selected; by default all.
+        Applied to the native pixels of every frame first.
+    numbers, window : range or tuple of int, tuple of slice
+        Ascending numbers, in the file, of the selected frames; selected rows and columns. By default all.
 
     Examples
     --------
     >>> import numpy as np
     >>> source = FrameSource.from_array(np.zeros((5, 4, 6), np.uint8))
-    >>> source.shape, source.bit_depth
-    ((5, 4, 6), 8)
     >>> part = source.select(frames=(1, None, 2), roi=(0, 1, 3, 2))
-    >>> len(part), [frame.shape for frame in part]
-    (2, [(2, 3), (2, 3)])
+    >>> source.shape, len(part), [frame.shape for frame in part]
+    ((5, 4, 6), 2, [(2, 3), (2, 3)])
     """
 
     name: str
@@ -105,7 +95,7 @@ class FrameSource:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(T, H, W) or (T, H, W, 3) of the frames selected."""
+        """(T, H, W) or (T, H, W, 3) of the selected frames."""
         rows, columns = self.window
         return (len(self.numbers), rows.stop - rows.start, columns.stop - columns.start, *self.file_shape[3:])
 
@@ -116,23 +106,14 @@ class FrameSource:
         return self._frames(self.numbers)
 
     def read(self, start: int = 0, stop: int | None = None) -> FloatArray:
-        """Frames ``start`` to ``stop`` (exclusive) as one array.
-
-        Parameters
-        ----------
-        start, stop : int
-            As in a slice, counted in the selection.
-
-        Returns
-        -------
-        ndarray, float32, shape (T, H, W) or (T, H, W, 3)
+        """Read frames ``start`` to ``stop`` (exclusive), counted in the selection, as one float32 array.
 
         Raises
         ------
         DataError
             Frames are damaged or missing.
         ConfigurationError
-            No frame lies in the range.
+            The range is empty.
 
         Examples
         --------
@@ -148,17 +129,7 @@ class FrameSource:
         return stack
 
     def native(self) -> Iterator[PixelArray]:
-        """Frames of the selection as the file has them: cropped, but neither scaled nor checked.
-
-        Yields
-        ------
-        ndarray, shape (H, W) or (H, W, 3)
-            In the type of the file.
-
-        Raises
-        ------
-        DataError
-            Frames are damaged or missing.
+        """Iterate over the selected frames in the type of the file: cropped, but neither scaled nor checked.
 
         Examples
         --------
@@ -170,18 +141,7 @@ class FrameSource:
             yield pixels
 
     def without(self, numbers: Collection[int], warning: str) -> FrameSource:
-        """Leave frames out.
-
-        Parameters
-        ----------
-        numbers : collection of int
-            Numbers, in the file, of the frames to leave out; those that are not selected do not count.
-        warning : str
-            Added to the warnings where a frame is left out.
-
-        Returns
-        -------
-        FrameSource
+        """Leave out the frames with these numbers in the file; where any is selected, ``warning`` is added.
 
         Raises
         ------
@@ -208,19 +168,15 @@ class FrameSource:
         )
 
     def select(self, frames: FrameRange | None = None, roi: Roi | None = None) -> FrameSource:
-        """Part of the frames, cropped.
+        """Select a range of frames and a rectangle.
 
         Parameters
         ----------
         frames : tuple, optional
-            (start, stop) or (start, stop, step), as in a slice; None stands for the end of the video. Nothing
-            counts from the end, and nothing may lie outside.
+            (start, stop) or (start, stop, step), as in a slice, but without negative numbers and within the video; None
+            as the stop is the end of the video.
         roi : tuple of int, optional
             (x, y, width, height) in pixels.
-
-        Returns
-        -------
-        FrameSource
 
         Raises
         ------
@@ -251,33 +207,22 @@ class FrameSource:
 
     @staticmethod
     def from_array(array: ArrayLike, name: str = "array", fps: float | None = None) -> FrameSource:
-        """Frames that lie in memory, or in a memory-mapped file.
+        """Use an array in memory, or a memory-mapped file, as a video.
 
         Parameters
         ----------
         array : array_like, shape (T, H, W) or (T, H, W, 3)
-            Unsigned integers, scaled by the range of their type, or floating point in [0, 1].
+            Unsigned integers, scaled by the range of their type, or floating point in [0, 1]; others raise DataError.
         name : str
-            How messages call the video.
+            Name of the video in messages.
         fps : float, optional
             Frames per second.
-
-        Returns
-        -------
-        FrameSource
-
-        Raises
-        ------
-        DataError
-            Wrong shape or type.
 
         Examples
         --------
         >>> import numpy as np
-        >>> FrameSource.from_array(np.full((2, 1, 1), 255, np.uint8)).read()
-        array([[[1.]],
-        <BLANKLINE>
-               [[1.]]], dtype=float32)
+        >>> FrameSource.from_array(np.full((2, 1, 1), 255, np.uint8)).read().ravel()
+        array([1., 1.], dtype=float32)
         """
         values = np.asanyarray(array)
         return FrameSource(
@@ -311,13 +256,12 @@ class FrameSource:
 
     def _native(self, chosen: range | tuple[int, ...]) -> Iterator[tuple[int, PixelArray]]:
         done = 0
-        for number, pixels in zip(chosen, self.pixels(chosen), strict=False):
+        # Without iter_frames a memory-mapped video would be in memory as a whole at the end.
+        for number, pixels in zip(chosen, iter_frames(self.pixels(chosen)), strict=False):
             if pixels.shape != self.file_shape[1:]:
                 expected, found = size_text(self.file_shape[1:]), size_text(pixels.shape)
                 raise DataError(f"{self.name}: frame {number}: expected {expected} as the first frame, found {found}")
             yield number, (pixels if self.repair is None else self.repair(pixels))[self.window]
-            # A mapped video would be in memory as a whole at the end.
-            drop_pages(pixels)
             done += 1
         if done < len(chosen):
             raise DataError(
@@ -326,27 +270,7 @@ class FrameSource:
 
 
 def check_frame_range(frames: FrameRange | None) -> slice:
-    """Return (start, stop[, step]) as a slice of non-negative integers.
-
-    Parameters
-    ----------
-    frames : tuple, optional
-        See :meth:`FrameSource.select`.
-
-    Returns
-    -------
-    slice
-
-    Raises
-    ------
-    ConfigurationError
-        Not two or three non-negative integers or None, or a step below 1.
-
-    Examples
-    --------
-    >>> check_frame_range((10, None, 2))
-    slice(10, None, 2)
-    """
+    """Return (start, stop[, step]) as a slice; raise ConfigurationError unless they are integers from 0 or None."""
     wrong = ConfigurationError(
         f"frames: expected (start, stop) or (start, stop, step) of integers from 0 or None, found {frames}"
     )
@@ -362,122 +286,33 @@ def check_frame_range(frames: FrameRange | None) -> slice:
     return slice(*values)
 
 
-def frame_files(folder: Path) -> list[Path]:
-    """Images of a folder that are the frames of a video: no hidden files, no folders, no links that lead nowhere.
+def check_cut_short(
+    path: Path, intact: int, stop: int | None, skip_damaged: bool, problem: str = "cut short"
+) -> tuple[str, ...]:
+    """Raise DataError for a video of which only the first ``intact`` frames are there, or return a warning.
 
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    list of Path
-        In the order of their names, with the digits counting as numbers.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be read.
+    The other frames may be missing if ``skip_damaged`` is true, or if frames from ``stop`` on are not needed.
 
     Examples
     --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     for name in ("a10.png", "a9.png", ".a1.png", "notes.txt"):
-    ...         Path(folder, name).touch()
-    ...     [path.name for path in frame_files(Path(folder))]
-    ['a9.png', 'a10.png']
+    >>> check_cut_short(Path("a.ser"), 59, None, skip_damaged=True)
+    ('cut short; only its first 59 frames are used',)
     """
-
-    def natural(file: Path) -> tuple[list[tuple[int, str]], str]:
-        parts = re.findall(r"\d+|\D+", file.name)
-        return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts], file.name
-
-    named = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != ".")
-    return sorted((path for path in named if path.is_file()), key=natural)
-
-
-def size_text(shape: tuple[int, ...]) -> str:
-    """Size and kind of a frame in words.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        (H, W) or (H, W, C).
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> size_text((480, 640, 3))
-    '640×480 RGB'
-    """
-    kind = "grey" if len(shape) == 2 else "RGB" if shape[2] == 3 else f"{shape[2]} channels"
-    return f"{shape[1]}×{shape[0]} {kind}"
-
-
-def cut_short_text(intact: int) -> str:
-    """Say what is wrong with, and what to do about, a video of which only the first ``intact`` frames are there.
-
-    Parameters
-    ----------
-    intact : int
-        Frames that can be read.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> cut_short_text(59)
-    'cut short after 59 whole frames; copy the file again or select frames up to 59'
-    >>> cut_short_text(0)
-    'cut short before the end of the first frame; copy the file again'
-    """
+    if skip_damaged and intact:
+        return (f"cut short; only its first {intact} frames are used",)
+    if stop is not None and stop <= intact:
+        return ()
     if intact < 1:
-        return "cut short before the end of the first frame; copy the file again"
-    return f"cut short after {intact} whole frames; copy the file again or select frames up to {intact}"
-
-
-def skipped_end_text(intact: int) -> str:
-    """Say that only the whole frames of a video that is cut short are used.
-
-    Parameters
-    ----------
-    intact : int
-        Frames that can be read.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> skipped_end_text(59)
-    'cut short; only its first 59 frames are used'
-    """
-    return f"cut short; only its first {intact} frames are used"
+        raise DataError(f"{path}: {problem} before the end of the first frame; copy the file again")
+    remedy = f"copy the file again or select frames up to {intact}"
+    raise DataError(f"{path}: {problem} after {intact} whole frames; {remedy}")
 
 
 def numbers_text(numbers: Collection[int]) -> str:
-    """Name frames: how many, and the first few.
-
-    Parameters
-    ----------
-    numbers : collection of int
-        Ascending.
-
-    Returns
-    -------
-    str
+    """List the first few of ascending frame numbers, and count the others.
 
     Examples
     --------
-    >>> numbers_text([4])
-    'frame 4'
     >>> numbers_text(range(10, 30))
     'frames 10, 11, 12, 13, 14 and 15 more'
     """

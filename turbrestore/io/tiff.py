@@ -1,76 +1,76 @@
-"""TIFF stacks: one page a frame, read page by page.
+"""TIFF images and stacks of one page a frame, read by tifffile page by page.
 
-Every page is checked before it is decoded (:mod:`turbrestore.io.tiff_pages`).
+tifffile returns fewer pages where the link to the next one is broken, fills up missing strips and tiles, and may
+decompress far more than a page holds. This module therefore follows the links and undoes common compressions itself.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import os
+import io
+import lzma
+import math
+import struct
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, from_unit
+from ..core.arrays import FloatArray
 from ..core.errors import DataError
-from .files import input_errors
-from .images import atomic_output
-from .limits import DEFAULT_LIMITS, Limits
-from .pixels import PixelArray, check_depth, depth_of, full_scale_of
+from ..runtime.jit import jit
+from .limits import DEFAULT_LIMITS, Limits, first_line, format_errors, input_errors
+from .output import atomic_output, frames_of_one_size
+from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, upright
 from .source import FrameSource
-from .tiff_pages import check_page, check_parts, count_pages, tiff_errors
 
 if TYPE_CHECKING:
     import tifffile
 
+TIFF_SUFFIXES = (".tif", ".tiff")
+_NONE, _LZW, _PACKBITS, _LZMA = 1, 5, 32773, 34925
+# Compressions that are undone here: LZW, two codes of deflate, PackBits and LZMA.
+_DECOMPRESSED = (_LZW, 8, 32946, _PACKBITS, _LZMA)
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
+_NOT_TIFF = "not a TIFF file, or damaged"
+_MOST_SAMPLES = 16
+_ORIENTATION = 274
+# LZW codes that start a new table and that end the data, and the size of the largest table.
+_CLEAR, _END, _TABLE = 256, 257, 4096
 
 
-def open_tiff(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> FrameSource:
-    """Open a TIFF stack, grey or RGB, of 8 or 16 bits or floating point.
+def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
+    """Open a TIFF, BigTIFF or ImageJ stack, grey or RGB, with 8 or 16 bits or floating point.
 
-    Parameters
-    ----------
-    path : path-like
-        TIFF, BigTIFF or ImageJ stack. Packed bits and compressions other than deflate need the package
-        ``imagecodecs``.
-    limits : Limits
-        Largest stack that is read.
-
-    Returns
-    -------
-    FrameSource
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        No such file, or it cannot be read.
-    DataError
-        Not a TIFF file, damaged, cut short, or of a kind that is not supported.
+    Packed bits, and compressions other than deflate, LZMA, LZW and PackBits, need the package ``imagecodecs``. The
+    errors are those of :func:`turbrestore.io.video.open_frames`.
 
     Examples
     --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_tiff(folder + "/a.tif", [np.full((2, 3), 0.25, np.float32)] * 4, bit_depth=32)
-    ...     source = open_tiff(folder + "/a.tif")
+    ...     write_tiff(Path(folder, "a.tif"), [np.full((2, 3), 0.25, np.float32)] * 4, bit_depth=32)
+    ...     source = open_tiff(Path(folder, "a.tif"))
     ...     source.shape, source.format, float(source.read().max())
     ((4, 2, 3), 'tiff/float32', 0.25)
     """
     import tifffile
 
-    path = Path(path)
     with input_errors(path), path.open("rb") as file:
         pages = count_pages(path, file, limits)
-    with input_errors(path), tiff_errors(path), tifffile.TiffFile(path) as tiff:
+    with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
         page = tiff.pages.first
-        check_page(path, page, limits)
+        _check_page(path, page, limits)
         packed = _packed_stack(path, tiff) if pages == 1 else None
         if packed is not None:
             return packed
-        channels, notes = _channels(path, page)
+        channels = _channels(page)
+        if channels is None:
+            kind = f"{getattr(page.photometric, 'name', page.photometric)} with {page.samplesperpixel} channels"
+            raise DataError(f"{path}: expected grey or RGB pages, found {kind}; convert the file")
         dtype = np.dtype(page.dtype)
         integer = np.issubdtype(dtype, np.unsignedinteger)
         return FrameSource(
@@ -81,93 +81,246 @@ def open_tiff(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> 
             bit_depth=min(page.bitspersample, 32) if integer else depth_of(dtype),
             pixels=lambda chosen: _frames(path, chosen, limits),
             path=path,
-            warnings=notes,
+            warnings=_notes(page),
         )
 
 
-def write_tiff(
-    path: str | os.PathLike[str], frames: Iterable[FloatArray], bit_depth: int = 16, overwrite: bool = False
-) -> None:
-    """Write frames as a TIFF stack, uncompressed, one page a frame.
+def read_tiff(path: Path, data: bytes, limits: Limits) -> tuple[PixelArray | None, tuple[str, ...]]:
+    """Read a TIFF file of one image whose content is ``data``: upright pixels in its type, and warnings.
 
-    Parameters
-    ----------
-    path : path-like
-        The file to be written.
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-        Intensities; values outside [0, 1] are clipped.
-    bit_depth : int
-        1 to 8 gives 8 bits, 9 to 16 gives 16 bits (scaled to the full range of the file), 32 floating point.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    ConfigurationError
-        Unsupported bit depth.
-    DataError
-        No frames, or frames of two sizes.
-    OutputError, StorageError
-        The file cannot be created or completed.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_tiff(folder + "/a.tif", [np.zeros((2, 3), np.float32)] * 4, bit_depth=12)
-    ...     open_tiff(folder + "/a.tif").format
-    'tiff/uint16'
+    The pixels are None for a file that OpenCV has to decode, such as one with a palette, one bit, JPEG or fax
+    compression.
     """
     import tifffile
 
-    depth = check_depth(bit_depth)
-    shape = None
-    with atomic_output(path, overwrite) as temporary, tifffile.TiffWriter(temporary, bigtiff=True) as tiff:
-        for number, frame in enumerate(frames):
-            if shape is not None and frame.shape != shape:
-                raise DataError(f"{path}: frame {number}: expected shape {shape}, found {frame.shape}")
-            shape = frame.shape
-            pixels: PixelArray = np.clip(frame, 0, 1) if depth == 32 else from_unit(frame, 8 if depth <= 8 else 16)
-            # Without metadata and contiguity each page is complete and stands alone, so any reader sees a stack.
-            tiff.write(pixels, photometric="minisblack" if frame.ndim == 2 else "rgb", contiguous=False, metadata=None)
-        if shape is None:
-            raise DataError(f"{path}: expected at least one frame, found none")
+    pages = count_pages(path, io.BytesIO(data), limits)
+    if pages != 1:
+        raise DataError(f"{path}: expected one image, found {pages} pages; read it as a video")
+    with format_errors(path, _NOT_TIFF), tifffile.TiffFile(io.BytesIO(data)) as tiff:
+        page = tiff.pages.first
+        _check_page(path, page, limits)
+        if _is_decodable(page):
+            return upright(_page_pixels(path, page), page.tags.valueof(_ORIENTATION)), _notes(page)
+        if page.compression in _DECOMPRESSED and isinstance(page.bitspersample, int):
+            # OpenCV prints that pixels are missing, and fills them up.
+            row = (page.imagewidth * page.samplesperpixel * page.bitspersample + 7) // 8
+            if sum(map(len, _parts(path, page))) < row * page.imagelength:
+                raise DataError(f"{path}: compressed pixels are damaged (cut short); copy the file again")
+        return None, ()
 
 
-def _frames(path: Path, chosen: Sequence[int], limits: Limits) -> Iterator[PixelArray]:
+def write_tiff(path: Path, frames: Iterable[FloatArray], bit_depth: int = 16, overwrite: bool = False) -> None:
+    """Write frames as an uncompressed TIFF stack of 8 bits, 16 bits or floating point, one page a frame."""
     import tifffile
 
-    with input_errors(path), tiff_errors(path), tifffile.TiffFile(path) as tiff:
-        for number in chosen:
-            page = tiff.pages[number].aspage()
-            check_page(path, page, limits)
-            channels, _ = _channels(path, page)
-            check_parts(path, page)
-            pixels = page.asarray()
-            if pixels.ndim == 3:
-                # Planes stored one after the other come as (C, H, W).
-                pixels = np.moveaxis(pixels, 0, -1) if page.axes.startswith("S") else pixels
-                pixels = pixels[..., :3] if channels else pixels[..., 0]
-            yield np.iinfo(pixels.dtype).max - pixels if page.photometric == _WHITE_IS_ZERO else pixels
+    depth = check_depth(bit_depth)
+    with atomic_output(path, overwrite) as temporary, tifffile.TiffWriter(temporary, bigtiff=True) as tiff:
+        for frame in frames_of_one_size(frames, path):
+            pixels = from_unit_to_type(frame, depth)
+            # Without metadata and contiguity every page is complete in itself, so any reader finds a stack.
+            tiff.write(pixels, photometric="minisblack" if frame.ndim == 2 else "rgb", contiguous=False, metadata=None)
 
 
-def _channels(path: Path, page: tifffile.TiffPage) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Trailing axes of a page without alpha, and what was left out."""
-    colours = page.samplesperpixel - len(page.extrasamples)
-    integer = np.issubdtype(page.dtype, np.unsignedinteger)
-    kinds = (_BLACK_IS_ZERO, _WHITE_IS_ZERO) if integer and page.bitspersample % 8 == 0 else (_BLACK_IS_ZERO,)
-    grey = colours == 1 and page.photometric in kinds
-    if page.imagedepth != 1 or not (grey or (colours == 3 and page.photometric == _RGB)):
-        kind = f"{getattr(page.photometric, 'name', page.photometric)} with {page.samplesperpixel} channels"
-        raise DataError(f"{path}: expected grey or RGB pages, found {kind}; convert the file")
-    return (() if grey else (3,)), (("alpha channel ignored",) if page.extrasamples else ())
+def count_pages(path: Path, file: BinaryIO, limits: Limits) -> int:
+    r"""Count the pages of a TIFF file by following the links from page to page; raise DataError for broken links.
+
+    Examples
+    --------
+    >>> count_pages(Path("a.tif"), io.BytesIO(b"II*\0\x08\0\0\0" + bytes(14)), Limits())
+    1
+    """
+    head = file.read(16)
+    order = {b"II": "<", b"MM": ">"}.get(head[:2], "")
+    version = struct.unpack(f"{order}H", head[2:4])[0] if len(head) == 16 else None
+    if not order or version not in (42, 43):
+        raise DataError(f"{path}: not a TIFF file")
+    count_format, entry_size, link_format = ("H", 12, "I") if version == 42 else ("Q", 20, "Q")
+    link_size = struct.calcsize(link_format)
+    offset = struct.unpack(order + link_format, head[4:8] if version == 42 else head[8:16])[0]
+    size = file.seek(0, io.SEEK_END)
+    seen: set[int] = set()
+    while offset:
+        if offset in seen:
+            raise DataError(f"{path}: damaged; its pages form a circle")
+        seen.add(offset)
+        limits.check_count(len(seen), str(path))
+        try:
+            # The system refuses to seek to offsets beyond its range; at the end of the file nothing is read.
+            file.seek(min(offset, size))
+            (entries,) = struct.unpack(order + count_format, file.read(struct.calcsize(count_format)))
+            file.seek(min(file.tell() + entries * entry_size, size))
+            (offset,) = struct.unpack(order + link_format, file.read(link_size))
+        except struct.error:
+            raise DataError(f"{path}: cut short after {len(seen) - 1} whole pages; copy the file again") from None
+    if not seen:
+        raise DataError(f"{path}: expected at least one page, found none")
+    return len(seen)
+
+
+def _check_page(path: Path, page: tifffile.TiffPage, limits: Limits) -> None:
+    """Refuse a page whose tags state too many pixels or too many values per pixel."""
+    limits.check_size(page.imagewidth, page.imagelength, str(path))
+    if page.is_tiled:
+        limits.check_size(page.tilewidth, page.tilelength, f"{path}: a tile")
+    if page.samplesperpixel > _MOST_SAMPLES:
+        raise DataError(f"{path}: expected up to {_MOST_SAMPLES} values per pixel, found {page.samplesperpixel}")
+
+
+def _channels(page: tifffile.TiffPage) -> tuple[int, ...] | None:
+    """Axes after height and width, without alpha; None unless the page is grey or RGB."""
+    whole_bytes = isinstance(page.bitspersample, int) and page.bitspersample % 8 == 0
+    greys = (_BLACK_IS_ZERO, _WHITE_IS_ZERO) if np.issubdtype(page.dtype, np.unsignedinteger) and whole_bytes else (1,)
+    if page.imagedepth == 1 and page.samplesperpixel - len(page.extrasamples) == 1 and page.photometric in greys:
+        return ()
+    # Some writers do not mark the fourth channel as alpha.
+    return (3,) if page.imagedepth == 1 and page.samplesperpixel >= 3 and page.photometric == _RGB else None
+
+
+def _notes(page: tifffile.TiffPage) -> tuple[str, ...]:
+    return ("alpha channel ignored",) if page.samplesperpixel not in (1, 3) else ()
 
 
 def _packed_stack(path: Path, tiff: tifffile.TiffFile) -> FrameSource | None:
-    """Frames that follow each other behind a single page, as ImageJ writes stacks of 4 GB and more."""
+    """Open frames that follow each other behind a single page, as ImageJ writes stacks of 4 GB and more."""
     series, page = tiff.series[0], tiff.pages.first
     if series.dataoffset is None or series.size <= page.imagewidth * page.imagelength * page.samplesperpixel:
         return None
     dtype = series.dtype.newbyteorder(tiff.byteorder)
     source = FrameSource.from_array(np.memmap(path, dtype, "r", series.dataoffset, series.shape), path.name)
     return dataclasses.replace(source, format=f"tiff/{series.dtype}", path=path)
+
+
+def _is_decodable(page: tifffile.TiffPage) -> bool:
+    """Whether :func:`_page_pixels` decodes the page of a still image."""
+    from tifffile import TIFF
+
+    known = page.compression in _DECOMPRESSED or page.compression in TIFF.DECOMPRESSORS
+    bits = page.bitspersample in (8, 16, 32, 64)
+    return _channels(page) is not None and bits and known and page.predictor in (1, *TIFF.UNPREDICTORS)
+
+
+def _frames(path: Path, chosen: Sequence[int], limits: Limits) -> Iterator[PixelArray]:
+    import tifffile
+
+    with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
+        for number in chosen:
+            page = tiff.pages[number].aspage()
+            _check_page(path, page, limits)
+            if _channels(page) is None:
+                raise DataError(f"{path}: frame {number}: expected grey or RGB; convert the file")
+            yield _page_pixels(path, page)
+
+
+def _page_pixels(path: Path, page: tifffile.TiffPage) -> PixelArray:
+    """Pixels of a page, grey or RGB, with white as the highest value."""
+    if page.compression in _DECOMPRESSED:
+        parts = list(_parts(path, page))
+        # tifffile decodes the parts as it does those of an uncompressed page.
+        page.compression = _NONE
+        pixels = np.zeros(page.shaped, page.dtype)
+        for index, part in enumerate(parts):
+            decoded: Any = page.decode(part, index)
+            segment, (plane, depth, top, left, _), shape = decoded
+            rows, columns = slice(top, top + shape[1]), slice(left, left + shape[2])
+            pixels[plane, depth : depth + shape[0], rows, columns] = segment[
+                : page.imagedepth - depth, : page.imagelength - top, : page.imagewidth - left
+            ]
+        pixels = pixels.reshape(page.shape)
+    else:
+        pixels = page.asarray()
+    if pixels.ndim == 3:
+        # Planes that are stored one after the other come as (C, H, W).
+        pixels = np.moveaxis(pixels, 0, -1) if page.axes.startswith("S") else pixels
+        pixels = pixels[..., :3] if _channels(page) else pixels[..., 0]
+    return np.iinfo(pixels.dtype).max - pixels if page.photometric == _WHITE_IS_ZERO else pixels
+
+
+def _parts(path: Path, page: tifffile.TiffPage) -> Iterator[bytes]:
+    """Decompress the strips or tiles of a page; each holds no more than its share of the pixels."""
+    file = page.parent.filehandle
+    most = math.prod(page.chunks) * np.dtype(page.dtype).itemsize
+    parts = list(zip(page.dataoffsets, page.databytecounts, strict=True))
+    # tifffile returns fewer parts where a tag lacks them.
+    if len(parts) < math.prod(page.chunked):
+        raise DataError(f"{path}: expected {math.prod(page.chunked)} parts, found {len(parts)}; the file is damaged")
+    for offset, size in parts:
+        file.seek(offset)
+        data = file.read(size)
+        if page.compression == _LZW:
+            part = _unlzw(path, data, most)
+        elif page.compression == _PACKBITS:
+            part = _unpack_bits(data, most)
+        else:
+            part = _inflate(path, data, most, page.compression)
+        if len(part) > most:
+            raise DataError(f"{path}: compressed pixels are damaged, or hold more than the {most} bytes of the page")
+        yield part
+
+
+def _unpack_bits(data: bytes, most: int) -> bytes:
+    found, place = bytearray(), 0
+    while place < len(data) and len(found) <= most:
+        head = data[place]
+        if head < 128:
+            found += data[place + 1 : place + 2 + head]
+            place += 2 + head
+        else:
+            # 128 has no meaning.
+            found += data[place + 1 : place + 2] * (257 - head) if head > 128 else b""
+            place += 2 if head > 128 else 1
+    return bytes(found)
+
+
+def _inflate(path: Path, data: bytes, most: int, compression: int) -> bytes:
+    inflate: Any = lzma.LZMADecompressor() if compression == _LZMA else zlib.decompressobj()
+    try:
+        # Room for one byte more than allowed shows whether there is more, and lets the checksum be compared.
+        found = inflate.decompress(data, most + 1)
+    except (zlib.error, lzma.LZMAError) as error:
+        raise DataError(f"{path}: compressed pixels are damaged ({first_line(error)}); copy the file again") from error
+    if len(found) <= most and not inflate.eof:
+        raise DataError(f"{path}: compressed pixels are damaged (cut short); copy the file again")
+    return found
+
+
+def _unlzw(path: Path, data: bytes, most: int) -> bytes:
+    pixels, state = np.empty(most, np.uint8), np.zeros(2, np.int64)
+    if data[:1] == b"\0" and data[1:2] and data[1] & 1:
+        raise DataError(f"{path}: LZW as it was before TIFF 6 is not supported; convert the file")
+    _decode_lzw(np.frombuffer(data, np.uint8), pixels, state)
+    if state[1]:
+        raise DataError(f"{path}: compressed pixels are damaged (unknown LZW code); copy the file again")
+    return pixels[: state[0]].tobytes()
+
+
+@jit
+def _decode_lzw(packed: NDArray[np.uint8], pixels: NDArray[np.uint8], state: NDArray[np.int64]) -> None:
+    """Decode LZW codes into ``pixels``; ``state`` becomes the count of bytes, and 1 where a code is unknown."""
+    # The string of every table entry has been written before, so its place and length are enough.
+    places, lengths = np.zeros(_TABLE, np.int64), np.ones(_TABLE, np.int64)
+    width, bits, held, entries, last, found = 9, 0, 0, _END + 1, 0, 0
+    for byte in packed:
+        held = ((held << 8) | int(byte)) & 0xFFFFFF
+        bits += 8
+        if bits < width:
+            continue
+        bits -= width
+        code = (held >> bits) & ((1 << width) - 1)
+        if code == _END or found == pixels.size:
+            break
+        if code == _CLEAR:
+            width, entries, last = 9, _END + 1, 0
+            continue
+        if last and entries < _TABLE:
+            places[entries], lengths[entries] = found - last, last + 1
+            entries += 1
+        if code >= entries:
+            state[1] = 1
+            break
+        last = min(lengths[code], pixels.size - found) if code > _END else 1
+        for index in range(last):
+            pixels[found + index] = pixels[places[code] + index] if code > _END else code
+        found += last
+        if entries >= (1 << width) - 1 and width < 12:
+            width += 1
+    state[0] = found

@@ -1,4 +1,4 @@
-"""Videos in and out: one function opens any supported input, one writes any supported output.
+"""Videos in and out: one function opens every supported input, one writes every supported output.
 
 =====================================  =================================  =====================================
 input                                  module                             output
@@ -6,46 +6,44 @@ input                                  module                             output
 .mkv .mp4 .m4v .mov .webm .avi .gif    :mod:`turbrestore.io.container`       .mkv (FFV1, lossless), .mp4 (H.264)
 .ser                                   :mod:`turbrestore.io.ser`             .ser
 .tif .tiff (a stack)                   :mod:`turbrestore.io.tiff`            .tif .tiff
-.npy, shape (T, H, W) or (T, H, W, 3)  here                               .npy
+.npy, shape (T, H, W) or (T, H, W, 3)  :mod:`turbrestore.io.npy`             .npy
+.png .apng .webp (an animation)        :mod:`turbrestore.io.images`          .gif .webp (for viewing)
 a folder of images                     here, :mod:`turbrestore.io.images`
 =====================================  =================================  =====================================
 """
 
 from __future__ import annotations
 
-import dataclasses
 import os
+import re
 import stat
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
-from ..core.arrays import FloatArray, check_image, from_unit
+from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, require
 from .container import CONTAINER_SUFFIXES, open_container
-from .encoding import write_mkv, write_mp4
-from .files import check_input, input_errors
-from .images import IMAGE_SUFFIXES, atomic_output, check_output, read_pixels
-from .limits import DEFAULT_LIMITS, Limits
-from .npy import map_npy
+from .encoding import write_container
+from .images import (
+    ANIMATION_OUTPUT_SUFFIXES,
+    ANIMATION_SUFFIXES,
+    IMAGE_SUFFIXES,
+    open_animation,
+    read_pixels,
+    write_animation,
+)
+from .limits import DEFAULT_LIMITS, Limits, check_input, input_errors
+from .npy import open_npy, write_npy
+from .output import check_output, size_text
 from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit
 from .ser import open_ser, write_ser
-from .source import (
-    FrameRange,
-    FrameSource,
-    Roi,
-    check_frame_range,
-    frame_files,
-    numbers_text,
-    size_text,
-)
-from .tiff import open_tiff, write_tiff
+from .source import FrameRange, FrameSource, Roi, check_frame_range, numbers_text
+from .tiff import TIFF_SUFFIXES, open_tiff, write_tiff
 
-TIFF_SUFFIXES = (".tif", ".tiff")
-VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy")
-VIDEO_OUTPUT_SUFFIXES = (".mkv", ".mp4", ".ser", *TIFF_SUFFIXES, ".npy")
+VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES)
+VIDEO_OUTPUT_SUFFIXES = (".mkv", ".mp4", ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_OUTPUT_SUFFIXES)
 
 __all__ = ["VIDEO_OUTPUT_SUFFIXES", "VIDEO_SUFFIXES", "FrameSource", "open_frames", "write_video"]
 
@@ -58,36 +56,36 @@ def open_frames(
     limits: Limits = DEFAULT_LIMITS,
     skip_damaged: bool = False,
 ) -> FrameSource:
-    """Open a video: read its headers, check that it is whole, decode its first frame.
+    """Open a video: read its headers, check that it is whole, and decode its first frame.
 
     Parameters
     ----------
     path : path-like
-        A video file, a TIFF stack, a .npy array or a folder of images. The files of a folder are taken in natural
-        order (frame2 before frame10); files that are no images are passed over.
+        A video file, an animated image, a TIFF stack, a .npy array or a folder of images. The images of a folder are
+        sorted in natural order (frame2 before frame10); its other files are ignored.
     frames : tuple, optional
-        (start, stop) or (start, stop, step), as in a slice; None stands for the end of the video. Damage outside
-        of the range is no error.
+        (start, stop) or (start, stop, step), as in a slice; None as the stop is the end of the video. Damage outside
+        the range is no error.
     roi : tuple of int, optional
         (x, y, width, height) in pixels.
     limits : Limits
         Largest video that is read.
     skip_damaged : bool
-        Leave out, with a warning, what would be refused: the missing end of a file that is cut short, and frames whose
-        checksum fails and that no others depend on.
+        Read a file that is cut short up to the cut, and leave out frames whose checksum fails and on which no others
+        depend, each with a warning, instead of raising DataError.
 
     Returns
     -------
     FrameSource
-        Decodes while iterating; nothing but one frame at a time is in memory. NaN and infinite values are refused
-        there, unless :func:`turbrestore.clean_source` has filled them.
+        Decodes while iterating, with one frame at a time in memory. NaN and infinite values raise DataError there,
+        unless :func:`turbrestore.clean_source` fills them.
 
     Raises
     ------
     InputNotFoundError
-        No such file or folder.
+        The file or folder does not exist.
     DataError
-        Not a video, damaged, cut short, empty, too large, or values that are no intensities.
+        Not a video, damaged, cut short, empty, too large, or values outside [0, 1].
     ConfigurationError
         Range or rectangle outside the video.
     StorageError
@@ -115,7 +113,9 @@ def open_frames(
     elif suffix in TIFF_SUFFIXES:
         source = open_tiff(path, limits)
     elif suffix == ".npy":
-        source = _open_npy(path, limits)
+        source = open_npy(path, limits)
+    elif suffix in ANIMATION_SUFFIXES:
+        source = open_animation(path, wanted.stop, limits, skip_damaged)
     elif suffix in IMAGE_SUFFIXES:
         raise DataError(f"{path}: a single image; name the folder that holds the frames")
     else:
@@ -128,26 +128,22 @@ def open_frames(
 
 
 def write_video(
-    path: str | os.PathLike[str],
-    frames: Iterable[FloatArray],
-    fps: float,
-    bit_depth: int = 8,
-    overwrite: bool = False,
+    path: str | os.PathLike[str], frames: Iterable[FloatArray], fps: float, bit_depth: int = 8, overwrite: bool = False
 ) -> None:
-    """Write frames as a video, in the format that the suffix names.
+    """Write frames as a video, in the format given by the suffix.
 
     Parameters
     ----------
     path : path-like
-        ``.mkv`` is FFV1 without loss and ``.mp4`` H.264 of 8 bits, for viewing; ``.ser``, ``.tif`` and ``.npy`` are
-        not compressed.
+        ``.mkv`` is lossless FFV1; ``.ser``, ``.tif`` and ``.npy`` are uncompressed; ``.mp4`` (H.264), ``.gif`` and
+        ``.webp`` have 8 bits and are for viewing.
     frames : iterable of array_like, shape (H, W) or (H, W, 3)
         Intensities, all of one size; values outside [0, 1] are clipped. Taken one at a time.
     fps : float
-        Frames per second; TIFF and .npy do not keep it.
+        Frames per second; TIFF and .npy do not store it.
     bit_depth : int
-        1 to 16, or 32 for floating point, which only TIFF and .npy have; the others write 16 bits then. TIFF and
-        .npy write 9 to 15 bits as 16, scaled to the full range.
+        1 to 16, or 32 for floating point, which only TIFF and .npy support; .mkv and .ser write 16 bits instead. TIFF
+        and .npy write 9 to 15 bits as 16, scaled to the full range.
     overwrite : bool
         Replace an existing file.
 
@@ -168,25 +164,49 @@ def write_video(
     ...     open_frames(folder + "/a.npy").format
     'npy/float32'
     """
+    path = Path(path)
     check_output(path, overwrite=overwrite, suffixes=VIDEO_OUTPUT_SUFFIXES)
     check_depth(bit_depth)
     require(0 < fps < np.inf, f"fps: expected a positive number of frames per second, found {fps}")
-    suffix = Path(path).suffix.lower()
+    suffix = path.suffix.lower()
     checked = (check_image(frame, f"frame {number}") for number, frame in enumerate(frames))
-    if suffix == ".mkv":
-        write_mkv(path, checked, fps, bit_depth, overwrite)
-    elif suffix == ".mp4":
-        write_mp4(path, checked, fps, overwrite)
+    if suffix in (".mkv", ".mp4"):
+        write_container(path, checked, fps, bit_depth, overwrite)
     elif suffix == ".ser":
         write_ser(path, checked, bit_depth, fps, overwrite)
     elif suffix == ".npy":
-        _write_npy(path, checked, bit_depth, overwrite)
+        write_npy(path, checked, bit_depth, overwrite)
+    elif suffix in ANIMATION_OUTPUT_SUFFIXES:
+        write_animation(path, checked, fps, overwrite)
     else:
         write_tiff(path, checked, bit_depth, overwrite)
 
 
+def frame_files(folder: Path) -> list[Path]:
+    """Images of a folder that are the frames of a video, without hidden files, folders and broken links.
+
+    They are sorted by name, with digits compared as numbers.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     for name in ("a10.png", "a9.png", ".a1.png", "notes.txt"):
+    ...         Path(folder, name).touch()
+    ...     [path.name for path in frame_files(Path(folder))]
+    ['a9.png', 'a10.png']
+    """
+
+    def natural(file: Path) -> tuple[list[tuple[int, str]], str]:
+        parts = re.findall(r"\d+|\D+", file.name)
+        return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts], file.name
+
+    named = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != ".")
+    return sorted((path for path in named if path.is_file()), key=natural)
+
+
 def _check_first(source: FrameSource) -> None:
-    """Refuse now what the first frame tells of all: a wrong size or scale."""
+    """Refuse a wrong size or scale of the first frame when the video is opened."""
     (pixels,) = source.select((0, 1)).native()
     if np.issubdtype(pixels.dtype, np.floating):
         pixels = np.where(np.isfinite(pixels), pixels, 0)
@@ -221,37 +241,3 @@ def _images(
             expected, found = f"{size_text(shape)} {dtype}", f"{size_text(pixels.shape)} {pixels.dtype}"
             raise DataError(f"{files[number]}: expected {expected} as the first image, found {found}")
         yield pixels
-
-
-def _open_npy(path: Path, limits: Limits) -> FrameSource:
-    array = map_npy(path)
-    source = FrameSource.from_array(array, path.name)
-    limits.check_size(source.shape[2], source.shape[1], str(path))
-    limits.check_count(len(source), str(path))
-    return dataclasses.replace(source, format=f"npy/{array.dtype}", path=path)
-
-
-def _write_npy(path: str | os.PathLike[str], frames: Iterable[FloatArray], bit_depth: int, overwrite: bool) -> None:
-    depth = 8 if bit_depth <= 8 else 16
-    shape, count, dtype = None, 0, np.dtype(np.float32)
-    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
-        for frame in frames:
-            pixels: PixelArray = np.clip(frame, 0, 1) if bit_depth == 32 else from_unit(frame, depth)
-            if shape is None:
-                shape, dtype = pixels.shape, pixels.dtype
-                _npy_header(file, (0, *shape), dtype)
-            if pixels.shape != shape:
-                expected, found = size_text(shape), size_text(pixels.shape)
-                raise DataError(f"{path}: frame {count}: expected {expected}, found {found}")
-            file.write(pixels.tobytes())
-            count += 1
-        if shape is None:
-            raise DataError(f"{path}: expected at least one frame, found none")
-        # NumPy pads the header so that the number of frames fits in afterwards.
-        file.seek(0)
-        _npy_header(file, (count, *shape), dtype)
-
-
-def _npy_header(file: BinaryIO, shape: tuple[int, ...], dtype: np.dtype) -> None:
-    description = np.lib.format.dtype_to_descr(dtype)
-    np.lib.format.write_array_header_1_0(file, {"descr": description, "fortran_order": False, "shape": shape})

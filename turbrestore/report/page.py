@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigurationError
-from ..io.images import atomic_write, check_output
+from ..io.output import atomic_write, check_output
 from ..results import Restoration
 from ..runs.run_record import RunRecord
 from .facts import findings, headline, laps, remarks, settings

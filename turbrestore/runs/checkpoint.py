@@ -11,8 +11,8 @@ from ..core.errors import DataError, InputNotFoundError
 from ..filtering.filter_records import FilterCheckpoint, FilterState, FrameRecord
 from ..filtering.image_state import PixelGaussian
 from ..filtering.kalman import Gaussian
-from ..io.images import atomic_output
 from ..io.npy import read_npz
+from ..io.output import atomic_output
 
 _FIGURES = ("gain", "innovation", "sharpness", "information")
 _ARRAYS = ("image", "variance", "flow", "covariance", "reference", "flow_states", *_FIGURES)

@@ -19,8 +19,8 @@ from ..core.errors import DataError, InputNotFoundError, OutputError
 from ..deconvolution.deconvolve import Deconvolution
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
-from ..io.images import atomic_output, atomic_write
 from ..io.npy import read_npz, write_npz
+from ..io.output import atomic_output, atomic_write
 from ..registration.centroid import Centroid
 from ..registration.coverage import Rectangle
 from ..results import Restoration

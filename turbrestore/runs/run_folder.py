@@ -36,8 +36,8 @@ from ..core.errors import DataError, OutputError, require
 from ..deconvolution.deconvolve import Deconvolution
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import FilterCheckpoint, Filtered
-from ..io.images import atomic_output
 from ..io.npy import map_npy
+from ..io.output import atomic_output
 from ..io.source import FrameSource
 from ..memory_plan import plan_memory
 from ..registration.centroid import Centroid

@@ -21,9 +21,10 @@ from ..core.errors import DataError, InputNotFoundError
 from ..deconvolution.deconvolve import Deconvolution
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
-from ..io.files import check_input
-from ..io.images import atomic_output, check_output, read_image
+from ..io.images import read_image
+from ..io.limits import check_input
 from ..io.npy import map_npy, read_npz, write_npz
+from ..io.output import atomic_output, check_output
 from ..registration.centroid import Centroid
 from .stage_fields import check_fields
 
