@@ -166,27 +166,6 @@ def strips(shape: tuple[int, ...]) -> Iterator[slice]:
     return (slice(start, min(start + rows, shape[0])) for start in range(0, shape[0], rows))
 
 
-def mirror(image: FloatArray, before: int, beyond: int) -> FloatArray:
-    """Continue an image beyond its border pixels, mirrored at them.
-
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, C)
-    before, beyond : int
-        Pixels at the top and at the left, at the bottom and at the right.
-
-    Returns
-    -------
-    ndarray, float32, shape (H + before + beyond, W + before + beyond) or with C
-
-    Examples
-    --------
-    >>> mirror(np.array([[1, 2, 3]], np.float32), 1, 2)[0]
-    array([2., 1., 2., 3., 2., 1.], dtype=float32)
-    """
-    return cv2.copyMakeBorder(image, before, beyond, before, beyond, cv2.BORDER_REFLECT_101)
-
-
 def _fade(seen: FloatArray, flow: FloatArray, reach: int) -> None:
     """Multiply ``seen`` by the mask of samples along the first axis; no sample moves by more than ``reach``."""
     length = len(flow)
