@@ -227,6 +227,14 @@ def test_png_of_every_kind_is_exact(tmp_path, mode):
     assert found.warnings == (("alpha channel ignored",) if "A" in mode else ())
 
 
+def test_a_transparent_palette_is_dropped_with_a_warning(tmp_path):
+    image = PIL.Image.fromarray(COLOUR[0]).quantize(20)
+    image.save(tmp_path / "a.png", transparency=0)
+    found = read_image(tmp_path / "a.png")
+    assert found.warnings == ("alpha channel ignored",)
+    np.testing.assert_array_equal(found.image, np.asarray(image.convert("RGB")) / np.float32(255))
+
+
 @pytest.mark.parametrize("channels", [2, 3, 4])
 def test_deep_png_with_and_without_alpha_is_exact(tmp_path, channels):
     import struct

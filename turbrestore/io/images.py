@@ -232,11 +232,12 @@ def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
     """Upright pixels of the only or first image, with all channels."""
     with _header(path, data, limits, _FORMATS) as header:
         mode, kind = header.mode, header.format
+        transparent = mode == "P" and "transparency" in header.info
         if kind == "PNG":
             # Decoding does not compare the checksums.
             header.verify()
     with _image_errors(path), _opened(data) as file:
-        pixels = file.read(index=0, mode="RGB" if mode in _OTHER_COLOURS else None)
+        pixels = file.read(index=0, mode="RGBA" if transparent else "RGB" if mode in _OTHER_COLOURS else None)
         orientation = file.metadata(index=0, exclude_applied=False).get("Orientation")
     if kind == "PPM" or (kind == "PNG" and data[24] == 16):
         pixels = _opencv_pixels(path, data)
