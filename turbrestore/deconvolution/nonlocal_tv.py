@@ -68,7 +68,7 @@ class NonlocalPenalty:
         return self.graph.norm_squared()
 
     def zero_dual(self, u: FloatArray) -> PairDual:
-        """P = 0."""
+        """Dual variable p = 0."""
         values, (factor, lag) = np.zeros((2, len(self.graph.heads)), np.float32), np.zeros((2, u.size), np.float32)
         return PairDual(values, factor, lag)
 
@@ -78,7 +78,7 @@ class NonlocalPenalty:
         pairs, (squares, pull) = (graph.starts, graph.heads, graph.roots), np.zeros((2, u.size), np.float32)
         change = p.lag + scaled
         self._over_bands(lambda band: add_gradient(p.factor, change, *pairs, band, p.values, squares))
-        factor: FloatArray = relaxation / np.sqrt(squares).clip(1) + (1 - relaxation)
+        factor = np.asarray(1 - relaxation + relaxation / np.sqrt(squares).clip(1), np.float32)
         p = PairDual(p.values, factor, (relaxation - 1) * scaled)
         self._over_bands(lambda band: add_adjoint(p.factor, p.lag, *pairs, band, p.values, pull))
         return p, pull.reshape(u.shape)
