@@ -36,8 +36,8 @@ from ..runtime.jit import jit
 from ..runtime.threads import ThreadTeam
 from .nonlocal_weights import NonlocalGraph
 
-# An image has about so many bands, and smaller ones are worked on by one thread.
-_BANDS, _PARALLEL_PIXELS = 16, 1 << 15
+# Bands of an image, which have at least so many rows; and pixels from which on threads share them.
+_BANDS, _LEAST_ROWS, _PARALLEL_PIXELS = 16, 32, 1 << 15
 
 
 class PairDual(NamedTuple):
@@ -92,7 +92,7 @@ class NonlocalPenalty:
     def _over_bands(self, work: Callable[[NDArray[np.int64]], None]) -> None:
         """Work on the first and last tail of every band; on even bands first, then on odd ones."""
         height, width = self.graph.shape
-        rows = max(self.graph.reach, -(-height // _BANDS), 1)
+        rows = max(self.graph.reach, -(-height // _BANDS), _LEAST_ROWS)
         bands = [np.array([top, min(top + rows, height)]) * width for top in range(0, height, rows)]
         parallel = self.team is not None and height * width >= _PARALLEL_PIXELS
         for half in (bands[::2], bands[1::2]):
