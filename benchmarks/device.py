@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from turbrestore.core.arrays import FloatArray
-from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
-from turbrestore.deconvolution.nonlocal_tv import NonlocalParams, nonlocal_weights
-from turbrestore.deconvolution.torch_weights import weights_on_device
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps
+from turbrestore.deconvolution.nonlocal_weights import NonlocalParams, nonlocal_weights
+from turbrestore.deconvolution.torch_nonlocal import torch_nonlocal_penalty
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import FilterParams, filter_frames
 from turbrestore.io.output import atomic_write
@@ -35,6 +35,7 @@ from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.device import PROCESSOR, find_device
 from turbrestore.runtime.runtime import Runtime
+from turbrestore.runtime.steps import finish
 from turbrestore.settings import RestoreParams
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
@@ -84,7 +85,7 @@ def stages(clip: Clip, device: str) -> list[Stage]:
     def weigh(name: str) -> object:
         if name == PROCESSOR:
             return nonlocal_weights(image)
-        return weights_on_device(image, NonlocalParams(h=0.1), name).root.cpu()
+        return torch_nonlocal_penalty(image, NonlocalParams(h=0.1), name).root.cpu()
 
     def fuse(name: str) -> object:
         settings, runtime = FilterParams(inner_iterations=1), Runtime(device=name)
@@ -116,14 +117,15 @@ def solver(clip: Clip, device: str, runs: int) -> tuple[float, float]:
     """Milliseconds of an iteration of nltv, and numbers a pixel that it takes and gives."""
     image = clip.frames.mean(axis=0)
 
-    params = DeconvolutionParams(iterations=MANY, tolerance=0.0, device=device)
+    params = DeconvolutionParams(iterations=MANY, tolerance=0.0)
     times = []
     for _ in range(runs):
         ends: list[float] = []
-        deconvolve(image, SIGMA, params, progress=lambda _, ends=ends: ends.append(time.perf_counter()))
+        steps = deconvolve_steps(image, SIGMA, params, runtime=Runtime(device=device))
+        finish(steps, lambda _, ends=ends: ends.append(time.perf_counter()))
         times.append(1e3 * float(np.median(np.diff(ends))))
 
-    edges = len(nonlocal_weights(image).weights) / image.size
+    edges = len(nonlocal_weights(image).heads) / image.size
     # The dual variable comes and goes, twice what it is made of; three maps of the edges come twice; four transforms.
     return min(times), 14 * edges + 16
 

@@ -8,7 +8,7 @@
 ``--stages`` prints the peak of every stage, in bytes a pixel, with training frames in memory and in a file, and of what
 is made of the whole image where frames are worked on in tiles: what the plan of ``turbrestore/memory_plan.py`` rests
 on.
-For deconvolutions it prints what they take of that which ``turbrestore/deconvolution/deconvolution_memory.py`` plans.
+For deconvolutions it prints what they take of what ``turbrestore/deconvolution/memory.py`` states.
 Memory is the largest resident set, mapped files included.
 """
 
@@ -311,7 +311,7 @@ def whole_calls(clip: Clip, folder: Path) -> Iterator[tuple[str, list[Callable[[
     from turbrestore.blur.blur_cues import bound_blur
     from turbrestore.blur.estimation import estimate_blur
     from turbrestore.blur.psf import estimate_noise
-    from turbrestore.deconvolution.planes import split_planes
+    from turbrestore.deconvolution.problem import split_planes
     from turbrestore.dynamics.dynamic_texture import identify
     from turbrestore.footage.content import check_content
     from turbrestore.io.images import write_image
@@ -397,32 +397,26 @@ def read_corners(path: Path) -> None:
 
 
 def measure_deconvolution(clip: Clip, method: str) -> None:
-    """Print the peak of a deconvolution in memory, with pairs in files and with images in files too, bytes a pixel."""
-    from turbrestore.deconvolution.deconvolution_memory import DeconvolutionWork, Room
+    """Print the peak of a deconvolution, bytes a pixel."""
     from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
-    from turbrestore.runtime.memory_size import DeconvolutionMemory
-    from turbrestore.runtime.scratch import release, returning_freed
+    from turbrestore.deconvolution.memory import deconvolution_memory
     from turbrestore.runtime.threads import available_cores
 
     pixels, threads = clip.height * clip.width, available_cores()
-    # Of a periodic image the margin is none.
+    # The image is periodic, so that there is no margin.
     params = DeconvolutionParams(method=method, iterations=60, tolerance=0, channels="each", boundary="periodic")
-    work = DeconvolutionWork((clip.height, clip.width), clip.channels, method, params.weights)
-    words = []
-    with returning_freed(), tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        write_apart(clip, folder / "clip.npy")
-        image = np.load(folder / "clip.npy")[0] / np.float32(255)
-        # What is loaded and compiled once.
-        deconvolve(image[:64, :64], 2.0, params)
-        filings = [(False, False), (True, False), (True, True)]
-        for files in filings if method == "nltv" else filings[::2]:
-            planned = work.peak(Room(threads, *files))
-            memory = DeconvolutionMemory(planned) if any(files) else None
-            watch = Watch()
-            release(deconvolve(image, 2.0, replace(params, memory=memory), scratch=folder).image)
-            words.append(f"{watch.lap() / pixels:.0f} of {planned / pixels:.0f}")
-    print(f"{clip} {method:6} {threads} threads, less and less in memory: {', '.join(words)} bytes a pixel", flush=True)
+    with tempfile.TemporaryDirectory() as name:
+        write_apart(clip, Path(name) / "clip.npy")
+        image = np.load(Path(name) / "clip.npy")[0] / np.float32(255)
+    # What is loaded and compiled once.
+    deconvolve(image[:64, :64], 2.0, params)
+    watch = Watch()
+    deconvolve(image, 2.0, params)
+    stated = deconvolution_memory(image.shape, params, threads)
+    print(
+        f"{clip} {method:6} {threads} threads: {watch.lap() / pixels:.0f} of {stated / pixels:.0f} bytes a pixel",
+        flush=True,
+    )
 
 
 def print_stages() -> None:

@@ -31,7 +31,7 @@ import tvl1
 from revisions import Figures, child, revision, take_two_cores
 
 from turbrestore.core.errors import TurbrestoreError
-from turbrestore.deconvolution.nonlocal_tv import nonlocal_weights
+from turbrestore.deconvolution.nonlocal_weights import nonlocal_weights
 from turbrestore.io.output import atomic_write
 from turbrestore.io.source import FrameSource
 from turbrestore.pipeline import RestoreParams, restore

@@ -1,10 +1,9 @@
-"""How near the image at which deconvolution stops is to that of two thousand iterations.
+"""How close the image at which deconvolution stops is to that of two thousand iterations.
 
 Run ``python benchmarks/stopping.py``; it prints a table and exits with 1 when a PSNR differs by more than the bound.
 ``--sizes 512`` looks at larger images and ``--widths 0.7 3`` at other blurs, for which there is no bound: a narrow blur
-with little noise leaves images of more than 40 dB, where a tenth of a level of 8 bits is tenths of a dB; often they are
-better before.
-The blur is known, and light comes from beyond the border.
+with little noise leaves images of more than 40 dB, where a tenth of a level of 8 bits is tenths of a dB, and earlier
+images are often better.  The blur is known, and light comes from beyond the border.
 
 ``--clips`` takes what the pipeline deblurs instead: the filtered images of simulated clips, with the blur estimated;
 ``--clips "smooth_*"`` those whose names match.  The bound holds for all of them.

@@ -130,11 +130,11 @@ class _Run:
     progress: Progress | None
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def stage(self, name: str, compute: Callable[[], Result]) -> Result:
-        """Take the result of a stage from the store, or compute it."""
+    def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:
+        """Take the result of that name from the store, or compute it; the time counts as that of the stage."""
         begun = time.perf_counter()
         result = self.store.get(name, compute)
-        self.seconds[name] = time.perf_counter() - begun
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begun
         return result
 
     def counter(self, stage: str, total: int) -> Callable[[object], None]:
@@ -181,7 +181,7 @@ def _restored(run: _Run, decisions: list[Decision]) -> Restoration:
     fused = _fuse(run, decisions)
     image, centroid, deblurred = fused.image, fused.centroid, None
     if params.runs("deconvolve"):
-        deblurred = run.stage("deblurred", lambda: _deblur(run, fused.image, centroid.image))
+        deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused.image, centroid.image))
         decisions += deblurred.decisions
         image = deblurred.deconvolution.image
     crop, on_border = _crop(image, centroid.flows, params.border, deblurred)
@@ -222,18 +222,18 @@ def _fuse(run: _Run, decisions: list[Decision]) -> _Fused:
     run.seconds["read"] = time.perf_counter() - begun
     decisions += [explain_training(train, len(run.source), params.train), *explain_input(training)]
 
-    centroid = run.stage("centroid", lambda: _find_centroid(run, training))
+    centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
     decisions += [explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows)]
     if not params.runs("identify"):
         return _Fused(centroid.image, mean_of(training), centroid)
 
-    dynamics = run.stage("dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
+    dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
     decisions += explain_dynamics(dynamics)
     if not params.runs("filter"):
         return _Fused(centroid.image, mean_of(training), centroid, dynamics)
 
-    filtered = run.stage("filtered", lambda: _filter(run, centroid, dynamics, training, stream))
-    mean = run.stage("mean", lambda: _temporal_mean(run.source))
+    filtered = run.stage("filter", "filtered", lambda: _filter(run, centroid, dynamics, training, stream))
+    mean = run.stage("filter", "mean", lambda: _temporal_mean(run.source))
     # The sharpness of frames that do not count is not measured.
     chosen = int(np.isfinite(filtered.sharpness).sum())
     decisions.append(explain_frames(filtered, None if params.keep_best == 1 else chosen))

@@ -74,7 +74,7 @@ for ax, (title, image) in zip(axes, panels.items(), strict=True):
 flows, errors = {}, {}
 for method in METHODS:
     start = time.perf_counter()
-    flows[method] = tr.estimate_flow(reference, frames, tr.FlowParams(method=method, threads=1))
+    flows[method] = tr.estimate_flow(reference, frames, tr.FlowParams(method=method), tr.Runtime(threads=1))
     milliseconds = 1000 * (time.perf_counter() - start) / FRAMES
     found = tr.compare_flows(flows[method], true_flows)
     errors[method] = np.linalg.norm(flows[method] - true_flows, axis=-1)

@@ -21,7 +21,7 @@ from turbrestore_cli import doctor
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.application import COMMANDS, build
 from turbrestore_cli.examples import EXAMPLES, FIRST_STEPS
-from turbrestore_cli.options import Selection
+from turbrestore_cli.options import Machine, Selection
 
 ROOT = Path(__file__).parents[2]
 STEPS = ["--deconvolution.iterations", "3", "--quiet"]
@@ -202,7 +202,7 @@ class TestSettings:
                 table = line[1:-1] + "."
             elif " =" in line and line.removeprefix("# ").split(" =")[0].isidentifier():
                 found[table + line.removeprefix("# ").split(" =")[0]] = before
-        assert set(found) == {*names(RestoreParams()), *names(Selection()), "sigma", "bit_depth"}
+        assert set(found) == {*names(RestoreParams()), *names(Selection()), *names(Machine()), "sigma", "bit_depth", "memory_limit"}
         assert all(comment.startswith("# ") and len(comment) > 4 for comment in found.values())
         text = "\n".join(lines)
         assert "(dis | tvl1 | farneback)" in text

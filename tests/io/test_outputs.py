@@ -122,7 +122,7 @@ def fails(capsys, words, code, part):
 def test_a_disk_that_is_too_full_is_told_before_the_work(place, monkeypatch, capsys, more, free):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr("turbrestore.io.output.shutil.disk_usage", lambda _: usage(1 << 30, 0, free))
-    monkeypatch.setattr("turbrestore.pipeline.find_centroid", None)
+    monkeypatch.setattr("turbrestore.pipeline.centroid_steps", None)
     fails(capsys, ["restore", "clip.npy", "o.png", *more, *QUICK], StorageError.exit_code, "make room on the disk")
     assert [path.name for path in place.iterdir()] == ["clip.npy"]
 
@@ -130,10 +130,10 @@ def test_a_disk_that_is_too_full_is_told_before_the_work(place, monkeypatch, cap
 @pytest.mark.parametrize(
     ("words", "stage"),
     [
-        (["centroid", "clip.npy", "c.npz"], "stages.find_centroid"),
-        (["flow", "centroid.npz", "clip.npy", "f.npy"], "stages.estimate_flow"),
+        (["centroid", "clip.npy", "c.npz"], "stages.centroid_steps"),
+        (["flow", "centroid.npz", "clip.npy", "f.npy"], "stages.iterate_flows"),
         (["identify", "centroid.npz", "d.npz"], "stages.identify_flows"),
-        (["filter", "clip.npy", "centroid.npz", "dynamics.npz", "o.tif"], "stages.filter_frames"),
+        (["filter", "clip.npy", "centroid.npz", "dynamics.npz", "o.tif"], "stages.filter_steps"),
         (["synthesize", "chart", "s.mkv", "--size=256x256", "--frames=9"], "synthesis._write_frames"),
     ],
 )

@@ -26,7 +26,7 @@ from turbrestore.runs.run_files import load_run, save_run
 from turbrestore.runs.run_record import RunRecord
 from turbrestore.runs.stage_files import KINDS, load_artifact, load_flows, save_artifact, save_flows
 from turbrestore_cli.application import build
-from turbrestore_cli.options import Selection
+from turbrestore_cli.options import Machine, Selection
 from turbrestore_cli.output import settings_record, write_settings
 
 EXAMPLES = 200
@@ -114,7 +114,7 @@ def settings_file(folder, chosen):
     """Write settings, and let the command line read them."""
     params, selection, bit_depth = chosen
     path = folder / "run.toml"
-    record = settings_record(params, selection, bit_depth)
+    record = settings_record(params, selection, bit_depth, Machine(), None)
     write_settings(path, record)
     words = ["restore", "a.mkv", "o.png", f"--config={path}"]
     _, bound, _ = APP().parse_args(words, exit_on_error=False, print_error=False)

@@ -187,7 +187,7 @@ class TestPage:
         found = facts.settings(run)
         assert [setting.name for setting in found if setting.changed] == ["centroid.iterations"]
         values = {setting.name: setting.value for setting in found}
-        assert (values["train"], values["displacement-cue"]) == ("automatic", "false")
+        assert (values["train"], values["flow.global-shift"]) == ("automatic", "true")
 
     def test_frames_that_count(self, whole):
         shares = np.array([0.5, 0.25, 0.25])
@@ -471,5 +471,5 @@ class TestCommand:
         assert bound.arguments["input"] == tmp_path / "-in put.mkv"
 
     def test_names_that_look_like_flags_stay_names(self, tmp_path):
-        words = repeating_command(Path("-x.mkv"), Path("o.png"), settings_record(RestoreParams(), Selection(), None))
+        words = repeating_command(Path("-x.mkv"), Path("o.png"), settings_record(RestoreParams(), Selection(), None, Machine(), None))
         assert words == ("turbrestore", "restore", "./-x.mkv", "o.png")

@@ -36,8 +36,8 @@ from ..runtime.jit import jit
 from ..runtime.threads import ThreadTeam
 from .nonlocal_weights import NonlocalGraph
 
-# An image has about so many bands, and smaller ones are worked on by one thread.
-_BANDS, _PARALLEL_PIXELS = 16, 1 << 15
+# Bands of an image, which have at least so many rows; and pixels from which on threads share them.
+_BANDS, _LEAST_ROWS, _PARALLEL_PIXELS = 16, 32, 1 << 15
 
 
 class PairDual(NamedTuple):
@@ -68,7 +68,7 @@ class NonlocalPenalty:
         return self.graph.norm_squared()
 
     def zero_dual(self, u: FloatArray) -> PairDual:
-        """P = 0."""
+        """Dual variable p = 0."""
         values, (factor, lag) = np.zeros((2, len(self.graph.heads)), np.float32), np.zeros((2, u.size), np.float32)
         return PairDual(values, factor, lag)
 
@@ -78,7 +78,7 @@ class NonlocalPenalty:
         pairs, (squares, pull) = (graph.starts, graph.heads, graph.roots), np.zeros((2, u.size), np.float32)
         change = p.lag + scaled
         self._over_bands(lambda band: add_gradient(p.factor, change, *pairs, band, p.values, squares))
-        factor: FloatArray = relaxation / np.sqrt(squares).clip(1) + (1 - relaxation)
+        factor = np.asarray(1 - relaxation + relaxation / np.sqrt(squares).clip(1), np.float32)
         p = PairDual(p.values, factor, (relaxation - 1) * scaled)
         self._over_bands(lambda band: add_adjoint(p.factor, p.lag, *pairs, band, p.values, pull))
         return p, pull.reshape(u.shape)
@@ -92,7 +92,7 @@ class NonlocalPenalty:
     def _over_bands(self, work: Callable[[NDArray[np.int64]], None]) -> None:
         """Work on the first and last tail of every band; on even bands first, then on odd ones."""
         height, width = self.graph.shape
-        rows = max(self.graph.reach, -(-height // _BANDS), 1)
+        rows = max(self.graph.reach, -(-height // _BANDS), _LEAST_ROWS)
         bands = [np.array([top, min(top + rows, height)]) * width for top in range(0, height, rows)]
         parallel = self.team is not None and height * width >= _PARALLEL_PIXELS
         for half in (bands[::2], bands[1::2]):

@@ -58,7 +58,7 @@ class Penalty(Protocol):
         ...
 
     def zero_dual(self, u: Array) -> Array:
-        """P = 0 for an image of the size of u."""
+        """Dual variable p = 0 for an image of the size of u."""
         ...
 
     def ascend(self, p: Array, u: Array, step: float, relaxation: float) -> tuple[Array, Array]:

@@ -83,7 +83,7 @@ class TorchNonlocalPenalty:
         return p * torch.stack([factor.index_select(0, self.tails), factor.index_select(0, self.heads)])
 
     def zero_dual(self, u: Tensor) -> Tensor:
-        """P = 0."""
+        """Dual variable p = 0."""
         return u.new_zeros((2, len(self.root)))
 
     def ascend(self, p: Tensor, u: Tensor, step: float, relaxation: float) -> tuple[Tensor, Tensor]:

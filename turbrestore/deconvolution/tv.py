@@ -76,7 +76,7 @@ class LocalPenalty:
         return 8.0
 
     def zero_dual(self, u: Array) -> Array:
-        """P = 0 for an image of the size of u."""
+        """Dual variable p = 0 for an image of the size of u."""
         return self.ops.arrays.stack([0 * u, 0 * u])
 
     def ascend(self, p: Array, u: Array, step: float, relaxation: float) -> tuple[Array, Array]:

@@ -36,6 +36,8 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
     Examples
     --------
     >>> import numpy as np
+    >>> from turbrestore.memory_plan import plan_memory
+    >>> from turbrestore.runtime.runtime import DEFAULT
     >>> source, params = FrameSource.from_array(np.zeros((5, 16, 16))), RestoreParams()
     >>> facts = stage_dependencies(source, params, plan_memory(source.shape, params, DEFAULT))
     >>> list(facts), facts["filtered"]["frames"]

@@ -142,7 +142,7 @@ def write_record(folder: Path, parts: Mapping[str, Any]) -> None:
     OutputError, StorageError
         Writing failed.
     """
-    text = json.dumps({"schema": SCHEMA, **parts}, indent=1, sort_keys=True) + "\n"
+    text = json.dumps({"schema": SCHEMA, **parts}, indent=1) + "\n"
     atomic_write(folder / RECORD, text.encode(), overwrite=True)
 
 

@@ -346,7 +346,7 @@ class RunFolder:
     def _record(self) -> dict[str, Any]:
         return {
             "facts": self._facts,
-            "files": self._files,
+            "files": dict(sorted(self._files.items())),
             "deblurred": self._verdict,
             "outputs": list(self._outputs),
             **self._completed,
