@@ -202,7 +202,14 @@ class TestSettings:
                 table = line[1:-1] + "."
             elif " =" in line and line.removeprefix("# ").split(" =")[0].isidentifier():
                 found[table + line.removeprefix("# ").split(" =")[0]] = before
-        assert set(found) == {*names(RestoreParams()), *names(Selection()), *names(Machine()), "sigma", "bit_depth", "memory_limit"}
+        assert set(found) == {
+            *names(RestoreParams()),
+            *names(Selection()),
+            *names(Machine()),
+            "sigma",
+            "bit_depth",
+            "memory_limit",
+        }
         assert all(comment.startswith("# ") and len(comment) > 4 for comment in found.values())
         text = "\n".join(lines)
         assert "(dis | tvl1 | farneback)" in text

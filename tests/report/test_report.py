@@ -471,5 +471,7 @@ class TestCommand:
         assert bound.arguments["input"] == tmp_path / "-in put.mkv"
 
     def test_names_that_look_like_flags_stay_names(self, tmp_path):
-        words = repeating_command(Path("-x.mkv"), Path("o.png"), settings_record(RestoreParams(), Selection(), None, Machine(), None))
+        words = repeating_command(
+            Path("-x.mkv"), Path("o.png"), settings_record(RestoreParams(), Selection(), None, Machine(), None)
+        )
         assert words == ("turbrestore", "restore", "./-x.mkv", "o.png")
