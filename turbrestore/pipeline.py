@@ -27,6 +27,7 @@ from .registration.centroid import Centroid, centroid_steps
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
 from .results import NoStore, Restoration, Store
+from .runtime.allocator import returning_freed_memory
 from .runtime.device import explain_device
 from .runtime.runtime import DEFAULT, Runtime
 from .runtime.scratch import fill_stack, iter_frames, mean_of
@@ -115,7 +116,8 @@ def restore(
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
     run = _Run(source, params, plan, tiles, store or NoStore(), progress)
     decisions = [*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method)]
-    return _restored(run, decisions)
+    with returning_freed_memory(runtime.memory_limit is not None):
+        return _restored(run, decisions)
 
 
 @dataclass(frozen=True)
