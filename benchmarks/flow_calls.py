@@ -27,12 +27,13 @@ from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
-from turbrestore.registration.flow import FlowParams, iterate_flows
+from turbrestore.registration.flow import iterate_flows
+from turbrestore.runtime.runtime import Runtime
 
 CLIPS = ("quick_*", "ao_*", "purdue1_*")
 FRAMES, SIDE, THREADS = 48, 160, 2
 CENTROID, INNER = range(1, 7), range(1, 4)
-DEFAULT = RestoreParams(flow=FlowParams(threads=THREADS))
+DEFAULT, RUNTIME = RestoreParams(), Runtime(threads=THREADS)
 # Quality that a default must not cost on any clip, dB.
 TOLERATED = 0.05
 
@@ -88,12 +89,12 @@ def settings() -> dict[str, RestoreParams]:
 def measure(frames: FloatArray, truth: FloatArray) -> Curves:
     """Restore with every setting."""
     begun = time.perf_counter()
-    for _ in iterate_flows(frames.mean(axis=0), frames, DEFAULT.flow):
+    for _ in iterate_flows(frames.mean(axis=0), frames, DEFAULT.flow, RUNTIME):
         pass
     a_call = (time.perf_counter() - begun) / len(frames)
     curves = {}
     for name, params in settings().items():
-        restoration = restore(frames, params)
+        restoration = restore(frames, params, RUNTIME)
         if restoration.filtered is None:
             raise RuntimeError("the whole chain did not run")
         passes = restoration.centroid.mean_flow_sizes.size

@@ -6,11 +6,8 @@ line changes with the last bits of an image.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +20,10 @@ from words import can_read, share_read
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import InputNotFoundError
 from turbrestore.metrics import compare
-from turbrestore.pipeline import restore
 
 # What a clip may lose, dB.
 LOSS_BOUND = 0.05
+CHILD = str(Path(__file__).with_name("restore_child.py"))
 STAGES = ("filtered", "result")
 FRAMES, IMAGES = "frames.npy", "images.npz"
 
@@ -116,24 +113,6 @@ def _restored_by(frames: FloatArray, tree: Path | None) -> dict[str, FloatArray]
     """
     with tempfile.TemporaryDirectory() as folder:
         np.save(Path(folder, FRAMES), frames)
-        child(__file__, {"folder": folder}, tree)
+        child(CHILD, {"frames": str(Path(folder, FRAMES)), "images": str(Path(folder, IMAGES))}, tree)
         with np.load(Path(folder, IMAGES)) as images:
             return {stage: images[stage] for stage in STAGES}
-
-
-def _restore_in(folder: Path) -> dict[str, float]:
-    """Put the images of the frames in a folder beside them, and say how long that took, s."""
-    frames = np.load(folder / FRAMES)
-    begun = time.perf_counter()
-    restored = restore(frames)
-    seconds = time.perf_counter() - begun
-    if restored.filtered is None:
-        raise RuntimeError("the filter did not run")
-    np.savez(folder / IMAGES, filtered=restored.filtered.image, result=restored.image)
-    return {"seconds": seconds}
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--child", metavar="JSON", required=True, help="folder with the frames; see revisions.py")
-    print(json.dumps(_restore_in(Path(json.loads(parser.parse_args().child)["folder"]))))

@@ -18,8 +18,11 @@ import numpy as np
 
 from turbrestore import pipeline
 from turbrestore.io.source import FrameSource
+from turbrestore.memory_plan import MemoryPlan, plan_memory
 from turbrestore.metrics import psnr
-from turbrestore.settings import Restoration, RestoreParams
+from turbrestore.results import Restoration
+from turbrestore.runtime.runtime import Runtime
+from turbrestore.settings import RestoreParams
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
 
@@ -31,9 +34,12 @@ BORDER = 16
 
 def restore_in_tiles(source: FrameSource) -> Restoration:
     """Restore in tiles although memory is not limited."""
-    plan = replace(pipeline.memory_plan(source, RestoreParams()), in_file=True, tile=TILE)
-    with mock.patch.object(pipeline, "memory_plan", lambda *_: plan):
-        return pipeline.restore(source, RestoreParams())
+
+    def plan(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime) -> MemoryPlan:
+        return replace(plan_memory(shape, params, runtime), tile=TILE)
+
+    with mock.patch.object(pipeline, "plan_memory", plan):
+        return pipeline.restore(source)
 
 
 def compare(scene: str, folder: Path | None) -> float:
