@@ -33,7 +33,7 @@ from turbrestore.pipeline import restore
 from turbrestore.registration.flow import FlowParams, estimate_flow
 from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
-from turbrestore.runtime.device import PROCESSOR, find_device
+from turbrestore.runtime.device import CPU, find_device
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.steps import finish
 from turbrestore.settings import RestoreParams
@@ -75,15 +75,15 @@ def make_clip(height: int, width: int) -> Clip:
 def stages(clip: Clip, device: str) -> list[Stage]:
     """List what is measured, up to the iterations of the deconvolution."""
     grey, image = 255 * clip.frames, clip.frames.mean(axis=0)
-    referred = {name: prepare_tvl1(grey.mean(axis=0), device=name) for name in (PROCESSOR, device)}
+    referred = {name: prepare_tvl1(grey.mean(axis=0), device=name) for name in (CPU, device)}
     params, dynamics = TvL1Params(), identify(clip.flows)
-    warps = float(tvl1_flows(grey[:1], referred[PROCESSOR]).warps[0])
+    warps = float(tvl1_flows(grey[:1], referred[CPU]).warps[0])
     # Flow, its extrapolation and the dual variable come and go in a sweep, and four maps of the data term come; a warp
     # takes coefficients, reference, gradient and flow and gives those maps and a median.  A pyramid adds a third.
     flow = 4 / 3 * warps * (20 * params.sweeps + 15)
 
     def weigh(name: str) -> object:
-        if name == PROCESSOR:
+        if name == CPU:
             return nonlocal_weights(image)
         return torch_nonlocal_penalty(image, NonlocalParams(h=0.1), name).root.cpu()
 
@@ -132,7 +132,7 @@ def solver(clip: Clip, device: str, runs: int) -> tuple[float, float]:
 
 def copy_bandwidth(device: str) -> float:
     """Bytes a second that copying moves, reading and writing."""
-    if device == PROCESSOR:
+    if device == CPU:
         a = np.zeros(2**26, np.float32)
         b = np.ones_like(a)
         return 2e3 * a.nbytes / milliseconds(lambda: np.copyto(b, a), 5)
@@ -153,9 +153,9 @@ def copy_bandwidth(device: str) -> float:
 def agreement(clip: Clip, device: str) -> tuple[float, float, float]:
     """Difference of a restoration in dB, and of its flows in pixels, mean and largest."""
     base = RestoreParams(flow=FlowParams(method="tvl1"))
-    here, there = (restore(clip.frames, replace(base, device=name)) for name in (PROCESSOR, device))
+    here, there = (restore(clip.frames, replace(base, device=name)) for name in (CPU, device))
     image = clip.frames.mean(axis=0)
-    flows = [estimate_flow(image, clip.frames, replace(base.flow, device=name)) for name in (PROCESSOR, device)]
+    flows = [estimate_flow(image, clip.frames, replace(base.flow, device=name)) for name in (CPU, device)]
     apart = np.linalg.norm(flows[0] - flows[1], axis=-1)
     return psnr(there.image, clip.scene) - psnr(here.image, clip.scene), float(apart.mean()), float(apart.max())
 
@@ -174,9 +174,9 @@ def document(size: tuple[int, int], device: str, runs: int) -> tuple[str, bool]:
     ]
     rows = []
     for stage in stages(clip, device):
-        times = [milliseconds(lambda s=stage, n=name: s.run(n), runs) / stage.count for name in (PROCESSOR, device)]
+        times = [milliseconds(lambda s=stage, n=name: s.run(n), runs) / stage.count for name in (CPU, device)]
         rows.append((stage.name, *times, stage.numbers))
-    here, (there, numbers) = solver(clip, PROCESSOR, runs)[0], solver(clip, device, runs)
+    here, (there, numbers) = solver(clip, CPU, runs)[0], solver(clip, device, runs)
     for name, on_cpu, on_device, a_pixel in [*rows, ("iteration of nltv", here, there, numbers)]:
         moved = 4e3 * a_pixel * clip.scene.size / on_device
         cells = f"{on_cpu:.1f} | {on_device:.1f} | {on_cpu / on_device:.2f} | {moved / 1e9:.1f}"
@@ -197,7 +197,7 @@ def main() -> int:
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
     options = parser.parse_args()
     device = find_device(options.device or "auto")
-    text, good = document(options.size, "cpu:0" if device == PROCESSOR else device, options.runs)
+    text, good = document(options.size, "cpu:0" if device == CPU else device, options.runs)
     print(text, end="")
     if options.write is not None:
         atomic_write(options.write, text.encode(), overwrite=True)

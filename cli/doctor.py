@@ -198,7 +198,7 @@ def _has_codec(codec: ModuleType, name: str, mode: str) -> bool:
 def _gpu(torch: ModuleType) -> Finding:
     if torch.cuda.is_available():
         return Finding("GPU", "ok", torch.cuda.get_device_name(0))
-    return Finding("GPU", "missing", "optional; torch sees none and computes on the processor")
+    return Finding("GPU", "missing", "optional; torch sees none and computes on the CPU")
 
 
 def _line(error: BaseException) -> str:

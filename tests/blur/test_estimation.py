@@ -13,7 +13,6 @@ from turbrestore.blur.estimation import (
     _reduce,
     _unreduced_width,
     estimate_blur,
-    estimate_blur_memory,
 )
 from turbrestore.blur.marginal_likelihood import image_gradients, likeliest_width, width_costs
 from turbrestore.blur.psf import GAUSSIAN, KOLMOGOROV, blur_otf
@@ -164,7 +163,3 @@ def test_bad_input_is_refused():
         estimate_blur(np.zeros((32, 32)), exponent=3.0)
     with pytest.raises(DataError):
         estimate_blur(np.full((32, 32), np.nan))
-
-
-def test_memory_grows_with_the_pixels_and_channels():
-    assert estimate_blur_memory((100, 200)) < estimate_blur_memory((100, 200, 3)) < estimate_blur_memory((200, 200, 3))

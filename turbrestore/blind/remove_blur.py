@@ -21,7 +21,7 @@ from ..core.arrays import FloatArray
 from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, DeconvolutionState
 from ..deconvolution.memory import deconvolution_memory
-from ..runtime.device import PROCESSOR, find_device
+from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.tiling import largest_tile
@@ -179,7 +179,7 @@ def remove_blur_steps(
     blur = estimate_blur(image, exponent=exponent, runtime=runtime) if params.sigma is None else None
     sigma, params = blur_to_remove(blur, params)
     memory = None
-    if runtime.memory_limit is not None and find_device(runtime.device) == PROCESSOR:
+    if runtime.memory_limit is not None and find_device(runtime.device) == CPU:
         memory = runtime.memory_limit - held - _image_bytes(image.shape, runtime.scratch is not None)
     numbers = itertools.count(1)
 

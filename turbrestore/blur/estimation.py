@@ -75,9 +75,6 @@ _PREFERENCE = 0.8
 _LARGER_REDUCTION = 0.15
 # Share of the uncertainty that is subtracted from the width to remove.
 _CAUTION = 0.5
-# Bytes per pixel, and per pixel and channel: the luminance, one reduced image, and the residual that noise is
-# estimated from.
-_BYTES, _CHANNEL_BYTES = 10, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,28 +214,6 @@ def estimate_blur(
             nothing = np.zeros(0)
             return BlurEstimate(0.0, float("inf"), exponent, noise or 0.0, 1, 0.0, nothing, nothing)
         return choose_blur(candidates, runtime)
-
-
-def estimate_blur_memory(shape: tuple[int, ...]) -> float:
-    """Return the memory that :func:`estimate_blur` takes beside the image.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        (H, W) or (H, W, 3).
-
-    Returns
-    -------
-    float
-        Bytes.
-
-    Examples
-    --------
-    >>> estimate_blur_memory((1000, 1000))
-    12000000.0
-    """
-    channels = shape[2] if len(shape) == 3 else 1
-    return float(shape[0] * shape[1] * (_BYTES + channels * _CHANNEL_BYTES))
 
 
 def find_candidates(

@@ -27,7 +27,7 @@ from ..core.errors import DataError, require, require_between
 from ..core.noise import estimate_noise
 from ..display.plots import plot_objective
 from ..display.preview import preview
-from ..runtime.device import PROCESSOR, find_device, memory_of
+from ..runtime.device import CPU, find_device, memory_of
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.threads import ThreadTeam, one_thread_each
@@ -269,7 +269,7 @@ def deconvolve_steps(
     oscillates = unknown and params.method in ("nltv", "tv")
     rim = min(int(np.ceil(sigma)), min(height, width) // 4) if oscillates else 0
     device = find_device(runtime.device)
-    ops = numpy_ops(runtime.workers) if device == PROCESSOR else torch_ops(device)
+    ops = numpy_ops(runtime.workers) if device == CPU else torch_ops(device)
     with memory_of(device, "take a smaller --roi"), one_thread_each(), ThreadTeam(runtime.workers) as team:
         seen, transfer = ops.load(margin.mask()), ops.load(otf)
         problems = [Problem(ops.load(margin.pad(plane)), seen, transfer, fidelity, ops) for plane in planes]
@@ -350,7 +350,7 @@ def _solve(
 
 
 def _nonlocal_penalty(guide: FloatArray, weights: NonlocalParams, resources: _Resources) -> Penalty:
-    if resources.device != PROCESSOR:
+    if resources.device != CPU:
         return torch_nonlocal_penalty(guide, weights, resources.device)
     return NonlocalPenalty(nonlocal_weights(guide, weights, resources.threads), resources.team)
 
@@ -362,7 +362,7 @@ def _sharpened(
     ops, blurred = problems[0].ops, list(problems)
     if guide is not None and params.sharpen_guide and params.method == "nltv":
         blurred.append(dataclasses.replace(problems[0], observed=ops.load(guide)))
-    side_by_side = resources.device == PROCESSOR and np.prod(problems[0].shape) >= _PARALLEL_PIXELS
+    side_by_side = resources.device == CPU and np.prod(problems[0].shape) >= _PARALLEL_PIXELS
     sharp = list(resources.team.map(wiener_image, blurred) if side_by_side else map(wiener_image, blurred))
     starts, further = sharp[: len(problems)], sharp[len(problems) :]
     if further:

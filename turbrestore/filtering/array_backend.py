@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..registration.warp import inside, warp
-from ..runtime.device import PROCESSOR, find_device, memory_of
+from ..runtime.device import CPU, find_device, memory_of
 from ..runtime.image_stacks import Stack, StackOps, numpy_ops, torch_ops, warp_stack
 from .frame_noise import FrameStatistics
 from .image_state import PixelGaussian, PixelStacks
@@ -45,7 +45,7 @@ class ArrayBackend:
     @property
     def is_cpu(self) -> bool:
         """Whether the arrays are NumPy's, whose operations run side by side in threads."""
-        return self.device == PROCESSOR
+        return self.device == CPU
 
     def memory(self) -> AbstractContextManager[None]:
         """Context in which a lack of memory on the device is a ConfigurationError."""
@@ -102,7 +102,7 @@ def array_backend(device: str) -> ArrayBackend:
     ((3, 4, 5), (4, 5), 1.0)
     """
     found = find_device(device)
-    if found == PROCESSOR:
+    if found == CPU:
         return ArrayBackend(found, numpy_ops(), _warp_on_cpu)
     ops = torch_ops(found)
     return ArrayBackend(found, ops, lambda frame, flow: _warp_in_torch(frame, flow, ops))

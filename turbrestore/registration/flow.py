@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.arrays import FloatArray, check_frames, check_image
 from ..core.errors import DataError, require, require_between
 from ..core.noise import estimate_noise
-from ..runtime.device import PROCESSOR, find_device
+from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import fill_frames, iter_frames, new_stack
 from ..runtime.threads import in_batches, map_ahead
@@ -323,7 +323,7 @@ def prepare_reference(
     levels = grey_levels(target, params.contrast_window, params.contrast_floor)
     position = prepare_shift_reference(target) if params.global_shift else None
     confidence = flow_confidence(target) if params.confidence else None
-    device = find_device(runtime.device) if params.method == "tvl1" else PROCESSOR
+    device = find_device(runtime.device) if params.method == "tvl1" else CPU
     solver = FLOW_METHODS[params.method](params, levels, start_level, device)
 
     def prepare(image: FloatArray) -> FlowFrame:
@@ -342,7 +342,7 @@ def prepare_reference(
         return [flow + p.shift if p.shift.any() else flow for flow, p in zip(flows, placed, strict=True)]
 
     # A device solves a batch at once while the next one is prepared; on the CPU every frame has a thread.
-    batch, threads = (1, runtime.threads) if device == PROCESSOR else (params.tvl1.batch, 2)
+    batch, threads = (1, runtime.threads) if device == CPU else (params.tvl1.batch, 2)
     return FlowReference(prepare, solve, target.shape[:2], batch, threads)
 
 

@@ -45,7 +45,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import FloatArray, check_flow, check_frames, check_image, luminance
 from ..core.errors import DataError, require, require_between
-from ..runtime.device import PROCESSOR, find_device, memory_of
+from ..runtime.device import CPU, find_device, memory_of
 from ..runtime.image_stacks import Shape, Stack, StackOps, numpy_ops, spline_coefficients, torch_ops
 from .opencv_flow import FlowSolver, GreyImage
 from .tvl1_sweeps import FlowProblem, SweepParams, resize_dual, sweep
@@ -167,7 +167,7 @@ class TvL1Flows:
     settled: NDArray[np.bool_]
 
 
-def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device: str = PROCESSOR) -> TvL1Reference:
+def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device: str = CPU) -> TvL1Reference:
     """Prepare the reference of many flows.
 
     Parameters
@@ -201,7 +201,7 @@ def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device:
     if min(image.shape) < _LEAST_SIDE // 2:
         raise DataError(f"reference: expected at least 16×16 pixels, found {image.shape[1]}×{image.shape[0]}")
     found = find_device(device)
-    ops = numpy_ops() if found == PROCESSOR else torch_ops(found)
+    ops = numpy_ops() if found == CPU else torch_ops(found)
     levels = (_prepare_level(stack, ops) for stack in _pyramid(ops.load(image[None]), params.levels, ops))
     return TvL1Reference(tuple(levels), params, ops)
 

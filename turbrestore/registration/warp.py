@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import ConfigurationError, DataError
-from ..runtime.device import PROCESSOR, find_device, memory_of
+from ..runtime.device import CPU, find_device, memory_of
 from ..runtime.image_stacks import numpy_ops, torch_ops, warp_stack
 
 INTERPOLATIONS = ("linear", "cubic")
@@ -30,7 +30,7 @@ INTERPOLATIONS = ("linear", "cubic")
 _STRIP = 1 << 16
 
 
-def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device: str = PROCESSOR) -> FloatArray:
+def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device: str = CPU) -> FloatArray:
     """Backward warp: ``result(x, y) = image(x + dx, y + dy)``.
 
     With ``flow = estimate_flow(reference, frame)`` the result lies on the reference (``I ∘ w``; paper 3, eq. 15).
@@ -75,7 +75,7 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device
         return sample_linear(cv2.split(image) if image.shape[2:] == (2,) else (image,), flow)
     planes = image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)
     found = find_device(device)
-    ops = numpy_ops() if found == PROCESSOR else torch_ops(found)
+    ops = numpy_ops() if found == CPU else torch_ops(found)
     with memory_of(found, "take a smaller --roi"):
         warped = ops.store(warp_stack(ops.load(planes), ops.load(flow), ops))
     return warped[0] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(warped, 0, -1))

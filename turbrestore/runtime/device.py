@@ -23,8 +23,8 @@ from pathlib import Path
 from ..core.decision import Decision
 from ..core.errors import ConfigurationError, require
 
-PROCESSOR = "cpu"
-# Memory of the process that torch 2.13 takes once it is imported and has computed something on the processor, bytes:
+CPU = "cpu"
+# Memory of the process that torch 2.13 takes once it is imported and has computed something on the CPU, bytes:
 # 200 MB, and 270 MB the first time, when its modules are compiled as well.  Builds with CUDA take more.
 TORCH_BYTES = 2.8e8
 _NAME = re.compile(r"[a-z]+(:\d+)?")
@@ -86,10 +86,10 @@ def find_device(wanted: str) -> str:
     'cpu'
     """
     check_device(wanted)
-    if wanted == PROCESSOR:
-        return PROCESSOR
+    if wanted == CPU:
+        return CPU
     if wanted == "auto":
-        return "cuda" if needs_torch(wanted) and _cuda_is_there() else PROCESSOR
+        return "cuda" if needs_torch(wanted) and _cuda_is_there() else CPU
     try:
         import torch
     except ImportError as error:
@@ -123,7 +123,7 @@ def needs_torch(wanted: str | None) -> bool:
     """
     if wanted == "auto":
         return importlib.util.find_spec("torch") is not None and _may_have_gpu()
-    return wanted is not None and wanted != PROCESSOR
+    return wanted is not None and wanted != CPU
 
 
 def explain_device(wanted: str, found: str, flow_method: str) -> tuple[Decision, ...]:
@@ -150,9 +150,9 @@ def explain_device(wanted: str, found: str, flow_method: str) -> tuple[Decision,
     >>> explain_device("cuda", "cuda", "dis")[1].choice
     'on the CPU'
     """
-    if wanted == PROCESSOR:
+    if wanted == CPU:
         return ()
-    if found == PROCESSOR:
+    if found == CPU:
         return (Decision("device", "CPU", _NO_GPU),)
     device = Decision("device", found, "asked for" if wanted == found else "torch sees this GPU")
     if flow_method == "tvl1":
@@ -188,7 +188,7 @@ def memory_of(device: str, advice: str) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        # torch names the processor's case in words only.
+        # torch has no exception of its own for a lack of memory on the CPU.
         if not any(said in str(error) for said in _NO_MEMORY):
             raise
         raise ConfigurationError(f"device: the memory of {device!r} is not enough; {advice} or use 'cpu'") from error

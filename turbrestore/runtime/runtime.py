@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..core.errors import require
-from .device import PROCESSOR, check_device
+from .device import CPU, check_device
 from .memory_size import MemorySize
 from .threads import available_cores
 
@@ -43,7 +43,7 @@ class Runtime:
 
     threads: int = 0
     memory_limit: MemorySize | None = None
-    device: str = PROCESSOR
+    device: str = CPU
     scratch: Path | None = None
 
     def __post_init__(self) -> None:
