@@ -138,6 +138,7 @@ def test_a_stage_depends_on_the_size_of_the_tiles():
     limits = (2e9, float(least_limit(source.shape)))
     loose, strict = (dependencies(source, params, replace(TWO, memory_limit=limit)) for limit in limits)
     assert "tile" not in loose["centroid"] and strict["centroid"].pop("tile") >= 384
+    assert "tile" not in loose["deblurred"] and strict["deblurred"].pop("tile") >= 384
     assert strict == loose
 
 

@@ -107,13 +107,27 @@ def test_a_plan_keeps_the_limit_or_names_one_that_can_be_kept(count, height, wid
     assert plan.tile is None or (384 <= plan.tile < max(height, width) and plan.runtime.scratch is not None)
     assert 1 <= plan.runtime.threads <= 2
     assert (plan.runtime.scratch is not None) == (plan.scratch_bytes > 0)
-    assert 0 < plan.held < limit
+    assert plan.deconvolution_side is None or plan.deconvolution_side >= 384
 
 
 def test_torch_counts(monkeypatch):
     monkeypatch.setattr("turbrestore.memory_plan.find_device", lambda name: name)
-    limits = [plan_memory(FULL_HD, RestoreParams(), Runtime(2, 1e12, device)).held for device in ("cpu", "cuda")]
-    assert limits[1] - limits[0] == TORCH_BYTES
+    least = []
+    for device in ("cpu", "cuda"):
+        with pytest.raises(ConfigurationError) as refusal:
+            plan_memory(FULL_HD, RestoreParams(), Runtime(2, 1e8, device))
+        least.append(MemorySize(str(refusal.value).split("at least ")[1].split(" for frames")[0]))
+    assert least[1] - least[0] == pytest.approx(TORCH_BYTES, rel=0.1)
+
+
+@pytest.mark.parametrize("channels", ["luminance", "each"])
+@pytest.mark.parametrize("limit", np.arange(1.6e9, 3.4e9, 1.5e8))
+def test_the_tiles_of_the_deconvolution_do_not_follow_from_the_number_of_threads(limit, channels):
+    params = {"deconvolution": DeconvolutionParams(channels=channels)}
+    plans = [plan_of((25, 1080, 1920, 3), limit, threads, **params) for threads in (1, 2, 8)]
+    assert len({plan.deconvolution_side for plan in plans}) == 1
+    said = [any("deconvolution in tiles" in item.choice for item in plan.decisions) for plan in plans]
+    assert said == [plan.deconvolution_side is not None for plan in plans]
 
 
 def test_more_memory_is_never_worse():

@@ -9,8 +9,8 @@ and what one stage takes.  The plan is the first of these that fits:
 4. fewer training frames, down to ten, unless their number was given;
 5. frames in tiles that overlap (:mod:`turbrestore.tiled_stages`), as large as fit.
 
-Only the last two change the result.  The deconvolution is given what is left, and splits its image into tiles where
-that is too little.
+The deconvolution splits its image into tiles where the limit is too small for the whole.  Fewer training frames and
+tiles change the result, slightly; nothing else does, and neither depends on the number of threads.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class MemoryPlan:
         Longest side of the tiles in which frames are processed, pixels; None for whole frames.
     scratch_bytes : int
         Size of all scratch files.
-    held : float
-        Bytes that the process takes before the deconvolution; 0 where there is no limit.
+    deconvolution_side : int or None
+        Longest side of the tiles in which the image is deconvolved, pixels; None for the whole image.
     decisions : tuple of Decision
         What the limit has caused, in words.
     """
@@ -81,7 +81,7 @@ class MemoryPlan:
     runtime: Runtime
     tile: int | None = None
     scratch_bytes: int = 0
-    held: float = 0.0
+    deconvolution_side: int | None = None
     decisions: tuple[Decision, ...] = ()
 
 
@@ -132,21 +132,21 @@ def plan_memory(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime)
     if limit is None:
         return MemoryPlan(train, replace(runtime, scratch=None))
     base = _BASE + COMPILER_BYTES + (TORCH_BYTES if needs_torch(runtime.device) else 0)
+    budget = limit - base
     for choice in _choices(shape, train, most, params):
-        if base + _peak(shape, params, choice) <= limit:
+        if _peak(shape, params, choice, budget) <= budget:
             break
     else:
         raise _too_little(shape, params, base, limit)
     if choice.tile is not None:
         threads = (replace(choice, threads=count) for count in range(most, 0, -1))
-        choice = next(other for other in threads if base + _peak(shape, params, other) <= limit)
-    chosen = replace(runtime, threads=choice.threads, scratch=folder if choice.in_scratch else None)
+        choice = next((other for other in threads if _peak(shape, params, other, budget) <= budget), choice)
     return MemoryPlan(
         choice.train,
-        chosen,
+        replace(runtime, threads=choice.threads, scratch=folder if choice.in_scratch else None),
         choice.tile,
         _scratch_bytes(shape, params, choice) if choice.in_scratch else 0,
-        base + _held_by_deconvolution(shape, params, choice),
+        _deconvolution_side(shape, params, choice, budget),
         tuple(_decisions(shape, params, choice, _Choice(train, most), base, limit)),
     )
 
@@ -217,7 +217,7 @@ def _tiles_of(shape: tuple[int, ...], train: int, threads: int, side: int) -> _C
     return _Choice(train, threads, in_scratch=True, tile=side)
 
 
-def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice) -> float:
+def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget: float) -> float:
     """Bytes of the stage that takes most, with what is held meanwhile."""
     part = shape if choice.tile is None else (shape[0], *largest_tile((shape[1], shape[2]), choice.tile), *shape[3:])
     train, threads = choice.train, choice.threads
@@ -225,18 +225,32 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice) -> flo
     if choice.in_scratch:
         in_hand = (2 * threads + 2) / train
         frames, flows, modes = frames * in_hand, flows * in_hand, min(modes, 4.0 * _IN_HAND * threads)
-    flow = flow_memory(part, threads)
+    # While tiles are processed the images of the whole lie in files, but for the frame that is being read.
+    held = frames + flows + (0.0 if choice.tile is None else 10.5 * _pixels(shape) * _channels(shape))
+    flow, side = flow_memory(part, threads), _deconvolution_side(shape, params, choice, budget)
+    results = _held_by_deconvolution(shape, params, choice)
     stages = {
-        "centroid": frames + flows + flow,
-        "identify": frames + flows + modes + identify_memory(part, train),
-        "filter": frames + flows + modes + flow + filter_memory(part, train, params.filter, threads),
-        "deconvolve": _held_by_deconvolution(shape, params, choice)
-        + remove_blur_memory(shape[1:], params.deconvolution, SMALLEST_SIDE),
+        "centroid": held + flow,
+        "identify": held + modes + identify_memory(part, train),
+        "filter": held + modes + flow + filter_memory(part, train, params.filter, threads),
+        "deconvolve": results + remove_blur_memory(shape[1:], params.deconvolution, side),
     }
-    after = _held_by_deconvolution(shape, params, choice) + _report(shape)
-    # While tiles are processed the images of the whole lie in files, but for a frame that is being read.
-    reading = 0.0 if choice.tile is None else 10.5 * _pixels(shape) * _channels(shape)
-    return max(reading + max(size for name, size in stages.items() if params.runs(name)), after)
+    return max(results + _report(shape), *(size for name, size in stages.items() if params.runs(name)))
+
+
+def _deconvolution_side(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget: float) -> int | None:
+    """Return the side of the largest tiles that fit while the training frames are in a scratch file.
+
+    It is the same where they are in memory, so that the result does not depend on the number of threads.
+    """
+    left = budget - _held_by_deconvolution(shape, params, replace(choice, in_scratch=True))
+    size = shape[1], shape[2]
+    sides = range(max(size) - _SIDE_STEP, SMALLEST_SIDE, -_SIDE_STEP)
+    for side in (None, *sides):
+        if remove_blur_memory(shape[1:], params.deconvolution, side) <= left:
+            # Of all sides that cut the same tiles the same one.
+            return None if side is None else max(*largest_tile(size, side), SMALLEST_SIDE)
+    return SMALLEST_SIDE
 
 
 def _stack(shape: tuple[int, ...], params: RestoreParams, train: int) -> tuple[float, float, float]:
@@ -279,7 +293,7 @@ def _channels(shape: tuple[int, ...]) -> int:
 
 def _too_little(shape: tuple[int, ...], params: RestoreParams, base: float, limit: float) -> ConfigurationError:
     train = training_share(shape[0], shape[1:], params.train)
-    least = base + min(_peak(shape, params, choice) for choice in _choices(shape, train, 1, params))
+    least = base + min(_peak(shape, params, choice, 0.0) for choice in _choices(shape, train, 1, params))
     asked = "" if params.train is None else f" and {train} training frames"
     return ConfigurationError(
         f"--memory-limit: expected at least {size_text(1.01 * least)} for frames of {shape[2]}×{shape[1]}{asked}, "
@@ -291,10 +305,20 @@ def _decisions(
     shape: tuple[int, ...], params: RestoreParams, choice: _Choice, wanted: _Choice, base: float, limit: float
 ) -> Iterator[Decision]:
     """Put into words what the limit has changed."""
+    yield from _on_frames(shape, params, choice, wanted, base, limit)
+    side = _deconvolution_side(shape, params, choice, limit - base)
+    if side is not None and params.runs("deconvolve"):
+        words = f"deconvolution in tiles of up to {side} pixels"
+        yield Decision("memory", words, f"the whole image would take more than the {size_text(limit)} allowed")
+
+
+def _on_frames(
+    shape: tuple[int, ...], params: RestoreParams, choice: _Choice, wanted: _Choice, base: float, limit: float
+) -> Iterator[Decision]:
     allowed = f"of {size_text(limit)} allowed"
 
     def needed(other: _Choice) -> str:
-        return f"{size_text(base + _peak(shape, params, other))} {allowed}"
+        return f"{size_text(base + _peak(shape, params, other, limit - base))} {allowed}"
 
     if choice.tile is not None:
         height, width = largest_tile((shape[1], shape[2]), choice.tile)

@@ -308,7 +308,7 @@ def _temporal_mean(source: FrameSource) -> FloatArray:
 def _deblur(run: _Run, image: FloatArray, guide: FloatArray) -> Deblurred:
     params = run.params
     plan = run.plan
-    steps = remove_blur_steps(image, guide, params.deconvolution, params.guards, plan.runtime, plan.held)
+    steps = remove_blur_steps(image, guide, params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side)
     return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 
 

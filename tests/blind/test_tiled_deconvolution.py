@@ -1,20 +1,13 @@
 """Tiles agree with the whole image, and fit the memory they are chosen for."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from turbrestore.blind.tiled_deconvolution import (
-    MOST_THREADS,
-    SMALLEST_SIDE,
-    deconvolution_tiles,
     tiled_deconvolution_steps,
 )
 from turbrestore.blur.psf import GAUSSIAN, blur_otf
-from turbrestore.core.errors import ConfigurationError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
-from turbrestore.deconvolution.memory import deconvolution_memory
 from turbrestore.metrics import psnr
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.steps import finish
@@ -55,21 +48,3 @@ def test_colour_and_files_make_no_difference(brick, tmp_path):
     assert np.array_equal(inside, outside)
     assert isinstance(outside, np.memmap)
     assert np.abs(inside - deconvolve(colour, 1.6, params).image).max() < 0.02
-
-
-def test_the_largest_tiles_that_fit_are_chosen():
-    shape, limits = (1500, 2000), (None, 1e12, 600e6, 300e6)
-    counts = [len(deconvolution_tiles(shape, PARAMS, limit)) for limit in limits]
-    assert counts[:2] == [1, 1]
-    assert 1 < counts[2] < counts[3]
-    for limit in limits[2:]:
-        tiles = deconvolution_tiles(shape, PARAMS, limit)
-        assert max(deconvolution_memory(tile.shape, PARAMS, MOST_THREADS) for tile in tiles) <= limit
-    assert deconvolution_tiles(shape, replace(PARAMS, sigma=0.0), 1.0)[0].shape == shape
-
-
-def test_too_little_memory_is_refused_and_what_is_needed_is_enough():
-    with pytest.raises(ConfigurationError, match="memory_limit: expected"):
-        deconvolution_tiles((1500, 2000), PARAMS, 1e6)
-    least = deconvolution_memory((SMALLEST_SIDE, SMALLEST_SIDE), PARAMS, MOST_THREADS)
-    assert all(max(tile.shape) <= SMALLEST_SIDE for tile in deconvolution_tiles((1500, 2000), PARAMS, least))

@@ -24,11 +24,11 @@ from ..deconvolution.memory import deconvolution_memory
 from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
-from ..runtime.tiling import largest_tile
+from ..runtime.tiling import halo_tiles, largest_tile
 from .blur_map import BlurMap, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
 from .decisions import explain_blur, explain_blur_map, explain_guards
 from .guards import GuardParams, GuardReading, evaluate_guards
-from .tiled_deconvolution import MOST_THREADS, deconvolution_tiles, tiled_deconvolution_steps
+from .tiled_deconvolution import MOST_THREADS, tiled_deconvolution_steps
 
 Result = TypeVar("Result")
 
@@ -93,7 +93,7 @@ def remove_blur(
     deconvolution: DeconvolutionParams | None = None,
     guards: GuardParams | None = None,
     runtime: Runtime = DEFAULT,
-    held: float = 0.0,
+    side: int | None = None,
 ) -> Deblurred:
     """Remove a blur of given or of estimated width.
 
@@ -108,10 +108,10 @@ def remove_blur(
     guards : GuardParams, optional
         Bounds that the result must keep.
     runtime : Runtime
-        Threads, device, memory limit, and the folder of files that hold images; without one they stay in memory.  If
-        the memory limit is too small for the whole image, the CPU deconvolves it in tiles.
-    held : float
-        Bytes that the process already takes, the images included; they count towards the memory limit.
+        Threads, device, and the folder of files that hold images; without one they stay in memory.
+    side : int, optional
+        Longest side of the overlapping tiles in which the CPU deconvolves the image, pixels; by default the image is
+        deconvolved as a whole.
 
     Returns
     -------
@@ -121,8 +121,6 @@ def remove_blur(
     ------
     DataError
         The shapes differ, or values are not finite.
-    ConfigurationError
-        The memory limit is too small even for tiles.
     StorageError
         The folder has no room for the images.
 
@@ -135,7 +133,7 @@ def remove_blur(
     >>> result.decisions
     (Decision(subject='blur', choice='none removed', reason='asked for'),)
     """
-    return finish(remove_blur_steps(image, guide, deconvolution, guards, runtime, held))
+    return finish(remove_blur_steps(image, guide, deconvolution, guards, runtime, side))
 
 
 def remove_blur_steps(
@@ -144,13 +142,13 @@ def remove_blur_steps(
     deconvolution: DeconvolutionParams | None = None,
     guards: GuardParams | None = None,
     runtime: Runtime = DEFAULT,
-    held: float = 0.0,
+    side: int | None = None,
 ) -> Steps[Deblurred]:
     """Remove a blur step by step; see :func:`remove_blur`.
 
     Parameters
     ----------
-    image, guide, deconvolution, guards, runtime, held
+    image, guide, deconvolution, guards, runtime, side
         See :func:`remove_blur`.
 
     Yields
@@ -178,14 +176,12 @@ def remove_blur_steps(
     exponent = params.exponent or KOLMOGOROV
     blur = estimate_blur(image, exponent=exponent, runtime=runtime) if params.sigma is None else None
     sigma, params = blur_to_remove(blur, params)
-    memory = None
-    if runtime.memory_limit is not None and find_device(runtime.device) == CPU:
-        memory = runtime.memory_limit - held - _image_bytes(image.shape, runtime.scratch is not None)
+    size = image.shape[0], image.shape[1]
+    in_tiles = () if side is None or find_device(runtime.device) != CPU else halo_tiles(size, side)
     numbers = itertools.count(1)
 
     def remove(width: float) -> Generator[DeconvolutionState, None, Deconvolution]:
-        tiles = deconvolution_tiles(image.shape, replace(params, sigma=width), memory)
-        return tiled_deconvolution_steps(image, width, params, guide, runtime, tiles)
+        return tiled_deconvolution_steps(image, width, params, guide, runtime, in_tiles)
 
     tiles, first = None, None
     if blur is not None and blur.blurred:
@@ -243,7 +239,7 @@ def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side
     part = shape if side is None else (*largest_tile((shape[0], shape[1]), side), *shape[2:])
     beside = float(pixels * (_BYTES + channels * _CHANNEL_BYTES))
     params = params if params.sigma is not None else replace(params, sigma=_WIDEST)
-    return _image_bytes(shape, in_file=False) + max(beside, deconvolution_memory(part, params, MOST_THREADS))
+    return _image_bytes(shape) + max(beside, deconvolution_memory(part, params, MOST_THREADS))
 
 
 def blur_to_remove(
@@ -374,7 +370,7 @@ def _map_meanwhile(
             stopped.set()
 
 
-def _image_bytes(shape: tuple[int, ...], in_file: bool) -> float:
-    """Bytes of the maps of widths and of the results of two attempts, unless these are in files."""
+def _image_bytes(shape: tuple[int, ...]) -> float:
+    """Bytes of the maps of widths and of the results of two attempts."""
     channels = shape[2] if len(shape) == 3 else 1
-    return float(shape[0] * shape[1] * (_WIDTHS_BYTES + (0 if in_file else channels * _RESULTS_BYTES)))
+    return float(shape[0] * shape[1] * (_WIDTHS_BYTES + channels * _RESULTS_BYTES))

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image
-from ..core.errors import ConfigurationError
 from ..deconvolution.deconvolve import (
     Deconvolution,
     DeconvolutionParams,
@@ -23,61 +22,14 @@ from ..deconvolution.deconvolve import (
     deconvolve_steps,
     whole_image_params,
 )
-from ..deconvolution.memory import deconvolution_memory
-from ..runtime.memory_size import size_text
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import to_scratch
-from ..runtime.tiling import HALO, HaloTile, add_tile, halo_tiles, largest_tile, new_mosaic
+from ..runtime.tiling import HALO, HaloTile, add_tile, new_mosaic
 
-# Shortest side that tiles may have, and the step in which sides are tried; pixels.
-SMALLEST_SIDE, _SIDE_STEP = 4 * HALO, 32
+# Shortest side that tiles may have, pixels.
+SMALLEST_SIDE = 4 * HALO
 # More threads than these take no more memory.
 MOST_THREADS = 4
-
-
-def deconvolution_tiles(
-    shape: tuple[int, ...], params: DeconvolutionParams, memory: float | None = None
-) -> tuple[HaloTile, ...]:
-    """Choose the largest tiles whose deconvolution takes no more than the given memory.
-
-    The memory is that of any number of threads, so that the result does not depend on it.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Of the image, (H, W) or (H, W, 3).
-    params : DeconvolutionParams
-        ``params.sigma`` is the width to remove.
-    memory : float, optional
-        Bytes; by default the memory is not limited.
-
-    Returns
-    -------
-    tuple of HaloTile
-        A single one for the whole image if that fits.
-
-    Raises
-    ------
-    ConfigurationError
-        The memory is too small for the smallest tiles.
-
-    Examples
-    --------
-    >>> params = DeconvolutionParams(sigma=1.5)
-    >>> len(deconvolution_tiles((1080, 1920), params)), len(deconvolution_tiles((1080, 1920), params, memory=300e6)) > 1
-    (1, True)
-    """
-    size, longest = (shape[0], shape[1]), max(*shape[:2], SMALLEST_SIDE)
-    if memory is None or params.sigma == 0:
-        return halo_tiles(size, longest)
-    for side in (longest, *range(longest - _SIDE_STEP, SMALLEST_SIDE, -_SIDE_STEP), SMALLEST_SIDE):
-        least = deconvolution_memory((*largest_tile(size, side), *shape[2:]), params, MOST_THREADS)
-        if least <= memory:
-            return halo_tiles(size, side)
-    raise ConfigurationError(
-        f"memory_limit: expected {size_text(least)} for the deconvolution of tiles of {SMALLEST_SIDE} pixels, found "
-        f"{size_text(max(memory, 0.0))}; allow more, or restore a part of the image"
-    )
 
 
 def tiled_deconvolution_steps(
@@ -103,7 +55,7 @@ def tiled_deconvolution_steps(
     runtime : Runtime
         Threads, device, and the folder of a file that holds the result.
     tiles : tuple of HaloTile
-        From :func:`deconvolution_tiles` or :func:`turbrestore.runtime.tiling.halo_tiles`; by default the whole image.
+        From :func:`turbrestore.runtime.tiling.halo_tiles`; by default the whole image.
 
     Yields
     ------
@@ -126,6 +78,7 @@ def tiled_deconvolution_steps(
     Examples
     --------
     >>> from turbrestore.runtime.steps import finish
+    >>> from turbrestore.runtime.tiling import halo_tiles
     >>> image = np.random.default_rng(0).uniform(size=(40, 64)).astype(np.float32)
     >>> wiener, tiles = DeconvolutionParams(method="wiener"), halo_tiles(image.shape, side=44, halo=8)
     >>> len(tiles), finish(tiled_deconvolution_steps(image, 1.0, wiener, tiles=tiles)).image.shape

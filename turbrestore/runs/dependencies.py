@@ -61,7 +61,10 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
         },
         "dynamics": {"dynamics": settings["dynamics"]},
         "filtered": {"frames": _span(source.numbers), **{name: settings[name] for name in ("keep_best", "filter")}},
-        "deblurred": {name: settings[name] for name in ("deconvolution", "guards")},
+        "deblurred": {
+            **({} if plan.deconvolution_side is None else {"tile": plan.deconvolution_side}),
+            **{name: settings[name] for name in ("deconvolution", "guards")},
+        },
     }
     return json.loads(json.dumps(facts))
 

@@ -28,7 +28,8 @@ class Runtime:
         Where flow by tvl1, warps, fusion and deconvolution are computed: cpu, cuda, or auto for a GPU where torch
         sees one.
     scratch : Path, optional
-        Folder of the files that hold stacks of frames and flows; without it they stay in memory.
+        Folder of the files that hold stacks of frames and flows.  A stage without it keeps them in memory; a whole
+        restoration uses files only where a memory limit asks for them, by default among the temporary files.
 
     Raises
     ------
