@@ -337,7 +337,7 @@ def try_interruption(
 
 def last_kept(folder: Path) -> str:
     """Where a run in the folder should go on, in its words; read from the folder, not from the run."""
-    record = folder / "kept" / "stages.json"
+    record = folder / "kept" / "run.json"
     if not record.exists():
         # Nothing was kept, and nothing is said of it.
         return ""
@@ -350,7 +350,7 @@ def last_kept(folder: Path) -> str:
     if checkpoint.exists() and "filtered.npz" not in files:
         with np.load(checkpoint) as arrays:
             words += f" and {len(arrays['gain'])} frames of the filter"
-    return f"goes on {words}\n"
+    return f"continues {words}\n"
 
 
 def whole(path: Path, expected: dict[str, str]) -> bool:

@@ -45,5 +45,5 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
 
 
 def read_input_image(input: Path, limits: Limits) -> FloatArray:
-    """Read an image file within limits, or the image of an artifact."""
+    """Read an image file within limits, or the image of a stage file."""
     return load_stage_image(input) if input.suffix.lower() == ".npz" else read_image(input, limits).image

@@ -87,7 +87,7 @@ def evaluate(
     Parameters
     ----------
     result : Path
-        Image, or artifact with an image (.npz); flows (.npy, centroid .npz, .flo) where the truth is flows.
+        Image, or stage file with an image (.npz); flows (.npy, centroid .npz, .flo) where the truth is flows.
     truth : Path
         Image of the true scene, or true flows.
     reference : Path

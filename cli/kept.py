@@ -39,16 +39,20 @@ def kept_stages(
         return
     with lock_folder(folder) as locks:
         if not locks:
-            say(f"{folder}: this file system knows no locks; see to it that no other run uses the folder", quiet)
+            say(
+                f"{folder}: this file system does not support locks; make sure that no other run uses the folder", quiet
+            )
         stages = RunFolder(folder, source, params, runtime, resume, every)
         for note in stages.notes:
             say(f"{folder}: {note}", quiet)
         try:
             yield stages
         except KeyboardInterrupt as stop:
-            stages.flush()
-            stages.withdraw()
-            stop.args = (f"{str(stop) or 'interrupted'}; --keep {folder} --resume continues {stages.progress()}",)
+            try:
+                stages.flush()
+                stages.withdraw()
+            finally:
+                stop.args = (f"{str(stop) or 'interrupted'}; --keep {folder} --resume continues {stages.progress()}",)
             raise
         except Exception:
             stages.withdraw()
@@ -63,7 +67,7 @@ def own_outputs(folder: Path) -> set[Path]:
 
 
 def check_room(source: FrameSource, params: RestoreParams, runtime: Runtime, output: Path, folder: Path | None) -> None:
-    """Refuse to begin what would end on a full disk."""
+    """Raise an error if the disk has too little space for the run."""
     height, width = source.shape[1:3]
     image = 4 * height * width * (3 if len(source.shape) == 4 else 1)
     check_space(output, image)

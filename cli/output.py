@@ -20,7 +20,7 @@ from turbrestore.io.output import atomic_write, check_output
 from turbrestore.metrics import compare
 from turbrestore.results import Restoration
 from turbrestore.runs.folder_lock import LOCK
-from turbrestore.runs.run_files import RUN_FILES, read_stages
+from turbrestore.runs.run_files import REPORT, RUN_FILES, read_stages
 from turbrestore.runs.run_folder import CHECKPOINT, RunFolder, is_part
 from turbrestore.runs.run_record import RunRecord
 from turbrestore.runtime.memory_size import MemorySize
@@ -107,7 +107,7 @@ def summary(output: Path, restoration: Restoration) -> str:
 def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: bool) -> None:
     """Refuse a folder for the stages that cannot be used, before any work begins.
 
-    It is new or empty, unless overwriting is allowed or a run in it is to go on, and none of the paths ``taken`` by
+    It is new or empty, unless overwriting is allowed or a run in it is resumed, and none of the paths ``taken`` by
     inputs and outputs.
     """
     if folder is None:
@@ -119,7 +119,7 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: 
         return
     if not folder.is_dir():
         raise OutputError(f"{folder}: is a file; name a folder to keep the stages in")
-    for name in (LOCK, *RUN_FILES, CHECKPOINT, *(f"{image}.png" for image in _IMAGES)):
+    for name in (LOCK, *RUN_FILES, REPORT, CHECKPOINT, *(f"{image}.png" for image in _IMAGES)):
         if (folder / name).is_symlink():
             raise OutputError(f"{folder / name}: is a link to a file elsewhere; remove it or name another folder")
         if (folder / name).resolve() in {path.resolve() for path in taken}:
@@ -166,7 +166,7 @@ def write_settings(path: Path, record: dict[str, Any]) -> None:
 
 
 def repeating_command(input: Path, output: Path, record: dict[str, Any]) -> tuple[str, ...]:
-    """Words of a command that repeats a run without its settings file: what differs from the defaults as flags."""
+    """Return the words of the command that repeats a run; settings that differ from the defaults become flags."""
     paths = (str(path) if not str(path).startswith("-") else f"./{path}" for path in (input, output))
     usual = settings_record(RestoreParams(), Selection(), None, Machine(), None)
     return ("turbrestore", "restore", *paths, *_flags(record, usual, ""))

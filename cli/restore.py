@@ -72,8 +72,8 @@ def restore(
     keep : Path
         Folder for the result of every stage, written as it is done.
     resume : bool
-        Go on where an interrupted run with this ``--keep`` folder stopped.  What a changed input or setting concerns is
-        done again.
+        Continue an interrupted run with this ``--keep`` folder.  Stages that a changed input or setting affects are
+        computed again.
     checkpoint_every : int
         Frames between two checkpoints of the filter in the ``--keep`` folder.
     report : Path
@@ -83,14 +83,14 @@ def restore(
     bit_depth : int
         Bits per channel of the output, 8, 16 or 32 (float, TIFF only).  Those of the input by default.
     memory_limit : MemorySize
-        Most memory to take, such as 2GB: training frames then go to a scratch file, fewer threads work, fewer frames
-        are trained on, or frames are processed in tiles that overlap, whichever comes first.
+        Most memory to take, such as 2GB.  To keep it, training frames go to a scratch file, fewer threads work, fewer
+        frames are trained on, and frames are processed in tiles that overlap, in this order.
     overwrite : bool
         Replace existing outputs.
     json : bool
         Print what was done, as JSON, on standard output.
     quiet : bool
-        No progress and no remarks.
+        Print neither progress nor remarks.
     """
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
     if bit_depth is not None:
@@ -122,7 +122,7 @@ def restore(
         if stages is not None and run is not None:
             save_stages(stages, restoration, run, depth)
             stages.expect(*outputs)
-        # Whatever else is there has been refused above.
+        # Other existing files were refused above.
         write_image(output, restoration.image, depth, overwrite=overwrite or output.absolute() in left)
         write_settings(settings_path, record)
         if report is not None and run is not None:

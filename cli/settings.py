@@ -47,7 +47,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text("utf-8"))
     except RecursionError as error:
-        raise ConfigurationError(f"{path}: expected settings as TOML, found lists in lists without end") from error
+        raise ConfigurationError(f"{path}: expected settings as TOML, found nesting that is too deep") from error
     except ValueError as error:
         raise ConfigurationError(f"{path}: expected settings as TOML, found {error}") from error
 

@@ -1,4 +1,4 @@
-"""One command a stage: artifact in, artifact out."""
+"""One command a stage: stage file in, stage file out."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def centroid(
     input : Path
         Video.
     output : Path
-        Artifact to write, .npz; it holds the flows as well.
+        Stage file to write, .npz; it holds the flows as well.
     train : int
         Frames to use, from the first on.
     centroid : CentroidParams
@@ -63,7 +63,7 @@ def centroid(
     overwrite : bool
         Replace an existing output.
     quiet : bool
-        No progress and no remarks.
+        Print neither progress nor remarks.
     """
     check_output(output, [input], overwrite, ARTIFACT)
     source = open_input(input, selection, quiet)
@@ -94,7 +94,7 @@ def flow(
     Parameters
     ----------
     reference : Path
-        Image, or centroid artifact.
+        Image, or centroid stage file.
     input : Path
         Video.
     output : Path
@@ -104,18 +104,18 @@ def flow(
     overwrite : bool
         Replace an existing output.
     quiet : bool
-        No progress and no remarks.
+        Print neither progress nor remarks.
     """
     check_output(output, [reference, input], overwrite, (".npy",))
     image = read_input_image(reference, selection.limits())
     source = open_input(input, selection, quiet)
     check_space(output, _flow_bytes(len(source), source.shape))
     with progress_bars(quiet) as progress:
-        measured, count = [], step_counter(progress, "flow", len(source))
-        for _, found in iterate_flows(image, source, flow, machine.runtime()):
-            measured.append(found)
+        flows = np.empty((*source.shape[:3], 2), np.float32)
+        count = step_counter(progress, "flow", len(source))
+        for measured, (_, found) in zip(flows, iterate_flows(image, source, flow, machine.runtime()), strict=True):
+            measured[...] = found
             count(found)
-        flows = np.stack(measured)
     save_flows(output, flows, overwrite)
     say(f"{output}: {len(flows)} flows, root mean square {float(np.sqrt(np.mean(flows**2))):.2f} pixels", quiet)
 
@@ -135,9 +135,9 @@ def identify(
     Parameters
     ----------
     flows : Path
-        Centroid artifact (.npz), or flows (.npy).
+        Centroid stage file (.npz), or flows (.npy).
     output : Path
-        Artifact to write, .npz.
+        Stage file to write, .npz.
     dynamics : DynamicsParams
         Dynamic texture of the flow.
     overwrite : bool
@@ -179,11 +179,11 @@ def filter_(
     input : Path
         Video; its first frames are those that the centroid was found from.
     centroid : Path
-        Centroid artifact.
+        Centroid stage file.
     dynamics : Path
-        Dynamics artifact.
+        Dynamics stage file.
     output : Path
-        Artifact (.npz) or image (.png, .tif) to write.
+        Stage file (.npz) or image (.png, .tif) to write.
     filter : FilterParams
         Alternating-estimation Kalman filter.
     flow : FlowParams
@@ -191,7 +191,7 @@ def filter_(
     overwrite : bool
         Replace an existing output.
     quiet : bool
-        No progress and no remarks.
+        Print neither progress nor remarks.
     """
     check_output(output, [input, centroid, dynamics], overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
     start, model = load_artifact(centroid, Centroid), load_artifact(dynamics, FlowDynamics)
@@ -230,30 +230,30 @@ def deconvolve(
     Parameters
     ----------
     input : Path
-        Image, or artifact of the filter or the centroid.
+        Image, or stage file of the filter or the centroid.
     output : Path
-        Image (.png, .tif) or artifact (.npz) to write.
+        Image (.png, .tif) or stage file (.npz) to write.
     sigma : float
         Width of the blur, pixels; a Gaussian unless --deconvolution.exponent says otherwise.  Estimated by default.
     guide : Path
-        Image or artifact that the nonlocal weights are taken from; the input by default, the centroid in the paper.
+        Image or stage file that the nonlocal weights are taken from; the input by default, the centroid in the paper.
     deconvolution : DeconvolutionParams
         Method and its settings.
     guards : GuardParams
         What the result must not exceed where the width is estimated.
     bit_depth : int
-        Bits per channel of an image that is written: 8, 16 or 32; by default those of the input, 16 for artifacts.
+        Bits per channel of an image that is written: 8, 16 or 32; by default those of the input, 16 for stage files.
     max_pixels : int
         Largest image to read, pixels; by default 67 million.
     overwrite : bool
         Replace an existing output.
     quiet : bool
-        No progress and no remarks.
+        Print neither progress nor remarks.
     """
     deconvolution = known_sigma(sigma, deconvolution)
     if bit_depth is not None:
         check_depth(bit_depth)
-        require(output.suffix.lower() not in ARTIFACT, "--bit-depth: has no effect on an artifact; leave it out")
+        require(output.suffix.lower() not in ARTIFACT, "--bit-depth: has no effect on a stage file; leave it out")
     inputs = [path for path in (input, guide) if path is not None]
     check_output(output, inputs, overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
     limits = limits_of(max_pixels)

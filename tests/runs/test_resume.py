@@ -323,7 +323,7 @@ class TestFolder:
     def test_a_file_system_without_locks_is_told(self, place, monkeypatch, capsys):
         monkeypatch.setattr("turbrestore.runs.folder_lock._lock", lambda _: False)
         assert main([*WORDS, "--until=centroid"]) == 0
-        assert "knows no locks" in capsys.readouterr().err
+        assert "does not support locks" in capsys.readouterr().err
 
 
 # The run waits for a signal after a checkpoint, so that it does not come too late on a fast machine.  It may come
@@ -469,3 +469,14 @@ def test_the_record_names_the_outputs_only_while_they_are_written(place):
     assert names == {"sharp.png", "sharp.png.toml"}
     assert main([*WORDS, "--resume"]) == 0
     assert read_stages("kept")["outputs"] == []
+
+
+def test_a_run_that_dies_twice_may_still_replace_its_own_outputs(place):
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt(patch, "turbrestore_cli.restore.write_settings", 1)
+        assert main(WORDS) == 130
+    assert (place / "sharp.png").exists()
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt(patch, "turbrestore.pipeline._crop", 1)
+        assert main([*WORDS, "--resume"]) == 130
+    assert main([*WORDS, "--resume"]) == 0

@@ -1,4 +1,4 @@
-"""The flow's half of the alternating filter: measured flows update the state of the flow (paper 3, eqs. 13b to 19).
+"""Flow update of the alternating filter (paper 3, eqs. 14b, 14d, 17 and 19).
 
 Symbols
 -------

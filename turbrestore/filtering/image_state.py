@@ -1,4 +1,4 @@
-"""The image's half of the alternating filter: registered frames update every pixel (paper 3, eqs. 13a to 16).
+"""Image update of the alternating filter (paper 3, eqs. 14a, 14c, 15 and 16).
 
 Symbols
 -------

@@ -26,7 +26,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, 
     path : path
     checkpoint : FilterCheckpoint
     key : str
-        Tells of which frames and settings it is; kept in the file, so that file and key cannot come apart.
+        Identifies the frames and settings; it is stored in the file itself.
 
     Raises
     ------

@@ -231,7 +231,7 @@ class RunFolder:
         return f"{words} and {self._written} frames of the filter" if self._written else words
 
     def withdraw(self) -> None:
-        """Leave no record of a run that has failed before it had anything to keep."""
+        """Remove the record of a run that failed before it stored a result."""
         if self._files or self._written:
             return
         for name in (*RUN_FILES, CHECKPOINT):
@@ -272,7 +272,7 @@ class RunFolder:
                 self._files[name] = wanted
             elif wanted is not None:
                 notes.append(f"{name} is missing or damaged and is made again")
-        self._verdict = record["deblurred"]
+        self._verdict, self._outputs = record["deblurred"], tuple(record["outputs"])
         if "filtered" in holds and "filtered.npz" not in self._files and (self.folder / CHECKPOINT).exists():
             try:
                 self._newest = load_checkpoint(self.folder / CHECKPOINT, self._key)
@@ -333,12 +333,14 @@ class RunFolder:
         """Remove what does not belong to this run, so that nobody takes it for a part of it."""
         kept = {*self._files, *([CHECKPOINT] if self._written else [])}
         try:
-            tiles = {path.name for path in self.folder.iterdir() if _TILE.fullmatch(path.stem)}
+            tiles = {
+                path.name for path in self.folder.iterdir() if path.suffix == ".npz" and _TILE.fullmatch(path.stem)
+            }
             for name in {*RUN_FILES, CHECKPOINT, *tiles} - kept:
                 (self.folder / name).unlink(missing_ok=True)
             for path in [path for path in self.folder.iterdir() if is_part(path)]:
                 path.unlink(missing_ok=True)
-            # First of all, so that whatever is found in the folder later is known to be of this run.
+            # Written before any result, so that every later file belongs to this run.
             self._write_record()
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written to ({error.strerror or error})") from error
@@ -357,7 +359,7 @@ class RunFolder:
 
 
 def is_part(path: Path) -> bool:
-    """Tell whether a file is what a writer leaves that is killed.
+    """Tell whether a file was left by a writer that was killed.
 
     Parameters
     ----------
@@ -387,7 +389,7 @@ def _is_whole(path: Path, digest: str) -> bool:
 
 
 def _verdict(deblurred: Deblurred) -> dict[str, Any]:
-    """List what of a deblurred image is in no stage file."""
+    """List the fields of a deblurred image that have no stage file."""
     return {
         "estimated": deblurred.blur is not None,
         "readings": [dataclasses.asdict(item) for item in deblurred.readings],

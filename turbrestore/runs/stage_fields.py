@@ -1,6 +1,6 @@
-"""What the fields of every kind of artifact are: type, shape and range, checked when one is read.
+"""What the fields of every kind of stage file are: type, shape and range, checked when one is read.
 
-Shapes name their axes; one name stands for one length within an artifact:
+Shapes name their axes; one name stands for one length within a stage file:
 
 ======  ===============================================
 H, W    height and width, pixels
@@ -36,7 +36,7 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Array:
-    """An array of an artifact.
+    """An array of a stage file.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Array:
 
 @dataclass(frozen=True)
 class Number:
-    """A number of an artifact.
+    """A number of a stage file.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ def check_fields(kind: str, fields: Mapping[str, Any], name: str) -> None:
     Parameters
     ----------
     kind : str
-        Kind of the artifact.
+        Kind of the stage file.
     fields : mapping
         Values by field.
     name : str

@@ -93,7 +93,7 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Pat
     Parameters
     ----------
     path : path
-        File written by :func:`save_stage`.
+        File written by :func:`save_artifact`.
     kind : type
         Class that is expected.
     scratch : Path, optional

@@ -1,9 +1,9 @@
 """Where a stage computes: on the CPU with NumPy and OpenCV, or on a device with torch.
 
-A device is a word: ``"cpu"`` is NumPy and OpenCV, ``"cuda"`` a GPU, and ``"auto"`` a GPU where torch sees one and else
-``"cpu"``.  Any other name that torch gives a device may be used from Python: ``"cuda:1"``, or ``"cpu:0"``, which is
-torch on the CPU, for tests.  Every stage takes and returns NumPy arrays wherever it computes, and the results agree to
-rounding.
+A device is named by a string: ``"cpu"`` is NumPy and OpenCV, ``"cuda"`` a GPU, and ``"auto"`` a GPU where torch sees
+one and else ``"cpu"``.  Any other name that torch gives a device may be used from Python: ``"cuda:1"``, or ``"cpu:0"``,
+which is torch on the CPU, for tests.  Every stage takes and returns NumPy arrays wherever it computes, and the results
+agree to rounding.
 
 torch is imported only when a device is asked for, because that takes two seconds and 200 MB.  ``"auto"`` imports it
 only where there may be a GPU.
@@ -30,7 +30,7 @@ TORCH_BYTES = 2.8e8
 _NAME = re.compile(r"[a-z]+(:\d+)?")
 _INSTALL = "install turbrestore[torch] or use 'cpu'"
 # What a system with a GPU that torch can use has among its devices: NVIDIA's, those of its boards, AMD's, and that of
-# Windows beneath Linux.  torch has no GPU of this kind under macOS; of other systems nothing is known.
+# the Windows Subsystem for Linux.  torch has no GPU of this kind under macOS; of other systems nothing is known.
 _NODES = {"linux": ("nvidia*", "nvhost*", "nvmap", "kfd", "dxg"), "darwin": ()}
 _DEVICES = Path("/dev")
 _NO_GPU = "torch sees no GPU"

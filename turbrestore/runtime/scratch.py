@@ -195,7 +195,7 @@ def iter_frames(items: Iterable[Item]) -> Iterator[Item]:
         try:
             yield item
         finally:
-            # Also where whoever walks has seen enough.
+            # Also where the consumer stops early.
             drop_pages(item)
 
 

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-# An array of this size is the largest from whose release the C library of Linux learns; bytes.
-_LEARNT = 31 << 20
+# Freeing an array of this size raises the threshold of glibc from which it maps arrays one by one; bytes.
+_THRESHOLD_BYTES = 31 << 20
 # Items that one thread sums before it hands the sum over.
 _SUMMED = 4
 
@@ -354,4 +354,4 @@ def _keep_freed_memory() -> None:
     zeros takes a seventh of the time of optical flow at 512×512.  It keeps what is smaller than the largest array that
     it has seen given back (mallopt(3), M_MMAP_THRESHOLD), so one that is never filled is all it takes.
     """
-    np.empty(_LEARNT, np.uint8)
+    np.empty(_THRESHOLD_BYTES, np.uint8)

@@ -2,8 +2,8 @@
 
 Every pixel belongs to one core; a tile is a core with a halo around it, which gives what is computed near the edge of
 the core its neighbourhood.  Around the edges between cores the results fade into each other: there the weights of the
-tiles rise and fall linearly over half of the halo on either side, and sum to one.  What lies further out is thrown
-away, so the edge of a tile leaves no trace.
+tiles rise and fall linearly over half of the halo on either side, and sum to one.  What lies further out is
+discarded, so the edge of a tile is invisible.
 """
 
 from __future__ import annotations
