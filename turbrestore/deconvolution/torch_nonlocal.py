@@ -225,15 +225,15 @@ def _best_keys(padded: Tensor, top: int, rows: int, height: int, params: Nonloca
     distances.masked_fill_(outside_y[:, None, :, None], np.inf).masked_fill_(outside_x[None, :, None, :], np.inf)
     offsets = params.offsets
     bits = len(offsets).bit_length()
-    # Where each offset, nearest first, stands among the rows and columns of the window.
-    stands = torch.from_numpy((offsets[:, 0] + reach) * params.search + offsets[:, 1] + reach).long()
+    # Position of each offset, nearest first, among the rows and columns of the window.
+    positions = torch.from_numpy((offsets[:, 0] + reach) * params.search + offsets[:, 1] + reach).long()
     ranks = torch.full((params.search**2,), (1 << bits) - 1, dtype=torch.int32)
-    ranks[stands] = torch.arange(len(offsets), dtype=torch.int32)
+    ranks[positions] = torch.arange(len(offsets), dtype=torch.int32)
     keys = distances.view(torch.int32).reshape(params.search**2, -1).T.contiguous()
     keys &= ~((1 << bits) - 1)
     keys |= ranks.to(keys.device)
     keys[:, (params.search**2) // 2] = _LAST
-    nearest = keys[:, stands[: params.nearest].to(keys.device)]
+    nearest = keys[:, positions[: params.nearest].to(keys.device)]
     if params.best == 0:
         return nearest
     return torch.cat([nearest, keys.topk(params.best, dim=1, largest=False).values], dim=1)
