@@ -76,7 +76,9 @@ def digests(folder: Path) -> dict[str, str]:
             data = path.read_bytes()
             if path.name == "run.json":
                 record = json.loads(data)
-                del record["run"]["finished"], record["restoration"]["seconds"]
+                # The record of an interrupted run has neither part yet.
+                record.get("run", {}).pop("finished", None)
+                record.get("restoration", {}).pop("seconds", None)
                 data = json.dumps(record).encode()
             found[str(path.relative_to(folder))] = hashlib.sha256(data).hexdigest()
     return found
