@@ -16,7 +16,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -152,10 +152,10 @@ def copy_bandwidth(device: str) -> float:
 
 def agreement(clip: Clip, device: str) -> tuple[float, float, float]:
     """Difference of a restoration in dB, and of its flows in pixels, mean and largest."""
-    base = RestoreParams(flow=FlowParams(method="tvl1"))
-    here, there = (restore(clip.frames, replace(base, device=name)) for name in (CPU, device))
-    image = clip.frames.mean(axis=0)
-    flows = [estimate_flow(image, clip.frames, replace(base.flow, device=name)) for name in (CPU, device)]
+    params, image = RestoreParams(flow=FlowParams(method="tvl1")), clip.frames.mean(axis=0)
+    runtimes = [Runtime(device=name) for name in (CPU, device)]
+    here, there = (restore(clip.frames, params, runtime) for runtime in runtimes)
+    flows = [estimate_flow(image, clip.frames, params.flow, runtime) for runtime in runtimes]
     apart = np.linalg.norm(flows[0] - flows[1], axis=-1)
     return psnr(there.image, clip.scene) - psnr(here.image, clip.scene), float(apart.mean()), float(apart.max())
 
