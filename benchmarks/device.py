@@ -75,9 +75,9 @@ def make_clip(height: int, width: int) -> Clip:
 def stages(clip: Clip, device: str) -> list[Stage]:
     """List what is measured, up to the iterations of the deconvolution."""
     grey, image = 255 * clip.frames, clip.frames.mean(axis=0)
-    referred = {name: prepare_tvl1(grey.mean(axis=0), device=name) for name in (CPU, device)}
+    references = {name: prepare_tvl1(grey.mean(axis=0), device=name) for name in (CPU, device)}
     params, dynamics = TvL1Params(), identify(clip.flows)
-    warps = float(tvl1_flows(grey[:1], referred[CPU]).warps[0])
+    warps = float(tvl1_flows(grey[:1], references[CPU]).warps[0])
     # Flow, its extrapolation and the dual variable come and go in a sweep, and four maps of the data term come; a warp
     # takes coefficients, reference, gradient and flow and gives those maps and a median.  A pyramid adds a third.
     flow = 4 / 3 * warps * (20 * params.sweeps + 15)
@@ -92,7 +92,7 @@ def stages(clip: Clip, device: str) -> list[Stage]:
         return filter_frames(clip.frames, image, dynamics, settings, known_flows=clip.flows, runtime=runtime)
 
     return [
-        Stage("flow (tvl1)", lambda name: tvl1_flows(grey, referred[name]), flow, FRAMES),
+        Stage("flow (tvl1)", lambda name: tvl1_flows(grey, references[name]), flow, FRAMES),
         # Pixels and flow come, pixels go; coefficients come and go between.
         Stage("warp", lambda name: warp(image, clip.flows[0], device=name), 6),
         # A frame and two flows come; eight maps, image and variance come, the last two go.

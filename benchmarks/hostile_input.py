@@ -25,19 +25,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from hostile_files import (
-    BOMBS,
-    CONTENT,
-    FLIPPED,
-    FORMATS,
-    STILLS,
-    Content,
-    flipped,
-    flipped_still,
-    malformed,
-    write_clip,
-    write_still,
-)
+from hostile_content import CONTENT, Content
+from hostile_files import BOMBS, FLIPPED, FORMATS, STILLS, flipped, flipped_still, malformed, write_clip, write_still
 
 from turbrestore.core.errors import DataError
 from turbrestore.io.images import read_image
@@ -79,7 +68,7 @@ class Row:
     note: str = ""
     failures: list[str] | None = None
 
-    def judge(self, name: str, complaint: str) -> None:
+    def add(self, name: str, complaint: str) -> None:
         """Count a case; an empty complaint means that it passed."""
         self.count += 1
         self.failures = [*(self.failures or []), *([f"{name}: {complaint}"] if complaint else [])]
@@ -126,7 +115,7 @@ def malformed_files(folder: Path, sample: bool) -> list[Row]:
         for name, data in list(cases.items())[:: 4 if sample else 1]:
             path = folder / f"{name}{suffix}"
             path.write_bytes(data)
-            row.judge(path.name, refusal(restored(path), _output(path)))
+            row.add(path.name, refusal(restored(path), _output(path)))
     return [row]
 
 
@@ -145,7 +134,7 @@ def flipped_bytes(folder: Path, sample: bool) -> list[Row]:
             path.write_bytes(data)
             ended = run_forked(["info", str(path)])
             found += ended.code == BAD_DATA
-            row.judge(f"{name} {number}", refusal(ended) if checked or ended.code != DONE else "")
+            row.add(f"{name} {number}", refusal(ended) if checked or ended.code != DONE else "")
             path.unlink()
         row.note = f"found {found}"
         rows.append(row)
@@ -163,7 +152,7 @@ def _flipped_stills(folder: Path, compression: str, count: int) -> Row:
         path.write_bytes(data)
         ended = run_forked(["evaluate", str(path), str(whole)])
         found += ended.code == BAD_DATA
-        row.judge(f"{compression} {number}", refusal(ended) if checked or ended.code != DONE else "")
+        row.add(f"{compression} {number}", refusal(ended) if checked or ended.code != DONE else "")
     row.note = f"found {found}"
     return row
 
@@ -181,7 +170,7 @@ def bombs(folder: Path, sample: bool) -> list[Row]:
         ended = run_apart(words)
         highest = max(highest, ended.peak_bytes)
         large = f"peak memory {ended.peak_bytes / 1e6:.0f} MB" if ended.peak_bytes > PEAK_BYTES else ""
-        row.judge(name, refusal(ended, output) or large)
+        row.add(name, refusal(ended, output) or large)
     row.note = f"highest {highest / 1e6:.0f} MB"
     return [row]
 
@@ -195,7 +184,7 @@ def odd_content(folder: Path, sample: bool) -> list[Row]:
     )
     _apart(lambda: [content.write(folder / content.name) for content in CONTENT])
     for content in CONTENT[:: 8 if sample else 1]:
-        row.judge(f"{content.name} {' '.join(content.options)}", _judged(folder, content))
+        row.add(f"{content.name} {' '.join(content.options)}", _content_complaint(folder, content))
     return [row]
 
 
@@ -252,7 +241,7 @@ GROUPS: dict[str, Callable[[Path, bool], list[Row]]] = {
 }
 
 
-def _judged(folder: Path, content: Content) -> str:
+def _content_complaint(folder: Path, content: Content) -> str:
     path = folder / content.name
     ended = restored(path, "--bit-depth", "32", *content.options)
     output = _output(path)

@@ -6,7 +6,7 @@
 ``--quick`` takes 40 frames of that size, with the same training frames.
 ``--largest`` adds frames of 3840×2160 and 7680×4320.
 ``--stages`` prints the peak of every stage and of the deconvolution, in bytes a pixel, which the constants of the
-functions ``flow_memory``, ``identify_memory``, ``filter_memory`` and ``deconvolution_memory`` rest on.
+functions ``flow_memory``, ``identify_memory``, ``filter_memory`` and ``deconvolution_memory`` were fitted to.
 Memory is the largest resident set, mapped files included.
 """
 

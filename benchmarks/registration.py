@@ -112,7 +112,7 @@ def invented_motion(scene: FloatArray, moving: bool) -> list[tuple[Comparison, C
 
 
 def main() -> int:
-    """Measure, print, and judge."""
+    """Print the tables; 1 when a bound is broken."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one scene, half of the frames")
     options = parser.parse_args()

@@ -35,6 +35,7 @@ def _load(name):
 
 
 hostile = _load("hostile_files")
+odd = _load("hostile_content")
 
 
 @pytest.fixture
@@ -108,7 +109,7 @@ def test_pipes_and_devices_are_no_input(run, tmp_path):
 
 CONTENT = {
     f"{content.name} {' '.join(content.options)}": content
-    for content in hostile.CONTENT
+    for content in odd.CONTENT
     if (content.refused or content.name in ("nan.npy", "two_scenes.mkv", "hot.mkv", "duplicated.mkv"))
     and not content.word.endswith("frames in")
 }
