@@ -1,5 +1,6 @@
 """Restorations within a memory limit: the same result, where files lie, and what is said."""
 
+import gc
 import json
 import weakref
 from dataclasses import replace
@@ -68,7 +69,9 @@ def test_the_truth_is_not_in_memory_while_the_stages_run(tmp_path, monkeypatch, 
         return image
 
     def run(*words):
-        assert [truth() for truth in truths] == [None]
+        # Readers may leave frames in cycles, which hold the local variables of their callers.
+        gc.collect()
+        assert [truth() is None for truth in truths] == [True]
         return pipeline.restore(*words)
 
     monkeypatch.setattr("turbrestore_cli.restore.read_input_image", read)
