@@ -15,8 +15,8 @@ from turbrestore.runtime.tiling import (
 )
 
 
-@given(st.integers(1, 700), st.integers(1, 700), st.integers(1, 40), st.integers(0, 300))
-@settings(max_examples=200, deadline=None)
+@given(st.integers(1, 400), st.integers(1, 400), st.integers(1, 40), st.integers(0, 200))
+@settings(max_examples=80, deadline=None)
 def test_tiles_count_for_one_at_every_pixel_and_only_far_from_their_edges(height, width, halo, more):
     side, total = 4 * halo + more, np.zeros((height, width))
     tallest, widest = largest_tile((height, width), side, halo)
@@ -52,7 +52,7 @@ def test_what_is_cut_is_put_together_again(tmp_path, channels):
 
 
 @given(st.integers(1, 700), st.integers(1, 40), st.integers(0, 300))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_there_are_as_few_tiles_as_there_can_be(width, halo, more):
     side = 4 * halo + more
     tiles = halo_tiles((1, width), side, halo)

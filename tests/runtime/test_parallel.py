@@ -115,7 +115,7 @@ LEAVE_OFTEN = """
 import itertools, sys
 from turbrestore.runtime.threads import map_in_turns
 sys.setswitchinterval(1e-6)
-for _ in range(6000):
+for _ in range(2500):
     found = map_in_turns(abs, abs, abs, itertools.count(), threads=4)
     assert [next(found), next(found)] == [0, 1]
     found.close()
