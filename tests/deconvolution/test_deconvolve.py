@@ -19,9 +19,9 @@ from turbrestore.deconvolution.deconvolve import (
     DeconvolutionParams,
     deconvolve,
     deconvolve_steps,
-    whole_image_params,
+    whole_image_fidelity,
 )
-from turbrestore.deconvolution.nonlocal_weights import NonlocalParams
+from turbrestore.deconvolution.nonlocal_weights import NonlocalParams, automatic_h
 from turbrestore.deconvolution.problem import automatic_fidelity
 from turbrestore.deconvolution.tv import LocalPenalty
 from turbrestore.runtime.runtime import Runtime
@@ -236,9 +236,9 @@ def test_a_tile_agrees_with_the_whole_away_from_its_border():
     """With a halo of 96 pixels; a sharpened guide makes the same choice of neighbours in a tile as in the whole."""
     halo, scene = 96, SCENES["camera"](256, 352)
     image = cv2.GaussianBlur(scene, (0, 0), 1.5) + np.random.default_rng(21).normal(0, 0.005, scene.shape)
-    params = whole_image_params(image)
+    params = with_whole_image_settings(image, image)
     guide = deconvolve(image, 1.5, DeconvolutionParams(method="wiener")).image
-    exact = dataclasses.replace(whole_image_params(image, None, guide), sharpen_guide=False, tolerance=1e-3)
+    exact = dataclasses.replace(with_whole_image_settings(image, guide), sharpen_guide=False, tolerance=1e-3)
     for settings, share, guide_of in ((params, 99, None), (exact, 100, guide)):
         whole = deconvolve(image, 1.5, settings, guide_of).image
         for left in (0, 96):
@@ -249,9 +249,22 @@ def test_a_tile_agrees_with_the_whole_away_from_its_border():
             assert np.sqrt(np.mean(difference**2)) < 2e-3
 
 
-def test_given_numbers_are_kept_for_tiles():
-    given = DeconvolutionParams(fidelity=300.0, weights=NonlocalParams(h=0.2))
+def with_whole_image_settings(image, guide):
+    """Settings with λ of a whole image and h of its whole guide."""
+    weights = NonlocalParams(h=automatic_h(np.asarray(guide, np.float32)))
+    return DeconvolutionParams(fidelity=whole_image_fidelity(image), weights=weights)
+
+
+def test_the_fidelity_of_tiles_is_that_of_the_whole():
     image = np.random.default_rng(22).random((16, 16))
-    assert whole_image_params(image, given) == given
-    found = whole_image_params(image, DeconvolutionParams(method="tv"))
-    assert found.fidelity == deconvolve(image, 1.0, DeconvolutionParams(method="tv", iterations=1)).fidelity
+    assert whole_image_fidelity(image, DeconvolutionParams(fidelity=300.0)) == 300.0
+    tv = DeconvolutionParams(method="tv", iterations=1)
+    assert whole_image_fidelity(image, tv) == deconvolve(image, 1.0, tv).fidelity
+
+
+def test_the_width_may_stand_in_the_settings():
+    image = np.random.default_rng(23).random((24, 24)).astype(np.float32)
+    params = DeconvolutionParams(method="tv", iterations=3, sigma=1.3)
+    assert np.array_equal(deconvolve(image, params=params).image, deconvolve(image, 1.3, params).image)
+    with pytest.raises(ConfigurationError, match="expected a blur here or in params.sigma, found neither"):
+        deconvolve(image)

@@ -54,6 +54,26 @@ def test_a_model_that_explains_everything_keeps_a_gain(rng, dynamics):
     np.testing.assert_allclose(state.mean, project_measured(uneven_flows()[1], dynamics).state, rtol=1e-4)
 
 
+def test_a_covariance_without_rank_stays_one(dynamics):
+    """P is singular where a state is known exactly, and spans twelve orders of magnitude at the start."""
+    basis = np.linalg.qr(np.random.default_rng(5).standard_normal((5, 5)))[0]
+    P = (basis * [1e6, 1e3, 1.0, 1e-6, 0.0]) @ basis.T
+    state, _ = update_state(
+        Gaussian(np.zeros(5), (P + P.T) / 2), project_measured(uneven_flows()[0], dynamics), replace(dynamics, R=1e-6)
+    )
+    values = np.linalg.eigvalsh(state.cov)
+    assert values.min() > -1e-18 and values.max() <= 1e-6
+    assert (state.cov == state.cov.T).all()
+
+
+def test_a_model_without_states_learns_nothing(dynamics):
+    still = identify(np.zeros((3, 2, 2, 2), np.float32))
+    state, innovation = update_state(
+        Gaussian(np.zeros(0), np.zeros((0, 0))), project_measured(np.ones((2, 2, 2), np.float32), still), still
+    )
+    assert state.mean.size == 0 and innovation == pytest.approx(1.0)
+
+
 def test_the_estimate_lies_between_model_and_measurement(rng):
     modelled, measured = rng.random((2, 3, 4, 2), np.float32)
     for share, expected in ((0, modelled), (1, measured), (0.25, 0.75 * modelled + 0.25 * measured)):

@@ -20,7 +20,7 @@ from ..deconvolution.deconvolve import (
     DeconvolutionParams,
     DeconvolutionState,
     deconvolve_steps,
-    whole_image_params,
+    whole_image_fidelity,
 )
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import to_scratch
@@ -92,7 +92,7 @@ def tiled_deconvolution_steps(
     params = params or DeconvolutionParams()
     # Each tile chooses its own h for the nonlocal weights, from its guide after sharpening; that of the whole guide
     # before sharpening would be too small (0.3 dB worse on brick).
-    params = replace(params, fidelity=whole_image_params(pixels, params, around).fidelity)
+    params = replace(params, fidelity=whole_image_fidelity(pixels, params))
     restored, parts = new_mosaic(pixels.shape, runtime.scratch), list[Deconvolution]()
     for tile in tiles:
         guide_part = None if around is None else _part(around, tile)

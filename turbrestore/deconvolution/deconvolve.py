@@ -1,6 +1,8 @@
 """Deconvolution by nonlocal TV, TV, Wiener or Tikhonov regularisation as one problem (paper 3, section 5).
 
-``min_u λ/2 ‖M(k∗u − f)‖² + J(u)``, the energy of which paper 3 gives the gradient flow (eqs. 21, 22, 24).
+``min_u λ/2 ‖M(k∗u − f)‖² + J(u)``.  Eq. 21 is its general form; eqs. 22 and 24 are the gradient flows of the energies
+with TV and with nonlocal TV.  The data term of eq. 21 has no λ/2, so that its μ is 1/λ for Wiener and Tikhonov.  The
+paper's Tikhonov penalty is ‖u‖²; here the deviation from the mean is penalised, which keeps the brightness.
 
 Symbols as in :mod:`turbrestore.deconvolution.problem`, and
 
@@ -23,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..blur.estimation import BlurEstimate
 from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, psf_to_otf
 from ..core.arrays import FloatArray, check_image, luminance
-from ..core.errors import DataError, require, require_between
+from ..core.errors import ConfigurationError, DataError, require, require_between
 from ..core.noise import estimate_noise
 from ..display.plots import plot_objective
 from ..display.preview import preview
@@ -34,7 +36,7 @@ from ..runtime.threads import ThreadTeam, one_thread_each
 from .array_ops import Array, numpy_ops, torch_ops
 from .conjugate_gradient import quadratic_solver, wiener_image
 from .nonlocal_tv import NonlocalPenalty
-from .nonlocal_weights import NonlocalParams, automatic_h, nonlocal_weights
+from .nonlocal_weights import NonlocalParams, nonlocal_weights
 from .primal_dual import Penalty, PrimalDual
 from .problem import Margin, Problem, automatic_fidelity, join_planes, margin_around, read_blur, split_planes
 from .stopping import DeconvolutionState, Solution, iterate
@@ -63,7 +65,8 @@ class DeconvolutionParams:
     method : {"nltv", "tv", "wiener", "tikhonov"}
         Penalty: nonlocal TV, TV, squared gradient, squared deviation from the mean.
     sigma : float, optional
-        Width of the blur, pixels, for callers that estimate it by default; :func:`deconvolve` does not use it.
+        Width of the blur, pixels; :func:`deconvolve` takes it where it is given no blur.  By default
+        :func:`turbrestore.blind.remove_blur.remove_blur` estimates the width.
     exponent : float, optional
         Shape of a blur of known width: 2 is a Gaussian, 5/3 turbulence; see ``turbrestore.blur.psf.blur_otf``.  By
         default 2 for a given width, and 5/3 for one that is estimated.
@@ -177,7 +180,7 @@ class Deconvolution:
 
 def deconvolve(
     image: ArrayLike,
-    sigma_or_psf: float | BlurEstimate | ArrayLike,
+    sigma_or_psf: float | BlurEstimate | ArrayLike | None = None,
     params: DeconvolutionParams | None = None,
     guide: ArrayLike | None = None,
     runtime: Runtime = DEFAULT,
@@ -188,10 +191,10 @@ def deconvolve(
     ----------
     image : array_like, shape (H, W) or (H, W, 3)
         f.
-    sigma_or_psf : float, BlurEstimate, or array_like of shape (h, w) with odd sizes
+    sigma_or_psf : float, BlurEstimate, or array_like of shape (h, w) with odd sizes, optional
         Width of a blur of shape ``params.exponent``, pixels; an estimate, of which the removable width and, unless
-        ``params.exponent`` is given, the shape are taken; or a sampled point spread function.  Without blur (0, or a
-        single pixel) the image is returned as it is.
+        ``params.exponent`` is given, the shape are taken; or a sampled point spread function.  By default
+        ``params.sigma``.  Without blur (0, or a single pixel) the image is returned as it is.
     params : DeconvolutionParams, optional
         Method and settings.
     guide : array_like, shape (H, W) or (H, W, 3), optional
@@ -209,7 +212,7 @@ def deconvolve(
     DataError
         Wrong shapes, values that are not finite, or an unusable PSF.
     ConfigurationError
-        ``sigma_or_psf`` is negative or not finite, or the memory of the device is not enough.
+        The blur is not given, negative or not finite, or the memory of the device is not enough.
 
     Examples
     --------
@@ -225,7 +228,7 @@ def deconvolve(
 
 def deconvolve_steps(
     image: ArrayLike,
-    sigma_or_psf: float | BlurEstimate | ArrayLike,
+    sigma_or_psf: float | BlurEstimate | ArrayLike | None = None,
     params: DeconvolutionParams | None = None,
     guide: ArrayLike | None = None,
     runtime: Runtime = DEFAULT,
@@ -253,6 +256,10 @@ def deconvolve_steps(
     """
     params = params or DeconvolutionParams()
     pixels = check_image(image)
+    if sigma_or_psf is None:
+        if params.sigma is None:
+            raise ConfigurationError("sigma_or_psf: expected a blur here or in params.sigma, found neither")
+        sigma_or_psf = params.sigma
     if isinstance(sigma_or_psf, BlurEstimate):
         params = dataclasses.replace(params, exponent=params.exponent or sigma_or_psf.exponent)
         sigma_or_psf = sigma_or_psf.removable
@@ -283,43 +290,35 @@ def deconvolve_steps(
     )
 
 
-def whole_image_params(
-    image: ArrayLike, params: DeconvolutionParams | None = None, guide: ArrayLike | None = None
-) -> DeconvolutionParams:
-    """Decide what depends on the whole image, so that it can be deconvolved in tiles.
+def whole_image_fidelity(image: ArrayLike, params: DeconvolutionParams | None = None) -> float:
+    """Weight λ of the data for the whole image, so that tiles of it can be deconvolved with the same weight.
 
     Parameters
     ----------
     image : array_like, shape (H, W) or (H, W, 3)
         f.
     params : DeconvolutionParams, optional
-    guide : array_like, shape (H, W) or (H, W, 3), optional
-        As of :func:`deconvolve`.
 
     Returns
     -------
-    DeconvolutionParams
-        With ``fidelity`` from the noise of the whole image, and ``weights.h`` from the contrast and the noise of the
-        whole guide, unless they are given.
+    float
+        ``params.fidelity`` where it is given, else λ from the noise of the image.
 
     Notes
     -----
-    Deconvolved with these, a tile agrees with the whole at 99 % of its pixels within .01, away from a halo of 96
-    pixels.  The others have neighbours of similar patches that differ, because each tile sharpens its part of the guide
-    by itself.  With a guide that is sharpened before (``method="wiener"``) and ``sharpen_guide=False`` all pixels
-    agree.
+    Deconvolved with the λ and the ``weights.h`` of the whole image, a tile agrees with the whole at 99 % of its pixels
+    within .01, away from a halo of 96 pixels.  The others have neighbours of similar patches that differ, because each
+    tile sharpens its part of the guide by itself.  With a guide that is sharpened before (``method="wiener"``) and
+    ``sharpen_guide=False`` all pixels agree.
 
     Examples
     --------
     >>> import numpy as np
-    >>> round(whole_image_params(np.tile(np.linspace(0, 1, 101), (9, 1))).weights.h, 4)
-    0.1225
+    >>> round(whole_image_fidelity(np.tile(np.linspace(0, 1, 101), (9, 1))))
+    5000
     """
     params = params or DeconvolutionParams()
-    pixels = check_image(image)
-    _, fidelity = _noise_and_fidelity(split_planes(pixels, params.channels), params)
-    h = params.weights.h or automatic_h(luminance(pixels if guide is None else check_image(guide, "guide")))
-    return dataclasses.replace(params, fidelity=fidelity, weights=dataclasses.replace(params.weights, h=h))
+    return _noise_and_fidelity(split_planes(check_image(image), params.channels), params)[1]
 
 
 class _Resources(NamedTuple):

@@ -4,7 +4,7 @@ Symbols as in :mod:`turbrestore.deconvolution.primal_dual` and :mod:`turbrestore
 
 ∇_w u : nonlocal gradient, ``(∇_w u)(x, y) = [u(y) − u(x)] √w(x, y)``; it is K.
 div_w v : nonlocal divergence, ``(div_w v)(x) = Σ_y [v(x, y) − v(y, x)] √w(x, y)``; Kᵀ = −div_w.
-J(u) : nonlocal total variation, ``Σ_x |∇_w u|(x)`` with ``|v|(x)² = Σ_y v(x, y)²`` (eq. 22).
+J(u) : nonlocal total variation, ``Σ_x |∇_w u|(x)`` with ``|v|(x)² = Σ_y v(x, y)²``; its gradient flow is eq. 24.
 
 A function on pairs is an array of shape (2, E): row 0 is its value from the tail to the head of each pair, row 1 from
 the head to the tail.
@@ -14,11 +14,11 @@ An iteration goes over the pairs twice, because |a| of ``a = p + sKu`` at a pixe
 
     p + ρ(fa − p) = ga + Kl,  g = 1 − ρ + ρf,  l = (ρ − 1)su.
 
-So a is stored in place of p, with the images g and l.  The next iteration finds its ``p + sKu = ga + K(l + su)`` in one
-pass, and Kᵀp is the other, which only reads.
+So a is stored in place of p, together with the images g and l.  The first pass of the next iteration computes
+``p + sKu = ga + K(l + su)``; the second pass computes Kᵀp and changes nothing on the pairs.
 
-The pairs are worked on in bands of rows.  Those of a band reach into the next one and no farther; therefore every
-second band can be worked on at the same time, and which thread does it changes nothing.
+The pairs are processed in bands of rows.  A pair of one band reaches at most into the next band.  Therefore every
+second band can be processed in parallel, and the result does not depend on the threads.
 """
 
 from __future__ import annotations

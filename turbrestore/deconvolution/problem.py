@@ -7,7 +7,8 @@ k : point spread function; B : convolution with k; H : its transfer function; B�
 M : 1 where a pixel was observed, 0 in the margin around the image.
 λ : fidelity, the weight of the data.  The paper's μ is 1 here.
 
-The data term is ``λ/2 ‖M(Bu − f)‖²`` (paper 3, eqs. 21 and 22, with the mask M).
+The data term ``λ/2 ‖M(Bu − f)‖²`` is that of F_λ,μ in paper 3, section 5, for the model ``f = k∗u + n`` (eq. 20), with
+the mask M added.
 
 Boundary
 --------

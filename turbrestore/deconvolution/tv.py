@@ -1,7 +1,7 @@
 """Total variation by differences of neighbouring pixels, periodic, as a penalty of the primal-dual splitting.
 
-``J(u) = Σ_x |∇u|(x)``, of which the gradient flow is eq. 21 of paper 3.  Symbols as in
-:mod:`turbrestore.deconvolution.primal_dual`: ``K = ∇``, ``Kᵀ = −div``.
+``J(u) = Σ_x |∇u|(x)`` is the penalty of the energy F_λ,μ of paper 3, section 5, whose gradient flow is eq. 22.  Symbols
+as in :mod:`turbrestore.deconvolution.primal_dual`: ``K = ∇``, ``Kᵀ = −div``.
 """
 
 from __future__ import annotations

@@ -25,10 +25,15 @@ Departures from the paper, each with its reason:
 * The flow outside the subspace is kept (``residual="keep"``): by eq. 10 the flow is ``C ξ + r``, and where r is
   motion its mean is ``Ŵ = C ξ̂ + G (W^meas − C ξ̂)``.  With ``Ŵ = C ξ̂`` alone (``"drop"``, as printed) that motion
   stays in the frames and blurs the image, below the centroid that the filter starts from.
-* Frames are handled in blocks, whose flows are measured side by side; the inner iteration repeats a block from the same
-  prior.  The last iteration of a block and the first of the next measure from the same image and run as one pass: that
-  image contains the earlier block as its last iteration but one has left it.  A block of one frame is the paper's
-  scheme but for that, and but for the frame itself, which the image does not contain when its flow is first measured.
+* The measurement equation 13c is nonlinear in image and flow together.  Eqs. 15 and 17, with which the paper replaces
+  it, are used alone.  The mean flow W̄ is part of eq. 17 here.
+* The paper first updates the image by the predicted flow (its step 2).  Here the flow is measured first, because the
+  image of the last frame is there to measure it from.
+* Frames are processed in blocks, whose flows are measured in parallel from one image; the inner iteration repeats a
+  block from the same prior.  The last iteration of a block and the first of the next block run as one pass, and measure
+  their flows from the same image.  That image contains the earlier block in its state before the last iteration.  With
+  blocks of one frame this is the paper's scheme but for two points: that image, and the frame itself, which the image
+  does not contain yet when the flow is first measured.
 * Every inner iteration starts from the prediction, not from its own result, so a frame counts once; on a linear
   model the iteration then changes nothing.
 * Z varies from pixel to pixel: it is lower where a frame is locally sharper than usual, and higher where the frame

@@ -42,7 +42,7 @@ class FilterParams:
     sharpness_window : float
         Standard deviation of the window in which sharpness is measured, pixels.
     image_noise : float, optional
-        Z: variance of a registered frame about the image, squared intensity; by default measured on the first block.
+        Z₀: variance of a registered frame about the image, squared intensity; by default measured on the first block.
     image_drift : float
         S: variance by which the image may drift from one frame to the next, squared intensity.
     prior_frames : float
@@ -167,7 +167,7 @@ class Filtered:
     shares : ndarray, float64, shape (N,)
         Share of the information that each frame brought, mean over the pixels; they sum to 1.
     image_noise : float
-        Z, squared intensity.
+        Z₀, squared intensity.
     motion_share : float
         G, mean over the pixels; 0 with ``residual="drop"``.
     """

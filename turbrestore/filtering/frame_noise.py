@@ -8,12 +8,13 @@ v : variance of z over the frames
 d : squared deviation of a frame from the mean frame, in units of its usual variance; e = max(d / 6, 1) the excess
 m : 1 where the frame gives no measurement, because the map id + Ŵ folds or leaves the frame
 
-The paper takes Z to be one number.  Here, with Z₀ for that number::
+The paper takes Z to be one number, Z₀.  So does this module for β = 0; for β > 0::
 
     Z = Z₀ e³ exp(β² v / 2 − β z + m log 1000),     z / e² in place of z where z > 0
 
-It falls where a frame is locally sharper than usual, which is the idea of lucky imaging inside the Kalman gain.  It
-rises where a frame shows something that the others do not (a bird, a flash), and where its flow is invalid.
+with z limited to ±3 and the exponent to 40.  Z falls where a frame is locally sharper than usual, which is the idea of
+lucky imaging inside the Kalman gain.  It rises where a frame shows something that the others do not (a bird, a flash),
+and where its flow is invalid.
 
 All functions here take NumPy arrays or torch tensors with the operations of their library (``ops``).
 """
