@@ -145,6 +145,7 @@ def test_a_stage_depends_on_the_size_of_the_tiles():
     assert strict == loose
 
 
+@pytest.mark.long
 def test_the_command_restores_large_frames_in_tiles(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     # Wide frames, so that the whole is out of reach at a size that a test has time for.
@@ -201,6 +202,7 @@ def test_a_kept_run_continues_with_another_limit(frames, limited, tmp_path, monk
     assert np.array_equal(found.dynamics.C, whole.dynamics.C)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("records", [16, 40])
 def test_a_limited_run_interrupted_in_the_filter_ends_the_same(tmp_path, records):
     frames = make_sequence(seed=52, count=64, size=96, blur=1.0).frames

@@ -58,6 +58,7 @@ def test_the_size_of_tiles_does_not_follow_from_the_number_of_threads(limit):
     assert [plan.runtime.threads for plan in plans] == sorted(plan.runtime.threads for plan in plans)
 
 
+@pytest.mark.long
 def test_limits_with_the_same_tiles_have_the_same_side():
     plans = [plan_of(FOUR_K, limit) for limit in np.arange(1.2e9, 4e9, 4e7)]
     sides = {}
@@ -79,6 +80,7 @@ def test_room_for_a_report_is_for_the_images_that_it_shows():
     assert _SHOWN_SIDE == _LONGEST
 
 
+@pytest.mark.long
 @given(
     st.integers(2, 3000),
     st.integers(16, 5000),

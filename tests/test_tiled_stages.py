@@ -131,6 +131,7 @@ def test_a_restoration_in_tiles_is_as_good_as_that_of_whole_frames(sequence, req
     assert [done for name, done, total in told if name == "filter"][-1] == 4 * (2 * 12 - 9)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_tiles")
 def test_a_restoration_in_tiles_is_the_same_bytes_whatever_the_number_of_threads(sequence):
     def run(threads):
@@ -157,6 +158,7 @@ def test_frames_that_do_not_count_do_not_in_any_tile(sequence):
     assert np.isfinite(restored.image).all()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_tiles")
 @pytest.mark.parametrize("finished", [1, 3])
 def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tmp_path, monkeypatch, finished):

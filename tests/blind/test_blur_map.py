@@ -39,6 +39,7 @@ def brick():
     return blurred("brick", 0.8, 2.2)
 
 
+@pytest.mark.long
 def test_a_blur_that_grows_to_the_right_is_found_and_removed(brick):
     scene, image, widths = brick
     found = estimate_blur_map(image, estimate_blur(image, exponent=2.0))
@@ -59,6 +60,7 @@ def test_a_blur_that_is_the_same_everywhere_is_taken_as_one(name):
     assert not estimate_blur_map(image, estimate_blur(image, exponent=2.0)).varies
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "right", "agree"), [("camera", 1.4, True), ("brick", 2.6, False)])
 def test_uncertainties_are_computed_only_if_widths_may_differ(monkeypatch, name, right, agree):
     _, image, _ = blurred(name, 1.4 if agree else 0.8, right)
@@ -148,6 +150,7 @@ def counted(monkeypatch):
     return widths
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("right", "varies"), [(1.4, False), (2.6, True)])
 def test_the_deconvolution_beside_the_widths_of_tiles_is_used_where_these_agree(counted, right, varies):
     _, image, _ = blurred("brick", 0.8 if varies else 1.4, right)

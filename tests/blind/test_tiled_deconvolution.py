@@ -25,6 +25,7 @@ def brick():
     return scene, (np.fft.irfft2(spectrum, scene.shape) + noise).astype(np.float32)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("method", "iterations"), [("nltv", 50), ("tv", 200), ("wiener", 200), ("tikhonov", 200)])
 def test_tiles_are_as_good_as_the_whole_image(brick, method, iterations):
     scene, image = brick

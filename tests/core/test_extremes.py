@@ -102,6 +102,7 @@ def test_covariances_stay_symmetric_and_positive(system):
     walk(*system, seen=0.7, steps=2000, every=100)
 
 
+@pytest.mark.long
 def test_covariances_stay_symmetric_and_positive_over_a_hundred_thousand_steps():
     # An update takes longer than a step, so few are measured.
     walk(1, 0.9999, [-12.0, -3.0, 0.0], seen=0.1, steps=100_000, every=1000)
@@ -127,6 +128,7 @@ def walk(seed, radius, noises, seen, steps, every):
     assert np.isfinite(state.mean).all()
 
 
+@pytest.mark.long
 def test_pixel_variances_stay_positive_over_a_hundred_thousand_steps():
     rng = np.random.default_rng(2)
     state = PixelStacks(np.zeros((1, 2, 3), np.float32), np.ones((2, 3), np.float32))

@@ -232,6 +232,7 @@ def test_an_estimate_stands_for_its_removable_width_and_its_shape():
     assert np.array_equal(deconvolve(image, estimate, gaussian).image, deconvolve(image, 1.0, gaussian).image)
 
 
+@pytest.mark.long
 def test_a_tile_agrees_with_the_whole_away_from_its_border():
     """With a halo of 96 pixels; a sharpened guide makes the same choice of neighbours in a tile as in the whole."""
     halo, scene = 96, SCENES["camera"](256, 352)

@@ -53,6 +53,7 @@ def test_weights_match_a_double_loop(nearest, shape):
     )
 
 
+@pytest.mark.long
 def test_tiles_leave_no_seam(monkeypatch):
     guide = np.random.default_rng(1).random((40, 31)).astype(np.float32)
     whole = nonlocal_weights(guide, SMALL)

@@ -99,6 +99,7 @@ def test_change_is_that_of_the_worst_tile_relative_to_the_brightest():
     assert change_of([1 + before], [2 + before], measured, OPS) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "scene", "noise", "size", "most"),
     [

@@ -122,6 +122,7 @@ for _ in range(2500):
 """
 
 
+@pytest.mark.long
 def test_a_stream_of_turns_can_be_left_at_any_moment():
     # In a process of its own: one that waits for an item that was given up never ends.
     subprocess.run([sys.executable, "-c", LEAVE_OFTEN], check=True, timeout=120)

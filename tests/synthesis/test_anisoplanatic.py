@@ -96,6 +96,7 @@ def exposures(request):
     return frequencies, np.mean(short, axis=0), np.mean(long, axis=0), errors, params
 
 
+@pytest.mark.long
 def test_long_exposure_is_frieds(exposures):
     nu, _, long, (_, error), params = exposures
     # Path differences of all layers, each seen through the cone.
@@ -371,6 +372,7 @@ def test_frames_come_one_at_a_time(chart):
     stream.close()
 
 
+@pytest.mark.long
 def test_threads_do_not_change_the_frames(chart):
     one, two = (
         list(phase_screen_frames(chart, 3, np.random.default_rng(0), path_of(), runtime=Runtime(threads=n)))

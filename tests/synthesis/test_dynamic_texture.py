@@ -57,6 +57,7 @@ def test_without_the_residual_the_flows_are_those_of_the_modes(training):
     assert np.linalg.norm(outside) > 0.05 * np.linalg.norm(kept[7])
 
 
+@pytest.mark.long
 def test_eigenvalues_are_found_again(training):
     flows, dynamics = seeded(training, 2000)
     again = identify([*flows], DynamicsParams(rank=dynamics.rank))

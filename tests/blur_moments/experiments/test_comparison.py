@@ -40,6 +40,7 @@ def at_most(score, limit):
     return score.ratio <= limit + 2 * score.ratio_error
 
 
+@pytest.mark.long
 class TestWavefront:
     def test_first_moment_errs_as_in_the_paper(self, waves):
         assert waves.scores["O1"].error == pytest.approx(0.07, abs=0.006)
@@ -81,6 +82,7 @@ class TestWavefront:
         assert np.abs(waves.estimates["image_map"] - waves.truth)[10:].mean() < 0.02
 
 
+@pytest.mark.long
 class TestMirror:
     def test_order_of_the_observers(self, known):
         assert at_most(known.scores["O2"], 0.98)
