@@ -85,9 +85,9 @@ def test_frames_that_do_not_count(device):
 @pytest.mark.parametrize(
     ("place", "advice", "params"),
     [
-        ("registration.tvl1.tvl1_flows", "lower --flow.tvl1.batch", RestoreParams(flow=TVL1)),
-        ("registration.warp.warp_stack", "take a smaller --roi", RestoreParams()),
-        ("filtering.array_backend.warp_stack", "take a smaller --roi", RestoreParams(filter=FilterParams())),
+        ("registration.tvl1.tvl1_flows", "lower flow.tvl1.batch", RestoreParams(flow=TVL1)),
+        ("registration.warp.warp_stack", "process a smaller part .*", RestoreParams()),
+        ("filtering.array_backend.warp_stack", "process a smaller part .*", RestoreParams(filter=FilterParams())),
     ],
 )
 def test_what_to_do_is_said_where_the_memory_of_the_device_is_too_small(device, place, advice, params, monkeypatch):

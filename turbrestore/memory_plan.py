@@ -296,8 +296,8 @@ def _too_little(shape: tuple[int, ...], params: RestoreParams, base: float, limi
     least = base + min(_peak(shape, params, choice, 0.0) for choice in _choices(shape, train, 1, params))
     asked = "" if params.train is None else f" and {train} training frames"
     return ConfigurationError(
-        f"--memory-limit: expected at least {size_text(1.01 * least)} for frames of {shape[2]}×{shape[1]}{asked}, "
-        f"found {size_text(limit)}; allow more, or use a --roi"
+        f"memory_limit: expected at least {size_text(1.01 * least)} for frames of {shape[2]}×{shape[1]}{asked}, "
+        f"found {size_text(limit)}; allow more, or restore a smaller part of the frame (roi)"
     )
 
 

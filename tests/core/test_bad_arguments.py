@@ -72,22 +72,19 @@ def misspelt():
         (RESTORE, "--until=filtr", "filter"),
         (RESTORE, "--centroid.mode=fussed", "fused"),
         (RESTORE, "--border=crp", "crop"),
-        (RESTORE, "--memory-limit=2GBB", "2GB?"),
         (FILTER, "--filter.residual=kep", "keep"),
         (DECONVOLVE, "--deconvolution.method=nltvv", "nltv"),
         (SYNTHESIZE, "--strength=meduim", "medium"),
         (SYNTHESIZE, "--model=phase-scren", "phase-screen"),
     ):
         yield Case([*words, option], (*option.split("="), near))
+    yield Case([*RESTORE, "--memory-limit=2GBB"], ("memory_limit", "2GBB", "2GB?"))
 
 
 def of_another_type():
     """Values that are no numbers where numbers belong, and the like."""
     for words, option in (
         (RESTORE, "--sigma=wide"),
-        (RESTORE, "--keep-best=thirty"),
-        (RESTORE, "--memory-limit=plenty"),
-        (RESTORE, "--memory-limit=2QB"),
         (RESTORE, "--frames=a:b"),
         (RESTORE, "--frames=1:2:3:4"),
         (RESTORE, "--frames=5"),
@@ -112,6 +109,9 @@ def of_another_type():
         (MIRROR, "--deviation=7dB"),
     ):
         yield Case([*words, option], (option.split("=")[0],))
+    yield Case([*RESTORE, "--keep-best=thirty"], ("keep_best", "thirty"))
+    yield Case([*RESTORE, "--memory-limit=plenty"], ("memory_limit", "plenty"))
+    yield Case([*RESTORE, "--memory-limit=2QB"], ("memory_limit", "2QB"))
 
 
 def out_of_range():
@@ -227,8 +227,8 @@ def settings_files():
         ("strict = 'perhaps'\n", ("strict",)),
         ("keep_best = 'thirty'\n", ("keep",)),
         ("keep_best = 2.0\n", ("keep_best",)),
-        ("memory_limit = '2 big'\n", ("--memory-limit", "2GB")),
-        ("memory_limit = true\n", ("--memory-limit",)),
+        ("memory_limit = '2 big'\n", ("memory_limit", "2GB")),
+        ("memory_limit = true\n", ("memory_limit",)),
         ("train = 1\n", ("train",)),
         ("roi = '1,2,3'\n", ("--roi",)),
         ("frames = 'a:b'\n", ("--frames",)),

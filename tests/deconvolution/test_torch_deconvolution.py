@@ -134,6 +134,6 @@ class TestDeconvolution:
             raise RuntimeError("CUDA out of memory.")
 
         monkeypatch.setattr("turbrestore.deconvolution.deconvolve.torch_nonlocal_penalty", fail)
-        line = f"^device: the memory of '{device[:3]}.* is not enough; take a smaller --roi or use 'cpu'$"
+        line = f"^device: the memory of '{device[:3]}.* is not enough; process a smaller part of the frame"
         with pytest.raises(ConfigurationError, match=line):
             deconvolve(SCENES["camera"](32, 32), 1.0, runtime=Runtime(device=device))

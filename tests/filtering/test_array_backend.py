@@ -116,7 +116,7 @@ def test_lack_of_memory_is_one_line(device, monkeypatch):
 
     monkeypatch.setattr("turbrestore.filtering.array_backend.warp_stack", fail)
     frames, flows = frames_of(SCENES["camera"](48), 3)
-    with pytest.raises(ConfigurationError, match="^device: the memory of .* is not enough; take a smaller --roi or"):
+    with pytest.raises(ConfigurationError, match="^device: the memory of .* is not enough; process a smaller part"):
         filter_both(frames, flows, flows, device)
 
 

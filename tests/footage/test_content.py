@@ -227,7 +227,7 @@ class TestFramesLeftOut:
         report, source = cleaned(np.concatenate([elsewhere[:8], frames]))
         assert [(scene.first, scene.last, scene.count) for scene in report.scenes] == [(0, 7, 8), (8, 21, 14)]
         np.testing.assert_array_equal(source.read(), frames)
-        assert "--frames selects another (0:8)" in report.warnings[0]
+        assert "to use another, select its frames (0:8)" in report.warnings[0]
 
     def test_a_scene_that_comes_back_is_one(self, frames, elsewhere):
         report, source = cleaned(np.concatenate([frames[:6], elsewhere[:3], frames[6:]]))

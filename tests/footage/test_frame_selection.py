@@ -41,7 +41,7 @@ def test_shares_are_read(text, value):
 
 @pytest.mark.parametrize("text", ["thirty", "", "%", "30%%"])
 def test_what_is_no_share_is_refused(text):
-    with pytest.raises(ConfigurationError, match="^--keep-best: expected a share such as"):
+    with pytest.raises(ConfigurationError, match="^keep_best: expected a share such as"):
         Share(text)
 
 

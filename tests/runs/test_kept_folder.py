@@ -164,7 +164,7 @@ def test_a_record_with_wrong_content_is_one_line_that_says_what_to_do(ended, cap
     err = capsys.readouterr().err
     assert err.count("\n") == 1
     assert RECORD in err
-    assert "start anew with --overwrite" in err
+    assert "start anew without resuming" in err
 
 
 @pytest.mark.parametrize(

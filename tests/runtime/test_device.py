@@ -122,9 +122,9 @@ class TestChoice:
         assert "farneback" in second.reason
 
     def test_lack_of_memory_is_one_line_and_other_errors_are_not(self):
-        line = r"^device: the memory of 'cuda:1' is not enough; lower --flow.tvl1.batch or use 'cpu'$"
+        line = r"^device: the memory of 'cuda:1' is not enough; lower flow.tvl1.batch or use 'cpu'$"
         for said in ("CUDA out of memory. Tried 2 GiB", "[enforce] DefaultCPUAllocator: not enough memory: you tried"):
-            with pytest.raises(ConfigurationError, match=line), memory_of("cuda:1", "lower --flow.tvl1.batch"):
+            with pytest.raises(ConfigurationError, match=line), memory_of("cuda:1", "lower flow.tvl1.batch"):
                 raise RuntimeError(said)
         with pytest.raises(RuntimeError, match="^a bug$"), memory_of("cuda", "lower the batch"):
             raise RuntimeError("a bug")

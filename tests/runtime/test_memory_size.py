@@ -18,7 +18,7 @@ def test_sizes_are_read(text, size):
 
 @pytest.mark.parametrize("text", ["", "GB", "2 bananas", "2QB", "0", "-1GB", "nan", "inf", "1e400GB", "2 G B", True])
 def test_what_is_no_size_is_refused(text):
-    with pytest.raises(ConfigurationError, match="^--memory-limit: expected a size such as 2GB") as caught:
+    with pytest.raises(ConfigurationError, match="^memory_limit: expected a size such as 2GB") as caught:
         MemorySize(text)
     assert "\n" not in str(caught.value)
 

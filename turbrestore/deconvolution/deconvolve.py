@@ -277,7 +277,7 @@ def deconvolve_steps(
     rim = min(int(np.ceil(sigma)), min(height, width) // 4) if oscillates else 0
     device = find_device(runtime.device)
     ops = numpy_ops(runtime.workers) if device == CPU else torch_ops(device)
-    with memory_of(device, "take a smaller --roi"), one_thread_each(), ThreadTeam(runtime.workers) as team:
+    with memory_of(device), one_thread_each(), ThreadTeam(runtime.workers) as team:
         seen, transfer = ops.load(margin.mask()), ops.load(otf)
         problems = [Problem(ops.load(margin.pad(plane)), seen, transfer, fidelity, ops) for plane in planes]
         measured = ops.load(margin.mask(rim))

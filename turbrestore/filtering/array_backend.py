@@ -49,7 +49,7 @@ class ArrayBackend:
 
     def memory(self) -> AbstractContextManager[None]:
         """Context in which a lack of memory on the device is a ConfigurationError."""
-        return memory_of(self.device, "take a smaller --roi")
+        return memory_of(self.device)
 
     def load(self, array: NDArray[np.floating]) -> Stack:
         """Bring an array to the device, float32."""

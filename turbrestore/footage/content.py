@@ -280,7 +280,7 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
         others = ", ".join(f"{scene.first}:{scene.last + 1}" for scene in report.scenes if scene is not longest)
         lines.append(
             f"{len(report.scenes)} scenes: only the longest is used, {longest.count} frames from {longest.first} to "
-            f"{longest.last}; --frames selects another ({others})"
+            f"{longest.last}; to use another, select its frames ({others})"
         )
     if report.saturated >= _SATURATED:
         lines.append(f"{100 * report.saturated:.0f} % of the values are at white: detail there is lost")

@@ -35,7 +35,7 @@ class Share(float):
         try:
             number = float(text[:-1]) / 100 if text.endswith("%") else float(text)
         except ValueError:
-            raise ConfigurationError(f"--keep-best: expected a share such as 0.3 or 30%, found {value!r}") from None
+            raise ConfigurationError(f"keep_best: expected a share such as 0.3 or 30%, found {value!r}") from None
         return super().__new__(cls, number)
 
 

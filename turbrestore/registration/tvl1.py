@@ -289,14 +289,14 @@ def tvl1_solver(params: TvL1Params, reference: GreyImage, device: str) -> FlowSo
     >>> tvl1_solver(TvL1Params(), image, "cpu")(image[None], [None]).shape
     (1, 32, 32, 2)
     """
-    with memory_of(device, "take a smaller --roi"):
+    with memory_of(device):
         prepared = prepare_tvl1(reference.astype(np.float32), params, device)
 
     def solve(frames: GreyImage, starts: list[FloatArray | None]) -> FloatArray:
         flows = np.empty((*frames.shape, 2), np.float32)
         started = [number for number, start in enumerate(starts) if start is not None]
         others = [number for number, start in enumerate(starts) if start is None]
-        with memory_of(device, "lower --flow.tvl1.batch"):
+        with memory_of(device, "lower flow.tvl1.batch"):
             if others:
                 flows[others] = tvl1_flows(frames[others].astype(np.float32), prepared).flows
             if started:

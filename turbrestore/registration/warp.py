@@ -76,7 +76,7 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device
     planes = image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)
     found = find_device(device)
     ops = numpy_ops() if found == CPU else torch_ops(found)
-    with memory_of(found, "take a smaller --roi"):
+    with memory_of(found):
         warped = ops.store(warp_stack(ops.load(planes), ops.load(flow), ops))
     return warped[0] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(warped, 0, -1))
 

@@ -37,7 +37,7 @@ RECORD, IMAGES, MEAN = "run.json", "images.npz", "mean.npy"
 RESULTS = ("centroid", "dynamics", "filtered", "blur", "deconvolution")
 # All files of a kept run.
 RUN_FILES = (*(f"{name}.npz" for name in RESULTS), MEAN, IMAGES, RECORD)
-_ANEW = "start anew with --overwrite, or keep the stages in another folder"
+_ANEW = "start anew without resuming, or keep the stages in another folder"
 # Where `turbrestore report` writes by default.
 REPORT = "report.html"
 
@@ -251,12 +251,12 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
     >>> load_run("missing")
     Traceback (most recent call last):
     ...
-    turbrestore.core.errors.InputNotFoundError: missing: expected a folder written by --keep, ...
+    turbrestore.core.errors.InputNotFoundError: missing: expected the folder of a kept run, ...
     """
     place = Path(folder)
     record = read_record(place)
     if record is None or "restoration" not in record:
-        raise InputNotFoundError(f"{place}: expected a folder written by --keep, found no complete {RECORD} in it")
+        raise InputNotFoundError(f"{place}: expected the folder of a kept run, found no complete {RECORD} in it")
     fields = JsonFields(place / RECORD, record)
     facts, run = fields.part("restoration"), fields.part("run")
     names = facts.texts("results")

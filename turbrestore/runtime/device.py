@@ -35,6 +35,7 @@ _NODES = {"linux": ("nvidia*", "nvhost*", "nvmap", "kfd", "dxg"), "darwin": ()}
 _DEVICES = Path("/dev")
 _NO_GPU = "torch sees no GPU"
 _NO_MEMORY = ("out of memory", "not enough memory")
+_SMALLER = "process a smaller part of the frame (roi)"
 
 
 def check_device(name: str) -> None:
@@ -162,7 +163,7 @@ def explain_device(wanted: str, found: str, flow_method: str) -> tuple[Decision,
 
 
 @contextmanager
-def memory_of(device: str, advice: str) -> Iterator[None]:
+def memory_of(device: str, advice: str = _SMALLER) -> Iterator[None]:
     """Say in one line that the memory of a device is not enough.
 
     Parameters
@@ -170,7 +171,7 @@ def memory_of(device: str, advice: str) -> Iterator[None]:
     device : str
         Its name.
     advice : str
-        What to do.
+        What to do other than to compute on the CPU.
 
     Raises
     ------

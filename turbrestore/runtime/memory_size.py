@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from typing import ClassVar, Self
+from typing import Self
 
 from ..core.errors import ConfigurationError, require
 
@@ -32,11 +32,9 @@ class MemorySize(float):
     (2000000000.0, 1572864.0, 3000000000.0)
     """
 
-    _option: ClassVar[str] = "--memory-limit"
-
     def __new__(cls, value: float | str) -> Self:
         """Read number and unit."""
-        expected = f"{cls._option}: expected a size such as 2GB, 800MB or 1.5GiB"
+        expected = "memory_limit: expected a size such as 2GB, 800MB or 1.5GiB"
         text = str(value).strip()
         digits = text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ ")
         unit = text[len(digits) :].strip().lower()

@@ -329,7 +329,7 @@ def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _another(folder: Path) -> str:
     temporary = folder == Path(tempfile.gettempdir())
-    return f"name another {'folder by TMPDIR' if temporary else '--keep folder'}"
+    return f"name another scratch folder{' by TMPDIR' if temporary else ''}"
 
 
 def _reserve(file: IO[bytes], size: int) -> None:
