@@ -115,9 +115,9 @@ def restore(
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
     run = _Run(source, params, plan, tiles, store or NoStore(), progress)
-    decisions = [*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method)]
+    on_machine = *plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method)
     with returning_freed_memory(runtime.memory_limit is not None):
-        return _restored(run, decisions)
+        return _restored(run, on_machine)
 
 
 @dataclass(frozen=True)
@@ -177,15 +177,15 @@ def step_counter(progress: Progress | None, stage: str, total: int) -> Callable[
     return observe
 
 
-def _restored(run: _Run, decisions: list[Decision]) -> Restoration:
+def _restored(run: _Run, on_machine: tuple[Decision, ...]) -> Restoration:
     """Fuse the frames, deblur the image and crop it."""
     params = run.params
-    fused = _fuse(run, decisions)
+    fused = _fuse(run)
     image, centroid, deblurred = fused.image, fused.centroid, None
     if params.runs("deconvolve"):
         deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused.image, centroid.image))
-        decisions += deblurred.decisions
         image = deblurred.deconvolution.image
+    on_blur = () if deblurred is None else deblurred.decisions
     crop, on_border = _crop(image, centroid.flows, params.border, deblurred)
     x, y, width, height = crop
     return Restoration(
@@ -198,7 +198,7 @@ def _restored(run: _Run, decisions: list[Decision]) -> Restoration:
         blur=None if deblurred is None else deblurred.blur,
         deconvolution=None if deblurred is None else deblurred.deconvolution,
         guard_readings=() if deblurred is None else deblurred.readings,
-        decisions=(*decisions, on_border),
+        decisions=(*on_machine, *fused.decisions, *on_blur, on_border),
         train=run.plan.train,
         frame_count=len(run.source) if params.runs("filter") else run.plan.train,
         seconds=run.seconds,
@@ -212,34 +212,35 @@ class _Fused:
     image: FloatArray
     mean: FloatArray
     centroid: Centroid
+    decisions: tuple[Decision, ...]
     dynamics: FlowDynamics | None = None
     filtered: Filtered | None = None
 
 
-def _fuse(run: _Run, decisions: list[Decision]) -> _Fused:
+def _fuse(run: _Run) -> _Fused:
     """Run the stages up to the filter; the training frames are gone when they are done."""
     params, train, stream = run.params, run.plan.train, iter(run.source)
     begun = time.perf_counter()
     training = _read_training(stream, train, run.source.shape, run.plan.runtime)
     run.seconds["read"] = time.perf_counter() - begun
-    decisions += [explain_training(train, len(run.source), params.train), *explain_input(training)]
+    on_frames = explain_training(train, len(run.source), params.train), *explain_input(training)
 
     centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
-    decisions += [explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows)]
+    on_flows = explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows)
     if not params.runs("identify"):
-        return _Fused(centroid.image, mean_of(training), centroid)
+        return _Fused(centroid.image, mean_of(training), centroid, (*on_frames, *on_flows))
 
     dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
-    decisions += explain_dynamics(dynamics)
+    decisions = *on_frames, *on_flows, *explain_dynamics(dynamics)
     if not params.runs("filter"):
-        return _Fused(centroid.image, mean_of(training), centroid, dynamics)
+        return _Fused(centroid.image, mean_of(training), centroid, decisions, dynamics)
 
     filtered = run.stage("filter", "filtered", lambda: _filter(run, centroid, dynamics, training, stream))
     mean = run.stage("filter", "mean", lambda: _temporal_mean(run.source))
     # The sharpness of frames that do not count is not measured.
     chosen = int(np.isfinite(filtered.sharpness).sum())
-    decisions.append(explain_frames(filtered, None if params.keep_best == 1 else chosen))
-    return _Fused(filtered.image, mean, centroid, dynamics, filtered)
+    on_weights = explain_frames(filtered, None if params.keep_best == 1 else chosen)
+    return _Fused(filtered.image, mean, centroid, (*decisions, on_weights), dynamics, filtered)
 
 
 def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
