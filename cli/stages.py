@@ -20,11 +20,10 @@ from turbrestore.io.images import read_image, write_image
 from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, check_output, check_space
 from turbrestore.io.pixels import check_depth
 from turbrestore.memory_plan import training_share
-from turbrestore.pipeline import step_counter
 from turbrestore.registration.centroid import Centroid, CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams, iterate_flows
 from turbrestore.runs.stage_files import load_artifact, load_flows, save_artifact, save_flows
-from turbrestore.runtime.steps import finish
+from turbrestore.runtime.steps import finish, step_counter
 
 from .inputs import open_input, read_input_image
 from .options import Flag, Machine, Selection, known_sigma, limits_of

@@ -23,7 +23,7 @@ from turbrestore.io.limits import Limits
 from turbrestore.io.output import check_output, check_space
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video
 from turbrestore.memory_plan import training_share
-from turbrestore.pipeline import Progress, step_counter
+from turbrestore.runtime.steps import Progress, step_counter
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import DynamicTextureParams, synthesize_like

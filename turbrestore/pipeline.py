@@ -31,7 +31,7 @@ from .runtime.allocator import returning_freed_memory
 from .runtime.device import explain_device
 from .runtime.runtime import DEFAULT, Runtime
 from .runtime.scratch import fill_stack, iter_frames, mean_of
-from .runtime.steps import finish
+from .runtime.steps import Progress, finish, step_counter
 from .runtime.tiling import HaloTile, cut_tile, halo_tiles
 from .settings import RestoreParams
 from .tiled_stages import join_filtered, tiled_centroid_steps
@@ -53,7 +53,6 @@ _LEAST_CONTRAST = 1 / 255
 # A blur wider than this share of the image leaves nothing to restore.
 _SIGMAS_A_SIDE = 8
 
-Progress = Callable[[str, int, int], None]
 Result = TypeVar("Result")
 
 
@@ -142,39 +141,6 @@ class _Run:
     def counter(self, stage: str, total: int) -> Callable[[object], None]:
         """Return the observer of the steps of one stage, which reports progress."""
         return step_counter(self.progress, stage, total)
-
-
-def step_counter(progress: Progress | None, stage: str, total: int) -> Callable[[object], None]:
-    """Turn ``progress(stage, done, total)`` into an observer of the states of one stage, which counts them.
-
-    Parameters
-    ----------
-    progress : callable or None
-    stage : str
-        Name of the stage.
-    total : int
-        Largest number of steps.
-
-    Returns
-    -------
-    callable
-        Takes a state, for :func:`turbrestore.runtime.steps.finish`.
-
-    Examples
-    --------
-    >>> observe = step_counter(lambda stage, done, total: print(stage, done, total), "filter", 5)
-    >>> observe("any state")
-    filter 1 5
-    """
-    done = 0
-
-    def observe(_: object) -> None:
-        nonlocal done
-        done = min(done + 1, total)
-        if progress is not None:
-            progress(stage, done, total)
-
-    return observe
 
 
 def _restored(run: _Run, on_machine: tuple[Decision, ...]) -> Restoration:

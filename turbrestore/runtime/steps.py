@@ -16,6 +16,8 @@ from typing import TypeVar
 
 State = TypeVar("State")
 Result = TypeVar("Result")
+# Called as ``progress(stage, done, total)``.
+Progress = Callable[[str, int, int], None]
 
 
 def finish(steps: Generator[State, None, Result], on_state: Callable[[State], None] | None = None) -> Result:
@@ -53,3 +55,36 @@ def finish(steps: Generator[State, None, Result], on_state: Callable[[State], No
             return end.value
         if on_state is not None:
             on_state(state)
+
+
+def step_counter(progress: Progress | None, stage: str, total: int) -> Callable[[object], None]:
+    """Turn ``progress(stage, done, total)`` into an observer of the states of one stage, which counts them.
+
+    Parameters
+    ----------
+    progress : callable or None
+    stage : str
+        Name of the stage.
+    total : int
+        Largest number of steps.
+
+    Returns
+    -------
+    callable
+        Takes a state, for :func:`finish`.
+
+    Examples
+    --------
+    >>> observe = step_counter(lambda stage, done, total: print(stage, done, total), "filter", 5)
+    >>> observe("any state")
+    filter 1 5
+    """
+    done = 0
+
+    def observe(_: object) -> None:
+        nonlocal done
+        done = min(done + 1, total)
+        if progress is not None:
+            progress(stage, done, total)
+
+    return observe
