@@ -110,7 +110,7 @@ def restore(
     plan = plan_memory(source.shape, params, runtime)
     _check_sigma(params.deconvolution.sigma, source.shape)
     if plan.runtime.scratch is not None:
-        check_space(plan.runtime.scratch / "scratch file", plan.scratch_bytes)
+        check_space(plan.runtime.scratch, plan.scratch_bytes)
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
     run = _Run(source, params, plan, tiles, store or NoStore(), progress)

@@ -156,6 +156,16 @@ def test_room_is_asked_for_with_a_margin(tmp_path):
         check_space(tmp_path / "o.png", free)
 
 
+def test_room_is_asked_for_in_the_folder_itself_or_that_of_a_file(tmp_path, monkeypatch):
+    asked, usage = [], namedtuple("usage", "total used free")
+    monkeypatch.setattr(
+        "turbrestore.io.output.shutil.disk_usage", lambda folder: asked.append(folder) or usage(0, 0, 0)
+    )
+    for path in (tmp_path, tmp_path / "o.png", tmp_path / "new"):
+        check_space(path, 1)
+    assert asked == [tmp_path.resolve()] * 3
+
+
 @pytest.mark.parametrize("kind", ["same", "symbolic", "hard", "through a folder"])
 def test_an_output_is_no_input_under_any_name(place, capsys, kind):
     data = (place / "clip.npy").read_bytes()

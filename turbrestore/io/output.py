@@ -64,7 +64,19 @@ def check_output(
 
 
 def check_space(path: str | os.PathLike[str], size: int) -> None:
-    """Raise StorageError unless ``size`` bytes, a tenth and a megabyte more are free in the folder of ``path``.
+    """Raise StorageError unless ``size`` bytes, a tenth and a megabyte more are free where ``path`` lies.
+
+    Parameters
+    ----------
+    path : path
+        A file that will be written, or a folder.
+    size : int
+        Bytes.
+
+    Raises
+    ------
+    StorageError
+        There is less space.
 
     Examples
     --------
@@ -73,10 +85,9 @@ def check_space(path: str | os.PathLike[str], size: int) -> None:
     ...
     turbrestore.core.errors.StorageError: result.png: needs ... MiB, found ... MiB free; make room on the disk
     """
-    folder = Path(os.path.realpath(path)).parent
-    needed = size + size // 10 + _SPARE
+    place, needed = Path(os.path.realpath(path)), size + size // 10 + _SPARE
     try:
-        total, _, free = shutil.disk_usage(folder)
+        total, _, free = shutil.disk_usage(place if place.is_dir() else place.parent)
     except OSError:
         return
     # Some file systems report no size.
