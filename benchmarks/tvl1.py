@@ -33,7 +33,7 @@ import numpy as np
 
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.dynamics.dynamic_texture import identify
-from turbrestore.dynamics.flow_model import predict_flow, project
+from turbrestore.dynamics.flow_model import predict_flow, project_deviation
 from turbrestore.metrics import endpoint_error
 from turbrestore.registration.contrast import normalise_contrast
 from turbrestore.registration.flow import FlowParams, iterate_flows
@@ -181,7 +181,8 @@ def compare_starts() -> None:
         found = tvl1_flows(frames, prepare_tvl1(reference)).flows
         dynamics = identify(found[:IDENTIFIED])
         before, own = found[IDENTIFIED - 1 : -1], found[IDENTIFIED:]
-        predicted = np.stack([predict_flow(dynamics, project(dynamics, flow)) for flow in before])
+        states = [project_deviation(dynamics, flow - dynamics.mean_flow) for flow in before]
+        predicted = np.stack([predict_flow(dynamics, state) for state in states])
         starts = {"nothing": np.zeros_like(own), "frame before": before, "prediction": predicted, "frame itself": own}
         print(f"## {name}\n\n| levels | start | its error, px | CPU, ms a frame | warps | error, px |")
         print("|---:|---|---:|---:|---:|---:|")

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_flow
+from ..core.arrays import FloatArray
 from ..core.errors import DataError
 from ..display.plots import plot_dynamics
 from ..display.preview import preview
@@ -130,11 +130,6 @@ class FlowDynamics:
         return values[np.argsort(-np.abs(values), kind="stable")]
 
     @property
-    def initial_state(self) -> Float64Array:
-        """State of the first flow, shape (n,)."""
-        return self.states[:, 0]
-
-    @property
     def last_state(self) -> Float64Array:
         """State of the last flow, shape (n,)."""
         return self.states[:, -1]
@@ -156,47 +151,16 @@ class FlowDynamics:
         return np.diag(self.singular_values[: self.rank] ** 2 / (self.frame_count - 1))
 
 
-def project(dynamics: FlowDynamics, flow: ArrayLike) -> Float64Array:
+def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64Array:
     """State of a flow: Cᵀ (W − W̄), the least-squares solution of eq. 10 since Cᵀ C = I (paper 3, eq. 9).
 
-    Parameters
-    ----------
-    dynamics : FlowDynamics
-    flow : array_like, shape (H, W, 2)
-        Pixels.
-
-    Returns
-    -------
-    ndarray, float64, shape (n,)
-
-    Raises
-    ------
-    DataError
-        The flow has another shape, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> flows = np.zeros((4, 2, 2, 2), np.float32); flows[..., 0] = np.array([1, -1, 1, -1])[:, None, None]
-    >>> dynamics = identify(flows)
-    >>> np.abs(project(dynamics, flows[0])).round(3)
-    array([2.])
-    """
-    flow = check_flow(flow)
-    if flow.shape != dynamics.mean_flow.shape:
-        raise DataError(f"flow: expected shape {dynamics.mean_flow.shape}, found {flow.shape}")
-    return project_deviation(dynamics, flow - dynamics.mean_flow)
-
-
-def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64Array:
-    """State of a flow that is given as its deviation W − W̄ from the mean; nothing is checked.
+    The arguments are not checked.
 
     Parameters
     ----------
     dynamics : FlowDynamics
     deviation : ndarray, float32, shape (H, W, 2)
-        Pixels.
+        W − W̄, pixels.
 
     Returns
     -------
@@ -205,9 +169,10 @@ def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64A
     Examples
     --------
     >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> dynamics = identify(np.zeros((3, 2, 2, 2), np.float32))
-    >>> project_deviation(dynamics, dynamics.mean_flow)
-    array([], dtype=float64)
+    >>> flows = np.zeros((4, 2, 2, 2), np.float32); flows[..., 0] = np.array([1, -1, 1, -1])[:, None, None]
+    >>> dynamics = identify(flows)
+    >>> np.abs(project_deviation(dynamics, flows[0] - dynamics.mean_flow)).round(3)
+    array([2.])
     """
     # C is stored column by column.
     modes, flat, state = dynamics.C.T, deviation.reshape(-1), np.zeros(dynamics.C.shape[1])

@@ -165,7 +165,7 @@ def pass_over(
         yield from tracked
 
 
-def register(image: FloatArray, measured: FloatArray, state: Gaussian, settings: PassSettings) -> RegisteredFrame:
+def _register(image: FloatArray, measured: FloatArray, state: Gaussian, settings: PassSettings) -> RegisteredFrame:
     """Warp a frame onto the image by Ŵ and estimate its noise Z (eq. 15).
 
     Parameters
@@ -237,7 +237,7 @@ def _track(item: _Item, state: Gaussian, innovation: float, settings: PassSettin
     if image is None or item.measured is None:
         return TrackedFrame(frame, state, innovation, None)
     if settings.backend.is_cpu:
-        registered = register(image, item.measured, state, settings)
+        registered = _register(image, item.measured, state, settings)
         return TrackedFrame(frame, state, innovation, lambda: registered)
     measured = item.measured
-    return TrackedFrame(frame, state, innovation, lambda: register(image, measured, state, settings))
+    return TrackedFrame(frame, state, innovation, lambda: _register(image, measured, state, settings))
