@@ -8,7 +8,7 @@ from flow_systems import uneven_flows
 
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import flow_of
-from turbrestore.filtering.flow_state import estimate_flow, predict_state, project_measured, update_state
+from turbrestore.filtering.flow_state import blend_flows, predict_state, project_measured, update_state
 from turbrestore.filtering.kalman import Gaussian, predict, update
 
 
@@ -77,5 +77,5 @@ def test_a_model_without_states_learns_nothing(dynamics):
 def test_the_estimate_lies_between_model_and_measurement(rng):
     modelled, measured = rng.random((2, 3, 4, 2), np.float32)
     for share, expected in ((0, modelled), (1, measured), (0.25, 0.75 * modelled + 0.25 * measured)):
-        found = estimate_flow(modelled, measured, np.full((3, 4, 2), share, np.float32))
+        found = blend_flows(modelled, measured, np.full((3, 4, 2), share, np.float32))
         np.testing.assert_allclose(found, expected, atol=1e-6)

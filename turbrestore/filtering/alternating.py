@@ -254,7 +254,7 @@ def _iterate(
     image = settled_image = backend.load_pixels(at.state.image)
     flow, records, block, flows_measured = at.state.flow, list(at.records), deque[Frame](), at.flows_measured
     for number, tracked in enumerate(pass_over(frames, starts, reference, at.state.flow, settled, settings)):
-        image, record = _fuse(image, tracked, settings)
+        image, record = _update_image(image, tracked, settings)
         if number < settled:
             settled_image, flow = image, tracked.state
             records.append(record)
@@ -267,7 +267,7 @@ def _iterate(
     return _Position(state, tuple(records), backend.store_image(image), block, flows_measured)
 
 
-def _fuse(image: PixelStacks, tracked: TrackedFrame, settings: PassSettings) -> tuple[PixelStacks, FrameRecord]:
+def _update_image(image: PixelStacks, tracked: TrackedFrame, settings: PassSettings) -> tuple[PixelStacks, FrameRecord]:
     """Update the image by a frame (eqs. 14a, 14c, 15 and 16)."""
     if tracked.registered is None:
         return image, FrameRecord(tracked.state.mean, 0.0, tracked.innovation, np.nan, 0.0)

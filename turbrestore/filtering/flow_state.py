@@ -137,15 +137,15 @@ def update_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDyn
     return state, (max(squared, 0.0) / measured.size) ** 0.5
 
 
-def estimate_flow(modelled: Stack, measured: Stack, motion_share: Stack) -> Stack:
-    """Ŵ = C ξ̂ + G (W^meas − C ξ̂), the mean of the flow C ξ + r of eq. 10.
+def blend_flows(modelled: Stack, measured: Stack, motion_share: Stack) -> Stack:
+    """Estimated flow ``Ŵ = W̄ + C ξ̂ + G (W^meas − W̄ − C ξ̂)``, the mean of the flow ``W̄ + C ξ + r`` (eq. 10).
 
     Parameters
     ----------
     modelled, measured : array, float32, shape (H, W, 2)
         W̄ + C ξ̂ and W^meas, pixels.
     motion_share : array, float32, shape (H, W, 2)
-        G for both components; 0 gives Ŵ = C ξ̂ as printed in the paper.
+        G for both components; with 0, Ŵ is the flow of the model, as printed in the paper.
 
     Returns
     -------
@@ -153,7 +153,7 @@ def estimate_flow(modelled: Stack, measured: Stack, motion_share: Stack) -> Stac
 
     Examples
     --------
-    >>> float(estimate_flow(np.float32(1), np.float32(2), np.float32(0.75)))
+    >>> float(blend_flows(np.float32(1), np.float32(2), np.float32(0.75)))
     1.75
     """
     return modelled + motion_share * (measured - modelled)

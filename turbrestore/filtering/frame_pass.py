@@ -24,7 +24,7 @@ from ..runtime.runtime import Runtime
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import in_batches, map_in_turns
 from .array_backend import ArrayBackend
-from .flow_state import ProjectedFlow, estimate_flow, predict_state, project_measured, update_state
+from .flow_state import ProjectedFlow, blend_flows, predict_state, project_measured, update_state
 from .frame_noise import FrameStatistics, frame_noise_variance
 from .kalman import Gaussian
 
@@ -146,7 +146,7 @@ def pass_over(
         measured = _take_known(items) if reference is None else _measure_flows(items, reference)
         return [_project(item, settings.dynamics) for item in measured]
 
-    def update(items: list[_Item]) -> list[tuple[_Item, Gaussian, float]]:
+    def update_states(items: list[_Item]) -> list[tuple[_Item, Gaussian, float]]:
         nonlocal state
         updated = []
         for item in items:
@@ -161,7 +161,7 @@ def pass_over(
 
     pairs = zip(iter_frames(frames), iter_frames(starts), strict=False)
     items = (_Item(*pair, number >= settled) for number, pair in enumerate(pairs))
-    for tracked in map_in_turns(measure, update, track, in_batches(items, batch), threads):
+    for tracked in map_in_turns(measure, update_states, track, in_batches(items, batch), threads):
         yield from tracked
 
 
@@ -184,7 +184,7 @@ def _register(image: FloatArray, measured: FloatArray, state: Gaussian, settings
     """
     backend = settings.backend
     modelled = flow_of(settings.dynamics, state.mean)
-    flow = estimate_flow(backend.ops.load(modelled), backend.ops.load(measured), settings.motion_share)
+    flow = blend_flows(backend.ops.load(modelled), backend.ops.load(measured), settings.motion_share)
     channels, grey, seen = backend.warp(image, flow)
     noise, sharpness = frame_noise_variance(grey, flow, seen, settings.statistics, settings.sharpness, backend.ops)
     return RegisteredFrame(channels, noise, sharpness)
