@@ -46,11 +46,11 @@ from .wording import (
     explain_training,
 )
 
-# Share of the training frames that show every pixel of a cropped image.
+# Every pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
-# A contrast below one grey level of an 8-bit camera is no scene.
+# Frames with less contrast than one grey level of an 8-bit camera show no scene.
 _LEAST_CONTRAST = 1 / 255
-# A blur wider than this share of the image leaves nothing to restore.
+# The shorter side of the image is at least this many widths of the blur; a wider blur leaves nothing to restore.
 _SIGMAS_A_SIDE = 8
 
 Result = TypeVar("Result")
@@ -65,7 +65,7 @@ def restore(
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
-    Frames are read in order.  Only the training frames stay in memory, or in a scratch file where they do not fit.
+    Frames are read in order.  Only the training frames are kept, in memory or, if they do not fit, in a scratch file.
 
     Parameters
     ----------
@@ -76,8 +76,8 @@ def restore(
     runtime : Runtime
         What the restoration may use of the machine.
     store : Store, optional
-        Keeps the results of the stages and knows those of an earlier run of the same frames and settings, which are
-        taken over as they are; the image is then the same, bit for bit.
+        Keeps the results of the stages.  The results of an earlier run of the same frames and settings are reused, and
+        the restored image is then the same, bit for bit.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
 
@@ -92,7 +92,7 @@ def restore(
     ConfigurationError
         More training frames than frames, a device that is not there, or a memory limit that cannot be kept.
     StorageError
-        There is no room for a scratch file.
+        The disk has no space for a scratch file.
 
     Examples
     --------
@@ -121,7 +121,7 @@ def restore(
 
 @dataclass(frozen=True)
 class _Run:
-    """What every stage needs, and the time that each has taken."""
+    """Arguments that every stage shares, and the wall time of the stages that have run."""
 
     source: FrameSource
     params: RestoreParams
@@ -132,7 +132,7 @@ class _Run:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:
-        """Take the result of that name from the store, or compute it; the time counts as that of the stage."""
+        """Return a result from the store, or compute it, and add the time that this takes to that of the stage."""
         begun = time.perf_counter()
         result = self.store.get(name, compute)
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begun
@@ -173,7 +173,7 @@ def _restored(run: _Run, on_machine: tuple[Decision, ...]) -> Restoration:
 
 @dataclass(frozen=True)
 class _Fused:
-    """What the stages before the deconvolution have found."""
+    """Results of the stages before the deconvolution."""
 
     image: FloatArray
     mean: FloatArray
@@ -184,7 +184,7 @@ class _Fused:
 
 
 def _fuse(run: _Run) -> _Fused:
-    """Run the stages up to the filter; the training frames are gone when they are done."""
+    """Run the stages up to the filter; the training frames are freed when this function returns."""
     params, train, stream = run.params, run.plan.train, iter(run.source)
     begun = time.perf_counter()
     training = _read_training(stream, train, run.source.shape, run.plan.runtime)
@@ -203,7 +203,7 @@ def _fuse(run: _Run) -> _Fused:
 
     filtered = run.stage("filter", "filtered", lambda: _filter(run, centroid, dynamics, training, stream))
     mean = run.stage("filter", "mean", lambda: _temporal_mean(run.source))
-    # The sharpness of frames that do not count is not measured.
+    # The sharpness is NaN for frames that do not count.
     chosen = int(np.isfinite(filtered.sharpness).sum())
     on_weights = explain_frames(filtered, None if params.keep_best == 1 else chosen)
     return _Fused(filtered.image, mean, centroid, (*decisions, on_weights), dynamics, filtered)
@@ -252,7 +252,7 @@ def _filter_tile(run: _Run, centroid: Centroid, training: FloatArray, counted: n
 
 
 def _observe_filter(run: _Run, tile: int, step: FilterStep) -> None:
-    """Report progress, and keep checkpoints of whole frames."""
+    """Report progress, and give the store the checkpoints, unless the frames are filtered in tiles."""
     flows = len(run.source) * run.params.filter.inner_iterations - run.plan.train
     if run.progress is not None:
         run.progress("filter", tile * flows + step.flows_measured, max(len(run.tiles), 1) * flows)
@@ -261,7 +261,7 @@ def _observe_filter(run: _Run, tile: int, step: FilterStep) -> None:
 
 
 def _counted(frames: Iterator[FloatArray], counted: np.ndarray) -> Iterator[FloatArray | None]:
-    """Put None in the place of frames that do not count."""
+    """Replace frames that do not count by None."""
     return (frame if counts else None for frame, counts in zip(frames, counted, strict=True))
 
 
@@ -285,7 +285,7 @@ def _crop(image: FloatArray, flows: FloatArray, border: str, deblurred: Deblurre
     whole = (0, 0, image.shape[1], image.shape[0])
     if border == "keep":
         return whole, explain_border(float(seen.min()), None)
-    # Pixels within one width of the border are deblurred from light that fell beyond it.
+    # Part of the light of pixels within one width of the blur from the border fell outside the frames.
     sigma = 0.0 if deblurred is None else deblurred.deconvolution.sigma
     crop = well_seen(seen, _SEEN, int(np.ceil(sigma)), MIN_SIDE)
     return crop, explain_border(float(seen.min()), None if crop == whole else crop)

@@ -40,8 +40,8 @@ def test_ascent_is_a_relaxed_projection(graph, relaxation):
     for _ in range(5):
         image = rng.normal(size=graph.shape).astype(np.float32)
         p += relaxation * (pairs.project(graph, p + 0.7 * pairs.gradient(graph, image)) - p)
-        dual, pull = penalty.ascend(dual, image, 0.7, relaxation)
-        assert pull == pytest.approx(-pairs.divergence(graph, p), abs=2e-5)
+        dual, adjoint = penalty.ascend(dual, image, 0.7, relaxation)
+        assert adjoint == pytest.approx(-pairs.divergence(graph, p), abs=2e-5)
         assert p_of(graph, dual) == pytest.approx(p, abs=2e-5)
     assert np.abs(p).max() > 0.5
 
@@ -54,8 +54,8 @@ def test_threads_change_nothing(graph, monkeypatch):
             penalty = NonlocalPenalty(graph, team)
             dual = penalty.zero_dual(image)
             for _ in range(3):
-                dual, pull = penalty.ascend(dual, image, 0.7, 1.4)
-            found.append(pull.tobytes())
+                dual, adjoint = penalty.ascend(dual, image, 0.7, 1.4)
+            found.append(adjoint.tobytes())
     assert len(set(found)) == 1
 
 

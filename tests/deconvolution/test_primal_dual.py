@@ -72,10 +72,10 @@ def test_one_step_is_that_of_dense_algebra(margin, number):
     # Moreau: the proximal step of th* is what the one of h/t, a weighted mean of pixels, leaves.
     ahead, seen, f = q.ravel() + t * blur @ (2 * expected - u.ravel()), problem.seen.ravel(), problem.observed.ravel()
     nearest = (30.0 * seen * f + ahead) / (30.0 * seen + t)
-    assert unrelaxed(after.pressure, q) == pytest.approx(ahead - t * nearest, abs=2e-4)
+    assert unrelaxed(after.data_dual, q) == pytest.approx(ahead - t * nearest, abs=2e-4)
     ascent = (p.ravel() + differences @ (2 * expected - u.ravel()) / (tau * TV.norm_squared)).reshape(2, 8, 8)
-    assert unrelaxed(after.dual, p) == pytest.approx(project(ascent.astype(np.float32)).ravel(), abs=1e-4)
-    assert after.pull == pytest.approx(adjoint(after.dual), abs=1e-5)
+    assert unrelaxed(after.penalty_dual, p) == pytest.approx(project(ascent.astype(np.float32)).ravel(), abs=1e-4)
+    assert after.adjoint == pytest.approx(adjoint(after.penalty_dual), abs=1e-5)
     assert after.number == number + 1
 
 
@@ -84,17 +84,17 @@ def test_the_start_is_that_of_dense_algebra():
     start, blurred = PrimalDual(TV).start(problem, u), dense_blur(problem) @ u.ravel()
     s = 1 / (primal_dual.PRIMAL_STEP * np.sqrt(TV.norm_squared))
     assert start.blurred.ravel() == pytest.approx(blurred, abs=1e-5)
-    assert start.pressure == pytest.approx(30.0 * problem.seen * (start.blurred - problem.observed), abs=1e-4)
-    assert start.dual == pytest.approx(project(s * gradient(u)), abs=1e-5)
-    assert start.pull == pytest.approx(adjoint(start.dual), abs=1e-5)
+    assert start.data_dual == pytest.approx(30.0 * problem.seen * (start.blurred - problem.observed), abs=1e-4)
+    assert start.penalty_dual == pytest.approx(project(s * gradient(u)), abs=1e-5)
+    assert start.adjoint == pytest.approx(adjoint(start.penalty_dual), abs=1e-5)
 
 
 def test_where_all_is_seen_the_first_step_solves_the_data_term_exactly():
     problem = small_problem(4, 30.0, margin=0)
     start = PrimalDual(TV).start(problem, np.random.default_rng(5).random((8, 8)).astype(np.float32))
-    pull, blur = start.pull.copy(), dense_blur(problem)
+    slope, blur = start.adjoint.copy(), dense_blur(problem)
     tau = primal_dual.PRIMAL_STEP / np.sqrt(TV.norm_squared)
-    target = (start.image - tau * pull).ravel()
+    target = (start.image - tau * slope).ravel()
     # Least squares: ‖(v − target)/√τ‖² + ‖√λ(Bv − f)‖².
     system = np.concatenate([np.eye(64) / np.sqrt(tau), np.sqrt(30.0) * blur])
     right = np.concatenate([target / np.sqrt(tau), np.sqrt(30.0) * problem.observed.ravel()])

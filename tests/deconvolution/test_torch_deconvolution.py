@@ -65,9 +65,9 @@ class TestWeights:
         p, q = here.zero_dual(u), there.zero_dual(torch.from_numpy(u).to(device))
         for _ in range(3):
             u = rng.normal(size=guide.shape).astype(np.float32)
-            p, pull = here.ascend(p, u, 0.7, 1.8)
+            p, adjoint = here.ascend(p, u, 0.7, 1.8)
             q, found = there.ascend(q, torch.from_numpy(u).to(device), 0.7, 1.8)
-            assert found.cpu().numpy() == pytest.approx(pull, abs=5e-4)
+            assert found.cpu().numpy() == pytest.approx(adjoint, abs=5e-4)
         assert there.value(torch.from_numpy(u).to(device)) == pytest.approx(here.value(u), rel=1e-4)
 
 

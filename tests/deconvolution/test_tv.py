@@ -21,9 +21,9 @@ def test_ascent_is_a_relaxed_projection(relaxation):
     raised = p + 0.7 * local_gradient(u, OPS)
     nearest = np.where((length := np.hypot(*raised)) > 1, raised / length, raised)
     expected = p + relaxation * (nearest - p)
-    found, pull = penalty.ascend(p, u, 0.7, relaxation)
+    found, adjoint = penalty.ascend(p, u, 0.7, relaxation)
     assert found == pytest.approx(expected, abs=1e-5)
-    assert pull == pytest.approx(-local_divergence(expected, OPS), abs=1e-5)
+    assert adjoint == pytest.approx(-local_divergence(expected, OPS), abs=1e-5)
     assert not penalty.zero_dual(u).any()
 
 

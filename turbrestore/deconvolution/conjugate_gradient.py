@@ -3,14 +3,14 @@
 Symbols as in :mod:`turbrestore.deconvolution.problem`, and
 
 m : mean of the observed pixels.
-R : penalty ``½⟨u − m, R(u − m)⟩``; diagonal in Fourier: −Δ (wiener) or 1 (tikhonov).
+R : operator of the penalty ``½⟨u − m, R(u − m)⟩``, diagonal in Fourier space: −Δ (wiener) or 1 (tikhonov).
 d : search direction; r : residual of the normal equations.
 
-The normal equations are ``(λBᵀMB + R)(u − m) = λBᵀM(f − m)``, and ``(λBᵀB + R)⁻¹``, which is the solution where M = 1,
-is the preconditioner.  Both penalties are relative to m, so that a constant image stays what it is.
+The normal equations are ``(λBᵀMB + R)(u − m) = λBᵀM(f − m)``.  The preconditioner is ``(λBᵀB + R)⁻¹``, which solves
+them if M = 1 everywhere.  Both penalties act on u − m, so a constant image is not changed.
 
-All iterates are half-spectra, and inner products are those of the images by Parseval's theorem, so that an iteration
-needs two transforms.
+All iterates are stored as half-spectra, and inner products of images are computed from these by Parseval's theorem.  An
+iteration therefore needs only two Fourier transforms.
 """
 
 from __future__ import annotations
@@ -25,14 +25,27 @@ from ..core.noise import estimate_noise
 from .array_ops import Array
 from .problem import Problem
 
-# Below this share of the energy of the data, the residual consists of rounding errors.
+# A residual below this share of the energy of the data consists of rounding errors.
 ROUNDING = 1e-14
-# Steps to the Wiener solution that nltv and tv start from; later ones change it near the border only.
+# Iterations for the Wiener solution that nltv and tv start from; further ones change it only near the border.
 _START_STEPS = 40
 
 
 class GradientState(NamedTuple):
-    """Transforms of u − m, r and d; the preconditioner; ⟨r, preconditioned r⟩, and its value at a solution."""
+    """State between two iterations.
+
+    Attributes
+    ----------
+    problem : Problem
+    deviation, residual, direction : array, complex64, shape (P, Q // 2 + 1)
+        Half-spectra of u − m, r and d.
+    inverse : array, float32, shape (P, Q // 2 + 1)
+        Preconditioner.
+    decrease : float
+        Inner product of r and the preconditioned r.
+    enough : float
+        Value of ``decrease`` at which the problem is solved to rounding.
+    """
 
     problem: Problem
     deviation: Array
@@ -44,7 +57,7 @@ class GradientState(NamedTuple):
 
     @property
     def image(self) -> Array:
-        """u; every access transforms it."""
+        """Image u, transformed at every access."""
         return self.problem.ops.back(self.deviation, self.problem.shape) + self.problem.mean
 
 
@@ -60,9 +73,9 @@ class ConjugateGradients:
 
     symbol: Array
 
-    # Iterations that one change is measured over: a single step may be short by chance.
+    # Number of iterations over which a change is measured, as a single step may be short by chance.
     window: ClassVar[int] = 2
-    # Conjugate gradients do not oscillate, so an image at rest is no reason to stop.
+    # Conjugate gradients do not oscillate, so the test for an image at rest is not needed.
     rest: ClassVar[int] = 0
 
     def start(self, problem: Problem) -> GradientState:
@@ -78,12 +91,14 @@ class ConjugateGradients:
         return GradientState(problem, deviation, residual, direction, inverse, decrease, enough)
 
     def step(self, problem: Problem, state: GradientState) -> GradientState:
-        """One iteration; a solved problem stays as it is.
+        """Do one iteration; the state of a solved problem is returned unchanged.
+
+        With P the preconditioner:
 
         a = ⟨r, Pr⟩ / ⟨d, (λBᵀMB + R)d⟩
         u ← u + a d
         r ← r − a (λBᵀMB + R)d
-        d ← Pr + (⟨r, Pr⟩ / its last value) d,  P the preconditioner
+        d ← Pr + (⟨r, Pr⟩ / its previous value) d
         """
         if state.decrease <= state.enough:
             return state
@@ -129,12 +144,12 @@ def quadratic_solver(problem: Problem, method: str) -> ConjugateGradients:
 
 
 def wiener_image(problem: Problem) -> Array:
-    """Wiener solution with its own fidelity, which nltv and tv start from.
+    """Wiener solution that nltv and tv start from, with a fidelity of its own.
 
     Parameters
     ----------
     problem : Problem
-        Its fidelity is not used.
+        Its fidelity is replaced by :func:`turbrestore.blur.psf.wiener_fidelity`.
 
     Returns
     -------
@@ -160,7 +175,7 @@ def wiener_image(problem: Problem) -> Array:
 def _inner(problem: Problem, a: Array, b: Array) -> float:
     """Inner product of two images from their half-spectra, in double precision.
 
-    The other half repeats all columns but the first and, of an even width, the last.
+    The other half mirrors all columns except the first and, if the width is even, the last, so these count only once.
     """
     (height, width), arrays = problem.shape, problem.ops.arrays
     columns = (a.conj() * b).real.sum(0, dtype=arrays.float64)

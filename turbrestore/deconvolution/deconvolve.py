@@ -50,7 +50,7 @@ METHODS = ("nltv", "tv", "wiener", "tikhonov")
 BOUNDARIES = ("unknown", "periodic")
 CHANNELS = ("luminance", "each")
 
-# Smaller images are sharpened one after the other: their transforms are shorter than a wait for the interpreter lock.
+# Smaller images are sharpened one after another: their transforms take less time than waiting for the interpreter lock.
 _PARALLEL_PIXELS = 1 << 15
 
 DeconvolutionSteps = Generator[DeconvolutionState, None, "Deconvolution"]
@@ -65,29 +65,29 @@ class DeconvolutionParams:
     method : {"nltv", "tv", "wiener", "tikhonov"}
         Penalty: nonlocal TV, TV, squared gradient, squared deviation from the mean.
     sigma : float, optional
-        Width of the blur, pixels; :func:`deconvolve` takes it where it is given no blur.  By default
-        :func:`turbrestore.blind.remove_blur.remove_blur` estimates the width.
+        Width of the blur, pixels.  :func:`deconvolve` uses it if it is called without a blur;
+        :func:`turbrestore.blind.remove_blur.remove_blur` estimates the width if it is not given.
     exponent : float, optional
-        Shape of a blur of known width: 2 is a Gaussian, 5/3 turbulence; see ``turbrestore.blur.psf.blur_otf``.  By
-        default 2 for a given width, and 5/3 for one that is estimated.
+        Shape of the blur: 2 is a Gaussian, 5/3 turbulence; see ``turbrestore.blur.psf.blur_otf``.  By default 2 if the
+        width is given, and 5/3 if it is estimated.
     fidelity : float, optional
-        λ: more is sharper and noisier; by default from the noise of the image, see
-        ``turbrestore.deconvolution.problem.automatic_fidelity``.
+        Weight λ of the data: a larger one gives a sharper and noisier image.  By default it is chosen from the noise
+        of the image, see ``turbrestore.deconvolution.problem.automatic_fidelity``.
     iterations : int
         Largest number of iterations.
     tolerance : float
-        Stop when no tile of 64×64 pixels is predicted to change by more than this any more, relative to the brightest
-        tile; see ``turbrestore.deconvolution.stopping``.  nltv and tv, whose images oscillate, also stop when no tile
-        has changed by more than this for 50 iterations.
+        Stop when every tile of 64×64 pixels is predicted to change by at most this from then on, relative to the
+        brightest tile; see ``turbrestore.deconvolution.stopping``.  nltv and tv, whose images oscillate, also stop when
+        no tile has changed by more than this for 50 iterations.
     boundary : {"unknown", "periodic"}
-        What lies beyond the border: pixels to be found, or the image itself.
+        What lies beyond the border: unknown pixels, which are estimated too, or the image repeated periodically.
     channels : {"luminance", "each"}
-        Of a colour image, deblur luminance and keep chroma, or deblur every channel.
+        For a colour image, deblur the luminance and keep the chroma, or deblur every channel.
     sharpen_guide : bool
-        Compare patches of the guide after a Wiener deconvolution, not of the blurred guide as in the paper: sharp
-        patches tell better which pixels belong together (0.2 to 4 dB on photographs, brick and text).
+        Compare patches of the guide after a Wiener deconvolution instead of the blurred guide as in the paper.  Sharp
+        patches show better which pixels are similar; this gains 0.2 to 4 dB on photographs, brick and text.
     weights : NonlocalParams
-        Nonlocal weights.
+        Settings of the nonlocal weights.
     """
 
     method: Literal["nltv", "tv", "wiener", "tikhonov"] = "nltv"
@@ -137,12 +137,12 @@ class Deconvolution:
     converged : bool
         Whether the predicted change fell below the tolerance, or the image was at rest.
     recorded : ndarray, int64, shape (n,)
-        Iterations at which the next two were recorded.
+        Iterations at which ``objective`` and ``changes`` were recorded.
     objective : ndarray, float64, shape (n,)
         Value of the minimised energy, summed over channels.
     changes : ndarray, float64, shape (n,)
-        Change for each iteration of the tile that changes most, relative to the brightest tile.  Of nltv and tv with an
-        unknown boundary the outermost pixels do not count, as many as the blur is wide.
+        Change per iteration of the tile that changes most, relative to the brightest tile.  For nltv and tv with an
+        unknown boundary, a border as wide as the blur is not counted.
     """
 
     image: FloatArray
@@ -192,14 +192,14 @@ def deconvolve(
     image : array_like, shape (H, W) or (H, W, 3)
         f.
     sigma_or_psf : float, BlurEstimate, or array_like of shape (h, w) with odd sizes, optional
-        Width of a blur of shape ``params.exponent``, pixels; an estimate, of which the removable width and, unless
-        ``params.exponent`` is given, the shape are taken; or a sampled point spread function.  By default
-        ``params.sigma``.  Without blur (0, or a single pixel) the image is returned as it is.
+        Width of a blur of shape ``params.exponent``, pixels; or an estimate, whose removable width is used, with its
+        shape unless ``params.exponent`` is given; or a sampled point spread function.  By default ``params.sigma``.
+        Without blur (0, or a single pixel) the image is returned unchanged.
     params : DeconvolutionParams, optional
         Method and settings.
     guide : array_like, shape (H, W) or (H, W, 3), optional
-        Image that nonlocal weights are taken from, as blurred as ``image``; by default ``image``.  The paper takes the
-        centroid.
+        Image from which the nonlocal weights are computed, with the same blur as ``image``; by default ``image``.  The
+        paper uses the centroid.
     runtime : Runtime
         Threads and device.
 
@@ -238,7 +238,7 @@ def deconvolve_steps(
     Yields
     ------
     DeconvolutionState
-        After every iteration; nothing where there is no blur to remove.
+        After every iteration; none if there is no blur to remove.
 
     Returns
     -------
@@ -302,14 +302,14 @@ def whole_image_fidelity(image: ArrayLike, params: DeconvolutionParams | None = 
     Returns
     -------
     float
-        ``params.fidelity`` where it is given, else λ from the noise of the image.
+        ``params.fidelity`` if it is given, else λ from the noise of the image.
 
     Notes
     -----
-    Deconvolved with the λ and the ``weights.h`` of the whole image, a tile agrees with the whole at 99 % of its pixels
-    within .01, away from a halo of 96 pixels.  The others have neighbours of similar patches that differ, because each
-    tile sharpens its part of the guide by itself.  With a guide that is sharpened before (``method="wiener"``) and
-    ``sharpen_guide=False`` all pixels agree.
+    If a tile is deconvolved with the λ and the ``weights.h`` of the whole image, 99 % of its pixels outside a halo of
+    96 pixels agree with the whole image within .01.  For the other pixels, other patches are the most similar ones,
+    because each tile sharpens its own part of the guide.  If the guide of the whole image is sharpened beforehand
+    (``method="wiener"``) and ``sharpen_guide`` is False, all pixels agree.
 
     Examples
     --------
@@ -357,7 +357,7 @@ def _nonlocal_penalty(guide: FloatArray, weights: NonlocalParams, resources: _Re
 def _sharpened(
     problems: list[Problem], guide: FloatArray | None, params: DeconvolutionParams, resources: _Resources
 ) -> tuple[list[Array], FloatArray]:
-    """Wiener solutions to start from, and the image whose patches are compared: by default the mean of the channels."""
+    """Return the Wiener solutions to start from, and the image for patches, by default the mean of the channels."""
     ops, blurred = problems[0].ops, list(problems)
     if guide is not None and params.sharpen_guide and params.method == "nltv":
         blurred.append(dataclasses.replace(problems[0], observed=ops.load(guide)))

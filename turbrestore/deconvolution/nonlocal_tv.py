@@ -75,13 +75,13 @@ class NonlocalPenalty:
     def ascend(self, p: PairDual, u: FloatArray, step: float, relaxation: float) -> tuple[PairDual, FloatArray]:
         """``p + ρ(p' − p)`` with p' the projection of ``p + s∇_w u`` on |p|(x) ≤ 1, and −div_w of it."""
         graph, scaled = self.graph, step * u.ravel()
-        pairs, (squares, pull) = (graph.starts, graph.heads, graph.roots), np.zeros((2, u.size), np.float32)
+        pairs, (squares, adjoint) = (graph.starts, graph.heads, graph.roots), np.zeros((2, u.size), np.float32)
         change = p.lag + scaled
         self._over_bands(lambda band: add_gradient(p.factor, change, *pairs, band, p.values, squares))
         factor = np.asarray(1 - relaxation + relaxation / np.sqrt(squares).clip(1), np.float32)
         p = PairDual(p.values, factor, (relaxation - 1) * scaled)
-        self._over_bands(lambda band: add_adjoint(p.factor, p.lag, *pairs, band, p.values, pull))
-        return p, pull.reshape(u.shape)
+        self._over_bands(lambda band: add_adjoint(p.factor, p.lag, *pairs, band, p.values, adjoint))
+        return p, adjoint.reshape(u.shape)
 
     def value(self, u: FloatArray) -> float:
         """J(u)."""
@@ -146,13 +146,13 @@ def add_adjoint(
     roots: FloatArray,
     band: NDArray[np.int64],
     values: FloatArray,
-    pull: FloatArray,
+    adjoint: FloatArray,
 ) -> None:
     """Add ``Kᵀ(ga + Kl)`` of the pairs of a band to their pixels.
 
     Parameters
     ----------
-    factor, lag, pull : ndarray, float32, shape (H · W,)
+    factor, lag, adjoint : ndarray, float32, shape (H · W,)
         g, l and the sum.
     starts, heads, roots, band, values : ndarray
         As of :func:`add_gradient`.
@@ -165,8 +165,8 @@ def add_adjoint(
             more = (lag[head] - own) * root
             net = (factor[head] * back[pair] - share * there[pair] - (more + more)) * root
             total += net
-            pull[head] -= net
-        pull[tail] += total
+            adjoint[head] -= net
+        adjoint[tail] += total
 
 
 @jit

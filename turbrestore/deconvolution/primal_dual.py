@@ -3,28 +3,38 @@
 Symbols as in :mod:`turbrestore.deconvolution.problem`, and
 
 K : gradient of the penalty ``J(u) = Σ_x |Ku|(x)``; p : dual variable of the penalty.
-q : dual variable of the data, on the pixels; in the end λM(Bu − f).
+q : dual variable of the data term, an image; at the solution q = λM(Bu − f).
 τ, s, t : step sizes of u, p and q; ρ : over-relaxation.
 
+Iteration
+---------
 With ``h(z) = λ/2 ‖M(z − f)‖²`` the problem is the saddle point ``min_u max_{p,q} ⟨Ku, p⟩ + ⟨Bu, q⟩ − h*(q)`` over
-|p|(x) ≤ 1.  Primal-dual splitting (Chambolle and Pock 2011) in the metric P = I/τ + tBᵀB:
+|p|(x) ≤ 1.  It is found by primal-dual splitting (Chambolle and Pock 2011) in the metric P = I/τ + tBᵀB:
 
     u' = u − P⁻¹(Kᵀp + Bᵀq)
     p' = projection of p + sK(2u' − u) on |p|(x) ≤ 1
     q' = λ/(λ + t) M [q + t(B(2u' − u) − f)],  the proximal step of th*
     (u, p, q) ← (u, p, q) + ρ(u' − u, p' − p, q' − q)
 
-P is diagonal in Fourier.  The iteration converges for sτ‖K‖² ≤ 1 and 0 < ρ < 2, whatever t is: with step sizes s and t
-of the dual variables, the preconditioner of the splitting is positive semidefinite if ``P − sKᵀK − tBᵀB = I/τ − sKᵀK``
-is.
+P is diagonal in Fourier space.  An iteration needs four Fourier transforms: Bu is not computed anew but updated by
+B(u' − u), whose transform is known.
 
-With t = λ and M = 1, q stays λ(Bu − f) if it starts there, and the first line is the proximal step of the data term.  A
-margin needs a smaller t: q = 0 there, but P limits the change of u by tBᵀB all the same, so that the margin, and what
-crosses the border, converges slowly.  So t is λ/k in iteration k, and λ/50 from the fiftieth on, from where on the
-splitting converges as from any other start.
+Step sizes
+----------
+The iteration converges if 0 < ρ < 2 and the preconditioner of the splitting is positive semidefinite.  With the dual
+step sizes s and t this holds if ``P − sKᵀK − tBᵀB = I/τ − sKᵀK`` is positive semidefinite, that is, if sτ‖K‖² ≤ 1.  The
+condition does not depend on t.
 
-The start is the Wiener solution by conjugate gradients, whose margin is good already, with q = λM(Bu − f) and the p
-that one step from 0 gives.  An iteration needs four transforms: Bu is updated by B(u' − u), which is known in Fourier.
+If t = λ and M = 1 everywhere, q stays equal to λ(Bu − f) once it has that value, and the step of u is the proximal step
+of the data term.  In a margin, where M = 0, q is zero, but the term tBᵀB of P still limits the change of u.  With
+t = λ the margin, and the part of the image that its light reaches, would therefore converge slowly.  So t decreases: it
+is λ/k in iteration k ≤ 50, and remains λ/50 afterwards.  The first 50 iterations thus only provide a starting point,
+from which the splitting with a constant t converges.
+
+Start
+-----
+u is the Wiener solution by conjugate gradients, whose margin is already good; q is λM(Bu − f); and p is the result of
+one dual step from p = 0.
 """
 
 from __future__ import annotations
@@ -37,15 +47,16 @@ import numpy as np
 from .array_ops import Array
 from .problem import Problem
 
-# ρ.
+# Over-relaxation ρ.
 RELAXATION = 1.8
-# τ‖K‖: small primal steps suit images in [0, 1] with fidelities from 300 to 30000.
+# τ‖K‖.  Small primal steps suit images in [0, 1] with λ between 300 and 30000.
 PRIMAL_STEP = 0.08
-# t/λ falls with the number of iterations to this.
+# Smallest t/λ.
 LEAST_DATA_STEP = 0.02
-# Iterations that one change is measured over: most of an oscillation cancels over as many, a drift does not.
+# Number of iterations over which a change of the image is measured.  Oscillations mostly cancel within that many
+# iterations; a drift does not.
 WINDOW = 10
-# Windows for which an image has to stay the same to be at rest.
+# An image is at rest if it has not changed over this many windows.
 REST = 5
 
 
@@ -62,7 +73,10 @@ class Penalty(Protocol):
         ...
 
     def ascend(self, p: Array, u: Array, step: float, relaxation: float) -> tuple[Array, Array]:
-        """``p + ρ(p' − p)`` with p' the projection of ``p + sKu`` on |p|(x) ≤ 1, and Kᵀ of it; p is overwritten."""
+        """Return the new p, ``p + ρ(p' − p)`` with p' the projection of ``p + sKu`` on |p|(x) ≤ 1, and Kᵀp for it.
+
+        The given p is overwritten.
+        """
         ...
 
     def value(self, u: Array) -> float:
@@ -71,13 +85,13 @@ class Penalty(Protocol):
 
 
 class PrimalDualState(NamedTuple):
-    """u, Bu, q, p, Kᵀp, and the number k of the next iteration.  The step of a state overwrites its p."""
+    """State before an iteration: u, Bu, q, p, Kᵀp, and its number k.  The iteration overwrites p."""
 
     image: Array
     blurred: Array
-    pressure: Array
-    dual: Array
-    pull: Array
+    data_dual: Array
+    penalty_dual: Array
+    adjoint: Array
     number: int
 
 
@@ -96,24 +110,24 @@ class PrimalDual:
     rest: ClassVar[int] = REST
 
     def start(self, problem: Problem, u: Array) -> PrimalDualState:
-        """Start from the image u with q = λM(Bu − f), and p one step from 0."""
+        """Start from the image u, with q = λM(Bu − f) and p after one dual step from 0."""
         blurred = problem.blur(problem.ops.forward(u))
         q = problem.fidelity * problem.seen * (blurred - problem.observed)
-        p, pull = self.regulariser.ascend(self.regulariser.zero_dual(u), u, self._steps[1], 1.0)
-        return PrimalDualState(u, blurred, q, p, pull, 1)
+        p, adjoint = self.regulariser.ascend(self.regulariser.zero_dual(u), u, self._steps[1], 1.0)
+        return PrimalDualState(u, blurred, q, p, adjoint, 1)
 
     def step(self, problem: Problem, state: PrimalDualState) -> PrimalDualState:
-        """One iteration, with d = u − u' = P⁻¹(Kᵀp + Bᵀq), so that 2u' − u = u − 2d."""
+        """Do one iteration.  With d = u − u' = P⁻¹(Kᵀp + Bᵀq), the point 2u' − u is u − 2d."""
         (tau, s), forward, otf = self._steps, problem.ops.forward, problem.otf
-        u, blurred, q, p, pull, k = state
+        u, blurred, q, p, adjoint, k = state
         share = max(1 / k, LEAST_DATA_STEP)
         t = share * problem.fidelity
-        spectrum = (forward(pull) + otf.conj() * forward(q)) / (1 / tau + t * problem.power)
+        spectrum = (forward(adjoint) + otf.conj() * forward(q)) / (1 / tau + t * problem.power)
         d, blurred_d = problem.ops.back(spectrum, problem.shape), problem.blur(spectrum)
-        p, pull = self.regulariser.ascend(p, u - 2 * d, s, RELAXATION)
+        p, adjoint = self.regulariser.ascend(p, u - 2 * d, s, RELAXATION)
         q_new = problem.seen * (q + t * (blurred - 2 * blurred_d - problem.observed)) / (1 + share)
         q = q + RELAXATION * (q_new - q)
-        return PrimalDualState(u - RELAXATION * d, blurred - RELAXATION * blurred_d, q, p, pull, k + 1)
+        return PrimalDualState(u - RELAXATION * d, blurred - RELAXATION * blurred_d, q, p, adjoint, k + 1)
 
     def penalty(self, problem: Problem, u: Array) -> float:
         """J(u)."""

@@ -2,7 +2,7 @@
 
 Symbols
 -------
-f : observed image; u : image that is sought.
+f : observed image; u : unknown image.
 k : point spread function; B : convolution with k; H : its transfer function; Bᵀ : adjoint of B.
 M : 1 where a pixel was observed, 0 in the margin around the image.
 λ : fidelity, the weight of the data.  The paper's μ is 1 here.
@@ -12,9 +12,9 @@ the mask M added.
 
 Boundary
 --------
-Pixels near the border of f received light from beyond it.  The unknown u therefore has a margin of at least 4σ on each
-side, in which M is 0, and the convolution is periodic on that larger domain: its two sides meet where nothing was
-observed.
+Pixels near the border of f received light from outside the image.  The unknown u therefore has a margin of at least 4σ
+on each side, in which M is 0.  The convolution is periodic on that padded domain; opposite sides meet within the
+margin, where nothing was observed.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Problem:
     Attributes
     ----------
     observed : array, float32, shape (P, Q)
-        f, continued by reflection into the margin.
+        f, extended by reflection into the margin.
     seen : array, float32, shape (P, Q)
         M.
     otf : array, float32 or complex64, shape (P, Q // 2 + 1)
@@ -87,14 +87,14 @@ class Problem:
 
 @dataclass(frozen=True)
 class Margin:
-    """Pixels added around an image, for which nothing was observed.
+    """Margin of pixels around an image, in which nothing was observed.
 
     Attributes
     ----------
     size : (int, int)
         H and W of the image.
     widths : tuple of (int, int)
-        Pixels before and after each axis.
+        Pixels before and after the image along each axis.
     """
 
     size: tuple[int, int]
@@ -118,12 +118,12 @@ class Margin:
         return mask
 
     def pad(self, image: FloatArray) -> FloatArray:
-        """Continue an image by reflection."""
+        """Extend an image into the margin by reflection."""
         return np.pad(image, self.widths, mode="symmetric")
 
 
 def margin_around(size: tuple[int, int], least: int | None) -> Margin:
-    """Margin of at least ``least`` pixels on each side, up to a size with a fast transform.
+    """Margin of at least ``least`` pixels on each side, enlarged to a size with a fast Fourier transform.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:
     ----------
     image : ndarray, float32, shape (H, W) or (H, W, 3)
     channels : {"luminance", "each"}
-        Of a colour image, luminance alone or every channel.
+        Whether a colour image gives its luminance alone or every channel.
 
     Returns
     -------
@@ -199,7 +199,7 @@ def join_planes(image: FloatArray, planes: list[FloatArray], channels: str) -> F
 
 
 def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
-    """Weight λ of the data from the noise of the blurred image.
+    """Choose the weight λ of the data term from the noise of the blurred image.
 
     Parameters
     ----------
@@ -213,16 +213,19 @@ def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
     Returns
     -------
     float
-        nltv ``20/√(n² + .004²)``, tv ``12/√(n² + .003²)``; wiener as :func:`turbrestore.blur.psf.wiener_fidelity`,
-        tikhonov half of that.
+        For nltv ``20/√(n² + .004²)``, for tv ``12/√(n² + .003²)``, for wiener the value of
+        :func:`turbrestore.blur.psf.wiener_fidelity`, and for tikhonov half of that.
 
     Notes
     -----
-    Total variation has the unit of intensity and the data term its square, hence 1/n. For nltv and tv on
-    photographs, brick and text blurred with σ 1–3 the result is within 0.4 dB of the best λ for n = .01–.02. Below,
-    a perfectly known blur allows 3 to 10 times more (0.1–3 dB, 5 dB on thin text). The floors keep λ so small
-    that a slightly wrong σ does little harm: a registered average is less sharp than its noise suggests. On
-    registered averages of simulated turbulence, with σ within 0.2 px, 3λ gains 0.3 dB at most and loses up to 1.7.
+    Total variation has the unit of intensity and the data term the unit of its square, so λ is proportional to 1/n.
+    For nltv and tv on photographs, brick and text, blurred with σ from 1 to 3 pixels, the result is within 0.4 dB of
+    that of the best λ if n is between .01 and .02.  For less noise and a blur that is known exactly, the best λ is 3
+    to 10 times larger; it gains 0.1 to 3 dB, and 5 dB on thin text.
+
+    The constants beside n limit λ, so that a slightly wrong σ does little harm.  This matters because a registered
+    average is less sharp than its low noise suggests.  On registered averages of simulated turbulence, with an error of
+    σ of up to 0.2 pixels, 3λ gains at most 0.3 dB and loses up to 1.7 dB.
 
     Examples
     --------
@@ -239,7 +242,7 @@ def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
 
 
 def read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:
-    """Read a blur that is given by its width or by its PSF.
+    """Read a blur that is given either by its width or by its PSF.
 
     Parameters
     ----------
@@ -249,11 +252,11 @@ def read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | No
     Returns
     -------
     psf : ndarray, float64, or None
-        None where only the width is known.
+        None if only the width is given.
     sigma : float
         Standard deviation, pixels.
     reach : int
-        Pixels that light is moved by at most.
+        Largest distance over which the blur moves light, pixels.
 
     Raises
     ------

@@ -20,10 +20,10 @@ e : residuals of the one-step prediction, ξ_{k+1} − A ξ_k
 Departures from the paper
 -------------------------
 - Ξ is Σ Vᵀ, where the paper prints Σ V.
-- Q is divided by τ − 2 − n, the paper by τ − 2. Each of the n regressors takes one degree of freedom, as the mean
-  does; without the n, Q is a third too small at τ = 3n.
-- R is one number (the paper says m×m and advises a multiple of the identity), with a map per pixel beside it,
-  divided by τ − 1 − n for the same reason.
+- Q is divided by τ − 2 − n, where the paper divides by τ − 2. Each of the n regressors takes one degree of freedom,
+  as the mean does; divided by τ − 2, Q is a third too small at τ = 3n.
+- R is one number, where the paper has an m×m matrix and advises a multiple of the identity. There is also a map of the
+  variance at each pixel. Both are divided by τ − 1 − n, for the same reason.
 - A may be damped (``ridge``).
 """
 
@@ -44,7 +44,7 @@ from .flow_subspace import FlowStrips, gram_matrix, singular_vectors, spatial_mo
 
 # Flows are float32, so singular values below this share of the norm of all flows are rounding errors.
 _ROUNDING = 1e-6
-# Bytes of the strips of all threads with what is computed from them, and bytes for each pixel of each flow where all
+# Bytes of the strips of all threads and of the arrays computed from them, and bytes for each pixel of each flow if all
 # flows fit into one strip.
 _STRIPS, _STRIP_NUMBER = 140e6, 70.0
 
@@ -56,15 +56,16 @@ class DynamicsParams:
     Parameters
     ----------
     rank : int or None
-        Number of states n. None chooses the smallest n whose modes hold the share ``energy`` of the variance, but
-        leaves out singular values below the optimal hard threshold for white noise of unknown level (Gavish and
-        Donoho, 2014), and chooses at most ``max_rank`` states and one for every ``frames_per_state`` flows.
+        Number of states n. If None, n is the smallest number of modes that hold the share ``energy`` of the variance,
+        but at most the number of singular values above the optimal hard threshold for white noise of unknown level
+        (Gavish and Donoho, 2014), at most ``max_rank``, and at most one for every ``frames_per_state`` flows.
     energy : float
         Share of the variance that the automatic choice keeps, in (0, 1].
     max_rank : int
         Largest automatic n.
     frames_per_state : float
-        At least 1. With fewer flows for each state the system is flagged as overfitted (paper 3, Figure 7a).
+        Smallest number of flows for each state, at least 1. A system with fewer is marked as overfitted (paper 3,
+        Figure 7a).
     ridge : float
         Damping of A: this share of the mean variance of the states is added to the variance of each state in the
         least-squares fit. 0 is the pseudo-inverse of the paper.
@@ -106,12 +107,13 @@ def identify(
     Parameters
     ----------
     flows : ndarray of shape (τ, H, W, 2), or iterable of arrays of shape (H, W, 2)
-        Flows from the reference to successive frames, in pixels. A memory map is read strip by strip and never
-        in memory as a whole. An iterable is iterated once for the shapes and twice for every 32 MB that its flows
-        take as float64, which costs nothing for a list of arrays but much if flows are computed on the fly.
+        Flows from the reference to successive frames, in pixels. A memory-mapped array is read strip by strip and is
+        never in memory as a whole. An iterable is iterated once for the shapes, and twice for every 32 MB that its
+        flows take as float64. For a list of arrays this costs nothing, but it is slow if the flows are computed during
+        the iteration.
     params : DynamicsParams, optional
     runtime : Runtime
-        Threads, and the scratch folder for C and the maps; without one they stay in memory.
+        Threads, and the scratch folder for C and the maps, which stay in memory if there is none.
 
     Returns
     -------
@@ -163,7 +165,7 @@ def identify(
 
 
 def identify_memory(shape: tuple[int, ...], train: int) -> float:
-    """Bytes that identification takes beside the flows and the model itself (:func:`modes_memory`).
+    """Bytes that identification takes in addition to the flows and to the model itself (:func:`modes_memory`).
 
     The constants were measured by ``benchmarks/memory.py --stages`` at 1280×720, grey and in colour, with one, two and
     four threads, and rounded up by at least a twentieth.

@@ -1,10 +1,10 @@
-"""One pass over consecutive frames: measure their flows, follow the flow state, register them (paper 3, section 4).
+"""One pass over consecutive frames: measure flows, update the flow state, register frames (paper 3, section 4).
 
 Symbols as in :mod:`turbrestore.filtering.flow_state` and :mod:`turbrestore.filtering.frame_noise`.
 
-Threads measure and project the flows of several frames side by side; the flow state is then updated by one frame after
-the other, and the frames are registered side by side again.  On a device of torch a frame is only registered when it is
-fused, so that no more than one registered frame takes memory there.
+Threads measure and project the flows of several frames in parallel.  The flow state is then updated by one frame after
+another, and the frames are registered in parallel again.  On a torch device a frame is registered only when the image
+is updated by it, so that at most one registered frame takes memory there.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ Frame = FloatArray | FlowFrame | None
 
 @dataclass(frozen=True, eq=False)
 class PassSettings:
-    """What is the same for every frame.
+    """Model, statistics and settings that are the same for every frame.
 
     Attributes
     ----------
     dynamics : FlowDynamics
     statistics : FrameStatistics
-        On the backend.
+        Its arrays are on the backend.
     motion_share : array, float32, shape (H, W, 2)
-        G for both components, on the backend: arrays of one shape multiply several times as fast.
+        G, repeated for both components, on the backend; arrays of equal shape are multiplied several times as fast.
     sharpness, drift : float
         β, and S in squared intensity.
     flow : FlowParams
@@ -62,7 +62,7 @@ class PassSettings:
 
 @dataclass(frozen=True, eq=False)
 class RegisteredFrame:
-    """A frame on the image (eq. 15).
+    """A frame registered to the image (eq. 15).
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class TrackedFrame:
     Attributes
     ----------
     frame : Frame
-        With a flow from which that of the next pass starts; None if no pass follows.
+        The frame for the next pass, with a flow to start from; None if no other pass follows.
     state : Gaussian
         ξ̂ and P after the frame.
     innovation : float
@@ -102,7 +102,7 @@ class TrackedFrame:
 
 @dataclass(frozen=True, eq=False)
 class _Item:
-    """A frame within a pass: ``start`` is a known flow to it, and ``kept`` says whether another pass follows."""
+    """A frame within a pass; ``start`` is a known flow to it, and ``kept`` is True if another pass follows."""
 
     frame: Frame
     start: FloatArray | None
@@ -119,20 +119,21 @@ def pass_over(
     settled: int,
     settings: PassSettings,
 ) -> Iterator[TrackedFrame]:
-    """Measure flows from an image to frames, update the flow state by them, and register the frames.
+    """Measure flows from an image to frames, update the flow state by these flows, and register the frames.
 
     Parameters
     ----------
     frames : iterable of Frame
         Consumed lazily.
     starts : iterable of ndarray or None
-        Known flow to each frame, pixels, which its flow starts from; at least as many as frames.
+        Known flow to each frame, pixels, from which the measurement of its flow starts; None if it is not known.  There
+        are at least as many as frames.
     image : ndarray, float32, shape (H, W) or (H, W, 3), or None
-        Reference of the flows; with None the known flows are taken as the measured ones.
+        Reference of the flows; if None, the known flows are used as the measured ones.
     state : Gaussian
         ξ̂ and P before the first frame.
     settled : int
-        Number of frames, from the first on, over which no other pass follows.
+        Number of frames at the start for which this is the last pass.
     settings : PassSettings
 
     Yields
@@ -203,7 +204,7 @@ def _take_known(items: list[_Item]) -> list[_Item]:
 
 
 def _prepare(item: _Item, reference: FlowReference) -> _Item:
-    """Prepare a frame for flow, unless an earlier pass has."""
+    """Prepare a frame for the measurement of flow, unless an earlier pass has done so."""
     if item.frame is None:
         return item
     frame = item.frame if isinstance(item.frame, FlowFrame) else reference.prepare(item.frame)
@@ -211,16 +212,17 @@ def _prepare(item: _Item, reference: FlowReference) -> _Item:
 
 
 def _with_flow(item: _Item, flow: FloatArray) -> _Item:
-    """Add the flow to a frame; that of the next pass starts from it, unless there is a known flow."""
+    """Add the measured flow, from which the measurement in the next pass starts unless there is a known flow."""
     if item.kept and item.start is None and isinstance(item.frame, FlowFrame):
         return replace(item, measured=flow, frame=replace(item.frame, start=_half_resolution(flow)))
     return replace(item, measured=flow)
 
 
 def _half_resolution(flow: FloatArray) -> NDArray[np.float16]:
-    """Flow at half the resolution, a byte a pixel of the image.
+    """Reduce a flow to half the resolution and to float16, which take one byte for each pixel of the image.
 
-    For a start that is enough: it is exact to a pixel up to 2,000 pixels, and the search recovers from several.
+    This is accurate enough for a flow to start from: displacements of up to 2,000 pixels are exact to one pixel, and
+    the search recovers from errors of several pixels.
     """
     height, width = flow.shape[:2]
     return cv2.resize(flow, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.float16)
@@ -231,7 +233,7 @@ def _project(item: _Item, dynamics: FlowDynamics) -> _Item:
 
 
 def _track(item: _Item, state: Gaussian, innovation: float, settings: PassSettings) -> TrackedFrame:
-    """Register a frame now on the CPU, but only when it is fused on a device."""
+    """Register a frame: at once on the CPU, but on a device only when the image is updated by it."""
     frame = item.frame if item.kept else None
     image = item.frame.image if isinstance(item.frame, FlowFrame) else item.frame
     if image is None or item.measured is None:
