@@ -217,7 +217,7 @@ def output_cases(mounts: bool) -> list[Case]:
         Case("synthesis onto its scene", ["synthesize", "clip.mkv", "clip.mkv", "--overwrite"], CREATE),
         Case("flows onto the input", ["flow", "clip.png", "mean.npy", "mean.npy", "--overwrite"], CREATE, kept_input),
         Case("image breaks off", restore("o.png"), STORAGE, limited=True),
-        Case("stage file breaks off", ["centroid", "clip.mkv", "c.npz", "--train=4", "--quiet"], STORAGE, limited=True),
+        Case("artifact breaks off", ["centroid", "clip.mkv", "c.npz", "--train=4", "--quiet"], STORAGE, limited=True),
         Case("video breaks off", ["synthesize", "chart", "s.mkv", "--frames=3", "--size=64x64"], STORAGE, limited=True),
         Case("kept stage breaks off", restore("o.png", "--keep=kept"), STORAGE, limited=True),
     ]
@@ -230,7 +230,7 @@ def output_cases(mounts: bool) -> list[Case]:
             Case("full disk", restore("full/o.png"), STORAGE, full(0)),
             Case("nearly full disk", restore("full/o.png"), STORAGE, full(8192)),
             Case("--keep on a full disk", restore("o.png", "--keep=full/kept"), STORAGE, full(65536)),
-            Case("stage file on a full disk", ["centroid", "clip.mkv", "full/c.npz", "--quiet"], STORAGE, full(65536)),
+            Case("artifact on a full disk", ["centroid", "clip.mkv", "full/c.npz", "--quiet"], STORAGE, full(65536)),
             Case("flows on a full disk", ["flow", "clip.png", "clip.mkv", "full/f.npy"], STORAGE, flow_on_full),
             Case("video on a full disk", ["synthesize", "chart", "full/s.mkv", "--frames=9"], STORAGE, full(65536)),
             Case("stack on a full disk", ["synthesize", "chart", "full/s.tif", "--frames=9"], STORAGE, full(65536)),

@@ -22,7 +22,7 @@ from turbrestore.io.pixels import check_depth
 from turbrestore.memory_plan import training_share
 from turbrestore.registration.centroid import Centroid, CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams, iterate_flows
-from turbrestore.runs.stage_files import load_flows, load_stage_file, save_flows, save_stage_file
+from turbrestore.runs.stage_files import load_artifact, load_flows, save_artifact, save_flows
 from turbrestore.runtime.steps import finish, step_counter
 
 from .inputs import open_input, read_input_image
@@ -71,7 +71,7 @@ def centroid(
     with progress_bars(quiet) as progress:
         steps = centroid_steps(source.read(0, count), centroid, flow, machine.runtime())
         found = finish(steps, step_counter(progress, "centroid", count * centroid.iterations))
-    save_stage_file(output, found, overwrite)
+    save_artifact(output, found, overwrite)
     sizes = ", ".join(f"{size:.2f}" for size in found.mean_flow_sizes)
     say(f"{output}: centroid of {count} frames, mean flow {sizes} pixels", quiet)
 
@@ -151,7 +151,7 @@ def identify(
     # The mean flow is one more.
     check_space(output, _flow_bytes(modes + 1, measured.shape))
     found = identify_flows(measured, dynamics, machine.runtime())
-    save_stage_file(output, found, overwrite)
+    save_artifact(output, found, overwrite)
     for note in found.notes:
         say(f"{output}: {note}", quiet)
     say(f"{output}: {found.rank} states hold {100 * found.energy_share:.0f} % of the motion", quiet)
@@ -193,7 +193,7 @@ def filter_(
         Print neither progress nor remarks.
     """
     check_output(output, [input, centroid, dynamics], overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
-    start, model = load_stage_file(centroid, Centroid), load_stage_file(dynamics, FlowDynamics)
+    start, model = load_artifact(centroid, Centroid), load_artifact(dynamics, FlowDynamics)
     source = open_input(input, selection, quiet)
     check_space(output, _image_bytes(source.shape))
     total = len(source) * filter.inner_iterations - len(start.flows)
@@ -280,6 +280,6 @@ def _image_bytes(shape: tuple[int, ...]) -> int:
 
 def _write(output: Path, result: Filtered | Deconvolution, bit_depth: int, overwrite: bool) -> None:
     if output.suffix.lower() in ARTIFACT:
-        save_stage_file(output, result, overwrite)
+        save_artifact(output, result, overwrite)
     else:
         write_image(output, result.image, bit_depth, overwrite)

@@ -47,8 +47,8 @@ from .runs.run_files import load_run as load_run
 from .runs.run_files import save_run as save_run
 from .runs.run_record import RunRecord as RunRecord
 from .runs.run_record import describe_run as describe_run
-from .runs.stage_files import load_stage_file as load_stage_file
-from .runs.stage_files import save_stage_file as save_stage_file
+from .runs.stage_files import load_artifact as load_artifact
+from .runs.stage_files import save_artifact as save_artifact
 from .runtime.runtime import Runtime as Runtime
 from .settings import RestoreParams as RestoreParams
 from .synthesis.anisoplanatic import diffraction_limited as diffraction_limited

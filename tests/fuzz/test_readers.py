@@ -24,7 +24,7 @@ from turbrestore.io.limits import Limits
 from turbrestore.io.npy import map_npy, read_npz
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.registration.centroid import Centroid
-from turbrestore.runs.stage_files import KINDS, load_stage_file, save_stage_file
+from turbrestore.runs.stage_files import KINDS, load_artifact, save_artifact
 
 SMALL = Limits(max_pixels=10_000, max_frames=200, max_bytes=10**6)
 FRAMES = np.random.default_rng(0).random((3, 8, 10), dtype=np.float32)
@@ -92,7 +92,7 @@ def whole(tmp_path_factory):
     for suffix in (".ser", ".npy", ".tif", ".mkv", ".mp4"):
         write_video(folder / f"a{suffix}", FRAMES, 25, 8)
     flows = np.zeros((2, 8, 10, 2), np.float32)
-    save_stage_file(folder / "a.npz", Centroid(FRAMES[0], flows, np.zeros(2), True))
+    save_artifact(folder / "a.npz", Centroid(FRAMES[0], flows, np.zeros(2), True))
     return folder
 
 
@@ -192,11 +192,11 @@ class TestArchives:
         kind=st.sampled_from(list(KINDS.values())),
     )
     @settings(MANY, max_examples=150)
-    def test_any_header_of_a_stage_file(self, tmp_path, header, kept, kind):
+    def test_any_header_of_an_artifact(self, tmp_path, header, kept, kind):
         arrays = {name: np.zeros(3) for name in kept}
         np.savez(tmp_path / "a.npz", allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
         try:
-            load_stage_file(tmp_path / "a.npz", kind)
+            load_artifact(tmp_path / "a.npz", kind)
         except TurbrestoreError as error:
             assert "\n" not in str(error) and "a.npz" in str(error)
 
@@ -254,14 +254,14 @@ def use(result):
 @settings(MANY, max_examples=60)
 # Numbers up to a billion are read; what they overflow to is told in words or is clipped.
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_doctored_stage_files_are_refused_or_can_be_used(tmp_path, kind, data):
+def test_doctored_artifacts_are_refused_or_can_be_used(tmp_path, kind, data):
     result = WHOLE[kind]
     field = data.draw(st.sampled_from([item.name for item in dataclasses.fields(result)]))
     value = getattr(result, field)
     changed_value = doctored(value, data.draw(ARRAYS)) if isinstance(value, np.ndarray) else data.draw(SCALARS)
-    save_stage_file(tmp_path / "a.npz", dataclasses.replace(result, **{field: changed_value}), overwrite=True)
+    save_artifact(tmp_path / "a.npz", dataclasses.replace(result, **{field: changed_value}), overwrite=True)
     try:
-        loaded = load_stage_file(tmp_path / "a.npz", KINDS[kind])
+        loaded = load_artifact(tmp_path / "a.npz", KINDS[kind])
     except TurbrestoreError as error:
         assert "\n" not in str(error) and "a.npz" in str(error)
         return

@@ -22,7 +22,7 @@ from turbrestore.io.output import atomic_write, check_space
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, write_video
 from turbrestore.registration.centroid import Centroid
 from turbrestore.runs.checkpoint import save_checkpoint
-from turbrestore.runs.stage_files import save_flows, save_stage_file
+from turbrestore.runs.stage_files import save_artifact, save_flows
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.output import write_settings
 
@@ -34,7 +34,7 @@ CHECKPOINT = FilterCheckpoint(FilterState(PixelGaussian(IMAGE, IMAGE), Gaussian(
 WRITERS = {
     "image.png": lambda path: write_image(path, IMAGE, 16),
     "image.tif": lambda path: write_image(path, IMAGE, 32),
-    "stage_file.npz": lambda path: save_stage_file(path, Centroid(IMAGE, FLOWS, np.zeros(1), True)),
+    "artifact.npz": lambda path: save_artifact(path, Centroid(IMAGE, FLOWS, np.zeros(1), True)),
     "flows.npy": lambda path: save_flows(path, FLOWS),
     "checkpoint.npz": lambda path: save_checkpoint(path, CHECKPOINT, "key"),
     "settings.toml": lambda path: write_settings(path, {"text": "long " * 1000}),

@@ -24,7 +24,7 @@ from turbrestore.registration.centroid import Centroid, CentroidParams
 from turbrestore.registration.flow import FlowParams
 from turbrestore.runs.run_files import load_run, save_run
 from turbrestore.runs.run_record import RunRecord
-from turbrestore.runs.stage_files import KINDS, load_flows, load_stage_file, save_flows, save_stage_file
+from turbrestore.runs.stage_files import KINDS, load_artifact, load_flows, save_artifact, save_flows
 from turbrestore_cli.application import build
 from turbrestore_cli.options import Machine, Selection
 from turbrestore_cli.output import settings_record, write_settings
@@ -104,10 +104,10 @@ def flow_file(folder, flows):
     same(np.array(load_flows(folder / "f.npy")), flows)
 
 
-def stage_file(folder, result):
-    """Write and read a stage file."""
-    save_stage_file(folder / "a.npz", result, overwrite=True)
-    same(load_stage_file(folder / "a.npz", type(result)), result)
+def artifact(folder, result):
+    """Write and read an artifact."""
+    save_artifact(folder / "a.npz", result, overwrite=True)
+    same(load_artifact(folder / "a.npz", type(result)), result)
 
 
 def settings_file(folder, chosen):
@@ -257,7 +257,7 @@ PAIRS = {
         flow_file,
         st.tuples(st.integers(1, 3), SIDES, SIDES).flatmap(lambda shape: floats(*shape, 2, scale=-99.0)),
     ),
-    **{f"stage file: {name}": (stage_file, results(kind)) for name, kind in KINDS.items()},
+    **{f"artifact: {name}": (artifact, results(kind)) for name, kind in KINDS.items()},
     "settings": (settings_file, chosen_settings()),
     "kept run": (kept_run, kept_runs()),
 }
@@ -298,7 +298,7 @@ def test_what_is_written_comes_back(name):
     assert passed(name, examples) >= examples
 
 
-@pytest.mark.parametrize("name", ["PNG, 8 bits", "flows", "stage file: centroid", "settings"])
+@pytest.mark.parametrize("name", ["PNG, 8 bits", "flows", "artifact: centroid", "settings"])
 def test_a_difference_is_seen(name, monkeypatch):
     def spoilt(found, expected):
         raise AssertionError(f"{found} is not {expected}")

@@ -15,14 +15,7 @@ from turbrestore.io.npy import write_npz
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import Centroid, CentroidParams
 from turbrestore.runs.stage_fields import FIELDS
-from turbrestore.runs.stage_files import (
-    KINDS,
-    load_flows,
-    load_stage_file,
-    load_stage_image,
-    save_flows,
-    save_stage_file,
-)
+from turbrestore.runs.stage_files import KINDS, load_artifact, load_flows, load_stage_image, save_artifact, save_flows
 from turbrestore.runtime.scratch import new_stack
 
 
@@ -36,20 +29,20 @@ def restoration():
 def test_a_result_comes_back_as_it_was(restoration, stage, tmp_path):
     result = getattr(restoration, stage)
     path = tmp_path / f"{stage}.npz"
-    save_stage_file(path, result)
-    again = load_stage_file(path, type(result))
+    save_artifact(path, result)
+    again = load_artifact(path, type(result))
     for item in dataclasses.fields(result):
         before, after = getattr(result, item.name), getattr(again, item.name)
         assert type(before) is type(after), item.name
         assert np.array_equal(before, after), item.name
 
 
-def test_an_image_is_read_from_stage_files_and_images(restoration, tmp_path):
-    save_stage_file(tmp_path / "a.npz", restoration.centroid)
+def test_an_image_is_read_from_artifacts_and_files(restoration, tmp_path):
+    save_artifact(tmp_path / "a.npz", restoration.centroid)
     assert (load_stage_image(tmp_path / "a.npz") == restoration.centroid.image).all()
     write_image(tmp_path / "a.tif", restoration.centroid.image, 32)
     assert np.allclose(load_stage_image(tmp_path / "a.tif"), np.clip(restoration.centroid.image, 0, 1))
-    save_stage_file(tmp_path / "d.npz", restoration.dynamics)
+    save_artifact(tmp_path / "d.npz", restoration.dynamics)
     with pytest.raises(DataError, match="expected a stage file with an image, found a dynamics"):
         load_stage_image(tmp_path / "d.npz")
 
@@ -57,27 +50,27 @@ def test_an_image_is_read_from_stage_files_and_images(restoration, tmp_path):
 def test_flows_come_back(restoration, tmp_path):
     save_flows(tmp_path / "f.npy", restoration.centroid.flows)
     assert (load_flows(tmp_path / "f.npy") == restoration.centroid.flows).all()
-    save_stage_file(tmp_path / "c.npz", restoration.centroid)
+    save_artifact(tmp_path / "c.npz", restoration.centroid)
     assert (load_flows(tmp_path / "c.npz") == restoration.centroid.flows).all()
 
 
 def test_existing_files_and_other_suffixes_are_refused(restoration, tmp_path):
     path = tmp_path / "c.npz"
-    save_stage_file(path, restoration.centroid)
+    save_artifact(path, restoration.centroid)
     with pytest.raises(OutputError, match="exists already"):
-        save_stage_file(path, restoration.centroid)
-    save_stage_file(path, restoration.centroid, overwrite=True)
+        save_artifact(path, restoration.centroid)
+    save_artifact(path, restoration.centroid, overwrite=True)
     with pytest.raises(ConfigurationError, match=r"ends in \.npz"):
-        save_stage_file(tmp_path / "c.zip", restoration.centroid)
+        save_artifact(tmp_path / "c.zip", restoration.centroid)
     with pytest.raises(ConfigurationError, match=r"ends in \.npy"):
         save_flows(tmp_path / "f.npz", restoration.centroid.flows)
 
 
 def test_damage_and_other_kinds_are_told_apart(restoration, tmp_path):
     path = tmp_path / "c.npz"
-    save_stage_file(path, restoration.centroid)
+    save_artifact(path, restoration.centroid)
     with pytest.raises(DataError, match="expected a dynamics stage file, found a centroid"):
-        load_stage_file(path, FlowDynamics)
+        load_artifact(path, FlowDynamics)
     data = path.read_bytes()
     (tmp_path / "cut.npz").write_bytes(data[: len(data) // 2])
     (tmp_path / "text.npz").write_text("not a stage file")
@@ -85,9 +78,9 @@ def test_damage_and_other_kinds_are_told_apart(restoration, tmp_path):
     np.savez(tmp_path / "pickled.npz", header=np.array({"kind": "centroid"}, dtype=object))
     for name in ("cut", "text", "plain", "pickled"):
         with pytest.raises(DataError, match="expected a stage file of turbrestore"):
-            load_stage_file(tmp_path / f"{name}.npz", Centroid)
+            load_artifact(tmp_path / f"{name}.npz", Centroid)
     with pytest.raises(InputNotFoundError):
-        load_stage_file(tmp_path / "none.npz", Centroid)
+        load_artifact(tmp_path / "none.npz", Centroid)
 
 
 def test_another_layout_or_missing_field_is_refused(restoration, tmp_path):
@@ -98,7 +91,7 @@ def test_another_layout_or_missing_field_is_refused(restoration, tmp_path):
     ):
         np.savez(tmp_path / f"{name}.npz", header=np.array(json.dumps(header)))
         with pytest.raises(DataError, match="expected"):
-            load_stage_file(tmp_path / f"{name}.npz", Deconvolution)
+            load_artifact(tmp_path / f"{name}.npz", Deconvolution)
 
 
 def test_flows_of_another_shape_are_refused(tmp_path):
@@ -160,9 +153,9 @@ def test_arrays_that_no_stage_makes_are_refused_by_name(restoration, tmp_path, s
         # Any number of flows is right; of rows, those of the image.
         changed = changed[:, :-1] if np.isfinite(changed).all() else changed
     path = tmp_path / "a.npz"
-    save_stage_file(path, dataclasses.replace(result, **{field: changed}))
+    save_artifact(path, dataclasses.replace(result, **{field: changed}))
     with pytest.raises(DataError, match=rf"a\.npz: expected {field} .*found") as caught:
-        load_stage_file(path, type(result))
+        load_artifact(path, type(result))
     assert "\n" not in str(caught.value)
 
 
@@ -183,9 +176,9 @@ def test_arrays_that_no_stage_makes_are_refused_by_name(restoration, tmp_path, s
 )
 def test_figures_that_no_stage_makes_are_refused_by_name(restoration, tmp_path, stage, field, value):
     result = getattr(restoration, stage)
-    save_stage_file(tmp_path / "a.npz", dataclasses.replace(result, **{field: value}))
+    save_artifact(tmp_path / "a.npz", dataclasses.replace(result, **{field: value}))
     with pytest.raises(DataError, match=rf"a\.npz: expected {field} .*found"):
-        load_stage_file(tmp_path / "a.npz", type(result))
+        load_artifact(tmp_path / "a.npz", type(result))
 
 
 @pytest.mark.parametrize(
@@ -202,7 +195,7 @@ def test_figures_that_no_stage_makes_are_refused_by_name(restoration, tmp_path, 
 def test_odd_headers_are_refused(tmp_path, header):
     np.savez(tmp_path / "a.npz", header=np.array(header))
     with pytest.raises(DataError, match=r"a\.npz: expected a stage file of"):
-        load_stage_file(tmp_path / "a.npz", BlurEstimate)
+        load_artifact(tmp_path / "a.npz", BlurEstimate)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from ..results import Restoration
 from ..settings import RestoreParams
 from .json_fields import JsonFields
 from .run_record import RunRecord
-from .stage_files import load_stage_file, save_stage_file
+from .stage_files import load_artifact, save_artifact
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -112,7 +112,7 @@ def save_results(folder: Path, restoration: Restoration, run: RunRecord, stored:
         if result is None:
             (folder / f"{name}.npz").unlink(missing_ok=True)
         elif f"{name}.npz" not in stored:
-            save_stage_file(folder / f"{name}.npz", result, overwrite=True)
+            save_artifact(folder / f"{name}.npz", result, overwrite=True)
     with atomic_output(folder / IMAGES, overwrite=True) as temporary, temporary.open("wb") as stream:
         write_npz(stream, {"frame": run.frame, "mean": restoration.mean, "image": restoration.image})
     described = {item.name: getattr(run, item.name) for item in dataclasses.fields(run) if item.name != "frame"}
@@ -268,7 +268,7 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
         image=images["image"],
         crop=crop,
         mean=images["mean"],
-        centroid=load_stage_file(place / "centroid.npz", Centroid),
+        centroid=load_artifact(place / "centroid.npz", Centroid),
         dynamics=_stage(place, names, "dynamics", FlowDynamics),
         filtered=_stage(place, names, "filtered", Filtered),
         blur=_stage(place, names, "blur", BlurEstimate),
@@ -293,7 +293,7 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
 
 
 def _stage(place: Path, names: tuple[str, ...], name: str, kind: type[Stage]) -> Stage | None:
-    return load_stage_file(place / f"{name}.npz", kind) if name in names else None
+    return load_artifact(place / f"{name}.npz", kind) if name in names else None
 
 
 def _crop(fields: JsonFields) -> Rectangle:

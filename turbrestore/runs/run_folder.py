@@ -50,7 +50,7 @@ from .digests import file_digest
 from .json_fields import JsonFields
 from .run_files import MEAN, RECORD, RUN_FILES, read_stages, save_results, write_record
 from .run_record import RunRecord
-from .stage_files import load_stage_file, save_stage_file
+from .stage_files import load_artifact, save_artifact
 
 CHECKPOINT = "checkpoint.npz"
 FILES = {
@@ -289,13 +289,13 @@ class RunFolder:
             return self._load_deblurred()
         if f"{name}.npz" not in self._files:
             return None
-        return load_stage_file(self.folder / f"{name}.npz", _KINDS[_kind(name)], self._scratch)
+        return load_artifact(self.folder / f"{name}.npz", _KINDS[_kind(name)], self._scratch)
 
     def _load_deblurred(self) -> Deblurred | None:
         if "deconvolution.npz" not in self._files or self._verdict.get("estimated") is not ("blur.npz" in self._files):
             return None
-        result = load_stage_file(self.folder / "deconvolution.npz", Deconvolution, self._scratch)
-        blur = load_stage_file(self.folder / "blur.npz", BlurEstimate) if "blur.npz" in self._files else None
+        result = load_artifact(self.folder / "deconvolution.npz", Deconvolution, self._scratch)
+        blur = load_artifact(self.folder / "blur.npz", BlurEstimate) if "blur.npz" in self._files else None
         fields = JsonFields(self.folder / RECORD, self._verdict)
         return Deblurred(result, blur, None, fields.guard_readings("readings"), fields.decisions("decisions"))
 
@@ -313,7 +313,7 @@ class RunFolder:
         for part, value in results.items():
             self._files.pop(f"{part}.npz", None)
             if value is not None:
-                save_stage_file(self.folder / f"{part}.npz", value, overwrite=True)
+                save_artifact(self.folder / f"{part}.npz", value, overwrite=True)
                 self._files[f"{part}.npz"] = file_digest(self.folder / f"{part}.npz")
         self._write_record()
         if name == "filtered":

@@ -1,4 +1,4 @@
-"""Stage files: the result of one stage on disk, an ``.npz`` of arrays plus a JSON header, never a pickle.
+"""Stage results on disk: one ``.npz`` file each, arrays plus a JSON header, never a pickle.
 
 The header names the kind of result and the version of this layout, and holds every field that is not an array.
 Flow stacks by themselves are plain ``.npy`` files, which anything reads and which can be memory-mapped.
@@ -44,8 +44,8 @@ _HEADER = "header"
 Result = TypeVar("Result", bound="DataclassInstance")
 
 
-def save_stage_file(path: str | os.PathLike[str], result: DataclassInstance, overwrite: bool = False) -> None:
-    """Write the result of a stage as a stage file.
+def save_artifact(path: str | os.PathLike[str], result: DataclassInstance, overwrite: bool = False) -> None:
+    """Write a stage result.
 
     Parameters
     ----------
@@ -71,8 +71,8 @@ def save_stage_file(path: str | os.PathLike[str], result: DataclassInstance, ove
     >>> from turbrestore.dynamics.flow_model import FlowDynamics
     >>> dynamics = identify(np.random.default_rng(0).normal(size=(5, 4, 4, 2)).astype(np.float32))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     save_stage_file(folder + "/dynamics.npz", dynamics)
-    ...     again = load_stage_file(folder + "/dynamics.npz", FlowDynamics)
+    ...     save_artifact(folder + "/dynamics.npz", dynamics)
+    ...     again = load_artifact(folder + "/dynamics.npz", FlowDynamics)
     >>> bool((again.A == dynamics.A).all())
     True
     """
@@ -87,13 +87,13 @@ def save_stage_file(path: str | os.PathLike[str], result: DataclassInstance, ove
         write_npz(stream, {_HEADER: np.array(header), **arrays})
 
 
-def load_stage_file(path: str | os.PathLike[str], kind: type[Result], scratch: Path | None = None) -> Result:
-    """Read the result of a stage from a stage file.
+def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Path | None = None) -> Result:
+    """Read a stage result back.
 
     Parameters
     ----------
     path : path
-        File written by :func:`save_stage_file`.
+        File written by :func:`save_artifact`.
     kind : type
         Class that is expected.
     scratch : Path, optional
@@ -113,7 +113,7 @@ def load_stage_file(path: str | os.PathLike[str], kind: type[Result], scratch: P
     Examples
     --------
     >>> from turbrestore.registration.centroid import Centroid
-    >>> load_stage_file("missing.npz", Centroid)
+    >>> load_artifact("missing.npz", Centroid)
     Traceback (most recent call last):
     ...
     turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
@@ -221,7 +221,7 @@ def load_flows(path: str | os.PathLike[str]) -> FloatArray:
     """
     source = Path(path)
     if source.suffix.lower() == ".npz":
-        return load_stage_file(source, Centroid).flows
+        return load_artifact(source, Centroid).flows
     if not source.is_file():
         raise InputNotFoundError(f"{source}: no such file")
     try:
