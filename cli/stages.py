@@ -29,7 +29,7 @@ from .inputs import open_input, read_input_image
 from .options import Flag, Machine, Selection, known_sigma, limits_of
 from .progress import progress_bars, say
 
-ARTIFACT = (".npz",)
+STAGE_FILE = (".npz",)
 
 
 def centroid(
@@ -64,7 +64,7 @@ def centroid(
     quiet : bool
         Print neither progress nor remarks.
     """
-    check_output(output, [input], overwrite, ARTIFACT)
+    check_output(output, [input], overwrite, STAGE_FILE)
     source = open_input(input, selection, quiet)
     count = training_share(len(source), source.shape[1:], train)
     check_space(output, _flow_bytes(count, source.shape) + _image_bytes(source.shape))
@@ -144,7 +144,7 @@ def identify(
     quiet : bool
         No remarks.
     """
-    check_output(output, [flows], overwrite, ARTIFACT)
+    check_output(output, [flows], overwrite, STAGE_FILE)
     measured = load_flows(flows)
     most = int(len(measured) / dynamics.frames_per_state) if dynamics.rank is None else dynamics.rank
     modes = min(most, dynamics.max_rank if dynamics.rank is None else len(measured))
@@ -192,7 +192,7 @@ def filter_(
     quiet : bool
         Print neither progress nor remarks.
     """
-    check_output(output, [input, centroid, dynamics], overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
+    check_output(output, [input, centroid, dynamics], overwrite, STAGE_FILE + tuple(IMAGE_OUTPUT_SUFFIXES))
     start, model = load_artifact(centroid, Centroid), load_artifact(dynamics, FlowDynamics)
     source = open_input(input, selection, quiet)
     check_space(output, _image_bytes(source.shape))
@@ -252,9 +252,9 @@ def deconvolve(
     deconvolution = known_sigma(sigma, deconvolution)
     if bit_depth is not None:
         check_depth(bit_depth)
-        require(output.suffix.lower() not in ARTIFACT, "--bit-depth: has no effect on a stage file; leave it out")
+        require(output.suffix.lower() not in STAGE_FILE, "--bit-depth: has no effect on a stage file; leave it out")
     inputs = [path for path in (input, guide) if path is not None]
-    check_output(output, inputs, overwrite, ARTIFACT + tuple(IMAGE_OUTPUT_SUFFIXES))
+    check_output(output, inputs, overwrite, STAGE_FILE + tuple(IMAGE_OUTPUT_SUFFIXES))
     limits = limits_of(max_pixels)
     image = read_input_image(input, limits)
     guide_image = image if guide is None else read_input_image(guide, limits)
@@ -262,7 +262,7 @@ def deconvolve(
         steps = remove_blur_steps(image, guide_image, deconvolution, guards, machine.runtime())
         deblurred = finish(steps, step_counter(progress, "deconvolve", deconvolution.iterations))
     if bit_depth is None:
-        bit_depth = 16 if input.suffix.lower() in ARTIFACT else read_image(input, limits).bit_depth
+        bit_depth = 16 if input.suffix.lower() in STAGE_FILE else read_image(input, limits).bit_depth
     _write(output, deblurred.deconvolution, bit_depth, overwrite)
     for decision in deblurred.decisions:
         say(f"{output}: {decision.subject}: {decision.choice} ({decision.reason})", quiet)
@@ -279,7 +279,7 @@ def _image_bytes(shape: tuple[int, ...]) -> int:
 
 
 def _write(output: Path, result: Filtered | Deconvolution, bit_depth: int, overwrite: bool) -> None:
-    if output.suffix.lower() in ARTIFACT:
+    if output.suffix.lower() in STAGE_FILE:
         save_artifact(output, result, overwrite)
     else:
         write_image(output, result.image, bit_depth, overwrite)
