@@ -204,7 +204,7 @@ def filter_(
                 progress("filter", step.flows_measured, total)
 
         steps = filter_steps(source, start.image, model, filter, flow, start.flows, machine.runtime())
-        filtered = finish(steps, observe)
+        filtered = finish(steps, observe).recentred()
     _write(output, filtered, source.bit_depth, overwrite)
     say(f"{output}: {len(source)} frames filtered", quiet)
 

@@ -65,10 +65,10 @@ def test_figures_of_the_filter_are_means_over_tiles():
     tiles = halo_tiles((40, 80), 44, 8)
 
     def part(tile, value):
-        image = np.full(tile.shape, 0.5, np.float32)
+        image, flow = np.full(tile.shape, 0.5, np.float32), np.full((*tile.shape, 2), 0.25, np.float32)
         one = np.array([value, np.nan])
         share = np.array([0.25, 0.75])
-        return Filtered(image, 2 * image, np.ones((2, 3)), one, one, one, share, value, value)
+        return Filtered(image, 2 * image, np.ones((2, 3)), one, one, one, share, value, value, flow)
 
     filtered = join_filtered(map(part, tiles, (1.0, 2.0, 6.0)), tiles, (40, 80))
     weights = [tile.row_weights.sum() * tile.column_weights.sum() for tile in tiles]
@@ -80,7 +80,7 @@ def test_figures_of_the_filter_are_means_over_tiles():
     assert filtered.image_noise == filtered.motion_share == pytest.approx(expected)
     assert filtered.shares == pytest.approx([0.25, 0.75])
     assert filtered.flow_states.shape == (2, 9)
-    for image, level in ((filtered.image, 0.5), (filtered.variance, 1.0)):
+    for image, level in ((filtered.image, 0.5), (filtered.variance, 1.0), (filtered.mean_flow, 0.25)):
         np.testing.assert_allclose(image, level, atol=1e-6)
 
 

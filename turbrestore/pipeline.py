@@ -26,6 +26,7 @@ from .memory_plan import MemoryPlan, plan_memory
 from .registration.centroid import Centroid, centroid_steps
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
+from .registration.recentring import recentre
 from .results import NoStore, Restoration, Store
 from .runtime.allocator import returning_freed_memory
 from .runtime.device import explain_device
@@ -41,6 +42,7 @@ from .wording import (
     explain_centroid,
     explain_dynamics,
     explain_frames,
+    explain_geometry,
     explain_input,
     explain_motion,
     explain_training,
@@ -149,7 +151,7 @@ def _restored(run: _Run, on_machine: tuple[Decision, ...]) -> Restoration:
     fused = _fuse(run)
     image, centroid, deblurred = fused.image, fused.centroid, None
     if params.runs("deconvolve"):
-        deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused.image, centroid.image))
+        deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused))
         image = deblurred.deconvolution.image
     on_blur = () if deblurred is None else deblurred.decisions
     crop, on_border = _crop(image, centroid.flows, params.border, deblurred)
@@ -201,12 +203,13 @@ def _fuse(run: _Run) -> _Fused:
     if not params.runs("filter"):
         return _Fused(centroid.image, mean_of(training), centroid, decisions, dynamics)
 
-    filtered = run.stage("filter", "filtered", lambda: _filter(run, centroid, dynamics, training, stream))
+    filtered = run.stage("filter", "filtered", lambda: _filter(run, centroid, dynamics, training, stream).recentred())
     mean = run.stage("filter", "mean", lambda: _temporal_mean(run.source))
     # The sharpness is NaN for frames that do not count.
     chosen = int(np.isfinite(filtered.sharpness).sum())
     on_weights = explain_frames(filtered, None if params.keep_best == 1 else chosen)
-    return _Fused(filtered.image, mean, centroid, (*decisions, on_weights), dynamics, filtered)
+    decisions = *decisions, on_weights, explain_geometry(filtered, dynamics)
+    return _Fused(filtered.image, mean, centroid, decisions, dynamics, filtered)
 
 
 def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
@@ -272,9 +275,10 @@ def _temporal_mean(source: FrameSource) -> FloatArray:
     return (total / len(source)).astype(np.float32)
 
 
-def _deblur(run: _Run, image: FloatArray, guide: FloatArray) -> Deblurred:
-    params = run.params
-    plan = run.plan
+def _deblur(run: _Run, fused: _Fused) -> Deblurred:
+    params, plan, image, guide = run.params, run.plan, fused.image, fused.centroid.image
+    if fused.filtered is not None:
+        guide = recentre(guide, fused.filtered.mean_flow)
     steps = remove_blur_steps(image, guide, params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side)
     return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 

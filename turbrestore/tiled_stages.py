@@ -108,16 +108,21 @@ def join_filtered(
     >>> from turbrestore.runtime.tiling import halo_tiles
     >>> one, tiles = np.ones(2), halo_tiles((40, 64), side=44, halo=8)
     >>> images = (np.ones(tile.shape, np.float32) for tile in tiles)
-    >>> parts = (Filtered(image, image, one[:, None], one, one, one, one / 2, 1e-4, 1.0) for image in images)
+    >>> parts = (
+    ...     Filtered(image, image, one[:, None], one, one, one, one / 2, 1e-4, 1.0, np.dstack([image, image]))
+    ...     for image in images
+    ... )
     >>> joined = join_filtered(parts, tiles, (40, 64))
     >>> joined.image.shape, joined.flow_states.shape, joined.shares
     ((40, 64), (2, 2), array([0.5, 0.5]))
     """
     image, variance = new_mosaic(shape, scratch), new_mosaic(shape[:2], scratch)
+    mean_flow = new_mosaic((*shape[:2], 2), scratch)
     records: dict[str, list[np.ndarray]] = {}
     for tile, part in zip(tiles, parts, strict=True):
         add_tile(image, tile, part.image)
         add_tile(variance, tile, part.variance)
+        add_tile(mean_flow, tile, part.mean_flow)
         for name in ("flow_states", "gains", "innovations", "sharpness", "shares", "image_noise", "motion_share"):
             records.setdefault(name, []).append(np.asarray(getattr(part, name)))
     areas = _areas(tiles)
@@ -135,6 +140,7 @@ def join_filtered(
         shares=average("shares"),
         image_noise=float(average("image_noise")),
         motion_share=float(average("motion_share")),
+        mean_flow=mean_flow,
     )
 
 

@@ -6,11 +6,12 @@ import numpy as np
 
 from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
-from .dynamics.flow_model import FlowDynamics
+from .dynamics.flow_model import FlowDynamics, mean_flow_error
 from .filtering.alternating import Filtered
 from .registration.centroid import Centroid
 from .registration.coverage import Rectangle
 from .registration.global_shift import DEAD_ZONE
+from .registration.recentring import recentring_flow
 from .runtime.scratch import iter_frames
 
 # A frame counts if its weight is at least this share of the average weight.
@@ -221,7 +222,8 @@ def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
     >>> import numpy as np
     >>> shares = np.array([0.45, 0.05, 0.5])
     >>> none = np.zeros(3)
-    >>> filtered = Filtered(np.zeros((4, 4)), np.zeros((4, 4)), none, none, none, none, shares, 1e-4, 1.0)
+    >>> black, still = np.zeros((4, 4)), np.zeros((4, 4, 2))
+    >>> filtered = Filtered(black, black, none, none, none, none, shares, 1e-4, 1.0, still)
     >>> explain_frames(filtered, None).choice
     '2 of 3 frames count'
     """
@@ -232,6 +234,36 @@ def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
     largest = f"the largest weight is {filtered.shares.max() / mean:.1f} times the average"
     asked = "" if chosen is None else f"; only the {chosen} sharpest were asked for"
     return Decision("frames", f"{counting} of {count} frames count", f"{reason}; {largest}{asked}")
+
+
+def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
+    """Say how far the image was moved onto the mean geometry, and how well that is known.
+
+    Parameters
+    ----------
+    filtered : Filtered
+    dynamics : FlowDynamics
+
+    Returns
+    -------
+    Decision
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> black, none, flows = np.zeros((4, 4)), np.zeros(8), np.zeros((8, 4, 4, 2), np.float32)
+    >>> filtered = Filtered(black, black, none, none, none, none, none, 1e-4, 1.0, flows[0] + np.float32(0.3))
+    >>> decision = explain_geometry(filtered, identify(flows))
+    >>> decision.choice
+    'moved by 0.42 pixels'
+    >>> decision.reason
+    'mean flow to all frames, root mean square; its standard error is 0.00 pixels'
+    """
+    moved = float(np.sqrt(2 * np.mean(np.square(recentring_flow(filtered.mean_flow)), dtype=np.float64)))
+    error = mean_flow_error(dynamics, int(np.isfinite(filtered.sharpness).sum()))
+    reason = f"mean flow to all frames, root mean square; its standard error is {error:.2f} pixels"
+    return Decision("geometry", f"moved by {moved:.2f} pixels", reason)
 
 
 def explain_border(least_seen: float, crop: Rectangle | None) -> Decision:

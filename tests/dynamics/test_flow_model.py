@@ -17,6 +17,7 @@ from turbrestore.dynamics.flow_model import (
     SUMMED,
     add_products,
     flow_of,
+    mean_flow_error,
     predict_flow,
     project_deviation,
 )
@@ -137,3 +138,21 @@ def test_a_state_takes_a_piece_of_the_modes_at_a_time(tmp_path, count, shape):
 def resident() -> int:
     """Bytes of this process that are in memory."""
     return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_the_error_of_the_mean_flow_is_that_of_its_spread_over_many_clips(rng):
+    """One state that is remembered from frame to frame, and the mean of each clip."""
+    mode, count, memory = rng.standard_normal((4, 4, 2)), 60, 0.7
+    mode /= np.sqrt((mode**2).sum(axis=-1).mean())
+
+    def clip():
+        state, flows = rng.standard_normal(), []
+        for _ in range(count):
+            state = memory * state + np.sqrt(1 - memory**2) * rng.standard_normal()
+            flows.append(state * mode)
+        return np.array(flows, np.float32)
+
+    clips = [clip() for _ in range(200)]
+    spread = np.sqrt(np.mean([(flows.mean(axis=0) ** 2).sum(axis=-1).mean() for flows in clips]))
+    errors = [mean_flow_error(identify(flows, DynamicsParams(rank=1)), count) for flows in clips]
+    assert np.median(errors) == pytest.approx(spread, rel=0.15)

@@ -151,6 +151,38 @@ class FlowDynamics:
         return np.diag(self.singular_values[: self.rank] ** 2 / (self.frame_count - 1))
 
 
+def mean_flow_error(dynamics: FlowDynamics, count: int) -> float:
+    """Standard error of the mean of consecutive flows, which is that of the mean geometry of so many frames.
+
+    Successive flows are alike, so they are worth fewer independent ones.  State i, with a correlation ρ_i from one
+    frame to the next, averages out as ``count (1 − ρ_i) / (1 + ρ_i)`` independent states do, and at least as one.  As
+    the states of the training flows are uncorrelated, ρ_i is ``A_ii``.
+
+    Parameters
+    ----------
+    dynamics : FlowDynamics
+    count : int
+        Number of frames, at least 1.
+
+    Returns
+    -------
+    float
+        Root mean square over the pixels of the length of the error, pixels.
+
+    Examples
+    --------
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> flows = np.zeros((6, 2, 2, 2)); flows[:3, ..., 0], flows[3:, ..., 0] = 1, -1
+    >>> dynamics = identify(flows)
+    >>> dynamics.A.round(2), round(mean_flow_error(dynamics, 100), 2)
+    (array([[0.6]]), 0.22)
+    """
+    correlation = np.clip(np.diag(dynamics.A), 0, max(1 - 2 / count, 0))
+    independent = np.maximum(count * (1 - correlation) / (1 + correlation), 1)
+    modelled = float(np.sum(np.diag(dynamics.state_covariance) / independent)) / dynamics.mean_flow[..., 0].size
+    return float(np.sqrt(modelled + 2 * dynamics.R / count))
+
+
 def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64Array:
     """State of a flow: Cᵀ (W − W̄), the least-squares solution of eq. 10 since Cᵀ C = I (paper 3, eq. 9).
 

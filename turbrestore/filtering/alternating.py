@@ -34,13 +34,12 @@ Departures from the paper, each with its reason:
   their flows from the same image.  That image contains the earlier block in its state before the last iteration.  With
   blocks of one frame this is the paper's scheme but for two points: that image, and the frame itself, which the image
   does not contain yet when the flow is first measured.
-* Every inner iteration starts from the prediction, not from its own result, so a frame counts once; on a linear
-  model the iteration then changes nothing.
+* Every inner iteration starts from the prediction, not from its own result, so a frame counts once.
 * Z varies from pixel to pixel: it is lower where a frame is locally sharper than usual, and higher where the frame
   shows what the others do not (a bird, a flash), where it was not seen, and where the flow folds, which a
   diffeomorphism does not.  β = 0 is the paper's scalar gain.
-* The image starts from a diffuse prior (``prior_frames=0``) and is updated by the training frames first; the paper
-  starts from the centroid.
+* The image starts from a diffuse prior (``prior_frames=0``), not from the centroid.
+* The mean of W^meas over all frames is kept: it leads from the reference to the mean geometry.
 """
 
 from __future__ import annotations
@@ -97,8 +96,7 @@ def filter_frames(
 ) -> Filtered:
     """Run the alternating-estimation filter over ``frames`` (paper 3, section 4).
 
-    Memory is bounded by the first block (as many frames as there are known flows) and does not grow with the number
-    of frames.
+    Memory is bounded by the first block, as many frames as there are known flows.
 
     Parameters
     ----------
@@ -252,18 +250,21 @@ def _iterate(
     frames, starts = chain(_drain(at.block), following), chain(known, repeat(None))
     reference = None if from_known else at.image
     image = settled_image = backend.load_pixels(at.state.image)
+    flow_sum = at.state.flow_sum.copy() if settle else at.state.flow_sum
     flow, records, block, flows_measured = at.state.flow, list(at.records), deque[Frame](), at.flows_measured
     for number, tracked in enumerate(pass_over(frames, starts, reference, at.state.flow, settled, settings)):
         image, record = _update_image(image, tracked, settings)
         if number < settled:
             settled_image, flow = image, tracked.state
             records.append(record)
+            if tracked.measured is not None:
+                flow_sum += tracked.measured
         else:
             block.append(tracked.frame)
         if not from_known:
             flows_measured += 1
             yield FilterStep(flows_measured)
-    state = FilterState(backend.store_pixels(settled_image), flow)
+    state = FilterState(backend.store_pixels(settled_image), flow, flow_sum)
     return _Position(state, tuple(records), backend.store_image(image), block, flows_measured)
 
 
@@ -325,6 +326,7 @@ def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params
     return FilterState(
         PixelGaussian(image, np.full(image.shape[:2], variance, np.float32)),
         Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance),
+        np.zeros((*image.shape[:2], 2), np.float32),
     )
 
 
@@ -349,9 +351,9 @@ def _first_block(
     stream: Iterator[FloatArray | None], size: int, flows: FloatArray | None
 ) -> tuple[list[FloatArray | None], Flows | None]:
     """Frames with known flows, else as many as any block has; more where none of them counts, without known flows."""
-    block = list(islice(stream, size if flows is None else len(flows)))
-    if not block or (flows is not None and len(block) < len(flows)):
-        raise DataError(f"frames: expected at least {1 if flows is None else len(flows)}, found {len(block)}")
+    block, least = list(islice(stream, size if flows is None else len(flows))), 1 if flows is None else len(flows)
+    if len(block) < max(least, 1):
+        raise DataError(f"frames: expected at least {least}, found {len(block)}")
     known: Flows | None = flows
     while all(frame is None for frame in block):
         known, more = None, list(islice(stream, size))
@@ -369,9 +371,10 @@ def _skip(
     dynamics: FlowDynamics,
 ) -> None:
     """Read the frames before a checkpoint that lie behind the first block."""
-    image, flow = start.state.image, start.state.flow
-    found = image.mean.shape, image.variance.shape, flow.mean.shape, start.reference.shape
-    if count < 0 or found != (shape, shape[:2], (dynamics.rank,), shape):
+    state, size = start.state, shape[:2]
+    pixels = state.image.mean.shape, state.image.variance.shape, state.flow_sum.shape, start.reference.shape
+    found = (*pixels, state.flow.mean.shape)
+    if count < 0 or found != (shape, size, (*size, 2), shape, (dynamics.rank,)):
         raise DataError(
             f"start: expected a checkpoint of these frames, found one of {len(start.records)} frames and shapes {found}"
         )
@@ -382,14 +385,17 @@ def _skip(
 def _filtered(at: _Position, image_noise: float, motion_share: float) -> Filtered:
     state, records = at.state, at.records
     information = np.array([record.information for record in records])
+    sharpness = np.array([record.sharpness for record in records])
     return Filtered(
         image=state.image.mean.astype(np.float32),
         variance=state.image.variance.astype(np.float32),
         flow_states=np.array([record.flow_state for record in records]),
         gains=np.array([record.gain for record in records]),
         innovations=np.array([record.innovation for record in records]),
-        sharpness=np.array([record.sharpness for record in records]),
+        sharpness=sharpness,
         shares=information / information.sum(),
         image_noise=image_noise,
         motion_share=motion_share,
+        # Frames that do not count have no sharpness.
+        mean_flow=state.flow_sum / np.float32(np.isfinite(sharpness).sum()),
     )

@@ -5,7 +5,7 @@ Symbols as in :mod:`turbrestore.filtering.alternating`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -14,6 +14,8 @@ from ..core.arrays import FloatArray
 from ..core.errors import require, require_between
 from ..display.plots import plot_frames
 from ..display.preview import preview
+from ..registration.recentring import recentring_flow
+from ..registration.warp import warp
 from .image_state import PixelGaussian
 from .kalman import Gaussian
 
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 RESIDUALS = ("keep", "drop")
 # Bytes a pixel while frames are registered and fused: for each channel, for each thread, and for each channel of that.
 _SHARED_CHANNEL, _EACH, _EACH_CHANNEL = 15.0, 10.0, 5.0
+# Bytes a pixel of the sum of flows, before and after a block, and of a flow that waits in each thread to be added.
+_SUMS, _WAITING = 16.0, 8.0
 
 
 @dataclass(frozen=True)
@@ -83,10 +87,13 @@ class FilterState:
         ρ̂ and Σ.
     flow : Gaussian
         ξ̂ and P.
+    flow_sum : ndarray, float32, shape (H, W, 2)
+        Sum of W^meas over the frames so far that count, pixels.
     """
 
     image: PixelGaussian
     flow: Gaussian
+    flow_sum: FloatArray
 
 
 @dataclass(frozen=True)
@@ -170,6 +177,10 @@ class Filtered:
         Z₀, squared intensity.
     motion_share : float
         G, mean over the pixels; 0 with ``residual="drop"``.
+    mean_flow : ndarray, float32, shape (H, W, 2)
+        Mean of W^meas of the last iteration over all frames that count, pixels: how far the image that the filter
+        started from, in whose geometry frames are fused, lies from the mean geometry of all frames.  :meth:`recentred`
+        moves image and variance there, as :func:`turbrestore.restore` does.
     """
 
     image: FloatArray
@@ -181,6 +192,18 @@ class Filtered:
     shares: np.ndarray
     image_noise: float
     motion_share: float
+    mean_flow: FloatArray
+
+    def recentred(self) -> Filtered:
+        """Move image and variance onto the mean geometry; ``mean_flow`` stays, as what was undone.
+
+        Returns
+        -------
+        Filtered
+        """
+        V = recentring_flow(self.mean_flow)
+        # Linear interpolation keeps variances positive.
+        return replace(self, image=warp(self.image, V), variance=warp(self.variance, V, interpolation="linear"))
 
     def plot(self) -> Figure:
         """Draw how sharp each frame is and how much it counts.
@@ -228,7 +251,7 @@ def filter_memory(shape: tuple[int, ...], train: int, params: FilterParams | Non
     Examples
     --------
     >>> filter_memory((120, 256, 256), 60, threads=2) / 256**2
-    189.0
+    221.0
     """
     params, pixels = params or FilterParams(), float(shape[1] * shape[2])
     channels = shape[3] if len(shape) == 4 else 1
@@ -236,4 +259,5 @@ def filter_memory(shape: tuple[int, ...], train: int, params: FilterParams | Non
     block = (4.0 * channels + 2.0) * min(params.block, shape[0] - train)
     # From the third iteration on, what flow prepares of the training frames is kept too.
     prepared = float(train) if params.inner_iterations > 2 else 0.0
-    return pixels * (_SHARED_CHANNEL * channels + threads * (_EACH + _EACH_CHANNEL * channels) + max(block, prepared))
+    each = _EACH + _WAITING + _EACH_CHANNEL * channels
+    return pixels * (_SHARED_CHANNEL * channels + _SUMS + threads * each + max(block, prepared))

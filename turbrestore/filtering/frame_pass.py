@@ -90,6 +90,8 @@ class TrackedFrame:
         ξ̂ and P after the frame.
     innovation : float
         Root mean square of W^meas − W̄ − C A ξ̂, pixels; NaN if the frame does not count.
+    measured : ndarray, float32, shape (H, W, 2), or None
+        W^meas, pixels; None if the frame does not count.
     registered : callable or None
         Returns the RegisteredFrame; None if the frame does not count.
     """
@@ -97,6 +99,7 @@ class TrackedFrame:
     frame: Frame
     state: Gaussian
     innovation: float
+    measured: FloatArray | None
     registered: Callable[[], RegisteredFrame] | None
 
 
@@ -237,9 +240,9 @@ def _track(item: _Item, state: Gaussian, innovation: float, settings: PassSettin
     frame = item.frame if item.kept else None
     image = item.frame.image if isinstance(item.frame, FlowFrame) else item.frame
     if image is None or item.measured is None:
-        return TrackedFrame(frame, state, innovation, None)
+        return TrackedFrame(frame, state, innovation, None, None)
     if settings.backend.is_cpu:
         registered = _register(image, item.measured, state, settings)
-        return TrackedFrame(frame, state, innovation, lambda: registered)
+        return TrackedFrame(frame, state, innovation, item.measured, lambda: registered)
     measured = item.measured
-    return TrackedFrame(frame, state, innovation, lambda: _register(image, measured, state, settings))
+    return TrackedFrame(frame, state, innovation, measured, lambda: _register(image, measured, state, settings))

@@ -15,7 +15,7 @@ from ..io.npy import read_npz
 from ..io.output import atomic_output
 
 _FIGURES = ("gain", "innovation", "sharpness", "information")
-_ARRAYS = ("image", "variance", "flow", "covariance", "reference", "flow_states", *_FIGURES)
+_ARRAYS = ("image", "variance", "flow", "covariance", "flow_sum", "reference", "flow_states", *_FIGURES)
 
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, key: str) -> None:
@@ -36,7 +36,8 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, 
     Examples
     --------
     >>> import tempfile
-    >>> state = FilterState(PixelGaussian(np.zeros((2, 3)), np.ones((2, 3))), Gaussian(np.zeros(1), np.eye(1)))
+    >>> image, flow = PixelGaussian(np.zeros((2, 3)), np.ones((2, 3))), Gaussian(np.zeros(1), np.eye(1))
+    >>> state = FilterState(image, flow, np.zeros((2, 3, 2), np.float32))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     one = FilterCheckpoint(state, (FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0),), np.zeros((2, 3)))
     ...     save_checkpoint(folder + "/c.npz", one, "A")
@@ -47,7 +48,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, 
     arrays: dict[str, np.ndarray] = {name: np.array([getattr(record, name) for record in records]) for name in _FIGURES}
     states = np.array([record.flow_state for record in records], np.float64)
     arrays |= {"image": image.mean, "variance": image.variance, "flow": flow.mean, "covariance": flow.cov}
-    arrays["reference"] = checkpoint.reference
+    arrays |= {"flow_sum": checkpoint.state.flow_sum, "reference": checkpoint.reference}
     with atomic_output(path, overwrite=True) as temporary, temporary.open("wb") as stream:
         np.savez(stream, allow_pickle=False, key=np.array(key), flow_states=states, **arrays)
 
@@ -87,7 +88,9 @@ def load_checkpoint(path: str | os.PathLike[str], key: str) -> FilterCheckpoint:
         states, figures = arrays["flow_states"], np.stack([arrays[name] for name in _FIGURES], axis=-1)
         records = tuple(FrameRecord(state, *map(float, row)) for state, row in zip(states, figures, strict=True))
         state = FilterState(
-            PixelGaussian(arrays["image"], arrays["variance"]), Gaussian(arrays["flow"], arrays["covariance"])
+            PixelGaussian(arrays["image"], arrays["variance"]),
+            Gaussian(arrays["flow"], arrays["covariance"]),
+            arrays["flow_sum"],
         )
     except (DataError, KeyError, ValueError, AttributeError, TypeError) as error:
         raise _something_else(source) from error

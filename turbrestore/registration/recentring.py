@@ -1,0 +1,88 @@
+"""The mean geometry of all frames: an image is moved onto it after the last frame.
+
+Symbols
+-------
+q : image; W_k : flow from q to frame I_k, pixels; W̄ : mean of W_k over the frames that count
+V : inverse flow, ``(id + V) = (id + W̄)^{-1}``
+
+The centroid of the training frames is not that of all frames: where turbulence is correlated in time, half of a clip
+has a mean flow of its own.  Flows from one image to all frames tell how far it lies from their mean geometry: exactly
+by W̄ (paper 3, eq. 12), so ``q ∘ (id + V)`` lies there, and the flows from it, ``W_k ∘ (id + V) + V``, average to zero.
+
+The mean geometry is itself known only as well as the motion of finitely many frames averages out; see
+:func:`turbrestore.dynamics.flow_model.mean_flow_error`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arrays import FloatArray, check_flow
+from ..core.errors import DataError
+from .flow_algebra import invert_flow
+from .global_shift import DEAD_ZONE
+from .warp import warp
+
+
+def recentring_flow(mean_flow: ArrayLike) -> FloatArray:
+    """Flow V that moves an image onto the mean geometry: the inverse of W̄.
+
+    A shift of the whole image by more than two pixels is the camera's; it is left, because it bends nothing, and
+    following it would move a part of the image out of the frame.
+
+    Parameters
+    ----------
+    mean_flow : array_like, shape (H, W, 2)
+        W̄, pixels.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W, 2)
+        V, pixels; ``warp(image, V)`` is the image at the mean geometry.
+
+    Raises
+    ------
+    DataError
+        Wrong shape, or values are not finite.
+
+    Examples
+    --------
+    >>> recentring_flow(np.full((4, 4, 2), 0.5, np.float32))[0, 0]
+    array([-0.5, -0.5], dtype=float32)
+    >>> float(abs(recentring_flow(np.full((4, 4, 2), 5.0, np.float32))).max())
+    0.0
+    """
+    flow = check_flow(mean_flow, "mean_flow")
+    if flow.ndim != 3:
+        raise DataError(f"mean_flow: expected shape (H, W, 2), found {flow.shape}")
+    shift = np.median(flow.reshape(-1, 2), axis=0)
+    return invert_flow(flow - shift if np.hypot(*shift) > DEAD_ZONE else flow)
+
+
+def recentre(image: ArrayLike, mean_flow: ArrayLike) -> FloatArray:
+    """Move an image onto the mean geometry of its frames: ``q ∘ (id + W̄)^{-1}``.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W) or (H, W, 3)
+        q.
+    mean_flow : array_like, shape (H, W, 2)
+        W̄, the mean of the flows from the image to the frames, pixels.
+
+    Returns
+    -------
+    ndarray, float32, shape of ``image``
+
+    Raises
+    ------
+    DataError
+        Shapes do not agree, or values are not finite.
+
+    Examples
+    --------
+    >>> ramp = np.tile(np.arange(16, dtype=np.float32), (16, 1))
+    >>> recentre(ramp, np.full((16, 16, 2), (0.5, 0.0), np.float32))[8, 8].round(3)
+    np.float32(7.5)
+    """
+    return warp(image, recentring_flow(mean_flow))
