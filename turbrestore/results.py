@@ -77,7 +77,7 @@ class Restoration:
     dynamics : FlowDynamics or None
         Where frames are processed in tiles it is for the record: the filter has a model of each tile.
     filtered : Filtered or None
-        Recentred: its image is at the mean geometry of all frames, whereas the centroid and its flows are at that of the
+        Recentred: its image is at the mean geometry of all frames; the centroid and its flows are at that of the
         training frames.
     blur : BlurEstimate or None
         Estimated blur of the filtered image; None where sigma was given.

@@ -392,7 +392,7 @@ def test_a_border_that_was_not_seen_is_not_made_of_its_repetition():
 
 def test_memory_grows_with_channels_threads_and_the_block():
     grey, colour = (filter_memory((100, 10, 10, *channels), 50, FilterParams(block=4)) for channels in ((), (3,)))
-    assert grey == 100 * (15 + 16 + 18 + 5 + 4 * 6)
-    assert colour == 100 * (45 + 16 + 18 + 15 + 4 * 14)
+    assert grey == 100 * (15 + 24 + 18 + 5 + 4 * 6)
+    assert colour == 100 * (45 + 24 + 18 + 15 + 4 * 14)
     assert filter_memory((100, 10, 10), 50, FilterParams(block=4), threads=3) == grey + 100 * 2 * 23
     assert filter_memory((100, 10, 10), 50, FilterParams(inner_iterations=3, block=4)) == grey + 100 * (50 - 24)

@@ -28,7 +28,9 @@ from turbrestore_cli.output import write_settings
 
 IMAGE = np.random.default_rng(0).uniform(size=(64, 64)).astype(np.float32)
 FLOWS = np.zeros((2, 64, 64, 2), np.float32)
-STATE = FilterState(PixelGaussian(IMAGE, IMAGE), Gaussian(np.zeros(1), np.eye(1)), np.zeros((*IMAGE.shape, 2), np.float32))
+STATE = FilterState(
+    PixelGaussian(IMAGE, IMAGE), Gaussian(np.zeros(1), np.eye(1)), *np.zeros((2, *IMAGE.shape, 2), np.float32)
+)
 CHECKPOINT = FilterCheckpoint(STATE, (), IMAGE)
 
 # Everything that is written goes through one of these.

@@ -402,7 +402,7 @@ def test_a_checkpoint_comes_back_bit_for_bit(tmp_path):
         image = PixelGaussian(rng.normal(size=shape).astype(np.float32), rng.uniform(size=(5, 4)).astype(np.float32))
         flow = Gaussian(rng.normal(size=rank), 0.1 * np.eye(rank))
         records = tuple(FrameRecord(rng.normal(size=rank), 0.1 * k, np.nan, np.nan, 3.0) for k in range(4))
-        state = FilterState(image, flow, rng.normal(size=(5, 4, 2)).astype(np.float32))
+        state = FilterState(image, flow, *rng.normal(size=(2, 5, 4, 2)).astype(np.float32))
         save_checkpoint(tmp_path / "c.npz", FilterCheckpoint(state, records, 2 * image.mean), "key")
         found = load_checkpoint(tmp_path / "c.npz", "key")
         assert np.array_equal(found.reference, 2 * image.mean)
@@ -412,6 +412,7 @@ def test_a_checkpoint_comes_back_bit_for_bit(tmp_path):
         assert np.array_equal(found.state.image.variance, image.variance)
         assert np.array_equal(found.state.flow.cov, flow.cov)
         assert np.array_equal(found.state.flow_sum, state.flow_sum)
+        assert np.array_equal(found.state.training_flow, state.training_flow)
         for one, other in zip(found.records, records, strict=True):
             assert np.array_equal(one.flow_state, other.flow_state)
             for name in ("gain", "innovation", "sharpness", "information"):

@@ -152,7 +152,7 @@ class FlowDynamics:
 
 
 def mean_flow_error(dynamics: FlowDynamics, count: int) -> float:
-    """Standard error of the mean of consecutive flows, which is that of the mean geometry of so many frames.
+    """Compute the standard error of the mean of consecutive flows, that of the mean geometry of so many frames.
 
     Successive flows are alike, so they are worth fewer independent ones.  State i, with a correlation ρ_i from one
     frame to the next, averages out as ``count (1 − ρ_i) / (1 + ρ_i)`` independent states do, and at least as one.  As

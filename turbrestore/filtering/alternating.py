@@ -36,10 +36,9 @@ Departures from the paper, each with its reason:
   does not contain yet when the flow is first measured.
 * Every inner iteration starts from the prediction, not from its own result, so a frame counts once.
 * Z varies from pixel to pixel: it is lower where a frame is locally sharper than usual, and higher where the frame
-  shows what the others do not (a bird, a flash), where it was not seen, and where the flow folds, which a
-  diffeomorphism does not.  β = 0 is the paper's scalar gain.
-* The image starts from a diffuse prior (``prior_frames=0``), not from the centroid.
-* The mean of W^meas over all frames is kept: it leads from the reference to the mean geometry.
+  shows what the others do not (a bird, a flash), where it was not seen, and where the flow folds.  β = 0 is the
+  paper's scalar gain.
+* The image starts from a diffuse prior (``prior_frames=0``), not from the centroid.  The mean of W^meas is kept.
 """
 
 from __future__ import annotations
@@ -59,7 +58,16 @@ from ..registration.flow import FlowParams, iterate_flows
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from .array_backend import array_backend
-from .filter_records import FilterCheckpoint, Filtered, FilterParams, FilterState, FilterStep, FrameRecord
+from .filter_records import (
+    FilterCheckpoint,
+    Filtered,
+    FilterParams,
+    FilterState,
+    FilterStep,
+    FrameRecord,
+    join_records,
+    mean_flow_over,
+)
 from .frame_pass import Frame, PassSettings, TrackedFrame, pass_over
 from .frame_statistics import measure_frame_statistics
 from .image_state import PixelGaussian, PixelStacks, update_pixels
@@ -203,7 +211,7 @@ def filter_steps(
         at = _Position(start.state, start.records, start.reference, deque(), flows_measured)
     del block
     at = yield from _filter_blocks(at, stream, known, params, settings)
-    return _filtered(at, image_noise, motion_share)
+    return join_records(at.state, at.records, image_noise, motion_share)
 
 
 def _filter_blocks(
@@ -264,7 +272,10 @@ def _iterate(
         if not from_known:
             flows_measured += 1
             yield FilterStep(flows_measured)
-    state = FilterState(backend.store_pixels(settled_image), flow, flow_sum)
+    training_flow = at.state.training_flow
+    if settled and not at.records and isinstance(known, np.ndarray):
+        training_flow = mean_flow_over(flow_sum, records)
+    state = FilterState(backend.store_pixels(settled_image), flow, flow_sum, training_flow)
     return _Position(state, tuple(records), backend.store_image(image), block, flows_measured)
 
 
@@ -326,7 +337,7 @@ def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params
     return FilterState(
         PixelGaussian(image, np.full(image.shape[:2], variance, np.float32)),
         Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance),
-        np.zeros((*image.shape[:2], 2), np.float32),
+        *np.zeros((2, *image.shape[:2], 2), np.float32),
     )
 
 
@@ -372,30 +383,11 @@ def _skip(
 ) -> None:
     """Read the frames before a checkpoint that lie behind the first block."""
     state, size = start.state, shape[:2]
-    pixels = state.image.mean.shape, state.image.variance.shape, state.flow_sum.shape, start.reference.shape
-    found = (*pixels, state.flow.mean.shape)
-    if count < 0 or found != (shape, size, (*size, 2), shape, (dynamics.rank,)):
+    flows, images = (state.flow_sum, state.training_flow), (state.image.mean, start.reference)
+    found = tuple(array.shape for array in (*images, state.image.variance, *flows, state.flow.mean))
+    if count < 0 or found != (shape, shape, size, (*size, 2), (*size, 2), (dynamics.rank,)):
         raise DataError(
             f"start: expected a checkpoint of these frames, found one of {len(start.records)} frames and shapes {found}"
         )
     for _ in islice(stream, count):
         pass
-
-
-def _filtered(at: _Position, image_noise: float, motion_share: float) -> Filtered:
-    state, records = at.state, at.records
-    information = np.array([record.information for record in records])
-    sharpness = np.array([record.sharpness for record in records])
-    return Filtered(
-        image=state.image.mean.astype(np.float32),
-        variance=state.image.variance.astype(np.float32),
-        flow_states=np.array([record.flow_state for record in records]),
-        gains=np.array([record.gain for record in records]),
-        innovations=np.array([record.innovation for record in records]),
-        sharpness=sharpness,
-        shares=information / information.sum(),
-        image_noise=image_noise,
-        motion_share=motion_share,
-        # Frames that do not count have no sharpness.
-        mean_flow=state.flow_sum / np.float32(np.isfinite(sharpness).sum()),
-    )

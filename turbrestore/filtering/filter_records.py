@@ -5,6 +5,7 @@ Symbols as in :mod:`turbrestore.filtering.alternating`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 RESIDUALS = ("keep", "drop")
 # Bytes a pixel while frames are registered and fused: for each channel, for each thread, and for each channel of that.
 _SHARED_CHANNEL, _EACH, _EACH_CHANNEL = 15.0, 10.0, 5.0
-# Bytes a pixel of the sum of flows, before and after a block, and of a flow that waits in each thread to be added.
-_SUMS, _WAITING = 16.0, 8.0
+# Bytes a pixel of means of flows: two sums and a mean; and of a flow that waits in each thread to be added.
+_SUMS, _WAITING = 24.0, 8.0
 
 
 @dataclass(frozen=True)
@@ -89,11 +90,14 @@ class FilterState:
         ξ̂ and P.
     flow_sum : ndarray, float32, shape (H, W, 2)
         Sum of W^meas over the frames so far that count, pixels.
+    training_flow : ndarray, float32, shape (H, W, 2)
+        Mean of W^meas over the frames with known flows, pixels; 0 before they are done, or if there are none.
     """
 
     image: PixelGaussian
     flow: Gaussian
     flow_sum: FloatArray
+    training_flow: FloatArray
 
 
 @dataclass(frozen=True)
@@ -178,9 +182,10 @@ class Filtered:
     motion_share : float
         G, mean over the pixels; 0 with ``residual="drop"``.
     mean_flow : ndarray, float32, shape (H, W, 2)
-        Mean of W^meas of the last iteration over all frames that count, pixels: how far the image that the filter
-        started from, in whose geometry frames are fused, lies from the mean geometry of all frames.  :meth:`recentred`
-        moves image and variance there, as :func:`turbrestore.restore` does.
+        Mean of W^meas over all frames that count, less that over the frames with known flows, pixels: how far the
+        centroid of those, in whose geometry frames are fused, lies from the mean geometry of all frames.  Both means
+        have the same bias of the flow method, and the difference has none.  :meth:`recentred` moves image and variance
+        there, as :func:`turbrestore.restore` does.
     """
 
     image: FloatArray
@@ -201,6 +206,8 @@ class Filtered:
         -------
         Filtered
         """
+        if not self.mean_flow.any():
+            return self
         V = recentring_flow(self.mean_flow)
         # Linear interpolation keeps variances positive.
         return replace(self, image=warp(self.image, V), variance=warp(self.variance, V, interpolation="linear"))
@@ -228,6 +235,67 @@ class Filtered:
         return preview("Filtered image", facts, self.image)
 
 
+def mean_flow_over(flow_sum: FloatArray, records: Sequence[FrameRecord]) -> FloatArray:
+    """Average the flows to the frames that count; 0 if none of them does.
+
+    Parameters
+    ----------
+    flow_sum : ndarray, float32, shape (H, W, 2)
+        Sum of W^meas, pixels.
+    records : sequence of FrameRecord
+        Of the frames; those that do not count have no sharpness.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W, 2)
+
+    Examples
+    --------
+    >>> none = np.zeros(0)
+    >>> records = [FrameRecord(none, 0.1, 0.1, sharpness, 1.0) for sharpness in (1.0, np.nan, 1.0)]
+    >>> float(mean_flow_over(np.full((2, 2, 2), 3, np.float32), records).max())
+    1.5
+    """
+    return flow_sum / np.float32(max(sum(np.isfinite(record.sharpness) for record in records), 1))
+
+
+def join_records(
+    state: FilterState, records: Sequence[FrameRecord], image_noise: float, motion_share: float
+) -> Filtered:
+    """Join the last state and the records of all frames.
+
+    Parameters
+    ----------
+    state : FilterState
+    records : sequence of FrameRecord
+    image_noise, motion_share : float
+
+    Returns
+    -------
+    Filtered
+
+    Examples
+    --------
+    >>> flow, pixels = np.zeros((2, 3, 2), np.float32), PixelGaussian(np.zeros((2, 3)), np.ones((2, 3)))
+    >>> state = FilterState(pixels, Gaussian(np.zeros(1), np.eye(1)), flow, flow)
+    >>> join_records(state, [FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0)] * 2, 1e-4, 1.0).shares
+    array([0.5, 0.5])
+    """
+    information = np.array([record.information for record in records])
+    return Filtered(
+        image=state.image.mean.astype(np.float32),
+        variance=state.image.variance.astype(np.float32),
+        flow_states=np.array([record.flow_state for record in records]),
+        gains=np.array([record.gain for record in records]),
+        innovations=np.array([record.innovation for record in records]),
+        sharpness=np.array([record.sharpness for record in records]),
+        shares=information / information.sum(),
+        image_noise=image_noise,
+        motion_share=motion_share,
+        mean_flow=mean_flow_over(state.flow_sum, records) - state.training_flow,
+    )
+
+
 def filter_memory(shape: tuple[int, ...], train: int, params: FilterParams | None = None, threads: int = 1) -> float:
     """Bytes that the filter takes beside flow, the training frames with their flows, and the modes of the flow model.
 
@@ -251,7 +319,7 @@ def filter_memory(shape: tuple[int, ...], train: int, params: FilterParams | Non
     Examples
     --------
     >>> filter_memory((120, 256, 256), 60, threads=2) / 256**2
-    221.0
+    229.0
     """
     params, pixels = params or FilterParams(), float(shape[1] * shape[2])
     channels = shape[3] if len(shape) == 4 else 1

@@ -9,6 +9,10 @@ The centroid of the training frames is not that of all frames: where turbulence 
 has a mean flow of its own.  Flows from one image to all frames tell how far it lies from their mean geometry: exactly
 by W̄ (paper 3, eq. 12), so ``q ∘ (id + V)`` lies there, and the flows from it, ``W_k ∘ (id + V) + V``, average to zero.
 
+Measured flows have a bias, up to 2 px where the image is much sharper than the frames, and their mean over the training
+frames, whose centroid has been found, shows it.  So the filter takes W̄ as the difference of the means over all frames
+and over the training frames: a clip that has trained as a whole is left where it is.
+
 The mean geometry is itself known only as well as the motion of finitely many frames averages out; see
 :func:`turbrestore.dynamics.flow_model.mean_flow_error`.
 """
@@ -18,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_flow
+from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import DataError
 from .flow_algebra import invert_flow
 from .global_shift import DEAD_ZONE
@@ -85,4 +89,6 @@ def recentre(image: ArrayLike, mean_flow: ArrayLike) -> FloatArray:
     >>> recentre(ramp, np.full((16, 16, 2), (0.5, 0.0), np.float32))[8, 8].round(3)
     np.float32(7.5)
     """
-    return warp(image, recentring_flow(mean_flow))
+    V = recentring_flow(mean_flow)
+    # Interpolation by no shift would change the last bits.
+    return warp(image, V) if V.any() else check_image(image)

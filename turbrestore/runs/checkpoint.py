@@ -15,7 +15,8 @@ from ..io.npy import read_npz
 from ..io.output import atomic_output
 
 _FIGURES = ("gain", "innovation", "sharpness", "information")
-_ARRAYS = ("image", "variance", "flow", "covariance", "flow_sum", "reference", "flow_states", *_FIGURES)
+_STATE = ("image", "variance", "flow", "covariance", "flow_sum", "training_flow")
+_ARRAYS = (*_STATE, "reference", "flow_states", *_FIGURES)
 
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, key: str) -> None:
@@ -37,7 +38,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, 
     --------
     >>> import tempfile
     >>> image, flow = PixelGaussian(np.zeros((2, 3)), np.ones((2, 3))), Gaussian(np.zeros(1), np.eye(1))
-    >>> state = FilterState(image, flow, np.zeros((2, 3, 2), np.float32))
+    >>> state = FilterState(image, flow, *np.zeros((2, 2, 3, 2), np.float32))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     one = FilterCheckpoint(state, (FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0),), np.zeros((2, 3)))
     ...     save_checkpoint(folder + "/c.npz", one, "A")
@@ -48,7 +49,8 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, 
     arrays: dict[str, np.ndarray] = {name: np.array([getattr(record, name) for record in records]) for name in _FIGURES}
     states = np.array([record.flow_state for record in records], np.float64)
     arrays |= {"image": image.mean, "variance": image.variance, "flow": flow.mean, "covariance": flow.cov}
-    arrays |= {"flow_sum": checkpoint.state.flow_sum, "reference": checkpoint.reference}
+    arrays |= {"flow_sum": checkpoint.state.flow_sum, "training_flow": checkpoint.state.training_flow}
+    arrays["reference"] = checkpoint.reference
     with atomic_output(path, overwrite=True) as temporary, temporary.open("wb") as stream:
         np.savez(stream, allow_pickle=False, key=np.array(key), flow_states=states, **arrays)
 
@@ -91,6 +93,7 @@ def load_checkpoint(path: str | os.PathLike[str], key: str) -> FilterCheckpoint:
             PixelGaussian(arrays["image"], arrays["variance"]),
             Gaussian(arrays["flow"], arrays["covariance"]),
             arrays["flow_sum"],
+            arrays["training_flow"],
         )
     except (DataError, KeyError, ValueError, AttributeError, TypeError) as error:
         raise _something_else(source) from error
