@@ -14,8 +14,8 @@ from turbrestore.blur.estimation import (
     _unreduced_width,
     estimate_blur,
 )
-from turbrestore.blur.marginal_likelihood import image_gradients, likeliest_width, width_costs
-from turbrestore.blur.psf import GAUSSIAN, KOLMOGOROV, blur_otf
+from turbrestore.blur.marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
+from turbrestore.blur.psf import GAUSSIAN, KOLMOGOROV, blur_otf, fused_exponent
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.threads import one_thread_each
@@ -57,10 +57,20 @@ def test_the_width_of_a_gaussian_is_found(name, sigma, noise):
 
 def test_the_width_of_a_turbulent_blur_is_found_and_depends_on_the_shape():
     scene = SCENES["camera"](256, 256)
-    image = np.fft.irfft2(blur_otf(scene.shape, 1.6, KOLMOGOROV) * np.fft.rfft2(scene), s=scene.shape)
-    image = (image + np.random.default_rng(1).normal(0, 0.002, scene.shape)).astype(np.float32)
-    assert estimate_blur(image).sigma == pytest.approx(1.6, rel=0.15)
-    assert estimate_blur(image).exponent == KOLMOGOROV
+    for sigma, shape in ((1.6, KOLMOGOROV), (1.0, fused_exponent(1.0)), (1.6, fused_exponent(1.6))):
+        image = np.fft.irfft2(blur_otf(scene.shape, sigma, shape) * np.fft.rfft2(scene), s=scene.shape)
+        image = (image + np.random.default_rng(1).normal(0, 0.002, scene.shape)).astype(np.float32)
+        asked = shape if shape == KOLMOGOROV else None
+        found = estimate_blur(image, exponent=asked)
+        assert found.sigma == pytest.approx(sigma, rel=0.2)
+        assert found.exponent == (asked or fused_exponent(found.sigma))
+
+
+def test_the_exponent_of_fused_frames_falls_with_their_width():
+    shapes = [fused_exponent(sigma) for sigma in np.linspace(0, 20, 60)]
+    assert np.all(np.diff(shapes) < 0)
+    assert shapes[0] == KOLMOGOROV
+    assert shapes[-1] == pytest.approx(1.2, abs=1e-3)
 
 
 @pytest.mark.parametrize("name", ["chart", "words", "camera"])
@@ -98,7 +108,8 @@ def test_the_uncertainty_is_half_the_difference_between_half_and_twice_the_noise
     found = estimate_blur(image)
     gradients = image_gradients(_most_detailed(_reduce(image, found.reduction)))
     with one_thread_each():
-        both = [width_costs(gradients, KOLMOGOROV, factor * found.noise, 1) for factor in (0.5, 2.0)]
+        shapes = [fused_exponent(found.reduction * width) for width in WIDTHS]
+        both = [width_costs(gradients, shapes, factor * found.noise, 1) for factor in (0.5, 2.0)]
     less, more = (_unreduced_width(likeliest_width(costs), found.reduction) for costs in both)
     assert found.uncertainty == abs(more - less) / 2
 

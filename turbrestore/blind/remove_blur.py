@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from ..blur.estimation import BlurEstimate, estimate_blur
-from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray
 from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, DeconvolutionState
@@ -173,8 +172,7 @@ def remove_blur_steps(
     [DeblurState(sigma=1.5, attempt=1, iteration=1)]
     """
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
-    exponent = params.exponent or KOLMOGOROV
-    blur = estimate_blur(image, exponent=exponent, runtime=runtime) if params.sigma is None else None
+    blur = estimate_blur(image, exponent=params.exponent, runtime=runtime) if params.sigma is None else None
     sigma, params = blur_to_remove(blur, params)
     size = image.shape[0], image.shape[1]
     in_tiles = () if side is None or find_device(runtime.device) != CPU else halo_tiles(size, side)

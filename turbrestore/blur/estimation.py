@@ -26,6 +26,7 @@ A fused image is never sharper than its pixels and the interpolation of the regi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -42,7 +43,7 @@ from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import ThreadTeam, one_thread_each
 from .marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
-from .psf import KOLMOGOROV, check_exponent
+from .psf import check_exponent, fused_exponent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -159,10 +160,13 @@ class BlurCandidate:
         Its uncertainty is infinite until :func:`choose_blur` has computed it.
     part : ndarray, float32, shape (h, w)
         The part of the reduced image that was analysed.
+    asked : float or None
+        Exponent that was asked for; None for that of fused frames.
     """
 
     estimate: BlurEstimate
     part: FloatArray
+    asked: float | None = None
 
     @property
     def plausible(self) -> bool:
@@ -174,7 +178,7 @@ class BlurCandidate:
 
 
 def estimate_blur(
-    image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV, runtime: Runtime = DEFAULT
+    image: ArrayLike, noise: float | None = None, exponent: float | None = None, runtime: Runtime = DEFAULT
 ) -> BlurEstimate:
     """Estimate the width of the blur of an image.
 
@@ -184,8 +188,9 @@ def estimate_blur(
         Colour is reduced to luminance.
     noise : float, optional
         Standard deviation of the noise, intensity; estimated by default.
-    exponent : float
-        Shape of the blur, 1 to 2: 5/3 for images fused from turbulent frames, 2 for a Gaussian.
+    exponent : float, optional
+        Shape of the blur, 1 to 2, 2 for a Gaussian; by default that of fused frames, which follows from the width:
+        :func:`turbrestore.blur.psf.fused_exponent`.
     runtime : Runtime
         Number of threads, of which at most two are used; it does not change the result.
 
@@ -212,12 +217,14 @@ def estimate_blur(
         candidates = find_candidates(image, noise, exponent)
         if not candidates:
             nothing = np.zeros(0)
-            return BlurEstimate(0.0, float("inf"), exponent, noise or 0.0, 1, 0.0, nothing, nothing)
+            return BlurEstimate(
+                0.0, float("inf"), exponent or fused_exponent(0.0), noise or 0.0, 1, 0.0, nothing, nothing
+            )
         return choose_blur(candidates, runtime)
 
 
 def find_candidates(
-    image: ArrayLike, noise: float | None = None, exponent: float = KOLMOGOROV
+    image: ArrayLike, noise: float | None = None, exponent: float | None = None
 ) -> tuple[BlurCandidate, ...]:
     """Find the likeliest blur at each reduction of an image, without its uncertainty.
 
@@ -250,7 +257,8 @@ def find_candidates(
         noise is None or (np.isfinite(noise) and noise >= 0),
         f"noise: expected a finite number of 0 or more, found {noise}",
     )
-    check_exponent(exponent)
+    if exponent is not None:
+        check_exponent(exponent)
     if min(grey.shape) < _SMALLEST_IMAGE or np.ptp(grey) <= _LEAST_NOISE:
         return ()
     factors = [factor for factor in _REDUCTIONS if factor == 1 or min(grey.shape) >= factor * _SMALLEST_SIDE]
@@ -284,7 +292,9 @@ def choose_blur(candidates: tuple[BlurCandidate, ...], runtime: Runtime = DEFAUL
         plausible = [_with_uncertainty(one, team) for one in candidates if one.plausible]
     if plausible:
         return min(plausible, key=_preference)
-    return replace(candidates[0].estimate, sigma=float(WIDTHS[0]), uncertainty=_PIXEL_UNCERTAINTY)
+    sharp, asked = float(WIDTHS[0]), candidates[0].asked
+    shape = fused_exponent(sharp) if asked is None else asked
+    return replace(candidates[0].estimate, sigma=sharp, uncertainty=_PIXEL_UNCERTAINTY, exponent=shape)
 
 
 def _preference(estimate: BlurEstimate) -> float:
@@ -298,22 +308,30 @@ def _preference(estimate: BlurEstimate) -> float:
     return weight * estimate.uncertainty / estimate.sigma
 
 
-def _find_candidate(grey: FloatArray, factor: int, exponent: float, noise: float | None) -> BlurCandidate:
+def _find_candidate(grey: FloatArray, factor: int, exponent: float | None, noise: float | None) -> BlurCandidate:
     reduced = _reduce(grey, factor)
     # The part is a copy, so that the reduced image is freed.
     part, level = _most_detailed(reduced).copy(), _effective_noise(reduced, factor, noise)
-    costs = width_costs(image_gradients(part), exponent, level, rises=2)
+    costs = width_costs(image_gradients(part), _exponents(exponent, factor), level, rises=2)
     evidence, width = float(costs[0] - costs.min()), _unreduced_width(likeliest_width(costs), factor)
     widths = factor * WIDTHS[: len(costs)]
-    return BlurCandidate(BlurEstimate(width, float("inf"), exponent, level, factor, evidence, widths, costs), part)
+    shape = fused_exponent(width) if exponent is None else exponent
+    estimate = BlurEstimate(width, float("inf"), shape, level, factor, evidence, widths, costs)
+    return BlurCandidate(estimate, part, exponent)
 
 
 def _with_uncertainty(candidate: BlurCandidate, team: ThreadTeam) -> BlurEstimate:
     found, gradients = candidate.estimate, image_gradients(candidate.part)
     levels = found.noise / 2, 2 * found.noise
-    both = team.map(lambda level: width_costs(gradients, found.exponent, level, rises=1), levels)
+    exponents = _exponents(candidate.asked, found.reduction)
+    both = team.map(lambda level: width_costs(gradients, exponents, level, rises=1), levels)
     less, more = (_unreduced_width(likeliest_width(costs), found.reduction) for costs in both)
     return replace(found, uncertainty=abs(more - less) / 2)
+
+
+def _exponents(exponent: float | None, factor: int) -> Sequence[float]:
+    """Exponents of the widths of an image that is reduced by a factor."""
+    return [fused_exponent(factor * width) if exponent is None else exponent for width in WIDTHS]
 
 
 def _effective_noise(reduced: FloatArray, factor: int, noise: float | None) -> float:

@@ -29,6 +29,7 @@ It is minimised by alternating
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -97,14 +98,14 @@ def image_gradients(image: FloatArray) -> ImageGradients:
     return ImageGradients(planes, cv2.dft(planes), frequency.astype(np.float32))
 
 
-def width_costs(gradients: ImageGradients, exponent: float, noise: float, rises: int) -> Float64Array:
+def width_costs(gradients: ImageGradients, exponent: float | Sequence[float], noise: float, rises: int) -> Float64Array:
     """Compute L for increasing widths until it has risen several times in a row; L has a single minimum.
 
     Parameters
     ----------
     gradients : ImageGradients
-    exponent : float
-        Shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`.
+    exponent : float or sequence of float
+        Shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`: of all, or of each of ``WIDTHS``.
     noise : float
         n, intensity, above 0.
     rises : int
@@ -126,9 +127,9 @@ def width_costs(gradients: ImageGradients, exponent: float, noise: float, rises:
     costs: list[float] = []
     scene = gradients.planes
     prior = np.full_like(scene, max(float(np.square(scene).mean()), _LEAST_VARIANCE))
-    for width in WIDTHS:
+    for width, shape in zip(WIDTHS, np.broadcast_to(exponent, WIDTHS.shape), strict=True):
         # The solution for one width is a good start for the next.
-        scene, prior, cost = fit_scene(gradients, scene, prior, (float(width), exponent), noise)
+        scene, prior, cost = fit_scene(gradients, scene, prior, (float(width), float(shape)), noise)
         costs.append(cost)
         if len(costs) > rises and (np.diff(costs[-rises - 1 :]) > 0).all():
             break

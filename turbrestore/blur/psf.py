@@ -29,6 +29,8 @@ Spectrum = NDArray[Any]
 
 # Exponents of the transfer function: a Gaussian, and a long exposure through Kolmogorov turbulence (Fried 1966).
 GAUSSIAN, KOLMOGOROV = 2.0, 5 / 3
+# Exponent of wide blurs of fused frames, and the width halfway between it and that of narrow ones, pixels.
+_WIDE, _HALFWAY = 1.2, 1.4
 
 
 def gaussian_psf(sigma: float) -> FloatArray:
@@ -97,8 +99,8 @@ def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -
     """Return the transfer function ``exp(−ln 2 (ν/ν_h)^p)`` on a periodic grid, ``ν_h = √(ln 2 / 2) / (π σ)``.
 
     p = 2 is the Gaussian of :func:`gaussian_otf`.  p = 5/3 is a long exposure through Kolmogorov turbulence (Fried
-    1966), whose point spread function has a narrower core and wider wings.  An average of frames with blurs of
-    different widths has wings as well: for fused frames of two simulators the measured p is 1.2 to 1.8.
+    1966), whose point spread function has a narrower core and wider wings.  Fused frames have wider wings still, see
+    :func:`fused_exponent`.
 
     Parameters
     ----------
@@ -131,6 +133,31 @@ def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -
         return np.ones((shape[0], shape[1] // 2 + 1), np.float32)
     rows, columns = _frequencies(shape)
     return np.exp(-np.log(2) * (np.hypot(rows, columns) / half_frequency(sigma)) ** exponent).astype(np.float32)
+
+
+def fused_exponent(sigma: float) -> float:
+    """Exponent of the transfer function of fused frames whose blur is this wide.
+
+    Short exposures, and averages of blurs of different widths, have a sharp core in a wide halo: p is 1 to 1.3.  Errors
+    of registration, interpolation and pixels add a blur of about half a pixel that is close to a Gaussian, and where the
+    whole is not much wider than that, p is larger.  Hence ``1.2 + (5/3 − 1.2) / (1 + (σ / 1.4)⁴)``.
+
+    Parameters
+    ----------
+    sigma : float
+        Width, pixels.
+
+    Returns
+    -------
+    float
+        p, 5/3 for narrow blurs to 1.2 for wide ones.
+
+    Examples
+    --------
+    >>> [round(fused_exponent(sigma), 2) for sigma in (0.35, 1.0, 1.4, 4.0)]
+    [1.66, 1.57, 1.43, 1.21]
+    """
+    return _WIDE + (KOLMOGOROV - _WIDE) / (1 + (sigma / _HALFWAY) ** 4)
 
 
 def half_frequency(sigma: float) -> float:

@@ -68,8 +68,9 @@ class DeconvolutionParams:
         Width of the blur, pixels.  :func:`deconvolve` uses it if it is called without a blur;
         :func:`turbrestore.blind.remove_blur.remove_blur` estimates the width if it is not given.
     exponent : float, optional
-        Shape of the blur: 2 is a Gaussian, 5/3 turbulence; see ``turbrestore.blur.psf.blur_otf``.  By default 2 if the
-        width is given, and 5/3 if it is estimated.
+        Shape of the blur: 2 is a Gaussian, 5/3 a long exposure through turbulence; see
+        ``turbrestore.blur.psf.blur_otf``.  By default 2 if the width is given, and that of fused frames,
+        ``turbrestore.blur.psf.fused_exponent``, if it is estimated.
     fidelity : float, optional
         Weight λ of the data: a larger one gives a sharper and noisier image.  By default it is chosen from the noise
         of the image, see ``turbrestore.deconvolution.problem.automatic_fidelity``.
