@@ -133,7 +133,7 @@ class TestFormats:
         path.write_bytes(data)
         assert open_frames(path).warnings == (
             "interlaced video: its fields are not separated",
-            "rotation of -90 degrees ignored",
+            "turned upright as players show it",
         )
 
     @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.gif"])

@@ -1,8 +1,8 @@
-"""Video files (MP4, MOV, Matroska, WebM, AVI, GIF) through PyAV, in their native pixel format.
+"""Video files (MP4, MOV, Matroska, AVI, MPEG, WMV and others) through PyAV, in their native pixel format.
 
 Grey formats stay grey at their depth, 8-bit colour becomes RGB, and deeper colour 16-bit RGB. Opening a file reads all
 packets once without decoding them, which gives the number of frames, their times, and damage that decoders do not
-report (:mod:`turbrestore.io.integrity`).
+report (:mod:`turbrestore.io.integrity`).  Frames are turned upright as the display matrix of the file demands.
 
 Losses within a packet of a lossy codec that its decoder conceals are not found. FFmpeg converts YUV colour of more than
 8 bits to values up to 0.4 % darker than exact. Grey video is taken as full range, as its decoder returns it.
@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,15 +23,21 @@ from numpy.typing import NDArray
 from ..core.errors import DataError
 from .integrity import ffv1_slices_intact, is_cut_short
 from .limits import DEFAULT_LIMITS, Limits, input_errors
-from .pixels import PixelArray
+from .pixels import PixelArray, upright
 from .source import FrameRange, FrameSource, check_cut_short, check_frame_range
 
 if TYPE_CHECKING:
     import av
 
-CONTAINER_SUFFIXES = (".mkv", ".mp4", ".m4v", ".mov", ".webm", ".avi", ".gif")
+# FFmpeg tells the formats apart by their content, so further suffixes are read too.
+CONTAINER_SUFFIXES = (
+    *(".mkv", ".mp4", ".m4v", ".mov", ".webm", ".avi", ".gif", ".mts", ".m2ts", ".ts", ".wmv", ".asf", ".3gp", ".3g2"),
+    *(".y4m", ".mpg", ".mpeg", ".m2v", ".vob", ".flv", ".f4v", ".ogv", ".dv", ".mxf", ".ivf", ".nut"),
+)
 # Without this list FFmpeg would also open playlists, which refer to other files.
-_OPEN_OPTIONS = {"format_whitelist": "matroska,webm,mov,mp4,avi,gif"}
+_OPEN_OPTIONS = {
+    "format_whitelist": "matroska,webm,mov,mp4,avi,gif,mpegts,asf,mpeg,mpegvideo,flv,ogg,yuv4mpegpipe,dv,mxf,ivf,nut,3gp"
+}
 # Codecs whose packets are decoded independently of each other.
 _INTRA_CODECS = {"ffv1", "mjpeg", "rawvideo", "png", "huffyuv", "ffvhuff", "utvideo", "prores", "dnxhd"}
 
@@ -46,6 +52,7 @@ class _PixelFormat:
     full_scale: int
     channels: tuple[int, ...]
     alpha: bool
+    orientation: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +66,7 @@ class _Scan:
     times: NDArray[np.float64] | None
     tick: float
     last: float
+    starts_whole: bool
 
 
 def open_container(
@@ -89,9 +97,14 @@ def open_container(
             frame = next(container.decode(stream), None)
             if frame is None:
                 raise DataError(f"{path}: expected at least one frame, found none")
-            layout = _pixel_format(path, frame.format)
-            notes = _notes(frame, layout, codec)
+            layout = replace(_pixel_format(path, frame.format), orientation=_orientation(frame))
+            notes = _notes(frame, layout, stream)
         scan = _scan(path, cut, limits)
+        if not scan.starts_whole:
+            # A recording of a transport stream can start anywhere; frames before the first whole one are not decoded.
+            scan, missing = _decoded_scan(path, scan, limits)
+            text = f"starts in the middle of a group of frames: its first {missing} cannot be decoded"
+            notes += (text,) if missing else ()
     cut = cut or scan.intact < scan.count or (duration is not None and _ends_early(scan, duration))
     intra = codec in _INTRA_CODECS and scan.keyframes == scan.count
     notes += check_cut_short(path, scan.intact, check_frame_range(frames).stop, skip_damaged) if cut else ()
@@ -103,7 +116,7 @@ def open_container(
     return FrameSource(
         name=path.name,
         format=f"{codec}/{layout.name}",
-        file_shape=(scan.intact, frame.height, frame.width, *layout.channels),
+        file_shape=(scan.intact, *_upright_size(frame, layout), *layout.channels),
         full_scale=layout.full_scale,
         bit_depth=layout.bit_depth,
         pixels=lambda chosen: _frames(path, layout, chosen, intra, limits),
@@ -113,6 +126,17 @@ def open_container(
         warnings=notes,
         damaged=damaged,
     )
+
+
+def is_container(path: Path) -> bool:
+    """Whether FFmpeg finds a video of a known format in a file, whatever its suffix."""
+    import av
+
+    try:
+        with input_errors(path), _open(path) as container:
+            return container.streams.best("video") is not None
+    except (av.error.FFmpegError, ValueError):
+        return False
 
 
 def _open(path: Path) -> av.container.InputContainer:
@@ -154,16 +178,39 @@ def _pixel_format(path: Path, native: av.VideoFormat) -> _PixelFormat:
     return _PixelFormat(name, "rgb24", 8, 255, (3,), alpha)
 
 
-def _notes(frame: av.VideoFrame, layout: _PixelFormat, codec: str) -> tuple[str, ...]:
+def _notes(frame: av.VideoFrame, layout: _PixelFormat, stream: av.VideoStream) -> tuple[str, ...]:
     notes = []
     # GIF frames are always decoded with alpha, which few images use.
-    if layout.alpha and codec != "gif":
+    if layout.alpha and stream.codec_context.name != "gif":
         notes.append("alpha channel ignored")
     if frame.interlaced_frame:
         notes.append("interlaced video: its fields are not separated")
-    if frame.rotation:
+    if frame.rotation % 90:
         notes.append(f"rotation of {frame.rotation} degrees ignored")
+    elif layout.orientation > 1:
+        notes.append("turned upright as players show it")
+    aspect = stream.sample_aspect_ratio or 1
+    if aspect > 0 and aspect != 1:
+        shape = f"{aspect.numerator}:{aspect.denominator}"
+        notes.append(f"pixels of {shape} are taken for square; widen the result by that ratio to see it as players do")
     return tuple(notes)
+
+
+def _orientation(frame: av.VideoFrame) -> int:
+    """Turn and reflection of the display matrix as an EXIF orientation; 1 where they are not multiples of 90°."""
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is None:
+        return 1
+    matrix = np.sign(np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2])
+    if frame.rotation % 90 or np.count_nonzero(matrix) != 2:
+        return 1
+    transposed = matrix[0, 0] == 0
+    flips = (matrix[1, 0], matrix[0, 1]) if transposed else (matrix[0, 0], matrix[1, 1])
+    return 1 + 4 * int(transposed) + [(1, 1), (-1, 1), (-1, -1), (1, -1)].index((int(flips[0]), int(flips[1])))
+
+
+def _upright_size(frame: av.VideoFrame, layout: _PixelFormat) -> tuple[int, int]:
+    return (frame.width, frame.height) if layout.orientation > 4 else (frame.height, frame.width)
 
 
 def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
@@ -171,7 +218,7 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
     stamps: list[int | None] = []
     damaged: list[int] = []
     unchecked: list[int] = []
-    keyframes, last, intact = 0, 0.0, None
+    keyframes, last, intact, starts_whole = 0, 0.0, None, True
     with _open(path) as container:
         stream = _video_stream(path, container, limits)
         codec = stream.codec_context.name
@@ -187,6 +234,7 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
                 verdict = ffv1_slices_intact(bytes(packet))
                 (unchecked if verdict is None else damaged if not verdict else []).append(len(stamps))
             keyframes += packet.is_keyframe
+            starts_whole = starts_whole and bool(stamps or packet.is_keyframe or codec in _INTRA_CODECS)
             stamps.append(packet.dts if packet.pts is None else packet.pts)
             limits.check_count(len(stamps), str(path))
             if stamps[-1] is not None:
@@ -204,7 +252,23 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
     if intact is None:
         # A truncated last frame of a GIF file is decoded without complaint.
         intact = count - 1 if cut and codec == "gif" else count
-    return _Scan(count, intact, keyframes, tuple(damaged), None if times is None else times[:intact], tick, last)
+    times = None if times is None else times[:intact]
+    return _Scan(count, intact, keyframes, tuple(damaged), times, tick, last, starts_whole)
+
+
+def _decoded_scan(path: Path, scan: _Scan, limits: Limits) -> tuple[_Scan, int]:
+    """Count the frames that can be decoded, and those that cannot."""
+    stamps: list[float] = []
+    with _open(path) as container:
+        for frame in container.decode(_video_stream(path, container, limits)):
+            if not frame.is_corrupt:
+                stamps.append(np.nan if frame.time is None else frame.time)
+    if not stamps:
+        raise DataError(f"{path}: expected at least one whole frame, found none")
+    times = np.sort(stamps) - np.min(stamps)
+    count = len(stamps)
+    whole = replace(scan, count=count, intact=count, times=times if np.isfinite(times).all() else None)
+    return whole, scan.count - count
 
 
 def _check_damage(path: Path, scan: _Scan, frames: FrameRange | None, intra: bool, skip: bool) -> tuple[int, ...]:
@@ -277,7 +341,7 @@ def _pixels(path: Path, frame: av.VideoFrame, layout: _PixelFormat, number: int)
         raise DataError(f"{path}: frame {number} is damaged; copy the file again or select other frames")
     if frame.format.name != layout.name:
         raise DataError(f"{path}: frame {number}: expected pixel format {layout.name}, found {frame.format.name}")
-    return convert(frame, layout.target).to_ndarray()
+    return upright(convert(frame, layout.target).to_ndarray(), layout.orientation)
 
 
 def convert(frame: av.VideoFrame, target: str) -> av.VideoFrame:

@@ -3,7 +3,7 @@
 =====================================  =================================  =====================================
 input                                  module                             output
 =====================================  =================================  =====================================
-.mkv .mp4 .m4v .mov .webm .avi .gif    :mod:`turbrestore.io.container`       .mkv (FFV1, lossless), .mp4 (H.264)
+.mkv .mp4 .mov .avi .gif and others    :mod:`turbrestore.io.container`       .mkv (FFV1, lossless), .mp4 (H.264)
 .ser                                   :mod:`turbrestore.io.ser`             .ser
 .tif .tiff (a stack)                   :mod:`turbrestore.io.tiff`            .tif .tiff
 .npy, shape (T, H, W) or (T, H, W, 3)  :mod:`turbrestore.io.npy`             .npy
@@ -24,7 +24,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, require
-from .container import CONTAINER_SUFFIXES, open_container
+from .container import CONTAINER_SUFFIXES, is_container, open_container
 from .encoding import write_container
 from .images import (
     ANIMATION_OUTPUT_SUFFIXES,
@@ -119,8 +119,7 @@ def open_frames(
     elif suffix in IMAGE_SUFFIXES:
         raise DataError(f"{path}: a single image; name the folder that holds the frames")
     else:
-        names = ", ".join(VIDEO_SUFFIXES)
-        raise DataError(f"{path}: expected a folder of images or one of {names}, found {suffix or 'no suffix'}")
+        source = _open_unknown(path, frames, limits, skip_damaged)
     source = source.select(frames, roi)
     source = source.without(source.damaged, f"checksum fails: {numbers_text(source.damaged)} left out")
     _check_first(source)
@@ -211,6 +210,14 @@ def _check_first(source: FrameSource) -> None:
     if np.issubdtype(pixels.dtype, np.floating):
         pixels = np.where(np.isfinite(pixels), pixels, 0)
     to_unit(pixels, source.full_scale, f"{source.name}: frame {source.numbers[0]}")
+
+
+def _open_unknown(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool) -> FrameSource:
+    """Open a file of an unknown suffix, or none, if its content is that of a video."""
+    if not is_container(path):
+        names, found = ", ".join(VIDEO_SUFFIXES), path.suffix.lower() or "no suffix"
+        raise DataError(f"{path}: expected a folder of images or one of {names}, found {found}")
+    return open_container(path, frames, limits, skip_damaged)
 
 
 def _open_folder(folder: Path, limits: Limits) -> FrameSource:

@@ -1,0 +1,104 @@
+"""Videos as cameras record them: turned, in any container, with pixels that are not square, begun in the middle."""
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from videos import encode, refused, scene
+
+from turbrestore.core.errors import DataError
+from turbrestore.io.video import open_frames
+
+ONE = 65536
+# Display matrix (a, b, c, d) by what a player does to a frame: a pixel x, y is shown at a x + c y, b x + d y.
+SHOWN = {
+    "a quarter turn clockwise": ((0, ONE, -ONE, 0), lambda frame: np.rot90(frame, -1)),
+    "half a turn": ((-ONE, 0, 0, -ONE), lambda frame: np.rot90(frame, 2)),
+    "a quarter turn to the left": ((0, -ONE, ONE, 0), lambda frame: np.rot90(frame)),
+    "mirrored": ((-ONE, 0, 0, ONE), lambda frame: frame[:, ::-1]),
+    "transposed": ((0, ONE, ONE, 0), lambda frame: np.swapaxes(frame, 0, 1)),
+}
+CONTAINERS = {
+    ".mts": "libx264",
+    ".m2ts": "mpeg2video",
+    ".ts": "mpeg2video",
+    ".wmv": "wmv2",
+    ".3gp": "mpeg4",
+    ".y4m": "wrapped_avframe",
+    ".mpg": "mpeg1video",
+    ".flv": "flv",
+    ".mxf": "mpeg2video",
+    ".ivf": "libvpx",
+}
+
+
+def with_display_matrix(path, values):
+    """Change the matrix in the track header of an MP4 file."""
+    data, (a, b, c, d) = bytearray(path.read_bytes()), values
+    start = data.find(b"tkhd") + 44
+    data[start : start + 36] = np.array([a, b, 0, c, d, 0, 0, 0, 1 << 30], ">i4").tobytes()
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("how", SHOWN)
+def test_phone_videos_are_turned_upright(tmp_path, how):
+    matrix, shown = SHOWN[how]
+    path = encode(tmp_path / "a.mp4", scene(), "libx264", "yuv420p", "rgb24", crf="10")
+    flat = open_frames(path).read()
+    turned = open_frames(with_display_matrix(path, matrix))
+    np.testing.assert_array_equal(turned.read(), [shown(frame) for frame in flat])
+    assert turned.shape[1:] == shown(flat[0]).shape and turned.warnings == ("turned upright as players show it",)
+
+
+def test_odd_rotations_are_remarked_on(tmp_path):
+    path = encode(tmp_path / "a.mp4", scene(), "libx264", "yuv420p", "rgb24")
+    (remark,) = open_frames(with_display_matrix(path, (46341, 46341, -46341, 46341))).warnings
+    assert remark.startswith("rotation of ") and remark.endswith(" ignored")
+
+
+def test_upright_videos_have_no_remark(tmp_path):
+    assert open_frames(encode(tmp_path / "a.mp4", scene(), "libx264", "yuv420p", "rgb24")).warnings == ()
+
+
+def test_pixels_that_are_not_square_are_remarked_on(tmp_path):
+    path = encode(tmp_path / "a.mp4", scene(), "libx264", "yuv420p", "rgb24", x264_params="sar=16/11")
+    (remark,) = open_frames(path).warnings
+    assert "16:11" in remark
+
+
+@pytest.mark.parametrize("suffix", CONTAINERS)
+def test_containers_of_cameras(tmp_path, suffix):
+    frames = scene()
+    muxer = {".y4m": "yuv4mpegpipe"}.get(suffix)
+    path = encode(tmp_path / f"a{suffix}", frames, CONTAINERS[suffix], "yuv420p", "rgb24", muxer=muxer)
+    source = open_frames(path)
+    assert source.shape == (12, 48, 64, 3) and source.fps == pytest.approx(30) and source.warnings == ()
+    assert np.abs(255 * source.read() - frames).mean() < 8
+
+
+@pytest.mark.parametrize("name", ["video", "video.tod"])
+def test_content_counts_where_the_suffix_is_unknown(tmp_path, name):
+    path = encode(tmp_path / "a.ts", scene(), "libx264", "yuv420p", "rgb24")
+    assert len(open_frames(path.rename(tmp_path / name))) == 12
+
+
+@pytest.mark.parametrize("suffix", [".wmv", ".ts", ".y4m", ".xyz"])
+def test_playlists_are_not_opened(tmp_path, suffix):
+    encode(tmp_path / "other.mkv", scene(), "libx264", "yuv420p", "rgb24")
+    for text in ("ffconcat version 1.0\nfile other.mkv\n", "#EXTM3U\n#EXTINF:1,\nother.mkv\n"):
+        (tmp_path / f"a{suffix}").write_text(text)
+        refused(tmp_path / f"a{suffix}", DataError, f"a{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".ts", ".mpg"])
+def test_recordings_that_begin_in_the_middle(tmp_path, suffix):
+    path = encode(tmp_path / f"a{suffix}", scene(40), "mpeg2video", "yuv420p", "rgb24", g="12", bf="2")
+    data = path.read_bytes()
+    Path(path).write_bytes(data[188 * (len(data) // 3 // 188) :])
+    source = open_frames(path)
+    with av.open(str(path)) as container:
+        count = sum(1 for _ in container.decode(video=0))
+    assert len(list(source)) == len(source) == count > 8
+    assert "cannot be decoded" in source.warnings[0]
