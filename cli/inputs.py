@@ -40,6 +40,7 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
         roi=selection.region(),
         limits=selection.limits(),
         skip_damaged=selection.skip_damaged,
+        bayer=selection.bayer,
     )
     return source, check_content(source, ContentParams(strict=selection.strict))
 

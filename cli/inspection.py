@@ -41,7 +41,7 @@ def info(
     Parameters
     ----------
     input : Path
-        Video (mp4, mkv, mov, avi, mts, wmv and others), animated PNG or WebP, TIFF stack, SER, .npy, or folder of images.
+        Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, .npy, or folder of images.
     json : bool
         Print JSON.
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -38,6 +38,8 @@ class Selection:
         Read a file that is cut short or damaged as far as possible, instead of refusing it.
     max_pixels : int, optional
         Largest frame or image to read, pixels; by default 67 million.
+    bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
+        Take grey frames for raw frames of a colour camera whose first pixels have these colours.
     """
 
     frames: str | None = None
@@ -45,6 +47,7 @@ class Selection:
     strict: Flag = False
     skip_damaged: Flag = False
     max_pixels: int | None = None
+    bayer: Literal["rggb", "grbg", "gbrg", "bggr"] | None = None
 
     def frame_range(self) -> FrameRange | None:
         """Return (start, stop, step), None where left out."""

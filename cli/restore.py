@@ -62,7 +62,7 @@ def restore(
     Parameters
     ----------
     input : Path
-        Video (mp4, mkv, mov, avi, mts, wmv and others), animated PNG or WebP, TIFF stack, SER, .npy, or folder of images.
+        Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, .npy, or folder of images.
     output : Path
         Image to write: .png (8 or 16 bit) or .tif (8, 16 bit or float).
     sigma : float

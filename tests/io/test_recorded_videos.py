@@ -5,17 +5,17 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from videos import encode, refused, scene
 
 from turbrestore.core.errors import DataError
 from turbrestore.io.video import open_frames
+from videos import encode, refused, scene
 
 ONE = 65536
 # Display matrix (a, b, c, d) by what a player does to a frame: a pixel x, y is shown at a x + c y, b x + d y.
 SHOWN = {
     "a quarter turn clockwise": ((0, ONE, -ONE, 0), lambda frame: np.rot90(frame, -1)),
     "half a turn": ((-ONE, 0, 0, -ONE), lambda frame: np.rot90(frame, 2)),
-    "a quarter turn to the left": ((0, -ONE, ONE, 0), lambda frame: np.rot90(frame)),
+    "a quarter turn to the left": ((0, -ONE, ONE, 0), np.rot90),
     "mirrored": ((-ONE, 0, 0, ONE), lambda frame: frame[:, ::-1]),
     "transposed": ((0, ONE, ONE, 0), lambda frame: np.swapaxes(frame, 0, 1)),
 }

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, OutputError, TurbrestoreError
+from turbrestore.footage.content import check_content, clean_source
 from turbrestore.io.ser import open_ser, read_ser_header, write_ser
 from turbrestore.io.video import open_frames
 
@@ -224,3 +225,75 @@ def test_debayering_of_a_scene_agrees_with_opencv(ser):
     for flag, order in ((0, "<"), (1, ">")):
         found = open_frames(ser(mosaic, colour=8, flag=flag, order=order)).read()[0]
         np.testing.assert_allclose(found * 65535, expected, atol=0.01)
+
+
+def moon_like(count=12, side=64, noise=60.0, full=65535):
+    """A bright disc with craters that drifts, with noise, uint16."""
+    rng, (y, x) = np.random.default_rng(3), np.mgrid[:side, :side].astype(np.float64)
+    frames = []
+    for k in range(count):
+        u = x + 0.8 * k
+        disc = 0.6 * (np.hypot(u - 36, y - 32) < 24) * (0.7 + 0.2 * np.sin(u / 3) * np.cos(y / 4)) + 0.05
+        frames.append(cv2.GaussianBlur(disc, (0, 0), 1.2) + noise / 65535 * rng.standard_normal(disc.shape))
+    return np.uint16(np.clip(np.rint(full * np.array(frames)), 0, full))
+
+
+class TestByteOrder:
+    @pytest.mark.parametrize(("flag", "order"), [(1, "<"), (0, ">")])
+    @pytest.mark.parametrize("depth", [12, 16])
+    @pytest.mark.parametrize("colour", [0, 9])
+    def test_pixels_decide_against_the_header(self, ser, flag, order, depth, colour):
+        frames = moon_like(full=2**depth - 1)
+        source = open_frames(ser(frames, flag=flag, order=order, depth=depth, colour=colour))
+        found = source.read()
+        kept = open_frames(ser(frames, depth=depth, colour=colour))
+        np.testing.assert_array_equal(found, kept.read())
+        assert kept.warnings == () and "endian by its pixels" in source.warnings[0]
+
+    @pytest.mark.parametrize(("flag", "order"), [(0, "<"), (1, ">")])
+    def test_noise_and_coarse_values_leave_the_header_right(self, ser, flag, order):
+        rng = np.random.default_rng(0)
+        for frames in (rng.integers(0, 65536, (2, 32, 32)), 256 * (moon_like() // 256), moon_like(noise=20000)):
+            source = open_frames(ser(frames, flag=flag, order=order))
+            assert source.warnings == ()
+            np.testing.assert_allclose(65535 * source.read(), frames, atol=0.01)
+
+
+class TestMosaics:
+    """Raw frames of colour cameras."""
+
+    COLOURS = np.array([[0.9, 0.5], [0.5, 0.25]])  # of the pixels of RGGB
+
+    def mosaic(self):
+        return np.uint16(moon_like() * np.tile(self.COLOURS, (32, 32)))
+
+    def test_a_mosaic_that_is_called_mono_is_remarked_on_and_read_in_colour(self, ser):
+        path = ser(self.mosaic())
+        mono, part = open_frames(path), open_frames(path, bayer="rggb", roi=(1, 2, 9, 8))
+        assert "--bayer" in mono.warnings[0] and mono.shape == (12, 64, 64)
+        found = open_frames(path, bayer="rggb").read()
+        np.testing.assert_array_equal(part.read(), found[:, 2:10, 1:10])
+        np.testing.assert_array_equal(open_frames(ser(self.mosaic(), colour=8)).read(), found)
+
+    def test_mono_is_not_taken_for_a_mosaic(self, ser):
+        assert open_frames(ser(moon_like())).warnings == ()
+
+    def test_colour_is_no_mosaic(self, ser):
+        refused(ser(self.mosaic(), colour=8), DataError, "--bayer", bayer="rggb")
+        refused(ser(self.mosaic()), ConfigurationError, "rggb", bayer="rgb")
+
+    @pytest.mark.parametrize("how", [{"colour": 8}, {"bayer": "rggb"}])
+    def test_hot_pixels_are_found_in_the_mosaic(self, ser, how):
+        clean, rng = self.mosaic(), np.random.default_rng(5)
+        hot = {tuple(place) for place in rng.integers(2, 62, (15, 2)).tolist()}
+        dirty = clean.copy()
+        for row, column in hot:
+            dirty[:, row, column] = 65000
+        options = {key: how[key] for key in how if key == "bayer"}
+        source = open_frames(ser(dirty, colour=how.get("colour", 0)), **options)
+        report = check_content(source)
+        assert {tuple(place) for place in report.stuck.tolist()} == hot
+        found = clean_source(source, report).read()
+        wanted = open_frames(ser(clean, colour=8))
+        assert np.sqrt(np.mean((found - wanted.read()) ** 2)) < 0.004
+        assert clean_source(wanted, check_content(wanted)).repair is None

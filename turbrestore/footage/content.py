@@ -24,8 +24,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import FloatArray
 from ..core.errors import ConfigurationError, DataError, require_between
-from ..io.pixels import PixelArray, to_unit
+from ..io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ..io.source import FrameSource, numbers_text
 from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
 from .stuck_pixels import StuckPixelDetector, repair_stuck
@@ -84,7 +85,8 @@ class ContentReport:
     filled_values : int
         Number of these values.
     stuck : ndarray, int, shape (N, 2) or (N, 3)
-        Row, column, and channel of colour frames, in the file, of every stuck pixel.
+        Row, column, and channel of colour frames, in the file, of every stuck pixel; in the mosaic of a Bayer sensor
+        row and column.
     duplicated : tuple of int
         Frames that equal the one before.
     blank : tuple of int
@@ -134,8 +136,8 @@ def check_content(source: FrameSource, params: ContentParams | None = None) -> C
     """
     params = params or ContentParams()
     scan = _ContentScan(source, params)
-    for number, pixels in zip(source.numbers, source.native(), strict=True):
-        scan.update(number, pixels)
+    for number, pixels, mosaic in zip(source.numbers, source.native(), source.mosaics(), strict=True):
+        scan.update(number, pixels, mosaic)
     report = scan.report()
     if params.strict and (report.left_out or report.filled or len(report.stuck)):
         raise DataError(f"{source.name}: {report.warnings[0]}; refused by strict, leave it out to go on")
@@ -168,6 +170,8 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
 
     def repaired(pixels: PixelArray) -> PixelArray:
         pixels = _filled(pixels) if fill else pixels
+        if source.develop is not None:
+            return with_planes(pixels, repair_stuck(planes_of(pixels), plane_places(stuck)))
         return repair_stuck(pixels, stuck) if len(stuck) else pixels
 
     return dataclasses.replace(
@@ -190,7 +194,7 @@ class _ContentScan:
         self._stuck = StuckPixelDetector(params.stuck_excess)
         self._scenes = SceneDetector(params.cut_similarity)
 
-    def update(self, number: int, pixels: PixelArray) -> None:
+    def update(self, number: int, pixels: PixelArray, mosaic: PixelArray | None) -> None:
         pixels = self._with_holes_filled(number, pixels)
         values = to_unit(pixels, self._source.full_scale, f"{self._source.name}: frame {number}")
         self._saturated += np.count_nonzero(values >= 1) / values.size
@@ -203,7 +207,8 @@ class _ContentScan:
         # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
         self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
         if contrast > max(_LEAST_CONTRAST, self._params.blank_contrast * self._usual):
-            self._stuck.update(values)
+            # Stuck pixels stand alone in the mosaic; interpolation of colours spreads them.
+            self._stuck.update(values if mosaic is None else self._planes(mosaic))
             self._scenes.update(thumb)
         else:
             self._scenes.skip()
@@ -222,8 +227,11 @@ class _ContentScan:
         left_out |= duplicated & ~repeated
         stuck = self._stuck.found()
         rows, columns = self._source.window
-        stuck[:, 0] += rows.start
-        stuck[:, 1] += columns.start
+        if self._source.develop is not None:
+            stuck = mosaic_places(stuck) if len(stuck) else stuck
+        else:
+            stuck[:, 0] += rows.start
+            stuck[:, 1] += columns.start
         report = ContentReport(
             numbers=self._source.numbers,
             filled=tuple(self._filled),
@@ -238,6 +246,9 @@ class _ContentScan:
             warnings=(),
         )
         return dataclasses.replace(report, warnings=tuple(_in_words(report, bool(repeated))))
+
+    def _planes(self, mosaic: PixelArray) -> FloatArray:
+        return np.divide(planes_of(mosaic), self._source.full_scale, dtype=np.float32)
 
     def _with_holes_filled(self, number: int, pixels: PixelArray) -> PixelArray:
         """Fill isolated values that are not finite; raise DataError where there are too many."""

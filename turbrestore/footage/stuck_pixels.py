@@ -2,7 +2,8 @@
 
 A stuck pixel differs from a small detail of the scene in one of two ways: its neighbours show nothing of it, although a
 lens and motion would spread a detail; or it never changes while its neighbours do. Pairs, clusters, pixels at the
-border, and pixels that a lossy codec or a Bayer pattern has spread are not found.
+border, and pixels that a lossy codec has spread are not found.  Those of a Bayer sensor are looked for in its mosaic,
+among the neighbours of their colour.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ CONTAINER_SUFFIXES = (
 )
 # Without this list FFmpeg would also open playlists, which refer to other files.
 _OPEN_OPTIONS = {
-    "format_whitelist": "matroska,webm,mov,mp4,avi,gif,mpegts,asf,mpeg,mpegvideo,flv,ogg,yuv4mpegpipe,dv,mxf,ivf,nut,3gp"
+    "format_whitelist": "matroska,webm,mov,mp4,avi,gif,mpegts,asf,mpeg,mpegvideo,flv,ogg,yuv4mpegpipe,dv,mxf,ivf,nut"
 }
 # Codecs whose packets are decoded independently of each other.
 _INTRA_CODECS = {"ffv1", "mjpeg", "rawvideo", "png", "huffyuv", "ffvhuff", "utvideo", "prores", "dnxhd"}
@@ -198,7 +198,7 @@ def _notes(frame: av.VideoFrame, layout: _PixelFormat, stream: av.VideoStream) -
 
 def _orientation(frame: av.VideoFrame) -> int:
     """Turn and reflection of the display matrix as an EXIF orientation; 1 where they are not multiples of 90°."""
-    data = frame.side_data.get("DISPLAYMATRIX")
+    data: Any = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
         return 1
     matrix = np.sign(np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2])

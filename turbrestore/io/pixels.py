@@ -2,12 +2,16 @@
 
 Integers are divided by the value that means white in their file. Floating point values must lie in [0, 1] already,
 because nothing in the file says what else they mean.
+
+The mosaic of a Bayer sensor shows one colour a pixel. Its planes are the mosaics of every second row and column, whose
+neighbours have one colour.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +25,15 @@ PixelArray = NDArray[Any]
 MAX_PIXELS = 2**26
 # Rounding and resampling overshoot a little; values further outside indicate another scale.
 FLOAT_MARGIN = 0.01
+# Patterns of a Bayer sensor, by the colours of its first pixels.
+BAYER_CODES = {
+    "rggb": cv2.COLOR_BayerRGGB2RGB,
+    "grbg": cv2.COLOR_BayerGRBG2RGB,
+    "gbrg": cv2.COLOR_BayerGBRG2RGB,
+    "bggr": cv2.COLOR_BayerBGGR2RGB,
+}
+# In a mosaic neighbours differ by this factor more than the next pixels of their colour; in an image they differ less.
+_ALTERNATING = 1.3
 
 
 def to_unit(pixels: PixelArray, full_scale: float, name: str) -> FloatArray:
@@ -115,3 +128,86 @@ def upright(pixels: PixelArray, orientation: object) -> PixelArray:
         pixels = np.swapaxes(pixels, 0, 1)
     horizontal, vertical = [(1, 1), (-1, 1), (-1, -1), (1, -1)][place % 4]
     return np.ascontiguousarray(pixels[::vertical, ::horizontal])
+
+
+def demosaic(pixels: PixelArray, pattern: str) -> PixelArray:
+    """Turn a mosaic (H, W) of uint8 or uint16 into RGB (H, W, 3) by bilinear interpolation.
+
+    Examples
+    --------
+    >>> mosaic = np.tile(np.array([[9, 5], [5, 1]], np.uint8), (4, 4))
+    >>> demosaic(mosaic, "rggb")[3, 3].tolist()
+    [9, 5, 1]
+    """
+    return cv2.cvtColor(pixels.astype(pixels.dtype.newbyteorder("=")), BAYER_CODES[pattern])
+
+
+def looks_like_bayer(pixels: PixelArray) -> bool:
+    """Whether pixels alternate along rows and columns, as the colours of a mosaic do.
+
+    Examples
+    --------
+    >>> looks_like_bayer(np.tile(np.array([[9, 5], [5, 1]], np.uint8), (8, 8)))
+    True
+    >>> looks_like_bayer(np.tile(np.arange(16), (16, 1)))
+    False
+    """
+    values = pixels.astype(np.float32)
+    if values.ndim != 2 or min(values.shape) < 16:
+        return False
+    for turned in (values, values.T):
+        next_one = float(np.abs(turned[:, 1:] - turned[:, :-1]).mean())
+        next_of_colour = float(np.abs(turned[:, 2:] - turned[:, :-2]).mean())
+        if next_one <= _ALTERNATING * next_of_colour:
+            return False
+    return True
+
+
+def planes_of(mosaic: PixelArray) -> PixelArray:
+    """Split a mosaic (H, W) into its planes (H // 2, W // 2, 4); a last odd row or column is left out.
+
+    Examples
+    --------
+    >>> planes_of(np.array([[1, 2], [3, 4]])).tolist()
+    [[[1, 2, 3, 4]]]
+    """
+    height, width = mosaic.shape[0] // 2 * 2, mosaic.shape[1] // 2 * 2
+    parts = [mosaic[row:height:2, column:width:2] for row in (0, 1) for column in (0, 1)]
+    return np.stack(parts, axis=-1)
+
+
+def mosaic_places(places: PixelArray) -> PixelArray:
+    """Turn rows, columns and numbers of planes, (N, 3), into rows and columns of the mosaic, (N, 2).
+
+    Examples
+    --------
+    >>> mosaic_places(np.array([[5, 7, 2]])).tolist()
+    [[11, 14]]
+    """
+    return np.stack([2 * places[:, 0] + places[:, 2] // 2, 2 * places[:, 1] + places[:, 2] % 2], axis=-1)
+
+
+def plane_places(places: PixelArray) -> PixelArray:
+    """Turn rows and columns of the mosaic, (N, 2), into rows, columns and numbers of planes, (N, 3).
+
+    Examples
+    --------
+    >>> plane_places(np.array([[11, 14]])).tolist()
+    [[5, 7, 2]]
+    """
+    return np.stack([places[:, 0] // 2, places[:, 1] // 2, 2 * (places[:, 0] % 2) + places[:, 1] % 2], axis=-1)
+
+
+def with_planes(mosaic: PixelArray, planes: PixelArray) -> PixelArray:
+    """Return a copy of a mosaic whose planes are replaced.
+
+    Examples
+    --------
+    >>> with_planes(np.zeros((2, 3), int), np.array([[[1, 2, 3, 4]]])).tolist()
+    [[1, 2, 0], [3, 4, 0]]
+    """
+    replaced = mosaic.copy()
+    height, width = 2 * planes.shape[0], 2 * planes.shape[1]
+    for number in range(4):
+        replaced[number // 2 : height : 2, number % 2 : width : 2] = planes[..., number]
+    return replaced

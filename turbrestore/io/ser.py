@@ -12,16 +12,16 @@ then    optionally one int64 per frame: time in units of 100 ns
 ======  ====================================================================================
 
 The description says that an endianness flag of 1 means little endian. The first programs wrote 0 with little-endian
-pixels and all later ones followed them, so 0 is read as little endian and every other value as big endian.
+pixels and most later ones followed them, so 0 is read as little endian and every other value as big endian, unless the
+pixels themselves say the opposite: with swapped bytes an image is noise, and values exceed its bit depth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,20 +29,18 @@ from ..core.arrays import FloatArray, from_unit
 from ..core.errors import DataError
 from .limits import DEFAULT_LIMITS, Limits, input_errors
 from .output import atomic_output, frames_of_one_size
-from .pixels import PixelArray, check_depth
+from .pixels import PixelArray, check_depth, demosaic, looks_like_bayer
 from .source import FrameSource, check_cut_short
 
 SIGNATURE = b"LUCAM-RECORDER"
 HEADER_SIZE = 178
 TICKS_PER_SECOND = 10_000_000
 _MONO, _RGB, _BGR = 0, 100, 101
-_BAYER = {
-    8: cv2.COLOR_BayerRGGB2RGB,
-    9: cv2.COLOR_BayerGRBG2RGB,
-    10: cv2.COLOR_BayerGBRG2RGB,
-    11: cv2.COLOR_BayerBGGR2RGB,
-}
-_NAMES = {_MONO: "mono", _RGB: "rgb", _BGR: "bgr", 8: "rggb", 9: "grbg", 10: "gbrg", 11: "bggr"}
+_BAYER = {8: "rggb", 9: "grbg", 10: "gbrg", 11: "bggr"}
+_NAMES = {_MONO: "mono", _RGB: "rgb", _BGR: "bgr", **_BAYER}
+# Fewest pixels along a side from which the byte order is judged, and the share of the roughness in the order of the
+# header that the other order may have.
+_LEAST_SIDE, _SMOOTHER = 16, 0.6
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ def read_ser_header(path: Path, limits: Limits = DEFAULT_LIMITS) -> SerHeader:
 def open_ser(
     path: Path, stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
 ) -> FrameSource:
-    """Open a SER file; Bayer patterns become RGB by bilinear interpolation.
+    """Open a SER file; Bayer mosaics become RGB by bilinear interpolation.
 
     Frames from ``stop`` on are not needed, so they may be missing. With ``skip_damaged`` the whole frames of a file
     that is cut short are read. The errors are those of :func:`turbrestore.io.video.open_frames`.
@@ -118,6 +116,10 @@ def open_ser(
     present = (size - HEADER_SIZE) // header.frame_bytes
     notes = check_cut_short(path, present, stop, skip_damaged) if present < header.frames else ()
     limits.check_count(min(header.frames, present), str(path))
+    if present:
+        header, remarks = _as_pixels_say(path, header)
+        notes = (*notes, *remarks)
+    pattern = _BAYER.get(header.colour)
     times = _timestamps(path, header, size)
     notes = (*(["variable frame rate"] if times is not None and _has_gaps(times) else []), *notes)
     channels = () if header.colour == _MONO else (3,)
@@ -132,6 +134,7 @@ def open_ser(
         fps=None if times is None else (len(times) - 1) / float(times[-1]),
         timestamps=times,
         warnings=notes,
+        develop=None if pattern is None else lambda mosaic: demosaic(mosaic, pattern),
     )
 
 
@@ -160,6 +163,38 @@ def write_ser(
         file.write(SIGNATURE + fields.tobytes())
 
 
+def _as_pixels_say(path: Path, header: SerHeader) -> tuple[SerHeader, tuple[str, ...]]:
+    """Correct the byte order in the header by the first frame; return remarks on it and on a mosaic."""
+    frame, remarks = next(_frames(path, header, [0])), []
+    if header.bit_depth > 8 and _is_swapped(frame, 2**header.bit_depth - 1):
+        header = replace(header, little_endian=not header.little_endian)
+        frame = next(_frames(path, header, [0]))
+        orders = ("little", "big") if header.little_endian else ("big", "little")
+        remarks.append(f"read as {orders[0]} endian by its pixels, which are noise as {orders[1]} endian")
+    if header.colour == _MONO and looks_like_bayer(frame):
+        remarks.append("pixels alternate as in a Bayer mosaic: --bayer rggb (or grbg, gbrg, bggr) gives colours")
+    return header, tuple(remarks)
+
+
+def _is_swapped(frame: PixelArray, full_scale: int) -> bool:
+    """Whether an image is an image only with its bytes swapped."""
+    if min(frame.shape[:2]) < _LEAST_SIDE:
+        return False
+    readings = (np.ascontiguousarray(frame), frame.byteswap())
+    fits = [bool(values.max() <= full_scale) for values in readings]
+    if fits[0] != fits[1]:
+        return fits[1]
+    given, other = (_roughness(values) for values in readings)
+    return other < _SMOOTHER * given
+
+
+def _roughness(frame: PixelArray) -> float:
+    """Mean difference of pixels of one colour side by side, relative to the mean deviation; 1.4 for noise."""
+    values = frame.astype(np.float32)
+    deviation = float(np.abs(values - values.mean()).mean())
+    return float(np.abs(values[:, 2:] - values[:, :-2]).mean()) / deviation if deviation else 0.0
+
+
 def _frames(path: Path, header: SerHeader, chosen: Sequence[int]) -> Iterator[PixelArray]:
     shape = (header.height, header.width) if header.planes == 1 else (header.height, header.width, 3)
     for number in chosen:
@@ -167,10 +202,7 @@ def _frames(path: Path, header: SerHeader, chosen: Sequence[int]) -> Iterator[Pi
             # Frames are mapped one by one, so the pages of earlier frames are no memory of this process.
             offset = HEADER_SIZE + number * header.frame_bytes
             frame = np.memmap(path, header.dtype, "r", offset, shape)
-        if header.colour in _BAYER:
-            yield cv2.cvtColor(frame.astype(frame.dtype.newbyteorder("=")), _BAYER[header.colour])
-        else:
-            yield frame[..., ::-1] if header.colour == _BGR else frame
+        yield frame[..., ::-1] if header.colour == _BGR else frame
 
 
 def _timestamps(path: Path, header: SerHeader, size: int) -> NDArray[np.float64] | None:

@@ -20,7 +20,7 @@ from ..core.arrays import CHANNELS, FloatArray
 from ..core.errors import ConfigurationError, DataError, require
 from ..runtime.scratch import iter_frames
 from .output import size_text
-from .pixels import PixelArray, depth_of, full_scale_of, to_unit
+from .pixels import BAYER_CODES, PixelArray, demosaic, depth_of, full_scale_of, to_unit
 
 FrameRange = tuple[int | None, int | None] | tuple[int | None, int | None, int | None]
 Roi = tuple[int, int, int, int]
@@ -54,6 +54,8 @@ class FrameSource:
         Numbers, in the file, of frames that are known to be damaged.
     repair : callable or None
         Applied to the native pixels of every frame first.
+    develop : callable or None
+        Turns repaired native pixels into a frame, such as a Bayer mosaic into colours.
     numbers, window : range or tuple of int, tuple of slice
         Ascending numbers, in the file, of the selected frames; selected rows and columns. By default all.
 
@@ -78,6 +80,7 @@ class FrameSource:
     warnings: tuple[str, ...] = ()
     damaged: tuple[int, ...] = ()
     repair: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
+    develop: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
     numbers: range | tuple[int, ...] = range(0)
     window: tuple[slice, slice] = (slice(0), slice(0))
 
@@ -139,6 +142,20 @@ class FrameSource:
         """
         for _, pixels in self._native(self.numbers):
             yield pixels
+
+    def mosaics(self) -> Iterator[PixelArray | None]:
+        """Iterate over whole frames as the sensor saw them, before they are repaired and developed; None for others.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> list(FrameSource.from_array(np.full((2, 1, 1), 7, np.uint8)).mosaics())
+        [None, None]
+        """
+        if self.develop is None:
+            yield from (None for _ in self.numbers)
+        else:
+            yield from self.pixels(self.numbers)
 
     def without(self, numbers: Collection[int], warning: str) -> FrameSource:
         """Leave out the frames with these numbers in the file; where any is selected, ``warning`` is added.
@@ -257,16 +274,46 @@ class FrameSource:
     def _native(self, chosen: range | tuple[int, ...]) -> Iterator[tuple[int, PixelArray]]:
         done = 0
         # Without iter_frames a memory-mapped video would be in memory as a whole at the end.
-        for number, pixels in zip(chosen, iter_frames(self.pixels(chosen)), strict=False):
+        for number, native in zip(chosen, iter_frames(self.pixels(chosen)), strict=False):
+            repaired = native if self.repair is None else self.repair(native)
+            pixels = repaired if self.develop is None else self.develop(repaired)
             if pixels.shape != self.file_shape[1:]:
                 expected, found = size_text(self.file_shape[1:]), size_text(pixels.shape)
                 raise DataError(f"{self.name}: frame {number}: expected {expected} as the first frame, found {found}")
-            yield number, (pixels if self.repair is None else self.repair(pixels))[self.window]
+            yield number, pixels[self.window]
             done += 1
         if done < len(chosen):
             raise DataError(
                 f"{self.name}: expected {len(chosen)} frames, found {done}; the file is damaged or cut short"
             )
+
+
+def as_bayer(source: FrameSource, pattern: str) -> FrameSource:
+    """Take grey frames for mosaics of a Bayer sensor.
+
+    Raises
+    ------
+    ConfigurationError
+        The pattern is unknown.
+    DataError
+        The frames are coloured, or neither of 8 nor of 16 bits.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> as_bayer(FrameSource.from_array(np.zeros((5, 4, 6), np.uint8)), "rggb").shape
+    (5, 4, 6, 3)
+    """
+    require(pattern in BAYER_CODES, f"bayer: expected one of {', '.join(BAYER_CODES)}, found {pattern!r}")
+    if len(source.file_shape) != 3 or source.bit_depth > 16:
+        kind = "floating point" if len(source.file_shape) == 3 else "colours"
+        raise DataError(f"{source.name}: --bayer: expected grey frames of 8 or 16 bits, found {kind}; leave it out")
+    return dataclasses.replace(
+        source,
+        file_shape=(*source.file_shape, 3),
+        format=f"{source.format} as {pattern}",
+        develop=lambda pixels: demosaic(pixels, pattern),
+    )
 
 
 def check_frame_range(frames: FrameRange | None) -> slice:

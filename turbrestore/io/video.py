@@ -39,7 +39,7 @@ from .npy import open_npy, write_npy
 from .output import check_output, size_text
 from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit
 from .ser import open_ser, write_ser
-from .source import FrameRange, FrameSource, Roi, check_frame_range, numbers_text
+from .source import FrameRange, FrameSource, Roi, as_bayer, check_frame_range, numbers_text
 from .tiff import TIFF_SUFFIXES, open_tiff, write_tiff
 
 VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES)
@@ -55,6 +55,7 @@ def open_frames(
     roi: Roi | None = None,
     limits: Limits = DEFAULT_LIMITS,
     skip_damaged: bool = False,
+    bayer: str | None = None,
 ) -> FrameSource:
     """Open a video: read its headers, check that it is whole, and decode its first frame.
 
@@ -73,6 +74,8 @@ def open_frames(
     skip_damaged : bool
         Read a file that is cut short up to the cut, and leave out frames whose checksum fails and on which no others
         depend, each with a warning, instead of raising DataError.
+    bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
+        Take grey frames for mosaics of a Bayer sensor whose first pixels have these colours.
 
     Returns
     -------
@@ -100,26 +103,8 @@ def open_frames(
     ...     source.shape, len([frame for frame in source])
     ((6, 2, 3), 6)
     """
-    path = Path(path)
-    wanted = check_frame_range(frames)
-    is_folder = stat.S_ISDIR(check_input(path).st_mode)
-    suffix = path.suffix.lower()
-    if is_folder:
-        source = _open_folder(path, limits)
-    elif suffix in CONTAINER_SUFFIXES:
-        source = open_container(path, frames, limits, skip_damaged)
-    elif suffix == ".ser":
-        source = open_ser(path, wanted.stop, limits, skip_damaged)
-    elif suffix in TIFF_SUFFIXES:
-        source = open_tiff(path, limits)
-    elif suffix == ".npy":
-        source = open_npy(path, limits)
-    elif suffix in ANIMATION_SUFFIXES:
-        source = open_animation(path, wanted.stop, limits, skip_damaged)
-    elif suffix in IMAGE_SUFFIXES:
-        raise DataError(f"{path}: a single image; name the folder that holds the frames")
-    else:
-        source = _open_unknown(path, frames, limits, skip_damaged)
+    source = _open(Path(path), frames, limits, skip_damaged)
+    source = source if bayer is None else as_bayer(source, bayer)
     source = source.select(frames, roi)
     source = source.without(source.damaged, f"checksum fails: {numbers_text(source.damaged)} left out")
     _check_first(source)
@@ -204,6 +189,28 @@ def frame_files(folder: Path) -> list[Path]:
     return sorted((path for path in named if path.is_file()), key=natural)
 
 
+def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool) -> FrameSource:
+    """Open a whole video by the reader of its format."""
+    stop = check_frame_range(frames).stop
+    is_folder = stat.S_ISDIR(check_input(path).st_mode)
+    suffix = path.suffix.lower()
+    if is_folder:
+        source = _open_folder(path, limits)
+    elif suffix in CONTAINER_SUFFIXES:
+        source = open_container(path, frames, limits, skip_damaged)
+    elif suffix == ".ser":
+        source = open_ser(path, stop, limits, skip_damaged)
+    elif suffix in TIFF_SUFFIXES:
+        source = open_tiff(path, limits)
+    elif suffix == ".npy":
+        source = open_npy(path, limits)
+    elif suffix in ANIMATION_SUFFIXES:
+        source = open_animation(path, stop, limits, skip_damaged)
+    else:
+        source = _open_unknown(path, frames, limits, skip_damaged)
+    return source
+
+
 def _check_first(source: FrameSource) -> None:
     """Refuse a wrong size or scale of the first frame when the video is opened."""
     (pixels,) = source.select((0, 1)).native()
@@ -214,6 +221,8 @@ def _check_first(source: FrameSource) -> None:
 
 def _open_unknown(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool) -> FrameSource:
     """Open a file of an unknown suffix, or none, if its content is that of a video."""
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        raise DataError(f"{path}: a single image; name the folder that holds the frames")
     if not is_container(path):
         names, found = ", ".join(VIDEO_SUFFIXES), path.suffix.lower() or "no suffix"
         raise DataError(f"{path}: expected a folder of images or one of {names}, found {found}")

@@ -48,6 +48,7 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
     facts = {
         "centroid": {
             "input": content_digest(source),
+            "format": source.format,
             "training_frames": _span(source.numbers[: plan.train]),
             # What is repaired is found by looking at all frames.
             "repaired": None if source.repair is None else [_span(source.numbers), *source.warnings],
