@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -243,9 +244,19 @@ def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
         pixels = _opencv_pixels(path, data)
         # OpenCV returns grey with alpha (type 4) as RGBA.
         pixels = pixels[..., [0, 3]] if kind == "PNG" and data[25] == 4 else pixels
+        pixels = _at_full_range(pixels, data) if kind == "PPM" else pixels
     if pixels.dtype == bool:
         pixels = np.uint8(255) * pixels
     return upright(pixels, orientation)
+
+
+def _at_full_range(pixels: PixelArray, data: bytes) -> PixelArray:
+    """Spread the values of a PGM or PPM file, whose header names its white, over the range of their type."""
+    header = re.match(rb"P[2356]\s+" + rb"(?:#[^\n]*\n\s*)*\d+\s+" * 2 + rb"(?:#[^\n]*\n\s*)*(\d+)", data)
+    full, white = np.iinfo(pixels.dtype).max, int(header[1]) if header else 0
+    if not 0 < white < full:
+        return pixels
+    return np.rint(np.minimum(pixels, white) * (full / white)).astype(pixels.dtype)
 
 
 def _opened(data: bytes) -> Any:

@@ -18,7 +18,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import CHANNELS, FloatArray
+from ..core.errors import DataError
 from ..runtime.scratch import iter_parts, new_stack
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
 from .output import atomic_output, frames_of_one_size
@@ -27,6 +28,9 @@ from .source import FrameSource
 
 # Arrays of more bytes may be moved to a scratch file.
 _LARGE = 1 << 22
+# Places along each axis at which the order of the axes is judged, and the factor by which the mean over time has more
+# contrast than the mean over rows.
+_SAMPLES, _STILLER = 48, 1.5
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -105,12 +109,48 @@ def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
-    """Open an array of shape (T, H, W) or (T, H, W, 3) as a video; the errors are those of :func:`map_npy`."""
-    array = map_npy(path)
+    """Open an array of shape (T, H, W) or (T, H, W, 3) as a video; the errors are those of :func:`map_npy`.
+
+    Other orders of the axes are told by the shape, and (H, W, T) by the content: the frames of a video resemble each
+    other more than its rows do.  A warning says how such an array was read.
+    """
+    array, order = _frames_first(path, map_npy(path))
     source = FrameSource.from_array(array, path.name)
     limits.check_size(source.shape[2], source.shape[1], str(path))
     limits.check_count(len(source), str(path))
-    return dataclasses.replace(source, format=f"npy/{array.dtype}", path=path)
+    remark = (f"its axes are taken for {order}; save it as (T, H, W) or (T, H, W, 3) if that is wrong",)
+    return dataclasses.replace(source, format=f"npy/{array.dtype}", path=path, warnings=remark if order else ())
+
+
+def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
+    """Bring the axes into the order (T, H, W) or (T, H, W, 3); say what they were taken for where that was another."""
+    shape = array.shape
+    if array.ndim == 4 and shape[3] not in CHANNELS:
+        if shape[1] in CHANNELS:
+            return np.moveaxis(array, 1, 3), "(T, 3, H, W)"
+        if shape[2] in CHANNELS:
+            return np.moveaxis(array, (3, 0, 1, 2), (0, 1, 2, 3)), "(H, W, 3, T)"
+        for axis, order in ((3, "(T, H, W, 1)"), (1, "(T, 1, H, W)")):
+            if shape[axis] == 1:
+                return np.squeeze(array, axis), order
+    if array.ndim == 3 and shape[2] in CHANNELS and min(shape[:2]) > _SAMPLES:
+        raise DataError(f"{path}: expected frames of shape (T, H, W), found {shape}, which is that of one colour image")
+    if array.ndim == 3 and min(shape) > 1 and array.dtype.kind in "uf" and _frames_last(array):
+        return np.moveaxis(array, 2, 0), "(H, W, T)"
+    return array, ""
+
+
+def _frames_last(array: NDArray[Any]) -> bool:
+    """Whether what is still in an array lies along its first two axes, and its last is the slowest to change."""
+    places = [np.unique(np.linspace(0, length - 1, _SAMPLES).astype(int)) for length in array.shape]
+    # Whole planes of the last axis would read the whole file.
+    spread = np.float64(array[places[0]][:, places[1]][:, :, places[2]])
+    middle = np.float64(array[tuple(slice(max(0, n // 2 - 16), n // 2 + 16) for n in array.shape)])
+    if not np.isfinite(spread).all() or not np.isfinite(middle).all():
+        return False
+    still = [float(spread.mean(axis=axis).std()) for axis in (0, 2)]
+    changes = [float(np.abs(np.diff(middle, axis=axis)).mean()) for axis in (0, 2)]
+    return still[1] > _STILLER * still[0] and changes[1] < changes[0]
 
 
 def write_npy(path: Path, frames: Iterable[FloatArray], bit_depth: int = 32, overwrite: bool = False) -> None:

@@ -13,6 +13,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -37,7 +38,9 @@ _DECOMPRESSED = (_LZW, 8, 32946, _PACKBITS, _LZMA)
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
 _NOT_TIFF = "not a TIFF file, or damaged"
 _MOST_SAMPLES = 16
-_ORIENTATION = 274
+_ORIENTATION, _SUBFILE = 274, 254
+# Type of a tag: a number of 32 bits.
+_LONG = 4
 # LZW codes that start a new table and that end the data, and the size of the largest table.
 _CLEAR, _END, _TABLE = 256, 257, 4096
 
@@ -60,14 +63,14 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     import tifffile
 
     with input_errors(path), path.open("rb") as file:
-        pages = count_pages(path, file, limits)
+        pages = list_pages(path, file, limits)
     with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
-        page = tiff.pages.first
+        page = tiff.pages[pages.whole[0]].aspage()
         _check_page(path, page, limits)
-        packed = _packed_stack(path, tiff) if pages == 1 else None
+        packed = _packed_stack(path, tiff) if pages.count == 1 else None
         if packed is not None:
             return packed
-        channels = _channels(page)
+        channels, planes = _channels(page), _plane_pages(path, tiff, pages)
         if channels is None:
             kind = f"{getattr(page.photometric, 'name', page.photometric)} with {page.samplesperpixel} channels"
             raise DataError(f"{path}: expected grey or RGB pages, found {kind}; convert the file")
@@ -76,12 +79,12 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
         return FrameSource(
             name=path.name,
             format=f"tiff/{dtype}",
-            file_shape=(pages, page.imagelength, page.imagewidth, *channels),
+            file_shape=(len(planes), page.imagelength, page.imagewidth, *((3,) if len(planes[0]) == 3 else channels)),
             full_scale=2**page.bitspersample - 1 if integer else full_scale_of(dtype, str(path)),
             bit_depth=min(page.bitspersample, 32) if integer else depth_of(dtype),
-            pixels=lambda chosen: _frames(path, chosen, limits),
+            pixels=lambda chosen: _frames(path, [planes[number] for number in chosen], limits),
             path=path,
-            warnings=_notes(page),
+            warnings=(*_notes(page), *pages.remarks()),
         )
 
 
@@ -93,11 +96,11 @@ def read_tiff(path: Path, data: bytes, limits: Limits) -> tuple[PixelArray | Non
     """
     import tifffile
 
-    pages = count_pages(path, io.BytesIO(data), limits)
-    if pages != 1:
-        raise DataError(f"{path}: expected one image, found {pages} pages; read it as a video")
+    pages = list_pages(path, io.BytesIO(data), limits)
+    if len(pages.whole) != 1:
+        raise DataError(f"{path}: expected one image, found {len(pages.whole)} pages; read it as a video")
     with format_errors(path, _NOT_TIFF), tifffile.TiffFile(io.BytesIO(data)) as tiff:
-        page = tiff.pages.first
+        page = tiff.pages[pages.whole[0]].aspage()
         _check_page(path, page, limits)
         if _is_decodable(page):
             return upright(_page_pixels(path, page), page.tags.valueof(_ORIENTATION)), _notes(page)
@@ -121,13 +124,26 @@ def write_tiff(path: Path, frames: Iterable[FloatArray], bit_depth: int = 16, ov
             tiff.write(pixels, photometric="minisblack" if frame.ndim == 2 else "rgb", contiguous=False, metadata=None)
 
 
-def count_pages(path: Path, file: BinaryIO, limits: Limits) -> int:
-    r"""Count the pages of a TIFF file by following the links from page to page; raise DataError for broken links.
+@dataclass(frozen=True)
+class Pages:
+    """Number of pages, and the numbers of those that are no reduced image of another one."""
+
+    count: int
+    whole: tuple[int, ...]
+
+    def remarks(self) -> tuple[str, ...]:
+        """Say how many pages are left out."""
+        reduced = self.count - len(self.whole)
+        return (f"{reduced} page{'s' * (reduced > 1)} of reduced size left out",) if reduced else ()
+
+
+def list_pages(path: Path, file: BinaryIO, limits: Limits) -> Pages:
+    r"""List the pages of a TIFF file by following the links from page to page; raise DataError for broken links.
 
     Examples
     --------
-    >>> count_pages(Path("a.tif"), io.BytesIO(b"II*\0\x08\0\0\0" + bytes(14)), Limits())
-    1
+    >>> list_pages(Path("a.tif"), io.BytesIO(b"II*\0\x08\0\0\0" + bytes(14)), Limits())
+    Pages(count=1, whole=(0,))
     """
     head = file.read(16)
     order = {b"II": "<", b"MM": ">"}.get(head[:2], "")
@@ -139,6 +155,7 @@ def count_pages(path: Path, file: BinaryIO, limits: Limits) -> int:
     offset = struct.unpack(order + link_format, head[4:8] if version == 42 else head[8:16])[0]
     size = file.seek(0, io.SEEK_END)
     seen: set[int] = set()
+    whole: list[int] = []
     while offset:
         if offset in seen:
             raise DataError(f"{path}: damaged; its pages form a circle")
@@ -148,13 +165,22 @@ def count_pages(path: Path, file: BinaryIO, limits: Limits) -> int:
             # The system refuses to seek to offsets beyond its range; at the end of the file nothing is read.
             file.seek(min(offset, size))
             (entries,) = struct.unpack(order + count_format, file.read(struct.calcsize(count_format)))
-            file.seek(min(file.tell() + entries * entry_size, size))
+            start = file.tell()
+            whole += [] if _is_reduced(file.read(entry_size if entries else 0), order, link_size) else [len(seen) - 1]
+            file.seek(min(start + entries * entry_size, size))
             (offset,) = struct.unpack(order + link_format, file.read(link_size))
         except struct.error:
             raise DataError(f"{path}: cut short after {len(seen) - 1} whole pages; copy the file again") from None
     if not seen:
         raise DataError(f"{path}: expected at least one page, found none")
-    return len(seen)
+    return Pages(len(seen), tuple(whole) or tuple(range(len(seen))))
+
+
+def _is_reduced(entry: bytes, order: str, link_size: int) -> bool:
+    """Whether the first tag of a page, which are sorted, says that it is a reduced version of another page."""
+    if len(entry) < 4 + 2 * link_size or struct.unpack(f"{order}HH", entry[:4]) != (_SUBFILE, _LONG):
+        return False
+    return bool(struct.unpack(f"{order}I", entry[4 + link_size : 8 + link_size])[0] & 1)
 
 
 def _check_page(path: Path, page: tifffile.TiffPage, limits: Limits) -> None:
@@ -180,13 +206,35 @@ def _notes(page: tifffile.TiffPage) -> tuple[str, ...]:
     return ("alpha channel ignored",) if page.samplesperpixel not in (1, 3) else ()
 
 
+def _plane_pages(path: Path, tiff: tifffile.TiffFile, pages: Pages) -> list[tuple[int, ...]]:
+    """Pages of every frame: one, or those of red, green and blue of an ImageJ or OME stack of channels."""
+    alone: list[tuple[int, ...]] = [(number,) for number in pages.whole]
+    if not (tiff.is_imagej or tiff.is_ome) or len(pages.whole) != pages.count:
+        return alone
+    series = tiff.series[0]
+    axes, shape = series.axes[:-2], series.shape[:-2]
+    if not series.axes.endswith("YX") or "C" not in axes or math.prod(shape) != pages.count:
+        return alone
+    channels = shape[axes.index("C")]
+    # Some programs call frames channels.
+    if channels in (pages.count, 1):
+        return alone
+    if channels != 3:
+        raise DataError(f"{path}: expected 1 or 3 channels, found {channels} (axes {series.axes}); save one as a stack")
+    numbers = np.moveaxis(np.arange(pages.count).reshape(shape), axes.index("C"), -1).reshape(-1, 3)
+    return [tuple(frame) for frame in numbers.tolist()]
+
+
 def _packed_stack(path: Path, tiff: tifffile.TiffFile) -> FrameSource | None:
     """Open frames that follow each other behind a single page, as ImageJ writes stacks of 4 GB and more."""
     series, page = tiff.series[0], tiff.pages.first
     if series.dataoffset is None or series.size <= page.imagewidth * page.imagelength * page.samplesperpixel:
         return None
     dtype = series.dtype.newbyteorder(tiff.byteorder)
-    source = FrameSource.from_array(np.memmap(path, dtype, "r", series.dataoffset, series.shape), path.name)
+    array = np.memmap(path, dtype, "r", series.dataoffset, series.shape)
+    if series.axes in ("TCYX", "ZCYX") and series.shape[1] == 3:
+        array = np.moveaxis(array, 1, -1)
+    source = FrameSource.from_array(array, path.name)
     return dataclasses.replace(source, format=f"tiff/{series.dtype}", path=path)
 
 
@@ -199,16 +247,19 @@ def _is_decodable(page: tifffile.TiffPage) -> bool:
     return _channels(page) is not None and bits and known and page.predictor in (1, *TIFF.UNPREDICTORS)
 
 
-def _frames(path: Path, chosen: Sequence[int], limits: Limits) -> Iterator[PixelArray]:
+def _frames(path: Path, chosen: Sequence[tuple[int, ...]], limits: Limits) -> Iterator[PixelArray]:
     import tifffile
 
     with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
-        for number in chosen:
-            page = tiff.pages[number].aspage()
-            _check_page(path, page, limits)
-            if _channels(page) is None:
-                raise DataError(f"{path}: frame {number}: expected grey or RGB; convert the file")
-            yield _page_pixels(path, page)
+        for numbers in chosen:
+            planes = []
+            for number in numbers:
+                page = tiff.pages[number].aspage()
+                _check_page(path, page, limits)
+                if _channels(page) is None:
+                    raise DataError(f"{path}: page {number}: expected grey or RGB; convert the file")
+                planes.append(_page_pixels(path, page))
+            yield planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
 
 
 def _page_pixels(path: Path, page: tifffile.TiffPage) -> PixelArray:

@@ -254,6 +254,19 @@ def _images(
     for number in chosen:
         pixels, _ = read_pixels(files[number], limits)
         if pixels.dtype != dtype or pixels.shape != shape:
-            expected, found = f"{size_text(shape)} {dtype}", f"{size_text(pixels.shape)} {pixels.dtype}"
-            raise DataError(f"{files[number]}: expected {expected} as the first image, found {found}")
+            raise _odd_image(files, number, limits)
         yield pixels
+
+
+def _odd_image(files: list[Path], number: int, limits: Limits) -> DataError:
+    """Error for an image that is not like the first; of three images it names the one that differs from the others."""
+    others = [0, number, number + 1 if number + 1 < len(files) else number // 2]
+    kinds = []
+    for place in others:
+        pixels, _ = read_pixels(files[place], limits)
+        kinds.append(f"{size_text(pixels.shape)} {pixels.dtype}")
+    odd, usual = (0, 1) if kinds[1] == kinds[2] else (1, 0)
+    return DataError(
+        f"{files[others[odd]]}: expected {kinds[usual]} as {files[others[usual]].name}, found {kinds[odd]}; "
+        "take it out of the folder if it is not a frame"
+    )

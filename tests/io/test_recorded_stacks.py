@@ -1,0 +1,129 @@
+"""Arrays, stacks and folders as programs and phones write them: axes, channels, white, turns, thumbnails."""
+
+import numpy as np
+import PIL.Image
+import pytest
+import tifffile
+
+from turbrestore.core.errors import DataError
+from turbrestore.footage.content import check_content
+from turbrestore.io.images import read_image
+from turbrestore.io.video import open_frames
+from videos import refused, scene
+
+COLOUR = np.stack(scene(14, 40, 56))
+# A still scene with noise; the waves of ``scene`` move.
+STILL = np.clip(COLOUR[:1].mean(axis=-1) + np.random.default_rng(0).normal(0, 4, (14, 40, 56)), 0, 255).astype(np.uint8)
+
+
+class TestArrays:
+    @pytest.mark.parametrize("count", [8, 14, 60])
+    def test_frames_along_the_last_axis(self, tmp_path, count):
+        frames = np.clip(STILL[0] + np.random.default_rng(1).normal(0, 9, (count, 40, 56)), 0, 255).astype(np.uint8)
+        np.save(tmp_path / "a.npy", np.moveaxis(frames, 0, -1))
+        source = open_frames(tmp_path / "a.npy")
+        np.testing.assert_array_equal(np.rint(source.read() * 255), frames)
+        (remark,) = source.warnings
+        assert "(H, W, T)" in remark and "save it" in remark
+
+    @pytest.mark.parametrize(
+        ("order", "axes"), [((0, 3, 1, 2), "(T, 3, H, W)"), ((1, 2, 3, 0), "(H, W, 3, T)")], ids=["TCHW", "HWCT"]
+    )
+    def test_channels_tell_the_order(self, tmp_path, order, axes):
+        np.save(tmp_path / "a.npy", np.transpose(COLOUR, order))
+        source = open_frames(tmp_path / "a.npy")
+        np.testing.assert_array_equal(source.read(), COLOUR / np.float32(255))
+        assert axes in source.warnings[0]
+
+    @pytest.mark.parametrize("axis", [1, 3])
+    def test_one_channel(self, tmp_path, axis):
+        np.save(tmp_path / "a.npy", np.expand_dims(STILL, axis))
+        assert open_frames(tmp_path / "a.npy").shape == STILL.shape
+
+    def test_usual_orders_have_no_remark(self, tmp_path):
+        rng = np.random.default_rng(0)
+        striped = np.broadcast_to(STILL[:, :1], STILL.shape)
+        drifting = np.stack([np.roll(STILL[k], 3 * k, axis=1) for k in range(14)])
+        for frames in (STILL, COLOUR, striped, drifting, rng.integers(0, 255, (14, 40, 56)), STILL[:, ::-1, :20]):
+            np.save(tmp_path / "a.npy", frames.astype(np.uint8))
+            source = open_frames(tmp_path / "a.npy")
+            assert source.warnings == () and source.shape == frames.shape
+
+    def test_one_colour_image_is_refused(self, tmp_path):
+        np.save(tmp_path / "a.npy", np.zeros((80, 90, 3), np.uint8))
+        refused(tmp_path / "a.npy", DataError, "one colour image", "(T, H, W)")
+
+
+class TestTiff:
+    @pytest.mark.parametrize(("axes", "shape"), [("TCYX", (14, 3)), ("TZCYX", (7, 2, 3)), ("ZCYX", (14, 3))])
+    @pytest.mark.parametrize("kind", ["imagej", "ome"])
+    def test_stacks_of_channels(self, tmp_path, axes, shape, kind):
+        frames = 257 * COLOUR.astype(np.uint16)
+        stack = np.moveaxis(frames, -1, 1).reshape(*shape, 40, 56)
+        name = "a.ome.tif" if kind == "ome" else "a.tif"
+        options = {"ome": True} if kind == "ome" else {"imagej": True}
+        tifffile.imwrite(
+            tmp_path / name, np.ascontiguousarray(stack), photometric="minisblack", metadata={"axes": axes}, **options
+        )
+        source = open_frames(tmp_path / name)
+        np.testing.assert_array_equal(source.read(), frames / np.float32(65535))
+
+    def test_other_numbers_of_channels_are_refused(self, tmp_path):
+        stack = np.ascontiguousarray(np.moveaxis(COLOUR[..., :2], -1, 1))
+        tifffile.imwrite(tmp_path / "a.tif", stack, imagej=True, metadata={"axes": "TCYX"})
+        refused(tmp_path / "a.tif", DataError, "3 channels, found 2")
+
+    @pytest.mark.parametrize("axes", ["TYX", "ZYX", "CYX"])
+    def test_grey_stacks_stay_grey(self, tmp_path, axes):
+        tifffile.imwrite(tmp_path / "a.tif", STILL, imagej=True, metadata={"axes": axes})
+        assert open_frames(tmp_path / "a.tif").shape == STILL.shape
+
+    def test_lzw(self, tmp_path):
+        pages = [PIL.Image.fromarray(frame) for frame in STILL]
+        pages[0].save(tmp_path / "a.tif", save_all=True, append_images=pages[1:], compression="tiff_lzw")
+        np.testing.assert_array_equal(open_frames(tmp_path / "a.tif").read(), STILL / np.float32(255))
+
+    @pytest.mark.parametrize("order", ["<", ">"])
+    @pytest.mark.parametrize("big", [False, True])
+    @pytest.mark.parametrize("first", [False, True])
+    def test_pages_of_reduced_size_are_left_out(self, tmp_path, order, big, first):
+        with tifffile.TiffWriter(tmp_path / "a.tif", byteorder=order, bigtiff=big) as output:
+            kinds = {"photometric": "minisblack", "contiguous": False, "metadata": None}
+            thumb = STILL[0, ::4, ::4]
+            if first:
+                output.write(thumb, subfiletype=1, **kinds)
+            for frame in STILL:
+                output.write(frame, **kinds)
+            output.write(thumb, subfiletype=1, **kinds)
+        source = open_frames(tmp_path / "a.tif")
+        np.testing.assert_array_equal(source.read(), STILL / np.float32(255))
+        assert source.warnings == (f"{1 + first} page{'s' * first} of reduced size left out",)
+
+
+class TestFolders:
+    @pytest.mark.parametrize("white", [100, 255, 1023, 4095, 65535])
+    def test_white_of_portable_maps(self, tmp_path, white):
+        values = np.linspace(0, white, 40 * 56).astype(np.int64).reshape(40, 56)
+        for number in range(3):
+            data = np.roll(values, number).astype(np.uint8 if white < 256 else ">u2").tobytes()
+            (tmp_path / f"{number}.pgm").write_bytes(b"P5\n# a comment\n56 40\n%d\n" % white + data)
+        found = open_frames(tmp_path).read()
+        np.testing.assert_allclose(found[1], np.roll(values, 1) / white, atol=0.003 if white < 256 else 1e-5)
+        assert read_image(tmp_path / "0.pgm").image.max() == 1
+
+    @pytest.mark.parametrize("name", ["thumb.png", "0.png", "9.png", "5a.png"])
+    def test_the_image_that_is_no_frame_is_named(self, tmp_path, name):
+        for number in range(1, 9):
+            PIL.Image.fromarray(STILL[number]).save(tmp_path / f"{number}.png")
+        PIL.Image.fromarray(np.ascontiguousarray(STILL[0, ::4, ::4])).save(tmp_path / name)
+        refused(tmp_path, DataError, f"{name}: expected 56×40", "found 14×10", "take it out")
+
+    def test_photographs_of_all_orientations_are_one_scene(self, tmp_path):
+        for number, frame in enumerate(COLOUR):
+            turn, tag = [(0, 1), (1, 6), (2, 3), (3, 8)][number % 4]
+            exif = PIL.Image.Exif()
+            exif[0x112] = tag
+            PIL.Image.fromarray(np.rot90(frame, turn)).save(tmp_path / f"{number}.jpg", quality=95, exif=exif)
+        source = open_frames(tmp_path)
+        assert source.shape == COLOUR.shape and np.abs(255 * source.read() - COLOUR).mean() < 6
+        assert not check_content(source).left_out
