@@ -59,9 +59,9 @@ class FrameStatistics:
     template_energy : float
         Sum of its square.
     mean_sharpness : array, float32, shape (H, W)
-        Mean over the frames of the local sharpness, see :func:`project_gradient`.
+        Mean over the frames of the local sharpness where they agree, see :func:`project_gradient`.
     score_scale : array, float32, shape (H, W)
-        Factor from a deviation of the local sharpness to z.
+        Factor from a deviation of the local sharpness to z; 0 where something has passed.
     score_variance : array, float32, shape (H, W)
         v, variance of z over the frames.
     motion_share : array, float32, shape (H, W)

@@ -6,12 +6,13 @@ Z₀ : variance of a registered frame about the image before sharpness is taken 
 G : share of the flow outside the model's subspace that is motion and not noise
 R : variance of that flow (eq. 10)
 
-Frames are warped twice: once for mean and variance, and once more to leave out what deviates from all others.
+Frames are warped three times: some of them for a median, which what passes through the scene does not change, and all
+of them twice: for mean and variance, and once more to leave out what deviates from all others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import cv2
 import numpy as np
@@ -41,6 +42,9 @@ _LEAST_DEVIATION = 0.1
 # Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels over which such
 # derivatives correlate.
 _SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
+# Frames of which the median is taken, the rows that it is taken of at once, the factor from a median deviation to a
+# standard deviation, and how many times the variance exceeds its robust estimate where something has passed.
+_RESERVOIR, _ROWS, _MEDIAN_DEVIATION, _HEAVY_TAIL = 25, 64, 1.4826, 4.0
 _OPS = numpy_ops()
 
 
@@ -94,25 +98,29 @@ def measure_frame_statistics(
     template = gradient(luminance(image), _OPS)
 
     def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
-        sums = tuple(np.zeros(image.shape[:2]) for _ in range(4))
+        sums = tuple(np.zeros(image.shape[:2]) for _ in range(2))
         for frame, flow in pairs:
-            registered = luminance(warp(frame, flow))
-            _add_moments(registered, *sums[:2])
-            _add_moments(smooth(project_gradient(registered, template, _OPS), window, _OPS), *sums[2:])
+            _add_moments(luminance(warp(frame, flow)), *sums)
         return *sums, np.array(float(len(pairs)))
 
     pairs = zip(iter_frames(frames), iter_frames(flows), strict=True)
-    total, squares, sharpness, spread, number = sum_in_threads(add, pairs, threads)
+    total, squares, number = sum_in_threads(add, pairs, threads)
     count = float(number)
     mean, variance = _mean_and_variance(total, squares, count)
     variance *= count / max(count - 1, 1)
-    sharpness, spread = _mean_and_variance(sharpness, spread, count)
-    mean_frame, deviation = _without_outliers(frames, flows, mean, variance, threads)
+    mean, variance, passed = _robust_start(frames, flows, mean, variance, int(count))
+
+    def sharpness_of(registered: FloatArray) -> FloatArray:
+        return smooth(project_gradient(registered, template, _OPS), window, _OPS)
+
+    mean_frame, deviation, sharpness, spread = _without_outliers(frames, flows, mean, variance, sharpness_of, threads)
     # The flattest fifth of the image varies by sensor noise alone; elsewhere blur and misregistration add to it.
     square = template[0] ** 2 + template[1] ** 2
     energy = smooth(square, window, _OPS)
     sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
     scale = _score_scale(sharpness, spread, energy * np.float32(_SOBEL_NOISE * sensor_noise), window)
+    # Near what passes flow is pulled along, and a frame may be sharp without showing the scene.
+    scale *= 1 - smooth(passed.astype(np.float32), window, _OPS)
     return FrameStatistics(
         image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
         template=template,
@@ -132,9 +140,39 @@ def _add_moments(plane: FloatArray, total: np.ndarray, squares: np.ndarray) -> N
     cv2.accumulateSquare(plane, squares)
 
 
-def _mean_and_variance(total: np.ndarray, squares: np.ndarray, count: float) -> tuple[np.ndarray, np.ndarray]:
+def _mean_and_variance(
+    total: np.ndarray, squares: np.ndarray, count: float | np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     mean = total / count
     return mean, np.maximum(squares / count - mean**2, 0.0)
+
+
+def _robust_start(
+    frames: Iterable[FloatArray], flows: Iterable[FloatArray], mean: np.ndarray, variance: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean and variance, but median and squared median deviation where something has passed; mark these pixels too.
+
+    What covers a pixel in a share p of the frames lies (1 − p) / p variances from the mean, and is no outlier if p
+    exceeds a seventh.  The median and the median deviation hardly know of it up to p = 0.3.
+    """
+    picked = set(np.linspace(0, count - 1, min(count, _RESERVOIR)).round().astype(int).tolist())
+    stack = np.empty((len(picked), *mean.shape), np.float16)
+    chosen = (
+        pair
+        for number, pair in enumerate(zip(iter_frames(frames), iter_frames(flows), strict=True))
+        if number in picked
+    )
+    for plane, (frame, flow) in zip(stack, chosen, strict=True):
+        plane[...] = luminance(warp(frame, flow))
+    centre, spread = np.empty(mean.shape), np.empty(mean.shape)
+    for top in range(0, len(mean), _ROWS):
+        rows = np.s_[top : top + _ROWS]
+        values = stack[:, rows].astype(np.float32)
+        centre[rows] = np.median(values, axis=0)
+        spread[rows] = (_MEDIAN_DEVIATION * np.median(np.abs(values - centre[rows]), axis=0)) ** 2
+    usual = smooth(spread.astype(np.float32), OUTLIER_WINDOW, _OPS) + np.float32(_IMAGE_NOISE_FLOOR)
+    passed = smooth(variance.astype(np.float32), OUTLIER_WINDOW, _OPS) > _HEAVY_TAIL * usual
+    return np.where(passed, centre, mean), np.where(passed, spread, variance), passed
 
 
 def _without_outliers(
@@ -142,26 +180,33 @@ def _without_outliers(
     flows: Iterable[FloatArray],
     mean: np.ndarray,
     variance: np.ndarray,
+    sharpness_of: Callable[[FloatArray], FloatArray],
     threads: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Mean of the registered frames and their variance about it, without the pixels that deviate from all others."""
+) -> tuple[FloatArray, FloatArray, np.ndarray, np.ndarray]:
+    """Mean and variance of the registered frames and of their sharpness, without pixels that deviate from all others.
+
+    What passes through the scene may be sharper than the scene, and would set the standard of sharpness.
+    """
     centre, usual = mean.astype(np.float32), _deviation(variance)
 
     def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
-        counts, total, squares = (np.zeros(mean.shape) for _ in range(3))
+        counts, total, squares, *moments = (np.zeros(mean.shape) for _ in range(5))
         for frame, flow in pairs:
             registered = luminance(warp(frame, flow))
             kept = (squared_deviation(registered, centre, usual, _OPS) <= OUTLIER).view(np.uint8)
             cv2.accumulate(kept, counts)
             cv2.accumulate(registered, total, kept)
             cv2.accumulateSquare(registered - centre, squares, kept)
-        return counts, total, squares
+            _add_moments(sharpness_of(registered) * kept, *moments)
+        return counts, total, squares, *moments
 
     pairs = zip(iter_frames(frames), iter_frames(flows), strict=True)
-    counts, total, squares = sum_in_threads(add, pairs, threads)
+    counts, total, squares, *moments = sum_in_threads(add, pairs, threads)
     some = np.maximum(counts, 1)
     trimmed = np.where(counts > 0, total / some, mean)
-    return trimmed.astype(np.float32), _deviation(np.maximum(squares / some - (trimmed - centre) ** 2, 0.0))
+    deviation = _deviation(np.maximum(squares / some - (trimmed - centre) ** 2, 0.0))
+    sharpness, squares = moments
+    return trimmed.astype(np.float32), deviation, *_mean_and_variance(sharpness, squares, some)
 
 
 def _deviation(variance: np.ndarray) -> FloatArray:
