@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from typing import TypeVar
@@ -15,17 +15,19 @@ from numpy.typing import ArrayLike
 from .blind.remove_blur import Deblurred, remove_blur_steps
 from .core.arrays import FloatArray
 from .core.decision import Decision
-from .core.errors import DataError, require
+from .core.errors import require
 from .dynamics.dynamic_texture import identify
 from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import Filtered, FilterStep, filter_steps
 from .footage.frame_selection import best_frames, frame_quality
+from .footage.levels import Levels, stretch_levels
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan, plan_memory
 from .registration.centroid import Centroid, centroid_steps
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
+from .registration.light import steady_light
 from .registration.recentring import recentre
 from .results import NoStore, Restoration, Store
 from .runtime.allocator import returning_freed_memory
@@ -50,8 +52,6 @@ from .wording import (
 
 # Every pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
-# Frames with less contrast than one grey level of an 8-bit camera show no scene.
-_LEAST_CONTRAST = 1 / 255
 # The shorter side of the image is at least this many widths of the blur; a wider blur leaves nothing to restore.
 _SIGMAS_A_SIDE = 8
 
@@ -115,8 +115,13 @@ def restore(
         check_space(plan.runtime.scratch, plan.scratch_bytes)
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
-    run = _Run(source, params, plan, tiles, store or NoStore(), progress)
-    on_machine = *plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method)
+    begun = time.perf_counter()
+    source, on_light = steady_light(source)
+    source, levels, on_range = stretch_levels(source, plan.train)
+    run = _Run(source, _stretched_params(params, levels), plan, tiles, store or NoStore(), progress, levels)
+    run.seconds["read"] = time.perf_counter() - begun
+    on_device = explain_device(runtime.device, plan.runtime.device, params.flow.method)
+    on_machine = *plan.decisions, *on_device, *on_light, *on_range
     with returning_freed_memory(runtime.memory_limit is not None):
         return _restored(run, on_machine)
 
@@ -131,12 +136,16 @@ class _Run:
     tiles: tuple[HaloTile, ...]
     store: Store
     progress: Progress | None
+    levels: Levels
     seconds: dict[str, float] = field(default_factory=dict)
 
     def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:
-        """Return a result from the store, or compute it, and add the time that this takes to that of the stage."""
+        """Return a result from the store, or compute it, and add the time that this takes to that of the stage.
+
+        Results have the levels of the clip.
+        """
         begun = time.perf_counter()
-        result = self.store.get(name, compute)
+        result = self.store.get(name, lambda: self.levels.original_result(compute()))
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begun
         return result
 
@@ -188,23 +197,24 @@ class _Fused:
 def _fuse(run: _Run) -> _Fused:
     """Run the stages up to the filter; the training frames are freed when this function returns."""
     params, train, stream = run.params, run.plan.train, iter(run.source)
-    begun = time.perf_counter()
-    training = _read_training(stream, train, run.source.shape, run.plan.runtime)
-    run.seconds["read"] = time.perf_counter() - begun
+    begun, levels = time.perf_counter(), run.levels
+    training = fill_stack((train, *run.source.shape[1:]), stream, run.plan.runtime.scratch)
+    run.seconds["read"] += time.perf_counter() - begun
     on_frames = explain_training(train, len(run.source), params.train), *explain_input(training)
 
     centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
     on_flows = explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows)
     if not params.runs("identify"):
-        return _Fused(centroid.image, mean_of(training), centroid, (*on_frames, *on_flows))
+        return _Fused(centroid.image, levels.original(mean_of(training)), centroid, (*on_frames, *on_flows))
 
     dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
     decisions = *on_frames, *on_flows, *explain_dynamics(dynamics)
     if not params.runs("filter"):
-        return _Fused(centroid.image, mean_of(training), centroid, decisions, dynamics)
+        return _Fused(centroid.image, levels.original(mean_of(training)), centroid, decisions, dynamics)
 
-    filtered = run.stage("filter", "filtered", lambda: _filter(run, centroid, dynamics, training, stream).recentred())
-    mean = run.stage("filter", "mean", lambda: _temporal_mean(run.source))
+    start = levels.stretched_result(centroid)
+    filtered = run.stage("filter", "filtered", lambda: _filter(run, start, dynamics, training, stream).recentred())
+    mean = run.stage("filter", "mean", lambda: levels.original(_temporal_mean(run.source)))
     # The sharpness is NaN for frames that do not count.
     chosen = int(np.isfinite(filtered.sharpness).sum())
     on_weights = explain_frames(filtered, None if params.keep_best == 1 else chosen)
@@ -276,11 +286,14 @@ def _temporal_mean(source: FrameSource) -> FloatArray:
 
 
 def _deblur(run: _Run, fused: _Fused) -> Deblurred:
-    params, plan, image, guide = run.params, run.plan, fused.image, fused.centroid.image
+    params, plan, levels = run.params, run.plan, run.levels
+    image, guide = levels.stretched(fused.image), levels.stretched(fused.centroid.image)
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
     steps = remove_blur_steps(image, guide, params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side)
-    return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
+    deblurred = finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
+    deconvolution, blur = map(levels.original_result, (deblurred.deconvolution, deblurred.blur))
+    return replace(deblurred, deconvolution=deconvolution, blur=blur)
 
 
 def _crop(image: FloatArray, flows: FloatArray, border: str, deblurred: Deblurred | None) -> tuple[Rectangle, Decision]:
@@ -303,11 +316,8 @@ def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
     )
 
 
-def _read_training(stream: Iterator[FloatArray], train: int, shape: tuple[int, ...], runtime: Runtime) -> FloatArray:
-    training = fill_stack((train, *shape[1:]), stream, runtime.scratch)
-    contrast = float(np.ptp(mean_of(training)))
-    if contrast < _LEAST_CONTRAST:
-        raise DataError(
-            f"frames: expected a scene with some contrast, found one intensity within {contrast:.1g} of full scale"
-        )
-    return training
+def _stretched_params(params: RestoreParams, levels: Levels) -> RestoreParams:
+    """Bring the settings that are intensities to the levels of the stages."""
+    given, square = params.filter, levels.gain**2
+    noise = None if given.image_noise is None else given.image_noise * square
+    return replace(params, filter=replace(given, image_noise=noise, image_drift=given.image_drift * square))

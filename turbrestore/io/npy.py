@@ -30,7 +30,7 @@ from .source import FrameSource
 _LARGE = 1 << 22
 # Places along each axis at which the order of the axes is judged, and the factor by which the mean over time has more
 # contrast than the mean over rows.
-_SAMPLES, _STILLER = 48, 1.5
+_SAMPLES, _STILLER = 48, 1.2
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 

@@ -56,6 +56,9 @@ class FrameSource:
         Applied to the native pixels of every frame first.
     develop : callable or None
         Turns repaired native pixels into a frame, such as a Bayer mosaic into colours.
+    adjust : callable or None
+        Takes the number of a frame in the file, its intensities, and the rows of the file that they are; returns the
+        intensities that are used instead, which may lie outside [0, 1].
     numbers, window : range or tuple of int, tuple of slice
         Ascending numbers, in the file, of the selected frames; selected rows and columns. By default all.
 
@@ -81,6 +84,7 @@ class FrameSource:
     damaged: tuple[int, ...] = ()
     repair: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
     develop: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
+    adjust: Callable[[int, FloatArray, slice], FloatArray] | None = field(default=None, repr=False)
     numbers: range | tuple[int, ...] = range(0)
     window: tuple[slice, slice] = (slice(0), slice(0))
 
@@ -269,7 +273,8 @@ class FrameSource:
 
     def _frames(self, chosen: range | tuple[int, ...]) -> Iterator[FloatArray]:
         for number, pixels in self._native(chosen):
-            yield to_unit(pixels, self.full_scale, f"{self.name}: frame {number}")
+            values = to_unit(pixels, self.full_scale, f"{self.name}: frame {number}")
+            yield values if self.adjust is None else self.adjust(number, values, self.window[0])
 
     def _native(self, chosen: range | tuple[int, ...]) -> Iterator[tuple[int, PixelArray]]:
         done = 0

@@ -1,0 +1,122 @@
+"""Clips as people record them come out as well as under steady light, at full scale, and with nobody in the way."""
+
+import numpy as np
+import pytest
+
+from conftest import make_sequence
+from turbrestore.core.errors import DataError
+from turbrestore.footage.levels import stretch_levels
+from turbrestore.io.source import FrameSource
+from turbrestore.metrics import compare
+from turbrestore.pipeline import restore
+from turbrestore.registration.light import steady_light
+from turbrestore.results import Restoration
+from turbrestore.settings import RestoreParams
+
+COUNT = 30
+FUSED = RestoreParams(until="filter")
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return make_sequence(7, COUNT, 80, "camera", blur=0.8, noise=0.008, rms=1.2)
+
+
+@pytest.fixture(scope="module")
+def steady(clip):
+    return score(u8(0.8 * clip.frames), clip)
+
+
+def u8(frames):
+    return np.rint(255 * np.clip(frames, 0, 1)).astype(np.uint8)
+
+
+def u16(frames):
+    return np.rint(65535 * np.clip(frames, 0, 1)).astype(np.uint16)
+
+
+def restored(frames) -> Restoration:
+    return restore(FrameSource.from_array(frames), FUSED)
+
+
+def score(frames, clip):
+    return compare(restored(frames).image, clip.scene).psnr_fit
+
+
+def subjects(restoration):
+    return {decision.subject for decision in restoration.decisions}
+
+
+T, Y = np.arange(COUNT)[:, None, None], np.arange(80)[None, :, None]
+PHASE = np.random.default_rng(3).uniform(0, 2 * np.pi, COUNT)[:, None, None]
+LIGHT = {
+    "exposure hunts by a tenth": (1 + 0.1 * np.sin(T / 4), 0),
+    "exposure hunts by a quarter": (1 + 0.25 * np.sin(T / 4), 0),
+    "bands of the mains": (1 + 0.2 * np.sin(2 * np.pi * Y / 60 + PHASE), 0),
+    "clouds": (1 - 0.3 * (T > 15) * (T < 30), 0),
+    "stray light": (1, 0.08 * np.sin(T / 5)),
+}
+
+
+class TestLight:
+    @pytest.mark.parametrize("how", LIGHT)
+    def test_what_changes_is_taken_out(self, clip, steady, how):
+        gain, offset = LIGHT[how]
+        found = restored(u8(0.7 * clip.frames * gain + 0.1 + offset))
+        assert "light" in subjects(found)
+        assert compare(found.image, clip.scene).psnr_fit > steady - 0.5
+
+    def test_in_colour_with_drift(self, clip):
+        colours = clip.frames[..., None] * np.float32([0.8, 0.6, 0.4])
+        drifting = np.stack([np.roll(frame, k // 3, axis=1) for k, frame in enumerate(colours)])
+        source, (found,) = steady_light(FrameSource.from_array(u8(drifting * (1 + 0.2 * np.sin(T / 4))[..., None])))
+        even = source.read()
+        left = [np.roll(frame, -(k // 3), axis=1)[:, :66].mean() for k, frame in enumerate(even)]
+        assert found.subject == "light" and np.ptp(left) < 0.05 * np.mean(left)
+
+    def test_rows_of_a_region_are_those_of_the_file(self, clip):
+        bands = u8(0.8 * clip.frames * LIGHT["bands of the mains"][0])
+        whole, _ = steady_light(FrameSource.from_array(bands))
+        part = whole.select((3, 9), (5, 40, 20, 30))
+        np.testing.assert_array_equal(part.read(), whole.read(3, 9)[:, 40:70, 5:25])
+
+    @pytest.mark.parametrize("scene", ["camera", "chart"])
+    @pytest.mark.parametrize("rms", [0.5, 3.0])
+    def test_steady_light_is_left_as_it_is(self, scene, rms):
+        source = FrameSource.from_array(make_sequence(5, 20, 96, scene, rms=rms).frames.clip(0, 1))
+        assert steady_light(source) == (source, ())
+
+
+class TestRange:
+    def test_scale_does_not_matter(self, clip):
+        scores = [score(u16(clip.frames / k), clip) for k in (1, 64, 160)]
+        assert np.ptp(scores) < 0.3
+
+    @pytest.mark.parametrize("span", [200, 2000])
+    def test_thermal_counts(self, clip, steady, span):
+        rng = np.random.default_rng(1)
+        counts = 7000 + span * clip.frames + 2 * rng.standard_normal(clip.frames.shape)
+        found = restored(np.rint(counts).astype(np.uint16))
+        assert compare(found.image, clip.scene).psnr_fit > steady - 1.5
+        # The levels are those of the counts.
+        np.testing.assert_allclose(
+            np.median(65535 * found.image), 7000 + span * np.median(clip.scene), atol=0.03 * span
+        )
+        assert abs(float((found.mean - counts.mean(axis=0) / 65535).mean())) < 0.001 * span / 65535
+
+    def test_results_of_all_stages_have_the_levels_of_the_clip(self, clip):
+        found = restore(FrameSource.from_array(u16(0.3 + clip.frames[:12] / 50)))
+        for image in (found.image, found.mean, found.centroid.image, found.filtered.image, found.deconvolution.image):
+            assert abs(float(np.mean(image)) - 0.3 - float(clip.scene.mean()) / 50) < 0.001
+        assert found.filtered.image_noise < 1e-5 and "range" in subjects(found)
+
+    def test_wide_clips_are_left_as_they_are(self, clip):
+        source = FrameSource.from_array(u8(clip.frames))
+        same, levels, decisions = stretch_levels(source, 10)
+        assert same is source and not levels.changed and decisions == ()
+
+    @pytest.mark.parametrize("deviation", [0, 0.0002])
+    def test_noise_is_no_scene(self, deviation):
+        noise = 0.1 + deviation * np.random.default_rng(0).standard_normal((20, 48, 48))
+        with pytest.raises(DataError, match="some contrast"):
+            stretch_levels(FrameSource.from_array(noise.astype(np.float32)), 20)

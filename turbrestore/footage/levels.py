@@ -1,0 +1,146 @@
+"""The range of a clip: frames that use a small part of the scale are worked on in units of that part.
+
+Twelve bits in a file of 16, or counts of a thermal camera from 7000 to 7400, leave most of the scale unused.  The
+thresholds of the stages are shares of full scale, so such frames are stretched first, and results are brought back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+
+from ..core.arrays import FloatArray, luminance
+from ..core.decision import Decision
+from ..core.errors import DataError
+from ..core.noise import estimate_noise
+from ..io.source import FrameSource
+
+# Clips that span less than this share of full scale are stretched to that share.
+_NARROW, _STRETCHED = 0.5, 0.8
+# Frames from whose mean the range is taken.
+_SAMPLES = 16
+# A contrast below one grey level of an 8-bit camera is a scene only if it is that many deviations of the noise.
+_LEAST_CONTRAST, _DEVIATIONS = 1 / 255, 12.0
+# Fields of results by the power of the gain that they scale with; images also have the offset.
+_SHIFTED, _SCALED, _SQUARED = ("image",), ("noise",), ("variance", "image_noise")
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Stretched intensities are ``gain * (intensity - low)``.
+
+    Attributes
+    ----------
+    low : float
+        Intensity that becomes 0.
+    gain : float
+
+    Examples
+    --------
+    >>> levels = Levels(0.1, 4.0)
+    >>> levels.stretched(np.float32([0.1, 0.2])), levels.original(np.float32([0, 0.4]))
+    (array([0. , 0.4], dtype=float32), array([0.1, 0.2], dtype=float32))
+    """
+
+    low: float = 0.0
+    gain: float = 1.0
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything is stretched."""
+        return (self.low, self.gain) != (0.0, 1.0)
+
+    def stretched(self, image: FloatArray) -> FloatArray:
+        """Bring an image from the levels of the clip to those of the stages."""
+        return (image - np.float32(self.low)) * np.float32(self.gain) if self.changed else image
+
+    def original(self, image: FloatArray) -> FloatArray:
+        """Bring an image back to the levels of the clip."""
+        return np.clip(image / np.float32(self.gain) + np.float32(self.low), 0, 1) if self.changed else image
+
+    def stretched_result(self, result: Result) -> Result:
+        """Bring the images and the noise of a stage's result to the levels of the stages."""
+        return self._converted(result, self.stretched, self.gain)
+
+    def original_result(self, result: Result) -> Result:
+        """Bring the images and the noise of a stage's result back to the levels of the clip."""
+        return self._converted(result, self.original, 1 / self.gain)
+
+    def _converted(self, result: Any, convert: Callable[[FloatArray], FloatArray], factor: float) -> Any:
+        if not self.changed or not dataclasses.is_dataclass(result) or isinstance(result, type):
+            return result
+        values = {item.name: getattr(result, item.name) for item in dataclasses.fields(result)}
+        changed = {name: convert(values[name]) for name in _SHIFTED if name in values}
+        for names, power in ((_SCALED, factor), (_SQUARED, factor**2)):
+            changed |= {name: values[name] * power for name in names if name in values}
+        return dataclasses.replace(result, **changed)
+
+
+def stretch_levels(source: FrameSource, train: int) -> tuple[FrameSource, Levels, tuple[Decision, ...]]:
+    """Stretch the frames of a clip that uses a small part of the scale.
+
+    Parameters
+    ----------
+    source : FrameSource
+    train : int
+        Number of frames, from the first on, that the range is taken from.
+
+    Returns
+    -------
+    source : FrameSource
+        With intensities of 0.1 to 0.9 where the clip was stretched, else as it was.
+    levels : Levels
+    decisions : tuple of Decision
+
+    Raises
+    ------
+    DataError
+        Frames are damaged, or show nothing.
+
+    Examples
+    --------
+    >>> frames = 0.1 + 0.01 * np.tile(np.linspace(0, 1, 16), (4, 16, 1))
+    >>> stretched, levels, (found,) = stretch_levels(FrameSource.from_array(frames), 4)
+    >>> bool(0.05 < stretched.read().min() < stretched.read().max() < 0.95), found.subject
+    (True, 'range')
+    """
+    low, high = _range_of(source, train)
+    span = high - low
+    if span >= _NARROW:
+        return source, Levels(), ()
+    gain = _STRETCHED / span
+    levels = Levels(low - (1 - _STRETCHED) / 2 / gain, gain)
+    before = source.adjust
+
+    def adjust(number: int, values: FloatArray, rows: slice) -> FloatArray:
+        return levels.stretched(values if before is None else before(number, values, rows))
+
+    reason = f"the scene spans {low:.4g} to {high:.4g} of full scale, and results come back to these levels"
+    decision = Decision("range", f"stretched {gain:.3g} times", reason)
+    return dataclasses.replace(source, adjust=adjust), levels, (decision,)
+
+
+def _range_of(source: FrameSource, train: int) -> tuple[float, float]:
+    """Darkest and brightest intensity of the mean of some frames, without lone pixels."""
+    part = source.select((0, train, max(1, train // _SAMPLES)))
+    total = np.zeros(source.shape[1:])
+    for frame in part:
+        total += frame
+    mean = (total / len(part)).astype(np.float32)
+    smooth = cv2.medianBlur(mean, 3)
+    low, high = float(smooth.min()), float(smooth.max())
+    coarse = high - low < _LEAST_CONTRAST
+    if high <= low or (
+        coarse and (source.bit_depth <= 8 or high - low < _DEVIATIONS * estimate_noise(luminance(mean)))
+    ):
+        raise DataError(
+            f"frames: expected a scene with some contrast, found one intensity within {high - low:.1g} of full scale"
+        )
+    return low, high
