@@ -6,10 +6,10 @@ import pytest
 from conftest import make_sequence
 from turbrestore.core.errors import DataError
 from turbrestore.footage.levels import stretch_levels
+from turbrestore.footage.light import steady_light
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
-from turbrestore.registration.light import steady_light
 from turbrestore.results import Restoration
 from turbrestore.settings import RestoreParams
 

@@ -21,13 +21,13 @@ from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import Filtered, FilterStep, filter_steps
 from .footage.frame_selection import best_frames, frame_quality
 from .footage.levels import Levels, stretch_levels
+from .footage.light import steady_light
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan, plan_memory
 from .registration.centroid import Centroid, centroid_steps
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
-from .registration.light import steady_light
 from .registration.recentring import recentre
 from .results import NoStore, Restoration, Store
 from .runtime.allocator import returning_freed_memory
@@ -292,7 +292,7 @@ def _deblur(run: _Run, fused: _Fused) -> Deblurred:
         guide = recentre(guide, fused.filtered.mean_flow)
     steps = remove_blur_steps(image, guide, params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side)
     deblurred = finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
-    deconvolution, blur = map(levels.original_result, (deblurred.deconvolution, deblurred.blur))
+    deconvolution, blur = levels.original_result(deblurred.deconvolution), levels.original_result(deblurred.blur)
     return replace(deblurred, deconvolution=deconvolution, blur=blur)
 
 

@@ -139,8 +139,8 @@ def fused_exponent(sigma: float) -> float:
     """Exponent of the transfer function of fused frames whose blur is this wide.
 
     Short exposures, and averages of blurs of different widths, have a sharp core in a wide halo: p is 1 to 1.3.  Errors
-    of registration, interpolation and pixels add a blur of about half a pixel that is close to a Gaussian, and where the
-    whole is not much wider than that, p is larger.  Hence ``1.2 + (5/3 − 1.2) / (1 + (σ / 1.4)⁴)``.
+    of registration, interpolation and pixels add a blur of about half a pixel that is close to a Gaussian, and p is
+    larger where the whole blur is not much wider than that.  Hence ``1.2 + (5/3 − 1.2) / (1 + (σ / 1.4)⁴)``.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import FrameSource
-from .global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
+from ..registration.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
 
 # Longest side of the reduced frames, pixels, of up to that many frames, and of more.
 _SIDE, _MANY, _SIDE_OF_MANY = 96, 4000, 48
@@ -190,7 +190,7 @@ def _evened_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     gains = rows @ basis.T
     low, high = np.percentile(gains, (_FEW, 100 - _FEW), axis=0)
     gains /= np.maximum((low + high) / 2, _LEAST_GAIN)
-    return np.linalg.lstsq(basis, np.maximum(gains, _LEAST_GAIN).T, rcond=None)[0].T
+    return np.asarray(np.linalg.lstsq(basis, np.maximum(gains, _LEAST_GAIN).T, rcond=None)[0].T, np.float64)
 
 
 def _reduced_frames(source: FrameSource) -> FloatArray:
