@@ -249,6 +249,12 @@ class TestPictures:
         assert (gallery.pictures[0].width, gallery.pictures[0].height) == (2048, 15)
         assert "reduced to 2048" in gallery.encoding
 
+    def test_clips_that_use_a_small_part_of_the_scale_are_not_shown_black(self):
+        ramp = np.tile(np.linspace(0.1, 0.11, 50, dtype=np.float32), (40, 1))
+        gallery = pictures.encode_gallery({"mean": ramp, "result": ramp}, 0)
+        assert "black is 0.09" in gallery.encoding and "white 0.11" in gallery.encoding
+        assert pictures.encode_gallery({"result": 50 * ramp - 4.9}, 0).encoding == "8 bits, lossless"
+
     def test_result_stands_once(self, whole, run):
         assert list(pictures.stages(whole, run.frame)) == ["frame", "mean", "centroid", "filtered", "result"]
         kept = dataclasses.replace(whole, image=whole.filtered.image.copy())

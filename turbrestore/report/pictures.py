@@ -24,6 +24,9 @@ _LOSSLESS_BYTES = 1_050_000
 _QUALITY = 95
 # Longest side of an image, pixels.
 _LONGEST = 2048
+# An image that spans less than this share of full scale is stretched; its percentage of pixels at either end that may
+# be clipped, and the margin beyond them, as a share of the span.
+_NARROW, _CLIPPED, _MARGIN = 0.2, 0.2, 0.1
 _TITLES = {
     "frame": "Frame",
     "mean": "Mean",
@@ -109,7 +112,8 @@ def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
     -------
     Gallery
     """
-    shown = dict(zip(images, map(_levels, iter_frames(images.values())), strict=True))
+    low, high = _shown_range(images["result"])
+    shown = {key: _levels(image, low, high) for key, image in zip(images, iter_frames(images.values()), strict=True)}
     encoding = "8 bits, lossless"
     files = {key: encode_image(levels, "webp") for key, levels in shown.items()}
     if sum(map(len, files.values())) > _LOSSLESS_BYTES:
@@ -117,6 +121,8 @@ def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
         encoding = f"8 bits, WebP of quality {_QUALITY}"
     if max(images["result"].shape[:2]) > _LONGEST:
         encoding += f", reduced to {_LONGEST} pixels"
+    if (low, high) != (0, 1):
+        encoding += f", black is {low:.4g} and white {high:.4g} of full scale"
     titles = {**_TITLES, "frame": f"{_TITLES['frame']} {frame_number}"}
     pictures = (
         Picture(key, titles[key], data_uri(data, "webp"), shown[key].shape[1], shown[key].shape[0])
@@ -125,5 +131,13 @@ def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
     return Gallery(tuple(pictures), encoding)
 
 
-def _levels(image: FloatArray) -> NDArray[np.unsignedinteger]:
-    return from_unit(shrink(image, _LONGEST), 8)
+def _shown_range(image: FloatArray) -> tuple[float, float]:
+    """Intensities that are shown black and white: 0 and 1, or those of an image that uses a small part of the scale."""
+    low, high = (float(value) for value in np.percentile(image, (_CLIPPED, 100 - _CLIPPED)))
+    margin = _MARGIN * (high - low)
+    return (low - margin, high + margin) if 0 < high - low < _NARROW else (0.0, 1.0)
+
+
+def _levels(image: FloatArray, low: float, high: float) -> NDArray[np.unsignedinteger]:
+    small = shrink(image, _LONGEST)
+    return from_unit(small if (low, high) == (0, 1) else (small - np.float32(low)) / np.float32(high - low), 8)
