@@ -9,7 +9,6 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from turbrestore.core.errors import require
-from turbrestore.io.images import write_image
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.metrics import comparable
@@ -30,6 +29,7 @@ from .output import (
     save_stages,
     settings_record,
     summary,
+    write_result,
     write_settings,
 )
 from .progress import progress_bars, say
@@ -62,9 +62,11 @@ def restore(
     Parameters
     ----------
     input : Path
-        Video (mp4, mkv, avi, mov, webm, gif), animated PNG or WebP, TIFF stack, SER, .npy, or folder of images.
+        Video (mp4, mkv, avi, mov, webm, gif), animated PNG or WebP, TIFF stack, SER, FITS cube, .npy, or folder of
+        images or FITS files.
     output : Path
-        Image to write: .png (8 or 16 bit) or .tif (8, 16 bit or float).
+        Image to write: .png (8 or 16 bit), .tif (8, 16 bit or float) or .fits (the same, with the header of a FITS
+        input and the history of the run).
     sigma : float
         Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.
     config : Path
@@ -81,7 +83,7 @@ def restore(
     truth : Path
         Image of the true scene: every stage is compared with it.
     bit_depth : int
-        Bits per channel of the output, 8, 16 or 32 (float, TIFF only).  Those of the input by default.
+        Bits per channel of the output, 8, 16 or 32 (float, TIFF and FITS).  Those of the input by default.
     memory_limit : MemorySize
         Most memory to take, such as 2GB.  To keep it, training frames go to a scratch file, fewer threads work, fewer
         frames are trained on, and frames are processed in tiles that overlap, in this order.
@@ -117,13 +119,15 @@ def restore(
         with progress_bars(quiet) as progress:
             restoration = run_pipeline(source, settings, runtime, stages, progress)
         record = settings_record(settings, selection, bit_depth, machine, memory_limit)
-        run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
+        command = repeating_command(input, output, record)
+        run = describe_run(source, record, command) if keep or report else None
         depth = source.bit_depth if bit_depth is None else bit_depth
         if stages is not None and run is not None:
             save_stages(stages, restoration, run, depth)
             stages.expect(*outputs)
         # Other existing files were refused above.
-        write_image(output, restoration.image, depth, overwrite=overwrite or output.absolute() in left)
+        replaces = overwrite or output.absolute() in left
+        write_result(output, restoration, source, depth, command, replaces)
         write_settings(settings_path, record)
         if report is not None and run is not None:
             write_report(report, restoration, run, overwrite=overwrite or report.absolute() in left)

@@ -52,6 +52,8 @@ class FrameSource:
         What was left out, or is unusual.
     damaged : tuple of int
         Numbers, in the file, of frames that are known to be damaged.
+    header : tuple of str
+        Cards of the header of a FITS file, 80 characters each.
     repair : callable or None
         Applied to the native pixels of every frame first.
     numbers, window : range or tuple of int, tuple of slice
@@ -77,6 +79,7 @@ class FrameSource:
     timestamps: NDArray[np.float64] | None = field(default=None, repr=False)
     warnings: tuple[str, ...] = ()
     damaged: tuple[int, ...] = ()
+    header: tuple[str, ...] = field(default=(), repr=False)
     repair: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
     numbers: range | tuple[int, ...] = range(0)
     window: tuple[slice, slice] = (slice(0), slice(0))
