@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -210,7 +211,9 @@ class FrameSource:
 
     @staticmethod
     def from_array(array: ArrayLike, name: str = "array", fps: float | None = None) -> FrameSource:
-        """Use an array in memory, or a memory-mapped file, as a video.
+        """Use an array in memory, a memory-mapped file, or an array that is computed or read on demand, as a video.
+
+        Arrays of Dask, xarray, Zarr and HDF5 are read frame by frame, while iterating; chunks of one frame are best.
 
         Parameters
         ----------
@@ -227,14 +230,16 @@ class FrameSource:
         >>> FrameSource.from_array(np.full((2, 1, 1), 255, np.uint8)).read().ravel()
         array([1., 1.], dtype=float32)
         """
-        values = np.asanyarray(array)
+        # What has a type of NumPy is indexed, and converted frame by frame.
+        values: Any = array if isinstance(getattr(array, "dtype", None), np.dtype) else np.asanyarray(array)
+        dtype = np.dtype(values.dtype)
         return FrameSource(
             name=name,
-            format=f"array/{values.dtype}",
-            file_shape=values.shape,
-            full_scale=full_scale_of(values.dtype, name),
-            bit_depth=depth_of(values.dtype),
-            pixels=lambda chosen: (values[number] for number in chosen),
+            format=f"array/{dtype}",
+            file_shape=tuple(values.shape),
+            full_scale=full_scale_of(dtype, name),
+            bit_depth=depth_of(dtype),
+            pixels=lambda chosen: (np.asanyarray(values[number]) for number in chosen),
             fps=fps,
         )
 
