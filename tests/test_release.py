@@ -19,7 +19,7 @@ def test_every_package_is_in_the_wheel():
 
 def test_every_data_file_is_in_the_wheel():
     for path in (ROOT / "turbrestore").rglob("*"):
-        if path.is_file() and path.suffix not in (".py", ".pyc"):
+        if path.is_file() and path.suffix != ".py" and path.parent.name != "__pycache__":
             package = ".".join(path.parent.relative_to(ROOT).parts)
             patterns = TOOL["package-data"].get(package, [])
             assert any(fnmatch(path.name, pattern) for pattern in patterns), path
