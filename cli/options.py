@@ -38,6 +38,10 @@ class Selection:
         Read a file that is cut short or damaged as far as possible, instead of refusing it.
     max_pixels : int, optional
         Largest frame or image to read, pixels; by default 67 million.
+    dark : str, optional
+        Video, image or folder of frames with the lens covered: their mean is subtracted, hot pixels are filled.
+    flat : str, optional
+        Video, image or folder of frames of an even surface: their mean is divided out.
     """
 
     frames: str | None = None
@@ -45,6 +49,8 @@ class Selection:
     strict: Flag = False
     skip_damaged: Flag = False
     max_pixels: int | None = None
+    dark: str | None = None
+    flat: str | None = None
 
     def frame_range(self) -> FrameRange | None:
         """Return (start, stop, step), None where left out."""

@@ -53,6 +53,8 @@ class FrameSource:
         What was left out, or is unusual.
     damaged : tuple of int
         Numbers, in the file, of frames that are known to be damaged.
+    levels : tuple of float or None
+        Values of a FITS file that were scaled to 0 and 1; None where the type of the file says what is black and white.
     header : tuple of str
         Cards of the header of a FITS file, 80 characters each.
     repair : callable or None
@@ -80,6 +82,7 @@ class FrameSource:
     timestamps: NDArray[np.float64] | None = field(default=None, repr=False)
     warnings: tuple[str, ...] = ()
     damaged: tuple[int, ...] = ()
+    levels: tuple[float, float] | None = None
     header: tuple[str, ...] = field(default=(), repr=False)
     repair: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
     numbers: range | tuple[int, ...] = range(0)

@@ -71,10 +71,11 @@ class _Levels:
         return values
 
 
-def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> FrameSource:
-    """Open a FITS cube as a video; its frames are read one at a time, those of a ``.gz`` file are loaded as a whole.
+def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, single: bool = False) -> FrameSource:
+    """Open a FITS cube as a video, with ``single`` also one grey image as a video of one frame.
 
-    Where the highest value has to be found, every frame is read once. The errors are those of
+    Frames are read one at a time, those of a ``.gz`` file are loaded as a whole. Where the highest value has to be
+    found, every frame is read once. The errors are those of
     :func:`turbrestore.io.video.open_frames`; ConfigurationError where Astropy is not installed.
 
     Examples
@@ -91,6 +92,8 @@ def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) -> 
     path = Path(path)
     image = find_image(path, limits)
     frames = _as_frames(image, image.numbers(limits))
+    if single and frames.ndim == 2:
+        frames = frames[None]
     if frames.ndim == 2:
         raise DataError(f"{path}: a single image; name the folder that holds the frames")
     limits.check_count(len(frames), str(path))
@@ -145,6 +148,7 @@ def _source(
         pixels=pixels,
         path=image.path,
         warnings=notes,
+        levels=None if (levels.black, levels.white) == (0, 1) else (levels.black, levels.white),
         header=image.cards[:-1],
     )
 
