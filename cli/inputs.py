@@ -9,6 +9,7 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import DataError, require
 from turbrestore.footage.calibration import calibrated, make_calibration
 from turbrestore.footage.content import ContentParams, ContentReport, check_content, clean_source
+from turbrestore.footage.object_crop import crop_to_object
 from turbrestore.io.astronomy.fits import open_fits
 from turbrestore.io.astronomy.fits_header import is_fits
 from turbrestore.io.images import IMAGE_SUFFIXES, read_image, read_pixels
@@ -47,6 +48,7 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
         skip_damaged=selection.skip_damaged,
     )
     source = _calibrated(source, selection)
+    source = crop_to_object(source) if selection.crop_to_object else source
     return source, check_content(source, ContentParams(strict=selection.strict))
 
 

@@ -42,6 +42,8 @@ class Selection:
         Video, image or folder of frames with the lens covered: their mean is subtracted, hot pixels are filled.
     flat : str, optional
         Video, image or folder of frames of an even surface: their mean is divided out.
+    crop_to_object : bool
+        Follow a bright object on a dark field, such as a planet, with a window that just holds it.
     """
 
     frames: str | None = None
@@ -51,6 +53,7 @@ class Selection:
     max_pixels: int | None = None
     dark: str | None = None
     flat: str | None = None
+    crop_to_object: Flag = False
 
     def frame_range(self) -> FrameRange | None:
         """Return (start, stop, step), None where left out."""
