@@ -294,3 +294,52 @@ class TestInterlaced:
         flags = {"flags": "+ilme+ildct", "crf": "1"}
         path = encode(tmp_path / "a.mkv", [still] * 5, "libx264", "yuv444p", "rgb24", **flags)
         assert np.abs(255 * open_frames(path).read() - still).mean() < 2
+
+
+class TestNamedAxes:
+    """TIFF files of OME and ImageJ, whose pages are in the order of the axes they name."""
+
+    @pytest.mark.parametrize("kind", ["ome", "imagej"])
+    @pytest.mark.parametrize(
+        ("axes", "shape", "order"),
+        [
+            ("TYX", (4, 6, 7), (0, 1, 2)),
+            ("ZYX", (4, 6, 7), (0, 1, 2)),
+            ("CYX", (4, 6, 7), (0, 1, 2)),
+            ("TCYX", (4, 3, 6, 7), (0, 2, 3, 1)),
+            ("ZCYX", (4, 3, 6, 7), (0, 2, 3, 1)),
+            ("TYXS", (4, 6, 7, 3), (0, 1, 2, 3)),
+        ],
+    )
+    def test_time_and_colour(self, tmp_path, kind, axes, shape, order):
+        dtype = np.uint8 if axes.endswith("S") else np.uint16
+        data = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape).astype(dtype)
+        tifffile.imwrite(tmp_path / "a.tif", data, metadata={"axes": axes}, **{kind: True})
+        source = open_frames(tmp_path / "a.tif")
+        np.testing.assert_array_equal(list(source.native()), data.transpose(order))
+        np.testing.assert_array_equal(list(source.select((1, 4, 2)).native()), data.transpose(order)[1:4:2])
+
+    def test_channels_that_come_first(self, tmp_path):
+        data = np.random.default_rng(0).integers(0, 255, (3, 4, 6, 7)).astype(np.uint8)
+        tifffile.imwrite(tmp_path / "a.tif", data, metadata={"axes": "CTYX"}, ome=True)
+        np.testing.assert_array_equal(list(open_frames(tmp_path / "a.tif").native()), data.transpose(1, 2, 3, 0))
+
+    @pytest.mark.parametrize(("axes", "shape"), [("TCYX", (4, 2, 6, 7)), ("TZYX", (4, 5, 6, 7))])
+    def test_other_axes_are_refused(self, tmp_path, axes, shape):
+        tifffile.imwrite(tmp_path / "a.tif", np.zeros(shape, np.uint8), metadata={"axes": axes}, ome=True)
+        with pytest.raises(DataError, match=f"expected one axis of time or depth.*{axes[0]} of 4"):
+            open_frames(tmp_path / "a.tif")
+
+    def test_other_files_are_not_opened(self, tmp_path):
+        """Two files that describe one series; each is read by itself."""
+        data = np.random.default_rng(0).integers(0, 255, (4, 6, 7)).astype(np.uint8)
+        tifffile.imwrite(tmp_path / "a.tif", data, metadata={"axes": "TYX"}, ome=True)
+        with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+            xml = tiff.ome_metadata
+        uuid = '<UUID FileName="b.tif">urn:uuid:1</UUID>'
+        xml = xml.replace('SizeT="4"', 'SizeT="8"').replace(
+            "</Pixels>", f'<TiffData FirstT="4">{uuid}</TiffData></Pixels>'
+        )
+        for name in ("a.tif", "b.tif"):
+            tifffile.imwrite(tmp_path / name, data, photometric="minisblack", description=xml, metadata=None)
+        np.testing.assert_array_equal(list(open_frames(tmp_path / "a.tif").native()), data)

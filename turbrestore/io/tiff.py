@@ -12,7 +12,7 @@ import lzma
 import math
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -37,6 +37,8 @@ _DECOMPRESSED = (_LZW, 8, 32946, _PACKBITS, _LZMA)
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
 _NOT_TIFF = "not a TIFF file, or damaged"
 _MOST_SAMPLES = 16
+# The description of an OME file may name other files, which are not opened.
+_ALONE: dict[str, Any] = {"_multifile": False}
 _ORIENTATION = 274
 # LZW codes that start a new table and that end the data, and the size of the largest table.
 _CLEAR, _END, _TABLE = 256, 257, 4096
@@ -45,8 +47,9 @@ _CLEAR, _END, _TABLE = 256, 257, 4096
 def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     """Open a TIFF, BigTIFF or ImageJ stack, grey or RGB, with 8 or 16 bits or floating point.
 
-    Packed bits, and compressions other than deflate, LZMA, LZW and PackBits, need the package ``imagecodecs``. The
-    errors are those of :func:`turbrestore.io.video.open_frames`.
+    Where OME or ImageJ name the axes, there may be one of time or depth, and one of three channels, which become RGB;
+    other files are read page by page. Packed bits, and compressions other than deflate, LZMA, LZW and PackBits, need
+    the package ``imagecodecs``. The errors are those of :func:`turbrestore.io.video.open_frames`.
 
     Examples
     --------
@@ -61,13 +64,14 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
 
     with input_errors(path), path.open("rb") as file:
         pages = count_pages(path, file, limits)
-    with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
+    with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path, **_ALONE) as tiff:
         page = tiff.pages.first
         _check_page(path, page, limits)
         packed = _packed_stack(path, tiff) if pages == 1 else None
         if packed is not None:
             return packed
         channels = _channels(page)
+        order = _page_order(path, tiff, pages)
         if channels is None:
             kind = f"{getattr(page.photometric, 'name', page.photometric)} with {page.samplesperpixel} channels"
             raise DataError(f"{path}: expected grey or RGB pages, found {kind}; convert the file")
@@ -76,10 +80,10 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
         return FrameSource(
             name=path.name,
             format=f"tiff/{dtype}",
-            file_shape=(pages, page.imagelength, page.imagewidth, *channels),
+            file_shape=(len(order), page.imagelength, page.imagewidth, *(channels if order.shape[1] == 1 else (3,))),
             full_scale=2**page.bitspersample - 1 if integer else full_scale_of(dtype, str(path)),
             bit_depth=min(page.bitspersample, 32) if integer else depth_of(dtype),
-            pixels=lambda chosen: _frames(path, chosen, limits),
+            pixels=lambda chosen: _frames(path, order[list(chosen)], limits),
             path=path,
             warnings=_notes(page),
         )
@@ -199,16 +203,44 @@ def _is_decodable(page: tifffile.TiffPage) -> bool:
     return _channels(page) is not None and bits and known and page.predictor in (1, *TIFF.UNPREDICTORS)
 
 
-def _frames(path: Path, chosen: Sequence[int], limits: Limits) -> Iterator[PixelArray]:
+def _page_order(path: Path, tiff: tifffile.TiffFile, pages: int) -> NDArray[np.intp]:
+    """Pages of every frame, shape (T, 1), or (T, 3) for channels in pages of their own."""
+    found = np.arange(pages)
+    series = tiff.series[0] if (tiff.is_ome or tiff.is_imagej) and pages > 1 else None
+    axes = [] if series is None else list(zip(series.axes, series.shape, strict=True))
+    axes = [(name, length) for name, length in axes if name not in "YXS" and length > 1]
+    # What does not speak of the pages of this file says nothing about their order.
+    if series is None or math.prod(length for _, length in axes) != pages:
+        return found[:, None]
+    listed = [page.index for page in series.pages if page is not None]
+    if len(listed) == pages:
+        found = np.array(listed)
+    # Writers that are not told call any single axis one of channels.
+    channels = [length for name, length in axes if name == "C" and len(axes) > 1]
+    if len(axes) - len(channels) > 1 or channels not in ([], [3]) or (channels and "S" in series.axes):
+        text = ", ".join(f"{name} of {length}" for name, length in axes)
+        raise DataError(
+            f"{path}: expected one axis of time or depth and up to three channels, found {text}; extract one"
+        )
+    found = found.reshape([length for _, length in axes])
+    if not channels:
+        return found.reshape(-1, 1)
+    return np.moveaxis(found, [name for name, _ in axes].index("C"), -1).reshape(-1, 3)
+
+
+def _frames(path: Path, order: NDArray[np.intp], limits: Limits) -> Iterator[PixelArray]:
     import tifffile
 
     with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
-        for number in chosen:
-            page = tiff.pages[number].aspage()
-            _check_page(path, page, limits)
-            if _channels(page) is None:
-                raise DataError(f"{path}: frame {number}: expected grey or RGB; convert the file")
-            yield _page_pixels(path, page)
+        for numbers in order:
+            planes = []
+            for number in numbers:
+                page = tiff.pages[int(number)].aspage()
+                _check_page(path, page, limits)
+                if _channels(page) is None or (len(numbers) > 1 and _channels(page)):
+                    raise DataError(f"{path}: page {number}: expected grey or RGB; convert the file")
+                planes.append(_page_pixels(path, page))
+            yield planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
 
 
 def _page_pixels(path: Path, page: tifffile.TiffPage) -> PixelArray:
