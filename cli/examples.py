@@ -10,6 +10,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore restore sample_data/chart.mkv all.png --keep stages --truth sample_data/chart_truth.png --json",
         "turbrestore restore sample_data/chart.mkv later.png --keep kept --resume",
     ),
+    "batch": (
+        "turbrestore batch sample_data/chart.mkv --out results",
+        "turbrestore batch sample_data 'sample_data/*.mkv' --out results --resume",
+    ),
     "report": ("turbrestore report stages", "turbrestore report stages report.html"),
     "centroid": ("turbrestore centroid sample_data/chart.mkv centroid.npz --train 40",),
     "flow": ("turbrestore flow centroid.npz sample_data/chart.mkv flows.npy --flow.method farneback",),

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import DataError, require
+from turbrestore.footage.calibration import calibrated, make_calibration
 from turbrestore.footage.content import ContentParams, ContentReport, check_content, clean_source
-from turbrestore.io.images import read_image
+from turbrestore.footage.object_crop import crop_to_object
+from turbrestore.io.astronomy.fits import open_fits
+from turbrestore.io.astronomy.fits_header import is_fits
+from turbrestore.io.images import IMAGE_SUFFIXES, read_image, read_pixels
 from turbrestore.io.limits import Limits
 from turbrestore.io.source import FrameSource
+from turbrestore.io.tiff import TIFF_SUFFIXES
 from turbrestore.io.video import open_frames
 from turbrestore.runs.stage_files import load_stage_image
 
@@ -42,9 +48,32 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
         skip_damaged=selection.skip_damaged,
         bayer=selection.bayer,
     )
+    source = _calibrated(source, selection)
+    source = crop_to_object(source) if selection.crop_to_object else source
     return source, check_content(source, ContentParams(strict=selection.strict))
 
 
 def read_input_image(input: Path, limits: Limits) -> FloatArray:
     """Read an image file within limits, or the image of a stage file."""
     return load_stage_image(input) if input.suffix.lower() == ".npz" else read_image(input, limits).image
+
+
+def _calibrated(source: FrameSource, selection: Selection) -> FrameSource:
+    """Take out what ``--dark`` and ``--flat`` name."""
+    if selection.dark is None and selection.flat is None:
+        return source
+    limits = selection.limits()
+    dark, flat = (
+        None if name is None else _open_frame(Path(name), limits) for name in (selection.dark, selection.flat)
+    )
+    return calibrated(source, make_calibration(source, dark, flat))
+
+
+def _open_frame(path: Path, limits: Limits) -> FrameSource:
+    """Open a video, or one image as a video of one frame."""
+    if is_fits(path):
+        return open_fits(path, limits, single=True)
+    if path.is_dir() or path.suffix.lower() not in IMAGE_SUFFIXES or path.suffix.lower() in TIFF_SUFFIXES:
+        return open_frames(path, limits=limits)
+    pixels, notes = read_pixels(path, limits)
+    return dataclasses.replace(FrameSource.from_array(pixels[None], path.name), path=path, warnings=notes)

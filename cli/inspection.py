@@ -41,7 +41,8 @@ def info(
     Parameters
     ----------
     input : Path
-        Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, .npy, or folder of images.
+        Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, FITS cube, .npy, or folder of
+        images or FITS files.
     json : bool
         Print JSON.
     """

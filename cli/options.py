@@ -40,6 +40,12 @@ class Selection:
         Largest frame or image to read, pixels; by default 67 million.
     bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
         Take grey frames for raw frames of a colour camera whose first pixels have these colours.
+    dark : str, optional
+        Video, image or folder of frames with the lens covered: their mean is subtracted, hot pixels are filled.
+    flat : str, optional
+        Video, image or folder of frames of an even surface: their mean is divided out.
+    crop_to_object : bool
+        Follow a bright object on a dark field, such as a planet, with a window that just holds it.
     """
 
     frames: str | None = None
@@ -48,6 +54,9 @@ class Selection:
     skip_damaged: Flag = False
     max_pixels: int | None = None
     bayer: Literal["rggb", "grbg", "gbrg", "bggr"] | None = None
+    dark: str | None = None
+    flat: str | None = None
+    crop_to_object: Flag = False
 
     def frame_range(self) -> FrameRange | None:
         """Return (start, stop, step), None where left out."""

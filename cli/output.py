@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,11 @@ import tomli_w
 from turbrestore import __version__
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import OutputError
+from turbrestore.io.astronomy.fits_header import is_fits
+from turbrestore.io.astronomy.fits_output import write_fits
 from turbrestore.io.images import write_image
 from turbrestore.io.output import atomic_write, check_output
+from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
 from turbrestore.results import Restoration
 from turbrestore.runs.folder_lock import LOCK
@@ -102,6 +106,33 @@ def summary(output: Path, restoration: Restoration) -> str:
         sigma = restoration.deconvolution.sigma
         words.append(f"blur of {sigma:.2f} pixels removed" if sigma > 0 else "no blur removed")
     return ", ".join(words)
+
+
+def write_result(
+    path: Path, restoration: Restoration, source: FrameSource, bit_depth: int, command: tuple[str, ...], overwrite: bool
+) -> None:
+    """Write the restored image; a FITS file also has the header of the input, the history of the run and UNCERT."""
+    if not is_fits(path):
+        write_image(path, restoration.image, bit_depth, overwrite)
+        return
+    x, y, width, height = restoration.crop
+    uncertainty = None
+    history = [f"turbrestore {__version__}: {shlex.join(command)}", *source.warnings]
+    history += [f"{decision.subject}: {decision.choice}" for decision in restoration.decisions]
+    if restoration.filtered is not None:
+        uncertainty = np.sqrt(restoration.filtered.variance[y : y + height, x : x + width])
+        history.append("UNCERT: standard deviation of each pixel, before deconvolution")
+    rows, columns = source.window
+    write_fits(
+        path,
+        restoration.image,
+        bit_depth,
+        overwrite,
+        header=source.header,
+        history=history,
+        origin=(columns.start + x, rows.start + y),
+        uncertainty=uncertainty,
+    )
 
 
 def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: bool) -> None:

@@ -14,6 +14,7 @@ TITLES = {
     "filter": "alternating filter",
     "deconvolve": "deconvolution",
     "synthesize": "frames",
+    "batch": "clips",
 }
 
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from turbrestore.core.errors import require
-from turbrestore.io.images import write_image
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
+from turbrestore.io.source import FrameSource
 from turbrestore.metrics import comparable
 from turbrestore.pipeline import restore as run_pipeline
 from turbrestore.report import check_report, write_report
+from turbrestore.results import Restoration
 from turbrestore.runs.run_record import describe_run
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.settings import RestoreParams
@@ -30,9 +32,41 @@ from .output import (
     save_stages,
     settings_record,
     summary,
+    write_result,
     write_settings,
 )
 from .progress import progress_bars, say
+
+
+@dataclass(frozen=True)
+class Order:
+    """What to restore, how, and what to write; the fields are the options of :func:`restore`."""
+
+    input: Path
+    output: Path
+    selection: Selection
+    params: RestoreParams
+    machine: Machine
+    bit_depth: int | None = None
+    memory_limit: MemorySize | None = None
+    config: Path | None = None
+    keep: Path | None = None
+    resume: bool = False
+    checkpoint_every: int = 50
+    report: Path | None = None
+    truth: Path | None = None
+    overwrite: bool = False
+    quiet: bool = False
+
+    @property
+    def settings_path(self) -> Path:
+        """File for the effective settings."""
+        return self.output.with_name(self.output.name + ".toml")
+
+    @property
+    def outputs(self) -> list[Path]:
+        """Files to write."""
+        return [path for path in (self.output, self.settings_path, self.report) if path is not None]
 
 
 def restore(
@@ -62,9 +96,11 @@ def restore(
     Parameters
     ----------
     input : Path
-        Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, .npy, or folder of images.
+        Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, FITS cube, .npy, or folder of
+        images or FITS files.
     output : Path
-        Image to write: .png (8 or 16 bit) or .tif (8, 16 bit or float).
+        Image to write: .png (8 or 16 bit), .tif (8, 16 bit or float) or .fits (the same, with the header of a FITS
+        input and the history of the run).
     sigma : float
         Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.
     config : Path
@@ -81,7 +117,7 @@ def restore(
     truth : Path
         Image of the true scene: every stage is compared with it.
     bit_depth : int
-        Bits per channel of the output, 8, 16 or 32 (float, TIFF only).  Those of the input by default.
+        Bits per channel of the output, 8, 16 or 32 (float, TIFF and FITS).  Those of the input by default.
     memory_limit : MemorySize
         Most memory to take, such as 2GB.  To keep it, training frames go to a scratch file, fewer threads work, fewer
         frames are trained on, and frames are processed in tiles that overlap, in this order.
@@ -93,45 +129,66 @@ def restore(
         Print neither progress nor remarks.
     """
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
-    if bit_depth is not None:
-        check_depth(bit_depth)
-    require(keep is not None or not resume, "--resume: expected --keep with the folder of the run to go on with")
-    inputs = [path for path in (input, config, truth) if path is not None]
-    left = own_outputs(keep) if resume and keep is not None else set()
-    check_output(output, inputs, overwrite or output.absolute() in left)
-    settings_path = output.with_name(output.name + ".toml")
-    of_before = config == settings_path or settings_path.absolute() in left
-    check_output(settings_path, [input], overwrite or of_before, suffixes=None)
-    if report is not None:
-        check_report(report, inputs, overwrite or report.absolute() in left)
-    outputs = [path for path in (output, settings_path, report) if path is not None]
-    check_keep(keep, [*inputs, *outputs], overwrite, resume)
-    runtime = machine.runtime(memory_limit, keep)
-    if truth is not None:
-        comparable(read_input_image(truth, selection.limits()), "truth")
-    source = open_input(input, selection, quiet)
-    if truth is not None:
-        comparable(source.read(0, 1)[0], source.name)
-    check_room(source, settings, runtime, output, keep)
-    with kept_stages(keep, source, settings, runtime, resume, checkpoint_every, quiet) as stages:
-        with progress_bars(quiet) as progress:
-            restoration = run_pipeline(source, settings, runtime, stages, progress)
-        record = settings_record(settings, selection, bit_depth, machine, memory_limit)
-        run = describe_run(source, record, repeating_command(input, output, record)) if keep or report else None
-        depth = source.bit_depth if bit_depth is None else bit_depth
-        if stages is not None and run is not None:
-            save_stages(stages, restoration, run, depth)
-            stages.expect(*outputs)
-        # Other existing files were refused above.
-        write_image(output, restoration.image, depth, overwrite=overwrite or output.absolute() in left)
-        write_settings(settings_path, record)
-        if report is not None and run is not None:
-            write_report(report, restoration, run, overwrite=overwrite or report.absolute() in left)
-        if stages is not None:
-            stages.expect()
+    order = Order(
+        input, output, selection, settings, machine, bit_depth, memory_limit,
+        config, keep, resume, checkpoint_every, report, truth, overwrite, quiet,
+    )  # fmt: skip
+    restoration, _ = restore_clip(order)
     if json:
         # The truth is read again, so that it takes no memory while the stages run.
         facts = describe(restoration, None if truth is None else read_input_image(truth, selection.limits()))
-        print_json({"input": str(input), "output": str(output), "settings": str(settings_path), **facts})
+        print_json({"input": str(input), "output": str(output), "settings": str(order.settings_path), **facts})
     else:
         say(summary(output, restoration), quiet)
+
+
+def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
+    """Restore one clip and write what was ordered; ``turbrestore batch`` calls this in every process."""
+    if order.bit_depth is not None:
+        check_depth(order.bit_depth)
+    left = _check_outputs(order)
+    runtime = order.machine.runtime(order.memory_limit, order.keep)
+    if order.truth is not None:
+        comparable(read_input_image(order.truth, order.selection.limits()), "truth")
+    source = open_input(order.input, order.selection, order.quiet)
+    if order.truth is not None:
+        comparable(source.read(0, 1)[0], source.name)
+    check_room(source, order.params, runtime, order.output, order.keep)
+    with kept_stages(
+        order.keep, source, order.params, runtime, order.resume, order.checkpoint_every, order.quiet
+    ) as stages:
+        with progress_bars(order.quiet) as progress:
+            restoration = run_pipeline(source, order.params, runtime, stages, progress)
+        record = settings_record(order.params, order.selection, order.bit_depth, order.machine, order.memory_limit)
+        command = repeating_command(order.input, order.output, record)
+        run = describe_run(source, record, command) if order.keep or order.report else None
+        depth = source.bit_depth if order.bit_depth is None else order.bit_depth
+        if stages is not None and run is not None:
+            save_stages(stages, restoration, run, depth)
+            stages.expect(*order.outputs)
+        # Other existing files were refused above.
+        write_result(
+            order.output, restoration, source, depth, command, order.overwrite or order.output.absolute() in left
+        )
+        write_settings(order.settings_path, record)
+        if order.report is not None and run is not None:
+            write_report(order.report, restoration, run, overwrite=order.overwrite or order.report.absolute() in left)
+        if stages is not None:
+            stages.expect()
+    return restoration, source
+
+
+def _check_outputs(order: Order) -> set[Path]:
+    """Refuse outputs that cannot be written; return those that a run which died has left."""
+    require(
+        order.keep is not None or not order.resume, "--resume: expected --keep with the folder of the run to go on with"
+    )
+    inputs = [path for path in (order.input, order.config, order.truth) if path is not None]
+    left = own_outputs(order.keep) if order.resume and order.keep is not None else set()
+    check_output(order.output, inputs, order.overwrite or order.output.absolute() in left)
+    of_before = order.config == order.settings_path or order.settings_path.absolute() in left
+    check_output(order.settings_path, [order.input], order.overwrite or of_before, suffixes=None)
+    if order.report is not None:
+        check_report(order.report, inputs, order.overwrite or order.report.absolute() in left)
+    check_keep(order.keep, [*inputs, *order.outputs], order.overwrite, order.resume)
+    return left

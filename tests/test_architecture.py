@@ -16,6 +16,7 @@ ORDER = [
     "pipeline", "runs", "report",
 ]  # fmt: skip
 HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
+HEAVY |= {"astropy", "dask", "distributed"}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")
 
 
@@ -62,7 +63,7 @@ def test_every_module_is_placed():
     assert {layer(path) for path in MODULES} == set(ORDER)
 
 
-LIBRARIES = {"torch", "kornia", "numba", "matplotlib", "cv2", "scipy"}
+LIBRARIES = {"torch", "kornia", "numba", "matplotlib", "cv2", "scipy", "astropy", "dask", "distributed"}
 
 
 @pytest.mark.parametrize(

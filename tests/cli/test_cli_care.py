@@ -58,7 +58,9 @@ def folder(tmp_path, monkeypatch):
 def smaller(words):
     """Words of an example with the numbers in ``SMALLER``, and settings that take less time."""
     quick = [SMALLER.get(pair, pair[1]) for pair in pairwise(["", *words])]
-    quick += {"restore": QUICK, "deconvolve": STEPS, "synthesize": ["--size", "64x64"]}.get(words[0], [])
+    quick += {"restore": QUICK, "batch": QUICK, "deconvolve": STEPS, "synthesize": ["--size", "64x64"]}.get(
+        words[0], []
+    )
     blurred = words[0] in ("restore", "deconvolve") and "--sigma" not in words
     return [*quick, "--sigma", "1"] if blurred else quick
 

@@ -14,6 +14,8 @@ from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 from videos import encode, encode_yuv, gif, grey_ffv1, scene
 
+INTERLACED = "interlaced video: the filter bwdif makes a whole frame of the first field of each"
+
 
 class TestFormats:
     @pytest.mark.parametrize("depth", [8, 9, 10, 12, 14, 16])
@@ -132,7 +134,7 @@ class TestFormats:
         data[matrix : matrix + 36] = np.array(quarter_turn, ">i4").tobytes()
         path.write_bytes(data)
         assert open_frames(path).warnings == (
-            "interlaced video: its fields are not separated",
+            INTERLACED,
             "turned upright as players show it",
         )
 
@@ -249,3 +251,95 @@ class TestArraysStacksAndFolders:
             with pytest.raises(DataError) as info:
                 FrameSource.from_array(array, "name")
             assert word in str(info.value) and "name" in str(info.value)
+
+
+class TestInterlaced:
+    """Fields of a scene that moves to the right, woven into frames, that of the odd rows first."""
+
+    @pytest.fixture
+    def fields(self):
+        x, y = np.arange(96)[None, :], np.arange(64)[:, None]
+        return [np.uint8(128 + 50 * np.sin((x - 3 * k) / 5) + 50 * np.cos(y / 9)) for k in range(16)]
+
+    @pytest.fixture
+    def clip(self, tmp_path, fields):
+        woven = [first.copy() for first in fields[::2]]
+        for frame, second in zip(woven, fields[1::2], strict=True):
+            frame[::2] = second[::2]
+        colours = [np.stack([frame] * 3, -1) for frame in woven]
+        path = tmp_path / "a.mkv"
+        return encode(path, colours, "libx264", "yuv444p", "rgb24", flags="+ilme+ildct", crf="1")
+
+    def test_frames_are_whole_and_as_many(self, clip, fields):
+        source = open_frames(clip)
+        assert source.warnings == (INTERLACED,) and len(source) == 8
+        found = source.read()
+        assert found.shape == (8, 64, 96, 3)
+        for frame, first, second in zip(found, fields[::2], fields[1::2], strict=True):
+            assert np.abs(255 * frame[..., 1] - first).mean() < 4
+            assert np.abs(first[::2].astype(float) - second[::2]).mean() > 15
+
+    def test_selections_give_the_same_frames(self, clip):
+        source = open_frames(clip)
+        np.testing.assert_array_equal(source.select((2, 8, 3), (5, 4, 30, 20)).read(), source.read()[2:8:3, 4:24, 5:35])
+
+    @pytest.mark.parametrize("count", [1, 2])
+    def test_few_frames(self, tmp_path, count):
+        frames = scene(count)
+        path = encode(tmp_path / "a.mp4", frames, "libx264", "yuv420p", "rgb24", flags="+ilme+ildct")
+        assert len(open_frames(path).read()) == count
+
+    def test_what_stands_still_keeps_its_colours(self, tmp_path):
+        still = scene(1)[0]
+        flags = {"flags": "+ilme+ildct", "crf": "1"}
+        path = encode(tmp_path / "a.mkv", [still] * 5, "libx264", "yuv444p", "rgb24", **flags)
+        assert np.abs(255 * open_frames(path).read() - still).mean() < 2
+
+
+class TestNamedAxes:
+    """TIFF files of OME and ImageJ, whose pages are in the order of the axes they name."""
+
+    @pytest.mark.parametrize("kind", ["ome", "imagej"])
+    @pytest.mark.parametrize(
+        ("axes", "shape", "order"),
+        [
+            ("TYX", (4, 6, 7), (0, 1, 2)),
+            ("ZYX", (4, 6, 7), (0, 1, 2)),
+            ("CYX", (4, 6, 7), (0, 1, 2)),
+            ("TCYX", (4, 3, 6, 7), (0, 2, 3, 1)),
+            ("ZCYX", (4, 3, 6, 7), (0, 2, 3, 1)),
+            ("TYXS", (4, 6, 7, 3), (0, 1, 2, 3)),
+        ],
+    )
+    def test_time_and_colour(self, tmp_path, kind, axes, shape, order):
+        dtype = np.uint8 if axes.endswith("S") else np.uint16
+        data = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape).astype(dtype)
+        tifffile.imwrite(tmp_path / "a.tif", data, metadata={"axes": axes}, **{kind: True})
+        source = open_frames(tmp_path / "a.tif")
+        np.testing.assert_array_equal(list(source.native()), data.transpose(order))
+        np.testing.assert_array_equal(list(source.select((1, 4, 2)).native()), data.transpose(order)[1:4:2])
+
+    def test_channels_that_come_first(self, tmp_path):
+        data = np.random.default_rng(0).integers(0, 255, (3, 4, 6, 7)).astype(np.uint8)
+        tifffile.imwrite(tmp_path / "a.tif", data, metadata={"axes": "CTYX"}, ome=True)
+        np.testing.assert_array_equal(list(open_frames(tmp_path / "a.tif").native()), data.transpose(1, 2, 3, 0))
+
+    @pytest.mark.parametrize(("axes", "shape"), [("TCYX", (4, 2, 6, 7)), ("TZYX", (4, 5, 6, 7))])
+    def test_other_axes_are_refused(self, tmp_path, axes, shape):
+        tifffile.imwrite(tmp_path / "a.tif", np.zeros(shape, np.uint8), metadata={"axes": axes}, ome=True)
+        with pytest.raises(DataError, match=f"expected one axis of time or depth.*{axes[0]} of 4"):
+            open_frames(tmp_path / "a.tif")
+
+    def test_other_files_are_not_opened(self, tmp_path):
+        """Two files that describe one series; each is read by itself."""
+        data = np.random.default_rng(0).integers(0, 255, (4, 6, 7)).astype(np.uint8)
+        tifffile.imwrite(tmp_path / "a.tif", data, metadata={"axes": "TYX"}, ome=True)
+        with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+            xml = tiff.ome_metadata
+        uuid = '<UUID FileName="b.tif">urn:uuid:1</UUID>'
+        xml = xml.replace('SizeT="4"', 'SizeT="8"').replace(
+            "</Pixels>", f'<TiffData FirstT="4">{uuid}</TiffData></Pixels>'
+        )
+        for name in ("a.tif", "b.tif"):
+            tifffile.imwrite(tmp_path / name, data, photometric="minisblack", description=xml, metadata=None)
+        np.testing.assert_array_equal(list(open_frames(tmp_path / "a.tif").native()), data)

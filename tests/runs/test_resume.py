@@ -110,7 +110,7 @@ PLACES = {
     "third block": ("turbrestore.filtering.alternating.pass_over", 4),
     "deconvolution": ("turbrestore.pipeline.remove_blur_steps", 1),
     "kept images": ("turbrestore_cli.output.write_image", 2),
-    "output": ("turbrestore_cli.restore.write_image", 1),
+    "output": ("turbrestore_cli.restore.write_result", 1),
     "settings": ("turbrestore_cli.restore.write_settings", 1),
 }
 

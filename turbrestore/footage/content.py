@@ -166,10 +166,11 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
     if report.numbers != source.numbers:
         raise ConfigurationError(f"{source.name}: the report is about other frames; check this selection")
     cleaned = source.without(report.left_out, "")
-    fill, stuck = bool(report.filled), report.stuck
+    fill, stuck, before = bool(report.filled), report.stuck, source.repair
 
     def repaired(pixels: PixelArray) -> PixelArray:
-        pixels = _filled(pixels) if fill else pixels
+        pixels = pixels if before is None else before(pixels)
+        pixels = fill_holes(pixels) if fill else pixels
         if source.develop is not None:
             return with_planes(pixels, repair_stuck(planes_of(pixels), plane_places(stuck)))
         return repair_stuck(pixels, stuck) if len(stuck) else pixels
@@ -263,7 +264,7 @@ class _ContentScan:
         if missing:
             self._filled.append(number)
             self._filled_values += missing
-        return _filled(pixels) if missing else pixels
+        return fill_holes(pixels) if missing else pixels
 
 
 def _in_words(report: ContentReport, repeated: bool) -> list[str]:
@@ -298,8 +299,14 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     return lines
 
 
-def _filled(pixels: PixelArray) -> PixelArray:
-    """Fill holes ring by ring with the mean of the known values among the eight neighbours."""
+def fill_holes(pixels: PixelArray) -> PixelArray:
+    """Fill what is not finite, ring by ring, with the mean of the known values among the eight neighbours.
+
+    Examples
+    --------
+    >>> fill_holes(np.array([[1.0, np.nan, 3.0]], np.float32))
+    array([[1., 2., 3.]], dtype=float32)
+    """
     missing = ~np.isfinite(pixels)
     if not missing.any():
         return pixels

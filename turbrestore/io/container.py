@@ -2,7 +2,8 @@
 
 Grey formats stay grey at their depth, 8-bit colour becomes RGB, and deeper colour 16-bit RGB. Opening a file reads all
 packets once without decoding them, which gives the number of frames, their times, and damage that decoders do not
-report (:mod:`turbrestore.io.integrity`).  Frames are turned upright as the display matrix of the file demands.
+report (:mod:`turbrestore.io.integrity`).  Frames that are marked as interlaced pass FFmpeg's filter bwdif.  Frames are
+turned upright as the display matrix of the file demands.
 
 Losses within a packet of a lossy codec that its decoder conceals are not found. FFmpeg converts YUV colour of more than
 8 bits to values up to 0.4 % darker than exact. Grey video is taken as full range, as its decoder returns it.
@@ -12,10 +13,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +99,7 @@ def open_container(
             if frame is None:
                 raise DataError(f"{path}: expected at least one frame, found none")
             layout = replace(_pixel_format(path, frame.format), orientation=_orientation(frame))
-            notes = _notes(frame, layout, stream)
+            notes, interlaced = _notes(frame, layout, stream), frame.interlaced_frame
         scan = _scan(path, cut, limits)
         if not scan.starts_whole:
             # A recording of a transport stream can start anywhere; frames before the first whole one are not decoded.
@@ -106,7 +107,8 @@ def open_container(
             text = f"starts in the middle of a group of frames: its first {missing} cannot be decoded"
             notes += (text,) if missing else ()
     cut = cut or scan.intact < scan.count or (duration is not None and _ends_early(scan, duration))
-    intra = codec in _INTRA_CODECS and scan.keyframes == scan.count
+    # A filter for fields looks at the frames before and after.
+    intra = codec in _INTRA_CODECS and scan.keyframes == scan.count and not interlaced
     notes += check_cut_short(path, scan.intact, check_frame_range(frames).stop, skip_damaged) if cut else ()
     damaged = _check_damage(path, scan, frames, intra, skip_damaged)
     varies = scan.times is not None and _varies(scan.times, scan.tick)
@@ -119,7 +121,7 @@ def open_container(
         file_shape=(scan.intact, *_upright_size(frame, layout), *layout.channels),
         full_scale=layout.full_scale,
         bit_depth=layout.bit_depth,
-        pixels=lambda chosen: _frames(path, layout, chosen, intra, limits),
+        pixels=lambda chosen: _frames(path, layout, chosen, intra, interlaced, limits),
         path=path,
         fps=fps,
         timestamps=scan.times,
@@ -184,7 +186,7 @@ def _notes(frame: av.VideoFrame, layout: _PixelFormat, stream: av.VideoStream) -
     if layout.alpha and stream.codec_context.name != "gif":
         notes.append("alpha channel ignored")
     if frame.interlaced_frame:
-        notes.append("interlaced video: its fields are not separated")
+        notes.append("interlaced video: the filter bwdif makes a whole frame of the first field of each")
     if frame.rotation % 90:
         notes.append(f"rotation of {frame.rotation} degrees ignored")
     elif layout.orientation > 1:
@@ -310,7 +312,7 @@ def _varies(times: NDArray[np.float64], tick: float) -> bool:
 
 
 def _frames(
-    path: Path, layout: _PixelFormat, chosen: Sequence[int], intra: bool, limits: Limits
+    path: Path, layout: _PixelFormat, chosen: Sequence[int], intra: bool, interlaced: bool, limits: Limits
 ) -> Iterator[PixelArray]:
     import av
 
@@ -325,23 +327,41 @@ def _frames(
                 # Frames outside the range or between the steps are not decoded.
                 numbers = iter(chosen)
                 packets = (packet for index, packet in enumerate(packets) if packet.size == 0 or index in wanted)
-            for packet in packets:
-                for frame in packet.decode():
-                    number = next(numbers)
-                    if number in wanted:
-                        yield _pixels(path, frame, layout, number)
-                    if number >= chosen[-1]:
-                        return
+            frames: Iterator[av.VideoFrame] = (frame for packet in packets for frame in packet.decode())
+            if interlaced:
+                checked = (_check(path, frame, layout, index) for index, frame in enumerate(frames))
+                frames = _deinterlaced(stream, checked)
+            for number, frame in zip(numbers, frames, strict=False):
+                if number in wanted:
+                    whole = frame if interlaced else _check(path, frame, layout, number)
+                    yield upright(convert(whole, layout.target).to_ndarray(), layout.orientation)
+                if number >= chosen[-1]:
+                    return
     except av.error.FFmpegError as error:
         raise DataError(f"{path}: frame {number + 1} or after cannot be decoded ({error.strerror})") from error
 
 
-def _pixels(path: Path, frame: av.VideoFrame, layout: _PixelFormat, number: int) -> PixelArray:
+def _check(path: Path, frame: av.VideoFrame, layout: _PixelFormat, number: int) -> av.VideoFrame:
     if frame.is_corrupt:
         raise DataError(f"{path}: frame {number} is damaged; copy the file again or select other frames")
     if frame.format.name != layout.name:
         raise DataError(f"{path}: frame {number}: expected pixel format {layout.name}, found {frame.format.name}")
-    return upright(convert(frame, layout.target).to_ndarray(), layout.orientation)
+    return frame
+
+
+def _deinterlaced(stream: av.VideoStream, frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
+    """Make whole frames, as many as there are: the first field is kept, the other interpolated in space and time."""
+    import av
+
+    graph = av.filter.Graph()
+    fields = graph.add("bwdif", "mode=send_frame:deint=interlaced")
+    graph.link_nodes(graph.add_buffer(template=stream), fields, graph.add("buffersink")).configure()
+    for frame in itertools.chain(frames, [None]):
+        graph.push(frame)
+        # The filter waits for the next frame before it gives one.
+        with suppress(av.error.BlockingIOError, av.error.EOFError):
+            while True:
+                yield cast("av.VideoFrame", graph.pull())
 
 
 def convert(frame: av.VideoFrame, target: str) -> av.VideoFrame:

@@ -22,6 +22,9 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image, from_unit
 from ..core.errors import DataError, StorageError, TurbrestoreError
+from .astronomy.fits import read_fits
+from .astronomy.fits_header import FITS_SUFFIXES, is_fits
+from .astronomy.fits_output import write_fits
 from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
 from .output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
 from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, to_unit, upright, without_alpha
@@ -55,7 +58,7 @@ def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) ->
     Parameters
     ----------
     path : path-like
-        PNG, JPEG, TIFF (one page), BMP, PGM, PPM or WebP file. Of an animation the first frame is read.
+        PNG, JPEG, TIFF (one page), BMP, PGM, PPM, WebP or FITS file. Of an animation the first frame is read.
     limits : Limits
         Largest image that is read.
 
@@ -88,9 +91,12 @@ def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) ->
 
 def read_pixels(path: Path, limits: Limits = DEFAULT_LIMITS) -> tuple[PixelArray, tuple[str, ...]]:
     """Read a still image as :func:`read_image` does, but in the type of its file; return warnings too."""
+    if is_fits(path):
+        return read_fits(path, limits)
     suffix = path.suffix.lower()
     if suffix not in IMAGE_SUFFIXES:
-        raise DataError(f"{path}: expected an image ({', '.join(IMAGE_SUFFIXES)}), found {suffix or 'no suffix'}")
+        names = ", ".join((*IMAGE_SUFFIXES, *FITS_SUFFIXES))
+        raise DataError(f"{path}: expected an image ({names}), found {suffix or 'no suffix'}")
     data = _read_file(path, limits)
     if suffix in TIFF_SUFFIXES:
         pixels, notes = read_tiff(path, data, limits)
@@ -101,17 +107,17 @@ def read_pixels(path: Path, limits: Limits = DEFAULT_LIMITS) -> tuple[PixelArray
 def write_image(
     path: str | os.PathLike[str], image: ArrayLike, bit_depth: int | None = None, overwrite: bool = False
 ) -> None:
-    """Write a still image as PNG or TIFF, chosen by the suffix.
+    """Write a still image as PNG, TIFF or FITS, chosen by the suffix.
 
     Parameters
     ----------
     path : path-like
-        Ends in ``.png``, ``.tif`` or ``.tiff``.
+        Ends in ``.png``, ``.tif``, ``.tiff`` or ``.fits``.
     image : array_like, shape (H, W) or (H, W, 3)
         Intensities; values outside [0, 1] are clipped.
     bit_depth : int, optional
         1 to 8 gives 8 bits, 9 to 16 gives 16 bits (always scaled to the full range of the file), 32 gives
-        floating point in TIFF and 16 bits in PNG. By default 32.
+        floating point in TIFF and FITS and 16 bits in PNG. By default 32.
     overwrite : bool
         Replace an existing file.
 
@@ -137,6 +143,9 @@ def write_image(
     """
     path = Path(path)
     check_output(path, overwrite=overwrite)
+    if is_fits(path):
+        write_fits(path, image, bit_depth, overwrite)
+        return
     depth = check_depth(32 if bit_depth is None else bit_depth)
     is_png = path.suffix.lower() == ".png"
     pixels = from_unit_to_type(check_image(image, "image"), min(depth, 16) if is_png else depth)

@@ -31,6 +31,8 @@ _LARGE = 1 << 22
 # Places along each axis at which the order of the axes is judged, and the factor by which the mean over time has more
 # contrast than the mean over rows.
 _SAMPLES, _STILLER = 48, 1.2
+# Frames have no shorter side.
+_LEAST_SIDE = 16
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -135,7 +137,13 @@ def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
                 return np.squeeze(array, axis), order
     if array.ndim == 3 and shape[2] in CHANNELS and min(shape[:2]) > _SAMPLES:
         raise DataError(f"{path}: expected frames of shape (T, H, W), found {shape}, which is that of one colour image")
-    if array.ndim == 3 and min(shape) > 1 and array.dtype.kind in "uf" and _frames_last(array):
+    if (
+        array.ndim == 3
+        and min(shape[:2]) >= _LEAST_SIDE
+        and shape[2] > 1
+        and array.dtype.kind in "uf"
+        and _frames_last(array)
+    ):
         return np.moveaxis(array, 2, 0), "(H, W, T)"
     return array, ""
 
@@ -147,6 +155,10 @@ def _frames_last(array: NDArray[Any]) -> bool:
     spread = np.float64(array[places[0]][:, places[1]][:, :, places[2]])
     middle = np.float64(array[tuple(slice(max(0, n // 2 - 16), n // 2 + 16) for n in array.shape)])
     if not np.isfinite(spread).all() or not np.isfinite(middle).all():
+        return False
+    # Blank frames would make a contrast of their own.
+    spread = spread[np.ptp(spread, axis=(1, 2)) > 0]
+    if not len(spread):
         return False
     still = [float(spread.mean(axis=axis).std()) for axis in (0, 2)]
     changes = [float(np.abs(np.diff(middle, axis=axis)).mean()) for axis in (0, 2)]

@@ -11,12 +11,13 @@ import secrets
 import shutil
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 from ..core.arrays import FloatArray
 from ..core.errors import ConfigurationError, DataError, OutputError, StorageError
 
-IMAGE_OUTPUT_SUFFIXES = (".png", ".tif", ".tiff")
+IMAGE_OUTPUT_SUFFIXES = (".png", ".tif", ".tiff", ".fits")
 # Bytes that must stay free beside the file.
 _SPARE = 1 << 20
 
@@ -35,7 +36,7 @@ def check_output(
     Raises
     ------
     ConfigurationError
-        Unsupported suffix.
+        Unsupported suffix, or FITS where Astropy is not installed.
     OutputError
         The path is a folder, a device or an input, it exists already, or its folder is missing or not writable.
     """
@@ -45,6 +46,10 @@ def check_output(
         *others, last = suffixes
         names = f"{', '.join(others)} or {last}" if others else last
         raise ConfigurationError(f"{path}: expected a name that ends in {names}, found {suffix or 'no suffix'}")
+    if suffixes is not None and suffix == ".fits" and find_spec("astropy") is None:
+        raise ConfigurationError(
+            f"{path}: expected astropy, which is not installed; run pip install 'turbrestore[fits]'"
+        )
     try:
         folder = Path(os.path.realpath(path)).parent
         if path.is_dir():

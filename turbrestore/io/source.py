@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,6 +53,10 @@ class FrameSource:
         What was left out, or is unusual.
     damaged : tuple of int
         Numbers, in the file, of frames that are known to be damaged.
+    levels : tuple of float or None
+        Values of a FITS file that were scaled to 0 and 1; None where the type of the file says what is black and white.
+    header : tuple of str
+        Cards of the header of a FITS file, 80 characters each.
     repair : callable or None
         Applied to the native pixels of every frame first.
     develop : callable or None
@@ -82,6 +87,8 @@ class FrameSource:
     timestamps: NDArray[np.float64] | None = field(default=None, repr=False)
     warnings: tuple[str, ...] = ()
     damaged: tuple[int, ...] = ()
+    levels: tuple[float, float] | None = None
+    header: tuple[str, ...] = field(default=(), repr=False)
     repair: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
     develop: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
     adjust: Callable[[int, FloatArray, slice], FloatArray] | None = field(default=None, repr=False)
@@ -228,7 +235,9 @@ class FrameSource:
 
     @staticmethod
     def from_array(array: ArrayLike, name: str = "array", fps: float | None = None) -> FrameSource:
-        """Use an array in memory, or a memory-mapped file, as a video.
+        """Use an array in memory, a memory-mapped file, or an array that is computed or read on demand, as a video.
+
+        Arrays of Dask, xarray, Zarr and HDF5 are read frame by frame, while iterating; chunks of one frame are best.
 
         Parameters
         ----------
@@ -245,14 +254,16 @@ class FrameSource:
         >>> FrameSource.from_array(np.full((2, 1, 1), 255, np.uint8)).read().ravel()
         array([1., 1.], dtype=float32)
         """
-        values = np.asanyarray(array)
+        # What has a type of NumPy is indexed, and converted frame by frame.
+        values: Any = array if isinstance(getattr(array, "dtype", None), np.dtype) else np.asanyarray(array)
+        dtype = np.dtype(values.dtype)
         return FrameSource(
             name=name,
-            format=f"array/{values.dtype}",
-            file_shape=values.shape,
-            full_scale=full_scale_of(values.dtype, name),
-            bit_depth=depth_of(values.dtype),
-            pixels=lambda chosen: (values[number] for number in chosen),
+            format=f"array/{dtype}",
+            file_shape=tuple(values.shape),
+            full_scale=full_scale_of(dtype, name),
+            bit_depth=depth_of(dtype),
+            pixels=lambda chosen: (np.asanyarray(values[number]) for number in chosen),
             fps=fps,
         )
 

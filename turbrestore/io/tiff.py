@@ -38,6 +38,8 @@ _DECOMPRESSED = (_LZW, 8, 32946, _PACKBITS, _LZMA)
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
 _NOT_TIFF = "not a TIFF file, or damaged"
 _MOST_SAMPLES = 16
+# The description of an OME file may name other files, which are not opened.
+_ALONE: dict[str, Any] = {"_multifile": False}
 _ORIENTATION, _SUBFILE = 274, 254
 # Type of a tag: a number of 32 bits.
 _LONG = 4
@@ -48,8 +50,9 @@ _CLEAR, _END, _TABLE = 256, 257, 4096
 def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     """Open a TIFF, BigTIFF or ImageJ stack, grey or RGB, with 8 or 16 bits or floating point.
 
-    Packed bits, and compressions other than deflate, LZMA, LZW and PackBits, need the package ``imagecodecs``. The
-    errors are those of :func:`turbrestore.io.video.open_frames`.
+    Where OME or ImageJ name the axes, there may be one of time or depth, and one of three channels, which become RGB;
+    other files are read page by page. Packed bits, and compressions other than deflate, LZMA, LZW and PackBits, need
+    the package ``imagecodecs``. The errors are those of :func:`turbrestore.io.video.open_frames`.
 
     Examples
     --------
@@ -64,7 +67,7 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
 
     with input_errors(path), path.open("rb") as file:
         pages = list_pages(path, file, limits)
-    with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
+    with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path, **_ALONE) as tiff:
         page = tiff.pages[pages.whole[0]].aspage()
         _check_page(path, page, limits)
         packed = _packed_stack(path, tiff) if pages.count == 1 else None
@@ -209,20 +212,24 @@ def _notes(page: tifffile.TiffPage) -> tuple[str, ...]:
 def _plane_pages(path: Path, tiff: tifffile.TiffFile, pages: Pages) -> list[tuple[int, ...]]:
     """Pages of every frame: one, or those of red, green and blue of an ImageJ or OME stack of channels."""
     alone: list[tuple[int, ...]] = [(number,) for number in pages.whole]
-    if not (tiff.is_imagej or tiff.is_ome) or len(pages.whole) != pages.count:
+    if not (tiff.is_imagej or tiff.is_ome) or len(pages.whole) != pages.count or pages.count == 1:
         return alone
     series = tiff.series[0]
-    axes, shape = series.axes[:-2], series.shape[:-2]
-    if not series.axes.endswith("YX") or "C" not in axes or math.prod(shape) != pages.count:
+    axes = [(name, n) for name, n in zip(series.axes, series.shape, strict=True) if name not in "YXS" and n > 1]
+    lengths = [length for _, length in axes]
+    # What does not speak of the pages of this file says nothing about their order.
+    if math.prod(lengths) != pages.count:
         return alone
-    channels = shape[axes.index("C")]
-    # Some programs call frames channels.
-    if channels in (pages.count, 1):
-        return alone
-    if channels != 3:
-        raise DataError(f"{path}: expected 1 or 3 channels, found {channels} (axes {series.axes}); save one as a stack")
-    numbers = np.moveaxis(np.arange(pages.count).reshape(shape), axes.index("C"), -1).reshape(-1, 3)
-    return [tuple(frame) for frame in numbers.tolist()]
+    # Some programs call any single axis one of channels.
+    channels = [length for name, length in axes if name == "C" and len(axes) > 1]
+    if len(axes) - len(channels) > 1 or channels not in ([], [3]) or (channels and "S" in series.axes):
+        text = ", ".join(f"{name} of {length}" for name, length in axes)
+        raise DataError(f"{path}: expected one axis of time or depth and 1 or 3 channels, found {text}; extract one")
+    listed = [page.index for page in series.pages if page is not None]
+    numbers = np.reshape(listed if len(listed) == pages.count else range(pages.count), lengths)
+    if channels:
+        numbers = np.moveaxis(numbers, [name for name, _ in axes].index("C"), -1)
+    return [tuple(frame) for frame in numbers.reshape(-1, 3 if channels else 1).tolist()]
 
 
 def _packed_stack(path: Path, tiff: tifffile.TiffFile) -> FrameSource | None:
@@ -250,7 +257,7 @@ def _is_decodable(page: tifffile.TiffPage) -> bool:
 def _frames(path: Path, chosen: Sequence[tuple[int, ...]], limits: Limits) -> Iterator[PixelArray]:
     import tifffile
 
-    with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path) as tiff:
+    with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path, **_ALONE) as tiff:
         for numbers in chosen:
             planes = []
             for number in numbers:

@@ -8,7 +8,8 @@ input                                  module                             output
 .tif .tiff (a stack)                   :mod:`turbrestore.io.tiff`            .tif .tiff
 .npy, shape (T, H, W) or (T, H, W, 3)  :mod:`turbrestore.io.npy`             .npy
 .png .apng .webp (an animation)        :mod:`turbrestore.io.images`          .gif .webp (for viewing)
-a folder of images                     here, :mod:`turbrestore.io.images`
+.fits .fit .fts (a cube), also .gz     :mod:`turbrestore.io.astronomy.fits`
+a folder of images or FITS files       here, :mod:`turbrestore.io.images`
 =====================================  =================================  =====================================
 """
 
@@ -24,6 +25,8 @@ import numpy as np
 
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, require
+from .astronomy.fits import open_fits, open_fits_folder
+from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .container import CONTAINER_SUFFIXES, is_container, open_container
 from .encoding import write_container
 from .images import (
@@ -42,7 +45,7 @@ from .ser import open_ser, write_ser
 from .source import FrameRange, FrameSource, Roi, as_bayer, check_frame_range, numbers_text
 from .tiff import TIFF_SUFFIXES, open_tiff, write_tiff
 
-VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES)
+VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES, *FITS_SUFFIXES)
 VIDEO_OUTPUT_SUFFIXES = (".mkv", ".mp4", ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_OUTPUT_SUFFIXES)
 
 __all__ = ["VIDEO_OUTPUT_SUFFIXES", "VIDEO_SUFFIXES", "FrameSource", "open_frames", "write_video"]
@@ -62,8 +65,8 @@ def open_frames(
     Parameters
     ----------
     path : path-like
-        A video file, an animated image, a TIFF stack, a .npy array or a folder of images. The images of a folder are
-        sorted in natural order (frame2 before frame10); its other files are ignored.
+        A video file, an animated image, a TIFF stack, a .npy array, a FITS cube or a folder of images or of FITS files.
+        The images of a folder are sorted in natural order (frame2 before frame10); its other files are ignored.
     frames : tuple, optional
         (start, stop) or (start, stop, step), as in a slice; None as the stop is the end of the video. Damage outside
         the range is no error.
@@ -90,7 +93,7 @@ def open_frames(
     DataError
         Not a video, damaged, cut short, empty, too large, or values outside [0, 1].
     ConfigurationError
-        Range or rectangle outside the video.
+        Range or rectangle outside the video, or FITS where Astropy is not installed.
     StorageError
         The file cannot be read.
 
@@ -185,8 +188,8 @@ def frame_files(folder: Path) -> list[Path]:
         parts = re.findall(r"\d+|\D+", file.name)
         return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts], file.name
 
-    named = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != ".")
-    return sorted((path for path in named if path.is_file()), key=natural)
+    named = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES or is_fits(path))
+    return sorted((path for path in named if path.name[0] != "." and path.is_file()), key=natural)
 
 
 def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool) -> FrameSource:
@@ -204,6 +207,8 @@ def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: b
         source = open_tiff(path, limits)
     elif suffix == ".npy":
         source = open_npy(path, limits)
+    elif is_fits(path):
+        source = open_fits(path, limits)
     elif suffix in ANIMATION_SUFFIXES:
         source = open_animation(path, stop, limits, skip_damaged)
     else:
@@ -233,8 +238,14 @@ def _open_folder(folder: Path, limits: Limits) -> FrameSource:
     with input_errors(folder):
         files = frame_files(folder)
     if not files:
-        raise DataError(f"{folder}: expected images ({', '.join(IMAGE_SUFFIXES)}), found none in the folder")
+        names = ", ".join((*IMAGE_SUFFIXES, *FITS_SUFFIXES))
+        raise DataError(f"{folder}: expected images ({names}), found none in the folder")
     limits.check_count(len(files), str(folder))
+    fits = sum(map(is_fits, files))
+    if fits == len(files):
+        return open_fits_folder(folder, files, limits)
+    if fits:
+        raise DataError(f"{folder}: expected images of one kind, found {fits} FITS files among {len(files)} images")
     first, notes = read_pixels(files[0], limits)
     return FrameSource(
         name=folder.name,

@@ -1,0 +1,283 @@
+"""``turbrestore batch``: many clips, side by side in processes of Dask."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from turbrestore.core.errors import ConfigurationError, TurbrestoreError, require
+from turbrestore.io.limits import first_line
+from turbrestore.report.batch_page import ClipRow, thumbnail_uri
+from turbrestore.runs.folder_lock import lock_folder
+from turbrestore.runs.run_folder import is_part
+from turbrestore.runtime.memory_size import MemorySize
+from turbrestore.runtime.threads import available_cores
+from turbrestore.settings import RestoreParams
+
+from .batch_plan import JOURNAL, TABLE, figures, find_clips, journal_line, key_of, name_outputs, plan, write_summary
+from .options import Flag, Machine, Selection, known_sigma
+from .output import print_json
+from .progress import progress_bars, say
+from .restore import Order, restore_clip
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+# Least memory for a process, bytes.
+_LEAST_MEMORY = 1e9
+# Seconds to wait for a scheduler.
+_PATIENCE = 10
+
+
+def batch(
+    *inputs: Path,
+    out: Path,
+    sigma: float | None = None,
+    selection: Annotated[Selection, Parameter(name="*")] = Selection(),
+    config: Path | None = None,
+    format: Literal["png", "tif", "fits"] = "png",
+    bit_depth: int | None = None,
+    reports: Flag = False,
+    resume: Flag = False,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    memory_limit: MemorySize | None = None,
+    machine: Annotated[Machine, Parameter(name="*")] = Machine(),
+    overwrite: Flag = False,
+    json: Flag = False,
+    quiet: Flag = False,
+    params: Annotated[RestoreParams, Parameter(name="*")] = RestoreParams(),
+) -> None:
+    """Restore many clips side by side; a clip that fails is a row of the summary with its reason.
+
+    Ends with 1 if any clip failed.
+
+    Parameters
+    ----------
+    inputs : Path
+        Videos, folders and patterns such as 'night/*.ser'.  Every video in a folder is a clip; a folder of images or
+        FITS files is one clip.
+    out : Path
+        Folder for the results: an image and its settings for each clip, summary.csv, and index.html with pictures.
+    sigma : float
+        Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.
+    config : Path
+        TOML file with settings; flags win over it.
+    format : str
+        Kind of the images to write.
+    bit_depth : int
+        Bits per channel of the results, 8, 16 or 32 (float, TIFF and FITS).  Those of the input by default.
+    reports : bool
+        Write an HTML report for each clip as well.
+    resume : bool
+        Do what an earlier batch in this folder has not done, and what has failed or has changed since.
+    scheduler : str
+        Address of a running Dask scheduler, tcp://host:port, whose workers see the same files.  By default processes
+        are started on this machine.
+    workers : int
+        Processes to start; by default one for each core, and no more than clips or than --memory-limit has gigabytes.
+    memory_limit : MemorySize
+        Most memory that all processes together take, such as 8GB; with --scheduler, that each clip takes.
+    overwrite : bool
+        Replace existing outputs.
+    json : bool
+        Print what was done, as JSON, on standard output.
+    quiet : bool
+        Print neither progress nor remarks.
+    """
+    _check(scheduler, workers)
+    clips = find_clips(inputs)
+    outputs = name_outputs(clips, out, f".{format}")
+    count = 1 if scheduler else processes(len(clips), memory_limit, workers)
+    each = MemorySize(memory_limit / count) if memory_limit is not None else None
+    settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
+    shared = Machine(machine.threads or max(1, available_cores() // count), machine.device)
+    orders = [
+        Order(
+            clip, output, selection, settings, machine if scheduler else shared, bit_depth, each,
+            report=output.with_suffix(".html") if reports else None,
+        )
+        for clip, output in zip(clips, outputs, strict=True)
+    ]  # fmt: skip
+    with lock_folder(out):
+        rows, missing = plan(orders, out, resume, overwrite)
+        _do(rows, missing, out, scheduler, count, quiet)
+    failed = [row for row in rows if row.state != "done"]
+    if json:
+        print_json({"out": str(out), "clips": [figures(row) for row in rows]})
+    say(f"{out}: {len(rows) - len(failed)} of {len(rows)} clips restored", quiet)
+    if failed:
+        raise TurbrestoreError(f"batch: {len(failed)} of {len(rows)} clips failed; {out / TABLE} says why")
+
+
+def processes(clips: int, memory_limit: float | None, workers: int | None) -> int:
+    """Count the processes to start: no more than cores, clips, or gigabytes."""
+    if workers is not None:
+        return min(workers, clips)
+    by_memory = clips if memory_limit is None else max(1, int(memory_limit // _LEAST_MEMORY))
+    return min(available_cores(), clips, by_memory)
+
+
+def work(order: Order) -> ClipRow:
+    """Restore one clip in a process of its own; a failure is a row, too."""
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
+    row = ClipRow(str(order.input), str(order.output), key=key_of(order))
+    try:
+        # A process that was killed while it did the same may have left a result.
+        restoration, source = restore_clip(dataclasses.replace(order, overwrite=True, quiet=True))
+        x, y, width, height = restoration.crop
+        middle = len(source) // 2
+        return dataclasses.replace(
+            row,
+            state="done",
+            frames=restoration.frame_count,
+            width=width,
+            height=height,
+            blur=0.0 if restoration.deconvolution is None else float(restoration.deconvolution.sigma),
+            seconds=float(sum(restoration.seconds.values())),
+            remarks="; ".join(source.warnings),
+            before=thumbnail_uri(source.read(middle, middle + 1)[0][y : y + height, x : x + width]),
+            after=thumbnail_uri(restoration.image),
+        )
+    except Exception as error:  # whatever happens to one clip, the others are restored
+        return dataclasses.replace(row, state="failed", reason=_reason(error))
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, TurbrestoreError):
+        return first_line(error)
+    if isinstance(error, MemoryError):
+        return "out of memory; fewer --workers or a --memory-limit take less"
+    return f"{type(error).__name__}: {first_line(error)}"
+
+
+def _check(scheduler: str | None, workers: int | None) -> None:
+    for package in ("distributed", "jinja2"):
+        if find_spec(package) is None:
+            raise ConfigurationError(
+                f"batch: expected {package}, which is not installed; run pip install 'turbrestore[distributed]'"
+            )
+    require(workers is None or workers >= 1, f"--workers: expected at least 1, found {workers}")
+    require(workers is None or scheduler is None, "--workers: has no effect with --scheduler; leave it out")
+
+
+def _do(
+    rows: list[ClipRow], orders: Sequence[Order], out: Path, scheduler: str | None, count: int, quiet: bool
+) -> None:
+    """Restore what is missing; ``rows`` get what comes of it, and the journal each at once."""
+    places = {row.output: place for place, row in enumerate(rows)}
+    try:
+        with (out / JOURNAL).open("w", encoding="utf-8") as journal:
+            journal.writelines(map(journal_line, rows))
+            journal.flush()
+            if orders:
+                with _client(scheduler, min(count, len(orders)), quiet) as client:
+                    for row in _finished(client, orders, out, quiet):
+                        rows[places[row.output]] = row
+                        journal.write(journal_line(row))
+                        journal.flush()
+    except KeyboardInterrupt as stop:
+        done = sum(row.state == "done" for row in rows)
+        stop.args = (f"{str(stop) or 'interrupted'}; {done} of {len(rows)} clips are done, --resume does the others",)
+        raise
+    finally:
+        # Processes that were killed leave their unfinished files.
+        for path in filter(is_part, out.iterdir()):
+            path.unlink(missing_ok=True)
+        write_summary(out, rows)
+
+
+def _finished(client: Client, orders: Sequence[Order], out: Path, quiet: bool) -> Iterator[ClipRow]:
+    """Hand out all clips, and yield the row of each when it is done."""
+    from distributed import as_completed
+
+    here = {str(order.output): order for order in orders}
+    absolute = [
+        dataclasses.replace(
+            order,
+            input=order.input.absolute(),
+            output=order.output.absolute(),
+            report=None if order.report is None else order.report.absolute(),
+        )
+        for order in orders
+    ]
+    futures = dict(zip(client.map(work, absolute, pure=False), orders, strict=True))
+    with progress_bars(quiet) as progress:
+        for number, future in enumerate(as_completed(list(futures)), 1):
+            order = futures.pop(future)
+            row = _as_named(_row_of(future, order), order)
+            if progress is not None:
+                progress("batch", number, len(here))
+            if progress is None or row.state == "failed":
+                result = row.reason if row.state == "failed" else f"{row.frames} frames in {row.seconds:.1f} s"
+                say(f"{number} of {len(here)}: {row.input}: {result}", quiet)
+            yield row
+
+
+def _as_named(row: ClipRow, order: Order) -> ClipRow:
+    """Say paths as they were given, and the input once."""
+    reason = row.reason.removeprefix(f"{order.input.absolute()}: ").removeprefix(f"{order.input.name}: ")
+    return dataclasses.replace(row, input=str(order.input), output=str(order.output), reason=reason)
+
+
+def _row_of(future: Future[ClipRow], order: Order) -> ClipRow:
+    """Return the row of a clip, also where its process was killed again and again or its scheduler has gone."""
+    from distributed import KilledWorker
+
+    try:
+        return future.result()
+    except KilledWorker:
+        reason = "its process was killed again and again, perhaps for want of memory; --memory-limit takes less"
+    except Exception as error:  # the errors of a connection, of other versions on the workers, and so on
+        reason = f"it was lost ({first_line(error) or type(error).__name__}); --resume does it"
+    return ClipRow(str(order.input), str(order.output), "failed", reason)
+
+
+@contextmanager
+def _client(scheduler: str | None, count: int, quiet: bool) -> Iterator[Client]:
+    """Connect to a scheduler, or start one and its processes; they are reached from this machine alone."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=_PATIENCE)
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(
+                f"--scheduler: expected a running scheduler, found none at {scheduler} ({first_line(error)})"
+            ) from error
+        with client:
+            _tell_dashboard(client.dashboard_link, quiet)
+            yield client
+        return
+    with (
+        TemporaryDirectory(prefix="turbrestore-", ignore_cleanup_errors=True) as scratch,
+        # A process that has died may have been the victim of another one.
+        dask.config.set({"distributed.scheduler.allowed-failures": 3}),
+        LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            memory_limit=0,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            local_directory=scratch,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        _tell_dashboard(cluster.dashboard_link, quiet)
+        yield client
+
+
+def _tell_dashboard(link: str | None, quiet: bool) -> None:
+    if link and find_spec("bokeh") is not None:
+        say(f"dashboard: {link}", quiet)

@@ -1,0 +1,234 @@
+"""Many clips: what counts as a clip, names, failures, what is resumed, and processes that are killed."""
+
+import csv
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from distributed import LocalCluster
+
+from conftest import make_sequence
+from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError
+from turbrestore.io.images import write_image
+from turbrestore.io.video import write_video
+from turbrestore.report.batch_page import ClipRow, render_batch
+from turbrestore_cli import batch as command
+from turbrestore_cli.__main__ import main
+from turbrestore_cli.batch_plan import find_clips, journal_line, name_outputs, read_journal
+
+QUICK = ["--centroid.iterations", "1", "--filter.inner-iterations", "1", "--sigma", "1", "--threads", "1"]
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clips")
+    for number in range(5):
+        write_video(folder / f"{number}.mkv", make_sequence(seed=number, count=8, size=64, rms=0.8).frames, 25)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """A scheduler with one worker, both of them threads of this process."""
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture
+def run(capsys, scheduler):
+    def call(*words):
+        code = main(["batch", *map(str, words), "--scheduler", scheduler, *QUICK])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+def rows(out):
+    with (out / "summary.csv").open(newline="") as table:
+        return list(csv.DictReader(table))
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".png", ".toml")}
+
+
+class TestClips:
+    def test_files_folders_and_patterns(self, clips, tmp_path):
+        names = [clips / f"{number}.mkv" for number in range(5)]
+        assert find_clips([clips]) == names
+        assert find_clips([clips / "3.mkv", clips / "[0-4].mkv"]) == [names[3], *names[:3], names[4]]
+        for night in ("a", "b"):
+            (tmp_path / night / "notes").mkdir(parents=True)
+            write_image(tmp_path / night / "1.png", np.zeros((4, 4), np.float32))
+        assert find_clips([tmp_path]) == [tmp_path / "a", tmp_path / "b"]
+
+    def test_what_is_none(self, tmp_path):
+        for path, error in (("x.mkv", InputNotFoundError), ("*.mkv", InputNotFoundError), ("", DataError)):
+            with pytest.raises(error):
+                find_clips([tmp_path / path])
+        with pytest.raises(ConfigurationError):
+            find_clips([])
+
+    def test_names(self, tmp_path):
+        paths = [tmp_path / name for name in ("a/x.mkv", "b/x.mkv", "y.mkv", "Y.ser", "z.mkv")]
+        for path in paths:
+            path.parent.mkdir(exist_ok=True)
+            path.touch()
+        names = [path.name for path in name_outputs(paths, tmp_path, ".png")]
+        assert names == ["a_x.mkv.png", "b_x.mkv.png", "y.mkv.png", "Y.ser.png", "z.png"]
+        (tmp_path / "c" / "a").mkdir(parents=True)
+        (tmp_path / "c" / "a" / "x.mkv").touch()
+        with pytest.raises(ConfigurationError, match="twice"):
+            name_outputs([tmp_path / "a/x.mkv", tmp_path / "c/a/x.mkv"], tmp_path, ".png")
+
+
+def test_processes(monkeypatch):
+    monkeypatch.setattr(command, "available_cores", lambda: 8)
+    cases = [(60, None, None), (3, None, None), (60, 4.5e9, None), (60, 1e8, None), (60, None, 20), (2, None, 20)]
+    assert [command.processes(*case) for case in cases] == [8, 3, 4, 1, 20, 2]
+
+
+class TestJournal:
+    def test_the_newest_row_counts_and_a_torn_line_does_not(self, tmp_path):
+        done = ClipRow("a.mkv", "out/a.png", "done", frames=8, blur=1.25)
+        text = journal_line(ClipRow("a.mkv", "out/a.png")) + journal_line(done) + '{"input": 3}\n[]\n'
+        (tmp_path / "j").write_text(text + journal_line(dataclasses.replace(done, state="failed"))[:40])
+        assert read_journal(tmp_path / "j") == {"a.png": done}
+        assert read_journal(tmp_path / "none") == {}
+
+    def test_page_escapes_what_it_is_told(self):
+        page = render_batch([ClipRow("<i>.mkv", "out/<i>#.png", "done"), ClipRow("b", "b.png")], "<b>")
+        assert "<i>" not in page and "<b>" not in page and "%3Ci%3E%23.png" in page and "not done yet" in page
+
+
+class TestBatch:
+    def test_a_clip_that_fails_is_a_row(self, run, clips, tmp_path):
+        (tmp_path / "bad.mkv").write_bytes(b"no video")
+        code, out, err = run(
+            clips / "0.mkv", tmp_path / "bad.mkv", clips / "1.mkv", "--out", tmp_path / "out", "--json"
+        )
+        assert code == 1 and "1 of 3 clips failed" in err.splitlines()[-1], err
+        table = rows(tmp_path / "out")
+        assert [row["state"] for row in table] == ["done", "failed", "done"]
+        assert table[1]["reason"].startswith("cannot be opened as a video") and table[1]["frames"] == ""
+        assert [row["frames"] for row in table[::2]] == ["8", "8"]
+        assert [row["state"] for row in json.loads(out)["clips"]] == ["done", "failed", "done"]
+        page = (tmp_path / "out" / "index.html").read_text()
+        assert page.count("data:image/webp") == 4 and "cannot be opened" in page
+        assert {path.name for path in (tmp_path / "out").iterdir()} == {
+            *("0.png", "0.png.toml", "1.png", "1.png.toml", "batch.jsonl", "index.html", "summary.csv")
+        }
+        assert main(["restore", str(clips / "0.mkv"), str(tmp_path / "0.png"), *QUICK, "--quiet"]) == 0
+        assert contents(tmp_path / "out").items() >= contents(tmp_path).items()
+
+    def test_resume_does_what_is_missing_or_changed(self, run, clips, tmp_path):
+        out, own = tmp_path / "out", tmp_path / "2.mkv"
+        own.write_bytes(b"not there yet")
+        words = [clips / "0.mkv", clips / "1.mkv", own, "--out", out]
+        assert run(*words)[0] == 1
+        first = contents(out)
+        own.write_bytes((clips / "2.mkv").read_bytes())
+        (out / "1.png").unlink()
+        (out / f".{16 * '0'}.part").touch()
+        times = {path: path.stat().st_mtime_ns for path in out.glob("0.*")}
+        code, _, err = run(*words, "--resume")
+        assert code == 0 and "of 2: " in err and "0.mkv" not in err, err
+        assert contents(out).items() >= first.items() and (out / "2.png").exists()
+        assert {path: path.stat().st_mtime_ns for path in times} == times
+        assert not list(out.glob(".*"))
+        assert [row["state"] for row in rows(out)] == ["done"] * 3
+        code, _, err = run(*words, "--resume", "--bit-depth", "16")
+        assert code == 0 and "3 of 3: " in err and contents(out)["0.png"] != first["0.png"]
+
+    def test_what_others_made_is_not_replaced(self, run, clips, tmp_path):
+        (tmp_path / "0.png").touch()
+        for words in ([], ["--resume"]):
+            code, _, err = run(clips / "0.mkv", "--out", tmp_path, *words)
+            assert code == 73 and "0.png: exists already" in err
+        assert [path.name for path in tmp_path.iterdir()] == ["0.png"]
+        assert run(clips / "0.mkv", "--out", tmp_path, "--overwrite", "--reports")[0] == 0
+        assert (tmp_path / "0.html").read_text().startswith("<!doctype html>")
+
+    def test_reasons(self, monkeypatch, clips):
+        monkeypatch.setattr(command, "restore_clip", lambda order: (_ for _ in ()).throw(MemoryError))
+        monkeypatch.setattr(command, "key_of", lambda order: "")
+        order = command.Order(
+            clips / "0.mkv", clips / "0.png", command.Selection(), command.RestoreParams(), command.Machine()
+        )
+        assert command.work(order).reason.startswith("out of memory")
+        monkeypatch.setattr(command, "restore_clip", lambda order: 1 / 0)
+        assert command.work(order).reason == "ZeroDivisionError: division by zero"
+
+    @pytest.mark.parametrize(
+        ("words", "code", "part"),
+        [
+            (["--scheduler", "tcp://127.0.0.1:1"], 2, "expected a running scheduler"),
+            (["--workers", "0"], 2, "--workers: expected at least 1"),
+            (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], 2, "--workers: has no effect"),
+        ],
+    )
+    def test_usage(self, clips, tmp_path, capsys, monkeypatch, words, code, part):
+        monkeypatch.setattr(command, "_PATIENCE", 0.3)
+        assert main(["batch", str(clips / "0.mkv"), "--out", str(tmp_path / "out"), *words]) == code
+        captured = capsys.readouterr()
+        assert captured.out == "" and captured.err.count("\n") == 1 and part in captured.err
+
+    def test_without_the_extra(self, clips, tmp_path, capsys, monkeypatch):
+        monkeypatch.setattr(command, "find_spec", lambda name: None)
+        assert main(["batch", str(clips / "0.mkv"), "--out", str(tmp_path / "out")]) == 2
+        assert "pip install 'turbrestore[distributed]'" in capsys.readouterr().err
+
+
+def children(process):
+    family = psutil.Process(process.pid).children(recursive=True)
+    return [child for child in family if "spawn_main" in " ".join(child.cmdline())]
+
+
+def start(words):
+    """Start a batch with two processes; it has restored one clip when this returns."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "turbrestore_cli", *words, "--workers", "2"],
+        stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    timer = threading.Timer(120, process.kill)
+    timer.start()
+    line = process.stderr.readline()
+    assert line.startswith("turbrestore: 1 of "), line
+    return process, timer
+
+
+@pytest.mark.long
+def test_an_interrupted_batch_whose_processes_are_killed_loses_no_clip(clips, tmp_path):
+    words = ["batch", str(clips), "--out", str(tmp_path / "out"), *QUICK]
+    process, timer = start(words)
+    family = children(process)
+    assert len(family) == 2
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate()
+    timer.cancel()
+    assert process.returncode == 130 and "--resume does the others" in err and err.count("\n") <= 4, err
+    assert not any(child.is_running() for child in family)
+    assert {row["state"] for row in rows(tmp_path / "out")} == {"done", "planned"}
+
+    process, timer = start([*words, "--resume"])
+    children(process)[0].kill()
+    _, err = process.communicate()
+    timer.cancel()
+    assert process.returncode == 0, err
+    assert [row["state"] for row in rows(tmp_path / "out")] == ["done"] * 5
+    singly = tmp_path / "singly"
+    singly.mkdir()
+    for clip in sorted(Path(clips).iterdir()):
+        assert main(["restore", str(clip), str(singly / f"{clip.stem}.png"), *QUICK, "--quiet"]) == 0
+    assert contents(tmp_path / "out") == contents(singly)
+    assert not list((tmp_path / "out").glob(".*"))

@@ -1,0 +1,39 @@
+"""What a release needs: one version, every package and data file in the wheel, a workflow without secrets."""
+
+import re
+import tomllib
+from fnmatch import fnmatch
+from pathlib import Path
+
+import turbrestore
+
+ROOT = Path(__file__).parents[1]
+TOOL = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+
+
+def test_every_package_is_in_the_wheel():
+    folders = {path.parent.relative_to(ROOT) for path in (ROOT / "turbrestore").rglob("__init__.py")}
+    found = {".".join(folder.parts) for folder in folders} | {"turbrestore_cli"}
+    assert set(TOOL["packages"]) == found
+
+
+def test_every_data_file_is_in_the_wheel():
+    for path in (ROOT / "turbrestore").rglob("*"):
+        if path.is_file() and path.suffix != ".py" and path.parent.name != "__pycache__":
+            package = ".".join(path.parent.relative_to(ROOT).parts)
+            patterns = TOOL["package-data"].get(package, [])
+            assert any(fnmatch(path.name, pattern) for pattern in patterns), path
+
+
+def test_the_version_stands_in_one_place_and_the_changelog_begins_with_it():
+    assert TOOL["dynamic"]["version"] == {"attr": "turbrestore.__version__"}
+    heading = re.search(r"(?m)^## (\S+?),? ", (ROOT / "CHANGELOG.md").read_text())[1]
+    assert heading == turbrestore.__version__
+    assert not re.search(r"(?m)^version:", (ROOT / "CITATION.cff").read_text())
+
+
+def test_the_workflow_has_no_secrets_and_writes_nothing():
+    text = (ROOT / ".github" / "workflows" / "release.yml").read_text()
+    assert "secrets." not in text and "password" not in text.replace("no password", "")
+    assert re.findall(r"(?m)^ +([\w-]+: write)$", text) == ["id-token: write"]
+    assert "python .ci/release.py --tag" in text

@@ -1,0 +1,217 @@
+"""FITS: cubes and folders of images in, images with header and history out.
+
+Rows and columns keep the order of the file, as NumPy and Astropy show it: the first row of the file is the first of the
+frame, whatever ROWORDER says. Axes are those of NumPy, the reverse of NAXIS1, NAXIS2 and so on.
+
+=================================  ==========================================================================
+axes                               frames
+=================================  ==========================================================================
+(T, H, W)                          grey
+(T, 3, H, W)                       colour, where the second axis has three values
+(3, T, H, W)                       colour, where the second has not and the first has
+(T, H, W, 3)                       colour, where only the last has
+(T, 1, H, W)                       grey
+a folder of (H, W) or (3, H, W)    grey or colour, one file a frame
+=================================  ==========================================================================
+
+==================================  =========================================================================
+numbers                             intensity
+==================================  =========================================================================
+8 bits                              0 to 255
+16 or 32 bits, BZERO of the middle  unsigned: 0 to 65535, or to 4294967295
+floating point in [0, 1]            as they are
+all others, with BSCALE and BZERO   0, or the lowest value of all frames if that is negative, becomes black; the
+                                    highest value of all frames becomes white; a remark says so
+NaN, BLANK                          missing: filled from around, where a frame has up to 1 % of them
+==================================  =========================================================================
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import DataError
+from ...runtime.scratch import iter_frames
+from ..limits import DEFAULT_LIMITS, Limits
+from ..pixels import FLOAT_MARGIN, PixelArray, depth_of, full_scale_of
+from ..source import FrameSource
+from .fits_header import FitsImage, find_image
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """How the numbers of a file become pixels: unsigned, as they are, or from ``black`` to ``white``."""
+
+    unsigned: np.dtype[Any] | None = None
+    black: float = 0.0
+    white: float = 1.0
+
+    def pixels(self, numbers: NDArray[Any], image: FitsImage) -> PixelArray:
+        if self.unsigned is None:
+            values = _values(numbers, image)
+            if (self.black, self.white) == (0.0, 1.0):
+                return values
+            return ((values - self.black) / (self.white - self.black)).astype(np.float32)
+        # Adding half of the range modulo the range flips the highest bit.
+        flip = 0 if numbers.dtype.kind == "u" else 1 << (8 * numbers.dtype.itemsize - 1)
+        found = np.ascontiguousarray(numbers, numbers.dtype.newbyteorder("=")).view(self.unsigned) ^ flip
+        found = found.astype(self.unsigned, copy=False)
+        if image.blank is None:
+            return found
+        values = np.divide(found, np.float32(np.iinfo(self.unsigned).max), dtype=np.float32)
+        values[numbers == image.blank] = np.nan
+        return values
+
+
+def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, single: bool = False) -> FrameSource:
+    """Open a FITS cube as a video, with ``single`` also one grey image as a video of one frame.
+
+    Frames are read one at a time, those of a ``.gz`` file are loaded as a whole. Where the highest value has to be
+    found, every frame is read once. The errors are those of
+    :func:`turbrestore.io.video.open_frames`; ConfigurationError where Astropy is not installed.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from astropy.io import fits
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     cube = np.arange(24, dtype=np.float32).reshape(4, 2, 3)
+    ...     fits.PrimaryHDU(cube).writeto(folder + "/a.fits")
+    ...     source = open_fits(folder + "/a.fits")
+    ...     source.shape, source.format, float(source.read().max()), source.warnings
+    ((4, 2, 3), 'fits/float32', 1.0, ('values 0 to 23 are scaled: 0 is black, 23 is white',))
+    """
+    path = Path(path)
+    image = find_image(path, limits)
+    frames = _as_frames(image, image.numbers(limits))
+    if single and frames.ndim == 2:
+        frames = frames[None]
+    if frames.ndim == 2:
+        raise DataError(f"{path}: a single image; name the folder that holds the frames")
+    limits.check_count(len(frames), str(path))
+    levels, notes = _levels(image, iter_frames(frames))
+
+    def pixels(chosen: Sequence[int]) -> Iterator[PixelArray]:
+        return (levels.pixels(frame, image) for frame in iter_frames(frames[number] for number in chosen))
+
+    return _source(image, levels, frames.shape, pixels, notes)
+
+
+def open_fits_folder(folder: Path, files: Sequence[Path], limits: Limits = DEFAULT_LIMITS) -> FrameSource:
+    """Open FITS files of one image each as a video; all have the size, type and scaling of the first."""
+    images = [find_image(file, limits) for file in files]
+    first = images[0]
+    for image in images:
+        if image.kind != first.kind:
+            expected, found = (f"{other.shape} {other.dtype} scaled by {other.scale}" for other in (first, image))
+            raise DataError(f"{image.path}: expected {expected} as the first image, found {found}")
+
+    def numbers(chosen: Sequence[int]) -> Iterator[NDArray[Any]]:
+        return (_as_image(images[number], images[number].numbers(limits)) for number in chosen)
+
+    def pixels(chosen: Sequence[int]) -> Iterator[PixelArray]:
+        return (levels.pixels(frame, first) for frame in numbers(chosen))
+
+    levels, notes = _levels(first, numbers(range(len(files))))
+    shape = (len(files), *next(numbers(range(1))).shape)
+    source = _source(first, levels, shape, pixels, notes)
+    return dataclasses.replace(source, name=folder.name, path=folder)
+
+
+def read_fits(path: Path, limits: Limits) -> tuple[PixelArray, tuple[str, ...]]:
+    """Read one image, grey or colour; return it in a type that its values fill, and remarks."""
+    image = find_image(path, limits)
+    numbers = _as_image(image, image.numbers(limits))
+    levels, notes = _levels(image, iter([numbers]))
+    return levels.pixels(numbers, image), notes
+
+
+def _source(
+    image: FitsImage, levels: _Levels, shape: tuple[int, ...], pixels: Any, notes: tuple[str, ...]
+) -> FrameSource:
+    dtype = levels.unsigned or image.dtype.newbyteorder("=")
+    unsigned = levels.unsigned is not None and image.blank is None
+    return FrameSource(
+        name=image.path.name,
+        format=f"fits/{dtype}",
+        file_shape=shape,
+        full_scale=full_scale_of(dtype, str(image.path)) if unsigned else 1,
+        bit_depth=min(8 * dtype.itemsize, 32) if dtype.kind in "iu" else depth_of(dtype),
+        pixels=pixels,
+        path=image.path,
+        warnings=notes,
+        levels=None if (levels.black, levels.white) == (0, 1) else (levels.black, levels.white),
+        header=image.cards[:-1],
+    )
+
+
+def _as_frames(image: FitsImage, numbers: NDArray[Any]) -> NDArray[Any]:
+    """View as (T, H, W) or (T, H, W, 3), or (H, W) for one image."""
+    shape = numbers.shape
+    if numbers.ndim < 4:
+        return numbers
+    if shape[1] == 1:
+        return numbers[:, 0]
+    if shape[1] == 3:
+        return np.moveaxis(numbers, 1, -1)
+    if shape[0] == 3:
+        return np.moveaxis(numbers, 0, -1)
+    if shape[3] != 3:
+        raise DataError(f"{image.path}: expected (T, H, W), (T, 3, H, W) or (3, T, H, W), found {shape}")
+    return numbers
+
+
+def _as_image(image: FitsImage, numbers: NDArray[Any]) -> NDArray[Any]:
+    """View as (H, W) or (H, W, 3)."""
+    shape = numbers.shape
+    if numbers.ndim == 3 and shape[0] == 3:
+        return np.moveaxis(numbers, 0, -1)
+    if numbers.ndim == 3 and shape[0] == 1:
+        return numbers[0]
+    if numbers.ndim != 2:
+        raise DataError(f"{image.path}: expected one image, (H, W) or (3, H, W), found {shape}; name a cube by itself")
+    return numbers
+
+
+def _levels(image: FitsImage, frames: Iterator[NDArray[Any]]) -> tuple[_Levels, tuple[str, ...]]:
+    """Decide what black and white are, and say what is unusual."""
+    unsigned = np.dtype(f"u{image.dtype.itemsize}")
+    middle = 0 if image.dtype.kind == "u" else 2 ** (8 * image.dtype.itemsize - 1)
+    if image.dtype.kind in "iu" and image.dtype.itemsize <= 4 and image.scale == (1, middle):
+        return _Levels(unsigned), image.notes
+    low, high = np.inf, -np.inf
+    for frame in frames:
+        values = _values(frame, image)
+        finite = np.isfinite(values)
+        low = min(low, float(values.min(initial=np.inf, where=finite)))
+        high = max(high, float(values.max(initial=-np.inf, where=finite)))
+    if high < low:
+        raise DataError(f"{image.path}: expected finite values, found none")
+    if image.dtype.kind == "f" and low >= -FLOAT_MARGIN and high <= 1 + FLOAT_MARGIN:
+        return _Levels(), image.notes
+    black = min(low, 0.0)
+    # Values that are all zero stay black.
+    white = high if high > black else black + 1
+    return _Levels(None, black, white), (
+        f"values {low:g} to {high:g} are scaled: {black:g} is black, {white:g} is white",
+        *image.notes,
+    )
+
+
+def _values(numbers: NDArray[Any], image: FitsImage) -> NDArray[Any]:
+    """Physical values; NaN where they are missing."""
+    scale, zero = image.scale
+    if image.dtype.kind == "f" and (scale, zero) == (1, 0):
+        return numbers.astype(numbers.dtype.newbyteorder("="))
+    values = numbers * np.float64(scale) + zero
+    if image.blank is not None:
+        values[numbers == image.blank] = np.nan
+    return values

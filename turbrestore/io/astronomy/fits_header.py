@@ -1,0 +1,231 @@
+"""Where the image of a FITS file lies, and what its numbers mean; headers are checked before any data are read.
+
+Astropy reads the cards of a header. The blocks of a file are followed here, one after the other, so that a header
+without an end, a size beyond the limits or a compressed file that holds far more than it seems ends in one line.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import ConfigurationError, DataError
+from ..limits import Limits, check_input, format_errors, input_errors
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
+FITS_SUFFIXES = (".fits", ".fit", ".fts")
+_BLOCK = 2880
+_PIECE = 1 << 20
+# Blocks of a header: 36 cards each.
+_MOST_BLOCKS = 1000
+# Headers of a file before its first image.
+_MOST_HEADERS = 100
+_TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
+_DAMAGED = "not a FITS file, or damaged"
+_CUT = "the file is cut short; copy it again"
+
+
+@dataclass(frozen=True, eq=False)
+class FitsImage:
+    """The first image of a FITS file.
+
+    Attributes
+    ----------
+    path : Path
+    cards : tuple of str
+        The header, 80 characters each.
+    shape : tuple of int
+        In the order of NumPy, the fastest axis last.
+    dtype : dtype
+        Of the numbers in the file.
+    offset : int
+        Of the first number, bytes.
+    scale : tuple of float
+        BSCALE and BZERO: the value of a number is BSCALE · number + BZERO.
+    blank : int or None
+        Integer that stands for a missing value.
+    notes : tuple of str
+        What is unusual.
+    """
+
+    path: Path
+    cards: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    offset: int
+    scale: tuple[float, float]
+    blank: int | None
+    notes: tuple[str, ...]
+
+    @property
+    def kind(self) -> tuple[object, ...]:
+        """What images of one folder have in common."""
+        return self.shape, self.dtype, self.scale, self.blank
+
+    def numbers(self, limits: Limits) -> NDArray[Any]:
+        """Map the numbers of the file into memory, or load them from a compressed file."""
+        with input_errors(self.path), format_errors(self.path, _DAMAGED):
+            if not _is_compressed(self.path):
+                return np.memmap(self.path, self.dtype, "r", self.offset, self.shape)
+            end = self.offset + math.prod(self.shape) * self.dtype.itemsize
+            limits.check_bytes(end, str(self.path))
+            with _opened(self.path) as file:
+                data = file.read(end)
+                # The checksum stands at the end; what other images follow is passed over.
+                for _ in range(end, limits.max_bytes, _PIECE):
+                    if not file.read(_PIECE):
+                        break
+            if len(data) < end:
+                raise DataError(f"{self.path}: expected {end} bytes, found {len(data)}; {_CUT}")
+            return np.frombuffer(data, self.dtype, offset=self.offset).reshape(self.shape)
+
+
+def is_fits(path: Path) -> bool:
+    """Whether a name is that of a FITS file: .fits, .fit or .fts, or one of them with .gz.
+
+    Examples
+    --------
+    >>> is_fits(Path("Moon.FIT")), is_fits(Path("moon.fits.gz")), is_fits(Path("moon.gz"))
+    (True, True, False)
+    """
+    name = path.name.lower().removesuffix(".gz")
+    return name.endswith(FITS_SUFFIXES)
+
+
+def astropy_fits() -> Any:
+    """Return the module ``astropy.io.fits``; raise ConfigurationError where it is not installed."""
+    try:
+        from astropy.io import fits
+    except ImportError as error:
+        raise ConfigurationError(
+            "FITS: expected astropy, which is not installed; run pip install 'turbrestore[fits]'"
+        ) from error
+    return fits
+
+
+def find_image(path: Path, limits: Limits) -> FitsImage:
+    """Find the first image of a FITS file; nothing but headers is read.
+
+    Raises
+    ------
+    ConfigurationError
+        Astropy is not installed.
+    InputNotFoundError, StorageError
+        The file does not exist, or cannot be read.
+    DataError
+        Not a FITS file, damaged, cut short, without an image, compressed by tiles, or larger than the limits.
+    """
+    fits = astropy_fits()
+    size = check_input(path).st_size
+    with input_errors(path), format_errors(path, _DAMAGED), _opened(path) as file, warnings.catch_warnings():
+        # Astropy warns of cards that break rules, and reads them.
+        warnings.simplefilter("ignore")
+        offset = 0
+        for _ in range(_MOST_HEADERS):
+            cards = _read_cards(path, file, offset)
+            if not cards:
+                break
+            header, offset = fits.Header.fromstring("".join(cards)), offset + -(-len(cards) // 36) * _BLOCK
+            length = _data_bytes(path, header)
+            if header.get("ZIMAGE", False):
+                raise DataError(f"{path}: expected an image as it is, found one in compressed tiles; unpack it first")
+            if header.get("XTENSION", "IMAGE").strip() == "IMAGE" and header["NAXIS"] >= 2 and length:
+                image = _image(path, cards, header, offset)
+                _check_size(image, limits)
+                if not _is_compressed(path) and offset + length > size:
+                    raise DataError(f"{path}: expected {offset + length} bytes, found {size}; {_CUT}")
+                return image
+            offset += -(-length // _BLOCK) * _BLOCK
+            _skip_to(path, file, offset, limits)
+    raise DataError(f"{path}: expected an image of two axes or more, found none")
+
+
+def _read_cards(path: Path, file: IO[bytes], offset: int) -> tuple[str, ...]:
+    """Read one header with its end, or nothing at the end of the file."""
+    cards: list[str] = []
+    while len(cards) < 36 * _MOST_BLOCKS:
+        block = file.read(_BLOCK)
+        if not cards and (len(block) < _BLOCK or not block.startswith((b"SIMPLE  =", b"XTENSION="))):
+            if offset:
+                # What follows the last header is no concern of ours.
+                return ()
+            raise DataError(f"{path}: not a FITS file; it does not begin with SIMPLE and a whole header")
+        if len(block) < _BLOCK:
+            raise DataError(f"{path}: damaged; its header does not end")
+        text = block.decode("ascii", "replace").replace("\ufffd", "?")
+        for start in range(0, _BLOCK, 80):
+            cards.append(text[start : start + 80])
+            if cards[-1].rstrip() == "END":
+                return tuple(cards)
+    raise DataError(f"{path}: expected a header of up to {36 * _MOST_BLOCKS} cards, found more")
+
+
+def _data_bytes(path: Path, header: Header) -> int:
+    axes = [header[f"NAXIS{place}"] for place in range(1, header["NAXIS"] + 1)]
+    counts = [header["BITPIX"], header["NAXIS"], *axes, header.get("PCOUNT", 0), header.get("GCOUNT", 1)]
+    if not all(type(count) is int for count in counts) or min(counts[1:]) < 0 or counts[0] not in _TYPES:
+        raise DataError(f"{path}: damaged; its header states no size")
+    return abs(counts[0]) // 8 * counts[-1] * (counts[-2] + math.prod(axes)) if axes else 0
+
+
+def _image(path: Path, cards: tuple[str, ...], header: Header, offset: int) -> FitsImage:
+    shape = tuple(int(header[f"NAXIS{place}"]) for place in range(header["NAXIS"], 0, -1))
+    dtype = np.dtype(_TYPES[header["BITPIX"]])
+    scale, zero, blank = float(header.get("BSCALE", 1)), float(header.get("BZERO", 0)), header.get("BLANK")
+    if not (math.isfinite(scale) and math.isfinite(zero)) or scale == 0:
+        raise DataError(f"{path}: expected finite BSCALE and BZERO, found {scale} and {zero}")
+    notes = []
+    if str(header.get("ROWORDER", "")).strip().upper() == "BOTTOM-UP":
+        notes.append("rows stand from the bottom up, and keep the order of the file")
+    pattern = str(header.get("BAYERPAT", "")).strip()
+    if pattern and 3 not in shape[:-2]:
+        notes.append(f"the Bayer pattern {pattern} is not made into colour")
+    missing = blank if dtype.kind in "iu" and isinstance(blank, int) else None
+    return FitsImage(path, cards, shape, dtype, offset, (scale, zero), missing, tuple(notes))
+
+
+def _check_size(image: FitsImage, limits: Limits) -> None:
+    """Refuse sizes beyond the limits, whichever axis counts the frames."""
+    if len(image.shape) > 4:
+        raise DataError(f"{image.path}: expected two to four axes, found {len(image.shape)}")
+    height, width = image.shape[-2:]
+    if len(image.shape) == 4 and width == 3 and 3 not in image.shape[:2]:
+        height, width = image.shape[1:3]
+    limits.check_size(width, height, str(image.path))
+    limits.check_count(max(image.shape[:-2], default=1), str(image.path))
+
+
+def _skip_to(path: Path, file: IO[bytes], offset: int, limits: Limits) -> None:
+    """Go to the next header; a compressed file is not unpacked beyond the limit for that."""
+    if _is_compressed(path):
+        limits.check_bytes(offset, str(path))
+    file.seek(offset)
+
+
+def _is_compressed(path: Path) -> bool:
+    return path.suffix.lower() == ".gz"
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
+    if not _is_compressed(path):
+        with path.open("rb") as file:
+            yield file
+        return
+    try:
+        with gzip.open(path) as unpacked:
+            yield unpacked  # type: ignore[misc]
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise DataError(f"{path}: compressed data are damaged or cut short; copy the file again") from error

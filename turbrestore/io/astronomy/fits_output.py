@@ -1,0 +1,128 @@
+"""FITS images out: the header of the input goes with them, and what was done is their history."""
+
+from __future__ import annotations
+
+import os
+import re
+import unicodedata
+import warnings
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.arrays import FloatArray, check_image
+from ..output import atomic_output, check_output, check_space
+from ..pixels import PixelArray, check_depth, from_unit_to_type
+from .fits_header import astropy_fits
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
+FITS_OUTPUT_SUFFIX = ".fits"
+# What describes the numbers and axes of the input, and not the scene.
+_STRUCTURE = re.compile(
+    r"SIMPLE|XTENSION|EXTEND|EXTNAME|EXTVER|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|GROUPS|BSCALE|BZERO|BLANK|BUNIT|DATAMIN|"
+    r"DATAMAX|CHECKSUM|DATASUM|BAYERPAT|[XY]BAYROFF|WCSAXES|(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|CNAME)[3-9]|"
+    r"(CD|PC)(\d_[3-9]|[3-9]_\d)|END"
+)
+
+
+def write_fits(
+    path: str | os.PathLike[str],
+    image: ArrayLike,
+    bit_depth: int | None = None,
+    overwrite: bool = False,
+    *,
+    header: Sequence[str] = (),
+    history: Iterable[str] = (),
+    origin: tuple[int, int] = (0, 0),
+    uncertainty: FloatArray | None = None,
+) -> None:
+    """Write an image as FITS; the same image and header give the same bytes.
+
+    Parameters
+    ----------
+    path : path-like
+        Ends in ``.fits``.
+    image : array_like, shape (H, W) or (H, W, 3)
+        Intensities; values outside [0, 1] are clipped. Colour is stored as (3, H, W).
+    bit_depth : int, optional
+        1 to 8 gives 8 bits, 9 to 16 gives 16 bits, 32 gives floating point. By default 32.
+    overwrite : bool
+        Replace an existing file.
+    header : sequence of str
+        Cards of the input, as ``FrameSource.header`` has them. Those that describe numbers, axes after the second and
+        checksums are left out.
+    history : iterable of str
+        Lines of HISTORY.
+    origin : tuple of int
+        x and y of the image in the frames of the input; CRPIX1 and CRPIX2 move by them.
+    uncertainty : ndarray, float32, shape (H, W), optional
+        Standard deviation of every pixel, stored as the extension ``UNCERT``.
+
+    Raises
+    ------
+    ConfigurationError
+        Unsupported suffix or bit depth, or Astropy is not installed.
+    DataError
+        The image has the wrong shape or is not finite.
+    OutputError, StorageError
+        The file cannot be created or completed; nothing is left behind.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from astropy.io import fits
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     card = fits.Card("OBJECT", "Moon").image
+    ...     write_fits(folder + "/a.fits", np.full((2, 3), 0.5, np.float32), 16, header=[card], history=["made here"])
+    ...     header = fits.getheader(folder + "/a.fits")
+    >>> header["OBJECT"], header["BITPIX"], str(header["HISTORY"])
+    ('Moon', 16, 'made here')
+    """
+    path = Path(path)
+    check_output(path, overwrite=overwrite, suffixes=(FITS_OUTPUT_SUFFIX,))
+    fits = astropy_fits()
+    pixels = from_unit_to_type(check_image(image, "image"), check_depth(32 if bit_depth is None else bit_depth))
+    check_space(path, pixels.nbytes + (0 if uncertainty is None else uncertainty.nbytes))
+    with warnings.catch_warnings():
+        # Cards of the input that break rules are written as they are, or repaired.
+        warnings.simplefilter("ignore")
+        images = [fits.PrimaryHDU(_planes_first(pixels), _kept(header, origin, fits))]
+        for line in history:
+            images[0].header.add_history(_ascii(line))
+        if uncertainty is not None:
+            images.append(fits.ImageHDU(uncertainty.astype(np.float32), name="UNCERT"))
+        with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+            fits.HDUList(images).writeto(file, output_verify="silentfix+ignore")
+
+
+def _kept(cards: Sequence[str], origin: tuple[int, int], fits: Any) -> Header:
+    """Cards of the input that are still true of the image."""
+    header = fits.Header()
+    for text in cards:
+        card = fits.Card.fromstring(text.encode("ascii", "replace"))
+        if _STRUCTURE.fullmatch(card.keyword) or not text.strip():
+            continue
+        try:
+            header.append(fits.Card(card.keyword, card.value, card.comment), end=True)
+        except (ValueError, fits.VerifyError):
+            # A card that cannot be read has nothing to keep.
+            continue
+    for place, name in enumerate(("CRPIX1", "CRPIX2")):
+        if isinstance(header.get(name), int | float):
+            header[name] -= origin[place]
+    return header
+
+
+def _planes_first(pixels: PixelArray) -> PixelArray:
+    return pixels if pixels.ndim == 2 else np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
+
+
+def _ascii(line: str) -> str:
+    """Letters that FITS has; Greek ones by their names would be longer, so that they become question marks."""
+    plain = unicodedata.normalize("NFKD", line).encode("ascii", "replace").decode()
+    return "".join(letter if letter.isprintable() else " " for letter in plain)

@@ -1,0 +1,117 @@
+"""Many restorations on one page: a picture, figures and, where a clip failed, the reason of each."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+from ..core.arrays import FloatArray, from_unit
+from ..display.preview import data_uri, encode_image, shrink
+from ..io.output import atomic_write
+from .page import _environment, _policy
+
+# Longest side of a picture, pixels, and its quality as WebP.
+_LONGEST, _QUALITY = 320, 90
+
+
+@dataclass(frozen=True)
+class ClipRow:
+    """What became of one clip.
+
+    Attributes
+    ----------
+    input, output : str
+        Paths as they were given.
+    state : str
+        planned, done or failed.
+    reason : str
+        Why it failed, in one line.
+    frames, width, height : int
+        Frames that were read, and size of the result.
+    blur : float
+        Width of the blur that was removed, pixels.
+    seconds : float
+        Time of all stages.
+    remarks : str
+        What was repaired, left out or unusual.
+    before, after : str
+        Pictures of a frame and of the result, as data URIs.
+    key : str
+        Stands for input and settings; a clip with another key has to be restored again.
+    """
+
+    input: str
+    output: str
+    state: str = "planned"
+    reason: str = ""
+    frames: int = 0
+    width: int = 0
+    height: int = 0
+    blur: float = 0.0
+    seconds: float = 0.0
+    remarks: str = ""
+    before: str = ""
+    after: str = ""
+    key: str = ""
+
+
+def thumbnail_uri(image: FloatArray) -> str:
+    """Make a small picture that a page can hold.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+
+    Returns
+    -------
+    str
+        Data URI.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> thumbnail_uri(np.zeros((4, 4), np.float32))[:23]
+    'data:image/webp;base64,'
+    """
+    return data_uri(encode_image(from_unit(shrink(image, _LONGEST), 8), "webp", _QUALITY), "webp")
+
+
+def render_batch(rows: Sequence[ClipRow], folder: str = "") -> str:
+    """Return the page of a batch as HTML.
+
+    Parameters
+    ----------
+    rows : sequence of ClipRow
+    folder : str
+        Name of the folder of the results, for the title.
+
+    Raises
+    ------
+    ConfigurationError
+        Jinja is not installed.
+
+    Examples
+    --------
+    >>> page = render_batch([ClipRow("<a>.mkv", "a.png", "failed", "cut short")])
+    >>> "&lt;a&gt;.mkv" in page, "cut short" in page
+    (True, True)
+    """
+    environment = _environment()
+    from markupsafe import Markup
+
+    style = files(__package__).joinpath("style.css").read_text("utf-8")
+    template = environment.from_string(files(__package__).joinpath("batch.html").read_text("utf-8"))
+    counts = {state: sum(row.state == state for row in rows) for state in ("done", "failed", "planned")}
+    links = {row.output: Path(row.output).name for row in rows}
+    return template.render(
+        rows=rows, counts=counts, links=links, folder=folder, policy=_policy(style, ""), style=Markup(style)
+    )
+
+
+def write_batch_page(path: str | os.PathLike[str], rows: Sequence[ClipRow]) -> None:
+    """Write the page of a batch beside its results, in place of an earlier one."""
+    page = render_batch(rows, Path(path).absolute().parent.name)
+    atomic_write(path, page.encode(errors="replace"), overwrite=True)
