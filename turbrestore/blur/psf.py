@@ -30,7 +30,7 @@ Spectrum = NDArray[Any]
 # Exponents of the transfer function: a Gaussian, and a long exposure through Kolmogorov turbulence (Fried 1966).
 GAUSSIAN, KOLMOGOROV = 2.0, 5 / 3
 # Exponent of wide blurs of fused frames, and the width halfway between it and that of narrow ones, pixels.
-_WIDE, _HALFWAY = 1.2, 1.4
+_WIDE, _HALFWAY = 1.2, 1.3
 
 
 def gaussian_psf(sigma: float) -> FloatArray:
@@ -138,9 +138,9 @@ def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -
 def fused_exponent(sigma: float) -> float:
     """Exponent of the transfer function of fused frames whose blur is this wide.
 
-    Short exposures, and averages of blurs of different widths, have a sharp core in a wide halo: p is 1 to 1.3.  Errors
-    of registration, interpolation and pixels add a blur of about half a pixel that is close to a Gaussian, and p is
-    larger where the whole blur is not much wider than that.  Hence ``1.2 + (5/3 − 1.2) / (1 + (σ / 1.4)⁴)``.
+    Short exposures, and averages of blurs of different widths, have a sharp core in a wide halo: p is 1 to 1.3.
+    Registration, interpolation and pixels add a blur of about half a pixel that is close to a Gaussian, so that p is
+    larger where the whole is not much wider than that: ``1.2 + (5/3 − 1.2) / (1 + (σ / 1.3)⁴)``.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def fused_exponent(sigma: float) -> float:
     Examples
     --------
     >>> [round(fused_exponent(sigma), 2) for sigma in (0.35, 1.0, 1.4, 4.0)]
-    [1.66, 1.57, 1.43, 1.21]
+    [1.66, 1.55, 1.4, 1.21]
     """
     return _WIDE + (KOLMOGOROV - _WIDE) / (1 + (sigma / _HALFWAY) ** 4)
 
