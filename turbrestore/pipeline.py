@@ -63,6 +63,7 @@ def restore(
     runtime: Runtime = DEFAULT,
     store: Store | None = None,
     progress: Progress | None = None,
+    on_decision: Callable[[Decision], None] | None = None,
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
@@ -81,6 +82,8 @@ def restore(
         taken over as they are; the image is then the same, bit for bit.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
+    on_decision : callable, optional
+        Called with every :class:`turbrestore.Decision` when it is made.
 
     Returns
     -------
@@ -114,15 +117,15 @@ def restore(
         check_space(plan.runtime.scratch / "scratch file", plan.scratch_bytes)
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
-    run = _Run(source, params, plan, tiles, store or NoStore(), progress)
-    decisions = [*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method)]
+    run = _Run(source, params, plan, tiles, store or NoStore(), progress, on_decision)
+    run.decide(*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
     with returning_freed_memory(runtime.memory_limit is not None):
-        return _restored(run, decisions)
+        return _restored(run)
 
 
 @dataclass(frozen=True)
 class _Run:
-    """What every stage needs, and the time that each has taken."""
+    """What every stage needs, what was decided, and the time that each stage has taken."""
 
     source: FrameSource
     params: RestoreParams
@@ -130,7 +133,16 @@ class _Run:
     tiles: tuple[HaloTile, ...]
     store: Store
     progress: Progress | None
+    on_decision: Callable[[Decision], None] | None
+    decisions: list[Decision] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+
+    def decide(self, *decisions: Decision) -> None:
+        """Record decisions, and tell whoever listens."""
+        self.decisions.extend(decisions)
+        if self.on_decision is not None:
+            for decision in decisions:
+                self.on_decision(decision)
 
     def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:
         """Take the result of that name from the store, or compute it; the time counts as that of the stage."""
@@ -177,16 +189,17 @@ def step_counter(progress: Progress | None, stage: str, total: int) -> Callable[
     return observe
 
 
-def _restored(run: _Run, decisions: list[Decision]) -> Restoration:
+def _restored(run: _Run) -> Restoration:
     """Fuse the frames, deblur the image and crop it."""
     params = run.params
-    fused = _fuse(run, decisions)
+    fused = _fuse(run)
     image, centroid, deblurred = fused.image, fused.centroid, None
     if params.runs("deconvolve"):
         deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused.image, centroid.image))
-        decisions += deblurred.decisions
+        run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
     crop, on_border = _crop(image, centroid.flows, params.border, deblurred)
+    run.decide(on_border)
     x, y, width, height = crop
     return Restoration(
         image=image if params.border == "keep" else image[y : y + height, x : x + width],
@@ -198,7 +211,7 @@ def _restored(run: _Run, decisions: list[Decision]) -> Restoration:
         blur=None if deblurred is None else deblurred.blur,
         deconvolution=None if deblurred is None else deblurred.deconvolution,
         guard_readings=() if deblurred is None else deblurred.readings,
-        decisions=(*decisions, on_border),
+        decisions=tuple(run.decisions),
         train=run.plan.train,
         frame_count=len(run.source) if params.runs("filter") else run.plan.train,
         seconds=run.seconds,
@@ -216,21 +229,21 @@ class _Fused:
     filtered: Filtered | None = None
 
 
-def _fuse(run: _Run, decisions: list[Decision]) -> _Fused:
+def _fuse(run: _Run) -> _Fused:
     """Run the stages up to the filter; the training frames are gone when they are done."""
     params, train, stream = run.params, run.plan.train, iter(run.source)
     begun = time.perf_counter()
     training = _read_training(stream, train, run.source.shape, run.plan.runtime)
     run.seconds["read"] = time.perf_counter() - begun
-    decisions += [explain_training(train, len(run.source), params.train), *explain_input(training)]
+    run.decide(explain_training(train, len(run.source), params.train), *explain_input(training))
 
     centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
-    decisions += [explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows)]
+    run.decide(explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows))
     if not params.runs("identify"):
         return _Fused(centroid.image, mean_of(training), centroid)
 
     dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
-    decisions += explain_dynamics(dynamics)
+    run.decide(*explain_dynamics(dynamics))
     if not params.runs("filter"):
         return _Fused(centroid.image, mean_of(training), centroid, dynamics)
 
@@ -238,7 +251,7 @@ def _fuse(run: _Run, decisions: list[Decision]) -> _Fused:
     mean = run.stage("filter", "mean", lambda: _temporal_mean(run.source))
     # The sharpness of frames that do not count is not measured.
     chosen = int(np.isfinite(filtered.sharpness).sum())
-    decisions.append(explain_frames(filtered, None if params.keep_best == 1 else chosen))
+    run.decide(explain_frames(filtered, None if params.keep_best == 1 else chosen))
     return _Fused(filtered.image, mean, centroid, dynamics, filtered)
 
 
