@@ -12,7 +12,10 @@ ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 # What `.ci/run` installs at its oldest.
-OLDEST = [Requirement(text) for text in (*PROJECT["dependencies"], *EXTRAS["torch"], *EXTRAS["report"], *EXTRAS["dev"])]
+TESTED = ("torch", "report", "app", "dev")
+OLDEST = [
+    Requirement(text) for text in (*PROJECT["dependencies"], *(text for extra in TESTED for text in EXTRAS[extra]))
+]
 ALL = [Requirement(text) for text in (*PROJECT["dependencies"], *(text for extra in EXTRAS.values() for text in extra))]
 # Style and types are checked with the newest version alone.
 CHECKERS = {"ruff", "mypy"}
