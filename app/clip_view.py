@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from nicegui import events, ui
 
 from .elements import set_most
+from .job import one_line
 from .pictures import LONGEST
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ class ClipView:
         self._page = page
         self._roi: Roi | None = None
         self._from: tuple[float, float] | None = None
-        self._wanted, self._shown = 0, -1
+        self._wanted, self._shown, self._busy = 0, -1, False
 
     def build(self) -> None:
         """Make the elements."""
@@ -41,7 +42,7 @@ class ClipView:
                     on_mouse=self._mouse, events=["mousedown", "mousemove", "mouseup"], sanitize=False
                 ).props("id=frame")
                 self._image.visible = False
-            with ui.element("div").classes("row") as self._below:
+            with ui.element("div").classes("fields") as self._below:
                 ui.label("Frame").classes("what")
                 self._scrubber = ui.slider(min=0, max=1, value=0, on_change=self._scrubbed).classes("grow")
                 self._scrubber.props('aria-label="Frame"')
@@ -116,14 +117,17 @@ class ClipView:
         """Show a frame; of those that are asked for while one is decoded, the last."""
         clip = self._page.tab.clip
         self._number.text = str(number)
-        busy = self._wanted != self._shown and self._shown >= 0
         self._wanted = number
-        if clip is None or busy:
+        if clip is None or self._busy:
             return
-        with self._page.catching():
+        self._busy = True
+        try:
             while self._shown != self._wanted:
                 number = self._wanted
                 image = await asyncio.to_thread(clip.frame, number)
-                address = await asyncio.to_thread(self._page.tab.pictures.put, image)
-                self._image.set_source(address)
+                self._image.set_source(await asyncio.to_thread(self._page.tab.pictures.put, image))
                 self._shown = number
+        except Exception as error:
+            self._page.tell(one_line(error))
+        finally:
+            self._busy = False

@@ -72,6 +72,8 @@ class Job:
     images : dict of str to ndarray
         Image of every stage that is done.
     result : Restored or None
+    seconds : float
+        What it took, once it is done.
     """
 
     def __init__(self, work: Callable[[Job], Restored]) -> None:
@@ -80,6 +82,8 @@ class Job:
         self.decisions: list[Decision] = []
         self.images: dict[str, FloatArray] = {}
         self.result: Restored | None = None
+        self.seconds = 0.0
+        self._begun = time.monotonic()
         self._stop = threading.Event()
         # The end of the program does not wait for it.
         self._thread = threading.Thread(target=self._run, args=(work,), name="restoration", daemon=True)
@@ -121,6 +125,7 @@ class Job:
             self.result = work(self)
             self.check()
             self._finish_bars()
+            self.seconds = time.monotonic() - self._begun
             self.state = "done"
         except Stopped:
             self.result, self.state = None, "stopped"

@@ -48,11 +48,11 @@ class OpenView:
     def _build_chooser(self) -> None:
         self._list = ui.element("div").classes("files").props('role=list aria-label="Clips of the folder"')
         self._enter(self._folder)
-        with ui.element("div").classes("row"):
+        with ui.element("div").classes("fields"):
             self._path = ui.input("Path of a clip", placeholder="clip.mkv").props("dense outlined").classes("grow")
             self._path.on("keydown.enter", self._open_path)
             ui.button("Open", on_click=self._open_path).props("outline no-wrap")
-        with ui.element("div").classes("row"):
+        with ui.element("div").classes("fields"):
             ui.upload(
                 label="Take a file from elsewhere: drop it here, or choose with +",
                 auto_upload=True,
@@ -74,7 +74,7 @@ class OpenView:
         )
         remarks = "".join(f'<p class="remark">{html.escape(remark)}</p>' for remark in clip.remarks)
         summary = html.escape(_summary(clip.facts))
-        more = f'<details><summary class="note">more</summary><dl class="facts">{facts}</dl></details>'
+        more = f'<details><summary class="note">All that is known</summary><dl class="facts">{facts}</dl></details>'
         self._facts.content = f'<p class="sum">{summary}</p>{remarks}{more}'
         self._choose(False)
         self._path.value = str(clip.name)

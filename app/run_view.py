@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from .page import Page
 
 _SIDES = ("x", "y", "width", "height")
-_STATES = {"running": "at work …", "done": "done", "stopped": "stopped", "failed": "failed"}
+_STATES = {"running": "at work …", "stopped": "stopped", "failed": "failed"}
 # Longer clips would take too long to be measured when they are opened.
 _MEASURED = 600
 # Sides of the graph of the quality, in units of its own.
@@ -57,24 +57,24 @@ class RunView:
                 self._roi = [ui.number(name, min=0, format="%d", on_change=self._typed) for name in _SIDES]
             for number in self._roi:
                 number.props("dense outlined clearable=false")
-            with ui.element("div").classes("row q-mt-md"):
+            with ui.element("div").classes("fields apart"):
                 ui.label("Frames").classes("what")
                 self._frames = ui.range(min=0, max=1, step=1, on_change=self._ranged).classes("grow q-mx-sm")
                 self._frames_text = ui.label("").classes("value")
-            with ui.element("div").classes("row"):
+            with ui.element("div").classes("fields"):
                 ui.label("Keep best").classes("what")
                 self._keep = ui.slider(min=5, max=100, step=5, value=100, on_change=self._kept).classes("grow q-mx-sm")
                 self._keep.props('aria-label="Share of the frames to keep, percent"')
                 self._keep_text = ui.label("100 %").classes("value")
             self._graph = ui.html("", sanitize=False)
-            with ui.element("div").classes("row q-mt-md"):
+            with ui.element("div").classes("fields apart"):
                 self._preview = ui.button("Preview", on_click=lambda: self._start(self._page.tab.preview))
                 self._preview.props("outline")
                 self._run = ui.button("Run", on_click=lambda: self._start(self._page.tab.run)).classes("grow")
                 self._run.props("unelevated")
                 self._stop = ui.button("Stop", on_click=self._page.tab.stop).props("outline")
                 self._stop.visible = False
-            self._state = ui.label("").classes("note q-mt-sm").props("role=status")
+            self._state = ui.label("").classes("note").props("role=status")
             self._stages = ui.element("div").classes("stages")
             self._decided = ui.html("", sanitize=False)
 
@@ -140,7 +140,8 @@ class RunView:
         self._show_bars(job)
         self._show_decisions(job)
         self._show_buttons(running)
-        self._state.text = _STATES[job.state]
+        self._state.text = f"done in {job.seconds:.1f} s" if job.state == "done" else _STATES[job.state]
+        self._stages.visible = job.state != "done"
         if running and len(job.images) > self._images:
             self._images = len(job.images)
             with self._page.catching():
@@ -221,6 +222,8 @@ class RunView:
             f"<dd>{html.escape(decision.reason)}</dd>"
             for decision in tuple(job.decisions)
         )
-        content = f'<dl class="decided">{"".join(lines)}</dl>'
+        shown = "" if job.state == "done" else " open"
+        head = f'<summary class="note">{len(job.decisions)} decisions</summary>'
+        content = f'<details class="decisions"{shown}>{head}<dl class="decided">{"".join(lines)}</dl></details>'
         if self._decided.content != content:
             self._decided.content = content

@@ -34,18 +34,19 @@ class SaveView:
         """Make the elements."""
         with ui.element("section") as self.place:
             ui.html('<span class="number">4</span> Save', tag="h2", sanitize=False)
-            with ui.element("div").classes("row"):
+            with ui.element("div").classes("fields"):
                 self._path = ui.input("Image, .png or .tif", on_change=self.refresh).props("dense outlined")
                 self._path.classes("grow")
-            with ui.element("div").classes("row q-mt-sm"):
+            with ui.element("div").classes("fields"):
                 self._depth = ui.select(_DEPTHS, label="Depth", value=None, on_change=self.refresh)
                 self._depth.props("dense outlined options-dense").classes("grow")
-                self._report = ui.checkbox("Report")
-                self._overwrite = ui.checkbox("Replace")
-            with ui.element("div").classes("row q-mt-sm"):
+            with ui.element("div").classes("fields"):
+                self._report = ui.checkbox("Write a report").props("dense")
+                self._overwrite = ui.checkbox("Replace existing files").props("dense")
+            with ui.element("div").classes("fields"):
                 ui.button("Save", on_click=self._save).props("unelevated").classes("grow")
                 ui.button("Copy command", on_click=self._copy).props("outline no-wrap")
-            self._note = ui.label("").classes("note q-mt-sm").props("role=status")
+            self._note = ui.label("").classes("note").props("role=status")
             self._command = ui.html("", tag="pre", sanitize=False).classes("command").props('aria-label="Command"')
 
     def opened(self) -> None:

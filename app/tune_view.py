@@ -56,18 +56,18 @@ class TuneView:
             self._sigma.on_value_change(self._changed)
             self._exponent.on_value_change(self._changed)
             self._fidelity.on_value_change(self._weighed)
-            with ui.element("div").classes("row q-mt-sm"):
+            with ui.element("div").classes("fields"):
                 self._method = ui.select(_METHODS, label="Method", value="nltv", on_change=self._changed)
                 self._method.props("dense outlined options-dense").classes("grow")
-            with ui.element("div").classes("row q-mt-sm"):
+            with ui.element("div").classes("fields"):
                 self._boundary = ui.select(_BOUNDARIES, label="Beyond it", value="unknown", on_change=self._changed)
                 self._border = ui.select(_BORDERS, label="Border", value="keep", on_change=self._border_changed)
                 for select in (self._boundary, self._border):
                     select.props("dense outlined options-dense").classes("grow")
-            with ui.element("div").classes("row q-mt-md"):
+            with ui.element("div").classes("fields apart"):
                 self._apply = ui.button("Apply to the whole", on_click=self.apply).props("unelevated").classes("grow")
                 self._reset = ui.button("As measured", on_click=self._measure).props("outline no-wrap")
-            self._note = ui.label("").classes("note q-mt-sm").props("role=status")
+            self._note = ui.label("").classes("note").props("role=status")
 
     def opened(self) -> None:
         """Leave everything to be measured in a new clip."""
@@ -105,7 +105,7 @@ class TuneView:
             self._page.tab.run(Order(order.path, order.selection, self.chosen(order.params)))
 
     def _slider(self, name: str, low: float, high: float, step: float, label: str) -> tuple[ui.slider, ui.label]:
-        with ui.element("div").classes("row"):
+        with ui.element("div").classes("fields"):
             ui.label(name).classes("what")
             slider = ui.slider(min=low, max=high, step=step, value=low).classes("grow")
             slider.props(f'aria-label="{label}"')
@@ -130,7 +130,7 @@ class TuneView:
     def _show_values(self) -> None:
         self._sigma_text.text = f"{self._sigma.value:.2f} px"
         self._exponent_text.text = f"{self._exponent.value:.2f}"
-        self._fidelity_text.text = f"{10 ** (self._fidelity.value or 0):.0f}{' auto' if self._automatic else ''}"
+        self._fidelity_text.text = f"{10 ** (self._fidelity.value or 0):.0f}{', auto' if self._automatic else ''}"
         self._apply.set_enabled(self.pending)
         self._page.save_view.refresh()
 
