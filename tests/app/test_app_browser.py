@@ -124,6 +124,7 @@ def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
     assert (pixels(page.locator("#frame")) != before).any()
 
     draw(page, 0.25, 0.25, 0.625, 0.75)
+    page.wait_for_function("document.querySelector('[aria-label=x]').value !== ''")
     sides = [int(page.get_by_label(name, exact=True).input_value()) for name in ("x", "y", "width", "height")]
     assert sides == pytest.approx([64, 48, 96, 96], abs=1)
     press(page, "Run")
@@ -136,7 +137,7 @@ def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
     begun = time.monotonic()
     push(page, "Width of the blur, pixels", "PageUp")
     page.get_by_text("nonlocal follows").wait_for()
-    assert time.monotonic() - begun < 5
+    assert time.monotonic() - begun < 10
     page.get_by_text("Apply computes the whole").wait_for()
     page.wait_for_timeout(200)
     middle = before.shape[1] // 2
