@@ -16,7 +16,7 @@ from turbrestore.settings import RestoreParams
 
 from .elements import set_most
 from .restoring import Order
-from .tuning import automatic_fidelity, impressions, part_around, tuned_params
+from .tuning import SLOW, automatic_fidelity, impressions, part_around, tuned_params
 
 if TYPE_CHECKING:
     from turbrestore.core.arrays import FloatArray
@@ -184,7 +184,7 @@ class TuneView:
         part = part_around(restored.frame.shape, x + across * width, y + down * height)
         begun = time.perf_counter()
         images = impressions(restored, params, part, lambda: number != self._wanted or self._page.tab.closed)
-        rounds = 2 if params.method == "nltv" else 1
+        rounds = 2 if params.method in SLOW else 1
         for count in range(1, rounds + 1):
             image = await asyncio.to_thread(next, images, None)
             if image is None:
@@ -195,7 +195,7 @@ class TuneView:
 
     def _words(self, image: FloatArray, seconds: float, more: bool) -> str:
         size = f"{image.shape[1]}×{image.shape[0]} pixels in {seconds:.2f} s"
-        return f"{size}, by total variation; nonlocal follows …" if more else f"{size}; Apply computes the whole"
+        return f"First impression of {size}; the end follows …" if more else f"{size}; Apply computes the whole"
 
     async def _measure(self) -> None:
         """Go back to what is measured."""

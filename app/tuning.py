@@ -1,7 +1,8 @@
 """Other settings of the deconvolution, seen at once on a part of the image.
 
-Nonlocal total variation takes seconds on the part, so total variation is shown first: with λ scaled by the ratio of
-their automatic values the two look alike.  Width, shape and λ are those of the whole image.
+Total variation takes a second on the part, and nonlocal total variation some, so a few steps of total variation are
+shown first: with λ scaled by the ratio of their automatic values the two look alike.  Width, shape and λ are those of
+the whole image.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ from .restoring import Restored
 
 # Side of the part that is shown at once, pixels.
 PART = 512
-# Iterations of total variation that make a first impression.
-_QUICK = 50
+# Iterations of total variation that make a first impression: of 512² pixels it is within .0025 of the end.
+_QUICK = 20
+# Methods that have a first impression.
+SLOW = ("nltv", "tv")
 
 Part = tuple[slice, slice]
 
@@ -101,7 +104,7 @@ def impressions(
     image, guide = _fused(restored), restored.restoration.centroid.image[part]
     lasting = params.fidelity or automatic_fidelity(restored, params)
     settings = [dataclasses.replace(params, fidelity=lasting)]
-    if params.method == "nltv":
+    if params.method in SLOW:
         quick = dataclasses.replace(params, method="tv", iterations=_QUICK)
         ratio = automatic_fidelity(restored, quick) / automatic_fidelity(restored, params)
         settings.insert(0, dataclasses.replace(quick, fidelity=lasting * ratio))

@@ -136,7 +136,7 @@ def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
     stage, before = page.locator("#stage"), pixels(page.locator("#stage"))
     begun = time.monotonic()
     push(page, "Width of the blur, pixels", "PageUp")
-    page.get_by_text("nonlocal follows").wait_for()
+    page.get_by_text("the end follows").wait_for()
     assert time.monotonic() - begun < 10
     page.get_by_text("Apply computes the whole").wait_for()
     page.wait_for_timeout(200)
