@@ -104,5 +104,10 @@ class Folders:
         )
 
 
+def printable(text: object) -> str:
+    """Return text that a browser can be sent: on most systems file names are bytes, which need not be valid text."""
+    return str(text).encode(errors="replace").decode()
+
+
 def _by_name(entry: Entry) -> str:
     return entry.name.lower()

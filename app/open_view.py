@@ -11,7 +11,7 @@ from nicegui import events, ui
 from turbrestore.io.limits import DEFAULT_LIMITS
 from turbrestore.io.video import VIDEO_SUFFIXES
 
-from .folders import Entry
+from .folders import Entry, printable
 
 if TYPE_CHECKING:
     from .page import Page
@@ -77,7 +77,7 @@ class OpenView:
         more = f'<details><summary class="note">All that is known</summary><dl class="facts">{facts}</dl></details>'
         self._facts.content = f'<p class="sum">{summary}</p>{remarks}{more}'
         self._choose(False)
-        self._path.value = str(clip.name)
+        self._path.value = printable(clip.name)
 
     def _enter(self, folder: Path) -> None:
         with self._page.catching():
@@ -97,7 +97,7 @@ class OpenView:
             else:
                 await self._page.open(entry.path)
 
-        button = ui.button(entry.name, on_click=chosen).props("flat dense no-caps align=left color=inherit")
+        button = ui.button(printable(entry.name), on_click=chosen).props("flat dense no-caps align=left color=inherit")
         if entry.is_folder:
             button.classes("folder")
 

@@ -15,6 +15,7 @@ from turbrestore.report.comparison import text_file
 
 from .clip_view import ClipView
 from .compare_view import CompareView
+from .folders import printable
 from .job import one_line
 from .open_view import OpenView
 from .run_view import RunView
@@ -64,12 +65,12 @@ class Page:
     async def open(self, path: Path) -> None:
         """Open a clip that is allowed, and show it."""
         with self.catching():
-            self._busy.text = f"looking through {path.name} …"
+            self._busy.text = printable(f"looking through {path.name} …")
             try:
                 clip = await asyncio.to_thread(self.tab.open, path)
             finally:
                 self._busy.text = ""
-            self._name.text = str(clip.name)
+            self._name.text = printable(clip.name)
             self.open_view.opened()
             self.save_view.opened()
             self.tune_view.opened()
@@ -98,7 +99,7 @@ class Page:
 
     def tell(self, message: str) -> None:
         """Show one line above all, or none."""
-        self._error.text = message
+        self._error.text = printable(message)
         self._error.visible = bool(message)
 
     async def ended(self) -> None:

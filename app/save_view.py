@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
+from .folders import printable
 from .restoring import Order
 from .saving import Outputs, check_outputs, command_line, save
 
@@ -53,7 +54,7 @@ class SaveView:
         """Suggest a name for the image of a new clip."""
         clip = self._page.tab.clip
         assert clip is not None
-        self._path.value = f"{clip.name.stem}.restored.png"
+        self._path.value = printable(f"{clip.name.stem}.restored.png")
         self._note.text = ""
 
     def refresh(self) -> None:
@@ -75,7 +76,7 @@ class SaveView:
     def _words(self, order: Order) -> str:
         clip = self._page.tab.clip
         assert clip is not None
-        return command_line(order, self._depth.value, clip.name, Path(self._path.value or "image.png"))
+        return printable(command_line(order, self._depth.value, clip.name, Path(self._path.value or "image.png")))
 
     async def _copy(self) -> None:
         order = self._order()
