@@ -6,6 +6,7 @@ import asyncio
 import json
 from typing import TYPE_CHECKING
 
+import numpy as np
 from nicegui import ui
 
 from turbrestore.core.arrays import FloatArray
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from .page import Page
     from .restoring import Restored
 
+# Quantiles of the intensity that are black and white where the contrast is stretched.
+_ENDS = (0.005, 0.995)
 _TITLES = {
     "frame": "Frame",
     "mean": "Mean",
@@ -40,17 +43,22 @@ class CompareView:
     def __init__(self, page: Page) -> None:
         self._page = page
         self.filled = False
-        self._result: FloatArray | None = None
+        self._shown: Restored | None = None
 
     def build(self) -> None:
         """Make the elements."""
         with ui.element("div") as self.place:
             ui.html('<div id="compare"></div>', sanitize=False)
+            self._stretch = ui.checkbox("Stretch the contrast, on this page alone", on_change=self._display).props(
+                "dense"
+            )
+            self._stretch.visible = False
             self._note = ui.label("").classes("note")
 
     def clear(self) -> None:
         """Forget the images."""
-        self.filled, self._result = False, None
+        self.filled, self._shown = False, None
+        self._stretch.visible = False
         ui.run_javascript('document.getElementById("compare").replaceChildren()')
 
     async def show(self, images: dict[str, FloatArray], note: str) -> None:
@@ -59,7 +67,7 @@ class CompareView:
         markup = comparison(Gallery(tuple(pictures), "8 bits, lossless"))
         ui.run_javascript(f"turbrestore.compare({json.dumps(markup)})")
         self._note.text = note
-        self.filled = True
+        self.filled, self._shown = True, None
         self._page.look_at("compare")
 
     async def show_result(self, restored: Restored) -> None:
@@ -67,13 +75,17 @@ class CompareView:
         found = restored.restoration
         height, width = found.image.shape[:2]
         whole = restored is self._page.tab.restored
-        self._result = found.image if whole else None
         what = f"{width}×{height} pixels from {found.frame_count} frames in {sum(found.seconds.values()):.1f} s"
         note = what if whole else f"Preview of a part: {what}"
         await self.show(stages(found, restored.frame), note)
+        self._shown = restored
+        self._stretch.visible = True
+        self._display()
 
     async def show_part(self, restored: Restored, part: tuple[slice, slice], image: FloatArray, note: str) -> None:
         """Put a part that was deblurred anew into the result that is shown."""
+        if self._shown is not restored:
+            await self.show_result(restored)
         x, y, width, height = restored.restoration.crop
         result = restored.restoration.image.copy()
         rows, columns = _within(part[0], y, height), _within(part[1], x, width)
@@ -93,6 +105,16 @@ class CompareView:
         except TimeoutError:
             return 0.5, 0.5
         return float(x), float(y)
+
+    def _display(self) -> None:
+        """Stretch the contrast of what is shown, or not."""
+        style = "none"
+        if self._stretch.value and self._shown is not None:
+            low, high = (float(value) for value in np.quantile(self._shown.restoration.image, _ENDS))
+            slope = 1 / max(high - low, 1 / 255)
+            contrast = 1 + 2 * low * slope
+            style = f"brightness({slope / contrast:.4f}) contrast({contrast:.4f})"
+        ui.run_javascript(f'document.getElementById("compare").style.setProperty("--display", "{style}")')
 
     def _picture(self, key: str, image: FloatArray) -> Picture:
         height, width = shrink(image, LONGEST).shape[:2]

@@ -22,6 +22,7 @@ from .restoring import Order
 if TYPE_CHECKING:
     import numpy as np
 
+    from turbrestore.deconvolution.deconvolve import DeconvolutionParams
     from turbrestore.io.source import Roi
 
     from .page import Page
@@ -74,6 +75,7 @@ class RunView:
                 self._run.props("unelevated")
                 self._stop = ui.button("Stop", on_click=self._page.tab.stop).props("outline")
                 self._stop.visible = False
+            self._method = ui.label("").classes("note")
             self._state = ui.label("").classes("note").props("role=status")
             self._stages = ui.element("div").classes("stages")
             self._decided = ui.html("", sanitize=False)
@@ -93,6 +95,11 @@ class RunView:
         if len(clip.source) <= _MEASURED:
             self._quality = await asyncio.to_thread(clip.quality)
         self._draw_quality()
+
+    def show_method(self, params: DeconvolutionParams | None) -> None:
+        """Say that the next run removes the blur that was chosen, where one was."""
+        self._method.text = "" if params is None else f"Removes {params.sigma:.2f} pixels of blur, as chosen in Tune."
+        self._method.visible = params is not None
 
     def set_region(self, roi: Roi | None) -> None:
         """Take over a region that was drawn."""

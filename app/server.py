@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 HOST = "127.0.0.1"
 # Seconds that open connections have at the end.
 _FAREWELL = 1
-# Seconds after which a tab that does not answer counts as closed.
-_ABSENCE = 3.0
+# Seconds after which a tab that has left is forgotten, and after which one that does not answer is called again: the
+# server answers late while all cores work.
+_ABSENCE, _SILENCE = 3.0, 20.0
 
 
 def serve(
@@ -111,7 +112,7 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
         data = next((tab.pictures.get(name) for tab in tuple(tabs) if secrets.compare_digest(tab.key, key)), None)
         if data is None:
             return Response(status_code=404)
-        return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=3600"})
+        return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})
 
     def stop_all() -> None:
         for tab in tabs:
@@ -120,7 +121,15 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
 
     app.on_shutdown(stop_all)
     web = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-    ui.run_with(web, mount_path=f"/{token}", title="turbrestore", dark=None, tailwind=False, show_welcome_message=False)
+    ui.run_with(
+        web,
+        mount_path=f"/{token}",
+        title="turbrestore",
+        dark=None,
+        tailwind=False,
+        show_welcome_message=False,
+        reconnect_timeout=_SILENCE,
+    )
     # Beside the file, a form has its own words.
     guard = Guard(web, token, port, DEFAULT_LIMITS.max_bytes + 4096)
     config = uvicorn.Config(guard, log_level="critical", access_log=False, timeout_graceful_shutdown=_FAREWELL)

@@ -73,6 +73,7 @@ class TuneView:
         """Leave everything to be measured in a new clip."""
         self._params, self._automatic = None, True
         self._border.value = "keep"
+        self._page.run_view.show_method(None)
 
     async def restored(self) -> None:
         """Show the settings of a run that has ended."""
@@ -133,6 +134,7 @@ class TuneView:
         self._fidelity_text.text = f"{10 ** (self._fidelity.value or 0):.0f}{', auto' if self._automatic else ''}"
         self._apply.set_enabled(self.pending)
         self._page.save_view.refresh()
+        self._page.run_view.show_method(self._params)
 
     def _border_changed(self) -> None:
         if self._page.tab.restored is not None:
@@ -175,7 +177,7 @@ class TuneView:
 
     async def _show_part(self, params: DeconvolutionParams, number: int) -> None:
         restored = self._page.tab.restored
-        if restored is None:
+        if restored is None or self._page.tab.busy:
             return
         if self._automatic:
             await self._show(params)

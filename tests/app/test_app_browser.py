@@ -129,10 +129,10 @@ def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
     page.wait_for_timeout(100)
     assert (pixels(page.locator("#frame")) != before).any()
 
-    draw(page, 0.25, 0.25, 0.625, 0.75)
+    draw(page, 0.25, 0.25, 0.5625, 0.6875)
     page.wait_for_function("document.querySelector('[aria-label=x]').value !== ''")
     sides = [int(page.get_by_label(name, exact=True).input_value()) for name in ("x", "y", "width", "height")]
-    assert sides == pytest.approx([64, 48, 96, 96], abs=1)
+    assert sides == pytest.approx([64, 48, 80, 84], abs=1)
     press(page, "Run")
     page.get_by_text(f"{sides[2]}×{sides[3]} pixels from 48 frames").wait_for(timeout=LONG)
     assert page.locator("#right option").all_inner_texts() == ["Frame", "Mean", "Centroid", "Filtered", "Result"]

@@ -1,6 +1,7 @@
 """What the app is made of, without a browser."""
 
 import asyncio
+import doctest
 import shlex
 import threading
 from dataclasses import replace
@@ -15,6 +16,7 @@ from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.io.video import write_video
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.settings import RestoreParams
+from turbrestore_app import folders, job, restoring, stage_memory, tuning
 from turbrestore_app.clip import open_clip
 from turbrestore_app.folders import Folders
 from turbrestore_app.guard import Guard
@@ -251,6 +253,11 @@ def test_a_clip_has_the_numbers_of_its_file(tmp_path):
     assert clip.remarks == ("1 duplicated: frame 3 left out",)
     assert clip.quality().shape == (6,)
     assert np.abs(clip.frame(5) - frames[5]).max() < 1 / 255
+
+
+@pytest.mark.parametrize("module", [folders, job, restoring, stage_memory, tuning])
+def test_examples(module):
+    assert doctest.testmod(module).failed == 0
 
 
 def test_only_the_newest_pictures_are_kept():
