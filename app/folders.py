@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from turbrestore.core.errors import ConfigurationError
+from turbrestore.io.images import IMAGE_SUFFIXES
 from turbrestore.io.limits import input_errors
 from turbrestore.io.video import VIDEO_SUFFIXES
 
@@ -86,6 +87,12 @@ class Folders:
         clips = [entry for entry in clips if entry.path.is_file()]
         above = [Entry("..", folder.parent, True)] if self._holds(folder.parent) else []
         return [*above, *sorted(below, key=_by_name), *sorted(clips, key=_by_name)]
+
+    def holds_images(self, folder: Path) -> bool:
+        """Tell whether a folder holds two images or more, which can be the frames of a clip."""
+        folder = self.locate(str(folder))
+        with input_errors(folder):
+            return sum(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir()) > 1
 
     def _real(self, name: str) -> Path:
         if not name.strip() or "\0" in name:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -85,6 +86,11 @@ class OpenView:
             self._folder = folder
             self._list.clear()
             with self._list:
+                if self._folders.holds_images(folder):
+                    images = ui.button(
+                        "the images of this folder, as frames", on_click=partial(self._page.open, folder)
+                    )
+                    images.props("flat dense no-caps align=left color=inherit")
                 for entry in entries:
                     self._line(entry)
                 if not entries:
@@ -104,7 +110,7 @@ class OpenView:
     async def _open_path(self) -> None:
         with self._page.catching():
             path = self._folders.locate(self._path.value or "")
-            if path.is_dir() and any(entry.path.is_file() for entry in self._folders.listing(path)):
+            if path.is_dir() and not self._folders.holds_images(path):
                 self._enter(path)
                 return
             await self._page.open(path)

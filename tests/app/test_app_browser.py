@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
+from conftest import make_sequence
+from turbrestore.io.images import write_image
 from turbrestore_cli.__main__ import main
 
 EVIL = "<img src=x onerror=document.title='taken'>.mkv"
@@ -55,6 +57,9 @@ def app(tmp_path_factory):
     folder, temporary = tmp_path_factory.mktemp("start"), tmp_path_factory.mktemp("temporary")
     shutil.copy(SAMPLE, folder)
     (folder / EVIL).write_bytes(SAMPLE.read_bytes()[:3000])
+    (folder / "images").mkdir()
+    for number, frame in enumerate(make_sequence(seed=3, count=4, size=64).frames):
+        write_image(folder / "images" / f"{number}.png", frame, 8)
     # Not every file system takes a name that is no text.
     with contextlib.suppress(OSError):
         (folder / os.fsdecode(b"broken\xff.mkv")).touch()
@@ -66,7 +71,7 @@ def app(tmp_path_factory):
     # A bug would have left its traceback.
     assert (app.process.returncode, complaints) == (130, "turbrestore: interrupted\n")
     assert list(temporary.iterdir()) == []
-    made = {path.name for path in folder.iterdir() if path.suffix != ".mkv"}
+    made = {path.name for path in folder.iterdir() if path.is_file() and path.suffix != ".mkv"}
     assert made <= {f"{name}.png{suffix}" for name in ("saved", "again") for suffix in ("", ".toml")}
 
 
@@ -193,6 +198,16 @@ def test_what_cannot_be_opened_is_said_in_one_line(open_tab, tmp_path):
         page.get_by_label("Path of a clip").fill(name)
         press(page, "Open")
         alert.get_by_text(re.compile(re.escape(name) + ": lies outside the folder")).wait_for()
+    # No block of it is written or read.
+    with (tmp_path / "large.mkv").open("wb") as file:
+        file.truncate(8 * 2**30)
+    page.locator("input[type=file]").set_input_files(tmp_path / "large.mkv")
+    alert.get_by_text("upload: expected one clip of up to 2147483648 bytes").wait_for()
+    (tmp_path / "large.mkv").unlink()
+    page.get_by_label("Path of a clip").fill("images")
+    press(page, "Open")
+    page.locator(".name").get_by_text("images").wait_for()
+    press(page, "Another clip")
     page.get_by_label("Path of a clip").fill("chart.mkv")
     press(page, "Open")
     page.get_by_role("button", name="Another clip").wait_for()
