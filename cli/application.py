@@ -30,6 +30,7 @@ COMMANDS = {
     "synthesize": ("synthesis:synthesize", "Make a turbulent video with known truth and flow."),
     "info": ("inspection:info", "Say what a video is."),
     "evaluate": ("inspection:evaluate", "Compare a result with the truth."),
+    "app": ("app:app", "Choose, restore and tune a clip in the browser, on this machine alone."),
     "config": ("config:config", "Write a settings file with every setting explained, or check one."),
     "doctor": ("doctor:doctor", "Check what this installation can do."),
     "moments wavefront": ("moments:wavefront", "A wavefront sensor that is exposed all the time."),
@@ -95,7 +96,7 @@ def run(words: list[str]) -> int:
         # The reader has seen enough; a second complaint at exit would be about the same.
         silence(sys.stdout)
     except (CycloptsError, TurbrestoreError, KeyboardInterrupt, OSError, MemoryError) as error:
-        message, code = _explain(error)
+        message, code = explain(error)
         tell(f"turbrestore: {' '.join(message.split())}")
         return code
     return 0
@@ -108,7 +109,7 @@ def _refuse_empty(words: list[str]) -> None:
             raise ConfigurationError(f"{word.rstrip('=') or 'command line'}: expected a value, found an empty word")
 
 
-def _explain(error: BaseException) -> tuple[str, int]:
+def explain(error: BaseException) -> tuple[str, int]:
     """One line and an exit code for a failure that is no bug."""
     if isinstance(error, TurbrestoreError):
         return str(error), error.exit_code

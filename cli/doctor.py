@@ -36,7 +36,14 @@ REQUIRED = {
     "numba": "numba",
     "threadpoolctl": "threadpoolctl",
 }
-EXTRAS = {"torch": "torch", "matplotlib": "report", "jinja2": "report", "astropy": "fits", "distributed": "distributed"}
+EXTRAS = {
+    "torch": "torch",
+    "matplotlib": "report",
+    "jinja2": "report",
+    "astropy": "fits",
+    "distributed": "distributed",
+    "nicegui": "app",
+}
 READ = ("h264", "ffv1", "hevc", "vp9", "mjpeg", "gif")
 WRITTEN = ("ffv1", "libx264")
 OLDEST_PYTHON = (3, 11)

@@ -2,6 +2,7 @@
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "info": ("turbrestore info sample_data/chart.mkv", "turbrestore info sample_data/chart.mkv --json"),
+    "app": ("turbrestore app sample_data/chart.mkv", "turbrestore app --allow results --port 8123 --no-browser"),
     "config": ("turbrestore config --init run.toml", "turbrestore config --check run.toml"),
     "restore": (
         "turbrestore restore sample_data/chart.mkv sharp.png",

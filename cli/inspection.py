@@ -12,9 +12,10 @@ from cyclopts import Parameter
 
 from turbrestore.core.arrays import FloatArray, check_flow
 from turbrestore.core.errors import DataError, require
-from turbrestore.footage.content import clean_source
+from turbrestore.footage.content import ContentReport, clean_source
 from turbrestore.io.images import read_image
 from turbrestore.io.limits import DEFAULT_LIMITS, check_input, input_errors
+from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import appearance, compare, compare_flows
 from turbrestore.runs.stage_files import load_flows
@@ -47,10 +48,13 @@ def info(
         Print JSON.
     """
     source, content = open_checked(input, selection)
-    source = clean_source(source, content)
+    _report({"input": str(input), **describe_clip(clean_source(source, content), content)}, json)
+
+
+def describe_clip(source: FrameSource, content: ContentReport) -> dict[str, object]:
+    """Facts of a clip that was looked through and cleaned, for a person or a script."""
     count, height, width = source.shape[:3]
-    record = {
-        "input": str(input),
+    return {
         "format": source.format,
         "frames": len(content.numbers),
         "usable_frames": count,
@@ -68,7 +72,6 @@ def info(
         "saturated": round(content.saturated, 4),
         "warnings": list(source.warnings),
     }
-    _report(record, json)
 
 
 def evaluate(

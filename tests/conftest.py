@@ -1,5 +1,6 @@
 """Small synthetic sequences with known motion, shared by several tests."""
 
+import shutil
 import signal
 from dataclasses import dataclass
 
@@ -10,6 +11,21 @@ import skimage.data
 
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        # A browser is no Python package: the extra `dev` cannot bring it.
+        pytest.skip("no Chromium on the path; install chromium to test pages in a browser")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
 
 
 @dataclass(frozen=True)

@@ -59,11 +59,39 @@ def test_rooms_and_modules_stay_small():
     assert max(len(path.read_text().splitlines()) for path in MODULES) <= 400
 
 
+APP = PACKAGE.parent / "app"
+
+
+def test_modules_of_the_app_stay_small_and_nicegui_stays_in_its_views():
+    using = set()
+    for path in APP.glob("*.py"):
+        text = path.read_text()
+        assert len(text.splitlines()) <= 400
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                assert node.end_lineno - node.body[0].lineno < 50, f"{path.name}: {node.name}"
+        if any(top and name.split(".")[0] == "nicegui" for top, name in imports(path)):
+            using.add(path.stem)
+    assert using == {"page", "elements", *(path.stem for path in APP.glob("*_view.py"))}
+
+
 def test_every_module_is_placed():
     assert {layer(path) for path in MODULES} == set(ORDER)
 
 
-LIBRARIES = {"torch", "kornia", "numba", "matplotlib", "cv2", "scipy", "astropy", "dask", "distributed"}
+LIBRARIES = {
+    "torch",
+    "kornia",
+    "numba",
+    "matplotlib",
+    "cv2",
+    "scipy",
+    "astropy",
+    "dask",
+    "distributed",
+    "nicegui",
+    "uvicorn",
+}
 
 
 @pytest.mark.parametrize(
@@ -72,6 +100,7 @@ LIBRARIES = {"torch", "kornia", "numba", "matplotlib", "cv2", "scipy", "astropy"
         ("import turbrestore", LIBRARIES | {"numpy"}),
         ("import turbrestore_cli.__main__ as m; m.main(['--help'])", LIBRARIES),
         ("import turbrestore_cli.__main__ as m; m.main(['restore', '--help'])", LIBRARIES - {"cv2", "scipy"}),
+        ("import turbrestore_cli.__main__ as m; m.main(['app', '--help'])", LIBRARIES),
     ],
 )
 def test_nothing_heavy_is_loaded(action, absent):

@@ -207,3 +207,10 @@ def test_every_stage_says_what_it_decided(blurred):
 def test_settings_that_make_no_sense_are_refused(settings, message):
     with pytest.raises(ConfigurationError, match=message):
         RestoreParams(**settings)
+
+
+def test_decisions_are_told_in_the_order_in_which_they_are_recorded(blurred):
+    told = []
+    restoration = restore(blurred.frames[:6], replace(QUICK, until="filter"), on_decision=told.append)
+    assert tuple(told) == restoration.decisions
+    assert told

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 # What `.ci/run` installs at its oldest.
-INSTALLED = ("torch", "report", "fits", "distributed", "dev")
+INSTALLED = ("torch", "report", "fits", "distributed", "app", "dev")
 OLDEST = [
     Requirement(text) for text in (*PROJECT["dependencies"], *(text for name in INSTALLED for text in EXTRAS[name]))
 ]

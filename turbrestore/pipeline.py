@@ -64,6 +64,7 @@ def restore(
     runtime: Runtime = DEFAULT,
     store: Store | None = None,
     progress: Progress | None = None,
+    on_decision: Callable[[Decision], None] | None = None,
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
@@ -82,6 +83,8 @@ def restore(
         the restored image is then the same, bit for bit.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
+    on_decision : callable, optional
+        Called with every :class:`turbrestore.Decision` when it is made.
 
     Returns
     -------
@@ -118,26 +121,36 @@ def restore(
     begun = time.perf_counter()
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, plan.train)
-    run = _Run(source, _stretched_params(params, levels), plan, tiles, store or NoStore(), progress, levels)
+    stretched, kept = _stretched_params(params, levels), store or NoStore()
+    run = _Run(source, stretched, plan, tiles, kept, levels, progress, on_decision)
     run.seconds["read"] = time.perf_counter() - begun
-    on_device = explain_device(runtime.device, plan.runtime.device, params.flow.method)
-    on_machine = *plan.decisions, *on_device, *on_light, *on_range
+    run.decide(*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
+    run.decide(*on_light, *on_range)
     with returning_freed_memory(runtime.memory_limit is not None):
-        return _restored(run, on_machine)
+        return _restored(run)
 
 
 @dataclass(frozen=True)
 class _Run:
-    """Arguments that every stage shares, and the wall time of the stages that have run."""
+    """Arguments that every stage shares, what was decided, and the wall time of the stages that have run."""
 
     source: FrameSource
     params: RestoreParams
     plan: MemoryPlan
     tiles: tuple[HaloTile, ...]
     store: Store
-    progress: Progress | None
     levels: Levels
+    progress: Progress | None
+    on_decision: Callable[[Decision], None] | None
+    decisions: list[Decision] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+
+    def decide(self, *decisions: Decision) -> None:
+        """Record decisions, and tell whoever listens."""
+        self.decisions.extend(decisions)
+        if self.on_decision is not None:
+            for decision in decisions:
+                self.on_decision(decision)
 
     def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:
         """Return a result from the store, or compute it, and add the time that this takes to that of the stage.
@@ -154,16 +167,17 @@ class _Run:
         return step_counter(self.progress, stage, total)
 
 
-def _restored(run: _Run, on_machine: tuple[Decision, ...]) -> Restoration:
+def _restored(run: _Run) -> Restoration:
     """Fuse the frames, deblur the image and crop it."""
     params = run.params
     fused = _fuse(run)
     image, centroid, deblurred = fused.image, fused.centroid, None
     if params.runs("deconvolve"):
         deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused))
+        run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
-    on_blur = () if deblurred is None else deblurred.decisions
     crop, on_border = _crop(image, centroid.flows, params.border, deblurred)
+    run.decide(on_border)
     x, y, width, height = crop
     return Restoration(
         image=image if params.border == "keep" else image[y : y + height, x : x + width],
@@ -175,7 +189,7 @@ def _restored(run: _Run, on_machine: tuple[Decision, ...]) -> Restoration:
         blur=None if deblurred is None else deblurred.blur,
         deconvolution=None if deblurred is None else deblurred.deconvolution,
         guard_readings=() if deblurred is None else deblurred.readings,
-        decisions=(*on_machine, *fused.decisions, *on_blur, on_border),
+        decisions=tuple(run.decisions),
         train=run.plan.train,
         frame_count=len(run.source) if params.runs("filter") else run.plan.train,
         seconds=run.seconds,
@@ -189,7 +203,6 @@ class _Fused:
     image: FloatArray
     mean: FloatArray
     centroid: Centroid
-    decisions: tuple[Decision, ...]
     dynamics: FlowDynamics | None = None
     filtered: Filtered | None = None
 
@@ -200,26 +213,27 @@ def _fuse(run: _Run) -> _Fused:
     begun, levels = time.perf_counter(), run.levels
     training = fill_stack((train, *run.source.shape[1:]), stream, run.plan.runtime.scratch)
     run.seconds["read"] += time.perf_counter() - begun
-    on_frames = explain_training(train, len(run.source), params.train), *explain_input(training)
+    run.decide(explain_training(train, len(run.source), params.train), *explain_input(training))
 
     centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
-    on_flows = explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows)
+    run.decide(explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows))
     if not params.runs("identify"):
-        return _Fused(centroid.image, levels.original(mean_of(training)), centroid, (*on_frames, *on_flows))
+        return _Fused(centroid.image, levels.original(mean_of(training)), centroid)
 
     dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
-    decisions = *on_frames, *on_flows, *explain_dynamics(dynamics)
+    run.decide(*explain_dynamics(dynamics))
     if not params.runs("filter"):
-        return _Fused(centroid.image, levels.original(mean_of(training)), centroid, decisions, dynamics)
+        return _Fused(centroid.image, levels.original(mean_of(training)), centroid, dynamics)
 
     start = levels.stretched_result(centroid)
     filtered = run.stage("filter", "filtered", lambda: _filter(run, start, dynamics, training, stream).recentred())
     mean = run.stage("filter", "mean", lambda: levels.original(_temporal_mean(run.source)))
     # The sharpness is NaN for frames that do not count.
     chosen = int(np.isfinite(filtered.sharpness).sum())
-    on_weights = explain_frames(filtered, None if params.keep_best == 1 else chosen)
-    decisions = *decisions, on_weights, explain_geometry(filtered, dynamics)
-    return _Fused(filtered.image, mean, centroid, decisions, dynamics, filtered)
+    run.decide(
+        explain_frames(filtered, None if params.keep_best == 1 else chosen), explain_geometry(filtered, dynamics)
+    )
+    return _Fused(filtered.image, mean, centroid, dynamics, filtered)
 
 
 def _find_centroid(run: _Run, training: FloatArray) -> Centroid:

@@ -1,13 +1,11 @@
 """The report in a browser: it shows what it should, reacts, keeps to itself."""
 
 import dataclasses
-import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import sync_playwright
 
 from conftest import make_sequence
 from turbrestore.core.decision import Decision
@@ -18,20 +16,8 @@ from turbrestore.registration.centroid import CentroidParams
 from turbrestore.report import write_report
 from turbrestore.runs.run_record import describe_run
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 EVIL = "<script>document.title='taken'</script><img src=x onerror=document.title='taken'>.mkv"
 WIDE, NARROW = {"width": 1000, "height": 700}, {"width": 360, "height": 640}
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        # A browser is no Python package: the extra `dev` cannot bring it.
-        pytest.skip("no Chromium on the path; install chromium to test the report in a browser")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

@@ -152,7 +152,7 @@ def _frames_last(array: NDArray[Any]) -> bool:
     """Whether what is still in an array lies along its first two axes, and its last is the slowest to change."""
     places = [np.unique(np.linspace(0, length - 1, _SAMPLES).astype(int)) for length in array.shape]
     # Whole planes of the last axis would read the whole file.
-    spread = np.float64(array[places[0]][:, places[1]][:, :, places[2]])
+    spread = np.asarray(array[places[0]][:, places[1]][:, :, places[2]], np.float64)
     middle = np.float64(array[tuple(slice(max(0, n // 2 - 16), n // 2 + 16) for n in array.shape)])
     if not np.isfinite(spread).all() or not np.isfinite(middle).all():
         return False

@@ -11,7 +11,7 @@ from pathlib import Path
 from ..core.arrays import FloatArray, from_unit
 from ..display.preview import data_uri, encode_image, shrink
 from ..io.output import atomic_write
-from .page import _environment, _policy
+from .page import environment, _policy
 
 # Longest side of a picture, pixels, and its quality as WebP.
 _LONGEST, _QUALITY = 320, 90
@@ -99,7 +99,7 @@ def render_batch(rows: Sequence[ClipRow], folder: str = "") -> str:
     >>> "&lt;a&gt;.mkv" in page, "cut short" in page
     (True, True)
     """
-    environment = _environment()
+    environment = environment()
     from markupsafe import Markup
 
     style = files(__package__).joinpath("style.css").read_text("utf-8")

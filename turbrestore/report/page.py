@@ -11,20 +11,15 @@ import hashlib
 import os
 import shlex
 from collections.abc import Iterable
-from importlib.resources import files
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
 
-from ..core.errors import ConfigurationError
 from ..io.output import atomic_write, check_output
 from ..results import Restoration
 from ..runs.run_record import RunRecord
+from .comparison import comparison, environment, missing, text_file
 from .facts import findings, headline, laps, remarks, settings
 from .panels import draw_panels
 from .pictures import encode_gallery, stages
-
-if TYPE_CHECKING:
-    import jinja2
 
 _SUFFIXES = (".html", ".htm")
 _PACKAGES = ("matplotlib", "jinja2")
@@ -62,7 +57,7 @@ def check_report(
     # The packages are only looked for here; loading them takes memory that the restoration needs.
     for package in _PACKAGES:
         if find_spec(package) is None:
-            raise _missing(package)
+            raise missing(package)
 
 
 def write_report(
@@ -134,11 +129,10 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
     >>> "<b>" in page, "&lt;b&gt;.mkv" in page
     (False, True)
     """
-    environment = _environment()
     from markupsafe import Markup
 
-    style, script = (files(__package__).joinpath(name).read_text("utf-8") for name in ("style.css", "script.js"))
-    template = environment.from_string(files(__package__).joinpath("template.html").read_text("utf-8"))
+    template = environment().from_string(text_file("template.html"))
+    style, script = text_file("compare.css") + text_file("style.css"), text_file("compare.js")
     gallery = encode_gallery(stages(restoration, run.frame), run.frame_number)
     panels = [(Markup(panel.svg), panel.caption) for panel in draw_panels(restoration, run)]
     return template.render(
@@ -147,7 +141,7 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
         policy=_policy(style, script),
         style=Markup(style),
         script=Markup(script),
-        gallery=gallery,
+        comparison=Markup(comparison(gallery)),
         panels=panels,
         headline=headline(restoration),
         findings=findings(restoration),
@@ -155,20 +149,6 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
         settings=settings(run),
         laps=laps(restoration),
         command=shlex.join(run.command),
-    )
-
-
-def _environment() -> jinja2.Environment:
-    try:
-        import jinja2
-    except ImportError as error:
-        raise _missing("jinja2") from error
-    return jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-
-
-def _missing(package: str) -> ConfigurationError:
-    return ConfigurationError(
-        f"report: expected {package}, which is not installed; run pip install 'turbrestore[report]'"
     )
 
 

@@ -1,0 +1,1 @@
+"""The app in the browser: a local page on which a clip is chosen, restored, tuned and saved."""

@@ -1,0 +1,89 @@
+"""A clip that was opened: what it is, what is unusual about it, and its frames to look at."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from turbrestore.core.arrays import FloatArray
+from turbrestore.footage.content import clean_source
+from turbrestore_cli.inputs import open_checked
+from turbrestore_cli.inspection import describe_clip
+from turbrestore_cli.options import Selection
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from turbrestore.io.source import FrameSource
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A clip that was looked through.
+
+    Attributes
+    ----------
+    path : Path
+    name : Path
+        The path as a command names it.
+    source : FrameSource
+        All frames of the file, repaired; their numbers are those that ``--frames`` takes.
+    facts : dict
+        What ``turbrestore info`` says.
+    """
+
+    path: Path
+    name: Path
+    source: FrameSource
+    facts: dict[str, object]
+    _reading: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.source.shape[2], self.source.shape[1]
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What was repaired or left out, or is unusual."""
+        warnings = self.facts["warnings"]
+        return tuple(warnings) if isinstance(warnings, list) else ()
+
+    def frame(self, number: int) -> FloatArray:
+        """Decode one frame."""
+        with self._reading:
+            return self.source.read(number, number + 1)[0]
+
+    def quality(self) -> np.ndarray:
+        """Sharpness of every frame."""
+        from turbrestore.footage.frame_selection import frame_quality
+
+        with self._reading:
+            return frame_quality(self.source)
+
+
+def open_clip(path: Path, name: Path) -> Clip:
+    """Open a clip and look at every frame, as ``turbrestore info`` does.
+
+    Parameters
+    ----------
+    path : Path
+    name : Path
+        How messages and commands name it.
+
+    Returns
+    -------
+    Clip
+
+    Raises
+    ------
+    TurbrestoreError
+        The file is missing, damaged, too large or no clip.
+    """
+    whole, content = open_checked(path, Selection())
+    cleaned = clean_source(whole, content)
+    facts = describe_clip(cleaned, content)
+    return Clip(path, name, dataclasses.replace(whole, repair=cleaned.repair), facts)

@@ -1,0 +1,133 @@
+"""The frames of the clip: a scrubber, and the region that is drawn on them."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from nicegui import events, ui
+
+from .elements import set_most
+from .job import one_line
+from .pictures import LONGEST
+
+if TYPE_CHECKING:
+    from turbrestore.io.source import Roi
+
+    from .page import Page
+
+# Smaller rectangles are clicks, pixels of the clip.
+_SMALLEST = 16
+
+
+class ClipView:
+    """One frame, a scrubber under it, and a rectangle that is drawn with the mouse.
+
+    Parameters
+    ----------
+    page : Page
+    """
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._roi: Roi | None = None
+        self._from: tuple[float, float] | None = None
+        self._wanted, self._shown, self._busy = 0, -1, False
+
+    def build(self) -> None:
+        """Make the elements."""
+        with ui.element("div") as self.place:
+            with ui.element("div").classes("clip") as self._frame:
+                self._image = ui.interactive_image(
+                    on_mouse=self._mouse, events=["mousedown", "mousemove", "mouseup"], sanitize=False
+                ).props("id=frame")
+                self._image.visible = False
+            with ui.element("div").classes("fields") as self._below:
+                ui.label("Frame").classes("what")
+                self._scrubber = ui.slider(min=0, max=1, value=0, on_change=self._scrubbed).classes("grow")
+                self._scrubber.props('aria-label="Frame"')
+                self._number = ui.label("0").classes("value")
+            self._hint = ui.label("Draw a rectangle to restore that part alone; a click takes it away.").classes("note")
+            self._below.visible = self._hint.visible = False
+
+    async def opened(self) -> None:
+        """Show the middle frame of a clip."""
+        clip = self._page.tab.clip
+        assert clip is not None
+        width, height = clip.size
+        # The frame is not wider than its height on the page allows.
+        self._frame.style(f"--ratio: {width / height}")
+        self._image.visible = self._below.visible = self._hint.visible = True
+        set_most(self._scrubber, len(clip.source) - 1)
+        self._shown = -1
+        self._scrubber.value = len(clip.source) // 2
+        await self._show(len(clip.source) // 2)
+        self.draw(None)
+
+    def draw(self, roi: Roi | None) -> None:
+        """Draw the region, or none."""
+        self._roi = roi
+        clip = self._page.tab.clip
+        if roi is None or clip is None:
+            self._image.content = ""
+            return
+        scale = self._scale()
+        x, y, width, height = (value / scale for value in roi)
+        whole = f"M0 0H{clip.size[0] / scale:g}V{clip.size[1] / scale:g}H0Z"
+        hole = f"M{x:g} {y:g}v{height:g}h{width:g}v{-height:g}Z"
+        self._image.content = (
+            f'<path d="{whole}{hole}" fill="#000" fill-opacity=".45" fill-rule="evenodd"/>'
+            f'<path d="{hole}" fill="none" stroke="#fff" stroke-width="2" vector-effect="non-scaling-stroke"/>'
+        )
+
+    def _scale(self) -> float:
+        """Pixels of the clip for one of the picture."""
+        clip = self._page.tab.clip
+        return 1.0 if clip is None else max(max(clip.size) / LONGEST, 1.0)
+
+    def _mouse(self, event: events.MouseEventArguments) -> None:
+        x, y = event.image_x, event.image_y
+        if event.type == "mousedown":
+            self._from = x, y
+        elif self._from is not None:
+            roi = self._rectangle(self._from, (x, y))
+            if event.type == "mouseup" or not event.buttons:
+                self._from = None
+                self._page.run_view.set_region(roi)
+            self.draw(roi)
+
+    def _rectangle(self, one: tuple[float, float], two: tuple[float, float]) -> Roi | None:
+        """Return the rectangle between two points of the picture, in pixels of the clip."""
+        clip = self._page.tab.clip
+        assert clip is not None
+        scale = self._scale()
+        (left, right), (top, bottom) = (
+            sorted(min(max(round(value * scale), 0), size) for value in ends)
+            for ends, size in zip(zip(one, two, strict=True), clip.size, strict=True)
+        )
+        if min(right - left, bottom - top) < _SMALLEST:
+            return None
+        return left, top, right - left, bottom - top
+
+    async def _scrubbed(self, event: events.ValueChangeEventArguments) -> None:
+        if event.value is not None:
+            await self._show(int(event.value))
+
+    async def _show(self, number: int) -> None:
+        """Show a frame; of those that are asked for while one is decoded, the last."""
+        clip = self._page.tab.clip
+        self._number.text = str(number)
+        self._wanted = number
+        if clip is None or self._busy:
+            return
+        self._busy = True
+        try:
+            while self._shown != self._wanted:
+                number = self._wanted
+                image = await asyncio.to_thread(clip.frame, number)
+                self._image.set_source(await asyncio.to_thread(self._page.tab.pictures.put, image))
+                self._shown = number
+        except Exception as error:
+            self._page.tell(one_line(error))
+        finally:
+            self._busy = False

@@ -1,0 +1,45 @@
+"""Images of one tab, encoded for the browser and served at addresses of their own."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+from turbrestore.core.arrays import FloatArray, from_unit
+from turbrestore.display.preview import encode_image, shrink
+
+# Longest side that the browser gets, pixels.
+LONGEST = 4096
+# So many are kept: what is on the page, and what it may still ask for.
+_KEPT = 24
+
+
+class Pictures:
+    """Encoded images, the newest ones.
+
+    Parameters
+    ----------
+    address : str
+        Beginning of their addresses, which are relative to that of the page.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._files: OrderedDict[str, bytes] = OrderedDict()
+        self._count = 0
+
+    def put(self, image: FloatArray) -> str:
+        """Encode an image, and return its address."""
+        self._count += 1
+        name = f"{self._count}.png"
+        self._files[name] = encode_image(from_unit(shrink(image, LONGEST), 8))
+        while len(self._files) > _KEPT:
+            self._files.popitem(last=False)
+        return f"{self._address}/{name}"
+
+    def get(self, name: str) -> bytes | None:
+        """Return the file of a name; None if there is none."""
+        return self._files.get(name)
+
+    def clear(self) -> None:
+        """Let all go."""
+        self._files.clear()

@@ -1,0 +1,143 @@
+"""The server of the page: on this machine alone, at an address that nobody can guess."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import tempfile
+import threading
+import webbrowser
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from turbrestore.core.errors import ConfigurationError, StorageError
+from turbrestore.io.limits import DEFAULT_LIMITS
+
+from .folders import Folders
+from .guard import Guard
+from .tab import Tab
+
+if TYPE_CHECKING:
+    import uvicorn
+    from fastapi import Response
+
+HOST = "127.0.0.1"
+# Seconds that open connections have at the end.
+_FAREWELL = 1
+# Seconds after which a tab that has left is forgotten, and after which one that does not answer is called again: the
+# server answers late while all cores work.
+_ABSENCE, _SILENCE = 3.0, 20.0
+
+
+def serve(
+    folders: Folders, file: Path | None, port: int, browser: bool, announce: Callable[[str], None] = print
+) -> None:
+    """Serve the page until the program is interrupted.
+
+    Parameters
+    ----------
+    folders : Folders
+        What the page may read and write.
+    file : Path or None
+        Clip to open at first.
+    port : int
+        0 takes one that is free.
+    browser : bool
+        Whether the page is opened in the browser of the system.
+    announce : callable
+        Called with the address once the server can be reached.
+
+    Raises
+    ------
+    ConfigurationError
+        NiceGUI is not installed.
+    StorageError
+        The port is taken.
+    """
+    with tempfile.TemporaryDirectory(prefix="turbrestore-") as storage:
+        # The library would keep a file in the folder of the start.
+        os.environ["NICEGUI_STORAGE_PATH"] = storage
+        try:
+            import nicegui  # noqa: F401
+        except ImportError as error:
+            raise ConfigurationError(
+                "app: expected nicegui, which is not installed; run pip install 'turbrestore[app]'"
+            ) from error
+        with closing(_listen(port)) as listener:
+            _serve(listener, folders, file, browser, announce)
+
+
+def _serve(
+    listener: socket.socket, folders: Folders, file: Path | None, browser: bool, announce: Callable[[str], None]
+) -> None:
+    token, port = secrets.token_urlsafe(18), listener.getsockname()[1]
+    address = f"http://{HOST}:{port}/{token}/"
+    tabs: set[Tab] = set()
+    server = _build(token, port, folders, file, tabs)
+    announce(address)
+    if browser:
+        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+    try:
+        server.run(sockets=[listener])
+    finally:
+        for tab in tuple(tabs):
+            tab.close()
+
+
+def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set[Tab]) -> uvicorn.Server:
+    """Put the page, its images and the guard together."""
+    import uvicorn
+    from fastapi import FastAPI, Response
+    from nicegui import app, ui
+
+    from .page import Page
+
+    @ui.page("/", title="turbrestore", reconnect_timeout=_ABSENCE)
+    async def page() -> None:
+        tab = Tab(folders)
+        tabs.add(tab)
+
+        def leave() -> None:
+            tabs.discard(tab)
+            threading.Thread(target=tab.close).start()
+
+        ui.context.client.on_delete(leave)
+        await Page(tab).show(file)
+
+    @app.get("/pictures/{key}/{name}", response_class=Response)
+    def picture(key: str, name: str) -> Response:
+        data = next((tab.pictures.get(name) for tab in tuple(tabs) if secrets.compare_digest(tab.key, key)), None)
+        if data is None:
+            return Response(status_code=404)
+        return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})
+
+    def stop_all() -> None:
+        for tab in tabs:
+            tab.closed = True
+            tab.stop()
+
+    app.on_shutdown(stop_all)
+    web = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+    ui.run_with(
+        web,
+        mount_path=f"/{token}",
+        title="turbrestore",
+        dark=None,
+        tailwind=False,
+        show_welcome_message=False,
+        reconnect_timeout=_SILENCE,
+    )
+    # Beside the file, a form has its own words.
+    guard = Guard(web, token, port, DEFAULT_LIMITS.max_bytes + 4096)
+    config = uvicorn.Config(guard, log_level="critical", access_log=False, timeout_graceful_shutdown=_FAREWELL)
+    return uvicorn.Server(config)
+
+
+def _listen(port: int) -> socket.socket:
+    try:
+        return socket.create_server((HOST, port))
+    except (OSError, OverflowError) as error:
+        raise StorageError(f"--port: {port} cannot be used ({error})") from error

@@ -1,0 +1,54 @@
+"""The results of the stages in memory, so that a change of the deconvolution runs the deconvolution alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from turbrestore.core.arrays import FloatArray
+
+Result = TypeVar("Result")
+
+# Image of the result that a store is asked for by this name.
+_IMAGES: dict[str, Callable[[Any], FloatArray]] = {
+    "centroid": lambda found: found.image,
+    "filtered": lambda found: found.image,
+    "mean": lambda found: found,
+    "deblurred": lambda found: found.deconvolution.image,
+}
+_ALWAYS_ANEW = "deblurred"
+
+
+class StageMemory:
+    """A store of :func:`turbrestore.restore` that keeps all results but the last, and shows images as they are done.
+
+    Parameters
+    ----------
+    show : callable, optional
+        Called as ``show(name, image)``; may raise to end the run.
+
+    Examples
+    --------
+    >>> memory = StageMemory()
+    >>> memory.get("dynamics", lambda: 1), memory.get("dynamics", lambda: 2)
+    (1, 1)
+    """
+
+    def __init__(self, show: Callable[[str, FloatArray], None] | None = None) -> None:
+        self.show = show
+        self._results: dict[str, Any] = {}
+
+    def get(self, name: str, compute: Callable[[], Result]) -> Result:
+        """Return what was computed under this name, or compute it."""
+        result = self._results[name] if name in self._results else compute()
+        if name != _ALWAYS_ANEW:
+            self._results[name] = result
+        if self.show is not None and name in _IMAGES:
+            self.show(name, _IMAGES[name](result))
+        return result
+
+    def filter_start(self) -> None:
+        """Return None: an interrupted filter starts anew."""
+
+    def checkpoint(self, state: object) -> None:
+        """Let the state go."""

@@ -1,0 +1,209 @@
+"""Step three: other settings of the deconvolution, seen at once, then applied to the whole."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import math
+import time
+from typing import TYPE_CHECKING, Literal, cast
+
+from nicegui import background_tasks, ui
+
+from turbrestore.blur.psf import GAUSSIAN
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.settings import RestoreParams
+
+from .elements import set_most
+from .restoring import Order
+from .tuning import SLOW, automatic_fidelity, impressions, part_around, tuned_params
+
+if TYPE_CHECKING:
+    from turbrestore.core.arrays import FloatArray
+
+    from .page import Page
+
+_METHODS = {"nltv": "nonlocal total variation", "tv": "total variation", "wiener": "Wiener", "tikhonov": "Tikhonov"}
+_BOUNDARIES = {"unknown": "unknown", "periodic": "periodic"}
+_BORDERS = {"keep": "keep", "crop": "crop"}
+# Logarithms of the smallest and the largest λ of the slider.
+_FIDELITIES = (1.0, 5.0)
+
+
+class TuneView:
+    """Sliders of the deconvolution.
+
+    Parameters
+    ----------
+    page : Page
+    """
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._setting = False
+        self._wanted, self._working = 0, False
+        # What the user has chosen; None leaves it to be measured.
+        self._params: DeconvolutionParams | None = None
+        self._automatic = True
+
+    def build(self) -> None:
+        """Make the elements."""
+        with ui.element("section") as self.place:
+            ui.html('<span class="number">3</span> Tune', tag="h2", sanitize=False)
+            self._sigma, self._sigma_text = self._slider("Width", 0, 6, 0.05, "Width of the blur, pixels")
+            self._exponent, self._exponent_text = self._slider("Shape", 1, 2, 0.01, "Shape of the blur, exponent")
+            self._fidelity, self._fidelity_text = self._slider("λ", *_FIDELITIES, 0.02, "Weight of the data, logarithm")
+            self._sigma.on_value_change(self._changed)
+            self._exponent.on_value_change(self._changed)
+            self._fidelity.on_value_change(self._weighed)
+            with ui.element("div").classes("fields"):
+                self._method = ui.select(_METHODS, label="Method", value="nltv", on_change=self._changed)
+                self._method.props("dense outlined options-dense").classes("grow")
+            with ui.element("div").classes("fields"):
+                self._boundary = ui.select(_BOUNDARIES, label="Beyond it", value="unknown", on_change=self._changed)
+                self._border = ui.select(_BORDERS, label="Border", value="keep", on_change=self._border_changed)
+                for select in (self._boundary, self._border):
+                    select.props("dense outlined options-dense").classes("grow")
+            with ui.element("div").classes("fields apart"):
+                self._apply = ui.button("Apply to the whole", on_click=self.apply).props("unelevated").classes("grow")
+                self._reset = ui.button("As measured", on_click=self._measure).props("outline no-wrap")
+            self._note = ui.label("").classes("note").props("role=status")
+
+    def opened(self) -> None:
+        """Leave everything to be measured in a new clip."""
+        self._params, self._automatic = None, True
+        self._border.value = "keep"
+        self._page.run_view.show_method(None)
+
+    async def restored(self) -> None:
+        """Show the settings of a run that has ended."""
+        restored = self._page.tab.restored
+        assert restored is not None
+        await self._show(tuned_params(restored))
+
+    def chosen(self, params: RestoreParams) -> RestoreParams:
+        """Put into the settings of a run what was chosen here."""
+        border = cast(Literal["keep", "crop"], self._border.value)
+        deconvolution = params.deconvolution if self._params is None else self._params
+        return dataclasses.replace(params, deconvolution=deconvolution, border=border)
+
+    @property
+    def pending(self) -> bool:
+        """Whether something was chosen that the result does not have yet."""
+        restored = self._page.tab.restored
+        if restored is None:
+            return False
+        return self.chosen(restored.order.params) != restored.order.params
+
+    def apply(self) -> None:
+        """Deconvolve the whole image by what was chosen."""
+        restored = self._page.tab.restored
+        if restored is None or self._page.tab.busy:
+            return
+        self._wanted += 1
+        order = restored.order
+        with self._page.catching():
+            self._page.tab.run(Order(order.path, order.selection, self.chosen(order.params)))
+
+    def _slider(self, name: str, low: float, high: float, step: float, label: str) -> tuple[ui.slider, ui.label]:
+        with ui.element("div").classes("fields"):
+            ui.label(name).classes("what")
+            slider = ui.slider(min=low, max=high, step=step, value=low).classes("grow")
+            slider.props(f'aria-label="{label}"')
+            value = ui.label("").classes("value")
+        return slider, value
+
+    async def _show(self, params: DeconvolutionParams) -> None:
+        """Set the sliders without taking that for a wish of the user."""
+        restored = self._page.tab.restored
+        assert restored is not None
+        self._automatic = params.fidelity is None
+        measured = await asyncio.to_thread(automatic_fidelity, restored, params)
+        self._setting = True
+        set_most(self._sigma, max(6.0, math.ceil(2 * (params.sigma or 0))))
+        self._sigma.value = params.sigma or 0.0
+        self._exponent.value = params.exponent or GAUSSIAN
+        self._fidelity.value = min(max(math.log10(params.fidelity or measured), _FIDELITIES[0]), _FIDELITIES[1])
+        self._method.value, self._boundary.value = params.method, params.boundary
+        self._setting = False
+        self._show_values()
+
+    def _show_values(self) -> None:
+        self._sigma_text.text = f"{self._sigma.value:.2f} px"
+        self._exponent_text.text = f"{self._exponent.value:.2f}"
+        self._fidelity_text.text = f"{10 ** (self._fidelity.value or 0):.0f}{', auto' if self._automatic else ''}"
+        self._apply.set_enabled(self.pending)
+        self._page.save_view.refresh()
+        self._page.run_view.show_method(self._params)
+
+    def _border_changed(self) -> None:
+        if self._page.tab.restored is not None:
+            self._show_values()
+
+    def _weighed(self) -> None:
+        """Take λ from its slider from now on."""
+        if not self._setting:
+            self._automatic = False
+        self._changed()
+
+    def _changed(self) -> None:
+        """Take over what the sliders say, and show what comes of it."""
+        restored = self._page.tab.restored
+        if self._setting or restored is None:
+            return
+        self._params = dataclasses.replace(
+            restored.order.params.deconvolution,
+            sigma=round(float(self._sigma.value or 0), 3),
+            exponent=round(float(self._exponent.value or GAUSSIAN), 3),
+            fidelity=None if self._automatic else round(10 ** float(self._fidelity.value or 0), 1),
+            method=self._method.value,
+            boundary=self._boundary.value,
+        )
+        self._show_values()
+        self._wanted += 1
+        if not self._working:
+            background_tasks.create(self._respond(), name="deblurring of a part")
+
+    async def _respond(self) -> None:
+        """Show the part by the newest settings; those that have changed meanwhile are not waited for."""
+        self._working, answered = True, -1
+        try:
+            with self.place, self._page.catching():
+                while answered != self._wanted and self._params is not None:
+                    answered = self._wanted
+                    await self._show_part(self._params, answered)
+        finally:
+            self._working = False
+
+    async def _show_part(self, params: DeconvolutionParams, number: int) -> None:
+        restored = self._page.tab.restored
+        if restored is None or self._page.tab.busy:
+            return
+        if self._automatic:
+            await self._show(params)
+        x, y, width, height = restored.restoration.crop
+        across, down = await self._page.compare_view.middle()
+        part = part_around(restored.frame.shape, x + across * width, y + down * height)
+        begun = time.perf_counter()
+        images = impressions(restored, params, part, lambda: number != self._wanted or self._page.tab.closed)
+        rounds = 2 if params.method in SLOW else 1
+        for count in range(1, rounds + 1):
+            image = await asyncio.to_thread(next, images, None)
+            if image is None:
+                return
+            note = self._words(image, time.perf_counter() - begun, count < rounds)
+            await self._page.compare_view.show_part(restored, part, image, note)
+            self._page.look_at("compare")
+
+    def _words(self, image: FloatArray, seconds: float, more: bool) -> str:
+        size = f"{image.shape[1]}×{image.shape[0]} pixels in {seconds:.2f} s"
+        return f"First impression of {size}; the end follows …" if more else f"{size}; Apply computes the whole"
+
+    async def _measure(self) -> None:
+        """Go back to what is measured."""
+        self._params, self._automatic = None, True
+        restored = self._page.tab.restored
+        if restored is not None and self.pending:
+            self.apply()
+        elif restored is not None:
+            await self._show(tuned_params(restored))

@@ -1,0 +1,257 @@
+"""The app in a browser, from the opening of a clip to the saved image, as a person would use it."""
+
+import contextlib
+import http.client
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+import pytest
+
+from conftest import make_sequence
+from turbrestore.io.images import write_image
+from turbrestore_cli.__main__ import main
+
+EVIL = "<img src=x onerror=document.title='taken'>.mkv"
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
+# Seconds until a run must have ended, on a machine that does other things too.
+LONG = 60_000
+
+
+class App:
+    """A server in a process of its own, in a folder with one good clip and one that is broken."""
+
+    def __init__(self, folder: Path, temporary: Path):
+        self.folder, self.temporary = folder, temporary
+        words = [sys.executable, "-m", "turbrestore_cli", "app", "chart.mkv", "--no-browser"]
+        environment = {**os.environ, "TMPDIR": str(temporary)}
+        self.process = subprocess.Popen(
+            words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+        )
+        self.address = self.process.stdout.readline().strip()
+
+    def ask(self, path="", method="GET", **headers):
+        """Status of the answer to a request."""
+        parts = urlsplit(self.address)
+        connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=10)
+        connection.putrequest(method, path or parts.path, skip_host="Host" in headers)
+        for name, value in headers.items():
+            connection.putheader(name.replace("_", "-"), value)
+        connection.endheaders()
+        status = connection.getresponse().status
+        connection.close()
+        return status
+
+
+@pytest.fixture(scope="module")
+def app(tmp_path_factory):
+    folder, temporary = tmp_path_factory.mktemp("start"), tmp_path_factory.mktemp("temporary")
+    shutil.copy(SAMPLE, folder)
+    (folder / EVIL).write_bytes(SAMPLE.read_bytes()[:3000])
+    (folder / "images").mkdir()
+    for number, frame in enumerate(make_sequence(seed=3, count=4, size=64).frames):
+        write_image(folder / "images" / f"{number}.png", frame, 8)
+    # Not every file system takes a name that is no text.
+    with contextlib.suppress(OSError):
+        (folder / os.fsdecode(b"broken\xff.mkv")).touch()
+    app = App(folder, temporary)
+    yield app
+    if app.process.poll() is None:
+        app.process.send_signal(signal.SIGINT)
+    _, complaints = app.process.communicate(timeout=20)
+    # A bug would have left its traceback.
+    assert (app.process.returncode, complaints) == (130, "turbrestore: interrupted\n")
+    assert list(temporary.iterdir()) == []
+    made = {path.name for path in folder.iterdir() if path.is_file() and path.suffix != ".mkv"}
+    assert made <= {f"{name}.png{suffix}" for name in ("saved", "again") for suffix in ("", ".toml")}
+
+
+@pytest.fixture
+def open_tab(browser, app):
+    """Open a tab; afterwards nothing must have been complained of, and nobody else asked."""
+    contexts, complaints, addresses = [], [], []
+
+    def call(size=(1280, 860), **options):
+        contexts.append(browser.new_context(viewport={"width": size[0], "height": size[1]}, **options))
+        page = contexts[-1].new_page()
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda request: addresses.append(request.url))
+        page.on("websocket", lambda opened: addresses.append(opened.url.replace("ws://", "http://")))
+        page.goto(app.address)
+        page.locator("#frame img").wait_for()
+        page.get_by_text("Sharpness of the frames; 48 of 48").wait_for()
+        return page
+
+    yield call
+    for context in contexts:
+        context.close()
+    assert complaints == []
+    assert [address for address in addresses if not address.startswith((app.address, "data:", "blob:"))] == []
+
+
+def pixels(element):
+    return cv2.imdecode(np.frombuffer(element.screenshot(), np.uint8), cv2.IMREAD_COLOR).astype(int)
+
+
+def draw(page, left, top, right, bottom):
+    """Draw a region, in shares of the frame."""
+    box = page.locator("#frame").bounding_box()
+    x, y = ([box[start] + share * box[length] for share in ends] for start, length, ends in (
+        ("x", "width", (left, right)), ("y", "height", (top, bottom))
+    ))  # fmt: skip
+    page.mouse.move(x[0], y[0])
+    page.mouse.down()
+    page.mouse.move(x[1], y[1], steps=3)
+    page.mouse.up()
+
+
+def push(page, name, key):
+    """Move a slider by the keyboard."""
+    page.get_by_role("slider", name=name, exact=True).locator("[tabindex='0']").press(key)
+
+
+def press(page, name):
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
+    page = open_tab(permissions=["clipboard-read", "clipboard-write"])
+    assert page.get_by_text("256×192 pixels, 8 bits, 48 frames, 25 per second").is_visible()
+    before = pixels(page.locator("#frame"))
+    address = page.locator("#frame img").get_attribute("src")
+    push(page, "Frame", "PageDown")
+    page.wait_for_function(f"!document.querySelector('#frame img').src.endsWith('{address}')")
+    page.wait_for_timeout(100)
+    assert (pixels(page.locator("#frame")) != before).any()
+
+    draw(page, 0.25, 0.25, 0.5625, 0.6875)
+    page.wait_for_function("document.querySelector('[aria-label=x]').value !== ''")
+    sides = [int(page.get_by_label(name, exact=True).input_value()) for name in ("x", "y", "width", "height")]
+    assert sides == pytest.approx([64, 48, 80, 84], abs=1)
+    press(page, "Run")
+    page.get_by_text(f"{sides[2]}×{sides[3]} pixels from 48 frames").wait_for(timeout=LONG)
+    assert page.locator("#right option").all_inner_texts() == ["Frame", "Mean", "Centroid", "Filtered", "Result"]
+    page.get_by_text("decisions").click()
+    assert page.get_by_text("blur: ").is_visible()
+
+    stage, before = page.locator("#stage"), pixels(page.locator("#stage"))
+    begun = time.monotonic()
+    push(page, "Width of the blur, pixels", "PageUp")
+    page.get_by_text("the end follows").wait_for()
+    assert time.monotonic() - begun < 10
+    page.get_by_text("Apply computes the whole").wait_for()
+    page.wait_for_timeout(200)
+    middle = before.shape[1] // 2
+    changed = (pixels(stage) != before).any(axis=(0, 2))
+    assert changed[middle + 20 :].any()
+    assert not changed[: middle - 20].any()
+
+    page.get_by_label("Image, .png or .tif").fill("saved.png")
+    press(page, "Copy command")
+    page.get_by_text("The command is copied").wait_for()
+    command = shlex.split(page.evaluate("navigator.clipboard.readText()"))
+    press(page, "Save")
+    page.get_by_text("Saved: saved.png, saved.png.toml").wait_for(timeout=LONG)
+    assert command[:4] == ["turbrestore", "restore", "chart.mkv", "saved.png"]
+    assert any(word.startswith("--deconvolution.sigma=") for word in command)
+    monkeypatch.chdir(app.folder)
+    assert main(["restore", "chart.mkv", "again.png", *command[4:], "--quiet"]) == 0
+    assert Path("again.png").read_bytes() == Path("saved.png").read_bytes()
+    assert Path("again.png.toml").read_bytes() == Path("saved.png.toml").read_bytes()
+
+    press(page, "Save")
+    page.get_by_role("alert").get_by_text("saved.png").wait_for()
+
+
+def test_a_run_is_stopped_and_another_tab_goes_on(open_tab):
+    one, other = open_tab(), open_tab()
+    press(one, "Run")
+    one.get_by_text("s left").first.wait_for(timeout=LONG)
+    press(other, "Preview")
+    press(one, "Stop")
+    one.get_by_text("stopped", exact=True).wait_for()
+    other.get_by_text("Preview of a part: 160×160 pixels from 24 frames").wait_for(timeout=LONG)
+    assert one.get_by_role("button", name="Run", exact=True).is_enabled()
+    assert not one.get_by_text("Tune", exact=True).is_visible()
+
+
+def test_what_cannot_be_opened_is_said_in_one_line(open_tab, tmp_path):
+    page = open_tab()
+    alert = page.get_by_role("alert")
+    press(page, "Another clip")
+    press(page, EVIL)
+    alert.get_by_text(f"{EVIL}: ").wait_for()
+    assert page.title() == "turbrestore"
+    assert "\n" not in alert.inner_text()
+    outside = tmp_path / "clip.mkv"
+    for name in (str(outside), "../elsewhere.mkv", "/proc/self/environ"):
+        page.get_by_label("Path of a clip").fill(name)
+        press(page, "Open")
+        alert.get_by_text(re.compile(re.escape(name) + ": lies outside the folder")).wait_for()
+    # No block of it is written or read.
+    with (tmp_path / "large.mkv").open("wb") as file:
+        file.truncate(8 * 2**30)
+    page.locator("input[type=file]").set_input_files(tmp_path / "large.mkv")
+    alert.get_by_text("upload: expected one clip of up to 2147483648 bytes").wait_for()
+    (tmp_path / "large.mkv").unlink()
+    page.get_by_label("Path of a clip").fill("images")
+    press(page, "Open")
+    page.locator(".name").get_by_text("images").wait_for()
+    press(page, "Another clip")
+    page.get_by_label("Path of a clip").fill("chart.mkv")
+    press(page, "Open")
+    page.get_by_role("button", name="Another clip").wait_for()
+    assert not alert.is_visible()
+
+
+def test_what_is_uploaded_goes_with_its_tab(open_tab, app):
+    page = open_tab()
+    before = set(app.temporary.iterdir())
+    press(page, "Another clip")
+    page.locator("input[type=file]").set_input_files(
+        {"name": "../\N{BULLET} elsewhere.mkv", "mimeType": "video/x-matroska", "buffer": SAMPLE.read_bytes()}
+    )
+    page.locator(".name").get_by_text("elsewhere.mkv").wait_for()
+    # The server may still have the file that it received itself.
+    (place,) = (path for path in set(app.temporary.iterdir()) - before if path.is_dir())
+    assert [path.suffix for path in place.iterdir()] == [".mkv"]
+    press(page, "Run")
+    page.get_by_text("s left").first.wait_for(timeout=LONG)
+    page.close()
+    until = time.monotonic() + 30
+    while place.exists() and time.monotonic() < until:
+        time.sleep(0.1)
+    assert not place.exists()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_fits_in_both_schemes(open_tab, scheme):
+    page = open_tab((900, 700), color_scheme=scheme)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 900
+    ground, ink = (
+        sum(int(part) for part in page.evaluate(f"getComputedStyle(document.body).{name}")[4:-1].split(","))
+        for name in ("backgroundColor", "color")
+    )
+    assert (ground > ink) == (scheme == "light")
+
+
+def test_strangers_are_refused(app):
+    here = urlsplit(app.address)
+    assert app.ask() == 200
+    assert app.ask("/") == app.ask("/pictures/a/1.png") == 404
+    assert app.ask(f"{here.path[:-2]}/") == 404
+    assert app.ask(f"{here.path}pictures/a/1.png") == 404
+    assert app.ask(Host="elsewhere.example") == 403
+    assert app.ask(Origin="http://elsewhere.example") == 403
+    assert app.ask(method="POST", Content_Length=str(8 * 2**30)) == 413
+    assert app.ask(method="POST", Transfer_Encoding="chunked") == 411

@@ -1,0 +1,267 @@
+"""What the app is made of, without a browser."""
+
+import asyncio
+import doctest
+import shlex
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import make_sequence
+from turbrestore.core.errors import ConfigurationError, DataError, OutputError
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.io.video import write_video
+from turbrestore.registration.centroid import CentroidParams
+from turbrestore.settings import RestoreParams
+from turbrestore_app import folders, job, restoring, stage_memory, tuning
+from turbrestore_app.clip import open_clip
+from turbrestore_app.folders import Folders
+from turbrestore_app.guard import Guard
+from turbrestore_app.job import Job, one_line
+from turbrestore_app.pictures import Pictures
+from turbrestore_app.restoring import Order, preview_order, restore_order
+from turbrestore_app.saving import Outputs, check_outputs, command_line, save
+from turbrestore_app.tab import Tab
+from turbrestore_app.tuning import impressions, part_around, tuned_params
+from turbrestore_cli.__main__ import main
+from turbrestore_cli.options import Selection
+
+QUICK = RestoreParams(centroid=CentroidParams(iterations=1), deconvolution=DeconvolutionParams(sigma=1.0, iterations=5))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("start")
+    write_video(folder / "clip.mkv", make_sequence(seed=5, count=6, size=64).frames, fps=25)
+    (folder / "below").mkdir()
+    (folder / "notes.txt").touch()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def restored(folder):
+    return ended(Job(lambda job: restore_order(Order(folder / "clip.mkv", params=QUICK), job))).result
+
+
+def ended(job):
+    job.join(60)
+    assert job.state != "running"
+    return job
+
+
+class TestFolders:
+    def test_only_what_lies_below(self, folder, tmp_path):
+        (folder / "out").unlink(missing_ok=True)
+        (folder / "out").symlink_to(tmp_path)
+        folders = Folders(folder)
+        assert folders.locate("clip.mkv") == folders.locate(str(folder / "below/../clip.mkv")) == folder / "clip.mkv"
+        for name in ("../x.mkv", "/etc/passwd", str(tmp_path / "x.mkv"), "out/x.mkv", "~/x.mkv"):
+            for find in (folders.locate, folders.output):
+                with pytest.raises(ConfigurationError, match="lies outside the folder"):
+                    find(name)
+        for name in ("", " ", "a\0b"):
+            with pytest.raises(ConfigurationError, match="expected the name of a file"):
+                folders.locate(name)
+
+    def test_what_the_command_line_allows(self, folder, tmp_path):
+        clip = tmp_path / "named" / "clip.mkv"
+        folders = Folders(folder, (tmp_path / "more",), (clip,))
+        assert folders.locate(str(clip)) == clip
+        assert folders.output(str(tmp_path / "more" / "a.png")) == tmp_path / "more" / "a.png"
+        with pytest.raises(ConfigurationError):
+            folders.output(str(clip))
+        assert (folders.shown(folder / "a.png"), folders.shown(clip)) == (Path("a.png"), clip)
+
+    def test_a_list_shows_folders_and_clips(self, folder):
+        names = [entry.name for entry in Folders(folder).listing(folder)]
+        assert [name for name in names if name != "out/"] == ["below/", "clip.mkv"]
+        assert [entry.name for entry in Folders(folder).listing(folder / "below")] == [".."]
+
+
+class TestGuard:
+    @pytest.mark.parametrize(
+        ("path", "headers", "status"),
+        [
+            ("/key/", {}, 200),
+            ("/key/_nicegui/x", {"origin": "http://127.0.0.1:80"}, 200),
+            ("/key", {"host": "localhost:80"}, 200),
+            ("/kex/", {}, 404),
+            ("", {}, 404),
+            ("/key/", {"host": "127.0.0.1"}, 403),
+            ("/key/", {"host": "a.example:80"}, 403),
+            ("/key/", {"origin": "http://a.example"}, 403),
+            ("/key/", {"origin": "null"}, 403),
+            ("/key/", {"content-length": "100"}, 200),
+            ("/key/", {"content-length": "101"}, 413),
+            ("/key/", {"content-length": "-1"}, 411),
+            ("/key/", {"transfer-encoding": "chunked"}, 411),
+        ],
+    )
+    @pytest.mark.parametrize("kind", ["http", "websocket"])
+    def test_who_may_come_in(self, path, headers, status, kind):
+        sent = []
+
+        async def app(scope, receive, send):
+            await send({"type": "http.response.start", "status": 200})
+
+        async def receive():
+            return {}
+
+        async def send(message):
+            sent.append(message)
+
+        pairs = [(name.encode(), value.encode()) for name, value in {"host": "127.0.0.1:80", **headers}.items()]
+        scope = {"type": kind, "path": path, "headers": pairs}
+        asyncio.run(Guard(app, "key", 80, 100)(scope, receive, send))
+        if kind == "http" or status == 200:
+            assert sent[0]["status"] == status
+        else:
+            assert sent == [{"type": "websocket.close", "code": 1008}]
+        assert (status != 200) or any(name == b"content-security-policy" for name, _ in sent[0]["headers"])
+
+
+class TestJob:
+    def test_it_says_what_it_does(self, restored, folder):
+        job = ended(Job(lambda job: restore_order(Order(folder / "clip.mkv", params=QUICK), job)))
+        assert job.state == "done"
+        assert list(job.bars) == ["centroid", "filter", "deconvolve"]
+        assert all(bar.share == 1 for bar in job.bars.values())
+        assert list(job.images) == ["frame", "centroid", "filtered", "mean", "deblurred"]
+        assert tuple(job.decisions) == job.result.restoration.decisions
+        assert (job.result.restoration.image == restored.restoration.image).all()
+
+    def test_it_stops_at_its_next_step(self, folder):
+        begun = threading.Event()
+
+        def work(job):
+            begun.set()
+            while True:
+                job.progress("filter", 1, 2)
+
+        job = Job(work)
+        begun.wait(10)
+        job.stop()
+        assert (ended(job).state, job.result) == ("stopped", None)
+
+    def test_failures_are_one_line(self, tmp_path, capsys):
+        job = ended(Job(lambda job: restore_order(Order(tmp_path / "none.mkv"), job)))
+        assert (job.state, job.message) == ("failed", f"{tmp_path / 'none.mkv'}: no such file or folder")
+        assert one_line(MemoryError()).startswith("out of memory")
+        assert capsys.readouterr().err == ""
+        assert one_line(ValueError("a\nb")) == "this is a bug (ValueError: a b); the terminal shows where"
+        assert "ValueError" in capsys.readouterr().err
+
+
+class TestOrders:
+    def test_another_deconvolution_alone_takes_over_the_rest(self, restored):
+        order = replace(restored.order, params=replace(QUICK, deconvolution=DeconvolutionParams(method="tv", sigma=2)))
+        job = ended(Job(lambda job: restore_order(order, job, restored)))
+        assert list(job.bars) == ["deconvolve"]
+        again = job.result.restoration
+        assert again.filtered is restored.restoration.filtered
+        anew = ended(Job(lambda job: restore_order(order, job))).result.restoration
+        assert (again.image == anew.image).all()
+        assert (again.image != restored.restoration.image).any()
+
+    def test_what_is_taken_over(self, restored):
+        order = restored.order
+        assert order.shares_filter_with(replace(order, params=replace(QUICK, border="crop")))
+        assert not order.shares_filter_with(replace(order, selection=Selection(frames="0:5")))
+        assert not order.shares_filter_with(replace(order, params=replace(QUICK, train=3)))
+
+    def test_a_preview_is_the_middle_of_the_region(self):
+        order = Order(Path("a.mkv"), Selection(frames="10:90:2", roi="100,50,400,100"))
+        selection = preview_order(order, (200, 480, 640)).selection
+        assert (selection.frames, selection.roi) == ("10:58:2", "220,50,160,100")
+        selection = preview_order(Order(Path("a.mkv")), (9, 100, 64)).selection
+        assert (selection.frames, selection.roi) == ("0:9", "0,0,64,100")
+
+
+class TestTuning:
+    def test_the_last_impression_is_the_method_itself(self, restored):
+        params = replace(tuned_params(restored), sigma=1.5, fidelity=500.0, iterations=100)
+        part = part_around((64, 64), 0, 40, side=32)
+        assert part == (slice(24, 56), slice(0, 32))
+        first, last = impressions(restored, params, part, lambda: False)
+        found = restored.restoration
+        expected = deconvolve(found.filtered.image[part], 1.5, params, found.centroid.image[part]).image
+        assert (last == expected).all()
+        assert np.abs(first - last).mean() < 0.05
+        assert len(list(impressions(restored, replace(params, method="wiener"), part, lambda: False))) == 1
+
+    def test_nobody_waits_for_what_is_not_wanted(self, restored):
+        assert list(impressions(restored, tuned_params(restored), part_around((64, 64), 0, 0), lambda: True)) == []
+
+
+class TestSaving:
+    def test_the_command_gives_the_same_files(self, restored, folder, tmp_path, monkeypatch):
+        outputs = Outputs(tmp_path / "a.png", 16, report=True)
+        written = save(restored, outputs, Path("clip.mkv"), Path("a.png"))
+        assert written == [tmp_path / name for name in ("a.png", "a.png.toml", "a.png.html")]
+        command = command_line(restored.order, 16, folder / "clip.mkv", tmp_path / "b.png")
+        monkeypatch.chdir(tmp_path)
+        assert main([*shlex.split(command)[1:], "--quiet"]) == 0
+        for suffix in (".png", ".png.toml"):
+            assert Path(f"a{suffix}").read_bytes() == Path(f"b{suffix}").read_bytes()
+        assert "turbrestore restore clip.mkv a.png" in Path("a.png.html").read_text()
+
+    def test_nothing_is_replaced_unasked(self, restored, folder, tmp_path):
+        (tmp_path / "a.png.html").touch()
+        outputs = Outputs(tmp_path / "a.png", report=True)
+        with pytest.raises(OutputError, match="a.png.html"):
+            save(restored, outputs, Path("clip.mkv"), Path("a.png"))
+        assert not (tmp_path / "a.png").exists()
+        check_outputs(replace(outputs, overwrite=True), folder / "clip.mkv")
+        (tmp_path / "clip.png").hardlink_to(folder / "clip.mkv")
+        with pytest.raises(OutputError):
+            check_outputs(Outputs(tmp_path / "clip.png", overwrite=True), folder / "clip.mkv")
+
+
+class TestTab:
+    def test_uploads_have_plain_names_and_go_in_the_end(self, folder):
+        tab = Tab(Folders(folder))
+        place = tab.place_for("../../.a/b\\c.mkv")
+        assert place.name == "c.mkv"
+        place.write_bytes((folder / "clip.mkv").read_bytes())
+        assert tab.open(place).name == Path("c.mkv")
+        for name in ("a.exe", "", "..", ".mkv"):
+            with pytest.raises(DataError):
+                tab.place_for(name)
+        job = tab.run(Order(place, params=replace(QUICK, deconvolution=DeconvolutionParams(sigma=1, tolerance=0))))
+        tab.close()
+        assert ended(job).state == "stopped"
+        assert not place.parent.exists()
+
+    def test_another_clip_ends_the_run(self, folder):
+        tab = Tab(Folders(folder))
+        tab.open(folder / "clip.mkv")
+        job = tab.run(Order(folder / "clip.mkv", params=QUICK))
+        tab.open(folder / "clip.mkv")
+        assert ended(job).state in ("stopped", "done")
+        assert (tab.restored, tab.job) == (None, None)
+
+
+def test_a_clip_has_the_numbers_of_its_file(tmp_path):
+    frames = make_sequence(seed=6, count=6, size=64).frames
+    frames[3] = frames[2]
+    write_video(tmp_path / "clip.mkv", frames, fps=25)
+    clip = open_clip(tmp_path / "clip.mkv", Path("clip.mkv"))
+    assert (clip.size, len(clip.source), clip.facts["usable_frames"]) == ((64, 64), 6, 5)
+    assert clip.remarks == ("1 duplicated: frame 3 left out",)
+    assert clip.quality().shape == (6,)
+    assert np.abs(clip.frame(5) - frames[5]).max() < 1 / 255
+
+
+@pytest.mark.parametrize("module", [folders, job, restoring, stage_memory, tuning])
+def test_examples(module):
+    assert doctest.testmod(module).failed == 0
+
+
+def test_only_the_newest_pictures_are_kept():
+    pictures = Pictures("pictures/key")
+    addresses = [pictures.put(np.zeros((4, 4), np.float32)) for _ in range(30)]
+    found = [pictures.get(address.rpartition("/")[2]) is not None for address in addresses]
+    assert found == [False] * 6 + [True] * 24
