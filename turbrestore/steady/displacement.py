@@ -1,0 +1,125 @@
+"""Turbulent displacement of a frame from its flows to its neighbours.
+
+Symbols
+-------
+k : the frame; k ± i its neighbours
+d : turbulent displacement of a frame, pixels
+F_i : flow from frame k to frame k + i; A_i its affine part, the camera
+S_i : mean of F_i − A_i and F_{−i} − A_{−i}; at the ends of a scene, where one of them is missing, the other
+c : what turbulence displaces at most, pixels
+w_i : weight of S_i
+
+A point of frame k that turbulence has displaced by d_k appears in frame k + i where the motion of scene and camera and
+d_{k+i} put it.  Motion at constant velocity cancels in S_i, so that ``S_i = −d_k + (d_{k+i} + d_{k−i}) / 2 + a i² / 2``
+with a the acceleration of the point.  Over several i the displacements of the neighbours average out::
+
+    D = Σ w_i S_i / (½ + Σ w_i) ≈ −d_k,      w_i = 1 / (1 + (|S_i|² / c²)²)
+
+with |S_i|² averaged in a small window.  A large S_i is motion rather than turbulence: it has little weight, and where
+all are large the frame passes as it is.  The ½ is the share of the frame itself, whose flow to itself is zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from ..core.arrays import FloatArray
+from .camera import Matrix, camera_flow, camera_size
+
+# Window in which |S|² is averaged, pixels; share of the frame itself.
+_WINDOW, _OWN_SHARE = 4.0, 0.5
+# The camera may shake by this share of c before its motion passes for wanted.
+_CAMERA_SHARE = 0.5
+
+
+def mean_displacement(flows: Mapping[int, FloatArray], largest: float) -> FloatArray:
+    """Weighted mean D of flows without the motion of the camera.
+
+    Parameters
+    ----------
+    flows : mapping of int to ndarray, float32, shape (H, W, 2)
+        F_i − A_i by i, pixels; not empty.
+    largest : float
+        c, pixels.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W, 2)
+        D, pixels.
+
+    Examples
+    --------
+    >>> still, steady = np.zeros((8, 8, 2), np.float32), np.full((8, 8, 2), 5.0, np.float32)
+    >>> float(mean_displacement({1: steady, -1: -steady}, 1.0).max())
+    0.0
+    >>> jolt = np.full((8, 8, 2), 0.2, np.float32)
+    >>> round(float(mean_displacement({1: jolt, -1: jolt}, 1.0).max()), 2)
+    0.13
+    """
+    total, weights = 0.0, _OWN_SHARE
+    for offset in sorted({abs(offset) for offset in flows}):
+        mean = _symmetric(flows, offset)
+        size = cv2.GaussianBlur(np.einsum("yxc,yxc->yx", mean, mean), (0, 0), _WINDOW)
+        weight = (1 / (1 + (size / largest**2) ** 2))[..., None]
+        total, weights = total + weight * mean, weights + weight
+    return np.asarray(total / weights, np.float32)
+
+
+def camera_displacement(cameras: Mapping[int, Matrix], shape: tuple[int, ...], largest: float) -> Matrix:
+    """Weighted mean of the motions of the camera, in which a large one has little weight.
+
+    Parameters
+    ----------
+    cameras : mapping of int to ndarray, float64, shape (2, 3)
+        M of A_i by i; not empty.
+    shape : tuple of int
+        (H, W) of the frames.
+    largest : float
+        c, pixels; infinity gives every motion the same weight.
+
+    Returns
+    -------
+    ndarray, float64, shape (2, 3)
+
+    Examples
+    --------
+    >>> pan = np.array([[0, 0, 7.0], [0, 0, 0]])
+    >>> float(abs(camera_displacement({1: pan, -1: -pan}, (8, 8), 1.0)).max())
+    0.0
+    """
+    total, weights = np.zeros((2, 3)), _OWN_SHARE
+    for offset in sorted({abs(offset) for offset in cameras}):
+        mean = _symmetric(cameras, offset)
+        weight = 1 / (1 + (camera_size(mean, shape) / (_CAMERA_SHARE * largest)) ** 4)
+        total, weights = total + weight * mean, weights + weight
+    return total / weights
+
+
+def without_camera(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix]) -> dict[int, FloatArray]:
+    """Flows less the motion of the camera.
+
+    Parameters
+    ----------
+    flows : mapping of int to ndarray, float32, shape (H, W, 2)
+    cameras : mapping of int to ndarray, float64, shape (2, 3)
+
+    Returns
+    -------
+    dict of int to ndarray
+
+    Examples
+    --------
+    >>> flow = np.ones((4, 4, 2), np.float32)
+    >>> float(without_camera({1: flow}, {1: np.array([[0, 0, 1.0], [0, 0, 1.0]])})[1].max())
+    0.0
+    """
+    return {offset: flow - camera_flow(cameras[offset], flow.shape) for offset, flow in flows.items()}
+
+
+def _symmetric(values: Mapping[int, np.ndarray], offset: int) -> np.ndarray:
+    if offset in values and -offset in values:
+        return (values[offset] + values[-offset]) / 2
+    return values[offset] if offset in values else values[-offset]
