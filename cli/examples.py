@@ -10,6 +10,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore restore sample_data/chart.mkv all.png --keep stages --truth sample_data/chart_truth.png --json",
         "turbrestore restore sample_data/chart.mkv later.png --keep kept --resume",
     ),
+    "steady": (
+        "turbrestore steady sample_data/chart.mkv steady.mp4 --frames 0:16",
+        "turbrestore steady sample_data/chart.mkv still.mkv --frames 0:16 --camera lock --mask moving.mkv --json",
+    ),
     "report": ("turbrestore report stages", "turbrestore report stages report.html"),
     "centroid": ("turbrestore centroid sample_data/chart.mkv centroid.npz --train 40",),
     "flow": ("turbrestore flow centroid.npz sample_data/chart.mkv flows.npy --flow.method farneback",),

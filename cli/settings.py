@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cyclopts.argument import Argument, ArgumentCollection
 
 # What a settings file must not decide behind the user's back.
-NOT_SETTINGS = {"config", "overwrite", "keep", "resume", "checkpoint_every", "truth", "report", "json", "quiet"}
+NOT_SETTINGS = {"config", "overwrite", "keep", "resume", "checkpoint_every", "truth", "report", "mask", "json", "quiet"}
 
 
 def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:

@@ -17,6 +17,9 @@ with a the acceleration of the point.  Over several i the displacements of the n
 
 with |S_i|² averaged in a small window.  A large S_i is motion rather than turbulence: it has little weight, and where
 all are large the frame passes as it is.  The ½ is the share of the frame itself, whose flow to itself is zero.
+
+Curvature of paths and turbulence cannot be told apart in a few frames, so c is a setting; only where the scene is known
+to stand still does it follow the median of |S_i|.
 """
 
 from __future__ import annotations
@@ -31,6 +34,10 @@ from .camera import Matrix, camera_flow, camera_size
 
 # Window in which |S|² is averaged, pixels; share of the frame itself.
 _WINDOW, _OWN_SHARE = 4.0, 0.5
+# c over the median of |S_i| where the scene stands still, and the smallest c, pixels.
+_SIZES, _LEAST = 2.5, 1.0
+# Every so many pixels enter the median.
+_SAMPLE = 4
 # The camera may shake by this share of c before its motion passes for wanted.
 _CAMERA_SHARE = 0.5
 
@@ -96,6 +103,30 @@ def camera_displacement(cameras: Mapping[int, Matrix], shape: tuple[int, ...], l
         weight = 1 / (1 + (camera_size(mean, shape) / (_CAMERA_SHARE * largest)) ** 4)
         total, weights = total + weight * mean, weights + weight
     return total / weights
+
+
+def still_displacement(flows: Mapping[int, FloatArray]) -> float:
+    """What turbulence displaces at most in a scene that stands still.
+
+    Parameters
+    ----------
+    flows : mapping of int to ndarray, float32, shape (H, W, 2)
+        F_i − A_i by i, pixels; not empty.
+
+    Returns
+    -------
+    float
+        c, pixels.
+
+    Examples
+    --------
+    >>> jolt = np.full((8, 8, 2), (3.0, 4.0), np.float32)
+    >>> still_displacement({-1: jolt, 1: jolt})
+    12.5
+    """
+    means = [_symmetric(flows, distance)[::_SAMPLE, ::_SAMPLE] for distance in {abs(offset) for offset in flows}]
+    sizes = [float(np.median(np.hypot(mean[..., 0], mean[..., 1]))) for mean in means]
+    return max(_LEAST, _SIZES * float(np.mean(sizes)))
 
 
 def without_camera(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix]) -> dict[int, FloatArray]:
