@@ -18,8 +18,8 @@ with a the acceleration of the point.  Over several i the displacements of the n
 with |S_i|² averaged in a small window.  A large S_i is motion rather than turbulence: it has little weight, and where
 all are large the frame passes as it is.  The ½ is the share of the frame itself, whose flow to itself is zero.
 
-Curvature of paths and turbulence cannot be told apart in a few frames, so c is a setting; only where the scene is known
-to stand still does it follow the median of |S_i|.
+Curved motion and turbulence cannot be told apart in a few frames.  While the camera stands still, most of a scene does,
+and c follows the median of |S_i| between 1 and 4 pixels; while it moves, c is 1 pixel.
 """
 
 from __future__ import annotations
@@ -34,8 +34,11 @@ from .camera import Matrix, camera_flow, camera_size
 
 # Window in which |S|² is averaged, pixels; share of the frame itself.
 _WINDOW, _OWN_SHARE = 4.0, 0.5
-# c over the median of |S_i| where the scene stands still, and the smallest c, pixels.
-_SIZES, _LEAST = 2.5, 1.0
+# c over the median of |S_i| while the camera stands still; smallest and largest c, pixels.
+_SIZES, _LEAST, _MOST = 2.5, 1.0, 4.0
+# Travel of the camera within the window, pixels, at which it counts as half moving; turbulence moves whole frames by
+# up to 3 pixels, and a hand by 10 and more.
+_TRAVEL = 6.0
 # Every so many pixels enter the median.
 _SAMPLE = 4
 # The camera may shake by this share of c before its motion passes for wanted.
@@ -105,13 +108,15 @@ def camera_displacement(cameras: Mapping[int, Matrix], shape: tuple[int, ...], l
     return total / weights
 
 
-def still_displacement(flows: Mapping[int, FloatArray]) -> float:
-    """What turbulence displaces at most in a scene that stands still.
+def largest_displacement(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix]) -> float:
+    """Tell what turbulence displaces at most.
 
     Parameters
     ----------
     flows : mapping of int to ndarray, float32, shape (H, W, 2)
         F_i − A_i by i, pixels; not empty.
+    cameras : mapping of int to ndarray, float64, shape (2, 3)
+        M of A_i by i; empty if the camera is known to stand still.
 
     Returns
     -------
@@ -120,13 +125,18 @@ def still_displacement(flows: Mapping[int, FloatArray]) -> float:
 
     Examples
     --------
-    >>> jolt = np.full((8, 8, 2), (3.0, 4.0), np.float32)
-    >>> still_displacement({-1: jolt, 1: jolt})
-    12.5
+    >>> jolt, pan = np.full((8, 8, 2), (0.6, 0.8), np.float32), np.array([[0, 0, 20.0], [0, 0, 0]])
+    >>> largest_displacement({-1: jolt, 1: jolt}, {})
+    2.5
+    >>> round(largest_displacement({-1: jolt, 1: jolt}, {-1: -pan, 1: pan}), 2)
+    1.0
     """
     means = [_symmetric(flows, distance)[::_SAMPLE, ::_SAMPLE] for distance in {abs(offset) for offset in flows}]
     sizes = [float(np.median(np.hypot(mean[..., 0], mean[..., 1]))) for mean in means]
-    return max(_LEAST, _SIZES * float(np.mean(sizes)))
+    still = float(np.clip(_SIZES * np.mean(sizes), _LEAST, _MOST))
+    shape = next(iter(flows.values())).shape
+    travel = float(np.median([camera_size(camera, shape) for camera in cameras.values()])) if cameras else 0.0
+    return _LEAST + (still - _LEAST) / (1 + (travel / _TRAVEL) ** 8)
 
 
 def without_camera(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix]) -> dict[int, FloatArray]:

@@ -23,7 +23,7 @@ from ..core.arrays import FloatArray
 
 # Windows, pixels, in which the difference and its square are averaged.
 _DIFFERENCE_WINDOW, _SQUARE_WINDOW = 1.5, 2.0
-# Difference that misregistration leaves at edges, intensity; share of the noise that remains in the averaged difference.
+# Difference that misregistration leaves at edges, intensity; share of the noise that the windows leave.
 _MISREGISTRATION, _NOISE_SHARE = 0.02, 0.5
 
 
@@ -62,5 +62,5 @@ def fuse(frame: FloatArray, neighbours: Iterable[FloatArray], noise: float) -> t
         total += weight * neighbour if frame.ndim == 2 else weight[..., None] * neighbour
         weights += weight
         count += 1
-    agreement = (weights - 1) / count if count else weights
+    agreement = np.asarray((weights - 1) / count if count else weights, np.float32)
     return total / (weights if frame.ndim == 2 else weights[..., None]), agreement

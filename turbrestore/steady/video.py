@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..blur.estimation import estimate_blur
 from ..blur.psf import KOLMOGOROV
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError, require, require_between
 from ..core.noise import estimate_noise
 from ..registration.flow import MIN_SIDE
@@ -42,8 +42,9 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_ahead
 from .camera import Matrix, camera_flow, fit_camera
 from .deblurring import deblur
-from .displacement import camera_displacement, mean_displacement, still_displacement, without_camera
+from .displacement import camera_displacement, largest_displacement, mean_displacement, without_camera
 from .fusion import fuse
+from .motion import moving_mask
 from .windows import Window, iter_windows
 
 CAMERAS = ("keep", "steady", "lock")
@@ -51,13 +52,9 @@ CAMERAS = ("keep", "steady", "lock")
 _FLOW = DisParams(finest_scale=1, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
 # Smallest side of a frame that is registered at half of the resolution.
 _HALVED = 128
-# What turbulence displaces at most where nothing is known, pixels.
-_LARGEST = 1.0
 # Share of the estimated width that is removed: on two videos with known truth, a width that is too small by 15 % costs
 # 0.1 dB, one that is too large by as much 0.4 dB, and estimates are too large by up to a third.
 _CAUTION = 0.8
-# Speed, pixels a frame, above which a point counts as moving; agreement below which it does.
-_SPEED, _AGREEMENT = 0.25, 0.5
 
 
 @dataclass(frozen=True)
@@ -74,8 +71,8 @@ class SteadyParams:
     reach : int
         Distance of the furthest neighbours of a frame, frames: the delay of a stream.
     largest : float, optional
-        What turbulence displaces at most, pixels; larger displacements pass for motion and are kept.  By default 1, and
-        measured where the camera is locked, because then all that moves is turbulence.
+        What turbulence displaces at most, pixels; larger displacements pass for motion and are kept.  By default it is
+        measured while the camera stands still or is locked, and 1 while it moves.
 
     Raises
     ------
@@ -219,9 +216,9 @@ def steady_frame(window: Window, params: SteadyParams) -> SteadyFrame:
     flows = _measure(window)
     cameras = {offset: fit_camera(flow) for offset, flow in flows.items()}
     own = without_camera(flows, cameras)
-    removed_camera, displacement = np.zeros((2, 3)), np.zeros((*shape, 2), np.float32)
+    removed_camera, displacement, largest = np.zeros((2, 3)), np.zeros((*shape, 2), np.float32), np.inf
     if flows:
-        largest = params.largest or (still_displacement(own) if params.camera == "lock" else _LARGEST)
+        largest = params.largest or largest_displacement(own, {} if params.camera == "lock" else cameras)
         removed_camera = camera_displacement(cameras, shape, largest if params.camera == "keep" else np.inf)
         displacement = mean_displacement(own, largest) + camera_flow(removed_camera, shape)
     inverse = invert_flow(displacement)
@@ -235,7 +232,7 @@ def steady_frame(window: Window, params: SteadyParams) -> SteadyFrame:
     return SteadyFrame(
         number=window.number,
         image=deblur(fused, sigma, KOLMOGOROV, noise * share),
-        moving=_moving(own, agreement),
+        moving=moving_mask(own, luminance(image), _placed(window, cameras), agreement, largest),
         displacement=float(np.sqrt(np.mean(np.sum(displacement**2, -1)))),
         sigma=sigma,
         starts_scene=window.starts_scene,
@@ -254,16 +251,15 @@ def _measure(window: Window) -> dict[int, FloatArray]:
     return {offset: solve(frame.levels[None], [None])[0] for offset, frame in window.neighbours.items()}
 
 
-def _moving(flows: dict[int, FloatArray], agreement: FloatArray) -> NDArray[np.bool_]:
-    """Points with a speed of their own, and those that neighbours show otherwise."""
-    moving = agreement < _AGREEMENT
-    pairs = [offset for offset in flows if offset > 0 and -offset in flows]
-    if pairs:
-        # Least squares fit of a velocity, pixels a frame, to the path of every point.
-        velocity = sum(offset * (flows[offset] - flows[-offset]) for offset in pairs)
-        velocity = velocity / (2 * sum(offset**2 for offset in pairs))
-        moving |= np.hypot(velocity[..., 0], velocity[..., 1]) > _SPEED
-    return moving
+def _placed(window: Window, cameras: dict[int, Matrix]) -> dict[int, FloatArray]:
+    """Luminance of the furthest pair of neighbours, without the motion of the camera; none if there is no pair."""
+    furthest = max((offset for offset in cameras if -offset in cameras), default=0)
+    pair = (furthest, -furthest) if furthest else ()
+    shape = window.frame.levels.shape
+    return {
+        offset: sample_linear((luminance(window.neighbours[offset].image),), camera_flow(cameras[offset], shape))
+        for offset in pair
+    }
 
 
 def _locked(frames: Iterable[SteadyFrame]) -> Iterator[SteadyFrame]:
@@ -271,13 +267,17 @@ def _locked(frames: Iterable[SteadyFrame]) -> Iterator[SteadyFrame]:
     path = np.eye(3)
     for frame in frames:
         shape = frame.moving.shape
-        path = np.eye(3) if frame.starts_scene else np.linalg.inv(_affine(frame.camera)) @ path
-        pose = _affine(frame.removed_camera) @ path
+        removed = _affine(frame.removed_camera)
+        # From the steadied first frame of the scene to this frame, before it was steadied.
+        path = np.linalg.inv(removed if frame.starts_scene else _affine(frame.camera)) @ (
+            np.eye(3) if frame.starts_scene else path
+        )
+        pose = removed @ path
         flow = camera_flow(pose[:2] - np.eye(3)[:2], shape)
         moving = sample_linear((frame.moving.astype(np.float32),), flow) > 0.5
         yield replace(frame, image=warp(frame.image, flow), moving=moving)
 
 
 def _affine(matrix: Matrix) -> NDArray[np.float64]:
-    """The map id + A as a matrix of homogeneous coordinates about the centre."""
+    """Write the map id + A as a matrix of homogeneous coordinates about the centre."""
     return np.eye(3) + np.vstack([matrix, np.zeros(3)])
