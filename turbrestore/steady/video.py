@@ -21,7 +21,8 @@ blur and, where the camera is locked, its path.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from typing import Literal
@@ -121,9 +122,9 @@ class SteadyFrame:
         Width of the blur that was removed, pixels.
     starts_scene : bool
         Whether a new scene starts here.
-    camera : ndarray, float64, shape (2, 3)
-        Affine motion of the camera from the frame to the one before, pixels about the centre of the image; zero for the
-        first frame of a scene.
+    cameras : mapping of int to ndarray, float64, shape (2, 3)
+        Affine motion of the camera from the frame to each neighbour, by its distance in frames, pixels about the centre
+        of the image.
     removed_camera : ndarray, float64, shape (2, 3)
         Its part in the displacement that was removed.
     """
@@ -134,7 +135,7 @@ class SteadyFrame:
     displacement: float
     sigma: float
     starts_scene: bool
-    camera: Matrix
+    cameras: Mapping[int, Matrix]
     removed_camera: Matrix
 
 
@@ -183,7 +184,7 @@ def steady_frames(
     known = replace(params, sigma=sigma)
     results = map_ahead(lambda window: steady_frame(window, known), chain(head, windows), runtime.threads)
     steadied = (result for _, result in results)
-    yield from _locked(steadied) if params.camera == "lock" else steadied
+    yield from _locked(steadied, params.reach) if params.camera == "lock" else steadied
 
 
 def steady_frame(window: Window, params: SteadyParams) -> SteadyFrame:
@@ -236,7 +237,7 @@ def steady_frame(window: Window, params: SteadyParams) -> SteadyFrame:
         displacement=float(np.sqrt(np.mean(np.sum(displacement**2, -1)))),
         sigma=sigma,
         starts_scene=window.starts_scene,
-        camera=cameras.get(-1, np.zeros((2, 3))),
+        cameras=cameras,
         removed_camera=removed_camera,
     )
 
@@ -262,18 +263,24 @@ def _placed(window: Window, cameras: dict[int, Matrix]) -> dict[int, FloatArray]
     }
 
 
-def _locked(frames: Iterable[SteadyFrame]) -> Iterator[SteadyFrame]:
-    """Show every frame of a scene from where its first frame was taken."""
-    path = np.eye(3)
+def _locked(frames: Iterable[SteadyFrame], reach: int) -> Iterator[SteadyFrame]:
+    """Show every frame of a scene from where its steadied first frame was taken.
+
+    The map from there to a frame is the mean over its earlier neighbours of the map to them and on to the frame; those
+    far away keep errors from adding up with every frame.
+    """
+    paths: deque[NDArray[np.float64]] = deque(maxlen=reach)
     for frame in frames:
-        shape = frame.moving.shape
         removed = _affine(frame.removed_camera)
-        # From the steadied first frame of the scene to this frame, before it was steadied.
-        path = np.linalg.inv(removed if frame.starts_scene else _affine(frame.camera)) @ (
-            np.eye(3) if frame.starts_scene else path
-        )
-        pose = removed @ path
-        flow = camera_flow(pose[:2] - np.eye(3)[:2], shape)
+        if frame.starts_scene:
+            paths.clear()
+            path = np.linalg.inv(removed)
+        else:
+            earlier = [offset for offset in frame.cameras if offset < 0]
+            steps = [np.linalg.inv(_affine(frame.cameras[offset])) @ paths[offset] for offset in earlier]
+            path = np.mean(steps, 0)
+        paths.append(path)
+        flow = camera_flow((removed @ path)[:2] - np.eye(3)[:2], frame.moving.shape)
         moving = sample_linear((frame.moving.astype(np.float32),), flow) > 0.5
         yield replace(frame, image=warp(frame.image, flow), moving=moving)
 
