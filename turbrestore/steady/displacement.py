@@ -84,7 +84,7 @@ def camera_displacement(cameras: Mapping[int, Matrix], shape: tuple[int, ...], l
     Parameters
     ----------
     cameras : mapping of int to ndarray, float64, shape (2, 3)
-        M of A_i by i; not empty.
+        M of A_i by i.
     shape : tuple of int
         (H, W) of the frames.
     largest : float

@@ -220,7 +220,12 @@ def steady_frame(window: Window, params: SteadyParams) -> SteadyFrame:
     removed_camera, displacement, largest = np.zeros((2, 3)), np.zeros((*shape, 2), np.float32), np.inf
     if flows:
         largest = params.largest or largest_displacement(own, {} if params.camera == "lock" else cameras)
-        removed_camera = camera_displacement(cameras, shape, largest if params.camera == "keep" else np.inf)
+        if params.camera == "steady":
+            # A pan is straight only as seen from its middle.
+            pairs = {offset: camera for offset, camera in cameras.items() if -offset in cameras}
+            removed_camera = camera_displacement(pairs, shape, np.inf)
+        else:
+            removed_camera = camera_displacement(cameras, shape, largest)
         displacement = mean_displacement(own, largest) + camera_flow(removed_camera, shape)
     inverse = invert_flow(displacement)
     registered = (
@@ -278,7 +283,7 @@ def _locked(frames: Iterable[SteadyFrame], reach: int) -> Iterator[SteadyFrame]:
         else:
             earlier = [offset for offset in frame.cameras if offset < 0]
             steps = [np.linalg.inv(_affine(frame.cameras[offset])) @ paths[offset] for offset in earlier]
-            path = np.mean(steps, 0)
+            path = np.sum(steps, 0) / len(steps)
         paths.append(path)
         flow = camera_flow((removed @ path)[:2] - np.eye(3)[:2], frame.moving.shape)
         moving = sample_linear((frame.moving.astype(np.float32),), flow) > 0.5
