@@ -113,23 +113,22 @@ class TestCamera:
         ours = images(truth, camera=camera, sigma=0)
         assert min(psnr(image, scene) for image, scene in zip(ours, truth, strict=True)) > 30
 
-    def test_a_locked_camera_shows_the_first_frame(self):
-        truth = self.pan(step=1, count=8)
+    def test_a_locked_camera_stands_still(self):
+        truth, left = self.pan(step=1, count=10), np.s_[16:-16, 16:-24]
         ours = images(truth, camera="lock", sigma=0)
-        left = np.s_[16:-16, 16:-24]
-        assert min(psnr(image, truth[0], left) for image in ours[2:-2]) > 28
+        assert min(psnr(image, ours[0], left) for image in ours[1:]) > 28
         assert psnr(truth[-1], truth[0], left) < 22
 
     def test_shake_is_smoothed(self):
-        large, shake = photo(size=SIZE + 12), [(0, 3)[k % 2] for k in range(12)]
-        truth = [large[6 : 6 + SIZE, 6 + x : 6 + x + SIZE] for x in shake]
+        shake = np.random.default_rng(0).integers(0, 7, 16)
+        large = photo(size=SIZE + 8)
+        truth = [large[4 : 4 + SIZE, x : x + SIZE] for x in shake]
 
         def change(frames):
             return np.mean([np.abs(b - a)[8:-8, 8:-8].mean() for a, b in itertools.pairwise(frames)])
 
-        kept, steadied = (change(images(truth, camera=camera, sigma=0)[3:9]) for camera in ("keep", "steady"))
-        assert steadied < 0.5 * kept
-        assert kept > 0.7 * change(truth[3:9])
+        kept, steadied = (change(images(truth, camera=camera, sigma=0)[4:12]) for camera in ("keep", "steady"))
+        assert steadied < 0.6 * kept
 
 
 class TestStream:

@@ -108,6 +108,32 @@ def camera_displacement(cameras: Mapping[int, Matrix], shape: tuple[int, ...], l
     return total / weights
 
 
+def camera_shake(cameras: Mapping[int, Matrix]) -> Matrix:
+    """Deviation of the camera from motion at constant velocity, with the sign of :func:`camera_displacement`.
+
+    Parameters
+    ----------
+    cameras : mapping of int to ndarray, float64, shape (2, 3)
+        M of A_i by i; not empty.
+
+    Returns
+    -------
+    ndarray, float64, shape (2, 3)
+        Value at the frame of the line that fits the path of the camera best.
+
+    Examples
+    --------
+    >>> pan = np.array([[0, 0, 7.0], [0, 0, 0]])
+    >>> bool(abs(camera_shake({1: pan, 2: 2 * pan})).max() < 1e-9)
+    True
+    """
+    offsets = np.array([0, *cameras])
+    path = np.stack([np.zeros((2, 3)), *cameras.values()]).reshape(-1, 6)
+    # With one neighbour a line fits both: the frame stays.
+    line = np.linalg.lstsq(np.stack([np.ones(len(offsets)), offsets], 1), path, rcond=None)[0]
+    return line[0].reshape(2, 3)
+
+
 def largest_displacement(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix]) -> float:
     """Tell what turbulence displaces at most.
 

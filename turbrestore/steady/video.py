@@ -43,7 +43,7 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_ahead
 from .camera import Matrix, camera_flow, fit_camera
 from .deblurring import deblur
-from .displacement import camera_displacement, largest_displacement, mean_displacement, without_camera
+from .displacement import camera_displacement, camera_shake, largest_displacement, mean_displacement, without_camera
 from .fusion import fuse
 from .motion import moving_mask
 from .windows import Window, iter_windows
@@ -51,6 +51,8 @@ from .windows import Window, iter_windows
 CAMERAS = ("keep", "steady", "lock")
 # Half of the resolution is enough for displacements as smooth as those of turbulence, and five times as fast.
 _FLOW = DisParams(finest_scale=1, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
+# Level of the pyramid, above the finest, at which a search with a start begins.
+_START_LEVEL = 3
 # Smallest side of a frame that is registered at half of the resolution.
 _HALVED = 128
 # Share of the estimated width that is removed: on two videos with known truth, a width that is too small by 15 % costs
@@ -214,18 +216,15 @@ def steady_frame(window: Window, params: SteadyParams) -> SteadyFrame:
     0.0
     """
     image, shape, sigma = window.frame.image, window.frame.levels.shape, params.sigma or 0.0
-    flows = _measure(window)
-    cameras = {offset: fit_camera(flow) for offset, flow in flows.items()}
+    flows, cameras = _measure(window)
     own = without_camera(flows, cameras)
     removed_camera, displacement, largest = np.zeros((2, 3)), np.zeros((*shape, 2), np.float32), np.inf
     if flows:
         largest = params.largest or largest_displacement(own, {} if params.camera == "lock" else cameras)
         if params.camera == "steady":
-            # A pan is straight only as seen from its middle.
-            pairs = {offset: camera for offset, camera in cameras.items() if -offset in cameras}
-            removed_camera = camera_displacement(pairs, shape, np.inf)
+            removed_camera = camera_shake(cameras)
         else:
-            removed_camera = camera_displacement(cameras, shape, largest)
+            removed_camera = camera_displacement(cameras, shape, largest if params.camera == "keep" else np.inf)
         displacement = mean_displacement(own, largest) + camera_flow(removed_camera, shape)
     inverse = invert_flow(displacement)
     registered = (
@@ -247,14 +246,28 @@ def steady_frame(window: Window, params: SteadyParams) -> SteadyFrame:
     )
 
 
-def _measure(window: Window) -> dict[int, FloatArray]:
-    """Flow from the frame to each neighbour."""
+def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
+    """Flow from the frame to each neighbour, and its affine part.
+
+    A pan leads far in a dozen frames, so the search for a far neighbour starts where the camera would be if it went on
+    as it went to the one before.
+    """
     levels = window.frame.levels
     if min(levels.shape) < MIN_SIDE:
         found = f"{levels.shape[1]}×{levels.shape[0]}"
         raise DataError(f"frames: expected at least {MIN_SIDE}×{MIN_SIDE} pixels for optical flow, found {found}")
-    solve = dis_solver(_FLOW if min(levels.shape) >= _HALVED else replace(_FLOW, finest_scale=0), levels, 0)
-    return {offset: solve(frame.levels[None], [None])[0] for offset, frame in window.neighbours.items()}
+    params = _FLOW if min(levels.shape) >= _HALVED else replace(_FLOW, finest_scale=0)
+    solve = dis_solver(params, levels, _START_LEVEL)
+    flows: dict[int, FloatArray] = {}
+    cameras: dict[int, Matrix] = {}
+    before = {-1: 0, 1: 0}
+    for offset in sorted(window.neighbours, key=abs):
+        side = 1 if offset > 0 else -1
+        near, before[side] = before[side], offset
+        start = camera_flow(cameras[near] * (offset / near), levels.shape) if near else None
+        flows[offset] = solve(window.neighbours[offset].levels[None], [start])[0]
+        cameras[offset] = fit_camera(flows[offset])
+    return flows, cameras
 
 
 def _placed(window: Window, cameras: dict[int, Matrix]) -> dict[int, FloatArray]:
@@ -274,7 +287,7 @@ def _locked(frames: Iterable[SteadyFrame], reach: int) -> Iterator[SteadyFrame]:
     The map from there to a frame is the mean over its earlier neighbours of the map to them and on to the frame; those
     far away keep errors from adding up with every frame.
     """
-    paths: deque[NDArray[np.float64]] = deque(maxlen=reach)
+    paths: deque[np.ndarray] = deque(maxlen=reach)
     for frame in frames:
         removed = _affine(frame.removed_camera)
         if frame.starts_scene:
@@ -283,7 +296,7 @@ def _locked(frames: Iterable[SteadyFrame], reach: int) -> Iterator[SteadyFrame]:
         else:
             earlier = [offset for offset in frame.cameras if offset < 0]
             steps = [np.linalg.inv(_affine(frame.cameras[offset])) @ paths[offset] for offset in earlier]
-            path = np.sum(steps, 0) / len(steps)
+            path = np.mean(steps, 0)
         paths.append(path)
         flow = camera_flow((removed @ path)[:2] - np.eye(3)[:2], frame.moving.shape)
         moving = sample_linear((frame.moving.astype(np.float32),), flow) > 0.5
