@@ -11,8 +11,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore restore sample_data/chart.mkv later.png --keep kept --resume",
     ),
     "steady": (
-        "turbrestore steady sample_data/chart.mkv steady.mp4 --frames 0:16",
-        "turbrestore steady sample_data/chart.mkv still.mkv --frames 0:16 --camera lock --mask moving.mkv --json",
+        "turbrestore steady sample_data/chart.mkv steady.mp4",
+        "turbrestore steady sample_data/chart.mkv still.mkv --camera lock --mask moving.mkv --json",
     ),
     "report": ("turbrestore report stages", "turbrestore report stages report.html"),
     "centroid": ("turbrestore centroid sample_data/chart.mkv centroid.npz --train 40",),

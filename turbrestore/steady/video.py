@@ -85,7 +85,7 @@ class SteadyParams:
     Examples
     --------
     >>> SteadyParams(reach=6).distances
-    (1, 2, 3, 4, 6)
+    (1, 3, 4, 6)
     """
 
     camera: Literal["keep", "steady", "lock"] = "keep"
