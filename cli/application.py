@@ -20,6 +20,7 @@ from .streams import flush, silence, tell
 # Where each command lives, and what it says in one line.
 COMMANDS = {
     "restore": ("restore:restore", "Restore a video: the whole chain, input first, output last."),
+    "steady": ("steady:steady", "Steady and sharpen a video; what moves keeps moving."),
     "batch": ("batch:batch", "Restore many videos side by side."),
     "report": ("report:report", "Write the report of a run that restore --keep has kept."),
     "centroid": ("stages:centroid", "Find the centroid of a video."),

@@ -11,6 +11,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore restore sample_data/chart.mkv all.png --keep stages --truth sample_data/chart_truth.png --json",
         "turbrestore restore sample_data/chart.mkv later.png --keep kept --resume",
     ),
+    "steady": (
+        "turbrestore steady sample_data/chart.mkv steady.mp4",
+        "turbrestore steady sample_data/chart.mkv still.mkv --camera lock --mask moving.mkv --json",
+    ),
     "batch": (
         "turbrestore batch sample_data/chart.mkv --out results",
         "turbrestore batch sample_data 'sample_data/*.mkv' --out results --resume",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # What a settings file must not decide behind the user's back.
 NOT_SETTINGS = {
-    *("config", "overwrite", "keep", "resume", "checkpoint_every", "truth", "report", "json", "quiet"),
+    *("config", "overwrite", "keep", "resume", "checkpoint_every", "truth", "report", "mask", "json", "quiet"),
     *("out", "format", "reports", "scheduler", "workers"),
 }
 

@@ -180,6 +180,21 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
     )
 
 
+def keep_all(report: ContentReport) -> ContentReport:
+    """Return the report for a use that keeps every frame: defects are repaired, and nothing is left out.
+
+    Examples
+    --------
+    >>> frames = np.random.default_rng(0).random((4, 20, 20))
+    >>> frames[2] = frames[1]
+    >>> report = check_content(FrameSource.from_array(frames))
+    >>> sorted(report.left_out), sorted(keep_all(report).left_out)
+    ([2], [])
+    """
+    kept = dataclasses.replace(report, blank=(), duplicated=(), scenes=report.scenes[:1], left_out=frozenset())
+    return dataclasses.replace(kept, warnings=tuple(_in_words(kept, False)))
+
+
 class _ContentScan:
     """State of the pass over the frames."""
 

@@ -58,7 +58,7 @@ class SceneDetector:
         candidates = [self._current, *others] if self._current >= 0 else []
         best = -1.0
         for label in candidates:
-            alike = _similarity(detail, self._references[label])
+            alike = similarity(detail, self._references[label])
             best = max(best, alike)
             if alike >= self._similarity:
                 self._current = label
@@ -112,7 +112,7 @@ def thumbnail(values: FloatArray) -> FloatArray:
     return thumb - thumb.mean()
 
 
-def _similarity(a: FloatArray, b: FloatArray) -> float:
+def similarity(a: FloatArray, b: FloatArray) -> float:
     """Normalised cross-correlation at the best circular shift; 0 where one thumbnail has no detail."""
     scale = float(np.linalg.norm(a)) * float(np.linalg.norm(b))
     if scale == 0:

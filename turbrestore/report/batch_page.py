@@ -11,7 +11,7 @@ from pathlib import Path
 from ..core.arrays import FloatArray, from_unit
 from ..display.preview import data_uri, encode_image, shrink
 from ..io.output import atomic_write
-from .page import environment, _policy
+from .page import _policy, environment
 
 # Longest side of a picture, pixels, and its quality as WebP.
 _LONGEST, _QUALITY = 320, 90
@@ -99,11 +99,11 @@ def render_batch(rows: Sequence[ClipRow], folder: str = "") -> str:
     >>> "&lt;a&gt;.mkv" in page, "cut short" in page
     (True, True)
     """
-    environment = environment()
+    templates = environment()
     from markupsafe import Markup
 
     style = files(__package__).joinpath("style.css").read_text("utf-8")
-    template = environment.from_string(files(__package__).joinpath("batch.html").read_text("utf-8"))
+    template = templates.from_string(files(__package__).joinpath("batch.html").read_text("utf-8"))
     counts = {state: sum(row.state == state for row in rows) for state in ("done", "failed", "planned")}
     links = {row.output: Path(row.output).name for row in rows}
     return template.render(

@@ -1,0 +1,93 @@
+"""``turbrestore steady`` from the command line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from turbrestore.io.video import open_frames, write_video
+from turbrestore_cli.__main__ import main
+
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
+PART = ("--frames", "0:6", "--roi", "40,40,64,48")
+
+
+@pytest.fixture
+def run(capfd):
+    def call(*words):
+        code = main([str(word) for word in words])
+        out, err = capfd.readouterr()
+        return code, out, err
+
+    return call
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".npy"])
+def test_output_has_the_frames_of_the_input(run, tmp_path, suffix):
+    output = tmp_path / f"o{suffix}"
+    code, out, err = run("steady", SAMPLE, output, *PART, "--json")
+    assert (code, err) == (0, "")
+    record = json.loads(out)
+    assert record["frames"] == 6
+    assert record["scenes"] == 1
+    assert record["sigma"] >= 0
+    assert open_frames(output).shape[:3] == (6, 48, 64)
+
+
+def test_settings_repeat_the_run(run, tmp_path):
+    first, second = tmp_path / "a.npy", tmp_path / "b.npy"
+    assert run("steady", SAMPLE, first, *PART, "--camera", "lock", "--sigma", "1.1", "--bit-depth", "32")[0] == 0
+    assert run("steady", SAMPLE, second, "--config", tmp_path / "a.npy.toml", "--quiet") == (0, "", "")
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_mask_shows_what_moves(run, tmp_path):
+    frames = np.full((8, 64, 96), 0.4, np.float32)
+    frames += np.random.default_rng(0).normal(0, 0.1, (64, 96)).astype(np.float32)
+    for number, frame in enumerate(frames):
+        frame[20:40, 10 + 4 * number : 30 + 4 * number] = 0.95
+    write_video(tmp_path / "a.npy", frames.clip(0, 1), 25, 32)
+    mask = tmp_path / "mask.mkv"
+    assert run("steady", tmp_path / "a.npy", tmp_path / "o.mkv", "--sigma", "0", "--mask", mask, "--quiet")[0] == 0
+    shown = open_frames(mask).read()
+    assert set(np.unique(shown)) <= {0.0, 1.0}
+    assert shown[4, :12].mean() < 0.05 < shown[4, 18:42].mean()
+
+
+def test_duplicated_and_blank_frames_and_cuts_stay(run, tmp_path):
+    rng = np.random.default_rng(0)
+    one, two = rng.random((2, 32, 32)).astype(np.float32)
+    write_video(tmp_path / "a.npy", [one, one, 0 * one, one, two, two, two], 25, 32)
+    code, out, err = run("steady", tmp_path / "a.npy", tmp_path / "o.npy", "--sigma", "0", "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["frames"] == 7
+    assert np.allclose(np.load(tmp_path / "o.npy")[5], two, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "part"),
+    [
+        (["none.mkv", "o.mkv"], 66, "none.mkv"),
+        ([SAMPLE, "o.jpg"], 2, ".mkv"),
+        ([SAMPLE, "o.mkv", "--camera", "still"], 2, "camera"),
+        ([SAMPLE, "o.mkv", "--mask", "o.mkv"], 2, "--mask"),
+        ([SAMPLE, "no/o.mkv"], 73, "does not exist"),
+        ([SAMPLE, "o.mkv", "--roi", "0,0,8,8", "--sigma", "0"], 65, "16×16"),
+    ],
+)
+def test_wrong_words_leave_nothing_behind(run, tmp_path, monkeypatch, words, code, part):
+    monkeypatch.chdir(tmp_path)
+    found, _, err = run("steady", *words)
+    assert found == code
+    assert part in err
+    assert err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_outputs_are_not_replaced_unasked(run, tmp_path):
+    output = tmp_path / "o.npy"
+    output.write_bytes(b"mine")
+    assert run("steady", SAMPLE, output, *PART)[0] == 73
+    assert output.read_bytes() == b"mine"
+    assert run("steady", SAMPLE, output, *PART, "--overwrite", "--quiet")[0] == 0

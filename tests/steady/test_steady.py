@@ -1,0 +1,198 @@
+"""Video in, video out: still scenes, things that move, cameras, cuts, ends and memory."""
+
+import itertools
+import weakref
+
+import cv2
+import numpy as np
+import pytest
+import skimage.data
+
+from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.runtime.runtime import Runtime
+from turbrestore.steady.video import SteadyParams, steady_frames
+from turbrestore.synthesis.anisoplanatic import phase_screen_frames
+from turbrestore.synthesis.atmosphere import PhaseScreenParams
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
+
+SIZE = 128
+
+
+def photo(name="camera", size=SIZE):
+    image = cv2.resize(getattr(skimage.data, name)(), (size, size), interpolation=cv2.INTER_AREA)
+    return image.astype(np.float32) / 255
+
+
+def psnr(image, truth, part=...):
+    return -10 * np.log10(np.mean((np.clip(image, 0, 1) - truth)[part] ** 2))
+
+
+def images(frames, **settings):
+    return [frame.image for frame in steady_frames(frames, SteadyParams(**settings), Runtime(threads=2))]
+
+
+def shaken(truth, rms=0.6, seed=0):
+    """Noisy frames through smooth displacements that are independent from frame to frame."""
+    rng = np.random.default_rng(seed)
+    params = SmoothFlowParams(rms=rms, correlation_length=24.0, persistence=0.0)
+    flows = smooth_flows(len(truth), *truth[0].shape[:2], rng, params)
+    frames = [distort(scene, flow[None], rng)[0] for scene, flow in zip(truth, flows, strict=True)]
+    return [(frame + rng.normal(0, 0.01, frame.shape)).astype(np.float32) for frame in frames]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("camera", ["keep", "steady", "lock"])
+def test_frames_of_a_still_scene_come_nearer_to_the_truth(camera):
+    scene, params = photo(), PhaseScreenParams(d_over_r0=1.2, wind=(8.0,))
+    frames = [frame.image for frame in phase_screen_frames(scene, 18, np.random.default_rng(1), params)]
+    pairs = zip(images(frames, camera=camera), frames, strict=True)
+    gains = [psnr(ours, scene) - psnr(seen, scene) for ours, seen in pairs]
+    assert np.mean(gains) > 3
+    assert min(gains) > 1.5
+
+
+@pytest.fixture(scope="module")
+def square():
+    """A bright square with a dark rim that crosses a still photo by 3 pixels a frame, and the same without air."""
+    scene, truth, masks = photo(), [], []
+    for number in range(16):
+        image, mask = scene.copy(), np.zeros(scene.shape, bool)
+        top, left = 52, 16 + 3 * number
+        image[top : top + 24, left : left + 24] = 0.1
+        image[top + 4 : top + 20, left + 4 : left + 20] = 0.9
+        mask[top : top + 24, left : left + 24] = True
+        truth.append(image)
+        masks.append(mask)
+    return truth, masks, list(steady_frames(shaken(truth), SteadyParams(sigma=0)))
+
+
+class TestMovingSquare:
+    def test_passes_whole(self, square):
+        truth, masks, steadied = square
+        seen = shaken(truth)
+        gains = [psnr(steadied[k].image, truth[k], masks[k]) - psnr(seen[k], truth[k], masks[k]) for k in range(4, 12)]
+        assert np.mean(gains) > 0.5
+
+    def test_leaves_nothing_behind(self, square):
+        truth, masks, _ = square
+        # Without air, whatever differs from the truth was brought in from other frames.
+        steadied = images(truth, sigma=0)
+        for k in range(4, 12):
+            rim = cv2.dilate(masks[k].astype(np.uint8), np.ones((9, 9))) > 0
+            for other in (k - 4, k + 4):
+                trail = masks[other] & ~rim
+                square_less_scene = (truth[other] - truth[k])[trail]
+                left = (steadied[k] - truth[k])[trail] @ square_less_scene / np.square(square_less_scene).sum()
+                assert abs(left) < 0.02
+
+    def test_background_is_steadied_as_without_the_square(self, square):
+        truth, masks, steadied = square
+        still, losses = images(shaken([photo()] * len(truth)), sigma=0), []
+        for k in range(4, 12):
+            rim = ~(cv2.dilate(masks[k].astype(np.uint8), np.ones((9, 9))) > 0)
+            losses.append(psnr(still[k], photo(), rim) - psnr(steadied[k].image, truth[k], rim))
+        assert np.mean(losses) < 0.8
+
+    def test_is_marked_as_moving(self, square):
+        _, masks, steadied = square
+        inside = [frame.moving[mask].mean() for frame, mask in zip(steadied, masks, strict=True)][4:12]
+        beyond = [frame.moving[:40].mean() for frame in steadied][4:12]
+        assert np.mean(inside) > 0.5
+        assert max(beyond) < 0.05
+
+
+class TestCamera:
+    @staticmethod
+    def pan(step=2, count=14):
+        large = photo(size=SIZE + step * count)
+        return [large[:SIZE, step * k : step * k + SIZE] for k in range(count)]
+
+    @pytest.mark.parametrize("camera", ["keep", "steady"])
+    def test_a_pan_is_kept(self, camera):
+        truth = self.pan()
+        ours = images(truth, camera=camera, sigma=0)
+        assert min(psnr(image, scene) for image, scene in zip(ours, truth, strict=True)) > 30
+
+    def test_a_locked_camera_stands_still(self):
+        truth, left = self.pan(step=1, count=10), np.s_[16:-16, 16:-24]
+        ours = images(truth, camera="lock", sigma=0)
+        assert min(psnr(image, ours[0], left) for image in ours[1:]) > 28
+        assert psnr(truth[-1], truth[0], left) < 22
+
+    def test_shake_is_smoothed(self):
+        shake = np.random.default_rng(0).integers(0, 7, 16)
+        large = photo(size=SIZE + 8)
+        truth = [large[4 : 4 + SIZE, x : x + SIZE] for x in shake]
+
+        def change(frames):
+            return np.mean([np.abs(b - a)[8:-8, 8:-8].mean() for a, b in itertools.pairwise(frames)])
+
+        kept, steadied = (change(images(truth, camera=camera, sigma=0)[4:12]) for camera in ("keep", "steady"))
+        assert steadied < 0.6 * kept
+
+
+class TestStream:
+    def test_delay_and_memory_are_bounded(self):
+        scene, read, alive, ahead, kept = photo(size=32), 0, [], [], []
+
+        def stream():
+            nonlocal read
+            for _ in range(60):
+                frame = scene.copy()
+                alive.append(weakref.ref(frame))
+                read += 1
+                yield frame
+
+        params = SteadyParams(sigma=0, reach=4)
+        for steadied in steady_frames(stream(), params, Runtime(threads=1)):
+            ahead.append(read - 1 - steadied.number)
+            kept.append(sum(frame() is not None for frame in alive))
+        assert len(ahead) == 60
+        # Two frames for the thread, and half of the reach at the start.
+        assert max(ahead) <= params.reach + params.reach // 2 + 3
+        assert max(ahead[10:]) <= params.reach + 3
+        assert max(kept) <= 4 * params.reach + 6
+
+    def test_a_cut_starts_anew(self):
+        first, second = photo(), photo("brick")
+        steadied = list(steady_frames([first] * 5 + [second] * 5, SteadyParams(sigma=0)))
+        assert [frame.number for frame in steadied if frame.starts_scene] == [0, 5]
+        assert min(psnr(frame.image, first if frame.number < 5 else second) for frame in steadied) > 40
+
+    @pytest.mark.parametrize("count", [1, 2, 3])
+    def test_few_frames_that_stand_still_stay(self, count):
+        scene = photo()
+        ours = images([scene] * count, sigma=0)
+        assert len(ours) == count
+        assert all(np.allclose(image, scene, atol=2e-3) for image in ours)
+
+    def test_blank_frames_pass(self):
+        scene, blank = photo(), np.zeros((SIZE, SIZE), np.float32)
+        ours = images([scene, scene, blank, scene, scene], sigma=0)
+        assert abs(ours[2]).max() < 0.03
+        assert psnr(ours[1], scene) > 40
+
+    def test_no_frame_is_no_error(self):
+        assert images([]) == []
+
+    def test_colours_are_kept(self):
+        colour = np.stack([photo(), 0.5 * photo(), 1 - photo()], -1)
+        assert psnr(images([colour] * 3, sigma=0)[1], colour) > 40
+
+    def test_the_number_of_threads_changes_nothing(self):
+        frames = shaken([photo(size=48)] * 6)
+        one, two = (
+            [frame.image for frame in steady_frames(frames, SteadyParams(sigma=1), Runtime(threads=threads))]
+            for threads in (1, 2)
+        )
+        assert np.array_equal(one, two)
+
+
+def test_bad_frames_and_settings_are_refused():
+    with pytest.raises(DataError, match="frame 1: expected shape"):
+        images([np.zeros((32, 32)), np.zeros((32, 33))])
+    with pytest.raises(DataError, match="16×16"):
+        images([np.zeros((8, 32))] * 2, sigma=0)
+    for wrong in ({"camera": "still"}, {"reach": 0}, {"sigma": -1}, {"largest": 0}):
+        with pytest.raises(ConfigurationError, match=next(iter(wrong))):
+            SteadyParams(**wrong)

@@ -1,0 +1,66 @@
+"""Fusion of a dewarped frame with its registered neighbours.
+
+Symbols
+-------
+J : the frame, dewarped; J_i its neighbours, warped onto it
+e : difference J_i − J, averaged in a small window and squared
+t : difference that misregistration and noise explain, intensity
+w : weight of a neighbour, ``exp(−e / 2t²)``
+
+Where a neighbour shows something else than the frame, because an object or the background it uncovers has moved, or
+the flow is wrong, e exceeds what t allows and the neighbour has no weight: the frame passes as it is, and nothing of
+the neighbour is left as a ghost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+
+from ..core.arrays import FloatArray
+
+# Windows, pixels, in which the difference and its square are averaged.
+_DIFFERENCE_WINDOW, _SQUARE_WINDOW = 1.5, 2.0
+# Difference that misregistration leaves at edges, intensity; share of the noise that the windows leave.
+_MISREGISTRATION, _NOISE_SHARE = 0.02, 0.5
+
+
+def fuse(frame: FloatArray, neighbours: Iterable[FloatArray], noise: float) -> tuple[FloatArray, FloatArray]:
+    """Average a frame with the neighbours that agree with it.
+
+    Parameters
+    ----------
+    frame : ndarray, float32, shape (H, W) or (H, W, 3)
+        J.
+    neighbours : iterable of ndarray, shape of ``frame``
+        J_i.
+    noise : float
+        Standard deviation of the noise of a frame, intensity.
+
+    Returns
+    -------
+    image : ndarray, float32, shape of ``frame``
+    agreement : ndarray, float32, shape (H, W)
+        Mean of w over the neighbours, 1 if there are none.
+
+    Examples
+    --------
+    >>> frame, other = np.full((9, 9), 0.5, np.float32), np.full((9, 9), 0.9, np.float32)
+    >>> image, agreement = fuse(frame, [frame, other], 0.0)
+    >>> float(image[4, 4]), float(agreement[4, 4])
+    (0.5, 0.5)
+    """
+    tolerance = 2 * (_MISREGISTRATION**2 + (_NOISE_SHARE * noise) ** 2)
+    total, weights, count = frame.copy(), np.ones(frame.shape[:2], np.float32), 0
+    for neighbour in neighbours:
+        difference = cv2.GaussianBlur(neighbour - frame, (0, 0), _DIFFERENCE_WINDOW)
+        np.square(difference, out=difference)
+        square = difference if frame.ndim == 2 else difference.mean(-1)
+        weight = np.exp(cv2.GaussianBlur(square, (0, 0), _SQUARE_WINDOW) / -tolerance)
+        total += weight * neighbour if frame.ndim == 2 else weight[..., None] * neighbour
+        weights += weight
+        count += 1
+    agreement = np.asarray((weights - 1) / count if count else weights, np.float32)
+    return total / (weights if frame.ndim == 2 else weights[..., None]), agreement

@@ -1,0 +1,135 @@
+"""Windows of a stream of frames: each frame with its neighbours in the same scene, as soon as they are there.
+
+Memory is bounded by the frames of two windows, however long the stream is.  A frame that is unlike the one before, as
+thumbnails show it (:mod:`turbrestore.footage.scene_cuts`), starts a new scene; a window holds frames of one scene only.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arrays import FloatArray, check_image
+from ..core.errors import DataError
+from ..footage.scene_cuts import similarity, thumbnail
+from ..registration.contrast import grey_levels
+from ..registration.opencv_flow import GreyImage
+
+# Likeness of two successive frames below which the second starts a new scene.
+_CUT = 0.5
+# Contrast normalisation of the images that flow is measured from, as in registration.flow.
+_CONTRAST_WINDOW, _CONTRAST_FLOOR = 10.0, 0.01
+# Standard deviation of the shading that is taken off thumbnails, pixels of the thumbnail.
+_SHADING = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class WindowFrame:
+    """A frame of a stream.
+
+    Attributes
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+    levels : ndarray, uint8, shape (H, W)
+        Contrast-normalised image, which flow is measured from.
+    scene : int
+        Number of the scene, from 0.
+    """
+
+    image: FloatArray
+    levels: GreyImage
+    scene: int
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A frame and its neighbours in the same scene.
+
+    Attributes
+    ----------
+    number : int
+        Number of the frame in the stream, from 0.
+    frame : WindowFrame
+    neighbours : mapping of int to WindowFrame
+        By their distance in frames, negative before the frame.
+    starts_scene : bool
+        Whether the frame is the first of its scene.
+    """
+
+    number: int
+    frame: WindowFrame
+    neighbours: Mapping[int, WindowFrame]
+    starts_scene: bool
+
+
+def iter_windows(frames: Iterable[ArrayLike], distances: Sequence[int]) -> Iterator[Window]:
+    """Yield the window of every frame, in order, once the last neighbour has been read.
+
+    Parameters
+    ----------
+    frames : iterable of array_like, shape (H, W) or (H, W, 3)
+        Consumed lazily.
+    distances : sequence of int
+        Distances of the neighbours, on both sides, positive.
+
+    Yields
+    ------
+    Window
+
+    Raises
+    ------
+    DataError
+        Frames differ in size, or values are not finite.
+
+    Examples
+    --------
+    >>> frames = np.random.default_rng(0).random((1, 32, 32)).repeat(4, 0)
+    >>> [(window.number, sorted(window.neighbours)) for window in iter_windows(frames, (1, 2))]
+    [(0, [1, 2]), (1, [-1, 1, 2]), (2, [-2, -1, 1]), (3, [-2, -1])]
+    """
+    reach = max(distances)
+    kept: deque[WindowFrame] = deque()
+    # Number of the first frame that is kept, and of the next one whose window is due.
+    first = due = 0
+    for frame in _prepared(frames):
+        kept.append(frame)
+        if len(kept) + first > due + reach:
+            yield _window(kept, first, due, distances)
+            due += 1
+        if len(kept) > 2 * reach:
+            kept.popleft()
+            first += 1
+    for number in range(due, first + len(kept)):
+        yield _window(kept, first, number, distances)
+
+
+def _window(kept: deque[WindowFrame], first: int, number: int, distances: Sequence[int]) -> Window:
+    place = number - first
+    frame = kept[place]
+    neighbours = {
+        offset: kept[place + offset]
+        for distance in distances
+        for offset in (-distance, distance)
+        if 0 <= place + offset < len(kept) and kept[place + offset].scene == frame.scene
+    }
+    return Window(number, frame, neighbours, number == 0 or kept[place - 1].scene != frame.scene)
+
+
+def _prepared(frames: Iterable[ArrayLike]) -> Iterator[WindowFrame]:
+    scene, before, shape = 0, None, None
+    for number, values in enumerate(frames):
+        image = check_image(values, f"frame {number}")
+        shape = shape or image.shape
+        if image.shape != shape:
+            raise DataError(f"frame {number}: expected shape {shape} as the first frame, found {image.shape}")
+        detail = thumbnail(image)
+        detail = detail - cv2.GaussianBlur(detail, (0, 0), _SHADING)
+        if before is not None and np.any(before) and np.any(detail):
+            scene += similarity(detail, before) < _CUT
+        before = detail
+        yield WindowFrame(image, grey_levels(image, _CONTRAST_WINDOW, _CONTRAST_FLOOR), scene)
