@@ -55,8 +55,8 @@ _FLOW = DisParams(finest_scale=1, patch_size=8, patch_stride=4, refinements=5, s
 _START_LEVEL = 3
 # Smallest side of a frame that is registered at half of the resolution.
 _HALVED = 128
-# Share of the estimated width that is removed: on two videos with known truth, a width that is too small by 15 % costs
-# 0.1 dB, one that is too large by as much 0.4 dB, and estimates are too large by up to a third.
+# Share of the estimated width that is removed: on the two videos of docs/steady.md, a width too small by 15 % costs
+# 0.1 dB, one too large by as much 0.4 dB, and estimates are too large by up to a third.
 _CAUTION = 0.8
 
 
