@@ -1,5 +1,6 @@
 """Clips as people record them come out as well as under steady light, at full scale, and with nobody in the way."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.light import steady_light
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
+from turbrestore.overlays import without_overlay
 from turbrestore.pipeline import restore
 from turbrestore.results import Restoration
 from turbrestore.settings import RestoreParams
@@ -85,6 +87,56 @@ class TestLight:
     def test_steady_light_is_left_as_it_is(self, scene, rms):
         source = FrameSource.from_array(make_sequence(5, 20, 96, scene, rms=rms).frames.clip(0, 1))
         assert steady_light(source) == (source, ())
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    """The scene under a camera that moves by some pixels."""
+    rng = np.random.default_rng(2)
+    clip = make_sequence(9, 24, 170, "camera", blur=0.8, noise=0.008, rms=0.8)
+    places = 28 + np.rint(np.clip(rng.normal(0, 7, (24, 2)), -20, 20)).astype(int)
+    return u8(np.stack([frame[y : y + 112, x : x + 112] for frame, (x, y) in zip(clip.frames, places, strict=True)]))
+
+
+class TestOverlays:
+    """What stands while the scene moves is no part of the scene."""
+
+    def alike(self, shaken, covered):
+        """Signal to noise between results around the middle, in dB."""
+        whole, found = restored(shaken), restored(covered)
+        assert "overlay" in subjects(found)
+        return compare(found.image[22:90, 22:90], whole.image[22:90, 22:90]).psnr
+
+    def test_field_stop(self, shaken):
+        y, x = np.mgrid[:112, :112]
+        stop = np.clip(52.5 - np.hypot(x - 56, y - 56), 0, 1)
+        assert self.alike(shaken, np.rint(shaken * stop).astype(np.uint8)) > 30
+
+    def test_reticle_and_clock(self, shaken):
+        covered = shaken.copy()
+        covered[:, 56, 36:76] = covered[:, 36:76, 56] = 255
+        covered[:, 96:106, 6:30] = 0
+        for k, frame in enumerate(covered):
+            cv2.putText(frame, f"{k:02d}", (8, 104), cv2.FONT_HERSHEY_SIMPLEX, 0.3, 255, 1)
+        assert self.alike(shaken, covered) > 30
+
+    def test_switched_off(self, shaken):
+        covered = shaken.copy()
+        covered[:, 40, 20:60] = 255
+        params = RestoreParams(until="centroid", static_mask="off")
+        assert "overlay" not in subjects(restore(FrameSource.from_array(covered), params))
+
+    def test_scenes_have_none(self, shaken, clip):
+        for frames in (shaken, u8(clip.frames), u8(0.2 + 0 * clip.frames[:1] + 0.3 * clip.frames)):
+            source = FrameSource.from_array(frames)
+            assert without_overlay(source) == (source, ())
+
+    def test_a_window_is_that_of_the_whole_frame(self, shaken):
+        covered = shaken.copy()
+        covered[:, 40, 20:60] = 255
+        source, _ = without_overlay(FrameSource.from_array(covered))
+        part = source.select((2, 5), (15, 30, 30, 25))
+        np.testing.assert_array_equal(part.read(), source.read(2, 5)[:, 30:55, 15:45])
 
 
 class TestRange:

@@ -25,6 +25,7 @@ from .footage.light import steady_light
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan, plan_memory
+from .overlays import without_overlay
 from .registration.centroid import Centroid, centroid_steps
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
@@ -119,13 +120,15 @@ def restore(
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
     begun = time.perf_counter()
+    # Before the light, because a stop would be taken for bands of it.
+    source, on_overlay = without_overlay(source) if params.static_mask == "auto" else (source, ())
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, plan.train)
     stretched, kept = _stretched_params(params, levels), store or NoStore()
     run = _Run(source, stretched, plan, tiles, kept, levels, progress, on_decision)
     run.seconds["read"] = time.perf_counter() - begun
     run.decide(*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
-    run.decide(*on_light, *on_range)
+    run.decide(*on_overlay, *on_light, *on_range)
     with returning_freed_memory(runtime.memory_limit is not None):
         return _restored(run)
 

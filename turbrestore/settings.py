@@ -16,6 +16,7 @@ from .registration.flow import FlowParams
 
 STAGES = ("centroid", "identify", "filter", "deconvolve")
 BORDERS = ("keep", "crop")
+STATIC_MASKS = ("auto", "off")
 _ALL = Share(1)
 
 
@@ -34,6 +35,9 @@ class RestoreParams:
         Lucky imaging: the share of the frames, the sharpest ones, from which the image is made, such as 0.3 or 30%.
     border : {"keep", "crop"}
         Keep the border, where fewer frames show the scene, or crop it to what nine frames in ten show.
+    static_mask : {"auto", "off"}
+        Whether what stands in the frame while the scene moves (a field stop, a reticle, a clock) is replaced by the
+        scene behind it.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -62,6 +66,7 @@ class RestoreParams:
     until: Literal["centroid", "identify", "filter", "deconvolve"] = "deconvolve"
     keep_best: Share = _ALL
     border: Literal["keep", "crop"] = "keep"
+    static_mask: Literal["auto", "off"] = "auto"
     flow: FlowParams = field(default_factory=FlowParams)
     centroid: CentroidParams = field(default_factory=CentroidParams)
     dynamics: DynamicsParams = field(default_factory=DynamicsParams)
@@ -76,6 +81,10 @@ class RestoreParams:
         require(
             self.until == STAGES[-1] or self.deconvolution.sigma is None,
             f"deconvolution.sigma: has no effect with until = {self.until}; leave one of them out",
+        )
+        require(
+            self.static_mask in STATIC_MASKS,
+            f"static_mask: expected one of {', '.join(STATIC_MASKS)}, found {self.static_mask!r}",
         )
         check_share(self.keep_best)
         require(

@@ -18,7 +18,7 @@ from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.errors import DataError
 from ..core.noise import estimate_noise
-from ..io.source import FrameSource
+from ..io.source import FrameSource, Window
 
 # Clips that span less than this share of full scale are stretched to that share; a wider span costs 0.2 dB at most.
 _NARROW, _STRETCHED = 0.2, 0.8
@@ -119,8 +119,8 @@ def stretch_levels(source: FrameSource, train: int) -> tuple[FrameSource, Levels
     levels = Levels(low - (1 - _STRETCHED) / 2 / gain, gain)
     before = source.adjust
 
-    def adjust(number: int, values: FloatArray, rows: slice) -> FloatArray:
-        return levels.stretched(values if before is None else before(number, values, rows))
+    def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
+        return levels.stretched(values if before is None else before(number, values, window))
 
     reason = f"the scene spans {low:.4g} to {high:.4g} of full scale, and results come back to these levels"
     decision = Decision("range", f"stretched {gain:.3g} times", reason)

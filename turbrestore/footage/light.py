@@ -21,8 +21,13 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
+<<<<<<< HEAD:turbrestore/footage/light.py
 from ..io.source import FrameSource
 from ..registration.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
+=======
+from ..io.source import FrameSource, Window
+from .global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
+>>>>>>> e8c4037 (What stands in the frame while the scene moves is replaced by what other frames show; the reference of a scene follows a shaken camera):turbrestore/registration/light.py
 
 # Longest side of the reduced frames, pixels, of up to that many frames, and of more.
 _SIDE, _MANY, _SIDE_OF_MANY = 96, 4000, 48
@@ -61,7 +66,7 @@ class Light:
     offsets: dict[int, float]
     rows: slice
 
-    def steady(self, number: int, values: FloatArray, rows: slice) -> FloatArray:
+    def steady(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Correct the rows of a frame.
 
         Parameters
@@ -69,8 +74,8 @@ class Light:
         number : int
             Of the frame, in the file.
         values : ndarray, float32, shape (H, W) or (H, W, 3)
-        rows : slice
-            Rows of the file that ``values`` holds.
+        window : tuple of slice
+            Rows and columns of the file that ``values`` holds.
 
         Returns
         -------
@@ -79,10 +84,10 @@ class Light:
         Examples
         --------
         >>> light = Light({7: np.array([2.0])}, {7: 0.1}, slice(0, 4))
-        >>> light.steady(7, np.full((2, 1), 0.5, np.float32), slice(1, 3)).ravel()
+        >>> light.steady(7, np.full((2, 1), 0.5, np.float32), np.s_[1:3, 0:1]).ravel()
         array([0.2, 0.2], dtype=float32)
         """
-        coefficients = self.gains[number]
+        coefficients, rows = self.gains[number], window[0]
         places = (np.arange(rows.start, rows.stop) - self.rows.start + 0.5) / (self.rows.stop - self.rows.start)
         gain = (_cosines(places, len(coefficients)) @ coefficients).astype(np.float32)
         steady = values - np.float32(self.offsets[number])
@@ -118,7 +123,12 @@ def steady_light(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]
     light, decisions = _measure_light(source)
     if light is None:
         return source, ()
-    return dataclasses.replace(source, adjust=light.steady), decisions
+    before = source.adjust
+
+    def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
+        return light.steady(number, values if before is None else before(number, values, window), window)
+
+    return dataclasses.replace(source, adjust=adjust), decisions
 
 
 def _measure_light(source: FrameSource) -> tuple[Light | None, tuple[Decision, ...]]:

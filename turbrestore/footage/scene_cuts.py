@@ -58,11 +58,13 @@ class SceneDetector:
         candidates = [self._current, *others] if self._current >= 0 else []
         best = -1.0
         for label in candidates:
-            alike = similarity(detail, self._references[label])
+            alike, shift = similarity_at(detail, self._references[label])
             best = max(best, alike)
             if alike >= self._similarity:
                 self._current = label
-                self._references[label] += _UPDATE_RATE * (detail - self._references[label])
+                # The reference follows the frame, so that jumps of the camera do not smear it.
+                moved = np.roll(self._references[label], shift, axis=(0, 1))
+                self._references[label] = moved + _UPDATE_RATE * (detail - moved)
                 break
         else:
             if len(self._references) < _MOST_SCENES:
@@ -112,10 +114,11 @@ def thumbnail(values: FloatArray) -> FloatArray:
     return thumb - thumb.mean()
 
 
-def similarity(a: FloatArray, b: FloatArray) -> float:
-    """Normalised cross-correlation at the best circular shift; 0 where one thumbnail has no detail."""
+def similarity_at(a: FloatArray, b: FloatArray) -> tuple[float, tuple[int, int]]:
+    """Normalised cross-correlation at the best circular shift of b, 0 where a thumbnail has no detail; that shift."""
     scale = float(np.linalg.norm(a)) * float(np.linalg.norm(b))
     if scale == 0:
-        return 0.0
-    peak = np.fft.irfft2(np.fft.rfft2(a) * np.conj(np.fft.rfft2(b)), a.shape).max()
-    return float(peak) / scale
+        return 0.0, (0, 0)
+    products = np.fft.irfft2(np.fft.rfft2(a) * np.conj(np.fft.rfft2(b)), a.shape)
+    row, column = np.unravel_index(int(np.argmax(products)), products.shape)
+    return float(products[row, column]) / scale, (int(row), int(column))

@@ -33,6 +33,8 @@ _LARGE = 1 << 22
 _SAMPLES, _STILLER = 48, 1.2
 # Frames have no shorter side.
 _LEAST_SIDE = 16
+# Planes of at most this share of the median contrast show nothing.
+_BLANK = 0.1
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -152,17 +154,24 @@ def _frames_last(array: NDArray[Any]) -> bool:
     """Whether what is still in an array lies along its first two axes, and its last is the slowest to change."""
     places = [np.unique(np.linspace(0, length - 1, _SAMPLES).astype(int)) for length in array.shape]
     # Whole planes of the last axis would read the whole file.
-    spread = np.asarray(array[places[0]][:, places[1]][:, :, places[2]], np.float64)
-    middle = np.float64(array[tuple(slice(max(0, n // 2 - 16), n // 2 + 16) for n in array.shape)])
+    spread = np.asarray(array[places[0]][:, places[1]][:, :, places[2]])
+    middle = np.asarray(array[tuple(slice(max(0, n // 2 - 16), n // 2 + 16) for n in array.shape)], np.float64)
     if not np.isfinite(spread).all() or not np.isfinite(middle).all():
         return False
-    # Blank frames would make a contrast of their own.
-    spread = spread[np.ptp(spread, axis=(1, 2)) > 0]
-    if not len(spread):
-        return False
+    spread, middle = (_without_blank_planes(block) for block in (spread, middle))
     still = [float(spread.mean(axis=axis).std()) for axis in (0, 2)]
     changes = [float(np.abs(np.diff(middle, axis=axis)).mean()) for axis in (0, 2)]
     return still[1] > _STILLER * still[0] and changes[1] < changes[0]
+
+
+def _without_blank_planes(block: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Leave out planes of the first and the last axis that show nothing: a blank frame changes more than any scene."""
+    for axis in (0, 2):
+        contrasts = block.std(axis=tuple(other for other in range(3) if other != axis))
+        block = np.asarray(np.compress(contrasts > _BLANK * np.median(contrasts), block, axis=axis), np.float64)
+        if min(block.shape) < 2:
+            return np.zeros((2, 2, 2))
+    return block
 
 
 def write_npy(path: Path, frames: Iterable[FloatArray], bit_depth: int = 32, overwrite: bool = False) -> None:

@@ -25,6 +25,7 @@ from .pixels import BAYER_CODES, PixelArray, demosaic, depth_of, full_scale_of, 
 
 FrameRange = tuple[int | None, int | None] | tuple[int | None, int | None, int | None]
 Roi = tuple[int, int, int, int]
+Window = tuple[slice, slice]
 # Number of frames that a message lists before it only counts the others.
 _NAMED = 5
 
@@ -62,8 +63,8 @@ class FrameSource:
     develop : callable or None
         Turns repaired native pixels into a frame, such as a Bayer mosaic into colours.
     adjust : callable or None
-        Takes the number of a frame in the file, its intensities, and the rows of the file that they are; returns the
-        intensities that are used instead, which may lie outside [0, 1].
+        Takes the number of a frame in the file, its intensities, and the rows and columns of the file that they are;
+        returns the intensities that are used instead, which may lie outside [0, 1].
     numbers, window : range or tuple of int, tuple of slice
         Ascending numbers, in the file, of the selected frames; selected rows and columns. By default all.
 
@@ -91,9 +92,9 @@ class FrameSource:
     header: tuple[str, ...] = field(default=(), repr=False)
     repair: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
     develop: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
-    adjust: Callable[[int, FloatArray, slice], FloatArray] | None = field(default=None, repr=False)
+    adjust: Callable[[int, FloatArray, Window], FloatArray] | None = field(default=None, repr=False)
     numbers: range | tuple[int, ...] = range(0)
-    window: tuple[slice, slice] = (slice(0), slice(0))
+    window: Window = (slice(0), slice(0))
 
     def __post_init__(self) -> None:
         shape = self.file_shape
@@ -285,7 +286,7 @@ class FrameSource:
     def _frames(self, chosen: range | tuple[int, ...]) -> Iterator[FloatArray]:
         for number, pixels in self._native(chosen):
             values = to_unit(pixels, self.full_scale, f"{self.name}: frame {number}")
-            yield values if self.adjust is None else self.adjust(number, values, self.window[0])
+            yield values if self.adjust is None else self.adjust(number, values, self.window)
 
     def _native(self, chosen: range | tuple[int, ...]) -> Iterator[tuple[int, PixelArray]]:
         done = 0

@@ -55,6 +55,7 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
             **({} if plan.tile is None else {"tile": plan.tile}),
             "region": [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start],
             "device": plan.runtime.device,
+            "static_mask": settings["static_mask"],
             "flow": settings["flow"],
             "centroid": settings["centroid"],
             "versions": versions(),

@@ -1,0 +1,213 @@
+"""What stands in the frame while the scene moves: a field stop, a reticle, a clock, bars beside the picture.
+
+Symbols
+-------
+mean, deviation : of the frames over time, at every pixel; where an edge of the mean moves by s pixels, the deviation is
+    about s times the gradient of the mean
+s : shift of the scene in a frame, measured without what stands
+
+Pixels of an overlay are replaced in every frame by what other frames show of the scene at that place, moved by whole
+pixels.  Where none shows anything the scene around is continued smoothly, because an edge there would be taken for one
+of the scene.  Flow, fusion and deconvolution then see the scene alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .core.arrays import FloatArray, luminance
+from .core.decision import Decision
+from .core.noise import estimate_noise
+from .io.source import FrameSource, Window
+from .registration.global_shift import global_shifts
+
+# Frames from which the overlay is found, and most frames of a clip in which one is looked for.
+_SAMPLES, _MOST = 60, 1500
+# Longest side of the reduced frames whose shifts are measured.
+_SIDE = 192
+# Root mean square of the shifts from which a scene moves, pixels.
+_LEAST_MOTION = 3.0
+# An edge stands if its gradient is that many times the deviation, and that many times the noise.
+_STANDS, _DEVIATIONS = 1.0, 8.0
+# Deviation of a pixel that stands, in units of the noise of a frame, and the least in intensity.
+_STILL, _LEAST_STILL = 2.5, 1 / 255
+# Deviation of what has no noise, in units of the noise, and how dark a stop is between black and the scene.
+_CONSTANT, _DARK = 0.5, 0.25
+# Fewest standing edge pixels of an overlay, as a share of the frame, and the largest part of a frame that it may cover.
+_LEAST_EDGES, _LARGEST = 0.0005, 0.7
+# Share of the frame that no frame shows from which it is reported, and factor between the reaches of its fill.
+_REPORTED, _WIDER = 0.002, 3.0
+# Pixels around an overlay that are replaced too, and reach of the fill under which shifts are measured.
+_AROUND, _REACH = 2, 12.0
+
+
+@dataclass(frozen=True, eq=False)
+class Overlay:
+    """Pixels that stand, and what is behind them.
+
+    Attributes
+    ----------
+    mask : ndarray, bool, shape (H, W)
+    scene : ndarray, float32, shape (H', W') or (H', W', 3)
+        Mean of the frames at one place, without the overlay.
+    hidden : float
+        Share of the frame that no frame shows.
+    origin : tuple of int
+        Row and column of the scene at which a frame without shift begins.
+    shifts : dict of int to tuple of int
+        (dx, dy) of each frame by its number in the file, pixels.
+    window : tuple of slice
+        Rows and columns of the file that the mask spans.
+    """
+
+    mask: NDArray[np.bool_]
+    scene: FloatArray
+    hidden: float
+    origin: tuple[int, int]
+    shifts: dict[int, tuple[int, int]]
+    window: Window
+
+    def without(self, number: int, values: FloatArray, window: Window) -> FloatArray:
+        """Replace the pixels that stand in a frame, or in a window of it, by the scene behind them."""
+        dx, dy = self.shifts[number]
+        down, across = (part.start - own.start for part, own in zip(window, self.window, strict=True))
+        top, left = self.origin[0] - dy + down, self.origin[1] - dx + across
+        behind = self.scene[top : top + len(values), left : left + values.shape[1]]
+        replaced = values.copy()
+        chosen = self.mask[down : down + len(values), across : across + values.shape[1]]
+        replaced[chosen] = behind[chosen]
+        return replaced
+
+
+def without_overlay(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
+    """Replace what stands in the frames while the scene moves; a source without it is returned as it is.
+
+    Parameters
+    ----------
+    source : FrameSource
+
+    Returns
+    -------
+    source : FrameSource
+    decisions : tuple of Decision
+
+    Raises
+    ------
+    DataError
+        Frames are damaged.
+
+    Examples
+    --------
+    >>> scene = cv2.GaussianBlur(np.random.default_rng(0).random((90, 140)).astype(np.float32), (0, 0), 3)
+    >>> frames = np.stack([scene[:, k : k + 96] for k in range(0, 40, 4)])
+    >>> frames[:, 40:42, 20:44] = 1
+    >>> cleaned, (found,) = without_overlay(FrameSource.from_array(frames))
+    >>> bool(cleaned.read()[5].max() < 0.9), found.subject
+    (True, 'overlay')
+    """
+    if not 3 <= len(source) <= _MOST:
+        return source, ()
+    mask = _standing(source)
+    if mask is None:
+        return source, ()
+    shifts = _shifts_of(source, mask)
+    if float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _LEAST_MOTION:
+        return source, ()
+    overlay = _overlay(source, mask, np.rint(shifts).astype(int))
+    before = source.adjust
+
+    def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
+        return overlay.without(number, values if before is None else before(number, values, window), window)
+
+    choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show there"
+    reason = "it stands while the scene moves"
+    if overlay.hidden >= _REPORTED:
+        reason += f"; {100 * overlay.hidden:.1f} % is shown by no frame, and is filled from around"
+    decision = Decision("overlay", choice, reason)
+    return dataclasses.replace(source, adjust=adjust), (decision,)
+
+
+def _standing(source: FrameSource) -> NDArray[np.bool_] | None:
+    """Pixels of connected regions that do not change and have edges that stand."""
+    part = source.select((0, len(source), max(1, len(source) // _SAMPLES)))
+    total, squares, noise = np.zeros(source.shape[1:3]), np.zeros(source.shape[1:3]), []
+    for frame in part:
+        grey = luminance(frame)
+        cv2.accumulate(grey, total)
+        cv2.accumulateSquare(grey, squares)
+        noise.append(estimate_noise(grey))
+    mean = (total / len(part)).astype(np.float32)
+    deviation = np.sqrt(np.maximum(squares / len(part) - np.square(total / len(part)), 0))
+    floor = max(_STILL * float(np.median(noise)), _LEAST_STILL)
+    still = deviation < floor
+    gradient = np.hypot(cv2.Sobel(mean, cv2.CV_32F, 1, 0), cv2.Sobel(mean, cv2.CV_32F, 0, 1)) / 8
+    edges = still & (gradient > _STANDS * deviation) & (gradient > _DEVIATIONS / _STILL * floor)
+    if edges.sum() < _LEAST_EDGES * edges.size:
+        return None
+    # A flat part of the scene does not change either; what stands has no noise of the scene, or is dark like a stop.
+    black = float(mean.min())
+    dark = mean < black + _DARK * (float(np.median(mean[~still])) - black) if (~still).any() else still
+    constant = deviation < _CONSTANT * max(float(np.median(noise)), _LEAST_STILL / _STILL)
+    grown = (still & dark) | constant | edges
+    _, labels = cv2.connectedComponents(grown.astype(np.uint8), connectivity=8)
+    counts = np.bincount(labels[edges], minlength=int(labels.max()) + 1)
+    counts[0] = 0
+    mask = (counts > 0)[labels]
+    if mask.mean() > _LARGEST:
+        return None
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * _AROUND + 1,) * 2, np.uint8)) > 0
+
+
+def _shifts_of(source: FrameSource, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Shift of the scene in every frame, pixels, measured under a smooth fill of the overlay."""
+    height, width = mask.shape
+    factor = max(1.0, max(height, width) / _SIDE)
+    size = max(16, round(width / factor)), max(16, round(height / factor))
+    known = (~mask).astype(np.float32)
+    reach = _REACH / factor
+    stack = np.empty((len(source), size[1], size[0]), np.float32)
+    weight = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
+    around = cv2.GaussianBlur(weight, (0, 0), reach) + 1e-3
+    for small, frame in zip(stack, source, strict=True):
+        seen = cv2.resize(luminance(frame) * known, size, interpolation=cv2.INTER_AREA)
+        middle = float(seen.sum() / max(float(weight.sum()), 1e-6))
+        fill = (cv2.GaussianBlur(seen, (0, 0), reach) + 1e-3 * middle) / around
+        small[...] = seen + (1 - weight) * fill
+    shifts = global_shifts(stack)
+    return shifts * (width / size[0], height / size[1])
+
+
+def _overlay(source: FrameSource, mask: NDArray[np.bool_], shifts: NDArray[np.int_]) -> Overlay:
+    """Average what all frames show of the scene, without the overlay."""
+    low, high = shifts.min(axis=0), shifts.max(axis=0)
+    height, width = mask.shape
+    shape = height + high[1] - low[1], width + high[0] - low[0]
+    total, count = np.zeros((*shape, *source.shape[3:])), np.zeros(shape)
+    origin = int(high[1]), int(high[0])
+    for (dx, dy), frame in zip(shifts, source, strict=True):
+        place = np.s_[origin[0] - dy : origin[0] - dy + height, origin[1] - dx : origin[1] - dx + width]
+        total[place][~mask] += frame[~mask]
+        count[place][~mask] += 1
+    scene = _continued((total.T / np.maximum(count, 1).T).T.astype(np.float32), count > 0)
+    hidden = float(np.mean(count[origin[0] : origin[0] + height, origin[1] : origin[1] + width] == 0))
+    places = {number: (int(dx), int(dy)) for number, (dx, dy) in zip(source.numbers, shifts, strict=True)}
+    return Overlay(mask, scene, hidden, origin, places, source.window)
+
+
+def _continued(scene: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
+    """Continue a scene into what is not known, by averages in wider and wider windows of what is."""
+    filled, missing, reach = scene.copy(), ~known, 1.0
+    weight = known.astype(np.float32)
+    while missing.any() and reach < 4 * max(known.shape):
+        around = cv2.GaussianBlur(weight, (0, 0), reach, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.GaussianBlur((scene.T * weight.T).T, (0, 0), reach, borderType=cv2.BORDER_CONSTANT)
+        near = missing & (around > 0.05)
+        filled[near] = (total[near].T / around[near]).T
+        missing &= ~near
+        reach *= _WIDER
+    return filled
