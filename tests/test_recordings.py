@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
+from turbrestore.bars import without_bars
 from turbrestore.core.errors import DataError
 from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.light import steady_light
@@ -139,6 +140,32 @@ class TestOverlays:
         np.testing.assert_array_equal(part.read(), source.read(2, 5)[:, 30:55, 15:45])
 
 
+class TestBars:
+    @pytest.mark.parametrize("sides", [(12, 12, 0, 0), (0, 0, 20, 30), (8, 0, 4, 0)])
+    def test_the_picture_is_as_without_them(self, clip, sides):
+        top, bottom, left, right = sides
+        frames = u8(0.2 + 0.7 * clip.frames)
+        barred = np.pad(frames, ((0, 0), (top, bottom), (left, right)), constant_values=16)
+        alone, found = restored(frames), restored(barred)
+        assert "bars" in subjects(found) and found.image.shape == barred.shape[1:]
+        part = found.image[top : top + 80, left : left + 80]
+        scores = [compare(image, clip.scene).psnr_fit for image in (part, alone.image)]
+        assert scores[0] > scores[1] - 0.5
+        outside = np.ones(found.image.shape, bool)
+        outside[top : top + 80, left : left + 80] = False
+        np.testing.assert_allclose(255 * found.image[outside], 16, atol=0.01)
+
+    def test_windows_are_those_of_the_whole_frame(self, clip):
+        source, _, _ = without_bars(FrameSource.from_array(np.pad(u8(clip.frames), ((0, 0), (9, 9), (0, 0)))))
+        np.testing.assert_array_equal(source.select((1, 3), (5, 0, 30, 25)).read(), source.read(1, 3)[:, :25, 5:35])
+
+    def test_black_around_a_disc_is_no_bar(self):
+        y, x = np.mgrid[:64, :80]
+        disc = 0.8 * (np.hypot(x - 40, y - 32) < 20)
+        source = FrameSource.from_array(u8(np.stack([np.roll(disc, k, axis=1) for k in range(5)])))
+        assert without_bars(source) == (source, None, ())
+
+
 class TestRange:
     def test_scale_does_not_matter(self, clip):
         scores = [score(u16(clip.frames / k), clip) for k in (1, 64, 160)]
@@ -161,6 +188,13 @@ class TestRange:
         for image in (found.image, found.mean, found.centroid.image, found.filtered.image, found.deconvolution.image):
             assert abs(float(np.mean(image)) - 0.3 - float(clip.scene.mean()) / 50) < 0.001
         assert found.filtered.image_noise < 1e-5 and "range" in subjects(found)
+
+    def test_a_disc_that_jumps_is_not_dark(self):
+        y, x = np.mgrid[:64, :80]
+        rng = np.random.default_rng(0)
+        discs = [0.8 * (np.hypot(x - 40 - dx, y - 32 - dy) < 8) for dx, dy in rng.uniform(-20, 20, (20, 2))]
+        source = FrameSource.from_array(u8(np.stack(discs)))
+        assert stretch_levels(source, 20)[0] is source
 
     def test_wide_clips_are_left_as_they_are(self, clip):
         source = FrameSource.from_array(u8(clip.frames))

@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .bars import without_bars
 from .blind.remove_blur import Deblurred, remove_blur_steps
 from .core.arrays import FloatArray
 from .core.decision import Decision
@@ -121,6 +122,7 @@ def restore(
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
     begun = time.perf_counter()
     # Before the light, because a stop would be taken for bands of it.
+    source, bars, on_bars = without_bars(source)
     source, on_overlay = without_overlay(source) if params.static_mask == "auto" else (source, ())
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, plan.train)
@@ -128,9 +130,13 @@ def restore(
     run = _Run(source, stretched, plan, tiles, kept, levels, progress, on_decision)
     run.seconds["read"] = time.perf_counter() - begun
     run.decide(*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
-    run.decide(*on_overlay, *on_light, *on_range)
+    run.decide(*on_bars, *on_overlay, *on_light, *on_range)
     with returning_freed_memory(runtime.memory_limit is not None):
-        return _restored(run)
+        restoration = _restored(run)
+    if bars is None:
+        return restoration
+    image = bars.put_back(restoration.image, *restoration.crop[:2])
+    return replace(restoration, image=image, mean=bars.put_back(restoration.mean))
 
 
 @dataclass(frozen=True)

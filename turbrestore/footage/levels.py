@@ -22,8 +22,10 @@ from ..io.source import FrameSource, Window
 
 # Clips that span less than this share of full scale are stretched to that share; a wider span costs 0.2 dB at most.
 _NARROW, _STRETCHED = 0.2, 0.8
-# Frames from whose mean the range is taken.
+# Frames from which the range is taken.
 _SAMPLES = 16
+# Percentage of the frames at either end whose extremes do not count.
+_FEW = 10
 # A contrast below one grey level of an 8-bit camera is a scene only if it is that many deviations of the noise.
 _LEAST_CONTRAST, _DEVIATIONS = 1 / 255, 12.0
 # Fields of results by the power of the gain that they scale with; images also have the offset.
@@ -128,11 +130,18 @@ def stretch_levels(source: FrameSource, train: int) -> tuple[FrameSource, Levels
 
 
 def _range_of(source: FrameSource, train: int) -> tuple[float, float]:
-    """Darkest and brightest intensity of the mean of some frames, without lone pixels."""
+    """Darkest and brightest intensity of most of some frames, without lone pixels.
+
+    The mean of the frames would not do: that of a planet that the wind shakes is dark.
+    """
     part = source.select((0, train, max(1, train // _SAMPLES)))
     total = np.zeros(source.shape[1:])
+    lows, highs = [], []
     for frame in part:
         total += frame
+        smooth = cv2.medianBlur(frame, 3)
+        lows.append(float(smooth.min()))
+        highs.append(float(smooth.max()))
     mean = (total / len(part)).astype(np.float32)
     smooth = cv2.medianBlur(mean, 3)
     low, high = float(smooth.min()), float(smooth.max())
@@ -143,4 +152,4 @@ def _range_of(source: FrameSource, train: int) -> tuple[float, float]:
         raise DataError(
             f"frames: expected a scene with some contrast, found one intensity within {high - low:.1g} of full scale"
         )
-    return low, high
+    return min(low, float(np.percentile(lows, _FEW))), max(high, float(np.percentile(highs, 100 - _FEW)))
