@@ -126,11 +126,24 @@ def round_trips() -> list[Row]:
     return [Row(title, len(pairs.PAIRS), "every array and field comes back, bit for bit", passed, tuple(failures))]
 
 
+def recordings() -> list[Row]:
+    """Clips of benchmarks/recordings.py."""
+    clips = importlib.import_module("recordings")
+    rows = list(clips.figures())
+    worse = tuple(
+        f"{name}: {result:.2f} dB, mean {mean:.2f}" for name, result, _, mean in rows if result < mean - clips.SLACK
+    )
+    rule = f"the result is no more than {clips.SLACK} dB worse than the temporal mean"
+    title = "clips as people record them: light, walkers, overlays, range"
+    return [Row(title, len(rows), rule, len(rows) - len(worse), worse)]
+
+
 GROUPS: dict[str, Callable[[], list[Row]]] = {
     "hostile-input": hostile_input,
     "bad-arguments": bad_arguments,
     "interruptions": interruptions,
     "round-trips": round_trips,
+    "recordings": recordings,
 }
 
 
