@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore.bars import without_bars
 from turbrestore.core.errors import DataError
+from turbrestore.footage.bars import without_bars
 from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.light import steady_light
+from turbrestore.footage.overlays import without_overlay
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
-from turbrestore.overlays import without_overlay
 from turbrestore.pipeline import restore
 from turbrestore.results import Restoration
 from turbrestore.settings import RestoreParams

@@ -12,7 +12,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .bars import without_bars
 from .blind.remove_blur import Deblurred, remove_blur_steps
 from .core.arrays import FloatArray
 from .core.decision import Decision
@@ -20,13 +19,14 @@ from .core.errors import require
 from .dynamics.dynamic_texture import identify
 from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import Filtered, FilterStep, filter_steps
+from .footage.bars import without_bars
 from .footage.frame_selection import best_frames, frame_quality
 from .footage.levels import Levels, stretch_levels
 from .footage.light import steady_light
+from .footage.overlays import without_overlay
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan, plan_memory
-from .overlays import without_overlay
 from .registration.centroid import Centroid, centroid_steps
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE

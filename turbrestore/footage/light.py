@@ -21,13 +21,8 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
-<<<<<<< HEAD:turbrestore/footage/light.py
-from ..io.source import FrameSource
-from ..registration.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
-=======
 from ..io.source import FrameSource, Window
-from .global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
->>>>>>> e8c4037 (What stands in the frame while the scene moves is replaced by what other frames show; the reference of a scene follows a shaken camera):turbrestore/registration/light.py
+from ..registration.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
 
 # Longest side of the reduced frames, pixels, of up to that many frames, and of more.
 _SIDE, _MANY, _SIDE_OF_MANY = 96, 4000, 48

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError
-from ..footage.scene_cuts import similarity, thumbnail
+from ..footage.scene_cuts import similarity_at, thumbnail
 from ..registration.contrast import grey_levels
 from ..registration.opencv_flow import GreyImage
 
@@ -130,6 +130,6 @@ def _prepared(frames: Iterable[ArrayLike]) -> Iterator[WindowFrame]:
         detail = thumbnail(image)
         detail = detail - cv2.GaussianBlur(detail, (0, 0), _SHADING)
         if before is not None and np.any(before) and np.any(detail):
-            scene += similarity(detail, before) < _CUT
+            scene += similarity_at(detail, before)[0] < _CUT
         before = detail
         yield WindowFrame(image, grey_levels(image, _CONTRAST_WINDOW, _CONTRAST_FLOOR), scene)

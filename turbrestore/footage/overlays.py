@@ -20,11 +20,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .core.arrays import FloatArray, luminance
-from .core.decision import Decision
-from .core.noise import estimate_noise
-from .io.source import FrameSource, Window
-from .registration.global_shift import global_shifts
+from ..core.arrays import FloatArray, luminance
+from ..core.decision import Decision
+from ..core.noise import estimate_noise
+from ..io.source import FrameSource, Window
+from ..registration.global_shift import global_shifts
 
 # Frames from which the overlay is found, and most frames of a clip in which one is looked for.
 _SAMPLES, _MOST = 60, 1500

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .core.arrays import FloatArray, luminance
-from .core.decision import Decision
-from .io.source import FrameSource, Window
+from ..core.arrays import FloatArray, luminance
+from ..core.decision import Decision
+from ..io.source import FrameSource, Window
 
 # Frames that are looked at.
 _SAMPLES = 16
