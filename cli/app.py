@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from turbrestore.core.errors import DataError, require
-from turbrestore.io.limits import check_input
 
 from .options import Flag
 from .streams import put
@@ -35,6 +34,8 @@ def app(
     no_browser : bool
         Print the address alone, and open no browser.
     """
+    from turbrestore.io.limits import check_input
+
     require(0 <= port <= 65535, f"--port: expected a number from 0 to 65535, found {port}")
     for folder in allow:
         check_input(folder)

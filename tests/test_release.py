@@ -13,7 +13,7 @@ TOOL = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"
 
 def test_every_package_is_in_the_wheel():
     folders = {path.parent.relative_to(ROOT) for path in (ROOT / "turbrestore").rglob("__init__.py")}
-    found = {".".join(folder.parts) for folder in folders} | {"turbrestore_cli"}
+    found = {".".join(folder.parts) for folder in folders} | {"turbrestore_cli", "turbrestore_app"}
     assert set(TOOL["packages"]) == found
 
 

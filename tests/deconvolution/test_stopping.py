@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from blurred_images import camera, psnr
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import fft
 from small_problems import OPS
@@ -75,6 +75,7 @@ def test_nan_never_converges():
 
 
 @given(st.integers(1, 3 * TILE), st.integers(1, 3 * TILE))
+@settings(deadline=None)
 def test_sums_over_tiles(height, width):
     image = np.random.default_rng(height * width).random((height, width), np.float32)
     expected = [
