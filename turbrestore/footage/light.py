@@ -33,6 +33,8 @@ _COSINES = 16
 # Change of a frame by its gain, or by bands, relative to the contrast of the scene, from which light changes.  Steady
 # simulated and real clips reach 0.01, and 0.03 along the rows where somebody walks through.
 _LEAST_CHANGE, _LEAST_BANDS = 0.025, 0.06
+# Share of these below which no model is fitted, as means over a frame include what passes through the scene.
+_CLEARLY = 0.7
 # Share of the residual that a model has to explain of what a simpler one leaves.
 _EXPLAINED = 0.3
 _SATURATED = 0.995
@@ -130,7 +132,7 @@ def _measure_light(source: FrameSource) -> tuple[Light | None, tuple[Decision, .
     if len(source) < 2:
         return None, ()
     frames = _reduced_frames(source)
-    reference = _reference_of(frames)
+    reference = None if _is_steady(frames) else _reference_of(frames)
     if reference is None:
         return None, ()
     anchor = _shift_reference(np.nan_to_num(reference))
@@ -208,6 +210,17 @@ def _reduced_frames(source: FrameSource) -> FloatArray:
         reduced = luminance(cv2.resize(frame, size, interpolation=cv2.INTER_AREA))
         small[...] = cv2.GaussianBlur(reduced, (0, 0), max(_LEAST_BLUR, _BLUR / factor))
     return stack
+
+
+def _is_steady(frames: FloatArray) -> bool:
+    """Whether level, contrast and rows of the frames hardly change, so that no model of the light has to be fitted."""
+    mean, rows, contrasts = frames.mean(axis=0), frames.mean(axis=2), frames.std(axis=(1, 2))
+    level = float(np.sqrt(np.mean(mean**2))) / max(float(mean.std()), 1e-9)
+    gains = rows / np.maximum(rows.mean(axis=0), 1e-6)
+    extent = gains.mean(axis=1)
+    bands = float((gains - extent[:, None]).std())
+    changes = max(float(extent.std()) * level, float(contrasts.std()) / max(float(contrasts.mean()), 1e-9))
+    return changes < _CLEARLY * _LEAST_CHANGE and bands * level < _CLEARLY * _LEAST_BANDS
 
 
 def _reference_of(frames: FloatArray) -> FloatArray | None:
