@@ -52,12 +52,15 @@ class Clip:
         Words to be read; none where there is no text.
     peers : dict of str to ndarray
         Results of other methods.
+    centroid : ndarray or None
+        The scene at the mean geometry of the frames, which is all that they can tell.
     """
 
     frames: FloatArray
     truth: FloatArray | None = None
     words: tuple[str, ...] = ()
     peers: dict[str, FloatArray] = field(default_factory=dict)
+    centroid: FloatArray | None = None
 
 
 def find_clips(patterns: Sequence[str] = ()) -> dict[str, Callable[[], Clip]]:
@@ -125,7 +128,9 @@ def _read(path: Path) -> Clip:
     truth, text = path.with_name("truth.png"), path.with_name("words.txt")
     peers = {peer.stem.removeprefix("peer_"): read_image(peer).image for peer in sorted(path.parent.glob("peer_*.png"))}
     if truth.is_file():
-        return Clip(open_frames(path).read(), read_image(truth).image, peers=peers)
+        bent = path.with_name("truth_centroid.png")
+        centroid = read_image(bent).image if bent.is_file() else None
+        return Clip(open_frames(path).read(), read_image(truth).image, peers=peers, centroid=centroid)
     words = tuple(text.read_text().split()) if text.is_file() else ()
     return Clip(_middle(path, whole=bool(words)), words=words, peers=peers)
 

@@ -132,6 +132,8 @@ def figures(image: FloatArray, clip: Clip, seconds: float) -> Figures:
     """All that can be measured of one restored image."""
     seen = appearance(image, clip.frames.mean(axis=0)) if clip.truth is None else compare(image, clip.truth)
     measured = {name: round(value, 4) for name, value in dataclasses.asdict(seen).items()}
+    if clip.centroid is not None:
+        measured["centroid_psnr"] = round(compare(image, clip.centroid).psnr, 4)
     if clip.words and can_read():
         measured["words"] = round(share_read(image, clip.words), 4)
     return measured | {"seconds": round(seconds, 2)}
@@ -171,9 +173,10 @@ def document(results: Results) -> str:
     ]
     for heading, figure, digits in (
         ("PSNR, dB", "psnr", 2),
+        ("PSNR, dB, against the scene at the mean geometry of the clip", "centroid_psnr", 2),
         ("Structural similarity, after the best gain and offset", "ssim", 3),
     ):
-        rows = _rows(results, "psnr", figure)
+        rows = _rows(results, figure, figure)
         parts.append(f"## {heading}\n\n{_table(rows, METHODS, digits, average=True)}")
     parts.append(_words_section(results))
     for heading, figure, digits in (
