@@ -181,7 +181,7 @@ def test_a_run_is_stopped_and_another_tab_goes_on(open_tab):
     press(one, "Stop")
     one.get_by_text("stopped", exact=True).wait_for()
     other.get_by_text("Preview of a part: 160×160 pixels from 24 frames").wait_for(timeout=LONG)
-    assert one.get_by_role("button", name="Run", exact=True).is_enabled()
+    one.get_by_role("button", name="Run", exact=True, disabled=False).wait_for()
     assert not one.get_by_text("Tune", exact=True).is_visible()
 
 
