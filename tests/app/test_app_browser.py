@@ -25,6 +25,7 @@ EVIL = "<img src=x onerror=document.title='taken'>.mkv"
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
 # Seconds until a run must have ended, on a machine that does other things too.
 LONG = 60_000
+pytestmark = pytest.mark.long
 
 
 class App:

@@ -88,6 +88,7 @@ class TestHelp:
 
         assert run("--version") == (0, f"{turbrestore.__version__}\n", "")
 
+    @pytest.mark.long
     def test_examples_run(self, run, folder):
         # The app serves until it is interrupted: tests/app starts it.
         for words in (name for name in EXAMPLES if name != "app"):

@@ -49,6 +49,7 @@ def test_no_file_takes_the_place_of_a_closed_stream(place):
     assert (done.returncode, done.stdout) == (0, "3\n")
 
 
+@pytest.mark.long
 @full
 def test_nobody_can_be_told_that_standard_error_is_full(place):
     done = call(place, ["restore", "clip.npy", "o.png", *RESTORE[4:]], "2>/dev/full")
@@ -57,6 +58,7 @@ def test_nobody_can_be_told_that_standard_error_is_full(place):
     assert call(place, ["info", "gone.npy"], "2>/dev/full").returncode == 66
 
 
+@pytest.mark.long
 @full
 @pytest.mark.parametrize("words", [["info", "clip.npy"], ["info", "clip.npy", "--json"], ["doctor"], ["--help"]])
 def test_a_full_standard_output_is_named(place, words):

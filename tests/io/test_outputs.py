@@ -232,6 +232,7 @@ def test_what_is_no_file_is_not_replaced(place, capsys, kind):
     assert not path.is_file()
 
 
+@pytest.mark.long
 def test_no_command_opens_a_socket(place):
     """Everything runs in a process that would end with 99 if it did."""
     commands = [
