@@ -214,12 +214,13 @@ def _finished(client: Client, orders: Sequence[Order], out: Path, quiet: bool) -
         for number, future in enumerate(as_completed(list(futures)), 1):
             order = futures.pop(future)
             row = _as_named(_row_of(future, order), order)
+            # The journal has a clip before anybody is told that it is done.
+            yield row
             if progress is not None:
                 progress("batch", number, len(here))
             if progress is None or row.state == "failed":
                 result = row.reason if row.state == "failed" else f"{row.frames} frames in {row.seconds:.1f} s"
                 say(f"{number} of {len(here)}: {row.input}: {result}", quiet)
-            yield row
 
 
 def _as_named(row: ClipRow, order: Order) -> ClipRow:
