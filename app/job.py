@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from .restoring import Restored
 
 
-class Stopped(Exception):  # noqa: N818 - it is no error
-    """Raised in the thread of a job that was stopped."""
+class Stopped(BaseException):
+    """Raised in the thread of a job that was stopped; as KeyboardInterrupt, it passes what catches errors."""
 
 
 @dataclass

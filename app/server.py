@@ -10,6 +10,7 @@ import threading
 import webbrowser
 from collections.abc import Callable
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,12 +61,10 @@ def serve(
     with tempfile.TemporaryDirectory(prefix="turbrestore-") as storage:
         # The library would keep a file in the folder of the start.
         os.environ["NICEGUI_STORAGE_PATH"] = storage
-        try:
-            import nicegui  # noqa: F401
-        except ImportError as error:
+        if find_spec("nicegui") is None:
             raise ConfigurationError(
                 "app: expected nicegui, which is not installed; run pip install 'turbrestore[app]'"
-            ) from error
+            )
         with closing(_listen(port)) as listener:
             _serve(listener, folders, file, browser, announce)
 

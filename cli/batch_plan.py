@@ -46,7 +46,9 @@ def find_clips(inputs: Iterable[Path]) -> list[Path]:
     for path in inputs:
         named = [path]
         if not path.exists() and glob.has_magic(str(path)):
-            named = [Path(name) for name in sorted(glob.glob(str(path), recursive=True))]  # noqa: PTH207 - patterns may be absolute
+            # Path.glob refuses absolute patterns, and matches hidden files.
+            names = sorted(glob.glob(str(path), recursive=True))  # noqa: PTH207
+            named = [Path(name) for name in names]
         if not named:
             raise InputNotFoundError(f"{path}: no file matches this pattern")
         for one in named:

@@ -9,6 +9,7 @@ neighbours have one colour.
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any
 
 import cv2
@@ -121,9 +122,9 @@ def without_alpha(pixels: PixelArray) -> tuple[PixelArray, tuple[str, ...]]:
 
 def upright(pixels: PixelArray, orientation: object) -> PixelArray:
     """Turn and mirror an image as its EXIF or TIFF orientation tag, 1 to 8, demands; other values do nothing."""
-    if orientation not in range(2, 9):
+    if not isinstance(orientation, Integral) or orientation not in range(2, 9):
         return pixels
-    place = int(orientation) - 1  # type: ignore[call-overload]
+    place = int(orientation) - 1
     if place >= 4:
         pixels = np.swapaxes(pixels, 0, 1)
     horizontal, vertical = [(1, 1), (-1, 1), (-1, -1), (1, -1)][place % 4]

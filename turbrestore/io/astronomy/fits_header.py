@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -226,6 +226,6 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
         return
     try:
         with gzip.open(path) as unpacked:
-            yield unpacked  # type: ignore[misc]
+            yield cast("IO[bytes]", unpacked)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise DataError(f"{path}: compressed data are damaged or cut short; copy the file again") from error
