@@ -49,7 +49,8 @@ def steady(
     Parameters
     ----------
     input : Path
-        Video (mp4, mkv, avi, mov, webm, gif), animated PNG or WebP, TIFF stack, SER, .npy, or folder of images.
+        Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, FITS cube, .npy, or folder of
+        images or FITS files.
     output : Path
         Video of the same length to write: .mp4 (H.264), .mkv (lossless), .ser, .tif, .npy, .gif or .webp.
     config : Path
