@@ -17,7 +17,7 @@ from turbrestore.io.limits import Limits
 from turbrestore.io.source import FrameSource
 from turbrestore.io.tiff import TIFF_SUFFIXES
 from turbrestore.io.video import open_frames
-from turbrestore.runs.stage_files import load_stage_image
+from turbrestore.runs.stage_files import load_guide, load_stage_image
 
 from .options import Selection
 from .progress import say
@@ -56,6 +56,13 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
 def read_input_image(input: Path, limits: Limits) -> FloatArray:
     """Read an image file within limits, or the image of a stage file."""
     return load_stage_image(input) if input.suffix.lower() == ".npz" else read_image(input, limits).image
+
+
+def read_guide(guide: Path, input: Path, limits: Limits) -> FloatArray:
+    """Read the guide of a deconvolution; between stage files it follows the geometry of the input."""
+    if guide.suffix.lower() == input.suffix.lower() == ".npz":
+        return load_guide(guide, input)
+    return read_input_image(guide, limits)
 
 
 def _calibrated(source: FrameSource, selection: Selection) -> FrameSource:

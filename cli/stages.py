@@ -25,7 +25,7 @@ from turbrestore.registration.flow import FlowParams, iterate_flows
 from turbrestore.runs.stage_files import load_artifact, load_flows, save_artifact, save_flows
 from turbrestore.runtime.steps import finish, step_counter
 
-from .inputs import open_input, read_input_image
+from .inputs import open_input, read_guide, read_input_image
 from .options import Flag, Machine, Selection, known_sigma, limits_of
 from .progress import progress_bars, say
 
@@ -235,7 +235,8 @@ def deconvolve(
     sigma : float
         Width of the blur, pixels; a Gaussian unless --deconvolution.exponent says otherwise.  Estimated by default.
     guide : Path
-        Image or stage file that the nonlocal weights are taken from; the input by default, the centroid in the paper.
+        Image or stage file that the nonlocal weights are taken from; the input by default, the centroid in the paper,
+        which is moved onto the geometry of a filtered image.
     deconvolution : DeconvolutionParams
         Method and its settings.
     guards : GuardParams
@@ -257,7 +258,7 @@ def deconvolve(
     check_output(output, inputs, overwrite, STAGE_FILE + tuple(IMAGE_OUTPUT_SUFFIXES))
     limits = limits_of(max_pixels)
     image = read_input_image(input, limits)
-    guide_image = image if guide is None else read_input_image(guide, limits)
+    guide_image = image if guide is None else read_guide(guide, input, limits)
     with progress_bars(quiet) as progress:
         steps = remove_blur_steps(image, guide_image, deconvolution, guards, machine.runtime())
         deblurred = finish(steps, step_counter(progress, "deconvolve", deconvolution.iterations))

@@ -112,6 +112,23 @@ class TestRestore:
         assert np.abs(read_image(tmp_path / "o32.tif").image - read_image(whole).image).max() < 1e-6
         assert np.load(tmp_path / "f.npy").shape == (3, 80, 80, 2)
 
+    def test_chain_of_stage_commands_equals_restore(self, run, clip, tmp_path):
+        # Half of the frames train, so the filter moves the image onto the mean geometry, and the guide must follow.
+        c, d, e, chain, whole = (tmp_path / name for name in ("c.npz", "d.npz", "e.npz", "chain.tif", "whole.tif"))
+        once, depth = ["--centroid.iterations", "1"], ["--bit-depth", "32"]
+        for words in (
+            ["restore", clip, whole, "--train", "4", *depth, *QUICK],
+            ["centroid", clip, c, "--train", "4", *once],
+            ["identify", c, d],
+            ["filter", clip, c, d, e, "--filter.inner-iterations", "1"],
+            ["deconvolve", e, chain, "--guide", c, *depth],
+        ):
+            code, _, err = run(*words)
+            assert code == 0, err
+        with np.load(e) as filtered:
+            assert np.abs(filtered["mean_flow"]).max() > 0.1
+        np.testing.assert_allclose(read_image(chain).image, read_image(whole).image, atol=1e-5)
+
     @pytest.mark.parametrize("until", ["centroid", "identify", "filter"])
     def test_until(self, run, clip, tmp_path, until):
         assert run("restore", clip, tmp_path / "o.png", "--until", until, *QUICK)[0] == 0

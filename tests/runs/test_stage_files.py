@@ -14,8 +14,17 @@ from turbrestore.io.images import write_image
 from turbrestore.io.npy import write_npz
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import Centroid, CentroidParams
+from turbrestore.registration.recentring import recentre
 from turbrestore.runs.stage_fields import FIELDS
-from turbrestore.runs.stage_files import KINDS, load_artifact, load_flows, load_stage_image, save_artifact, save_flows
+from turbrestore.runs.stage_files import (
+    KINDS,
+    load_artifact,
+    load_flows,
+    load_guide,
+    load_stage_image,
+    save_artifact,
+    save_flows,
+)
 from turbrestore.runtime.scratch import new_stack
 
 
@@ -45,6 +54,21 @@ def test_an_image_is_read_from_artifacts_and_files(restoration, tmp_path):
     save_artifact(tmp_path / "d.npz", restoration.dynamics)
     with pytest.raises(DataError, match="expected a stage file with an image, found a dynamics"):
         load_stage_image(tmp_path / "d.npz")
+
+
+def test_only_a_centroid_follows_the_geometry_of_a_filtered_image(restoration, tmp_path):
+    centroid, flow = restoration.centroid, np.full_like(restoration.filtered.mean_flow, 0.5)
+    save_artifact(tmp_path / "c.npz", centroid)
+    save_artifact(tmp_path / "f.npz", dataclasses.replace(restoration.filtered, mean_flow=flow))
+    moved = load_guide(tmp_path / "c.npz", tmp_path / "f.npz")
+    assert (moved == recentre(centroid.image, flow)).all()
+    assert not (moved == centroid.image).all()
+    assert (load_guide(tmp_path / "c.npz", tmp_path / "c.npz") == centroid.image).all()
+    assert (load_guide(tmp_path / "f.npz", tmp_path / "f.npz") == restoration.filtered.image).all()
+    small = dataclasses.replace(restoration.filtered, image=np.zeros((8, 8), np.float32), mean_flow=flow[:8, :8])
+    save_artifact(tmp_path / "s.npz", dataclasses.replace(small, variance=np.ones((8, 8), np.float32)))
+    with pytest.raises(DataError, match=r"c\.npz: expected the size of .*s\.npz, \(8, 8\), found"):
+        load_guide(tmp_path / "c.npz", tmp_path / "s.npz")
 
 
 def test_flows_come_back(restoration, tmp_path):

@@ -26,6 +26,7 @@ from ..io.limits import check_input
 from ..io.npy import map_npy, read_npz, write_npz
 from ..io.output import atomic_output, check_output
 from ..registration.centroid import Centroid
+from ..registration.recentring import recentre
 from .stage_fields import check_fields
 
 if TYPE_CHECKING:
@@ -153,10 +154,48 @@ def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
     source = Path(path)
     if source.suffix.lower() != ".npz":
         return read_image(source).image
-    kind, fields = _read(source)
-    if "image" not in fields:
-        raise DataError(f"{source}: expected a stage file with an image, found a {kind} stage file")
-    return check_image(fields["image"], str(source))
+    return _image_of(source, *_read(source))
+
+
+def load_guide(path: str | os.PathLike[str], image: str | os.PathLike[str]) -> FloatArray:
+    """Read the image of a stage file that guides the deconvolution of another one, in the geometry of the latter.
+
+    A filtered image lies at the mean geometry of all frames, the centroid at that of the training frames.  So the
+    centroid is moved as the filtered image was, as :func:`turbrestore.restore` does.
+
+    Parameters
+    ----------
+    path : path
+        Stage file of the guide.
+    image : path
+        Stage file of the image whose deconvolution it guides.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W) or (H, W, 3)
+
+    Raises
+    ------
+    InputNotFoundError
+        There is no such file.
+    DataError
+        A file is damaged or holds no image, or the stage files are of clips of different sizes.
+
+    Examples
+    --------
+    >>> load_guide("missing.npz", "missing.npz")
+    Traceback (most recent call last):
+    ...
+    turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
+    """
+    (kind, fields), (other, fields_of_image) = _read(Path(path)), _read(Path(image))
+    guide = _image_of(Path(path), kind, fields)
+    if (kind, other) != ("centroid", "filtered"):
+        return guide
+    mean_flow = fields_of_image["mean_flow"]
+    if guide.shape[:2] != mean_flow.shape[:2]:
+        raise DataError(f"{path}: expected the size of {image}, {mean_flow.shape[:2]}, found {guide.shape[:2]}")
+    return recentre(guide, mean_flow)
 
 
 def save_flows(path: str | os.PathLike[str], flows: ArrayLike, overwrite: bool = False) -> None:
@@ -251,6 +290,12 @@ def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any
         )
     check_fields(kind, fields, str(source))
     return kind, fields
+
+
+def _image_of(source: Path, kind: str, fields: dict[str, Any]) -> FloatArray:
+    if "image" not in fields:
+        raise DataError(f"{source}: expected a stage file with an image, found a {kind} stage file")
+    return check_image(fields["image"], str(source))
 
 
 def _build(kind: type[Result], fields: dict[str, Any]) -> Result:
