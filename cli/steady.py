@@ -18,7 +18,8 @@ from turbrestore.footage.content import clean_source, keep_all
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, write_video
-from turbrestore.steady.video import SteadyFrame, SteadyParams, steady_frames
+from turbrestore.steady.settings import SteadyParams
+from turbrestore.steady.video import SteadyFrame, steady_frames
 
 from .inputs import open_checked
 from .options import Flag, Machine, Selection

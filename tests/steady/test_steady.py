@@ -10,7 +10,8 @@ import skimage.data
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.runtime.runtime import Runtime
-from turbrestore.steady.video import SteadyParams, steady_frames
+from turbrestore.steady.settings import SteadyParams
+from turbrestore.steady.video import steady_frames
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows

@@ -1,13 +1,17 @@
-"""Wiener filter of one blur for all frames of a clip.
+"""Wiener filters of one blur for all frames of a clip.
 
 Symbols
 -------
 B : transfer function of the blur; L that of −Δ; λ fidelity
+n : number of frames that the memory holds, for every pixel (:mod:`turbrestore.steady.memory`)
 
 ``u = λ B (λ B² + L)⁻¹ f`` is the minimum of ``λ/2 ‖Bu − f‖² + ½ ‖∇u‖²`` (see
 :mod:`turbrestore.deconvolution.conjugate_gradient`); the image is continued by reflection.  The filter is linear and
 the same for every frame, so it adds no flicker.  λ follows the contrast and the noise; a floor of the noise stands for
 what noise does not explain, registration that differs from frame to frame and video compression.
+
+What is remembered has averaged that out: there a second filter has a lower floor and a width of its own, and the result
+is ``u_1 + (1 − 1/√n) (u_2 − u_1)``.
 """
 
 from __future__ import annotations
@@ -21,22 +25,30 @@ from scipy import fft
 from ..blur.psf import blur_otf, laplacian_symbol
 from ..core.arrays import FloatArray
 
-# Weight of contrast over noise as in psf.wiener_fidelity, and floor of the noise.
-_FIDELITY, _LEAST_NOISE = 6.0, 0.015
+# Weight of contrast over noise as in psf.wiener_fidelity.
+_FIDELITY = 6.0
+# Floors of the noise, of a frame and of what is remembered.
+_LEAST_NOISE = 0.015, 0.005
 # Margin of the reflection, in widths of the blur.
 _MARGIN = 6.0
 
 
-def deblur(image: FloatArray, sigma: float, exponent: float, noise: float) -> FloatArray:
-    """Remove a blur from an image by a linear filter.
+def deblur(
+    image: FloatArray, widths: tuple[float, float], exponent: float, noise: tuple[float, float], held: FloatArray
+) -> FloatArray:
+    """Remove a blur from an image by linear filters.
 
     Parameters
     ----------
     image : ndarray, float32, shape (H, W) or (H, W, 3)
-    sigma, exponent : float
-        Width, pixels, and shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`; a width of 0 removes none.
-    noise : float
-        Standard deviation of the noise of the image, intensity.
+    widths : tuple of float
+        Width of the blur, pixels, that is removed from a frame and from what is remembered; 0 removes none.
+    exponent : float
+        Shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`.
+    noise : tuple of float
+        Standard deviation of the noise of a frame and of what is remembered, intensity.
+    held : ndarray, float32, shape (H, W)
+        n.
 
     Returns
     -------
@@ -46,27 +58,34 @@ def deblur(image: FloatArray, sigma: float, exponent: float, noise: float) -> Fl
     --------
     >>> edge = np.repeat(np.float32([[0.2, 0.8]]), 16, 1).repeat(8, 0)
     >>> soft = cv2.GaussianBlur(edge, (0, 0), 1.0)
-    >>> bool(np.ptp(deblur(soft, 1.0, 2.0, 0.0)[4, 14:18]) > np.ptp(soft[4, 14:18]))
+    >>> sharp = deblur(soft, (1.0, 1.0), 2.0, (0.0, 0.0), np.ones((8, 32), np.float32))
+    >>> bool(np.ptp(sharp[4, 14:18]) > np.ptp(soft[4, 14:18]))
     True
     """
-    if sigma == 0:
+    if max(widths) == 0:
         return image
     height, width = image.shape[:2]
-    margin = min(int(np.ceil(_MARGIN * sigma)), height - 1, width - 1)
+    margin = min(int(np.ceil(_MARGIN * max(widths))), height - 1, width - 1)
     padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
     shape = fft.next_fast_len(padded.shape[0], real=True), fft.next_fast_len(padded.shape[1], real=True)
     below, right = shape[0] - padded.shape[0], shape[1] - padded.shape[1]
     padded = cv2.copyMakeBorder(padded, 0, below, 0, right, cv2.BORDER_REPLICATE)
-    fidelity = _FIDELITY * float(image.std()) / float(np.hypot(noise, _LEAST_NOISE))
-    power, otf, laplacian = _transfer(shape, sigma, exponent)
-    gain = max(fidelity, 1.0) * otf / (max(fidelity, 1.0) * power + laplacian)
-    planes = padded[None] if image.ndim == 2 else np.moveaxis(padded, -1, 0)
-    filtered = fft.irfft2(fft.rfft2(planes) * gain, shape)
-    cropped = filtered[:, margin : margin + height, margin : margin + width].astype(np.float32, copy=False)
-    return cropped[0] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(cropped, 0, -1))
+    planes = fft.rfft2(padded[None] if image.ndim == 2 else np.moveaxis(padded, -1, 0))
+    contrast, inner = float(image.std()), np.s_[:, margin : margin + height, margin : margin + width]
+
+    def filtered(kind: int) -> FloatArray:
+        fidelity = max(_FIDELITY * contrast / float(np.hypot(noise[kind], _LEAST_NOISE[kind])), 1.0)
+        power, otf, laplacian = _transfer(shape, widths[kind], exponent)
+        return fft.irfft2(planes * (fidelity * otf / (fidelity * power + laplacian)), shape)[inner].astype(np.float32)
+
+    result = filtered(0)
+    share = 1 - 1 / np.sqrt(held)
+    if np.any(share):
+        result += share * (filtered(1) - result)
+    return result[0] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(result, 0, -1))
 
 
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=4)
 def _transfer(shape: tuple[int, int], sigma: float, exponent: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """B², B and L."""
     otf = blur_otf(shape, sigma, exponent)

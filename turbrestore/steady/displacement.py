@@ -161,8 +161,31 @@ def largest_displacement(flows: Mapping[int, FloatArray], cameras: Mapping[int, 
     sizes = [float(np.median(np.hypot(mean[..., 0], mean[..., 1]))) for mean in means]
     still = float(np.clip(_SIZES * np.mean(sizes), _LEAST, _MOST))
     shape = next(iter(flows.values())).shape
+    return _LEAST + (still - _LEAST) * camera_stillness(cameras, shape)
+
+
+def camera_stillness(cameras: Mapping[int, Matrix], shape: tuple[int, ...]) -> float:
+    """Tell whether the camera stands still.
+
+    Parameters
+    ----------
+    cameras : mapping of int to ndarray, float64, shape (2, 3)
+        M of A_i by i; empty if the camera is known to stand still.
+    shape : tuple of int
+        (H, W) of the frames.
+
+    Returns
+    -------
+    float
+        1 for a camera that stands still, near 0 for one that travels far within the window.
+
+    Examples
+    --------
+    >>> camera_stillness({1: np.zeros((2, 3))}, (8, 8))
+    1.0
+    """
     travel = float(np.median([camera_size(camera, shape) for camera in cameras.values()])) if cameras else 0.0
-    return _LEAST + (still - _LEAST) / (1 + (travel / _TRAVEL) ** 8)
+    return 1 / (1 + (travel / _TRAVEL) ** 8)
 
 
 def without_camera(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix]) -> dict[int, FloatArray]:

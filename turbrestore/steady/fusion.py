@@ -52,15 +52,39 @@ def fuse(frame: FloatArray, neighbours: Iterable[FloatArray], noise: float) -> t
     >>> float(image[4, 4]), float(agreement[4, 4])
     (0.5, 0.5)
     """
-    tolerance = 2 * (_MISREGISTRATION**2 + (_NOISE_SHARE * noise) ** 2)
     total, weights, count = frame.copy(), np.ones(frame.shape[:2], np.float32), 0
     for neighbour in neighbours:
-        difference = cv2.GaussianBlur(neighbour - frame, (0, 0), _DIFFERENCE_WINDOW)
-        np.square(difference, out=difference)
-        square = difference if frame.ndim == 2 else difference.mean(-1)
-        weight = np.exp(cv2.GaussianBlur(square, (0, 0), _SQUARE_WINDOW) / -tolerance)
+        weight = agreement_weight(neighbour, frame, noise)
         total += weight * neighbour if frame.ndim == 2 else weight[..., None] * neighbour
         weights += weight
         count += 1
     agreement = np.asarray((weights - 1) / count if count else weights, np.float32)
     return total / (weights if frame.ndim == 2 else weights[..., None]), agreement
+
+
+def agreement_weight(neighbour: FloatArray, frame: FloatArray, noise: float) -> FloatArray:
+    """Weight of a registered image beside another.
+
+    Parameters
+    ----------
+    neighbour, frame : ndarray, float32, shape (H, W) or (H, W, 3)
+        J_i and J.
+    noise : float
+        Standard deviation of the noise of a frame, intensity.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W)
+        w, 0 to 1.
+
+    Examples
+    --------
+    >>> frame = np.full((9, 9), 0.5, np.float32)
+    >>> float(agreement_weight(frame, frame, 0.0)[4, 4]), float(agreement_weight(frame + 0.4, frame, 0.0)[4, 4])
+    (1.0, 0.0)
+    """
+    tolerance = 2 * (_MISREGISTRATION**2 + (_NOISE_SHARE * noise) ** 2)
+    difference = cv2.GaussianBlur(neighbour - frame, (0, 0), _DIFFERENCE_WINDOW)
+    np.square(difference, out=difference)
+    square = difference if frame.ndim == 2 else difference.mean(-1)
+    return np.asarray(np.exp(cv2.GaussianBlur(square, (0, 0), _SQUARE_WINDOW) / -tolerance), np.float32)

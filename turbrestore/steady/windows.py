@@ -108,6 +108,25 @@ def iter_windows(frames: Iterable[ArrayLike], distances: Sequence[int]) -> Itera
         yield _window(kept, first, number, distances)
 
 
+def contrast_levels(image: FloatArray) -> GreyImage:
+    """Contrast-normalised image, which flow is measured from.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+
+    Returns
+    -------
+    ndarray, uint8, shape (H, W)
+
+    Examples
+    --------
+    >>> contrast_levels(np.full((2, 2), 0.3, np.float32))[0]
+    array([128, 128], dtype=uint8)
+    """
+    return grey_levels(image, _CONTRAST_WINDOW, _CONTRAST_FLOOR)
+
+
 def _window(kept: deque[WindowFrame], first: int, number: int, distances: Sequence[int]) -> Window:
     place = number - first
     frame = kept[place]
@@ -132,4 +151,4 @@ def _prepared(frames: Iterable[ArrayLike]) -> Iterator[WindowFrame]:
         if before is not None and np.any(before) and np.any(detail):
             scene += similarity_at(detail, before)[0] < _CUT
         before = detail
-        yield WindowFrame(image, grey_levels(image, _CONTRAST_WINDOW, _CONTRAST_FLOOR), scene)
+        yield WindowFrame(image, contrast_levels(image), scene)

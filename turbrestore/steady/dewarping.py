@@ -1,0 +1,208 @@
+"""One frame without its turbulent displacement, fused with its neighbours.
+
+Symbols
+-------
+k : the frame; I_k; k ± i its neighbours, i from ``distances``
+F_i : flow from frame k to frame k + i, pixels
+D : mean displacement of frame k to its neighbours (:mod:`turbrestore.steady.displacement`), about −d_k
+V : its inverse map, ``(id + D) ∘ (id + V) = id``, about d_k
+
+1. F_i is measured by dense inverse search, and its affine part, the camera, is taken off
+   (:mod:`turbrestore.steady.camera`).
+2. ``J = I_k ∘ (id + V)`` is the frame without its turbulent displacement.
+3. ``J_i = I_{k+i} ∘ (id + F_i) ∘ (id + V)`` are its neighbours, registered to it; those that agree are averaged with it
+   (:mod:`turbrestore.steady.fusion`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.arrays import FloatArray, luminance
+from ..core.errors import DataError
+from ..core.noise import estimate_noise
+from ..registration.flow import MIN_SIDE
+from ..registration.flow_algebra import invert_flow
+from ..registration.opencv_flow import DisParams, FlowSolver, GreyImage, dis_solver
+from ..registration.warp import sample_linear, warp
+from .camera import Matrix, camera_flow, fit_camera
+from .displacement import (
+    camera_displacement,
+    camera_shake,
+    largest_displacement,
+    mean_displacement,
+    without_camera,
+)
+from .fusion import fuse
+from .motion import moving_mask
+from .settings import SteadyParams
+from .windows import Window, contrast_levels
+
+# Half of the resolution is enough for displacements as smooth as those of turbulence, and five times as fast.
+_FLOW = DisParams(finest_scale=1, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
+# Level of the pyramid, above the finest, at which a search with a start begins.
+_START_LEVEL = 3
+# Smallest side of a frame that is registered at half of the resolution.
+_HALVED = 128
+
+
+@dataclass(frozen=True, eq=False)
+class DewarpedFrame:
+    """A frame that has been dewarped and fused.
+
+    Attributes
+    ----------
+    number : int
+        Number of the frame in the stream, from 0.
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        Not deblurred.
+    moving : ndarray, bool, shape (H, W)
+        Where something moves against the scene.
+    displacement : float
+        Root mean square of the displacement that was removed, pixels.
+    noise : float
+        Standard deviation of the noise of the frame before it was fused, intensity.
+    share : float
+        What fusion has left of it.
+    largest : float
+        What turbulence displaces at most, pixels; infinite without neighbours.
+    starts_scene : bool
+        Whether a new scene starts here.
+    cameras : mapping of int to ndarray, float64, shape (2, 3)
+        Affine motion of the camera from the frame to each neighbour, by its distance in frames, pixels about the centre
+        of the image.
+    removed_camera : ndarray, float64, shape (2, 3)
+        Its part in the displacement that was removed.
+    """
+
+    number: int
+    image: FloatArray
+    moving: NDArray[np.bool_]
+    displacement: float
+    noise: float
+    share: float
+    largest: float
+    starts_scene: bool
+    cameras: Mapping[int, Matrix]
+    removed_camera: Matrix
+
+
+def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
+    """Free a frame of its turbulent displacement, and fuse it with its neighbours.
+
+    Parameters
+    ----------
+    window : Window
+    params : SteadyParams
+
+    Returns
+    -------
+    DewarpedFrame
+        The camera is not locked.
+
+    Raises
+    ------
+    DataError
+        The frame is smaller than 16×16.
+
+    Examples
+    --------
+    >>> from turbrestore.steady.windows import iter_windows
+    >>> frames = np.random.default_rng(0).random((1, 32, 32)).repeat(3, 0)
+    >>> first, *_ = iter_windows(frames, (1,))
+    >>> dewarp_frame(first, SteadyParams()).displacement
+    0.0
+    """
+    image, shape = window.frame.image, window.frame.levels.shape
+    flows, cameras = _measure(window)
+    own = without_camera(flows, cameras)
+    removed_camera, displacement, largest = np.zeros((2, 3)), np.zeros((*shape, 2), np.float32), np.inf
+    if flows:
+        largest = params.largest or largest_displacement(own, {} if params.camera == "lock" else cameras)
+        if params.camera == "steady":
+            removed_camera = camera_shake(cameras)
+        else:
+            removed_camera = camera_displacement(cameras, shape, largest if params.camera == "keep" else np.inf)
+        displacement = mean_displacement(own, largest) + camera_flow(removed_camera, shape)
+    inverse = invert_flow(displacement)
+    registered = (
+        warp(frame.image, inverse + sample_linear((flows[offset][..., 0], flows[offset][..., 1]), inverse))
+        for offset, frame in window.neighbours.items()
+    )
+    noise = estimate_noise(image)
+    fused, agreement = fuse(warp(image, inverse), registered, noise)
+    return DewarpedFrame(
+        number=window.number,
+        image=fused,
+        moving=moving_mask(own, luminance(image), _placed(window, cameras), agreement, largest),
+        displacement=float(np.sqrt(np.mean(np.sum(displacement**2, -1)))),
+        noise=noise,
+        share=float(1 / np.sqrt(1 + len(flows) * float(agreement.mean()))),
+        largest=largest,
+        starts_scene=window.starts_scene,
+        cameras=cameras,
+        removed_camera=removed_camera,
+    )
+
+
+def measure_flow(reference: FloatArray, image: FloatArray) -> FloatArray:
+    """Flow between two images that lie close together, as between a frame and its neighbours.
+
+    Parameters
+    ----------
+    reference, image : ndarray, float32, shape (H, W) or (H, W, 3)
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W, 2)
+        From ``reference`` to ``image``, pixels.
+
+    Examples
+    --------
+    >>> image = np.random.default_rng(0).random((32, 32)).astype(np.float32)
+    >>> float(abs(measure_flow(image, image)).max())
+    0.0
+    """
+    return _solver(contrast_levels(reference))(contrast_levels(image)[None], [None])[0]
+
+
+def _solver(levels: GreyImage) -> FlowSolver:
+    return dis_solver(_FLOW if min(levels.shape) >= _HALVED else replace(_FLOW, finest_scale=0), levels, _START_LEVEL)
+
+
+def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
+    """Flow from the frame to each neighbour, and its affine part.
+
+    A pan leads far in a dozen frames, so the search for a far neighbour starts where the camera would be if it went on
+    as it went to the one before.
+    """
+    levels = window.frame.levels
+    if min(levels.shape) < MIN_SIDE:
+        found = f"{levels.shape[1]}×{levels.shape[0]}"
+        raise DataError(f"frames: expected at least {MIN_SIDE}×{MIN_SIDE} pixels for optical flow, found {found}")
+    solve = _solver(levels)
+    flows: dict[int, FloatArray] = {}
+    cameras: dict[int, Matrix] = {}
+    before = {-1: 0, 1: 0}
+    for offset in sorted(window.neighbours, key=abs):
+        side = 1 if offset > 0 else -1
+        near, before[side] = before[side], offset
+        start = camera_flow(cameras[near] * (offset / near), levels.shape) if near else None
+        flows[offset] = solve(window.neighbours[offset].levels[None], [start])[0]
+        cameras[offset] = fit_camera(flows[offset])
+    return flows, cameras
+
+
+def _placed(window: Window, cameras: dict[int, Matrix]) -> dict[int, FloatArray]:
+    """Luminance of the furthest pair of neighbours, without the motion of the camera; none if there is no pair."""
+    furthest = max((offset for offset in cameras if -offset in cameras), default=0)
+    pair = (furthest, -furthest) if furthest else ()
+    shape = window.frame.levels.shape
+    return {
+        offset: sample_linear((luminance(window.neighbours[offset].image),), camera_flow(cameras[offset], shape))
+        for offset in pair
+    }

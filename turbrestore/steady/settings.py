@@ -1,0 +1,57 @@
+"""Settings of steadied video."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ..core.errors import require, require_between
+
+CAMERAS = ("keep", "steady", "lock")
+
+
+@dataclass(frozen=True)
+class SteadyParams:
+    """How a video is steadied.
+
+    Parameters
+    ----------
+    camera : {"keep", "steady", "lock"}
+        What becomes of the motion of the camera: kept, smoothed, or removed, so that every frame of a scene shows what
+        its first frame shows.
+    sigma : float, optional
+        Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.
+    reach : int
+        Distance of the furthest neighbours of a frame, frames: the delay of a stream.
+    largest : float, optional
+        What turbulence displaces at most, pixels; larger displacements pass for motion and are kept.  By default it is
+        measured while the camera stands still or is locked, and 1 while it moves.
+
+    Raises
+    ------
+    ConfigurationError
+        A setting is out of range.
+
+    Examples
+    --------
+    >>> SteadyParams(reach=6).distances
+    (1, 3, 4, 6)
+    """
+
+    camera: Literal["keep", "steady", "lock"] = "keep"
+    sigma: float | None = None
+    reach: int = 12
+    largest: float | None = None
+
+    def __post_init__(self) -> None:
+        require(self.camera in CAMERAS, f"camera: expected one of {', '.join(CAMERAS)}, found {self.camera!r}")
+        require_between("reach", self.reach, 1, 60, "frames")
+        if self.largest is not None:
+            require_between("largest", self.largest, 0.1, 100, "pixels")
+        if self.sigma is not None:
+            require_between("sigma", self.sigma, 0, 20, "pixels")
+
+    @property
+    def distances(self) -> tuple[int, ...]:
+        """Distances of the neighbours in frames: 1, and the quarters of ``reach``."""
+        return tuple(sorted({1, *(max(self.reach * quarter // 4, 1) for quarter in (1, 2, 3, 4))}))
