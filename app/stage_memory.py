@@ -34,6 +34,9 @@ class StageMemory:
     (1, 1)
     """
 
+    # There are no files.
+    stored = frozenset[str]()
+
     def __init__(self, show: Callable[[str, FloatArray], None] | None = None) -> None:
         self.show = show
         self._results: dict[str, Any] = {}

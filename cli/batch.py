@@ -5,15 +5,12 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from turbrestore.core.errors import ConfigurationError, TurbrestoreError, require
+from turbrestore.core.errors import TurbrestoreError
 from turbrestore.io.limits import first_line
 from turbrestore.report.batch_page import ClipRow, thumbnail_uri
 from turbrestore.runs.folder_lock import lock_folder
@@ -23,6 +20,7 @@ from turbrestore.runtime.threads import available_cores
 from turbrestore.settings import RestoreParams
 
 from .batch_plan import JOURNAL, TABLE, figures, find_clips, journal_line, key_of, name_outputs, plan, write_summary
+from .cluster import check_cluster, connected
 from .options import Flag, Machine, Selection, known_sigma
 from .output import print_json
 from .progress import progress_bars, say
@@ -33,8 +31,6 @@ if TYPE_CHECKING:
 
 # Least memory for a process, bytes.
 _LEAST_MEMORY = 1e9
-# Seconds to wait for a scheduler.
-_PATIENCE = 10
 
 
 def batch(
@@ -50,6 +46,7 @@ def batch(
     scheduler: str | None = None,
     workers: int | None = None,
     memory_limit: MemorySize | None = None,
+    tile: int | None = None,
     machine: Annotated[Machine, Parameter(name="*")] = Machine(),
     overwrite: Flag = False,
     json: Flag = False,
@@ -86,6 +83,9 @@ def batch(
         Processes to start; by default one for each core, and no more than clips or than --memory-limit has gigabytes.
     memory_limit : MemorySize
         Most memory that all processes together take, such as 8GB; with --scheduler, that each clip takes.
+    tile : int
+        Longest side of the tiles that larger frames are processed in, pixels.  By default frames are processed as a
+        whole.
     overwrite : bool
         Replace existing outputs.
     json : bool
@@ -93,7 +93,7 @@ def batch(
     quiet : bool
         Print neither progress nor remarks.
     """
-    _check(scheduler, workers)
+    check_cluster("batch", scheduler, workers)
     clips = find_clips(inputs)
     outputs = name_outputs(clips, out, f".{format}")
     count = 1 if scheduler else processes(len(clips), memory_limit, workers)
@@ -103,7 +103,7 @@ def batch(
     orders = [
         Order(
             clip, output, selection, settings, machine if scheduler else shared, bit_depth, each,
-            report=output.with_suffix(".html") if reports else None,
+            report=output.with_suffix(".html") if reports else None, tile=tile,
         )
         for clip, output in zip(clips, outputs, strict=True)
     ]  # fmt: skip
@@ -159,16 +159,6 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {first_line(error)}"
 
 
-def _check(scheduler: str | None, workers: int | None) -> None:
-    for package in ("distributed", "jinja2"):
-        if find_spec(package) is None:
-            raise ConfigurationError(
-                f"batch: expected {package}, which is not installed; run pip install 'turbrestore[distributed]'"
-            )
-    require(workers is None or workers >= 1, f"--workers: expected at least 1, found {workers}")
-    require(workers is None or scheduler is None, "--workers: has no effect with --scheduler; leave it out")
-
-
 def _do(
     rows: list[ClipRow], orders: Sequence[Order], out: Path, scheduler: str | None, count: int, quiet: bool
 ) -> None:
@@ -179,7 +169,7 @@ def _do(
             journal.writelines(map(journal_line, rows))
             journal.flush()
             if orders:
-                with _client(scheduler, min(count, len(orders)), quiet) as client:
+                with connected(scheduler, min(count, len(orders)), quiet) as client:
                     for row in _finished(client, orders, out, quiet):
                         rows[places[row.output]] = row
                         journal.write(journal_line(row))
@@ -240,45 +230,3 @@ def _row_of(future: Future[ClipRow], order: Order) -> ClipRow:
     except Exception as error:  # the errors of a connection, of other versions on the workers, and so on
         reason = f"it was lost ({first_line(error) or type(error).__name__}); --resume does it"
     return ClipRow(str(order.input), str(order.output), "failed", reason)
-
-
-@contextmanager
-def _client(scheduler: str | None, count: int, quiet: bool) -> Iterator[Client]:
-    """Connect to a scheduler, or start one and its processes; they are reached from this machine alone."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    if scheduler is not None:
-        try:
-            client = Client(scheduler, timeout=_PATIENCE)
-        except (OSError, ValueError) as error:
-            raise ConfigurationError(
-                f"--scheduler: expected a running scheduler, found none at {scheduler} ({first_line(error)})"
-            ) from error
-        with client:
-            _tell_dashboard(client.dashboard_link, quiet)
-            yield client
-        return
-    with (
-        TemporaryDirectory(prefix="turbrestore-", ignore_cleanup_errors=True) as scratch,
-        # A process that has died may have been the victim of another one.
-        dask.config.set({"distributed.scheduler.allowed-failures": 3}),
-        LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            memory_limit=0,
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            local_directory=scratch,
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        _tell_dashboard(cluster.dashboard_link, quiet)
-        yield client
-
-
-def _tell_dashboard(link: str | None, quiet: bool) -> None:
-    if link and find_spec("bokeh") is not None:
-        say(f"dashboard: {link}", quiet)

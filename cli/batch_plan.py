@@ -105,7 +105,7 @@ def plan(orders: Sequence[Order], out: Path, resume: bool, overwrite: bool) -> t
 
 def key_of(order: Order) -> str:
     """Stand for the input and all settings that a result depends on."""
-    settings = (order.params, order.selection, order.bit_depth, order.memory_limit, order.machine.device)
+    settings = (order.params, order.selection, order.bit_depth, order.memory_limit, order.tile, order.machine.device)
     named = [order.input, *(Path(name) for name in (order.selection.dark, order.selection.flat) if name is not None)]
     stamps = [_stamp(file) for path in named for file in (frame_files(path) if path.is_dir() else [path])]
     text = f"{__version__}\0{settings!r}\0{stamps!r}\0{order.report is not None}"

@@ -184,9 +184,10 @@ def settings_record(
     bit_depth: int | None,
     machine: Machine,
     memory_limit: MemorySize | None,
+    tile: int | None = None,
 ) -> dict[str, Any]:
     """All settings of a run, nested as in a settings file; None where they are left to be measured."""
-    head = {"bit_depth": bit_depth, "memory_limit": memory_limit}
+    head = {"bit_depth": bit_depth, "memory_limit": memory_limit, "tile": tile}
     return {**head, **dataclasses.asdict(machine), **dataclasses.asdict(selection), **dataclasses.asdict(params)}
 
 

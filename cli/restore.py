@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +22,9 @@ from turbrestore.results import Restoration
 from turbrestore.runs.run_record import describe_run
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.settings import RestoreParams
+from turbrestore.tiled_stages import TileMap
 
+from .cluster import check_cluster, connected, over_workers
 from .inputs import open_input, read_input_image
 from .kept import check_room, kept_stages, own_outputs
 from .options import Flag, Machine, Selection, known_sigma
@@ -36,6 +40,9 @@ from .output import (
     write_settings,
 )
 from .progress import progress_bars, say
+
+# Longest side of the tiles that are shared among processes, pixels: halos of a fifth on either side.
+TILE = 1088
 
 
 @dataclass(frozen=True)
@@ -57,6 +64,9 @@ class Order:
     truth: Path | None = None
     overwrite: bool = False
     quiet: bool = False
+    tile: int | None = None
+    scheduler: str | None = None
+    workers: int | None = None
 
     @property
     def settings_path(self) -> Path:
@@ -84,6 +94,9 @@ def restore(
     truth: Path | None = None,
     bit_depth: int | None = None,
     memory_limit: MemorySize | None = None,
+    tile: int | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
     machine: Annotated[Machine, Parameter(name="*")] = Machine(),
     overwrite: Flag = False,
     json: Flag = False,
@@ -120,7 +133,15 @@ def restore(
         Bits per channel of the output, 8, 16 or 32 (float, TIFF and FITS).  Those of the input by default.
     memory_limit : MemorySize
         Most memory to take, such as 2GB.  To keep it, training frames go to a scratch file, fewer threads work, fewer
-        frames are trained on, and frames are processed in tiles that overlap, in this order.
+        frames are trained on, and frames are processed in tiles that overlap, in this order.  With --workers, what all
+        processes together take; with --scheduler, what each takes.
+    tile : int
+        Longest side of the tiles that larger frames are processed in, pixels.  By default frames are processed as a
+        whole; with --workers or --scheduler it is 1088.
+    scheduler : str
+        Address of a running Dask scheduler, tcp://host:port, whose workers see the same files, to work on the tiles.
+    workers : int
+        Processes to start on this machine, to work on the tiles.
     overwrite : bool
         Replace existing outputs.
     json : bool
@@ -129,9 +150,14 @@ def restore(
         Print neither progress nor remarks.
     """
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
+    if scheduler is not None or workers is not None:
+        check_cluster("restore", scheduler, workers)
+        tile = tile or TILE
+    if memory_limit is not None and workers is not None:
+        memory_limit = MemorySize(memory_limit / (workers + 1))
     order = Order(
         input, output, selection, settings, machine, bit_depth, memory_limit,
-        config, keep, resume, checkpoint_every, report, truth, overwrite, quiet,
+        config, keep, resume, checkpoint_every, report, truth, overwrite, quiet, tile, scheduler, workers,
     )  # fmt: skip
     restoration, _ = restore_clip(order)
     if json:
@@ -147,7 +173,7 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     if order.bit_depth is not None:
         check_depth(order.bit_depth)
     left = _check_outputs(order)
-    runtime = order.machine.runtime(order.memory_limit, order.keep)
+    runtime = dataclasses.replace(order.machine.runtime(order.memory_limit, order.keep), tile=order.tile)
     if order.truth is not None:
         comparable(read_input_image(order.truth, order.selection.limits()), "truth")
     source = open_input(order.input, order.selection, order.quiet)
@@ -157,9 +183,11 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     with kept_stages(
         order.keep, source, order.params, runtime, order.resume, order.checkpoint_every, order.quiet
     ) as stages:
-        with progress_bars(order.quiet) as progress:
-            restoration = run_pipeline(source, order.params, runtime, stages, progress)
-        record = settings_record(order.params, order.selection, order.bit_depth, order.machine, order.memory_limit)
+        with _elsewhere(order, source) as map_tiles, progress_bars(order.quiet) as progress:
+            restoration = run_pipeline(source, order.params, runtime, stages, progress, map_tiles=map_tiles)
+        record = settings_record(
+            order.params, order.selection, order.bit_depth, order.machine, order.memory_limit, order.tile
+        )
         command = repeating_command(order.input, order.output, record)
         run = describe_run(source, record, command) if order.keep or order.report else None
         depth = source.bit_depth if order.bit_depth is None else order.bit_depth
@@ -176,6 +204,22 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
         if stages is not None:
             stages.expect()
     return restoration, source
+
+
+@contextmanager
+def _elsewhere(order: Order, source: FrameSource) -> Iterator[TileMap | None]:
+    """Connect to the processes that work on the tiles, if there are to be any."""
+    if order.scheduler is None and order.workers is None:
+        yield None
+    elif order.tile is None or max(source.shape[1:3]) <= order.tile:
+        say(
+            f"frames of {source.shape[2]}×{source.shape[1]} are one tile, so no other process works on them",
+            order.quiet,
+        )
+        yield None
+    else:
+        with connected(order.scheduler, order.workers or 1, order.quiet) as client:
+            yield over_workers(client)
 
 
 def _check_outputs(order: Order) -> set[Path]:

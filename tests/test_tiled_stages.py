@@ -1,12 +1,15 @@
 """Stages in tiles: close to those of the whole, the same where there is one tile, and records that add up."""
 
+import pickle
 from dataclasses import replace
 
+import cloudpickle
 import numpy as np
 import pytest
 
 from conftest import make_sequence
 from turbrestore import pipeline
+from turbrestore.core.errors import ConfigurationError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.filtering.alternating import Filtered
@@ -14,14 +17,12 @@ from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import plan_memory
 from turbrestore.metrics import psnr
 from turbrestore.registration.centroid import CentroidParams, find_centroid
-from turbrestore.registration.flow import FlowParams
 from turbrestore.runs import run_folder as run_folder_module
 from turbrestore.runs.run_folder import RunFolder
 from turbrestore.runtime.runtime import Runtime
-from turbrestore.runtime.steps import finish
-from turbrestore.runtime.tiling import halo_tiles
+from turbrestore.runtime.tiling import cut_tile, halo_tiles
 from turbrestore.settings import RestoreParams
-from turbrestore.tiled_stages import join_filtered, tiled_centroid_steps
+from turbrestore.tiled_stages import join_centroids, join_filtered
 
 HALO = 24
 TILES = halo_tiles((128, 128), 112, HALO)
@@ -43,8 +44,8 @@ def test_there_are_four_tiles():
 
 def test_a_centroid_in_tiles_is_as_good_as_that_of_the_whole(sequence, tmp_path):
     whole = find_centroid(sequence.frames)
-    steps = tiled_centroid_steps(sequence.frames, TILES, CentroidParams(), FlowParams(), Runtime(scratch=tmp_path))
-    tiled = finish(steps)
+    parts = (find_centroid(cut_tile(sequence.frames, tile)) for tile in TILES)
+    tiled = join_centroids(parts, TILES, sequence.frames.shape, tmp_path)
     assert isinstance(tiled.flows, np.memmap) and isinstance(tiled.image, np.memmap)
     inner = slice(8, -8)
     found, usual = (psnr(centroid.image[inner, inner], sequence.scene[inner, inner]) for centroid in (tiled, whole))
@@ -56,7 +57,7 @@ def test_a_centroid_in_tiles_is_as_good_as_that_of_the_whole(sequence, tmp_path)
 def test_one_tile_is_the_whole(sequence, blurred):
     tiles = halo_tiles((128, 128), 128, HALO)
     whole = find_centroid(sequence.frames)
-    tiled = finish(tiled_centroid_steps(sequence.frames, tiles, CentroidParams(), FlowParams(), Runtime()))
+    tiled = join_centroids([whole], tiles, sequence.frames.shape)
     for name in ("image", "flows", "mean_flow_sizes"):
         assert np.array_equal(getattr(whole, name), getattr(tiled, name))
 
@@ -148,6 +149,65 @@ def test_a_restoration_in_tiles_is_the_same_bytes_whatever_the_number_of_threads
 
     one, *others = map(run, (1, 2, 5))
     assert all(other == one for other in others)
+
+
+def elsewhere(function, tasks):
+    """What other processes do, with what they are sent."""
+    for task in tasks:
+        yield pickle.loads(cloudpickle.dumps(function(pickle.loads(cloudpickle.dumps(task)))))
+
+
+@pytest.mark.usefixtures("in_tiles")
+@pytest.mark.parametrize("keep_best", [1, 0.5])
+def test_tiles_are_the_same_bytes_wherever_they_are_worked_on(sequence, keep_best):
+    params, told = replace(QUICK, keep_best=keep_best), []
+    source = FrameSource.from_array(sequence.frames)
+    here = pipeline.restore(source, params)
+    there = pipeline.restore(
+        source, params, progress=lambda stage, done, total: told.append((stage, done, total)), map_tiles=elsewhere
+    )
+    assert np.array_equal(here.image, there.image)
+    assert np.array_equal(here.centroid.flows, there.centroid.flows)
+    for name in ("image", "variance", "flow_states", "shares"):
+        assert np.array_equal(getattr(here.filtered, name), getattr(there.filtered, name))
+    for stage in ("centroid", "filter"):
+        assert [step for step in told if step[0] == stage] == [(stage, done, 4) for done in (1, 2, 3, 4)]
+
+
+@pytest.mark.usefixtures("in_tiles")
+def test_tiles_that_were_kept_are_not_sent_to_other_processes(sequence, tmp_path):
+    source, sent = FrameSource.from_array(sequence.frames), []
+    (folder := tmp_path / "kept").mkdir()
+
+    def interrupted(function, tasks):
+        for task in tasks:
+            if len(sent) == 6:
+                raise KeyboardInterrupt
+            sent.append(task)
+            yield function(task)
+
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.restore(source, QUICK, store=RunFolder(folder, source, QUICK), map_tiles=interrupted)
+    whole = pipeline.restore(source, QUICK)
+    sent.clear()
+    later = RunFolder(folder, source, QUICK, resume=True)
+    assert later.notes == ("continues after the flow model and 2 tiles of the filter",)
+    resumed = pipeline.restore(source, QUICK, store=later, map_tiles=interrupted)
+    assert len(sent) == 2 and np.array_equal(resumed.image, whole.image)
+
+
+def test_tiles_may_be_asked_for():
+    shape, params = (300, 1080, 1920), RestoreParams()
+    plan = plan_memory(shape, params, Runtime(tile=1088))
+    assert (plan.train, plan.tile, plan.deconvolution_side) == (60, 1080, None)
+    assert plan.runtime.scratch is not None and plan.scratch_bytes > 0
+    assert plan.decisions[0].reason == "tiles were asked for"
+    assert plan_memory(shape, params, Runtime(tile=1920)).tile is None
+    assert plan_memory((20, 4320, 7680), params, Runtime(tile=1088)).train == 10
+    limited = plan_memory(shape, params, Runtime(tile=1088, memory_limit="700MB"))
+    assert limited.tile < 1080
+    with pytest.raises(ConfigurationError, match="at least 384"):
+        Runtime(tile=200)
 
 
 @pytest.mark.usefixtures("in_tiles")

@@ -15,6 +15,7 @@ tiles change the result, slightly; nothing else does, and neither depends on the
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -128,12 +129,14 @@ def plan_memory(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime)
     train = training_share(shape[0], shape[1:], params.train)
     runtime = replace(runtime, device=find_device(runtime.device))
     folder = runtime.scratch or Path(tempfile.gettempdir())
-    limit, most = runtime.memory_limit, runtime.workers
-    if limit is None:
+    most = runtime.workers
+    tile = runtime.tile if runtime.tile is not None and max(shape[1:3]) > runtime.tile else None
+    if runtime.memory_limit is None and tile is None:
         return MemoryPlan(train, replace(runtime, scratch=None))
     base = _BASE + COMPILER_BYTES + (TORCH_BYTES if needs_torch(runtime.device) else 0)
+    limit = math.inf if runtime.memory_limit is None else runtime.memory_limit
     budget = limit - base
-    for choice in _choices(shape, train, most, params):
+    for choice in _choices(shape, train, most, params, tile):
         if _peak(shape, params, choice, budget) <= budget:
             break
     else:
@@ -147,7 +150,7 @@ def plan_memory(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime)
         choice.tile,
         _scratch_bytes(shape, params, choice) if choice.in_scratch else 0,
         _deconvolution_side(shape, params, choice, budget),
-        tuple(_decisions(shape, params, choice, _Choice(train, most), base, limit)),
+        tuple(_decisions(shape, params, choice, _Choice(train, most, tile=tile), base, limit)),
     )
 
 
@@ -195,20 +198,30 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
     return min(frame_count, max(2, min(share, int(_TRAINING_BYTES // frame_bytes))))
 
 
-def _choices(shape: tuple[int, ...], train: int, most: int, params: RestoreParams) -> Iterator[_Choice]:
-    """Yield what may be done, the best first."""
+def _choices(
+    shape: tuple[int, ...], train: int, most: int, params: RestoreParams, tile: int | None = None
+) -> Iterator[_Choice]:
+    """Yield what may be done, the best first; only tiles that are not larger than ``tile``, if that is given."""
+    if tile is None:
+        yield from _choices_of_whole_frames(train, most, params)
+    # A file holds more frames than memory does without a limit.
+    train = train if params.train is not None else max(train, min(_FEWEST_IN_NEED, shape[0]))
+    longest = max(shape[1:3])
+    if tile is not None:
+        yield _tiles_of(shape, train, _THREADS_OF_TILES, tile)
+        longest = tile
+    for side in reversed(range(_WORTH, longest, _SIDE_STEP)):
+        yield _tiles_of(shape, train, _THREADS_OF_TILES, side)
+    for side in reversed(range(4 * HALO, min(_WORTH, longest), _SIDE_STEP)):
+        yield _tiles_of(shape, train, 1, side)
+
+
+def _choices_of_whole_frames(train: int, most: int, params: RestoreParams) -> Iterator[_Choice]:
     fewest = train if params.train is not None else min(train, _FEWEST_IN_NEED)
     for count in range(train, fewest - 1, -1):
         for threads in range(most, 0, -1):
             yield _Choice(count, threads)
             yield _Choice(count, threads, in_scratch=True)
-    # A file holds more frames than memory does without a limit.
-    train = train if params.train is not None else max(train, min(_FEWEST_IN_NEED, shape[0]))
-    longest = max(shape[1:3])
-    for side in reversed(range(_WORTH, longest, _SIDE_STEP)):
-        yield _tiles_of(shape, train, _THREADS_OF_TILES, side)
-    for side in reversed(range(4 * HALO, min(_WORTH, longest), _SIDE_STEP)):
-        yield _tiles_of(shape, train, 1, side)
 
 
 def _tiles_of(shape: tuple[int, ...], train: int, threads: int, side: int) -> _Choice:
@@ -324,7 +337,8 @@ def _on_frames(
         height, width = largest_tile((shape[1], shape[2]), choice.tile)
         count = len(halo_tiles((shape[1], shape[2]), choice.tile))
         words = f"{count} tiles of up to {width}×{height} pixels, training frames in a scratch file"
-        yield Decision("memory", words, f"whole frames would take more than the {size_text(limit)} allowed")
+        because = f"whole frames would take more than the {size_text(limit)} allowed"
+        yield Decision("memory", words, because if wanted.tile is None else "tiles were asked for")
         if choice.threads < wanted.threads:
             words = f"{choice.threads} of {wanted.threads} threads"
             yield Decision("memory", words, "more threads would need smaller tiles")

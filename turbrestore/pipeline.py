@@ -39,7 +39,17 @@ from .runtime.scratch import fill_stack, iter_frames, mean_of
 from .runtime.steps import Progress, finish, step_counter
 from .runtime.tiling import HaloTile, cut_tile, halo_tiles
 from .settings import RestoreParams
-from .tiled_stages import join_filtered, tiled_centroid_steps
+from .tiled_stages import (
+    TileMap,
+    centroid_tasks,
+    filter_tasks,
+    join_centroids,
+    join_filtered,
+    only_counted,
+    run_centroid_task,
+    run_filter_task,
+    tile_filter_steps,
+)
 from .wording import (
     explain_border,
     explain_camera,
@@ -67,6 +77,7 @@ def restore(
     store: Store | None = None,
     progress: Progress | None = None,
     on_decision: Callable[[Decision], None] | None = None,
+    map_tiles: TileMap | None = None,
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
@@ -87,6 +98,9 @@ def restore(
         Called as ``progress(stage, done, total)``.
     on_decision : callable, optional
         Called with every :class:`turbrestore.Decision` when it is made.
+    map_tiles : callable, optional
+        Works on tiles elsewhere, where ``runtime.tile`` or a memory limit asks for tiles; see
+        :data:`turbrestore.tiled_stages.TileMap`.  By default they are worked on here, with the same result.
 
     Returns
     -------
@@ -127,7 +141,7 @@ def restore(
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, plan.train)
     stretched, kept = _stretched_params(params, levels), store or NoStore()
-    run = _Run(source, stretched, plan, tiles, kept, levels, progress, on_decision)
+    run = _Run(source, stretched, plan, tiles, kept, levels, progress, on_decision, map_tiles)
     run.seconds["read"] = time.perf_counter() - begun
     run.decide(*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
     run.decide(*on_bars, *on_overlay, *on_light, *on_range)
@@ -151,6 +165,7 @@ class _Run:
     levels: Levels
     progress: Progress | None
     on_decision: Callable[[Decision], None] | None
+    map_tiles: TileMap | None = None
     decisions: list[Decision] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -246,13 +261,30 @@ def _fuse(run: _Run) -> _Fused:
 
 
 def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
-    params, runtime = run.params, run.plan.runtime
-    count = max(len(run.tiles), 1) * len(training) * params.centroid.iterations
+    params, runtime, train = run.params, run.plan.runtime, len(training)
     if run.tiles:
-        steps = tiled_centroid_steps(training, run.tiles, params.centroid, params.flow, runtime)
-    else:
-        steps = centroid_steps(training, params.centroid, params.flow, runtime)
-    return finish(steps, run.counter("centroid", count))
+        parts = _centroids_here(run, training) if run.map_tiles is None else _centroids_elsewhere(run, train)
+        return join_centroids(parts, run.tiles, training.shape, runtime.scratch)
+    steps = centroid_steps(training, params.centroid, params.flow, runtime)
+    return finish(steps, run.counter("centroid", train * params.centroid.iterations))
+
+
+def _centroids_here(run: _Run, training: FloatArray) -> Iterator[Centroid]:
+    params, runtime = run.params, run.plan.runtime
+    count = run.counter("centroid", len(run.tiles) * len(training) * params.centroid.iterations)
+    for tile in run.tiles:
+        yield finish(
+            centroid_steps(cut_tile(training, tile, runtime.scratch), params.centroid, params.flow, runtime), count
+        )
+
+
+def _centroids_elsewhere(run: _Run, train: int) -> Iterator[Centroid]:
+    params, count = run.params, run.counter("centroid", len(run.tiles))
+    assert run.map_tiles is not None
+    tasks = centroid_tasks(run.source, run.tiles, train, params.centroid, params.flow, run.plan.runtime)
+    for part in run.map_tiles(run_centroid_task, tasks):
+        count(part)
+        yield part
 
 
 def _filter(
@@ -263,28 +295,47 @@ def _filter(
     if params.keep_best < 1:
         counted = best_frames(frame_quality(source), params.keep_best)
     if run.tiles:
-        parts = (
-            run.store.get(f"filtered_tile_{number}", partial(_filter_tile, run, centroid, training, counted, number))
-            for number in range(len(run.tiles))
-        )
+        parts = (_tiles_here if run.map_tiles is None else _tiles_elsewhere)(run, centroid, training, counted)
         return join_filtered(parts, run.tiles, source.shape[1:], run.plan.runtime.scratch)
-    frames, start = _counted(chain(iter_frames(training), rest), counted), run.store.filter_start()
+    frames, start = only_counted(chain(iter_frames(training), rest), counted), run.store.filter_start()
     runtime, flows = run.plan.runtime, centroid.flows
     steps = filter_steps(frames, centroid.image, dynamics, params.filter, params.flow, flows, runtime, start)
     return finish(steps, partial(_observe_filter, run, 0))
 
 
+def _tiles_here(run: _Run, centroid: Centroid, training: FloatArray, counted: np.ndarray) -> Iterator[Filtered]:
+    for number in range(len(run.tiles)):
+        yield run.store.get(_tile_name(number), partial(_filter_tile, run, centroid, training, counted, number))
+
+
+def _tiles_elsewhere(run: _Run, centroid: Centroid, training: FloatArray, counted: np.ndarray) -> Iterator[Filtered]:
+    """Filter those tiles in other processes that the store does not have."""
+    params, total = run.params, len(run.tiles)
+    assert run.map_tiles is not None
+    missing = [tile for number, tile in enumerate(run.tiles) if f"{_tile_name(number)}.npz" not in run.store.stored]
+    settings = params.dynamics, params.filter, params.flow, run.plan.runtime
+    tasks = filter_tasks(run.source, missing, centroid, counted, *settings)
+    results = iter(run.map_tiles(run_filter_task, tasks))
+    for number in range(total):
+        part = run.store.get(_tile_name(number), lambda: next(results))
+        if run.progress is not None:
+            run.progress("filter", number + 1, total)
+        yield part
+
+
+def _tile_name(number: int) -> str:
+    return f"filtered_tile_{number}"
+
+
 def _filter_tile(run: _Run, centroid: Centroid, training: FloatArray, counted: np.ndarray, number: int) -> Filtered:
-    """Identify the motion of a tile and filter it."""
-    tile = run.tiles[number]
-    params, runtime = run.params, run.plan.runtime
+    """Filter a tile in this process."""
+    tile, params, runtime = run.tiles[number], run.params, run.plan.runtime
     frames, flows = (cut_tile(stack, tile, runtime.scratch) for stack in (training, centroid.flows))
-    image = centroid.image[tile.rows, tile.columns].copy()
-    dynamics = identify(flows, params.dynamics, runtime)
-    rest = iter(run.source.select(frames=(len(frames), None), roi=tile.roi)) if len(frames) < len(run.source) else ()
-    every = _counted(chain(iter_frames(frames), rest), counted)
-    steps = filter_steps(every, image, dynamics, params.filter, params.flow, flows, runtime)
-    return finish(steps, partial(_observe_filter, run, number))
+    image, source = centroid.image[tile.rows, tile.columns].copy(), run.source.select(roi=tile.roi)
+    settings = params.dynamics, params.filter, params.flow, runtime
+    return finish(
+        tile_filter_steps(source, frames, image, flows, counted, *settings), partial(_observe_filter, run, number)
+    )
 
 
 def _observe_filter(run: _Run, tile: int, step: FilterStep) -> None:
@@ -294,11 +345,6 @@ def _observe_filter(run: _Run, tile: int, step: FilterStep) -> None:
         run.progress("filter", tile * flows + step.flows_measured, max(len(run.tiles), 1) * flows)
     if step.checkpoint is not None and not run.tiles:
         run.store.checkpoint(step.checkpoint)
-
-
-def _counted(frames: Iterator[FloatArray], counted: np.ndarray) -> Iterator[FloatArray | None]:
-    """Replace frames that do not count by None."""
-    return (frame if counts else None for frame, counts in zip(frames, counted, strict=True))
 
 
 def _temporal_mean(source: FrameSource) -> FloatArray:

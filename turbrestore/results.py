@@ -33,6 +33,10 @@ class Store(Protocol):
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
         """Return the result of that name: the one that was kept, else the one that is computed now and then kept."""
 
+    @property
+    def stored(self) -> frozenset[str]:
+        """Names of the files on disk that hold the results of stages."""
+
     def filter_start(self) -> FilterCheckpoint | None:
         """Return the state from which an interrupted filter continues."""
 
@@ -48,6 +52,8 @@ class NoStore:
     >>> NoStore().get("seven", lambda: 7)
     7
     """
+
+    stored = frozenset[str]()
 
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
         """Compute the result."""

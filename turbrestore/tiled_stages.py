@@ -1,48 +1,283 @@
-"""Centroid and filter of frames that are too large for memory, in tiles that overlap.
+"""Centroid and filter of frames that are processed in tiles that overlap, one after the other or in other processes.
 
 Each tile is a clip of its own that passes through the same functions as a whole frame; images and flows of the tiles
 are blended by :mod:`turbrestore.runtime.tiling`.  The result is close to that of whole frames but not the same, because
 what is estimated from all pixels at once (the flow model, the noise of the frames) is estimated from those of the tile.
 Frames that are shifted by more than the halo of 96 pixels leave a part of a tile unseen.
+
+What is done with a tile is described by a task, which another process can be handed: it has the frames of the tile as
+a source that reads them there.  Where a tile is worked on changes nothing in the result, bit for bit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Sequence
+import tempfile
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .core.arrays import FloatArray
-from .filtering.alternating import Filtered
-from .registration.centroid import Centroid, CentroidParams, CentroidState, centroid_steps
+from .dynamics.dynamic_texture import DynamicsParams, identify
+from .filtering.alternating import Filtered, FilterParams, FilterStep, filter_steps
+from .io.source import FrameSource
+from .registration.centroid import Centroid, CentroidParams, find_centroid
 from .registration.flow import FlowParams
 from .runtime.runtime import Runtime
-from .runtime.scratch import iter_frames
+from .runtime.scratch import fill_stack, iter_frames
+from .runtime.steps import finish
 from .runtime.tiling import HaloTile, add_tile, cut_tile, new_mosaic
 
+# As ``map`` does, applies a function to every task and yields the results in order; it may do so in other processes,
+# to which it has to pickle closures too.  The tasks should be taken as they are needed, because those of the filter
+# hold arrays.
+TileMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
 
-def tiled_centroid_steps(
-    frames: FloatArray, tiles: Sequence[HaloTile], params: CentroidParams, flow_params: FlowParams, runtime: Runtime
-) -> Generator[CentroidState, None, Centroid]:
-    """Find the centroid of every tile, and blend their images and flows.
 
-    Parameters
+@dataclass(frozen=True, eq=False)
+class CentroidTask:
+    """The centroid of a tile, to be found in another process.
+
+    Attributes
     ----------
-    frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
-        At least two frames, in memory or in a scratch file.
-    tiles : sequence of HaloTile
-        Tiles of these frames.
+    source : FrameSource
+        All frames of the tile.
+    train : int
+        Number of training frames.
     params : CentroidParams
     flow_params : FlowParams
     runtime : Runtime
-        Its scratch folder holds images and flows; without one they stay in memory.
+        Where it has a scratch folder, that of temporary files is used.
+    """
+
+    source: FrameSource
+    train: int
+    params: CentroidParams
+    flow_params: FlowParams
+    runtime: Runtime
+
+
+@dataclass(frozen=True, eq=False)
+class FilterTask:
+    """The filter of a tile, to be run in another process.
+
+    Attributes
+    ----------
+    source : FrameSource
+        All frames of the tile.
+    image, flows : ndarray
+        Centroid of the tile, and flows to the training frames.
+    counted : ndarray, bool, shape (T,)
+        Frames that count.
+    dynamics_params : DynamicsParams
+    params : FilterParams
+    flow_params : FlowParams
+    runtime : Runtime
+        Where it has a scratch folder, that of temporary files is used.
+    """
+
+    source: FrameSource
+    image: FloatArray
+    flows: FloatArray
+    counted: NDArray[np.bool_]
+    dynamics_params: DynamicsParams
+    params: FilterParams
+    flow_params: FlowParams
+    runtime: Runtime
+
+
+def centroid_tasks(
+    source: FrameSource,
+    tiles: Iterable[HaloTile],
+    train: int,
+    params: CentroidParams,
+    flow_params: FlowParams,
+    runtime: Runtime,
+) -> Iterator[CentroidTask]:
+    """Describe the centroids of all tiles.
+
+    Parameters
+    ----------
+    source : FrameSource
+        Whole frames.
+    tiles : iterable of HaloTile
+    train, params, flow_params, runtime
+        As in :class:`CentroidTask`.
 
     Yields
     ------
-    CentroidState
-        After each flow to each tile.
+    CentroidTask
+    """
+    return (CentroidTask(source.select(roi=tile.roi), train, params, flow_params, runtime) for tile in tiles)
+
+
+def run_centroid_task(task: CentroidTask) -> Centroid:
+    """Find the centroid of a tile whose frames are read here.
+
+    Parameters
+    ----------
+    task : CentroidTask
+
+    Returns
+    -------
+    Centroid
+        In memory.
+
+    Examples
+    --------
+    >>> source = FrameSource.from_array(np.ones((3, 16, 16), np.float32))
+    >>> run_centroid_task(CentroidTask(source, 2, CentroidParams(), FlowParams(), Runtime())).flows.shape
+    (2, 16, 16, 2)
+    """
+    runtime = _here(task.runtime)
+    frames = fill_stack((task.train, *task.source.shape[1:]), iter(task.source), runtime.scratch)
+    found = find_centroid(frames, task.params, task.flow_params, runtime)
+    return replace(found, image=np.array(found.image), flows=np.array(found.flows))
+
+
+def filter_tasks(
+    source: FrameSource,
+    tiles: Iterable[HaloTile],
+    centroid: Centroid,
+    counted: NDArray[np.bool_],
+    dynamics_params: DynamicsParams,
+    params: FilterParams,
+    flow_params: FlowParams,
+    runtime: Runtime,
+) -> Iterator[FilterTask]:
+    """Describe the filters of tiles.
+
+    Parameters
+    ----------
+    source : FrameSource
+        Whole frames.
+    tiles : iterable of HaloTile
+    centroid : Centroid
+        Of whole frames.
+    counted, dynamics_params, params, flow_params, runtime
+        As in :class:`FilterTask`.
+
+    Yields
+    ------
+    FilterTask
+        With copies of the image and the flows of the tile.
+    """
+    settings = counted, dynamics_params, params, flow_params, runtime
+    for tile in tiles:
+        image, flows = centroid.image[tile.rows, tile.columns].copy(), cut_tile(centroid.flows, tile)
+        yield FilterTask(source.select(roi=tile.roi), image, flows, *settings)
+
+
+def run_filter_task(task: FilterTask) -> Filtered:
+    """Filter a tile whose frames are read here.
+
+    Parameters
+    ----------
+    task : FilterTask
+
+    Returns
+    -------
+    Filtered
+
+    Examples
+    --------
+    >>> source = FrameSource.from_array(np.random.default_rng(0).uniform(0.4, 0.6, (3, 16, 16)).astype(np.float32))
+    >>> flows, every = np.zeros((2, 16, 16, 2), np.float32), np.ones(3, bool)
+    >>> settings = DynamicsParams(), FilterParams(), FlowParams(), Runtime()
+    >>> run_filter_task(FilterTask(source, source.read()[0], flows, every, *settings)).image.shape
+    (16, 16)
+    """
+    runtime = _here(task.runtime)
+    frames = fill_stack((len(task.flows), *task.source.shape[1:]), iter(task.source), runtime.scratch)
+    settings = task.dynamics_params, task.params, task.flow_params, runtime
+    return finish(tile_filter_steps(task.source, frames, task.image, task.flows, task.counted, *settings))
+
+
+def tile_filter_steps(
+    source: FrameSource,
+    frames: FloatArray,
+    image: FloatArray,
+    flows: FloatArray,
+    counted: NDArray[np.bool_],
+    dynamics_params: DynamicsParams,
+    params: FilterParams,
+    flow_params: FlowParams,
+    runtime: Runtime,
+) -> Generator[FilterStep, None, Filtered]:
+    """Identify the motion of a tile and filter it.
+
+    Parameters
+    ----------
+    source : FrameSource
+        All frames of the tile.
+    frames : ndarray, float32, shape (K, h, w) or (K, h, w, 3)
+        Its training frames, the first of the source.
+    image : ndarray, float32, shape (h, w) or (h, w, 3)
+        Centroid of the tile.
+    flows : ndarray, float32, shape (K, h, w, 2)
+        Flows from it to the training frames, pixels.
+    counted : ndarray, bool, shape (T,)
+        Frames that count.
+    dynamics_params, params, flow_params, runtime
+        Settings of the flow model, the filter and the flow, and what may be used of the machine.
+
+    Yields
+    ------
+    FilterStep
+
+    Returns
+    -------
+    Filtered
+
+    Raises
+    ------
+    DataError
+        As :func:`turbrestore.filtering.alternating.filter_frames`.
+    """
+    dynamics = identify(flows, dynamics_params, runtime)
+    rest = iter(source.select(frames=(len(frames), None))) if len(frames) < len(source) else ()
+    every = only_counted(chain(iter_frames(frames), rest), counted)
+    return (yield from filter_steps(every, image, dynamics, params, flow_params, flows, runtime))
+
+
+def only_counted(frames: Iterable[FloatArray], counted: NDArray[np.bool_]) -> Iterator[FloatArray | None]:
+    """Replace frames that do not count by None.
+
+    Parameters
+    ----------
+    frames : iterable of ndarray
+    counted : ndarray, bool, shape (T,)
+
+    Yields
+    ------
+    ndarray or None
+
+    Examples
+    --------
+    >>> list(only_counted([np.float32(1), np.float32(2)], np.array([False, True])))
+    [None, np.float32(2.0)]
+    """
+    return (frame if counts else None for frame, counts in zip(frames, counted, strict=True))
+
+
+def join_centroids(
+    parts: Iterable[Centroid], tiles: Sequence[HaloTile], shape: tuple[int, ...], scratch: Path | None = None
+) -> Centroid:
+    """Blend the centroids of all tiles and the flows from them.
+
+    Parameters
+    ----------
+    parts : iterable of Centroid
+        One for each tile; consumed lazily, so that the flows of one tile at a time are in memory.
+    tiles : sequence of HaloTile
+    shape : tuple of int
+        Shape of the training frames, (T, H, W) or (T, H, W, 3).
+    scratch : Path, optional
+        Folder of the files that hold image and flows; without one they stay in memory.
 
     Returns
     -------
@@ -50,26 +285,19 @@ def tiled_centroid_steps(
         It has converged if all tiles have.  The mean flow of an iteration is the mean over the tiles, of which those
         that have stopped count with their last.
 
-    Raises
-    ------
-    DataError, ConfigurationError
-        As :func:`turbrestore.registration.centroid.find_centroid`.
-
     Examples
     --------
-    >>> from turbrestore.runtime.steps import finish
     >>> from turbrestore.runtime.tiling import halo_tiles
     >>> tiles = halo_tiles((40, 64), side=44, halo=8)
-    >>> frames = np.ones((2, 40, 64), np.float32)
-    >>> centroid = finish(tiled_centroid_steps(frames, tiles, CentroidParams(), FlowParams(), Runtime()))
-    >>> len(tiles), centroid.flows.shape
-    (2, (2, 40, 64, 2))
+    >>> parts = (find_centroid(np.ones((2, *tile.shape), np.float32)) for tile in tiles)
+    >>> centroid = join_centroids(parts, tiles, (2, 40, 64))
+    >>> len(tiles), centroid.flows.shape, centroid.converged
+    (2, (2, 40, 64, 2), True)
     """
-    image = new_mosaic(frames.shape[1:], runtime.scratch)
-    flows = new_mosaic((*frames.shape[:3], 2), runtime.scratch)
-    sizes, converged = list[NDArray[np.float64]](), True
+    image, flows = new_mosaic(shape[1:], scratch), new_mosaic((*shape[:3], 2), scratch)
+    sizes, converged, remaining = list[NDArray[np.float64]](), True, iter(parts)
     for tile in tiles:
-        part = yield from centroid_steps(cut_tile(frames, tile, runtime.scratch), params, flow_params, runtime)
+        part = next(remaining)
         add_tile(image, tile, part.image)
         for whole, flow in zip(flows, iter_frames(part.flows), strict=True):
             add_tile(whole, tile, flow)
@@ -142,6 +370,11 @@ def join_filtered(
         motion_share=float(average("motion_share")),
         mean_flow=mean_flow,
     )
+
+
+def _here(runtime: Runtime) -> Runtime:
+    """Use the folder of temporary files of this process."""
+    return runtime if runtime.scratch is None else replace(runtime, scratch=Path(tempfile.gettempdir()))
 
 
 def _areas(tiles: Sequence[HaloTile]) -> NDArray[np.float64]:

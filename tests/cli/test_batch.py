@@ -7,19 +7,21 @@ import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
-from distributed import LocalCluster
+from distributed import CancelledError, KilledWorker, LocalCluster
 
 from conftest import make_sequence
-from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError
+from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, TurbrestoreError
 from turbrestore.io.images import write_image
 from turbrestore.io.video import write_video
 from turbrestore.report.batch_page import ClipRow, render_batch
 from turbrestore_cli import batch as command
+from turbrestore_cli import cluster
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.batch_plan import find_clips, journal_line, name_outputs, read_journal
 
@@ -178,15 +180,66 @@ class TestBatch:
         ],
     )
     def test_usage(self, clips, tmp_path, capsys, monkeypatch, words, code, part):
-        monkeypatch.setattr(command, "_PATIENCE", 0.3)
+        monkeypatch.setattr(cluster, "_PATIENCE", 0.3)
         assert main(["batch", str(clips / "0.mkv"), "--out", str(tmp_path / "out"), *words]) == code
         captured = capsys.readouterr()
         assert captured.out == "" and captured.err.count("\n") == 1 and part in captured.err
 
     def test_without_the_extra(self, clips, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr(command, "find_spec", lambda name: None)
+        monkeypatch.setattr(cluster, "find_spec", lambda name: None)
         assert main(["batch", str(clips / "0.mkv"), "--out", str(tmp_path / "out")]) == 2
         assert "pip install 'turbrestore[distributed]'" in capsys.readouterr().err
+
+
+class TestTiles:
+    """One clip whose frames are larger than a tile."""
+
+    WORDS = ("--until", "filter", "--centroid.iterations", "1", "--filter.inner-iterations", "1", "--threads", "1")
+
+    def test_tiles_are_the_same_bytes_in_other_processes(self, scheduler, tmp_path, capsys):
+        frames = make_sequence(seed=3, count=3, size=448, rms=0.8).frames[:, 100:180]
+        write_video(tmp_path / "a.npy", frames, 25)
+        for name, words in {
+            "here": ["--tile", "384"],
+            "there": ["--tile", "384", "--scheduler", scheduler],
+            "one": ["--scheduler", scheduler],
+        }.items():
+            assert main(["restore", str(tmp_path / "a.npy"), str(tmp_path / f"{name}.png"), *self.WORDS, *words]) == 0
+        found = contents(tmp_path)
+        assert found["here.png"] == found["there.png"] and found["here.png"] != found["one.png"]
+        assert found["here.png.toml"] == found["there.png.toml"] and b"tile = 384" in found["there.png.toml"]
+        assert "frames of 448×80 are one tile" in capsys.readouterr().err
+
+    def test_usage(self, clips, tmp_path, capsys):
+        for words in (["--workers", "0"], ["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], ["--tile", "100"]):
+            assert main(["restore", str(clips / "0.mkv"), str(tmp_path / "a.png"), *words]) == 2
+            assert capsys.readouterr().err.count("\n") == 1
+
+    @pytest.mark.parametrize("times", [1, 9])
+    def test_a_tile_that_loses_its_process_is_sent_again(self, times):
+        losses = [KilledWorker.__new__(KilledWorker), CancelledError()] * times
+
+        class Lossy:
+            def scheduler_info(self):
+                return {"workers": {}}
+
+            def scatter(self, task, hash):
+                return task
+
+            def submit(self, function, task, pure):
+                future = Future()
+                if losses and task == 2:
+                    future.set_exception(losses.pop())
+                else:
+                    future.set_result(function(task))
+                return future
+
+        squares = cluster.over_workers(Lossy())(lambda number: number**2, iter([1, 2, 3]))
+        if times == 1:
+            assert list(squares) == [1, 4, 9]
+        else:
+            with pytest.raises(TurbrestoreError, match="killed again and again"):
+                list(squares)
 
 
 def children(process):

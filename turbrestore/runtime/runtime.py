@@ -9,6 +9,7 @@ from ..core.errors import require
 from .device import CPU, check_device
 from .memory_size import MemorySize
 from .threads import available_cores
+from .tiling import HALO
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,10 @@ class Runtime:
         sees one.
     scratch : Path, optional
         Folder of the files that hold stacks of frames and flows.  A stage without it keeps them in memory; a whole
-        restoration uses files only where a memory limit asks for them, by default among the temporary files.
+        restoration uses files only where a memory limit or tiles ask for them, by default among the temporary files.
+    tile : int, optional
+        Longest side of the tiles in which a restoration processes larger frames, pixels; at least 384.  By default
+        frames are processed as a whole, if that keeps the memory limit.
 
     Raises
     ------
@@ -46,10 +50,15 @@ class Runtime:
     memory_limit: MemorySize | None = None
     device: str = CPU
     scratch: Path | None = None
+    tile: int | None = None
 
     def __post_init__(self) -> None:
         require(self.threads >= 0, f"threads: expected 0 or more, found {self.threads}")
         check_device(self.device)
+        require(
+            self.tile is None or self.tile >= 4 * HALO,
+            f"tile: expected at least {4 * HALO} pixels, found {self.tile}",
+        )
         if self.memory_limit is not None:
             # A number or text is as good where settings are written in Python.
             object.__setattr__(self, "memory_limit", MemorySize(self.memory_limit))
