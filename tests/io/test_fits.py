@@ -10,7 +10,9 @@ import pytest
 from astropy.io import fits
 
 from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.footage.calibration import calibrated, make_calibration
 from turbrestore.footage.content import check_content, clean_source
+from turbrestore.io.astronomy.fits import open_fits
 from turbrestore.io.astronomy.fits_output import write_fits
 from turbrestore.io.images import read_image, write_image
 from turbrestore.io.limits import Limits
@@ -279,3 +281,61 @@ def test_restore_gives_the_bytes_of_the_array(sequence, tmp_path, written, capsy
         assert "turbrestore restore" in "".join(file[0].header["HISTORY"])
         assert file["UNCERT"].data.shape == file[0].data.shape
         assert importlib.util.find_spec("astropy") and np.all(file["UNCERT"].data > 0)
+
+
+def mosaic_of(pattern, shape, kind):
+    level = {"R": 200, "G": 120, "B": 30}
+    mosaic = np.empty(shape, kind)
+    for place, letter in enumerate(pattern):
+        mosaic[..., place // 2 :: 2, place % 2 :: 2] = level[letter] / (1 if np.dtype(kind).kind == "u" else 255)
+    return mosaic
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "GRBG", "GBRG", "BGGR"])
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32, np.float32])
+def test_a_bayer_pattern_in_the_header_gives_colours(written, pattern, kind):
+    data = mosaic_of(pattern, (2, 8, 10), kind)
+    source = open_frames(written(data, BAYERPAT=pattern), roi=(2, 2, 4, 4))
+    assert source.warnings == () and source.shape == (2, 4, 4, 3) and source.format.endswith(f"as {pattern.lower()}")
+    scale = {1: 255, 2: 65535, 4: 2**32 - 1 if kind == np.uint32 else 255}[data.itemsize]
+    np.testing.assert_allclose(source.read() * scale, np.broadcast_to([200, 120, 30], (2, 4, 4, 3)), atol=0.01)
+
+
+def test_the_pattern_of_a_header_agrees_with_ser(written, tmp_path):
+    mosaic = RNG.integers(0, 65536, (3, 8, 10), np.uint16)
+    np.save(tmp_path / "a.npy", mosaic)
+    expected = open_frames(tmp_path / "a.npy", bayer="grbg").read()
+    np.testing.assert_array_equal(open_frames(written(mosaic, BAYERPAT="GRBG")).read(), expected)
+    # In the interior floating point is the same but for rounding to the type.
+    found = open_frames(written((mosaic / 65535).astype(np.float32), BAYERPAT="GRBG")).read()
+    assert np.abs(found - expected)[:, 1:-1, 1:-1].max() < 1 / 65535
+
+
+@pytest.mark.parametrize("height", [8, 9])
+def test_offsets_and_rows_from_the_bottom_up_shift_the_pattern(written, height):
+    sensor = mosaic_of("RGGB", (2, 13, 14), np.uint8)
+    read = {
+        "offsets": open_frames(written(sensor[:, 3:11, 5:], XBAYROFF=5, YBAYROFF=3, BAYERPAT="RGGB")),
+        "bottom up": open_frames(written(sensor[:, :height][:, ::-1], ROWORDER="BOTTOM-UP", BAYERPAT="RGGB")),
+    }
+    for source in read.values():
+        inner = source.select(roi=(2, 2, 4, 4)).read() * 255
+        np.testing.assert_allclose(inner, np.broadcast_to([200, 120, 30], (2, 4, 4, 3)), atol=0.01)
+
+
+def test_one_image_with_a_pattern_and_patterns_that_are_unknown(written):
+    image = mosaic_of("RGGB", (8, 10), np.uint8)
+    assert read_image(written(image, BAYERPAT="RGGB")).image.shape == (8, 10, 3)
+    source = open_frames(written(image[None], BAYERPAT="XTRANS"))
+    assert source.shape == (1, 8, 10) and "XTRANS is unknown" in source.warnings[0]
+
+
+def test_darks_and_flats_of_a_bayer_sensor_come_before_colours(written, tmp_path):
+    mosaic = mosaic_of("RGGB", (4, 16, 18), np.float32)
+    dark = np.full((16, 18), 0.1, np.float32)
+    hot = mosaic * 0.5 + dark
+    hot[:, 7, 7] = dark[7, 7] = 0.9
+    clip, single = written(hot, BAYERPAT="RGGB"), written(dark, "dark.fits", BAYERPAT="RGGB")
+    source = calibrated(open_frames(clip), make_calibration(open_frames(clip), open_fits(single, single=True), None))
+    expected = np.broadcast_to(np.array([200, 120, 30]) / 510, (4, 12, 14, 3))
+    np.testing.assert_allclose(source.select(roi=(2, 2, 14, 12)).read(), expected, atol=1e-4)

@@ -1,5 +1,6 @@
 """Videos in: every format, exact at its depth."""
 
+import struct
 from fractions import Fraction
 
 import cv2
@@ -343,3 +344,45 @@ class TestNamedAxes:
         for name in ("a.tif", "b.tif"):
             tifffile.imwrite(tmp_path / name, data, photometric="minisblack", description=xml, metadata=None)
         np.testing.assert_array_equal(list(open_frames(tmp_path / "a.tif").native()), data)
+
+
+def avi_with_palette(path, frames, palette):
+    """An uncompressed AVI of 8 bits as capture programs write it: rows from the bottom up, and a palette."""
+    height, width = frames[0].shape
+    row = -(-width // 4) * 4
+
+    def chunk(name, data):
+        return name + struct.pack("<I", len(data)) + data + bytes(len(data) % 2)
+
+    head = struct.pack("<14I", 40_000, 0, 0, 16, len(frames), 0, 1, row * height, width, height, 0, 0, 0, 0)
+    numbers = 0, 0, 0, 0, 1, 25, 0, len(frames), row * height, 0xFFFFFFFF, 0, 0, 0, width, height
+    stream = b"vidsDIB " + struct.pack("<IHHIIIIIIIIhhhh", *numbers)
+    image = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 8, 0, row * height, 0, 0, 256, 0) + palette.tobytes()
+    lists = chunk(b"LIST", b"strl" + chunk(b"strh", stream) + chunk(b"strf", image))
+    pictures = (np.pad(frame[::-1], ((0, 0), (0, row - width))).tobytes() for frame in frames)
+    movie = b"".join(chunk(b"00db", picture) for picture in pictures)
+    body = b"AVI " + chunk(b"LIST", b"hdrl" + chunk(b"avih", head) + lists) + chunk(b"LIST", b"movi" + movie)
+    path.write_bytes(b"RIFF" + struct.pack("<I", len(body)) + body)
+    return path
+
+
+class TestRawAvi:
+    def test_a_grey_palette_is_grey_and_may_be_a_mosaic(self, tmp_path):
+        ramp = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 4, axis=1)
+        ramp[:, 3] = 0
+        frames = np.random.default_rng(0).integers(0, 90, (3, 24, 30), np.uint8)
+        frames[:, ::2, ::2] += 150
+        frames[:, 1::2, 1::2] += 100
+        path = avi_with_palette(tmp_path / "a.avi", frames, ramp)
+        source = open_frames(path)
+        assert source.shape == (3, 24, 30) and "--bayer" in source.warnings[0]
+        np.testing.assert_array_equal(list(source.native()), frames)
+        np.save(tmp_path / "a.npy", frames)
+        expected = open_frames(tmp_path / "a.npy", bayer="rggb").read()
+        np.testing.assert_array_equal(open_frames(path, bayer="rggb").read(), expected)
+
+    def test_another_palette_is_colour(self, tmp_path):
+        palette = np.random.default_rng(1).integers(0, 256, (256, 4), np.uint8)
+        frames = np.random.default_rng(0).integers(0, 256, (3, 24, 30), np.uint8)
+        source = open_frames(avi_with_palette(tmp_path / "a.avi", frames, palette))
+        np.testing.assert_array_equal(list(source.native()), palette[frames][..., 2::-1])

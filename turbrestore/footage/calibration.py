@@ -1,8 +1,9 @@
 """Dark and flat frames: what a camera adds and how unequal its pixels are, taken out of every frame.
 
 ``calibrated = (frame − dark) · mean(flat) / flat``. Pixels that stand out in the dark are hot, those that see less than
-a tenth of the mean flat are dead; both are filled from around. The dark has the exposure, gain and temperature of the
-clip; the flat is used as it is, so its own dark should be small or subtracted already.
+a tenth of the mean flat are dead; both are filled from around. Frames of a Bayer sensor are calibrated as it saw them,
+before they have colours. The dark has the exposure, gain and temperature of the clip; the flat is used as it is, so its
+own dark should be small or subtracted already.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray
 from ..core.errors import DataError
 from ..io.output import size_text
-from ..io.pixels import PixelArray, to_unit
+from ..io.pixels import PixelArray, planes_of, to_unit, with_planes
 from ..io.source import FrameSource
 from .content import fill_holes
 
@@ -73,6 +74,7 @@ def make_calibration(clip: FrameSource, dark: FrameSource | None, flat: FrameSou
     >>> make_calibration(clip, None, flat).gain[0].round(3).tolist()
     [2.0, 1.0, 2.0, 0.5]
     """
+    clip, dark, flat = _as_sensor(clip), *(None if each is None else _as_sensor(each) for each in (dark, flat))
     shape = clip.file_shape[1:]
     bad, remarks = np.zeros(shape, bool), []
     offset = gain = None
@@ -101,13 +103,15 @@ def make_calibration(clip: FrameSource, dark: FrameSource | None, flat: FrameSou
     return Calibration(offset, gain, bad, "; ".join(remarks))
 
 
-def calibrate(frame: FloatArray, calibration: Calibration) -> FloatArray:
+def calibrate(frame: FloatArray, calibration: Calibration, mosaic: bool = False) -> FloatArray:
     """Return a frame without dark, unequal gains and bad pixels; what leaves [0, 1] is clipped.
 
     Parameters
     ----------
     frame : ndarray, float32, shape (H, W) or (H, W, 3)
     calibration : Calibration
+    mosaic : bool
+        The frame is that of a Bayer sensor: bad pixels are filled from pixels of their colour.
 
     Returns
     -------
@@ -126,7 +130,7 @@ def calibrate(frame: FloatArray, calibration: Calibration) -> FloatArray:
     if calibration.bad.any():
         missing = np.isnan(light)
         light[calibration.bad] = np.nan
-        light = fill_holes(light)
+        light = with_planes(light, fill_holes(planes_of(light))) if mosaic else fill_holes(light)
         # What was missing before is for the check of the content to find.
         light[missing] = np.nan
     return light
@@ -149,9 +153,16 @@ def calibrated(clip: FrameSource, calibration: Calibration) -> FrameSource:
         pixels = pixels if before is None else before(pixels)
         if not np.issubdtype(pixels.dtype, np.floating):
             pixels = to_unit(pixels, clip.full_scale, clip.name)
-        return calibrate(pixels.astype(np.float32), calibration)
+        return calibrate(pixels.astype(np.float32), calibration, mosaic=clip.develop is not None)
 
     return dataclasses.replace(clip, repair=repaired, warnings=(*clip.warnings, calibration.remark))
+
+
+def _as_sensor(source: FrameSource) -> FrameSource:
+    """Take the mosaic of a Bayer sensor for grey frames: calibration comes before colour."""
+    if source.develop is None:
+        return source
+    return dataclasses.replace(source, file_shape=source.file_shape[:3], develop=None)
 
 
 def _dark_level(clip: FrameSource, dark: FrameSource) -> FloatArray:

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import DataError
-from .integrity import ffv1_slices_intact, is_cut_short
+from .integrity import ends_early, ffv1_slices_intact, is_cut_short, varies_in_time
 from .limits import DEFAULT_LIMITS, Limits, input_errors
-from .pixels import PixelArray, upright
+from .pixels import BAYER_REMARK, PixelArray, looks_like_bayer, upright
 from .source import FrameRange, FrameSource, check_cut_short, check_frame_range
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ class _PixelFormat:
     channels: tuple[int, ...]
     alpha: bool
     orientation: int = 1
+    ramp: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,19 +100,23 @@ def open_container(
             if frame is None:
                 raise DataError(f"{path}: expected at least one frame, found none")
             layout = replace(_pixel_format(path, frame.format), orientation=_orientation(frame))
+            if _has_grey_palette(frame):
+                layout = replace(layout, channels=(), ramp=True)
             notes, interlaced = _notes(frame, layout, stream), frame.interlaced_frame
+            if codec == "rawvideo" and not layout.channels and looks_like_bayer(_array(frame, layout)):
+                notes += (BAYER_REMARK,)
         scan = _scan(path, cut, limits)
         if not scan.starts_whole:
             # A recording of a transport stream can start anywhere; frames before the first whole one are not decoded.
             scan, missing = _decoded_scan(path, scan, limits)
             text = f"starts in the middle of a group of frames: its first {missing} cannot be decoded"
             notes += (text,) if missing else ()
-    cut = cut or scan.intact < scan.count or (duration is not None and _ends_early(scan, duration))
+    cut = cut or scan.intact < scan.count or (duration is not None and ends_early(scan.times, scan.last, duration))
     # A filter for fields looks at the frames before and after.
     intra = codec in _INTRA_CODECS and scan.keyframes == scan.count and not interlaced
     notes += check_cut_short(path, scan.intact, check_frame_range(frames).stop, skip_damaged) if cut else ()
     damaged = _check_damage(path, scan, frames, intra, skip_damaged)
-    varies = scan.times is not None and _varies(scan.times, scan.tick)
+    varies = scan.times is not None and varies_in_time(scan.times, scan.tick)
     fps = float(rate) if rate else None
     if varies and scan.times is not None:
         fps, notes = (len(scan.times) - 1) / float(scan.times[-1]), (*notes, "variable frame rate")
@@ -178,6 +183,22 @@ def _pixel_format(path: Path, native: av.VideoFormat) -> _PixelFormat:
     if depth > 8:
         return _PixelFormat(name, "rgb48le", depth, 65535, (3,), alpha)
     return _PixelFormat(name, "rgb24", 8, 255, (3,), alpha)
+
+
+def _has_grey_palette(frame: av.VideoFrame) -> bool:
+    """Whether the palette of a frame is black to white, as programs write it beside grey frames in AVI."""
+    if frame.format.name != "pal8":
+        return False
+    _, palette = frame.to_ndarray()
+    return bool((palette[:, 1:] == np.arange(256)[:, None]).all())
+
+
+def _array(frame: av.VideoFrame, layout: _PixelFormat) -> PixelArray:
+    """Pixels of a frame; converted from a palette FFmpeg's grey is off by one."""
+    if not layout.ramp:
+        return convert(frame, layout.target).to_ndarray()
+    indices, _ = frame.to_ndarray()
+    return indices
 
 
 def _notes(frame: av.VideoFrame, layout: _PixelFormat, stream: av.VideoStream) -> tuple[str, ...]:
@@ -296,21 +317,6 @@ def _declared_duration(stream: av.VideoStream) -> float | None:
         return None
 
 
-def _ends_early(scan: _Scan, duration: float) -> bool:
-    """Whether another frame should follow the last one, judged by the longest interval."""
-    if scan.times is None or len(scan.times) < 2:
-        return False
-    return scan.last < duration - 1.5 * float(np.diff(scan.times).max())
-
-
-def _varies(times: NDArray[np.float64], tick: float) -> bool:
-    """Whether frame intervals differ by more than the rounding to the clock of the file."""
-    if len(times) < 3:
-        return False
-    intervals = np.diff(times)
-    return bool(np.ptp(intervals) > max(2.5 * tick, 0.05 * float(np.median(intervals))))
-
-
 def _frames(
     path: Path, layout: _PixelFormat, chosen: Sequence[int], intra: bool, interlaced: bool, limits: Limits
 ) -> Iterator[PixelArray]:
@@ -334,7 +340,7 @@ def _frames(
             for number, frame in zip(numbers, frames, strict=False):
                 if number in wanted:
                     whole = frame if interlaced else _check(path, frame, layout, number)
-                    yield upright(convert(whole, layout.target).to_ndarray(), layout.orientation)
+                    yield upright(_array(whole, layout), layout.orientation)
                 if number >= chosen[-1]:
                     return
     except av.error.FFmpegError as error:
@@ -344,7 +350,7 @@ def _frames(
 def _check(path: Path, frame: av.VideoFrame, layout: _PixelFormat, number: int) -> av.VideoFrame:
     if frame.is_corrupt:
         raise DataError(f"{path}: frame {number} is damaged; copy the file again or select other frames")
-    if frame.format.name != layout.name:
+    if frame.format.name != layout.name or layout.ramp > _has_grey_palette(frame):
         raise DataError(f"{path}: frame {number}: expected pixel format {layout.name}, found {frame.format.name}")
     return frame
 

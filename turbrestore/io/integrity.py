@@ -14,6 +14,9 @@ import zlib
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
+
 _REVERSED_BITS = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
 _EBML_HEADER, _MATROSKA_SEGMENT = b"\x1aE\xdf\xa3", b"\x18S\x80g"
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"moof", b"mfra", b"wide", b"free", b"skip", b"pnot", b"styp", b"sidx")
@@ -99,3 +102,30 @@ def _mp4_end(file: BinaryIO, size: int) -> int:
             break  # 0: to the end of the file
         position += length
     return position
+
+
+def ends_early(times: NDArray[np.float64] | None, last: float, duration: float) -> bool:
+    """Whether another frame should follow the one at ``last`` seconds, judged by the longest interval.
+
+    Examples
+    --------
+    >>> ends_early(np.array([0.0, 0.1, 0.2]), 0.2, 0.3), ends_early(np.array([0.0, 0.1, 0.2]), 0.2, 0.9)
+    (False, True)
+    """
+    if times is None or len(times) < 2:
+        return False
+    return last < duration - 1.5 * float(np.diff(times).max())
+
+
+def varies_in_time(times: NDArray[np.float64], tick: float) -> bool:
+    """Whether frame intervals differ by more than the rounding to the clock of the file, ``tick`` seconds.
+
+    Examples
+    --------
+    >>> varies_in_time(np.array([0.0, 0.1, 0.2]), 0.001), varies_in_time(np.array([0.0, 0.1, 0.4]), 0.001)
+    (False, True)
+    """
+    if len(times) < 3:
+        return False
+    intervals = np.diff(times)
+    return bool(np.ptp(intervals) > max(2.5 * tick, 0.05 * float(np.median(intervals))))

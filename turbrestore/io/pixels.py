@@ -33,6 +33,7 @@ BAYER_CODES = {
     "gbrg": cv2.COLOR_BayerGBRG2RGB,
     "bggr": cv2.COLOR_BayerBGGR2RGB,
 }
+BAYER_REMARK = "pixels alternate as in a Bayer mosaic: --bayer rggb (or grbg, gbrg, bggr) gives colours"
 # In a mosaic neighbours differ by this factor more than the next pixels of their colour; in an image they differ less.
 _ALTERNATING = 1.3
 
@@ -132,15 +133,36 @@ def upright(pixels: PixelArray, orientation: object) -> PixelArray:
 
 
 def demosaic(pixels: PixelArray, pattern: str) -> PixelArray:
-    """Turn a mosaic (H, W) of uint8 or uint16 into RGB (H, W, 3) by bilinear interpolation.
+    """Turn a mosaic (H, W) into RGB (H, W, 3) of its type by bilinear interpolation.
 
     Examples
     --------
     >>> mosaic = np.tile(np.array([[9, 5], [5, 1]], np.uint8), (4, 4))
     >>> demosaic(mosaic, "rggb")[3, 3].tolist()
     [9, 5, 1]
+    >>> demosaic(mosaic / np.float32(8), "bggr")[3, 3].tolist()
+    [0.125, 0.625, 1.125]
     """
+    if pixels.dtype.itemsize > 2:
+        return _demosaic_wide(pixels, pattern)
     return cv2.cvtColor(pixels.astype(pixels.dtype.newbyteorder("=")), BAYER_CODES[pattern])
+
+
+def _demosaic_wide(pixels: PixelArray, pattern: str) -> PixelArray:
+    """Do the same for types that OpenCV does not take: means of the pixels of a colour, weighted by their distance."""
+    values, colours = pixels.astype(np.float64), []
+    for colour in "rgb":
+        own = np.zeros(values.shape)
+        for place in range(4):
+            own[place // 2 :: 2, place % 2 :: 2] = pattern[place] == colour
+        # Every second pixel is green, so the nearest green ones share a side.
+        corner = 0 if colour == "g" else 0.25
+        near = np.array([[corner, 0.5, corner], [0.5, 1, 0.5], [corner, 0.5, corner]])
+        total, weight = (cv2.filter2D(part, -1, near, borderType=cv2.BORDER_CONSTANT) for part in (own * values, own))
+        # A frame of one row lacks a colour.
+        colours.append(total / np.maximum(weight, 1e-9))
+    image = np.stack(colours, axis=-1)
+    return (np.rint(image) if pixels.dtype.kind in "iu" else image).astype(pixels.dtype.newbyteorder("="))
 
 
 def looks_like_bayer(pixels: PixelArray) -> bool:

@@ -29,7 +29,7 @@ from ..core.arrays import FloatArray, from_unit
 from ..core.errors import DataError
 from .limits import DEFAULT_LIMITS, Limits, input_errors
 from .output import atomic_output, frames_of_one_size
-from .pixels import PixelArray, check_depth, demosaic, looks_like_bayer
+from .pixels import BAYER_REMARK, PixelArray, check_depth, demosaic, looks_like_bayer
 from .source import FrameSource, check_cut_short
 
 SIGNATURE = b"LUCAM-RECORDER"
@@ -172,7 +172,7 @@ def _as_pixels_say(path: Path, header: SerHeader) -> tuple[SerHeader, tuple[str,
         orders = ("little", "big") if header.little_endian else ("big", "little")
         remarks.append(f"read as {orders[0]} endian by its pixels, which are noise as {orders[1]} endian")
     if header.colour == _MONO and looks_like_bayer(frame):
-        remarks.append("pixels alternate as in a Bayer mosaic: --bayer rggb (or grbg, gbrg, bggr) gives colours")
+        remarks.append(BAYER_REMARK)
     return header, tuple(remarks)
 
 

@@ -12,6 +12,7 @@ axes                               frames
 (T, H, W, 3)                       colour, where only the last has
 (T, 1, H, W)                       grey
 a folder of (H, W) or (3, H, W)    grey or colour, one file a frame
+grey, with BAYERPAT                colour, by bilinear interpolation
 =================================  ==========================================================================
 
 ==================================  =========================================================================
@@ -41,7 +42,7 @@ from numpy.typing import NDArray
 from ...core.errors import DataError
 from ...runtime.scratch import iter_frames
 from ..limits import DEFAULT_LIMITS, Limits
-from ..pixels import FLOAT_MARGIN, PixelArray, depth_of, full_scale_of
+from ..pixels import FLOAT_MARGIN, PixelArray, demosaic, depth_of, full_scale_of
 from ..source import FrameSource
 from .fits_header import FitsImage, find_image
 
@@ -131,7 +132,8 @@ def read_fits(path: Path, limits: Limits) -> tuple[PixelArray, tuple[str, ...]]:
     image = find_image(path, limits)
     numbers = _as_image(image, image.numbers(limits))
     levels, notes = _levels(image, iter([numbers]))
-    return levels.pixels(numbers, image), notes
+    pixels, bayer = levels.pixels(numbers, image), image.bayer if numbers.ndim == 2 else None
+    return pixels if bayer is None else demosaic(pixels, bayer), notes
 
 
 def _source(
@@ -139,10 +141,11 @@ def _source(
 ) -> FrameSource:
     dtype = levels.unsigned or image.dtype.newbyteorder("=")
     unsigned = levels.unsigned is not None and image.blank is None
+    bayer = image.bayer if len(shape) == 3 else None
     return FrameSource(
         name=image.path.name,
-        format=f"fits/{dtype}",
-        file_shape=shape,
+        format=f"fits/{dtype}" if bayer is None else f"fits/{dtype} as {bayer}",
+        file_shape=shape if bayer is None else (*shape, 3),
         full_scale=full_scale_of(dtype, str(image.path)) if unsigned else 1,
         bit_depth=min(8 * dtype.itemsize, 32) if dtype.kind in "iu" else depth_of(dtype),
         pixels=pixels,
@@ -150,6 +153,7 @@ def _source(
         warnings=notes,
         levels=None if (levels.black, levels.white) == (0, 1) else (levels.black, levels.white),
         header=image.cards[:-1],
+        develop=None if bayer is None else lambda mosaic: demosaic(mosaic, bayer),
     )
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import ConfigurationError, DataError
 from ..limits import Limits, check_input, format_errors, input_errors
+from ..pixels import BAYER_CODES
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
@@ -58,6 +59,8 @@ class FitsImage:
         Integer that stands for a missing value.
     notes : tuple of str
         What is unusual.
+    bayer : str or None
+        Colours of the first pixels of the file, where the header says that they are those of a Bayer sensor.
     """
 
     path: Path
@@ -68,11 +71,12 @@ class FitsImage:
     scale: tuple[float, float]
     blank: int | None
     notes: tuple[str, ...]
+    bayer: str | None = None
 
     @property
     def kind(self) -> tuple[object, ...]:
         """What images of one folder have in common."""
-        return self.shape, self.dtype, self.scale, self.blank
+        return self.shape, self.dtype, self.scale, self.blank, self.bayer
 
     def numbers(self, limits: Limits) -> NDArray[Any]:
         """Map the numbers of the file into memory, or load them from a compressed file."""
@@ -187,13 +191,28 @@ def _image(path: Path, cards: tuple[str, ...], header: Header, offset: int) -> F
     if not (math.isfinite(scale) and math.isfinite(zero)) or scale == 0:
         raise DataError(f"{path}: expected finite BSCALE and BZERO, found {scale} and {zero}")
     notes = []
-    if str(header.get("ROWORDER", "")).strip().upper() == "BOTTOM-UP":
+    bottom_up = str(header.get("ROWORDER", "")).strip().upper() == "BOTTOM-UP"
+    if bottom_up:
         notes.append("rows stand from the bottom up, and keep the order of the file")
     pattern = str(header.get("BAYERPAT", "")).strip()
-    if pattern and 3 not in shape[:-2]:
-        notes.append(f"the Bayer pattern {pattern} is not made into colour")
+    bayer = _first_colours(pattern, header, shape[-2] if bottom_up and len(shape) > 1 else None)
+    if pattern and bayer is None:
+        notes.append(f"the Bayer pattern {pattern} is unknown, so it is not made into colour")
     missing = blank if dtype.kind in "iu" and isinstance(blank, int) else None
-    return FitsImage(path, cards, shape, dtype, offset, (scale, zero), missing, tuple(notes))
+    return FitsImage(path, cards, shape, dtype, offset, (scale, zero), missing, tuple(notes), bayer)
+
+
+def _first_colours(pattern: str, header: Header, rows: int | None) -> str | None:
+    """Colours of the first 2×2 pixels of the file; ``rows`` counts them where the last is the first of the sensor."""
+    colours = pattern.lower()
+    if colours not in BAYER_CODES:
+        return None
+    across, down = (header.get(name, 0) for name in ("XBAYROFF", "YBAYROFF"))
+    across, down = (
+        int(value) if isinstance(value, int | float) and math.isfinite(value) else 0 for value in (across, down)
+    )
+    down += 0 if rows is None else rows - 1
+    return "".join(colours[2 * ((row + down) % 2) + (column + across) % 2] for row in (0, 1) for column in (0, 1))
 
 
 def _check_size(image: FitsImage, limits: Limits) -> None:
