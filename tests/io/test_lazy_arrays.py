@@ -1,12 +1,13 @@
 """Arrays that are computed or read on demand: one frame at a time, with the same result as arrays in memory."""
 
+import dask.array as dask_array
 import numpy as np
 import pytest
+import xarray
 
 from turbrestore.io.source import FrameSource
 
 FRAMES = np.random.default_rng(0).random((6, 8, 9, 3), np.float32)
-dask_array = pytest.importorskip("dask.array")
 
 
 @pytest.fixture
@@ -34,7 +35,6 @@ def test_frames_are_computed_when_they_are_read(lazy):
 
 
 def test_labelled_arrays_stay_lazy(lazy):
-    xarray = pytest.importorskip("xarray")
     array, computed = lazy
     source = FrameSource.from_array(xarray.DataArray(array, dims=("time", "y", "x", "channel")))
     assert computed == [] and source.format == "array/float32"
