@@ -1,0 +1,82 @@
+"""Run one package of others on frames; the interpreter of their own environment runs this file.
+
+    python package_child.py NAME FRAMES.npy IMAGE.npy
+
+reads frames of shape (T, H, W) or (T, H, W, 3), 0 to 1, writes the image, and prints what the process has used.  Other
+files go beside the image.
+"""
+
+import builtins
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from usage import peak_megabytes, processor_seconds
+
+# Of 30 to 120 frames the tenth that the stacker takes by itself is too few: on crops of synthetic clips half of them
+# give more than a quarter and more than all.  Everything else is as the program has it.
+STACKED_PERCENT = 50
+
+
+def planetary_system_stacker(frames: np.ndarray, folder: Path, deliver: Callable[[np.ndarray], None]) -> None:
+    """Stack the best frames around every alignment point, as the command line of the program does."""
+    import cv2
+
+    source = folder / "frames"
+    source.mkdir()
+    for number, frame in enumerate(frames):
+        pixels = np.rint(255 * np.clip(frame, 0, 1)).astype(np.uint8)
+        cv2.imwrite(str(source / f"{number:05d}.png"), pixels[..., ::-1] if pixels.ndim == 3 else pixels)
+
+    def read(code: int) -> None:
+        written = cv2.imread(str(folder / "frames_pss.png"), cv2.IMREAD_UNCHANGED)
+        if written is None:
+            print(f"PlanetarySystemStacker wrote no image, exit status {code}", file=sys.stderr, flush=True)
+            os._exit(1)
+        image = written / np.float32(np.iinfo(written.dtype).max)
+        if image.ndim == 3:
+            image = image[..., ::-1] if frames.ndim == 4 else image.mean(axis=-1)
+        deliver(image)
+
+    # The program ends itself in the middle of an event of Qt.
+    builtins.quit = read  # type: ignore[assignment]
+    os.environ["QT_QPA_PLATFORM"] = "offscreen"
+    sys.argv = ["pss", str(source), "--stack_percent", str(STACKED_PERCENT)]
+    from planetary_system_stacker.planetary_system_stacker import main
+
+    main()
+
+
+def pystackreg(frames: np.ndarray, folder: Path, deliver: Callable[[np.ndarray], None]) -> None:
+    """Mean of the frames after a bilinear registration of each to the temporal mean."""
+    from pystackreg import StackReg
+
+    grey = frames if frames.ndim == 3 else frames.mean(axis=-1)
+    register = StackReg(StackReg.BILINEAR)
+    matrices = register.register_stack(grey.astype(np.float64), reference="mean")
+    channels = [frames] if frames.ndim == 3 else [frames[..., c] for c in range(frames.shape[3])]
+    means = [register.transform_stack(channel.astype(np.float64), tmats=matrices).mean(axis=0) for channel in channels]
+    deliver(means[0] if frames.ndim == 3 else np.stack(means, axis=-1))
+
+
+PACKAGES = {"PlanetarySystemStacker": planetary_system_stacker, "pystackreg": pystackreg}
+
+
+def run() -> None:
+    """Read, restore, write, report."""
+    name, source, target = sys.argv[1:]
+
+    def deliver(image: np.ndarray) -> None:
+        np.save(target, image.astype(np.float32))
+        # What packages print comes before it.
+        print("\n" + json.dumps({"seconds": processor_seconds(), "peak": peak_megabytes()}), flush=True)
+        os._exit(0)
+
+    PACKAGES[name](np.load(source), Path(target).parent, deliver)
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,106 @@
+"""Videos of ``peers.py``: frame by frame against the truth, and how much they flicker.
+
+One video is made here: a square that moves before a photograph, through smooth random flows.  Others lie under
+``TURBRESTORE_DATA``: ``dynamic/NAME/clip.mp4`` with ``truth.mp4`` and the published output of a network as
+``peer_NAME.mp4``.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from clips import data_folder
+from methods.sobolev import sobolev_flow
+from methods.usage import processor_seconds
+from peer_tables import Figures
+from scipy.ndimage import uniform_filter1d
+
+from turbrestore.core.arrays import FloatArray
+from turbrestore.io.video import open_frames
+from turbrestore.metrics import psnr
+from turbrestore.steady.video import steady_frames
+from turbrestore.synthesis.scenes import SCENES
+from turbrestore.synthesis.smooth_flow import distort, smooth_flows
+
+# Frames and pixels a side, so that a table of all takes minutes.
+COUNT, SIDE, EVERY = 45, 256, 3
+SMOOTHED = 5
+
+# Each takes frames and returns as many.
+VIDEO_METHODS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "input": lambda frames: frames,
+    f"mean of {SMOOTHED} frames": lambda frames: uniform_filter1d(frames, SMOOTHED, axis=0, mode="nearest"),
+    "Sobolev flow": sobolev_flow,
+    "turbrestore": lambda frames: np.stack([frame.image for frame in steady_frames(frames)]),
+}
+
+
+def measure_videos() -> dict[str, dict[str, Figures]]:
+    """Figures of every video by every method."""
+    results: dict[str, dict[str, Figures]] = {}
+    for name, frames, truth, networks in _videos():
+        results[name] = {}
+        for method, run in VIDEO_METHODS.items():
+            begun = processor_seconds()
+            video = np.clip(run(frames), 0, 1)
+            results[name][method] = score_video(video, truth) | {"seconds": round(processor_seconds() - begun, 2)}
+        results[name] |= {f"{method} (network)": score_video(video, truth) for method, video in networks.items()}
+        print(f"{name}: {results[name]}", file=sys.stderr, flush=True)
+    return results
+
+
+def score_video(video: FloatArray, truth: FloatArray) -> Figures:
+    """PSNR and SSIM, means over every third frame, and the flicker of all frames relative to the truth.
+
+    Both have the shape (T, H, W) or (T, H, W, 3).
+    """
+    from skimage.metrics import structural_similarity
+
+    grey = [frames if frames.ndim == 3 else frames.mean(axis=-1) for frames in (video, truth)]
+    pairs = [*zip(*grey, strict=True)][::EVERY]
+    flicker = np.abs(np.diff(video, axis=0)).mean() / np.abs(np.diff(truth, axis=0)).mean()
+    return {
+        "psnr": round(float(np.mean([psnr(a, t) for a, t in zip(video[::EVERY], truth[::EVERY], strict=True)])), 3),
+        "ssim": round(float(np.mean([structural_similarity(a, t, data_range=1.0) for a, t in pairs])), 4),
+        "flicker": round(float(flicker), 3),
+    }
+
+
+def moving_square(count: int = COUNT, side: int = SIDE) -> tuple[FloatArray, FloatArray]:
+    """Frames of a square that moves before a photograph, and the same without turbulence."""
+    rng = np.random.default_rng(5)
+    scene, size = SCENES["camera"](side, side), side // 8
+    truth = np.repeat(scene[None], count, axis=0)
+    for number, frame in enumerate(truth):
+        left = round(size + number * (side - 3 * size) / count)
+        frame[side // 2 : side // 2 + size, left : left + size] = 0.9
+    flows = smooth_flows(count, side, side, rng)
+    flows -= flows.mean(axis=0)
+    frames = [distort(t, flow[None], rng, blur=1.0, noise=0.01)[0] for t, flow in zip(truth, flows, strict=True)]
+    return np.stack(frames), truth
+
+
+def _videos() -> Iterator[tuple[str, FloatArray, FloatArray, dict[str, FloatArray]]]:
+    """Name, frames, truth and outputs of networks."""
+    yield "moving square", *moving_square(), {}
+    root = data_folder()
+    for path in sorted(root.glob("dynamic/*/truth.mp4")) if root is not None else []:
+        clip = path.with_name("clip.mp4")
+        height, width = open_frames(clip).shape[1:3]
+        h, w = min(height, SIDE), min(width, SIDE)
+        region = ((width - w) // 2, (height - h) // 2, w, h)
+        frames, truth = (open_frames(file, frames=(0, COUNT), roi=region).read() for file in (clip, path))
+        peers = {file.stem.removeprefix("peer_"): file for file in sorted(path.parent.glob("peer_*.mp4"))}
+        networks = {name: _as_large(file, (height, width), (h, w)) for name, file in peers.items()}
+        yield path.parent.name, frames, truth, networks
+
+
+def _as_large(file: object, size: tuple[int, int], kept: tuple[int, int]) -> FloatArray:
+    """Middle of the output of a network, which may be cropped by as much on opposite sides."""
+    own = open_frames(file).shape[1:3]
+    left, top = ((own[axis] - kept[axis]) // 2 for axis in (1, 0))
+    if any((size[axis] - own[axis]) % 2 for axis in (0, 1)):
+        print(f"{file}: cropped unevenly, so that it may be off by half a pixel", file=sys.stderr)
+    return open_frames(file, frames=(0, COUNT), roi=(left, top, kept[1], kept[0])).read()

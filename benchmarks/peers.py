@@ -1,0 +1,213 @@
+"""Restore the same clips by methods of others and by this project, and print how they compare.
+
+Run ``TURBRESTORE_DATA=DIR python benchmarks/peers.py --write benchmarks/results/peers.md``; without the folder only the
+clips and the video that are made here are used.  Each method runs in a process of its own over all clips, one method
+after the other.  Packages of others run in an environment (``--environment``) that is made where there is none; where
+that fails they are left out, with the reason.  ``--clips`` and ``--methods`` take names or patterns, ``--images``
+writes the results of every clip side by side, ``--json`` the figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from clips import Clip, find_clips
+from methods.diffeomorphic import deblurred_template
+from methods.low_rank import low_rank_image
+from methods.packages import PackageError, make_environment, run_package
+from methods.sobolev import sobolev_latent_image
+from methods.usage import peak_megabytes, processor_seconds
+from peer_tables import SAME, TURBRESTORE, Figures, Results, document
+from peer_videos import measure_videos
+from quality import panel
+from revisions import child
+from words import can_read, share_read
+
+from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import TurbrestoreError
+from turbrestore.footage.frame_selection import best_frames, frame_quality
+from turbrestore.io.images import write_image
+from turbrestore.io.output import atomic_write
+from turbrestore.metrics import compare
+from turbrestore.pipeline import restore
+
+ENVIRONMENT = Path(__file__).resolve().parent.parent / ".venv-peers"
+# Share of the frames that a lucky average keeps: as the stacker does here.
+LUCKY = 0.5
+PACKAGES = ("PlanetarySystemStacker", "pystackreg")
+# What is compiled and loaded once does not count.
+WARM = np.s_[:6, :64, :64]
+
+Images = tuple[FloatArray, FloatArray | None]
+
+
+def _turbrestore(frames: FloatArray) -> Images:
+    restoration = restore(frames)
+    filtered = restoration.centroid if restoration.filtered is None else restoration.filtered
+    return filtered.image, restoration.image
+
+
+def _sobolev(frames: FloatArray) -> Images:
+    image = sobolev_latent_image(frames)
+    return image, image
+
+
+# Each returns the image that frames are merged into, and the same without its blur where the method has a way to it.
+METHODS: dict[str, Callable[[FloatArray], Images]] = {
+    "middle frame": lambda frames: (frames[len(frames) // 2], None),
+    "mean": lambda frames: (frames.mean(axis=0), None),
+    "median": lambda frames: (np.median(frames, axis=0), None),
+    "lucky average": lambda frames: (frames[best_frames(frame_quality(frames), LUCKY)].mean(axis=0), None),
+    "Sobolev flow": _sobolev,
+    "low rank": lambda frames: (low_rank_image(frames), None),
+    "template": deblurred_template,
+    TURBRESTORE: _turbrestore,
+}
+MEANINGS = {
+    "middle frame": "one frame as it is",
+    "mean": "temporal mean",
+    "median": "temporal median",
+    "lucky average": f"mean of the sharper {LUCKY:.0%} of the frames",
+    "PlanetarySystemStacker": "the stacker of that name, 0.9.8.2, with half of the frames",
+    "pystackreg": "mean after bilinear registration of every frame to the mean by the package pystackreg 0.2.8",
+    "Sobolev flow": "Sobolev gradient flow and lucky regions (Lou, Kang, Soatto, Bertozzi 2013), sharp by itself",
+    "low rank": "registration to the mean and three-term decomposition (Oreifej, Li, Shah 2013)",
+    "template": "diffeomorphic template (Lao, Wang, Wong, Soatto 2024), deblurred by a Gaussian of estimated width",
+    TURBRESTORE: "this project with its defaults; merged is its image before deconvolution",
+}
+
+
+def main() -> int:
+    """Measure and print."""
+    options = _options()
+    try:
+        chosen = [name for name in MEANINGS if any(fnmatch(name, pattern) for pattern in options.methods)]
+        results, skipped = measure_all(options.clips, chosen, options.environment, options.images)
+        videos = {} if options.without_videos else measure_videos()
+    except TurbrestoreError as error:
+        print(f"peers: {error}", file=sys.stderr)
+        return error.exit_code
+    text = document(results, {name: MEANINGS[name] for name in chosen}, skipped, videos)
+    print(text, end="")
+    if options.write is not None:
+        atomic_write(options.write, text.encode(), overwrite=True)
+    if options.json is not None:
+        figures = {"clips": results, "videos": videos, "skipped": skipped}
+        atomic_write(options.json, (json.dumps(figures, indent=2) + "\n").encode(), overwrite=True)
+    return 0
+
+
+def measure_all(
+    patterns: list[str], methods: list[str], environment: Path, images: Path | None
+) -> tuple[Results, dict[str, str]]:
+    """Figures of every method and clip, and why methods are missing."""
+    clips = {name: load() for name, load in find_clips(patterns).items()}
+    # Without a truth or words there is nothing to compare.
+    clips = {name: clip for name, clip in clips.items() if clip.truth is not None or (clip.words and can_read())}
+    results: Results = {}
+    skipped: dict[str, str] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for clip_name, clip in clips.items():
+            np.save(folder / f"{clip_name}.npy", clip.frames)
+        for method in methods:
+            try:
+                python = make_environment(environment) if method in PACKAGES else None
+                task = {"method": method, "folder": name, "clips": [*clips], "python": python and str(python)}
+                used = child(__file__, task)
+            except PackageError as error:
+                skipped[method] = str(error)
+                continue
+            skipped |= {f"{method} on {clip_name}": reason for clip_name, reason in used["failed"].items()}
+            results[method] = {
+                clip_name: _figures(folder / f"{method}-{clip_name}.npz", clips[clip_name]) | spent
+                for clip_name, spent in used["clips"].items()
+            }
+        if images is not None:
+            _write_panels(images, folder, clips, [*results])
+    return results, skipped
+
+
+def run_child(task: dict[str, Any]) -> dict[str, Any]:
+    """Restore all clips by one method; images go beside the frames, the figures tell time and memory."""
+    name, folder = task["method"], Path(task["folder"])
+    spent: dict[str, Figures] = {}
+    failed: dict[str, str] = {}
+    if name in METHODS:
+        METHODS[name](np.load(folder / f"{task['clips'][0]}.npy")[WARM])
+    remove_blur(*[np.load(folder / f"{task['clips'][0]}.npy")[WARM].mean(axis=0)] * 2)
+    for clip in task["clips"]:
+        frames = np.load(folder / f"{clip}.npy")
+        begun = processor_seconds()
+        try:
+            if name in METHODS:
+                merged, sharp = METHODS[name](frames)
+                used = {"seconds": processor_seconds() - begun, "peak": peak_megabytes()}
+            else:
+                merged, used = run_package(name, frames, Path(task["python"]))
+                sharp = None
+        except TurbrestoreError as error:
+            failed[clip] = str(error)
+            continue
+        begun = processor_seconds()
+        if sharp is None:
+            sharp = remove_blur(merged, merged).deconvolution.image
+        spent[clip] = used | {"deblurring": processor_seconds() - begun}
+        np.savez(folder / f"{name}-{clip}.npz", merged=merged, sharp=sharp)
+    return {"clips": spent, "failed": failed}
+
+
+def _figures(path: Path, clip: Clip) -> Figures:
+    """Quality of the merged image, and under names with a suffix of the deblurred one."""
+    measured: Figures = {}
+    with np.load(path) as images:
+        for name, suffix in (("merged", ""), ("sharp", SAME)):
+            image = images[name]
+            if clip.truth is not None:
+                found = compare(image, clip.truth)
+                measured |= {f"psnr{suffix}": found.psnr, f"ssim{suffix}": found.ssim}
+            if clip.centroid is not None:
+                measured[f"centroid{suffix}"] = compare(image, clip.centroid).psnr
+            if clip.words and can_read():
+                measured[f"words{suffix}"] = share_read(image, clip.words)
+    return {name: round(float(value), 4) for name, value in measured.items()}
+
+
+def _write_panels(images: Path, folder: Path, clips: Mapping[str, Clip], methods: list[str]) -> None:
+    """Write the deblurred image of every method and the truth, one file a clip."""
+    images.mkdir(parents=True, exist_ok=True)
+    for name, clip in clips.items():
+        found = {method: folder / f"{method}-{name}.npz" for method in methods}
+        shown = {method: (np.load(path)["sharp"], 0.0) for method, path in found.items() if path.exists()}
+        write_image(images / f"{name}.png", panel(shown, clip), 8, overwrite=True)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="names or patterns; all by default")
+    parser.add_argument("--methods", nargs="+", default=["*"], metavar="NAME", help="names or patterns; all by default")
+    parser.add_argument(
+        "--environment", type=Path, default=ENVIRONMENT, metavar="DIR", help="environment of packages of others"
+    )
+    parser.add_argument("--without-videos", action="store_true", help="measure images only")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="write one panel of images a clip")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
+    parser.add_argument("--child", metavar="JSON", help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    if "--child" in sys.argv:
+        print(json.dumps(run_child(json.loads(_options().child))))
+    else:
+        sys.exit(main())

@@ -1,0 +1,113 @@
+"""The table of methods: every method runs, figures land in the right cells, and a lead of others is printed."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import peers
+import pytest
+from methods.packages import PackageError, make_environment, run_package
+from methods.usage import peak_megabytes
+from peer_tables import document
+from peer_videos import moving_square, score_video
+
+from conftest import make_sequence
+
+BENCHMARKS = Path(peers.__file__).parent
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("clips")
+    np.save(path / "tiny.npy", make_sequence(3, 8, 72, "camera", rms=1.0).frames)
+    return path
+
+
+@pytest.mark.parametrize("method", ["mean", "median", "lucky average", "middle frame", "turbrestore"])
+def test_a_method_leaves_both_images_and_says_what_it_used(method, folder):
+    used = peers.run_child({"method": method, "folder": str(folder), "clips": ["tiny"], "python": None})
+    assert used["failed"] == {}
+    assert set(used["clips"]["tiny"]) == {"seconds", "peak", "deblurring"}
+    with np.load(folder / f"{method}-tiny.npz") as images:
+        assert images["merged"].shape == images["sharp"].shape == (72, 72)
+
+
+def test_every_method_has_a_meaning():
+    assert set(peers.MEANINGS) == {*peers.METHODS, *peers.PACKAGES}
+
+
+def test_a_package_that_fails_is_left_out_with_its_reason(folder, tmp_path):
+    used = peers.run_child(
+        {"method": "pystackreg", "folder": str(folder), "clips": ["tiny"], "python": str(tmp_path / "none")}
+    )
+    assert used["clips"] == {}
+    assert "No such file" in used["failed"]["tiny"]
+    with pytest.raises(PackageError, match="ModuleNotFoundError"):
+        # The interpreter of the tests has no such package.
+        run_package("pystackreg", np.zeros((2, 8, 8), np.float32), Path(sys.executable))
+
+
+def test_an_environment_that_cannot_be_made_gives_its_reason(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(PackageError, match="cannot be made"):
+        make_environment(tmp_path / "file" / "environment")
+
+
+def test_the_memory_of_the_parent_is_not_counted():
+    command = [sys.executable, "-c", "import usage; print(usage.peak_megabytes())"]
+    ballast = np.ones(20_000_000)
+    peak = float(subprocess.run(command, cwd=BENCHMARKS / "methods", capture_output=True, check=True).stdout)
+    assert np.isnan(peak) or peak < ballast.nbytes / 1e6 < peak_megabytes()
+
+
+class TestDocument:
+    FIGURES = {"psnr": 20.0, "psnr_sharp": 25.0, "ssim": 0.5, "ssim_sharp": 0.6}  # noqa: RUF012
+    SPENT = {"seconds": 1.0, "deblurring": 0.5, "peak": 100.0}  # noqa: RUF012
+
+    def document(self, **others):
+        results = {
+            "mean": {"a": {**self.FIGURES, **self.SPENT, **others}, "b": {**self.FIGURES, **self.SPENT}},
+            "turbrestore": {"a": {**self.FIGURES, **self.SPENT}, "b": {**self.FIGURES, **self.SPENT, "psnr": 30.0}},
+        }
+        return document(results, {"mean": "temporal mean"}, {"other": "not installed"}, {})
+
+    def test_means_are_those_of_the_clips(self):
+        text = self.document()
+        assert "| turbrestore | 25.00 | 25.00 | 0.500 | 0.600 | – | – | – | 1.0 | 0.5 | 100 |" in text
+        assert "- other: not installed" in text
+        assert "On no clip." in text
+
+    def test_a_lead_of_another_method_is_printed(self):
+        assert "- a: mean 25.40; turbrestore 25.00 dB" in self.document(psnr_sharp=25.4)
+
+    def test_less_than_the_least_lead_is_none(self):
+        assert "On no clip." in self.document(psnr_sharp=25.04)
+
+
+def test_videos_are_scored_frame_by_frame():
+    frames, truth = moving_square(6, 64)
+    assert frames.shape == truth.shape == (6, 64, 64)
+    still = np.repeat(truth[:1], 6, axis=0)
+    assert score_video(truth, truth)["flicker"] == 1
+    assert score_video(truth, truth)["ssim"] == 1
+    assert score_video(still, truth)["flicker"] == 0
+    assert score_video(truth + np.float32(0.1), truth)["psnr"] == pytest.approx(20, abs=1e-3)
+    spoilt = truth + np.float32(0.1)
+    # Only every third frame is compared.
+    spoilt[[1, 2, 4, 5]] = 0
+    assert score_video(spoilt, truth)["psnr"] == pytest.approx(20, abs=1e-3)
+
+
+def test_the_script_prints_and_writes_its_document(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("TURBRESTORE_DATA", raising=False)
+    figures = {"mean": {"tiny": {"psnr": 20.0, "seconds": 1.0}}}
+    monkeypatch.setattr(peers, "measure_all", lambda *_: (figures, {}))
+    target = tmp_path / "peers.md"
+    monkeypatch.setattr(
+        sys, "argv", ["peers.py", "--without-videos", "--write", str(target), "--json", str(tmp_path / "f.json")]
+    )
+    assert peers.main() == 0
+    assert target.read_text() == capsys.readouterr().out
+    assert json.loads((tmp_path / "f.json").read_text())["clips"] == figures
