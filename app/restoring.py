@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from turbrestore.core.arrays import FloatArray
-from turbrestore.settings import RestoreParams
+from turbrestore.settings import Preset, RestoreParams
 from turbrestore_cli.inputs import open_input
 from turbrestore_cli.options import Machine, Selection
 
@@ -34,11 +34,14 @@ class Order:
     selection : Selection
         Range of frames and region.
     params : RestoreParams
+    preset : str
+        Name of the preset that they started from.
     """
 
     path: Path
     selection: Selection = field(default_factory=Selection)
     params: RestoreParams = field(default_factory=RestoreParams)
+    preset: Preset = "standard"
 
     def shares_filter_with(self, other: Order) -> bool:
         """Tell whether two orders differ in the deconvolution alone."""

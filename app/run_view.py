@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import html
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ from nicegui import ui
 
 from turbrestore.core.errors import require
 from turbrestore.footage.frame_selection import Share, best_frames
-from turbrestore.settings import RestoreParams
+from turbrestore.settings import PRESETS
 from turbrestore_cli.options import Selection
 from turbrestore_cli.progress import TITLES
 
@@ -68,6 +69,9 @@ class RunView:
                 self._keep.props('aria-label="Share of the frames to keep, percent"')
                 self._keep_text = ui.label("100 %").classes("value")
             self._graph = ui.html("", sanitize=False)
+            with ui.element("div").classes("fields"):
+                ui.label("Preset").classes("what")
+                self._preset = ui.toggle(list(PRESETS), value="standard").props('dense no-caps aria-label="Preset"')
             with ui.element("div").classes("fields apart"):
                 self._preview = ui.button("Preview", on_click=lambda: self._start(self._page.tab.preview))
                 self._preview.props("outline")
@@ -85,7 +89,7 @@ class RunView:
         clip = self._page.tab.clip
         assert clip is not None
         self._job, self._quality = None, None
-        self._keep.value = 100
+        self._keep.value, self._preset.value = 100, "standard"
         set_most(self._frames, len(clip.source))
         self._frames.value = {"min": 0, "max": len(clip.source)}
         self.set_region(None)
@@ -132,8 +136,9 @@ class RunView:
             frames=None if (first, last) == (0, len(clip.source)) else f"{first}:{last}",
             roi=None if roi is None or roi == (0, 0, *clip.size) else ",".join(map(str, roi)),
         )
-        params = RestoreParams(keep_best=Share((self._keep.value or 100) / 100))
-        return Order(clip.path, selection, self._page.tune_view.chosen(params))
+        preset = self._preset.value
+        params = dataclasses.replace(PRESETS[preset], keep_best=Share((self._keep.value or 100) / 100))
+        return Order(clip.path, selection, self._page.tune_view.chosen(params), preset)
 
     async def follow(self) -> bool:
         """Show how the run goes; tell whether it has just ended."""

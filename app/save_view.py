@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,8 +71,8 @@ class SaveView:
         restored = self._page.tab.restored
         if restored is None:
             return None
-        order = restored.order
-        return Order(order.path, order.selection, self._page.tune_view.chosen(order.params))
+        params = self._page.tune_view.chosen(restored.order.params)
+        return dataclasses.replace(restored.order, params=params)
 
     def _words(self, order: Order) -> str:
         clip = self._page.tab.clip

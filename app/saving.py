@@ -50,7 +50,7 @@ class Outputs:
 
 def settings_of(order: Order, bit_depth: int | None) -> dict[str, Any]:
     """All settings of an order, as in a settings file."""
-    return settings_record(order.params, order.selection, bit_depth, Machine(), None)
+    return settings_record(order.params, order.selection, bit_depth, Machine(), None, order.preset)
 
 
 def command_line(order: Order, bit_depth: int | None, input: Path, output: Path) -> str:

@@ -15,7 +15,6 @@ from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.settings import RestoreParams
 
 from .elements import set_most
-from .restoring import Order
 from .tuning import SLOW, automatic_fidelity, impressions, part_around, tuned_params
 
 if TYPE_CHECKING:
@@ -103,7 +102,7 @@ class TuneView:
         self._wanted += 1
         order = restored.order
         with self._page.catching():
-            self._page.tab.run(Order(order.path, order.selection, self.chosen(order.params)))
+            self._page.tab.run(dataclasses.replace(order, params=self.chosen(order.params)))
 
     def _slider(self, name: str, low: float, high: float, step: float, label: str) -> tuple[ui.slider, ui.label]:
         with ui.element("div").classes("fields"):

@@ -14,10 +14,10 @@ from turbrestore import __version__
 from turbrestore.core.errors import require
 from turbrestore.io.output import atomic_write, check_output
 from turbrestore.io.pixels import check_depth
-from turbrestore.settings import RestoreParams
+from turbrestore.settings import Preset, RestoreParams
 
 from .options import Flag, known_sigma
-from .settings import read_toml, settings
+from .settings import preset_settings, read_toml, settings
 from .streams import put
 
 if TYPE_CHECKING:
@@ -27,40 +27,47 @@ if TYPE_CHECKING:
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 
 
-def config(*, init: Path | None = None, check: Path | None = None, overwrite: Flag = False) -> None:
+def config(
+    *, init: Path | None = None, check: Path | None = None, preset: Preset = "standard", overwrite: Flag = False
+) -> None:
     """Write a settings file for ``restore --config`` with every setting explained, or check one.
 
     Parameters
     ----------
     init : Path
-        File to write, .toml: every setting with its meaning, what it may be, and its default.
+        File to write, .toml: every setting with its meaning, what it may be, and its value.
     check : Path
         File to check; what differs from the defaults is listed.
+    preset : str
+        Settings that the file starts from, with --init.
     overwrite : bool
         Replace an existing file.
     """
     require((init is None) != (check is None), "config: expected either --init FILE or --check FILE")
     require(init is not None or not overwrite, "--overwrite: has no effect with --check; leave it out")
+    require(init is not None or preset == "standard", "--preset: has no effect with --check; leave it out")
     # The commands hang on the application, and the application on this command.
     from .application import build
 
     app = build()
     if init is not None:
         check_output(init, overwrite=overwrite, suffixes=(".toml",))
-        atomic_write(init, template(app).encode(), overwrite)
+        atomic_write(init, template(app, preset).encode(), overwrite)
     if check is not None:
         put("\n".join([f"{check}: valid", *_changes(app, check)]))
 
 
-def template(app: App) -> str:
-    """Every setting of ``restore`` as TOML, explained by the words that ``--help`` has."""
+def template(app: App, preset: Preset) -> str:
+    """Every setting of ``restore`` as TOML, with the values of a preset, explained by the words that ``--help`` has."""
+    chosen = {"preset": preset, **dict(_values(preset_settings(preset)))}
     tables: dict[str, list[str]] = {"": []}
     for key, argument in _settings(app).items():
         table, _, name = key.rpartition(".")
-        tables.setdefault(table, []).append(_entry(name, argument))
+        value = chosen.get(key, argument.field_info.default)
+        tables.setdefault(table, []).append(_entry(name, argument, value))
     head = (
         f"# Settings of turbrestore {__version__}: turbrestore restore INPUT OUTPUT --config THIS_FILE\n"
-        "# Values are the defaults.  Lines without a value are measured or left open unless you give one.\n"
+        f"# Values are those of the preset {preset}.  Lines without one are measured or left open.\n"
     )
     parts = [head, *tables.pop("")]
     for table, entries in tables.items():
@@ -72,12 +79,11 @@ def _settings(app: App) -> dict[str, Argument]:
     return settings(app["restore"].assemble_argument_collection(parse_docstring=True))
 
 
-def _entry(name: str, argument: Argument) -> str:
+def _entry(name: str, argument: Argument, value: Any) -> str:
     """Comment and line of one setting; one without a default is a comment as a whole."""
     comment = textwrap.wrap(
         f"{_plain(argument.parameter.help or '')} {_allowed(argument)}", 100, break_on_hyphens=False
     )
-    value = argument.field_info.default
     line = f"# {name} =" if value is None else tomli_w.dumps({name: value}).strip()
     return "\n".join([*(f"# {words}" for words in comment), line, ""])
 

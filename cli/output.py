@@ -29,7 +29,7 @@ from turbrestore.runs.run_folder import CHECKPOINT, RunFolder, is_part
 from turbrestore.runs.run_record import RunRecord
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.scratch import iter_frames
-from turbrestore.settings import RestoreParams
+from turbrestore.settings import PRESETS, Preset, RestoreParams
 
 from .options import Machine, Selection
 from .streams import put
@@ -184,10 +184,11 @@ def settings_record(
     bit_depth: int | None,
     machine: Machine,
     memory_limit: MemorySize | None,
+    preset: Preset = "standard",
     tile: int | None = None,
 ) -> dict[str, Any]:
     """All settings of a run, nested as in a settings file; None where they are left to be measured."""
-    head = {"bit_depth": bit_depth, "memory_limit": memory_limit, "tile": tile}
+    head = {"preset": preset, "bit_depth": bit_depth, "memory_limit": memory_limit, "tile": tile}
     return {**head, **dataclasses.asdict(machine), **dataclasses.asdict(selection), **dataclasses.asdict(params)}
 
 
@@ -198,9 +199,10 @@ def write_settings(path: Path, record: dict[str, Any]) -> None:
 
 
 def repeating_command(input: Path, output: Path, record: dict[str, Any]) -> tuple[str, ...]:
-    """Return the words of the command that repeats a run; settings that differ from the defaults become flags."""
+    """Return the words of the command that repeats a run; settings that differ from its preset become flags."""
     paths = (str(path) if not str(path).startswith("-") else f"./{path}" for path in (input, output))
-    usual = settings_record(RestoreParams(), Selection(), None, Machine(), None)
+    preset: Preset = record["preset"]
+    usual = settings_record(PRESETS[preset], Selection(), None, Machine(), None)
     return ("turbrestore", "restore", *paths, *_flags(record, usual, ""))
 
 

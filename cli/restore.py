@@ -21,7 +21,7 @@ from turbrestore.report import check_report, write_report
 from turbrestore.results import Restoration
 from turbrestore.runs.run_record import describe_run
 from turbrestore.runtime.memory_size import MemorySize
-from turbrestore.settings import RestoreParams
+from turbrestore.settings import Preset, RestoreParams
 from turbrestore.tiled_stages import TileMap
 
 from .cluster import check_cluster, connected, over_workers
@@ -56,6 +56,7 @@ class Order:
     machine: Machine
     bit_depth: int | None = None
     memory_limit: MemorySize | None = None
+    preset: Preset = "standard"
     config: Path | None = None
     keep: Path | None = None
     resume: bool = False
@@ -84,6 +85,7 @@ def restore(
     output: Path,
     /,
     *,
+    preset: Preset = "standard",
     sigma: float | None = None,
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
     config: Path | None = None,
@@ -114,6 +116,9 @@ def restore(
     output : Path
         Image to write: .png (8 or 16 bit), .tif (8, 16 bit or float) or .fits (the same, with the header of a FITS
         input and the history of the run).
+    preset : str
+        Settings to start from: fast takes a third of the time, paper is the method as published.  Any other setting
+        given wins over those of the preset.
     sigma : float
         Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.
     config : Path
@@ -156,7 +161,7 @@ def restore(
     if memory_limit is not None and workers is not None:
         memory_limit = MemorySize(memory_limit / (workers + 1))
     order = Order(
-        input, output, selection, settings, machine, bit_depth, memory_limit,
+        input, output, selection, settings, machine, bit_depth, memory_limit, preset,
         config, keep, resume, checkpoint_every, report, truth, overwrite, quiet, tile, scheduler, workers,
     )  # fmt: skip
     restoration, _ = restore_clip(order)
@@ -186,7 +191,7 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
         with _elsewhere(order, source) as map_tiles, progress_bars(order.quiet) as progress:
             restoration = run_pipeline(source, order.params, runtime, stages, progress, map_tiles=map_tiles)
         record = settings_record(
-            order.params, order.selection, order.bit_depth, order.machine, order.memory_limit, order.tile
+            order.params, order.selection, order.bit_depth, order.machine, order.memory_limit, order.preset, order.tile
         )
         command = repeating_command(order.input, order.output, record)
         run = describe_run(source, record, command) if order.keep or order.report else None

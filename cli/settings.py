@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import tomllib
 from collections.abc import Iterator
@@ -24,7 +25,11 @@ NOT_SETTINGS = {
 
 
 def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
-    """Fill what no flag has set from the TOML file named by ``--config``, and check numbers."""
+    """Fill what no flag has set from the preset and from the TOML file named by ``--config``, and check numbers.
+
+    A preset on the command line wins over the file; the settings of a file win over its own preset.
+    """
+    _fill_preset(app, commands, arguments)
     for argument in arguments:
         if "--config" in argument.names and argument.tokens:
             path = Path(argument.tokens[0].value)
@@ -34,6 +39,7 @@ def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollec
             for command in reversed(commands):
                 record = {command: record}
             Dict(record, source=str(path))(app, commands, arguments)
+            _fill_preset(app, commands, arguments)
     for argument in arguments:
         if argument.hint in (int, int | None):
             _refuse_fractions(argument)
@@ -83,6 +89,34 @@ def _flat(record: dict[str, Any], head: str = "") -> Iterator[tuple[str, Any]]:
         yield head + key, value
         if isinstance(value, dict):
             yield from _flat(value, f"{head}{key}.")
+
+
+def _fill_preset(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
+    """Fill what has not been set from the preset that has been, if any; values of another name are refused later."""
+    takes_settings = any("--config" in argument.names for argument in arguments)
+    for argument in arguments:
+        if takes_settings and argument.name == "--preset" and argument.tokens:
+            name = argument.tokens[0].value
+            record = preset_settings(name)
+            for command in reversed(commands):
+                record = {command: record}
+            Dict(record, source=f"--preset {name}")(app, commands, arguments)
+
+
+def preset_settings(name: str) -> dict[str, Any]:
+    """Return the settings in which presets differ as one of them has them, and none for an unknown name."""
+    from turbrestore.settings import PRESETS
+
+    known = {str(preset): dict(_flat(dataclasses.asdict(params))) for preset, params in PRESETS.items()}
+    record: dict[str, Any] = {}
+    for key, value in known.get(name, {}).items():
+        if not isinstance(value, dict) and any(other[key] != value for other in known.values()):
+            *tables, last = key.split(".")
+            table = record
+            for part in tables:
+                table = table.setdefault(part, {})
+            table[last] = value
+    return record
 
 
 def _suggestion(name: str, known: set[str]) -> str:

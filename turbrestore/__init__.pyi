@@ -56,6 +56,7 @@ from .runs.stage_files import load_artifact as load_artifact
 from .runs.stage_files import save_artifact as save_artifact
 from .runtime.runtime import Runtime as Runtime
 from .settings import RestoreParams as RestoreParams
+from .settings import preset as preset
 from .steady.settings import SteadyParams as SteadyParams
 from .steady.video import SteadyFrame as SteadyFrame
 from .steady.video import steady_frames as steady_frames

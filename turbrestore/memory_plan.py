@@ -126,7 +126,7 @@ def plan_memory(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime)
     >>> plan.train, plan.runtime.scratch is None, plan.tile
     (60, False, None)
     """
-    train = training_share(shape[0], shape[1:], params.train)
+    train = training_share(shape[0], shape[1:], params.train, params.filter.training == "skip")
     runtime = replace(runtime, device=find_device(runtime.device))
     folder = runtime.scratch or Path(tempfile.gettempdir())
     most = runtime.workers
@@ -154,7 +154,9 @@ def plan_memory(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime)
     )
 
 
-def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int | None = None) -> int:
+def training_share(
+    frame_count: int, frame_shape: tuple[int, ...], wanted: int | None = None, half: bool = False
+) -> int:
     """Return how many frames the centroid and the flow dynamics are found from, if memory is not limited.
 
     Parameters
@@ -165,11 +167,14 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
         (H, W) or (H, W, 3).
     wanted : int, optional
         Number that the user asked for.
+    half : bool
+        Whether more than half would leave too few frames to filter.
 
     Returns
     -------
     int
-        ``wanted``; else all of up to 40 frames, then half of them, at most 100 and at most what 1.5 GB hold.
+        ``wanted``; else all of up to 40 frames unless ``half``, then half of them, at most 100 and at most what 1.5 GB
+        hold.
 
     Raises
     ------
@@ -182,6 +187,8 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
     --------
     >>> [training_share(n, (256, 256)) for n in (5, 40, 60, 120, 900)]
     [5, 40, 40, 60, 100]
+    >>> training_share(40, (256, 256), half=True)
+    20
     """
     if frame_count < 2:
         raise DataError(f"frames: expected at least 2 to restore an image from, found {frame_count}")
@@ -193,7 +200,7 @@ def training_share(frame_count: int, frame_shape: tuple[int, ...], wanted: int |
         require(wanted >= 2, f"train: expected 2 frames or more, found {wanted}")
         require(wanted <= frame_count, f"train: expected at most the {frame_count} frames there are, found {wanted}")
         return wanted
-    share = min(max(frame_count // 2, _FEWEST_TRAINED), _MOST_TRAINED)
+    share = min(max(frame_count // 2, 0 if half else _FEWEST_TRAINED), _MOST_TRAINED)
     frame_bytes = 4 * (int(np.prod(frame_shape)) + 2 * frame_shape[0] * frame_shape[1])
     return min(frame_count, max(2, min(share, int(_TRAINING_BYTES // frame_bytes))))
 
@@ -305,7 +312,7 @@ def _channels(shape: tuple[int, ...]) -> int:
 
 
 def _too_little(shape: tuple[int, ...], params: RestoreParams, base: float, limit: float) -> ConfigurationError:
-    train = training_share(shape[0], shape[1:], params.train)
+    train = training_share(shape[0], shape[1:], params.train, params.filter.training == "skip")
     least = base + min(_peak(shape, params, choice, 0.0) for choice in _choices(shape, train, 1, params))
     asked = "" if params.train is None else f" and {train} training frames"
     return ConfigurationError(

@@ -130,6 +130,7 @@ def restore(
     source = frames if isinstance(frames, FrameSource) else FrameSource.from_array(frames)
     plan = plan_memory(source.shape, params, runtime)
     _check_sigma(params.deconvolution.sigma, source.shape)
+    _check_training(params, plan.train, len(source))
     if plan.runtime.scratch is not None:
         check_space(plan.runtime.scratch, plan.scratch_bytes)
     size = source.shape[1], source.shape[2]
@@ -382,6 +383,13 @@ def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
     require(
         sigma is None or sigma <= largest,
         f"sigma: expected at most {largest:g} pixels for frames of {shape[2]}×{shape[1]}, found {sigma}",
+    )
+
+
+def _check_training(params: RestoreParams, train: int, count: int) -> None:
+    require(
+        params.filter.training == "filter" or not params.runs("filter") or train < count,
+        f"train: expected fewer than the {count} frames there are, as those that train are not filtered, found {train}",
     )
 
 

@@ -1,11 +1,14 @@
-"""The settings of a restoration."""
+"""The settings of a restoration, and the presets: named sets of them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Literal
 
 from .blind.guards import GuardParams
+from .blur.psf import GAUSSIAN
 from .core.errors import require
 from .deconvolution.deconvolve import DeconvolutionParams
 from .dynamics.dynamic_texture import DynamicsParams
@@ -13,11 +16,14 @@ from .filtering.alternating import FilterParams
 from .footage.frame_selection import Share, check_share
 from .registration.centroid import CentroidParams
 from .registration.flow import FlowParams
+from .registration.opencv_flow import DisParams
 
 STAGES = ("centroid", "identify", "filter", "deconvolve")
 BORDERS = ("keep", "crop")
 STATIC_MASKS = ("auto", "off")
 _ALL = Share(1)
+
+Preset = Literal["fast", "standard", "paper"]
 
 
 @dataclass(frozen=True)
@@ -109,3 +115,52 @@ class RestoreParams:
         False
         """
         return STAGES.index(stage) <= STAGES.index(self.until)
+
+
+# ``standard`` lies where more time no longer gains quality, and ``fast`` gives up little of it for half the time or
+# less; ``benchmarks/flow_calls.py --presets`` shows both on the curve.  ``paper`` is paper 3 as it is printed, with
+# this project's flow; there the width of the blur is chosen by hand, and here it is estimated where none is given.
+PRESETS: Mapping[Preset, RestoreParams] = MappingProxyType(
+    {
+        "fast": RestoreParams(
+            flow=FlowParams(dis=DisParams(finest_scale=1)),
+            filter=FilterParams(inner_iterations=1),
+        ),
+        "standard": RestoreParams(),
+        "paper": RestoreParams(
+            centroid=CentroidParams(mode="single", iterations=10),
+            filter=FilterParams(residual="drop", training="skip", block=1, sharpness=0.0, prior_frames=1.0),
+            deconvolution=DeconvolutionParams(exponent=GAUSSIAN, sharpen_guide=False),
+        ),
+    }
+)
+
+
+def preset(name: Preset) -> RestoreParams:
+    """Return a named set of settings.
+
+    Parameters
+    ----------
+    name : {"fast", "standard", "paper"}
+        ``standard`` is ``RestoreParams()``; ``fast`` takes a third of its time; ``paper`` is paper 3 as it is printed:
+        one warped frame as the centroid, a filter that starts after the training frames from the last of their states,
+        drops the flow outside the subspace and weighs all frames alike, and a Gaussian blur.  The paper chooses its
+        width by hand, ``deconvolution.sigma``; it is estimated where none is given.
+
+    Returns
+    -------
+    RestoreParams
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such preset.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> replace(preset("fast"), train=60).filter.inner_iterations
+    1
+    """
+    require(name in PRESETS, f"preset: expected one of {', '.join(PRESETS)}, found {name!r}")
+    return PRESETS[name]

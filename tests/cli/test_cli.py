@@ -12,7 +12,9 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore.io.images import read_image, write_image
-from turbrestore.io.video import write_video
+from turbrestore.io.video import open_frames, write_video
+from turbrestore.pipeline import restore
+from turbrestore.settings import PRESETS
 from turbrestore_cli.__main__ import main
 
 SAMPLE = Path(__file__).parents[2] / "sample_data"
@@ -83,6 +85,47 @@ class TestRestore:
         settings = tomllib.loads((tmp_path / "o.png.toml").read_text())
         assert settings["train"] == 6
         assert settings["filter"]["residual"] == "drop"
+
+    def test_options_win_over_the_preset_and_the_preset_over_the_file(self, run, clip, tmp_path):
+        (tmp_path / "run.toml").write_text('preset = "paper"\ntrain = 4\n[filter]\nblock = 3\n')
+        words = ["restore", clip, tmp_path / "o.png", "--config", tmp_path / "run.toml", "--sigma", "1", "--quiet"]
+
+        def used(*more):
+            code, _, err = run(*words, *more, "--overwrite")
+            assert code == 0, err
+            return tomllib.loads((tmp_path / "o.png.toml").read_text())
+
+        of_file, of_flag = used("--filter.sharpness", "0.5"), used("--preset", "fast")
+        assert of_file["preset"] == "paper"
+        assert of_file["filter"] | {"block": 3, "sharpness": 0.5, "training": "skip"} == of_file["filter"]
+        assert of_flag["preset"] == "fast"
+        assert of_flag["filter"] | {"block": 24, "inner_iterations": 1, "training": "filter"} == of_flag["filter"]
+        assert "exponent" not in of_flag["deconvolution"]
+        assert of_flag["train"] == 4
+
+    @pytest.mark.parametrize("preset", PRESETS)
+    def test_a_preset_is_what_python_has_by_that_name(self, run, clip, tmp_path, preset):
+        words = ["--preset", preset, "--report", tmp_path / "o.html"]
+        assert run("restore", clip, tmp_path / "o.png", *words, "--quiet")[0] == 0
+        image = read_image(tmp_path / "o.png").image
+        assert np.abs(image - restore(open_frames(clip), PRESETS[preset]).image).max() <= 0.5 / 255 + 1e-6
+        again = tmp_path / "again.png"
+        assert run("restore", clip, again, "--config", tmp_path / "o.png.toml", "--quiet")[0] == 0
+        assert again.read_bytes() == (tmp_path / "o.png").read_bytes()
+        assert f"--preset={preset}" in (tmp_path / "o.html").read_text() or preset == "standard"
+
+    def test_a_settings_file_starts_from_a_preset(self, run, tmp_path):
+        assert run("config", "--init", tmp_path / "run.toml", "--preset", "fast")[0] == 0
+        code, out, _ = run("config", "--check", tmp_path / "run.toml")
+        assert code == 0
+        assert "preset = 'fast' (default: 'standard')" in out.splitlines()
+        assert "filter.inner_iterations = 1 (default: 2)" in out.splitlines()
+        fails(run("config", "--check", tmp_path / "run.toml", "--preset", "fast"), 2, "--preset: has no effect")
+
+    def test_the_paper_needs_frames_after_the_training(self, run, clip, tmp_path):
+        words = ["--preset", "paper", "--train", "8", "--quiet"]
+        result = run("restore", clip, tmp_path / "o.png", *words)
+        fails(result, 2, "train: expected fewer than the 8 frames")
 
     def test_kept_stages_feed_the_stage_commands(self, run, clip, tmp_path):
         keep, whole = tmp_path / "keep", tmp_path / "whole.tif"

@@ -210,6 +210,7 @@ class TestSettings:
             *names(RestoreParams()),
             *names(Selection()),
             *names(Machine()),
+            "preset",
             "sigma",
             "bit_depth",
             "memory_limit",

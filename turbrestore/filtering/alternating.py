@@ -31,14 +31,14 @@ Departures from the paper, each with its reason:
   image of the last frame is there to measure it from.
 * Frames are processed in blocks, whose flows are measured in parallel from one image; the inner iteration repeats a
   block from the same prior.  The last iteration of a block and the first of the next block run as one pass, and measure
-  their flows from the same image.  That image contains the earlier block in its state before the last iteration.  With
-  blocks of one frame this is the paper's scheme but for two points: that image, and the frame itself, which the image
-  does not contain yet when the flow is first measured.
+  their flows from the same image.  That image contains the earlier block in its state before the last iteration.
+  Blocks of one frame are not joined: with ``block=1`` the image is that after the last frame, as in the paper.
 * Every inner iteration starts from the prediction, not from its own result, so a frame counts once.
 * Z varies from pixel to pixel: it is lower where a frame is locally sharper than usual, and higher where the frame
   shows what the others do not (a bird, a flash), where it was not seen, and where the flow folds.  β = 0 is the
   paper's scalar gain.
-* The image starts from a diffuse prior (``prior_frames=0``), not from the centroid.  The mean of W^meas is kept.
+* The filter includes the training frames, from a diffuse image (``prior_frames=0``).  With ``training="skip"`` it
+  starts after them as in the paper: from the centroid and the last of their states.  The mean of W^meas is kept.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ from .filter_records import (
     FilterState,
     FilterStep,
     FrameRecord,
+    after_training,
     join_records,
     mean_flow_over,
 )
@@ -203,6 +204,8 @@ def filter_steps(
         known = [None if frame is None else next(measured) for frame in block]
     settings = _settings(block, known, image, dynamics, params, flow_params, runtime)
     image_noise, motion_share = settings.statistics.image_noise, float(settings.motion_share.mean())
+    if start is None and params.training == "skip":
+        start = after_training(_prior(image, image_noise, dynamics, params), image, dynamics, len(known))
     if start is None:
         at = _Position(_prior(image, image_noise, dynamics, params), (), image, deque(block), 0)
     else:
@@ -211,7 +214,10 @@ def filter_steps(
         at = _Position(start.state, start.records, start.reference, deque(), flows_measured)
     del block
     at = yield from _filter_blocks(at, stream, known, params, settings)
-    return join_records(at.state, at.records, image_noise, motion_share)
+    filtered = join_records(at.state, at.records, image_noise, motion_share)
+    # The paper leaves the image in the geometry of the training frames.
+    unmoved = np.zeros_like(filtered.mean_flow)
+    return filtered if params.training == "filter" else replace(filtered, mean_flow=unmoved)
 
 
 def _filter_blocks(
@@ -222,7 +228,8 @@ def _filter_blocks(
     settings: PassSettings,
 ) -> Generator[FilterStep, None, _Position]:
     """Do steps 1 to 4 of the module docstring for one block after the other."""
-    once, size = params.inner_iterations == 1, params.block
+    size, once = params.block, params.inner_iterations == 1
+    alone = once or size == 1
     if at.block:
         # The flows of the first block are known in its first iteration.
         at = yield from _iterate(at, settings, known, settle=once, from_known=True)
@@ -239,9 +246,9 @@ def _filter_blocks(
             at = yield from _iterate(at, settings, known)
         # The last iteration of this block and the first of the next are one pass, as threads idle at the end of each.
         reference = at.image
-        at = yield from _iterate(at, settings, known, settle=True, following=islice(stream, 0 if once else size))
+        at = yield from _iterate(at, settings, known, settle=True, following=islice(stream, 0 if alone else size))
         known = ()
-        reference = at.image if once else reference
+        reference = at.image if alone else reference
         yield FilterStep(at.flows_measured, FilterCheckpoint(at.state, at.records, reference))
 
 

@@ -12,18 +12,20 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ..core.arrays import FloatArray
-from ..core.errors import require, require_between
+from ..core.errors import DataError, require, require_between
 from ..display.plots import plot_frames
 from ..display.preview import preview
+from ..dynamics.flow_model import FlowDynamics
 from ..registration.recentring import recentring_flow
 from ..registration.warp import warp
+from .flow_state import flow_noise
 from .image_state import PixelGaussian
 from .kalman import Gaussian
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-RESIDUALS = ("keep", "drop")
+RESIDUALS, TRAININGS = ("keep", "drop"), ("filter", "skip")
 # Bytes a pixel while frames are registered and fused: for each channel, for each thread, and for each channel of that.
 _SHARED_CHANNEL, _EACH, _EACH_CHANNEL = 15.0, 10.0, 5.0
 # Bytes a pixel of means of flows: two sums and a mean; and of a flow that waits in each thread to be added.
@@ -40,8 +42,11 @@ class FilterParams:
         Whether measured flow outside the subspace of the flow model is kept; ``"drop"`` is the paper as printed.
     inner_iterations : int
         Times that flow is measured, and image and flow updated, for each block of frames.
+    training : {"filter", "skip"}
+        Whether the frames with known flows are filtered too, or the filter starts after them as in the paper: from the
+        state of the last of them, and the image stays in their geometry.
     block : int
-        Frames whose flows are measured against the same image; 1 is closest to the paper, more run side by side.
+        Frames whose flows are measured against the same image; 1 is the paper's, more run side by side.
     sharpness : float
         β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.
     sharpness_window : float
@@ -55,6 +60,7 @@ class FilterParams:
     """
 
     residual: Literal["keep", "drop"] = "keep"
+    training: Literal["filter", "skip"] = "filter"
     inner_iterations: int = 2
     block: int = 24
     sharpness: float = 2.0
@@ -67,6 +73,10 @@ class FilterParams:
         require(
             self.residual in RESIDUALS,
             f"residual: expected one of {', '.join(RESIDUALS)}, found {self.residual!r}",
+        )
+        require(
+            self.training in TRAININGS,
+            f"training: expected one of {', '.join(TRAININGS)}, found {self.training!r}",
         )
         require_between("inner_iterations", self.inner_iterations, 1, 100)
         require_between("block", self.block, 1, 10_000, "frames")
@@ -235,6 +245,47 @@ class Filtered:
         return preview("Filtered image", facts, self.image)
 
 
+def after_training(prior: FilterState, image: FloatArray, dynamics: FlowDynamics, known_flows: int) -> FilterCheckpoint:
+    """Start after the training frames, with the state of the last of them (paper 3, section 6).
+
+    Parameters
+    ----------
+    prior : FilterState
+        Its flow is replaced: ξ̂_τ is Cᵀ (W_τ − W̄), a measurement of the state with the noise R I.
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+        Image to start from.
+    dynamics : FlowDynamics
+    known_flows : int
+        Number of flows to training frames.
+
+    Returns
+    -------
+    FilterCheckpoint
+        The training frames have records, and do not count.
+
+    Raises
+    ------
+    DataError
+        The model was identified from another number of flows.
+
+    Examples
+    --------
+    >>> from turbrestore.dynamics.dynamic_texture import identify
+    >>> flow, pixels = np.zeros((2, 3, 2), np.float32), PixelGaussian(np.zeros((2, 3)), np.ones((2, 3)))
+    >>> state = FilterState(pixels, Gaussian(np.zeros(0), np.eye(0)), flow, flow)
+    >>> len(after_training(state, pixels.mean, identify(np.zeros((4, 2, 3, 2), np.float32)), 4).records)
+    4
+    """
+    if known_flows != dynamics.frame_count:
+        raise DataError(
+            f"known_flows: expected the {dynamics.frame_count} flows that the dynamics were identified from, found "
+            f"{known_flows}"
+        )
+    last = Gaussian(dynamics.last_state, flow_noise(dynamics) * np.eye(dynamics.rank))
+    records = tuple(FrameRecord(state, 0.0, np.nan, np.nan, 0.0) for state in dynamics.states.T)
+    return FilterCheckpoint(replace(prior, flow=last), records, image)
+
+
 def mean_flow_over(flow_sum: FloatArray, records: Sequence[FrameRecord]) -> FloatArray:
     """Average the flows to the frames that count; 0 if none of them does.
 
@@ -282,6 +333,8 @@ def join_records(
     array([0.5, 0.5])
     """
     information = np.array([record.information for record in records])
+    if not information.any():
+        raise DataError("frames: expected at least one after those with known flows, found none; train on fewer")
     return Filtered(
         image=state.image.mean.astype(np.float32),
         variance=state.image.variance.astype(np.float32),

@@ -76,6 +76,11 @@ def project_measured(measured: FloatArray, dynamics: FlowDynamics) -> ProjectedF
     return ProjectedFlow(state, float(np.square(deviation, out=deviation).sum(dtype=np.float64)), deviation.size)
 
 
+def flow_noise(dynamics: FlowDynamics) -> float:
+    """R, squared pixels, with a floor for flows that lie in the subspace of the model as a whole."""
+    return max(dynamics.R, _FLOW_NOISE_FLOOR)
+
+
 def predict_state(state: Gaussian, dynamics: FlowDynamics) -> Gaussian:
     """Predict the state of the flow one frame ahead (paper 3, eqs. 14b and 14d).
 
@@ -126,7 +131,7 @@ def update_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDyn
     >>> np.abs(state.mean).round(3), round(innovation, 3)
     (array([2.]), 0.707)
     """
-    R = max(dynamics.R, _FLOW_NOISE_FLOOR)
+    R = flow_noise(dynamics)
     p, V = np.linalg.eigh(predicted.cov)
     p = np.maximum(p, 0)  # Rounding may leave the variance of a known direction slightly negative.
     gain = (V * (p / (p + R))) @ V.T  # P (P + R I)⁻¹, of M in (19)
