@@ -13,7 +13,11 @@ TOOL = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"
 
 def test_every_package_is_in_the_wheel():
     folders = {path.parent.relative_to(ROOT) for path in (ROOT / "turbrestore").rglob("__init__.py")}
-    found = {".".join(folder.parts) for folder in folders} | {"turbrestore_cli", "turbrestore_app"}
+    found = {".".join(folder.parts) for folder in folders} | {
+        "turbrestore_cli",
+        "turbrestore_app",
+        "turbrestore_napari",
+    }
     assert set(TOOL["packages"]) == found
 
 

@@ -1,0 +1,1 @@
+"""turbrestore in napari: clips as layers, and a widget that restores one."""
