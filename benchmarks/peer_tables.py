@@ -116,6 +116,9 @@ def _videos(videos: Mapping[str, Results]) -> str:
         for method, found in methods.items():
             cells = [_number(found.get(figure), digits) for figure, digits in VIDEO_FIGURES]
             lines.append(f"| {method} | {' | '.join(cells)} |")
+        own = methods[TURBRESTORE]["psnr"] + LEADS[f"psnr{SAME}"] if TURBRESTORE in methods else np.inf
+        ahead = [method for method, found in methods.items() if found["psnr"] > own]
+        lines.append(f"\nAhead of {TURBRESTORE} in PSNR: {', '.join(ahead) or 'none'}.")
         parts.append("\n".join(lines) + "\n")
     return "\n".join(parts)
 

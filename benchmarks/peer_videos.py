@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 from clips import data_folder
@@ -24,8 +25,8 @@ from turbrestore.steady.video import steady_frames
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
 
-# Frames and pixels a side, so that a table of all takes minutes.
-COUNT, SIDE, EVERY = 45, 256, 3
+# Frames, pixels a side of the video that is made here, and which frames are compared: all takes minutes.
+COUNT, SIDE, EVERY = 30, 256, 3
 SMOOTHED = 5
 
 # Each takes frames and returns as many.
@@ -54,10 +55,13 @@ def measure_videos() -> dict[str, dict[str, Figures]]:
 def score_video(video: FloatArray, truth: FloatArray) -> Figures:
     """PSNR and SSIM, means over every third frame, and the flicker of all frames relative to the truth.
 
-    Both have the shape (T, H, W) or (T, H, W, 3).
+    Both have the shape (T, H, W) or (T, H, W, 3).  A video that is cropped is compared with the middle of the truth, as
+    networks crop by the same number of pixels on opposite sides.
     """
     from skimage.metrics import structural_similarity
 
+    top, left = ((truth.shape[axis] - video.shape[axis]) // 2 for axis in (1, 2))
+    truth = truth[:, top : top + video.shape[1], left : left + video.shape[2]]
     grey = [frames if frames.ndim == 3 else frames.mean(axis=-1) for frames in (video, truth)]
     pairs = [*zip(*grey, strict=True)][::EVERY]
     flicker = np.abs(np.diff(video, axis=0)).mean() / np.abs(np.diff(truth, axis=0)).mean()
@@ -87,20 +91,10 @@ def _videos() -> Iterator[tuple[str, FloatArray, FloatArray, dict[str, FloatArra
     yield "moving square", *moving_square(), {}
     root = data_folder()
     for path in sorted(root.glob("dynamic/*/truth.mp4")) if root is not None else []:
-        clip = path.with_name("clip.mp4")
-        height, width = open_frames(clip).shape[1:3]
-        h, w = min(height, SIDE), min(width, SIDE)
-        region = ((width - w) // 2, (height - h) // 2, w, h)
-        frames, truth = (open_frames(file, frames=(0, COUNT), roi=region).read() for file in (clip, path))
-        peers = {file.stem.removeprefix("peer_"): file for file in sorted(path.parent.glob("peer_*.mp4"))}
-        networks = {name: _as_large(file, (height, width), (h, w)) for name, file in peers.items()}
+        frames, truth = _read(path.with_name("clip.mp4")), _read(path)
+        networks = {file.stem.removeprefix("peer_"): _read(file) for file in sorted(path.parent.glob("peer_*.mp4"))}
         yield path.parent.name, frames, truth, networks
 
 
-def _as_large(file: object, size: tuple[int, int], kept: tuple[int, int]) -> FloatArray:
-    """Middle of the output of a network, which may be cropped by as much on opposite sides."""
-    own = open_frames(file).shape[1:3]
-    left, top = ((own[axis] - kept[axis]) // 2 for axis in (1, 0))
-    if any((size[axis] - own[axis]) % 2 for axis in (0, 1)):
-        print(f"{file}: cropped unevenly, so that it may be off by half a pixel", file=sys.stderr)
-    return open_frames(file, frames=(0, COUNT), roi=(left, top, kept[1], kept[0])).read()
+def _read(path: Path) -> FloatArray:
+    return open_frames(path, frames=(0, COUNT)).read()

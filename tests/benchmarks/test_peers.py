@@ -82,6 +82,12 @@ class TestDocument:
     def test_a_lead_of_another_method_is_printed(self):
         assert "- a: mean 25.40; turbrestore 25.00 dB" in self.document(psnr_sharp=25.4)
 
+    def test_a_lead_on_a_video_is_printed(self):
+        methods = {"mean": {"psnr": 22.0}, "turbrestore": {"psnr": 21.0}}
+        text = document({}, {}, {}, {"road": methods})
+        assert "| mean | 22.00 | – | – | – |" in text
+        assert "Ahead of turbrestore in PSNR: mean." in text
+
     def test_less_than_the_least_lead_is_none(self):
         assert "On no clip." in self.document(psnr_sharp=25.04)
 
@@ -98,6 +104,8 @@ def test_videos_are_scored_frame_by_frame():
     # Only every third frame is compared.
     spoilt[[1, 2, 4, 5]] = 0
     assert score_video(spoilt, truth)["psnr"] == pytest.approx(20, abs=1e-3)
+    # What a network crops is cropped from the truth.
+    assert score_video(truth[:, 2:-2, 4:-4], truth)["ssim"] == 1
 
 
 def test_the_script_prints_and_writes_its_document(tmp_path, monkeypatch, capsys):
