@@ -17,6 +17,7 @@ from turbrestore.io.output import atomic_write, check_output
 
 from .options import Flag
 from .output import print_json
+from .progress import say
 from .streams import flush
 
 _PLOTS = (".png",)
@@ -50,6 +51,7 @@ def wavefront(
     start = time.perf_counter()
     experiment = run_wavefront(range(seeds), params)
     _draw(plot, draw_wavefront, experiment, overwrite)
+    _warn(experiment)
     record = {"experiment": "wavefront", "seeds": seeds, "seconds": _rounded(time.perf_counter() - start)}
     if json:
         print_json(record | describe(experiment))
@@ -86,6 +88,8 @@ def mirror(
     known = run_mirror(range(seeds))
     unknown = run_mirror(range(seeds), MirrorParams(deviation=deviation))
     _draw(plot, draw_mirror, known, overwrite)
+    _warn(known)
+    _warn(unknown)
     record = {"experiment": "mirror", "seeds": seeds, "seconds": _rounded(time.perf_counter() - start)}
     if json:
         print_json(record | {"plant_known": describe(known), "plant_unknown": describe(unknown)})
@@ -110,7 +114,8 @@ def describe(experiment: Experiment) -> dict[str, Any]:
             "innovation_band": [_rounded(score.innovation_low), _rounded(score.innovation_high)],
             "consistent": score.consistent,
         }
-    return {"bounds": {name: _rounded(value) for name, value in experiment.bounds.items()}, "observers": observers}
+    bounds = {name: _rounded(value) for name, value in experiment.bounds.items()}
+    return {"bounds": bounds, "observers": observers, "lit": _rounded(experiment.lit)}
 
 
 def table(experiment: Experiment) -> str:
@@ -137,6 +142,11 @@ def _check(seeds: int, plot: Path | None, overwrite: bool) -> None:
 def _draw(plot: Path | None, draw: Callable[[Experiment], bytes], experiment: Experiment, overwrite: bool) -> None:
     if plot is not None:
         atomic_write(plot, draw(experiment), overwrite)
+
+
+def _warn(experiment: Experiment) -> None:
+    for warning in experiment.warnings:
+        say(warning, quiet=False)
 
 
 def _rounded(value: float) -> float:

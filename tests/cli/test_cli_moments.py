@@ -48,6 +48,14 @@ class TestWavefront:
         ]  # fmt: skip
         assert len({len(line) for line in lines[1:11] if not line.endswith("*")}) == 1
 
+    def test_an_observer_that_loses_its_light_is_said(self, run):
+        words = ["--seeds", 4, "--params.slope-disturbance", 0.316, "--json"]
+        code, out, err = run("wavefront", *words)
+        assert code == 0
+        assert json.loads(out)["lit"] < 0.95
+        assert "turbrestore: image_map errs " in err
+        assert "times as much as O1: an image without its light misleads it" in err
+
     def test_settings_are_used(self, run):
         _, quiet, _ = run("wavefront", *SHORT, "--params.noise", 0.001, "--json")
         _, loud, _ = run("wavefront", *SHORT, "--json")

@@ -6,11 +6,13 @@ from scipy.stats import chi2
 
 from turbrestore.blur_moments.experiments.comparison import Contestant, Track, follow, mirror, score, wavefront
 from turbrestore.blur_moments.experiments.scenarios import (
+    WAVEFRONT_AS_PRINTED,
     MirrorParams,
     WavefrontParams,
     mirror_model,
     mirror_oscillator,
     record_mirror,
+    wavefront_model,
 )
 from turbrestore.blur_moments.image_observer import ImageFilter
 from turbrestore.blur_moments.observers import steady_kalman
@@ -23,6 +25,11 @@ SEEDS = 40
 @pytest.fixture(scope="module")
 def waves():
     return wavefront(range(SEEDS))
+
+
+@pytest.fixture(scope="module")
+def printed():
+    return wavefront(range(10), WAVEFRONT_AS_PRINTED)
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +87,33 @@ class TestWavefront:
         assert set(waves.estimates) == set(waves.errors) == set(waves.scores)
         # The slow estimate of the first seed follows its truth, within and between the exposures.
         assert np.abs(waves.estimates["image_map"] - waves.truth)[10:].mean() < 0.02
+
+
+class TestPrintedProcessNoise:
+    """W = .1, as paper 1 prints it, and its error of .07 exclude each other."""
+
+    def test_it_is_the_one_printed(self):
+        model = wavefront_model(WAVEFRONT_AS_PRINTED)
+        assert model.motion.Q[0, 0] == pytest.approx(0.1)
+        assert (WAVEFRONT_AS_PRINTED.noise, model.motion.timing.exposure) == (0.1, 0.2)
+
+    def test_the_first_moment_errs_far_more_than_printed(self, printed):
+        assert printed.scores["O1"].error > 0.3
+
+    def test_whose_light_is_lost_is_said(self, printed):
+        lost = printed.scores["image_map"]
+        assert lost.of_image
+        assert lost.ratio > 1
+        assert printed.lit < 0.9
+        said = [warning for warning in printed.warnings if warning.startswith("image_map errs ")]
+        assert len(said) == 1
+        assert f"on the sensor for {100 * printed.lit:.0f} %" in said[0]
+        assert not any(warning.startswith("O") for warning in printed.warnings)
+
+    def test_nothing_is_said_where_the_spot_stays_on_the_sensor(self):
+        usual = wavefront(range(4), WavefrontParams(frames=12, burn_in=2))
+        assert usual.warnings == ()
+        assert usual.lit == 1.0
 
 
 @pytest.mark.long

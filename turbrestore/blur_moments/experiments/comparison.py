@@ -8,7 +8,7 @@ a seed, because the ratio of two observers has a much smaller standard error tha
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -107,6 +107,8 @@ class Score:
         Normalised innovation squared per degree of freedom.
     innovation_low, innovation_high : float
         Band that contains it in 95 % of all runs if the model fits.
+    of_image : bool
+        Whether the observer uses the whole image, and not its moments.
     """
 
     error: float
@@ -119,6 +121,7 @@ class Score:
     innovation: float
     innovation_low: float
     innovation_high: float
+    of_image: bool = False
 
     @property
     def consistent(self) -> bool:
@@ -145,6 +148,8 @@ class Experiment:
         Of the first seed, by observer.
     errors : dict of str to ndarray, float64, shape (T,)
         Error after every frame, mean over the seeds, by observer.
+    lit : float
+        Share of the exposures, over all seeds, in which the spot is on the sensor.
     """
 
     seeds: int
@@ -154,6 +159,17 @@ class Experiment:
     truth: Float64Array
     estimates: dict[str, Float64Array]
     errors: dict[str, Float64Array]
+    lit: float
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One line for each observer of the whole image that errs more than O1, which uses the first moment alone."""
+        return tuple(
+            f"{name} errs {score.ratio:.2f} times as much as O1: an image without its light misleads it, and the spot "
+            f"is on the sensor for {100 * self.lit:.0f} % of the exposures"
+            for name, score in self.scores.items()
+            if score.of_image and score.ratio > 1
+        )
 
 
 def wavefront(seeds: Sequence[int], params: WavefrontParams = WAVEFRONT) -> Experiment:
@@ -330,28 +346,37 @@ def _run(
     require(len(seeds) >= 1, "seeds: expected at least 1, found none")
     chunks = [seeds[k : k + _CHUNK] for k in range(0, len(seeds), _CHUNK)]
 
-    def work(chunk: Sequence[int]) -> tuple[dict[str, Track], dict[str, Float64Array], Float64Array]:
+    first, bounds = contestants["O1"], dict[str, float]()
+    exposed, pixels = first.model.motion.timing.exposure_steps, first.model.sensor.pixels
+
+    def work(chunk: Sequence[int]) -> tuple[dict[str, Track], dict[str, Float64Array], Float64Array, float]:
         recording = record(chunk)
         tracks = {name: follow(contestant, recording, of_state) for name, contestant in contestants.items()}
-        return tracks, recorded_information(linear, recording) if linear else {}, recording.outputs[:, 0]
+        seen = recording.outputs[burn_in:, :, :exposed]
+        lit = float(np.mean((seen >= pixels.start) & (seen <= pixels.stop)))
+        return tracks, recorded_information(linear, recording) if linear else {}, recording.outputs[:, 0], lit
 
     parts = [part for _, part in map_ahead(work, chunks)]
     tracks = {name: _joined([part[0][name] for part in parts]) for name in contestants}
-    first, bounds = contestants["O1"], dict[str, float]()
+    shares = [len(chunk) / len(seeds) for chunk in chunks]
     if linear is not None:
-        shares = [len(chunk) / len(seeds) for chunk in chunks]
         for name in parts[0][1]:
             information = np.asarray(sum(share * part[1][name] for share, part in zip(shares, parts, strict=True)))
             bounds[name] = error_bound(linear, first.start.cov, information, burn_in, of_state)
     of_observers = {name: bounds[c.bound] for name, c in contestants.items() if c.bound in bounds}
+    scores = score(tracks, of_observers, burn_in)
     return Experiment(
         seeds=len(seeds),
-        scores=score(tracks, of_observers, burn_in),
+        scores={
+            name: replace(found, of_image=isinstance(contestants[name].observer, ImageFilter))
+            for name, found in scores.items()
+        },
         bounds=bounds,
         timing=first.model.motion.timing,
         truth=parts[0][2],
         estimates={name: track.example for name, track in tracks.items()},
         errors={name: track.errors.mean(1) for name, track in tracks.items()},
+        lit=sum(share * part[3] for share, part in zip(shares, parts, strict=True)),
     )
 
 
