@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from turbrestore.blind.blur_map import blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
+from turbrestore.blind.guards import GuardParams
 from turbrestore.blind.remove_blur import remove_blur
 from turbrestore.blur.estimation import choose_blur, estimate_blur, find_candidates
 from turbrestore.core.arrays import luminance
@@ -19,6 +20,8 @@ from turbrestore.synthesis.scenes import SCENES
 
 SIDE = 384
 WIENER = DeconvolutionParams(method="wiener", exponent=2.0)
+# The first attempt passes.
+FIRST = GuardParams(ringing=1.0)
 
 
 def blurred(name, left, right):
@@ -154,10 +157,10 @@ def counted(monkeypatch):
 @pytest.mark.parametrize(("right", "varies"), [(1.4, False), (2.6, True)])
 def test_the_deconvolution_beside_the_widths_of_tiles_is_used_where_these_agree(counted, right, varies):
     _, image, _ = blurred("brick", 0.8 if varies else 1.4, right)
-    result = remove_blur(image, image, WIENER)
+    result = remove_blur(image, image, WIENER, FIRST)
     tried = counted.copy()
     counted.clear()
-    in_turn = remove_blur(image, image, WIENER, runtime=Runtime(memory_limit=1e9))
+    in_turn = remove_blur(image, image, WIENER, FIRST, runtime=Runtime(memory_limit=1e9))
     assert np.array_equal(result.deconvolution.image, in_turn.deconvolution.image)
     assert result.decisions == in_turn.decisions
     assert result.tiles.varies == varies
@@ -178,7 +181,7 @@ def test_widths_and_deconvolution_do_not_wait_for_each_other(monkeypatch):
 
     monkeypatch.setattr("turbrestore.blind.tiled_deconvolution.deconvolve_steps", waiting(deconvolve_steps))
     monkeypatch.setattr("turbrestore.blind.remove_blur.blur_map_steps", waiting(blur_map_steps))
-    assert remove_blur(image, image, WIENER).tiles is not None
+    assert remove_blur(image, image, WIENER, FIRST).tiles is not None
 
 
 def test_after_an_interrupt_the_remaining_tiles_are_left_out(monkeypatch):

@@ -15,6 +15,8 @@ from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.scenes import SCENES
 
 WIENER = DeconvolutionParams(method="wiener")
+# What a Wiener filter does to the fine detail of this small scene passes.
+LENIENT = GuardParams(ringing=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +29,7 @@ def camera():
 
 def test_a_blind_result_is_sharper_and_closer_to_the_scene(camera):
     scene, image = camera
-    result = remove_blur(image, image, WIENER)
+    result = remove_blur(image, image, WIENER, LENIENT)
     assert result.blur.sigma == pytest.approx(1.6, rel=0.25)
     assert result.deconvolution.sigma == result.blur.removable == result.readings[0].sigma
     assert psnr(result.deconvolution.image, scene) > psnr(image, scene) + 1
@@ -37,9 +39,9 @@ def test_a_blind_result_is_sharper_and_closer_to_the_scene(camera):
 
 def test_a_failed_guard_lowers_the_width(camera):
     _, image = camera
-    free = remove_blur(image, image, WIENER)
+    free = remove_blur(image, image, WIENER, LENIENT)
     bound = free.readings[0].noise_gain * 0.9
-    result = remove_blur(image, image, WIENER, GuardParams(noise_gain=bound))
+    result = remove_blur(image, image, WIENER, replace(LENIENT, noise_gain=bound))
     assert 0 < result.deconvolution.sigma < free.deconvolution.sigma
     assert [reading.passed for reading in result.readings][-2:] == [False, True]
     assert result.decisions[1].choice.startswith(f"blur lowered from {free.deconvolution.sigma:.2f} to")

@@ -194,7 +194,7 @@ def chosen_settings(draw):
     return params, selection, draw(st.sampled_from([None, 8, 16, 32]))
 
 
-READINGS = st.builds(GuardReading, NUMBERS, NUMBERS, NUMBERS, st.booleans())
+READINGS = st.builds(GuardReading, NUMBERS, NUMBERS, NUMBERS, NUMBERS, st.booleans())
 
 
 @st.composite

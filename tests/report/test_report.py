@@ -198,12 +198,12 @@ class TestPage:
         assert found["Innovation"] == "2.00 px"
 
     def test_guards_that_object_stand_out(self, whole):
-        readings = (GuardReading(2.0, 0.125, 7.0, False), GuardReading(1.7, 0.02, 3.0, True))
+        readings = (GuardReading(2.0, 0.25, 0.125, 7.0, False), GuardReading(1.7, 0.05, 0.02, 3.0, True))
         found = facts.findings(dataclasses.replace(whole, guard_readings=readings))
         guards = [fact for fact in found if fact.name.startswith("Guards")]
         assert [fact.doubtful for fact in guards] == [True, False]
         assert guards[0].name == "Guards at 2.00 px"
-        assert guards[0].value == "12.5 % overshoots, noise ×7.0"
+        assert guards[0].value == "25.0 % of edges ring, 12.5 % overshoots, noise ×7.0"
 
     def test_laps_follow_each_other(self, whole):
         laps = facts.laps(whole)
@@ -387,7 +387,7 @@ DAMAGE = {
     "more than a number holds": (spoil("restoration.seconds", {"filter": 10**400}), DataError),
     "reading is no record": (spoil("restoration.guard_readings", [1]), DataError),
     "verdict of a guard is no flag": (
-        spoil("restoration.guard_readings", [{"sigma": 1, "overshoot": 1, "noise_gain": 1, "passed": 1}]),
+        spoil("restoration.guard_readings", [{"sigma": 1, "ringing": 0, "overshoot": 1, "noise_gain": 1, "passed": 1}]),
         DataError,
     ),
     "half a decision": (spoil("restoration.decisions", [{"subject": "blur"}]), DataError),

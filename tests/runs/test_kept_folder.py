@@ -135,7 +135,7 @@ def test_a_pipe_in_the_folder_holds_nobody_up(ended, capsys, name):
     assert capsys.readouterr().err.count("\n") == 1
 
 
-READING = {"sigma": 1.0, "overshoot": 0.1, "noise_gain": 1.0, "passed": True}
+READING = {"sigma": 1.0, "ringing": 0.0, "overshoot": 0.1, "noise_gain": 1.0, "passed": True}
 DAMAGE = {
     "empty": lambda record: {},
     "no record": lambda record: [1],

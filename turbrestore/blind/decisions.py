@@ -87,11 +87,11 @@ def explain_guards(sigma: float, readings: tuple[GuardReading, ...], guards: Gua
 
     Examples
     --------
-    >>> [decision] = explain_guards(2.0, (GuardReading(2.0, 0.01, 1.5, passed=True),), GuardParams())
+    >>> [decision] = explain_guards(2.0, (GuardReading(2.0, 0.03, 0.01, 1.5, passed=True),), GuardParams())
     >>> decision.choice
     'passed'
     >>> decision.reason
-    'at 2.00 px 1.0% of the image overshoots (bound 12%), noise of flat regions × 1.50 (bound 6)'
+    'at 2.00 px 3% of edges ring (bound 15%), 1% of pixels near edges overshoot (bound 12%), noise × 1.5 (bound 6)'
     """
     if not readings:
         return ()
@@ -101,7 +101,8 @@ def explain_guards(sigma: float, readings: tuple[GuardReading, ...], guards: Gua
     else:
         choice = "failed, kept because the width was given" if sigma > 0 else "failed at every width, no blur removed"
     reason = (
-        f"at {first.sigma:.2f} px {first.overshoot:.1%} of the image overshoots (bound {guards.overshoot:.0%}), "
-        f"noise of flat regions × {first.noise_gain:.2f} (bound {guards.noise_gain:g})"
+        f"at {first.sigma:.2f} px {first.ringing:.0%} of edges ring (bound {guards.ringing:.0%}), "
+        f"{first.overshoot:.0%} of pixels near edges overshoot (bound {guards.overshoot:.0%}), "
+        f"noise × {first.noise_gain:.1f} (bound {guards.noise_gain:g})"
     )
     return (Decision("guards", choice, reason),)

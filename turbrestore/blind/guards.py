@@ -1,17 +1,20 @@
-"""Guards: bounds on ringing and on amplified noise that a deconvolved image must keep.
+"""Guards: bounds on ringing, overshoot and amplified noise that a deconvolved image must keep.
 
 Symbols
 -------
 f : blurred image; u : deconvolved image; σ : width of the blur that was removed, pixels
 W(x) : window of 4σ around pixel x, at least 8 pixels; ``range(x) = max f − min f`` over W(x)
 
-Overshoot is the share of pixels with ``u > max f + 0.3 range`` or ``u < min f − 0.3 range``, where range is at least a
-tenth of the contrast of f.  The right width restores the contrast of fine detail, so u leaves the range of the pixels
-right next to it: a correctly restored chart does so at every third pixel.  But it hardly leaves the range of a window
-wider than the blur, which contains the plateaus on either side of an edge.  Too large a width causes ringing, which
-overshoots the plateaus.
+Ringing is the share of strong edges beside which u passes a plateau of f and returns to it; see
+:mod:`turbrestore.blind.ringing`.
 
-Noise gain is the ratio, after to before, of the standard deviation of fine detail in the flattest fifth of f.
+Overshoot is the share of pixels with ``u > max f + 0.3 range`` or ``u < min f − 0.3 range`` among those whose range is
+at least a tenth of the contrast of f, the area that has edges.  The right width restores the contrast of fine detail,
+so u leaves the range of the pixels right next to it: a correctly restored chart does so at every third pixel.  But it
+hardly leaves the range of a window wider than the blur.  Too large a width does, in texture too, which has no plateaus.
+
+Noise gain is the ratio, after to before, of the standard deviation of fine detail in the flattest fifth of f.  Pixels
+near black or white do not count, because clipping takes the noise away; all of them count if few are left.
 
 ``docs/decisions/guards.md`` lists both for right and for wrong widths.
 """
@@ -28,6 +31,7 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import DataError, require_between
 from ..runtime.scratch import iter_parts
+from .ringing import ringing
 
 _WINDOW_SIGMAS = 4.0
 _SMALLEST_WINDOW = 8
@@ -35,6 +39,8 @@ _BEYOND = 0.3
 # A range below this share of the contrast of the whole image is taken for noise.
 _LEAST_RANGE = 0.1
 _FLAT_SHARE = 0.2
+# Distance from black and white, in ranges of f, at which noise is not clipped; least share of such pixels.
+_CLIPPED, _LEAST_SHARE = 0.05, 0.01
 # Standard deviation of the Gaussian that separates fine detail, pixels.
 _DETAIL_WINDOW = 4.0
 _LEAST_DEVIATION = 1e-4
@@ -46,6 +52,8 @@ class GuardParams:
 
     Parameters
     ----------
+    ringing : float
+        Largest share of strong edges along which the image rings.
     overshoot : float
         Largest share of pixels beyond the local range of the blurred image by 30 % of that range.
     noise_gain : float
@@ -56,12 +64,14 @@ class GuardParams:
         Largest number of attempts; if the last one fails, no blur is removed.
     """
 
+    ringing: float = 0.15
     overshoot: float = 0.12
     noise_gain: float = 6.0
-    back_off: float = 0.8
-    tries: int = 8
+    back_off: float = 0.85
+    tries: int = 10
 
     def __post_init__(self) -> None:
+        require_between("ringing", self.ringing, 0, 1)
         require_between("overshoot", self.overshoot, 0, 1)
         require_between("noise_gain", self.noise_gain, 1, 1000)
         require_between("back_off", self.back_off, 0.1, 0.99)
@@ -76,15 +86,18 @@ class GuardReading:
     ----------
     sigma : float
         Width that was removed, pixels.
+    ringing : float
+        Share of strong edges along which the image rings.
     overshoot : float
-        Share of pixels beyond the local range.
+        Share of pixels beyond the local range, of those near edges.
     noise_gain : float
         Ratio of the standard deviations in flat regions, after to before.
     passed : bool
-        Whether both are within their bounds.
+        Whether all are within their bounds.
     """
 
     sigma: float
+    ringing: float
     overshoot: float
     noise_gain: float
     passed: bool
@@ -120,10 +133,9 @@ def evaluate_guards(
     --------
     >>> import numpy as np
     >>> edge = np.repeat([[0.2] * 24 + [0.8] * 24], 48, axis=0)
-    >>> evaluate_guards(edge, edge, 1.0).overshoot
+    >>> evaluate_guards(edge, edge, 1.0).ringing
     0.0
-    >>> ringing = edge + 0.3 * (abs(np.arange(48) - 27) < 3.5)
-    >>> evaluate_guards(ringing, edge, 1.0).passed
+    >>> evaluate_guards(edge + 0.15 * (abs(np.arange(48) - 25.5) < 2), edge, 1.0).passed
     False
     """
     params = params or GuardParams()
@@ -132,9 +144,10 @@ def evaluate_guards(
         raise DataError(f"result: expected the shape {before.shape} of the blurred image, found {after.shape}")
     # One pair of planes at a time, because those of a large image take a good part of the memory.
     pairs = zip(_planes(after), _planes(before), strict=True)
-    figures = [(_overshoot(*pair, sigma), _noise_gain(*pair)) for pair in pairs]
-    overshoot, gain = (max(values) for values in zip(*figures, strict=True))
-    return GuardReading(float(sigma), overshoot, gain, overshoot <= params.overshoot and gain <= params.noise_gain)
+    figures = [(ringing(*pair, sigma), _overshoot(*pair, sigma), _noise_gain(*pair)) for pair in pairs]
+    rings, overshoot, gain = (max(values) for values in zip(*figures, strict=True))
+    passed = rings <= params.ringing and overshoot <= params.overshoot and gain <= params.noise_gain
+    return GuardReading(float(sigma), rings, overshoot, gain, passed)
 
 
 def _planes(image: FloatArray) -> Iterator[FloatArray]:
@@ -154,19 +167,24 @@ def _overshoot(after: FloatArray, before: FloatArray, sigma: float) -> float:
     high, low = cv2.dilate(before, window), cv2.erode(before, window)
     contrast = float(np.subtract(*np.percentile(before, (99, 1))))
     margin = high - low
-    np.maximum(margin, _LEAST_RANGE * contrast, out=margin)
+    edges = margin > _LEAST_RANGE * contrast
     margin *= _BEYOND
     np.subtract(after, high, out=high)
     np.subtract(low, after, out=low)
-    return float(np.mean(np.maximum(high, low, out=high) > margin))
+    beyond = np.maximum(high, low, out=high) > margin
+    return float((beyond & edges).sum() / max(edges.sum(), 1))
 
 
 def _noise_gain(after: FloatArray, before: FloatArray) -> float:
     energy = np.square(cv2.Sobel(before, cv2.CV_32F, 1, 0))
     energy += np.square(cv2.Sobel(before, cv2.CV_32F, 0, 1))
     energy = cv2.GaussianBlur(energy, (0, 0), _DETAIL_WINDOW)
-    flat = energy <= np.quantile(energy, _FLAT_SHARE)
-    del energy
+    low, high = float(before.min()), float(before.max())
+    room = _CLIPPED * (high - low)
+    seen = (before > room) & (before < 1 - room)
+    seen |= seen.mean() < _LEAST_SHARE
+    flat = seen & (energy <= np.quantile(energy[seen], _FLAT_SHARE))
+    del energy, seen
     deviations = [
         float(np.std((image - cv2.GaussianBlur(image, (0, 0), _DETAIL_WINDOW))[flat])) for image in (after, before)
     ]

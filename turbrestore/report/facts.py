@@ -233,7 +233,8 @@ def _blur_facts(restoration: Restoration) -> Iterator[Fact]:
 
 def _guard_facts(restoration: Restoration) -> Iterator[Fact]:
     for reading in restoration.guard_readings:
-        value = f"{100 * reading.overshoot:.1f} % overshoots, noise ×{reading.noise_gain:.1f}"
+        shares = f"{100 * reading.ringing:.1f} % of edges ring, {100 * reading.overshoot:.1f} % overshoots"
+        value = f"{shares}, noise ×{reading.noise_gain:.1f}"
         note = "passed" if reading.passed else "failed: less blur is removed"
         yield Fact(f"Guards at {reading.sigma:.2f} px", value, note, not reading.passed)
 

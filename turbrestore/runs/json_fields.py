@@ -83,7 +83,7 @@ class JsonFields:
 
     def guard_readings(self, name: str) -> tuple[GuardReading, ...]:
         """Return a list of readings of the guards."""
-        names = ("sigma", "overshoot", "noise_gain")
+        names = ("sigma", "ringing", "overshoot", "noise_gain")
         return tuple(
             GuardReading(**{name: part.value(name, float) for name in names}, passed=part.flag("passed"))
             for part in self.parts(name)

@@ -1,0 +1,161 @@
+"""Ringing along edges: how far a deconvolved image overshoots the plateaus on either side of the edges.
+
+Symbols
+-------
+f : blurred image; u : deconvolved image; σ : width of the blur that was removed, pixels
+p(t), q(t) : u and f at the distance t from an edge, along its normal away from it, so that q rises; on the dark side of
+    an edge both are negated
+s : step of the edge, the difference of f between its two sides
+
+A ring is a fall of p where q does not fall: behind an edge the image has passed its plateau and returns to it.  A fall
+is found whatever the slope of the plateau, so also at the limb of a planet, whose disc grows brighter inwards.  Only
+sides along which q rises up to 4σ count: on others, between thin lines, a right result falls as well.  Nor do sides
+count whose plateau is so near to black or white that a ring would be clipped, such as the sky around a planet.
+
+Detail that f has lost makes p fall too, but at a different distance behind every edge, whereas rings are alike.
+Therefore p and q are averaged over the edges of a tile before the falls are compared.  The weaker edges of a tile are
+left out, because rings of its strongest edge would be diluted by theirs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ..core.arrays import FloatArray
+from ..core.noise import estimate_noise
+
+# Distance up to which edges are followed: widths of the blur, and pixels.
+_REACH_SIGMAS, _SMALLEST_REACH = 4.0, 6
+# Distance within which the step of an edge ends, in widths of the blur and in pixels.
+_STEP_SIGMAS, _SMALLEST_STEP = 2.5, 3
+# Gradients count from this multiple of the noise, steps from this multiple, and from this share of the steps of most
+# edges.
+_GRADIENT, _STEP, _STRONG, _MOST = 4.0, 12.0, 0.3, 90
+# Share of the step, and multiple of the noise, by which q may fall.
+_EVEN, _EVEN_NOISE = 0.03, 2.0
+# Side of a tile, pixels; fewest sides of edges in it; share of its largest step from which an edge counts.
+_TILE, _FEWEST, _ALIKE = 16, 5, 0.6
+# Share of the step from which an overshoot is a ring.
+_RING = 0.12
+# Most samples of all profiles, and rows in which edges are looked for at a time.
+_SAMPLES, _ROWS = 1 << 18, 64
+# Standard deviation of the Gaussian under which gradients are measured, and rows that its filters reach.
+_SMOOTH, _AROUND = 0.7, 6
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Pixels on edges, as rows and columns, and the unit normals towards the brighter side, shape (n, 2)."""
+
+    places: NDArray[np.float32]
+    normals: NDArray[np.float32]
+
+
+def ringing(after: FloatArray, before: FloatArray, sigma: float) -> float:
+    """Return the share of strong edges along which a deconvolved image rings.
+
+    Parameters
+    ----------
+    after : ndarray, float32, shape (H, W)
+        u.
+    before : ndarray, float32, shape (H, W)
+        f.
+    sigma : float
+        Width of the blur that was removed, pixels.
+
+    Returns
+    -------
+    float
+        0 to 1; 0 where there is no edge beside a plateau.
+
+    Examples
+    --------
+    >>> edge = np.repeat([[0.2] * 24 + [0.8] * 24], 48, axis=0).astype(np.float32)
+    >>> blurred = cv2.GaussianBlur(edge, (0, 0), 1.5)
+    >>> ringing(edge, blurred, 1.5), ringing(edge + 2 * (edge - blurred), blurred, 1.5)
+    (0.0, 1.0)
+    """
+    reach = max(_SMALLEST_REACH, int(np.ceil(_REACH_SIGMAS * sigma)))
+    noise = estimate_noise(before)
+    edges = _fewer(_find_edges(before, noise), _SAMPLES // (2 * reach + 1))
+    if not len(edges.places):
+        return 0.0
+    of_before, of_after = (_profiles(image, edges, reach) for image in (before, after))
+    within = max(_SMALLEST_STEP, int(np.ceil(_STEP_SIGMAS * sigma)))
+    steps = sum(side[:, : within + 1].max(axis=1) for side in of_before)
+    strong = steps > max(_STRONG * float(np.percentile(steps, _MOST)), _STEP * noise)
+    falls: list[NDArray[Any]] = []
+    counts: list[NDArray[Any]] = []
+    for q, p, limit in zip(of_before, of_after, (1, 0), strict=True):
+        rises = _falls(q) < np.maximum(_EVEN * steps, _EVEN_NOISE * noise)
+        chosen = strong & rises & (limit - q.max(axis=1) > _RING * steps)
+        fall, count = _falls_by_tile(q[chosen], p[chosen], steps[chosen], edges.places[chosen])
+        falls.append(fall)
+        counts.append(count)
+    number = np.concatenate(counts)
+    return float(number[np.concatenate(falls) > _RING].sum() / max(number.sum(), 1))
+
+
+def _find_edges(image: FloatArray, noise: float) -> _Edges:
+    """Pixels at which the gradient is largest along its own direction."""
+    places, normals = [np.zeros((0, 2), np.float32)], [np.zeros((0, 2), np.float32)]
+    for top in range(0, len(image), _ROWS):
+        start = max(top - _AROUND, 0)
+        strip = cv2.GaussianBlur(image[start : top + _ROWS + _AROUND], (0, 0), _SMOOTH)
+        across, down = (cv2.Sobel(strip, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1)))
+        size = np.hypot(across, down)
+        y, x = np.mgrid[: strip.shape[0], : strip.shape[1]].astype(np.float32)
+        unit = np.stack([down, across]) / np.maximum(size, np.finfo(np.float32).tiny)
+        ahead, behind = (cv2.remap(size, x + sign * unit[1], y + sign * unit[0], cv2.INTER_LINEAR) for sign in (1, -1))
+        crest = (size >= ahead) & (size > behind) & (size > _GRADIENT * noise)
+        crest[: top - start] = crest[top - start + _ROWS :] = False
+        rows, columns = np.nonzero(crest)
+        places.append(np.stack([rows + start, columns], axis=1).astype(np.float32))
+        normals.append(unit[:, rows, columns].T)
+    return _Edges(np.concatenate(places), np.concatenate(normals))
+
+
+def _fewer(edges: _Edges, most: int) -> _Edges:
+    """Leave out rows of tiles until no more edges remain than wanted."""
+    every = -(-len(edges.places) // most)
+    kept = (edges.places[:, 0] // _TILE) % max(every, 1) == 0
+    return _Edges(edges.places[kept], edges.normals[kept])
+
+
+def _profiles(image: FloatArray, edges: _Edges, reach: int) -> tuple[FloatArray, FloatArray]:
+    """Image along the normals on the bright and, negated, on the dark side, each of shape (n, reach + 1)."""
+    distances = np.arange(reach + 1, dtype=np.float32)
+    sides = []
+    for sign in (1, -1):
+        at = edges.places.T[..., None] + sign * edges.normals.T[..., None] * distances
+        sides.append(sign * ndimage.map_coordinates(image, at, np.float32, order=1, mode="mirror"))
+    return sides[0], sides[1]
+
+
+def _falls(profiles: NDArray[Any]) -> NDArray[Any]:
+    """Largest fall of each profile from any sample to a later one."""
+    return (np.maximum.accumulate(profiles, axis=1) - profiles).max(axis=1)
+
+
+def _falls_by_tile(
+    q: FloatArray, p: FloatArray, steps: FloatArray, places: FloatArray
+) -> tuple[NDArray[Any], NDArray[np.int_]]:
+    """Fall of the mean p less that of the mean q, relative to the step, and number of edges, of every tile."""
+    _, tiles = np.unique(places // _TILE, axis=0, return_inverse=True)
+    largest = np.zeros(len(places), np.float32)
+    np.maximum.at(largest, tiles.ravel(), steps)
+    alike = steps >= _ALIKE * largest[tiles.ravel()]
+    _, tiles, counts = np.unique(tiles.ravel()[alike], return_inverse=True, return_counts=True)
+    means = []
+    for profiles in (p, q):
+        total = np.zeros((len(counts), profiles.shape[1]))
+        np.add.at(total, tiles, profiles[alike] / steps[alike, None])
+        means.append(total / counts[:, None])
+    enough = counts >= _FEWEST
+    return (_falls(means[0]) - _falls(means[1]))[enough], counts[enough]
