@@ -23,6 +23,7 @@ COMMANDS = {
     "steady": ("steady:steady", "Steady and sharpen a video; what moves keeps moving."),
     "batch": ("batch:batch", "Restore many videos side by side."),
     "report": ("report:report", "Write the report of a run that restore --keep has kept."),
+    "seeing": ("seeing:seeing", "Measure how strong the turbulence in a video is."),
     "centroid": ("stages:centroid", "Find the centroid of a video."),
     "flow": ("stages:flow", "Measure the flow from one image to every frame of a video."),
     "identify": ("stages:identify", "Identify the dynamics of flows."),

@@ -20,6 +20,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore batch sample_data 'sample_data/*.mkv' --out results --resume",
     ),
     "report": ("turbrestore report stages", "turbrestore report stages report.html"),
+    "seeing": (
+        "turbrestore seeing sample_data/chart.mkv",
+        "turbrestore seeing sample_data/chart.mkv --pixel-scale 2.75e-6 --aperture 0.1 --distance 2000 --json",
+    ),
     "centroid": ("turbrestore centroid sample_data/chart.mkv centroid.npz --train 40",),
     "flow": ("turbrestore flow centroid.npz sample_data/chart.mkv flows.npy --flow.method farneback",),
     "identify": ("turbrestore identify centroid.npz dynamics.npz",),

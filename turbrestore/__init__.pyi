@@ -55,6 +55,10 @@ from .runs.run_record import describe_run as describe_run
 from .runs.stage_files import load_artifact as load_artifact
 from .runs.stage_files import save_artifact as save_artifact
 from .runtime.runtime import Runtime as Runtime
+from .seeing.strength import Estimate as Estimate
+from .seeing.strength import Seeing as Seeing
+from .seeing.strength import measure_seeing as measure_seeing
+from .seeing.tilt_theory import Optics as Optics
 from .settings import RestoreParams as RestoreParams
 from .settings import preset as preset
 from .steady.settings import SteadyParams as SteadyParams

@@ -38,6 +38,8 @@ from .runtime.runtime import DEFAULT, Runtime
 from .runtime.scratch import fill_stack, iter_frames, mean_of
 from .runtime.steps import Progress, finish, step_counter
 from .runtime.tiling import HaloTile, cut_tile, halo_tiles
+from .seeing.displacement import LEAST_FRAMES
+from .seeing.strength import Seeing, measure_seeing
 from .settings import RestoreParams
 from .tiled_stages import (
     TileMap,
@@ -59,6 +61,7 @@ from .wording import (
     explain_geometry,
     explain_input,
     explain_motion,
+    explain_seeing,
     explain_training,
 )
 
@@ -218,6 +221,7 @@ def _restored(run: _Run) -> Restoration:
         train=run.plan.train,
         frame_count=len(run.source) if params.runs("filter") else run.plan.train,
         seconds=run.seconds,
+        seeing=fused.seeing,
     )
 
 
@@ -228,6 +232,7 @@ class _Fused:
     image: FloatArray
     mean: FloatArray
     centroid: Centroid
+    seeing: Seeing | None
     dynamics: FlowDynamics | None = None
     filtered: Filtered | None = None
 
@@ -242,13 +247,14 @@ def _fuse(run: _Run) -> _Fused:
 
     centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
     run.decide(explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows))
+    seeing = _measure_seeing(run, training, centroid)
     if not params.runs("identify"):
-        return _Fused(centroid.image, levels.original(mean_of(training)), centroid)
+        return _Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing)
 
     dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
     run.decide(*explain_dynamics(dynamics))
     if not params.runs("filter"):
-        return _Fused(centroid.image, levels.original(mean_of(training)), centroid, dynamics)
+        return _Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, dynamics)
 
     start = levels.stretched_result(centroid)
     filtered = run.stage("filter", "filtered", lambda: _filter(run, start, dynamics, training, stream).recentred())
@@ -258,7 +264,7 @@ def _fuse(run: _Run) -> _Fused:
     run.decide(
         explain_frames(filtered, None if params.keep_best == 1 else chosen), explain_geometry(filtered, dynamics)
     )
-    return _Fused(filtered.image, mean, centroid, dynamics, filtered)
+    return _Fused(filtered.image, mean, centroid, seeing, dynamics, filtered)
 
 
 def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
@@ -286,6 +292,17 @@ def _centroids_elsewhere(run: _Run, train: int) -> Iterator[Centroid]:
     for part in run.map_tiles(run_centroid_task, tasks):
         count(part)
         yield part
+
+
+def _measure_seeing(run: _Run, training: FloatArray, centroid: Centroid) -> Seeing | None:
+    """Measure the strength of the turbulence, unless there are too few frames."""
+    if len(training) < LEAST_FRAMES:
+        return None
+    begun, image, threads = time.perf_counter(), run.levels.stretched(centroid.image), run.plan.runtime.threads
+    seeing = measure_seeing(training, centroid.flows, image, mean_of(training), threads=threads)
+    run.seconds["seeing"] = time.perf_counter() - begun
+    run.decide(*explain_seeing(seeing))
+    return seeing
 
 
 def _filter(

@@ -17,6 +17,7 @@ from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import FilterCheckpoint, Filtered
 from .registration.centroid import Centroid
 from .registration.coverage import Rectangle
+from .seeing.strength import Seeing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,6 +99,8 @@ class Restoration:
         Number of frames that were read.
     seconds : dict of str to float
         Wall time of each stage.
+    seeing : Seeing or None
+        Strength of the turbulence in the training frames, in pixels and frames; None for fewer than three.
     """
 
     image: FloatArray
@@ -113,6 +116,7 @@ class Restoration:
     train: int
     frame_count: int
     seconds: dict[str, float]
+    seeing: Seeing | None = None
 
     def plot(self) -> Figure:
         """Draw the temporal mean beside the result.

@@ -13,6 +13,7 @@ from .registration.coverage import Rectangle
 from .registration.global_shift import DEAD_ZONE
 from .registration.recentring import recentring_flow
 from .runtime.scratch import iter_frames
+from .seeing.strength import Seeing
 
 # A frame counts if its weight is at least this share of the average weight.
 _COUNTS = 0.2
@@ -264,6 +265,34 @@ def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
     error = mean_flow_error(dynamics, int(np.isfinite(filtered.sharpness).sum()))
     reason = f"mean flow to all frames, root mean square; its standard error is {error:.2f} pixels"
     return Decision("geometry", f"moved by {moved:.2f} pixels", reason)
+
+
+def explain_seeing(seeing: Seeing) -> tuple[Decision, ...]:
+    """Compare the displacement by flow with that by blur, and pass on the remarks.
+
+    Parameters
+    ----------
+    seeing : Seeing
+
+    Returns
+    -------
+    tuple of Decision
+        Empty where the displacement could not be measured and there is nothing to remark.
+
+    Examples
+    --------
+    >>> from turbrestore.seeing.strength import Estimate
+    >>> nothing = [None] * 3
+    >>> same = Estimate(1.0, 0.8, 1.2)
+    >>> explain_seeing(Seeing(*nothing, same, same, *nothing, 0.0, 9.0, 0.1))[0].choice
+    'by blur as by flow'
+    """
+    remarks = tuple(Decision("displacement", "to be looked at", remark) for remark in seeing.remarks)
+    by_flow, by_blur = seeing.displacement_by_flow, seeing.displacement_by_blur
+    if remarks or by_flow is None or by_blur is None:
+        return remarks
+    reason = f"variance {by_flow.value:.2f} and {by_blur.value:.2f} squared pixels agree within their errors"
+    return (Decision("displacement", "by blur as by flow", reason),)
 
 
 def explain_border(least_seen: float, crop: Rectangle | None) -> Decision:

@@ -19,6 +19,7 @@ from ..settings import RestoreParams
 _STAGE_NAMES = {
     "read": "Reading",
     "centroid": "Centroid",
+    "seeing": "Seeing",
     "identify": "Flow model",
     "filter": "Alternating filter",
     "deconvolve": "Deconvolution",

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from ..blind.guards import GuardReading
 from ..core.decision import Decision
 from ..core.errors import DataError
+from ..seeing.strength import Estimate, Seeing
 
 Kind = TypeVar("Kind")
 
@@ -88,6 +89,24 @@ class JsonFields:
             GuardReading(**{name: part.value(name, float) for name in names}, passed=part.flag("passed"))
             for part in self.parts(name)
         )
+
+    def seeing(self, name: str) -> Seeing | None:
+        """Return the strength of the turbulence; None where it is missing, as in older records, or was not measured."""
+        if self.record.get(name) is None:
+            return None
+        part = self.part(name)
+        values: dict[str, Any] = {}
+        for item in dataclasses.fields(Seeing):
+            if item.name == "remarks":
+                values[item.name] = part.texts(item.name)
+            elif item.type == "float":
+                values[item.name] = part.value(item.name, float)
+            elif part.record.get(item.name) is None:
+                values[item.name] = None
+            else:
+                estimate = part.part(item.name)
+                values[item.name] = Estimate(*(estimate.value(end, float) for end in ("value", "low", "high")))
+        return Seeing(**values)
 
     def like(self, usual: Mapping[str, Any]) -> dict[str, Any]:
         """Return the record, whose values are sections and numbers where ``usual`` has such.

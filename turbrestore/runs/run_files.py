@@ -124,6 +124,7 @@ def save_results(folder: Path, restoration: Restoration, run: RunRecord, stored:
         "train": restoration.train,
         "frame_count": restoration.frame_count,
         "seconds": restoration.seconds,
+        "seeing": None if restoration.seeing is None else dataclasses.asdict(restoration.seeing),
     }
     return {"run": described, "restoration": restored}
 
@@ -278,6 +279,7 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
         train=facts.value("train", int),
         frame_count=facts.value("frame_count", int),
         seconds=facts.numbers("seconds"),
+        seeing=facts.seeing("seeing"),
     )
     return restoration, RunRecord(
         name=run.value("name", str),

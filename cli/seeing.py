@@ -1,0 +1,114 @@
+"""``turbrestore seeing``: how strong the turbulence in a clip is."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from turbrestore.core.errors import ConfigurationError
+from turbrestore.memory_plan import training_share
+from turbrestore.registration.centroid import CentroidParams, centroid_steps
+from turbrestore.registration.flow import FlowParams
+from turbrestore.runtime.scratch import mean_of
+from turbrestore.runtime.steps import finish, step_counter
+from turbrestore.seeing.strength import Estimate, Seeing, measure_seeing
+from turbrestore.seeing.tilt_theory import Optics
+
+from .inputs import open_input
+from .options import Flag, Machine, Selection
+from .output import print_json
+from .progress import progress_bars
+from .streams import put
+
+
+def seeing(
+    input: Path,
+    /,
+    *,
+    pixel_scale: float | None = None,
+    aperture: float | None = None,
+    distance: float | None = None,
+    wavelength: float = 550e-9,
+    path: Literal["spherical", "plane"] = "spherical",
+    train: int | None = None,
+    selection: Annotated[Selection, Parameter(name="*")] = Selection(),
+    json: Flag = False,
+    quiet: Flag = False,
+    machine: Annotated[Machine, Parameter(name="*")] = Machine(),
+    centroid: CentroidParams = CentroidParams(),
+    flow: FlowParams = FlowParams(),
+) -> None:
+    """Measure how strong the turbulence in a clip is.
+
+    Parameters
+    ----------
+    input : Path
+        Video.
+    pixel_scale : float
+        Angle of a pixel, rad.  With it and the aperture D/r0 and r0 are reported.
+    aperture : float
+        Diameter of the aperture, m.
+    distance : float
+        From the aperture to the scene, m.  With it Cn² is reported too, and D/r0 is much better known.
+    wavelength : float
+        m.
+    path : {"spherical", "plane"}
+        Plane where the scene lies far beyond the turbulence; the distance is then the length of the turbulent path.
+    train : int
+        Frames to use, from the first on.
+    json : bool
+        Print JSON.
+    quiet : bool
+        Print neither progress nor remarks on the input.
+    centroid : CentroidParams
+        Centroid iteration.
+    flow : FlowParams
+        Optical flow.
+    """
+    optics = _optics(pixel_scale, aperture, wavelength, distance, path)
+    source = open_input(input, selection, quiet)
+    runtime = machine.runtime()
+    count = training_share(len(source), source.shape[1:], train)
+    frames = source.read(0, count)
+    with progress_bars(quiet) as progress:
+        steps = centroid_steps(frames, centroid, flow, runtime)
+        found = finish(steps, step_counter(progress, "centroid", count * centroid.iterations))
+    measured = measure_seeing(frames, found.flows, found.image, mean_of(frames), optics, runtime.threads)
+    if json:
+        print_json({"input": str(input), "frames": count, **asdict(measured)})
+    else:
+        put("\n".join(_lines(measured)))
+
+
+def _optics(
+    pixel_scale: float | None,
+    aperture: float | None,
+    wavelength: float,
+    distance: float | None,
+    path: Literal["spherical", "plane"],
+) -> Optics | None:
+    if pixel_scale is None and aperture is None and distance is None:
+        return None
+    if pixel_scale is None or aperture is None:
+        missing = "--pixel-scale" if pixel_scale is None else "--aperture"
+        raise ConfigurationError(f"{missing}: expected it for r0, which needs the angle of a pixel and the aperture")
+    return Optics(pixel_scale, aperture, wavelength, distance, path)
+
+
+def _lines(seeing: Seeing) -> list[str]:
+    lines = [
+        f"{name.replace('_', ' '):<26}{_words(estimate, unit)}"
+        for name, (estimate, unit) in seeing.estimates().items()
+        if estimate is not None
+    ]
+    if seeing.displacement_variance is not None:
+        lines.append(f"{'wind direction':<26}{seeing.wind_direction:.0f}° from right downwards")
+        lines.append(f"{'independent frames':<26}{seeing.independent_frames:.1f}")
+    return [*lines, *(f"remark: {remark}" for remark in seeing.remarks)]
+
+
+def _words(estimate: Estimate, unit: str) -> str:
+    return f"{estimate.value:.3g} ({estimate.low:.3g} to {estimate.high:.3g}) {unit}".rstrip()

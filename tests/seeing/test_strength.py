@@ -1,0 +1,103 @@
+"""Strength of the turbulence on small synthetic clips, and the remarks."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+import turbrestore
+from turbrestore.io.video import write_video
+from turbrestore.registration.centroid import Centroid, find_centroid
+from turbrestore.seeing.strength import Seeing, measure_seeing
+from turbrestore.seeing.tilt_theory import Optics
+from turbrestore.synthesis.anisoplanatic import phase_screen_frames
+from turbrestore.synthesis.atmosphere import PhaseScreenParams
+from turbrestore.synthesis.scenes import resolution_chart
+from turbrestore.synthesis.smooth_flow import distort, smooth_flows
+from turbrestore_cli.application import run as run_command
+
+OPTICS = Optics(2.75e-6, aperture=0.1, distance=2000.0)
+STRENGTH, CN2 = 2.0, 3.56e-15
+
+
+@pytest.fixture(scope="module")
+def clip() -> tuple[np.ndarray, Centroid]:
+    params = PhaseScreenParams(d_over_r0=STRENGTH, wind=(4.0,), wind_direction=(30.0,))
+    made = phase_screen_frames(resolution_chart(96, 96), 32, np.random.default_rng(5), params)
+    frames = np.stack([frame.image for frame in made])
+    return frames, find_centroid(frames)
+
+
+def measure(clip, **kwargs) -> Seeing:
+    frames, centroid = clip
+    return measure_seeing(frames, centroid.flows, centroid.image, frames.mean(axis=0), **kwargs)
+
+
+def test_strength_of_a_known_path(clip):
+    seeing = measure(clip, optics=OPTICS)
+    assert seeing.d_over_r0.value == pytest.approx(STRENGTH, rel=0.15)
+    assert seeing.d_over_r0.low < STRENGTH < seeing.d_over_r0.high
+    assert seeing.cn2.low < CN2 < seeing.cn2.high
+    assert seeing.r0.value == pytest.approx(0.1 / seeing.d_over_r0.value)
+    assert seeing.rotation < 0.3
+    assert abs((seeing.wind_direction - 30 + 90) % 180 - 90) < 25
+    # By blur and by flow the same, within the errors.
+    assert seeing.displacement_by_blur.value == pytest.approx(seeing.displacement_by_flow.value, rel=0.25)
+    assert not seeing.remarks
+
+
+def test_without_a_distance_the_interval_is_wide_and_without_optics_there_is_no_strength(clip):
+    far = measure(clip, optics=Optics(2.75e-6, aperture=0.1))
+    assert far.cn2 is None
+    assert far.d_over_r0.low < STRENGTH < far.d_over_r0.high
+    assert far.d_over_r0.high / far.d_over_r0.low > 1.5
+    plain = measure(clip)
+    assert plain.d_over_r0 is None and plain.r0 is None and plain.displacement_variance is not None
+
+
+def test_displacements_without_the_form_of_tilt_have_no_r0():
+    rng = np.random.default_rng(0)
+    frames = distort(resolution_chart(96, 96), smooth_flows(24, 96, 96, rng), rng, blur=0.7, noise=0.01)
+    seeing = measure((frames, find_centroid(frames)), optics=OPTICS)
+    assert seeing.d_over_r0 is None
+    assert any("rotates as much as it diverges" in remark for remark in seeing.remarks)
+
+
+def test_a_mean_that_is_blurred_more_than_the_flow_explains_is_remarked(clip):
+    frames, centroid = clip
+    mean = cv2.GaussianBlur(frames.mean(axis=0), (0, 0), 2.0)
+    (remark,) = measure_seeing(frames, centroid.flows, centroid.image, mean).remarks
+    assert "motion that the flow has missed" in remark
+    (remark,) = measure_seeing(frames, centroid.flows, centroid.image, centroid.image).remarks
+    assert "more motion than the mean shows" in remark
+
+
+def test_a_still_clip_says_that_nothing_moves():
+    frames = np.repeat(resolution_chart(64, 64)[None], 4, axis=0)
+    seeing = measure_seeing(frames, np.zeros((4, 64, 64, 2), np.float32), frames[0], frames[0], OPTICS)
+    assert seeing.displacement_variance is None and "too little structure or motion" in seeing.remarks[0]
+
+
+def test_a_restoration_has_it_and_keeps_it(clip, tmp_path):
+    restoration = turbrestore.restore(clip[0], turbrestore.RestoreParams(until="centroid"))
+    assert restoration.seeing is not None
+    assert [decision.choice for decision in restoration.decisions if decision.subject == "displacement"] == [
+        "by blur as by flow"
+    ]
+    turbrestore.save_run(tmp_path / "run", restoration, turbrestore.RunRecord("clip", clip[0][0]))
+    assert turbrestore.load_run(tmp_path / "run")[0].seeing == restoration.seeing
+
+
+def test_the_command_prints_every_value_with_its_interval(clip, tmp_path, capsys):
+    video = tmp_path / "clip.mkv"
+    write_video(video, clip[0], 30.0)
+    words = ["seeing", str(video), "--pixel-scale=2.75e-6", "--aperture=0.1", "--distance=2000", "--quiet"]
+    assert run_command([*words, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    for name in ("d_over_r0", "r0", "cn2", "displacement_variance", "displacement_by_blur"):
+        assert printed[name]["low"] < printed[name]["value"] < printed[name]["high"]
+    assert run_command(words) == 0
+    assert "d over r0" in capsys.readouterr().out
+    assert run_command(["seeing", str(video), "--aperture=0.1", "--quiet"]) == 2
+    assert "--pixel-scale" in capsys.readouterr().err
