@@ -1,5 +1,7 @@
 """Clips as people record them come out as well as under steady light, at full scale, and with nobody in the way."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from turbrestore.core.errors import DataError
 from turbrestore.footage.bars import without_bars
 from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.light import steady_light
-from turbrestore.footage.overlays import without_overlay
+from turbrestore.footage.overlays import read_static_mask, without_overlay
+from turbrestore.io.images import write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
@@ -126,6 +129,27 @@ class TestOverlays:
         covered[:, 40, 20:60] = 255
         params = RestoreParams(until="centroid", static_mask="off")
         assert "overlay" not in subjects(restore(FrameSource.from_array(covered), params))
+
+    def test_given_as_a_file(self, shaken, tmp_path):
+        covered, mask = shaken.copy(), np.zeros((112, 112), np.float32)
+        covered[:, 40:44, 20:60] = np.random.default_rng(0).integers(0, 255, (24, 4, 40))
+        mask[40:44, 20:60] = 1
+        write_image(tmp_path / "mask.png", mask, 8)
+        params = replace(FUSED, static_mask=str(tmp_path / "mask.png"))
+        whole, found = restored(shaken), restore(FrameSource.from_array(covered), params)
+        assert [decision.reason for decision in found.decisions if decision.subject == "overlay"] == ["asked for"]
+        assert compare(found.image[22:90, 22:90], whole.image[22:90, 22:90]).psnr > 30
+
+    def test_a_file_of_the_wrong_size_or_without_marks_is_refused(self, shaken, tmp_path):
+        source = FrameSource.from_array(shaken).select(roi=(10, 20, 60, 50))
+        for name, mask in (("small", np.ones((40, 60))), ("black", np.zeros((112, 112))), ("white", np.ones((50, 60)))):
+            write_image(tmp_path / f"{name}.png", mask.astype(np.float32), 8)
+            with pytest.raises(DataError, match=rf"{name}.png: expected .*, found (60×40|none|all of them)"):
+                read_static_mask(tmp_path / f"{name}.png", source)
+        mask = np.zeros((112, 112), np.float32)
+        mask[25, 12] = 1
+        write_image(tmp_path / "file.png", mask, 8)
+        assert np.argwhere(read_static_mask(tmp_path / "file.png", source)).tolist() == [[5, 2]]
 
     def test_scenes_have_none(self, shaken, clip):
         for frames in (shaken, u8(clip.frames), u8(0.2 + 0 * clip.frames[:1] + 0.3 * clip.frames)):

@@ -23,7 +23,7 @@ from .footage.bars import without_bars
 from .footage.frame_selection import best_frames, frame_quality
 from .footage.levels import Levels, stretch_levels
 from .footage.light import steady_light
-from .footage.overlays import without_overlay
+from .footage.overlays import read_static_mask, without_overlay
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan, plan_memory
@@ -112,7 +112,9 @@ def restore(
     Raises
     ------
     DataError
-        Too few, too small, damaged or constant frames.
+        Too few, too small, damaged or constant frames, or a static mask of another size.
+    InputNotFoundError
+        The static mask does not exist.
     ConfigurationError
         More training frames than frames, a device that is not there, or a memory limit that cannot be kept.
     StorageError
@@ -139,9 +141,11 @@ def restore(
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
     begun = time.perf_counter()
+    automatic = params.static_mask in ("auto", "off")
+    mask = None if automatic else read_static_mask(params.static_mask, source)
     # Before the light, because a stop would be taken for bands of it.
     source, bars, on_bars = without_bars(source)
-    source, on_overlay = without_overlay(source) if params.static_mask == "auto" else (source, ())
+    source, on_overlay = without_overlay(source, mask) if params.static_mask != "off" else (source, ())
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, plan.train)
     stretched, kept = _stretched_params(params, levels), store or NoStore()

@@ -20,7 +20,6 @@ from .registration.opencv_flow import DisParams
 
 STAGES = ("centroid", "identify", "filter", "deconvolve")
 BORDERS = ("keep", "crop")
-STATIC_MASKS = ("auto", "off")
 _ALL = Share(1)
 
 Preset = Literal["fast", "standard", "paper"]
@@ -41,9 +40,9 @@ class RestoreParams:
         Lucky imaging: the share of the frames, the sharpest ones, from which the image is made, such as 0.3 or 30%.
     border : {"keep", "crop"}
         Keep the border, where fewer frames show the scene, or crop it to what nine frames in ten show.
-    static_mask : {"auto", "off"}
-        Whether what stands in the frame while the scene moves (a field stop, a reticle, a clock) is replaced by the
-        scene behind it.
+    static_mask : str
+        What stands in the frame while the scene moves (a field stop, a reticle, a clock) is replaced by the scene
+        behind it: auto finds it, off leaves it, and else it is the path of an image that is not black there.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -72,7 +71,7 @@ class RestoreParams:
     until: Literal["centroid", "identify", "filter", "deconvolve"] = "deconvolve"
     keep_best: Share = _ALL
     border: Literal["keep", "crop"] = "keep"
-    static_mask: Literal["auto", "off"] = "auto"
+    static_mask: str = "auto"
     flow: FlowParams = field(default_factory=FlowParams)
     centroid: CentroidParams = field(default_factory=CentroidParams)
     dynamics: DynamicsParams = field(default_factory=DynamicsParams)
@@ -88,10 +87,7 @@ class RestoreParams:
             self.until == STAGES[-1] or self.deconvolution.sigma is None,
             f"deconvolution.sigma: has no effect with until = {self.until}; leave one of them out",
         )
-        require(
-            self.static_mask in STATIC_MASKS,
-            f"static_mask: expected one of {', '.join(STATIC_MASKS)}, found {self.static_mask!r}",
-        )
+        require(self.static_mask != "", "static_mask: expected auto, off or the path of an image, found an empty text")
         check_share(self.keep_best)
         require(
             self.keep_best == 1 or self.until in STAGES[2:],

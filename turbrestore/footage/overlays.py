@@ -14,6 +14,7 @@ of the scene.  Flow, fusion and deconvolution then see the scene alone.
 from __future__ import annotations
 
 import dataclasses
+import os
 from dataclasses import dataclass
 
 import cv2
@@ -22,7 +23,9 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
+from ..core.errors import DataError
 from ..core.noise import estimate_noise
+from ..io.images import read_image
 from ..io.source import FrameSource, Window
 from ..registration.global_shift import global_shifts
 
@@ -84,12 +87,57 @@ class Overlay:
         return replaced
 
 
-def without_overlay(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
+def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArray[np.bool_]:
+    """Read which pixels of the frames do not show the scene.
+
+    Parameters
+    ----------
+    path : path-like
+        Image of the size of the frames, or of the frames in the file if ``source`` is a region of them; pixels that are
+        not black do not show the scene.
+    source : FrameSource
+
+    Returns
+    -------
+    ndarray, bool, shape (H, W)
+
+    Raises
+    ------
+    InputNotFoundError, StorageError
+        The file does not exist, or cannot be read.
+    DataError
+        No image, of another size, or all of it black or none.
+
+    Examples
+    --------
+    >>> read_static_mask("none.png", FrameSource.from_array(np.zeros((2, 16, 16))))
+    Traceback (most recent call last):
+    turbrestore.core.errors.InputNotFoundError: none.png: no such file or folder
+    """
+    image = read_image(path).image
+    marked: NDArray[np.bool_] = luminance(image) > 0
+    size = source.shape[1:3]
+    if marked.shape != size and all(side >= part.stop for side, part in zip(marked.shape, source.window, strict=True)):
+        marked = marked[source.window]
+    if marked.shape != size:
+        found = f"{marked.shape[1]}×{marked.shape[0]}"
+        raise DataError(f"{path}: expected a mask of {size[1]}×{size[0]} pixels, as the frames, found {found}")
+    if marked.all() or not marked.any():
+        what = "all of them" if marked.all() else "none"
+        raise DataError(f"{path}: expected white where the frames do not show the scene, found {what} white")
+    return marked
+
+
+def without_overlay(
+    source: FrameSource, mask: NDArray[np.bool_] | None = None
+) -> tuple[FrameSource, tuple[Decision, ...]]:
     """Replace what stands in the frames while the scene moves; a source without it is returned as it is.
 
     Parameters
     ----------
     source : FrameSource
+    mask : ndarray, bool, shape (H, W), optional
+        Pixels that are replaced; by default they are looked for.
 
     Returns
     -------
@@ -110,13 +158,13 @@ def without_overlay(source: FrameSource) -> tuple[FrameSource, tuple[Decision, .
     >>> bool(cleaned.read()[5].max() < 0.9), found.subject
     (True, 'overlay')
     """
-    if not 3 <= len(source) <= _MOST:
-        return source, ()
-    mask = _standing(source)
+    given = mask is not None
+    if mask is None and 3 <= len(source) <= _MOST:
+        mask = _standing(source)
     if mask is None:
         return source, ()
     shifts = _shifts_of(source, mask)
-    if float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _LEAST_MOTION:
+    if not given and float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _LEAST_MOTION:
         return source, ()
     overlay = _overlay(source, mask, np.rint(shifts).astype(int))
     before = source.adjust
@@ -125,7 +173,7 @@ def without_overlay(source: FrameSource) -> tuple[FrameSource, tuple[Decision, .
         return overlay.without(number, values if before is None else before(number, values, window), window)
 
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show there"
-    reason = "it stands while the scene moves"
+    reason = "asked for" if given else "it stands while the scene moves"
     if overlay.hidden >= _REPORTED:
         reason += f"; {100 * overlay.hidden:.1f} % is shown by no frame, and is filled from around"
     decision = Decision("overlay", choice, reason)

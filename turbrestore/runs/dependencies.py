@@ -6,16 +6,18 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
+from ..io.limits import input_errors
 from ..io.source import FrameSource
 from ..memory_plan import MemoryPlan
 from ..settings import RestoreParams
-from .digests import content_digest
+from .digests import content_digest, file_digest
 from .run_record import versions
 
 # Raised where the same frames and settings begin to give another image.
-_RESULTS = 8
+_RESULTS = 9
 
 
 def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryPlan) -> dict[str, dict[str, Any]]:
@@ -55,7 +57,7 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
             **({} if plan.tile is None else {"tile": plan.tile}),
             "region": [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start],
             "device": plan.runtime.device,
-            "static_mask": settings["static_mask"],
+            "static_mask": _mask_digest(params.static_mask),
             "flow": settings["flow"],
             "centroid": settings["centroid"],
             "versions": versions(),
@@ -86,6 +88,14 @@ def filter_key(facts: dict[str, dict[str, Any]]) -> str:
     """
     parts = [facts[stage] for stage in ("centroid", "dynamics", "filtered")]
     return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def _mask_digest(mask: str) -> str:
+    """Return the setting of the mask, or the checksum of its file."""
+    if mask in ("auto", "off"):
+        return mask
+    with input_errors(Path(mask)):
+        return file_digest(Path(mask))
 
 
 def _span(numbers: Sequence[int]) -> list[int]:
