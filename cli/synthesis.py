@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,6 +28,7 @@ from turbrestore.runtime.steps import Progress, step_counter
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.dynamic_texture import DynamicTextureParams, synthesize_like
+from turbrestore.synthesis.moving_objects import MovingObject, draw_objects, with_objects
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.sequence import (
     CameraParams,
@@ -43,6 +45,8 @@ from .progress import progress_bars, say
 
 # Endings of the names of the files written beside the video.
 VIDEO, TRUTH, DIFFRACTION, FLOW, PARAMETERS = "", ".truth.png", ".truth_diffraction.png", ".flow.npy", ".json"
+# Written with moving objects only.
+FRAMES_TRUTH, MASK = ".truth.mkv", ".mask.mkv"
 CENTROID = "centroid"
 MOST_FRAMES = 1_000_000
 SIGN = "before blur truth(x, y) = frame(x + dx, y + dy), pixels; mean over the exposure"
@@ -50,13 +54,14 @@ SIGN = "before blur truth(x, y) = frame(x + dx, y + dy), pixels; mean over the e
 
 @dataclass(frozen=True, eq=False)
 class Synthesis:
-    """Content of the output: the truths, the frames and their number, and the parameters."""
+    """Content of the output: the truths, the frames and their number, the objects, and the parameters."""
 
     truth: FloatArray
     diffraction: FloatArray | None
     frames: Iterator[SyntheticFrame]
     count: int
     record: dict[str, Any]
+    objects: tuple[MovingObject, ...] = ()
 
 
 def synthesize(
@@ -68,6 +73,7 @@ def synthesize(
     frames: int = 120,
     seed: int = 0,
     size: str | None = None,
+    moving: int = 0,
     strength: Literal["weak", "medium", "strong"] | None = None,
     like: Path | None = None,
     train: int | None = None,
@@ -82,6 +88,7 @@ def synthesize(
     """Make a turbulent video of a scene, with the truth, the true flow and all parameters beside it.
 
     Beside clip.mkv lie clip.truth.png, clip.flow.npy, clip.json and, for phase screens, clip.truth_diffraction.png.
+    With moving objects, clip.truth.mkv has the truth of every frame, and clip.mask.mkv shows where the objects are.
 
     Parameters
     ----------
@@ -98,6 +105,8 @@ def synthesize(
         Seed of the random numbers; the same seed gives the same bytes.
     size : str
         Width and height of an included scene, as ``256x256``, the default.
+    moving : int
+        Number of objects that move on straight paths in front of the scene, behind the air of phase screens.
     strength : {"weak", "medium", "strong"}
         D/r0 of 1.2, 2.5 or 5, in place of ``--d-over-r0``, ``--r0`` or ``--cn2``.
     like : Path
@@ -124,7 +133,7 @@ def synthesize(
     require(seed >= 0, f"--seed: expected a whole number from 0, found {seed}")
     inputs = [item for item in (None if scene in (*SCENES, CENTROID) else Path(scene), like) if item is not None]
     check_output(output, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
-    outputs = _outputs(output, model == "phase-screen")
+    outputs = _outputs(output, model == "phase-screen", moving > 0)
     for name in outputs.values():
         check_output(name, inputs, overwrite, suffixes=None)
     rng = np.random.default_rng(seed)
@@ -133,22 +142,27 @@ def synthesize(
             require(like is None and train is None, "--like, --train: have no effect on phase screens; leave them out")
             idle = dynamic_texture == DynamicTextureParams()
             require(idle, "--dynamic-texture: has no effect on phase screens; leave it out")
-            made = _through_screens(_scene(scene, size, limits), frames, rng, _with_strength(path, strength), camera)
+            truth = _scene(scene, size, limits)
+            # Their generator is another one, so that the air is that of a clip without objects.
+            objects = draw_objects(moving, truth.shape, np.random.default_rng([seed, 1]))
+            made = _through_screens(truth, frames, rng, _with_strength(path, strength), camera, objects)
         else:
+            require(moving == 0, "--moving: has no effect with --model dynamic-texture; leave it out")
             require(strength is None, "--strength: has no effect with --model dynamic-texture; leave it out")
             require(
                 path == PhaseScreenParams(),
                 "--model dynamic-texture: has no path and no optics; leave their options out",
             )
-            truth = None if scene == CENTROID and size is None else _scene(scene, size, limits)
+            given = None if scene == CENTROID and size is None else _scene(scene, size, limits)
             made = _like_a_clip(
-                _training_frames(like, train, limits), truth, frames, rng, dynamic_texture, camera, progress
+                _training_frames(like, train, limits), given, frames, rng, dynamic_texture, camera, progress
             )
         request = {"scene": scene, "model": model, "like": None if like is None else str(like), "seed": seed}
         facts = _write(outputs, made, camera, request, step_counter(progress, "synthesize", frames))
-    if overwrite and DIFFRACTION not in outputs:
-        # The file of an earlier run would not belong to this one.
-        output.with_name(output.stem + DIFFRACTION).unlink(missing_ok=True)
+    if overwrite:
+        # Files of an earlier run would not belong to this one.
+        for ending in {DIFFRACTION, FRAMES_TRUTH, MASK} - set(outputs):
+            output.with_name(output.stem + ending).unlink(missing_ok=True)
     if json:
         print_json({**facts, "output": str(output)})
     else:
@@ -156,9 +170,10 @@ def synthesize(
         say(f"{output}: {frames} frames, flow of {along_x:.2f} and {along_y:.2f} pixels along x and y", quiet)
 
 
-def _outputs(output: Path, has_diffraction: bool) -> dict[str, Path]:
+def _outputs(output: Path, has_diffraction: bool, has_objects: bool) -> dict[str, Path]:
     """Files to write by the endings of their names; that of the video is empty."""
-    endings = (TRUTH, *([DIFFRACTION] if has_diffraction else []), FLOW, PARAMETERS)
+    optional = ([DIFFRACTION] if has_diffraction else []) + ([FRAMES_TRUTH, MASK] if has_objects else [])
+    endings = (TRUTH, *optional, FLOW, PARAMETERS)
     return {VIDEO: output, **{ending: output.with_name(output.stem + ending) for ending in endings}}
 
 
@@ -196,7 +211,12 @@ def _with_strength(path: PhaseScreenParams, strength: str | None) -> PhaseScreen
 
 
 def _through_screens(
-    scene: FloatArray, count: int, rng: np.random.Generator, path: PhaseScreenParams, camera: CameraParams
+    scene: FloatArray,
+    count: int,
+    rng: np.random.Generator,
+    path: PhaseScreenParams,
+    camera: CameraParams,
+    objects: tuple[MovingObject, ...],
 ) -> Synthesis:
     derived = {
         "r0": path.fried,
@@ -205,9 +225,11 @@ def _through_screens(
         "expected_flow_rms": path.tilt_rms(),
         "layers": [dataclasses.asdict(layer) for layer in path.path()],
     }
-    frames = phase_screen_frames(scene, count, rng, path, camera)
-    facts = {"path": dataclasses.asdict(path), "derived": derived}
-    return Synthesis(scene, diffraction_limited(scene, path), frames, count, facts)
+    frames = phase_screen_frames(scene, count, rng, path, camera, objects=objects)
+    facts: dict[str, Any] = {"path": dataclasses.asdict(path), "derived": derived}
+    if objects:
+        facts["objects"] = [dataclasses.asdict(item) for item in objects]
+    return Synthesis(scene, diffraction_limited(scene, path), frames, count, facts, objects)
 
 
 def _like_a_clip(
@@ -249,6 +271,10 @@ def _write(
         staged = {ending: folder / path.name for ending, path in outputs.items()}
         flow_rms = _write_frames(staged[VIDEO], staged[FLOW], made, camera, count)
         write_image(staged[TRUTH], made.truth, bit_depth=16)
+        if made.objects:
+            shown = [partial(with_objects, made.truth, made.objects, number) for number in range(made.count)]
+            write_video(staged[FRAMES_TRUTH], (draw()[0] for draw in shown), camera.frame_rate, 16)
+            write_video(staged[MASK], (draw()[1].astype(np.float32) for draw in shown), camera.frame_rate)
         if made.diffraction is not None:
             write_image(staged[DIFFRACTION], made.diffraction, bit_depth=16)
         facts = {

@@ -73,6 +73,24 @@ def test_phase_screens_write_video_truth_flow_and_parameters(run, tmp_path):
     assert printed == record
 
 
+def test_moving_objects_have_a_truth_and_a_mask_for_every_frame(run, tmp_path):
+    output = tmp_path / "a.mkv"
+    assert run("chart", output, *QUICK, "--moving", "2")[0] == 0
+    sides = {"a.truth.png", "a.truth_diffraction.png", "a.flow.npy", "a.json", "a.truth.mkv", "a.mask.mkv"}
+    assert names(tmp_path) == {"a.mkv", *sides}
+    truth, mask = (open_frames(tmp_path / f"a.{ending}.mkv").read() for ending in ("truth", "mask"))
+    background = read_image(tmp_path / "a.truth.png").image
+    assert truth.shape == mask.shape == (3, 64, 80)
+    assert set(np.unique(mask)) == {0.0, 1.0}
+    for frame, moving in zip(truth, mask, strict=True):
+        beyond = cv2.dilate(moving, np.ones((3, 3))) == 0
+        assert np.allclose(frame[beyond], background[beyond], atol=1e-4)
+        assert np.abs(frame - background)[moving > 0].mean() > 0.05
+    assert len(json.loads((tmp_path / "a.json").read_text())["objects"]) == 2
+    assert run("chart", output, *QUICK, "--overwrite")[0] == 0
+    assert names(tmp_path) == {"a.mkv", *sides} - {"a.truth.mkv", "a.mask.mkv"}
+
+
 @pytest.mark.parametrize("suffix", ["npy", "mkv"])
 def test_the_same_seed_writes_the_same_bytes(run, tmp_path, suffix):
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):

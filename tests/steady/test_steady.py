@@ -10,6 +10,8 @@ import skimage.data
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.runtime.runtime import Runtime
+from turbrestore.steady.dewarping import measure_flow
+from turbrestore.steady.memory import remember
 from turbrestore.steady.settings import SteadyParams
 from turbrestore.steady.video import steady_frames
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
@@ -51,6 +53,71 @@ def test_frames_of_a_still_scene_come_nearer_to_the_truth(camera):
     gains = [psnr(ours, scene) - psnr(seen, scene) for ours, seen in pairs]
     assert np.mean(gains) > 3
     assert min(gains) > 1.5
+
+
+class TestMemory:
+    """Frames that have been dewarped, with displacements that are left over."""
+
+    @staticmethod
+    def remembered(frames, flows, stillness=1.0, moving=None):
+        memory, still = None, np.zeros(frames[0].shape, bool)
+        for number, (frame, flow) in enumerate(zip(frames, flows, strict=True)):
+            mask = still if moving is None else moving[number]
+            memory = remember(memory, frame, lambda *_, flow=flow: flow, 0.02, 2.0, stillness, mask)
+        return memory
+
+    def test_noise_falls_as_in_a_mean_of_all_frames(self):
+        scene, rng = photo(size=64), np.random.default_rng(0)
+        frames = [(scene + rng.normal(0, 0.02, scene.shape)).astype(np.float32) for _ in range(32)]
+        memory = self.remembered(frames, np.zeros((32, 64, 64, 2), np.float32))
+        assert 24 < memory.held.mean() <= 32
+        assert np.std(memory.image - scene) < 1.3 * 0.02 / np.sqrt(32)
+
+    def test_geometry_is_the_mean_of_all_frames(self):
+        # A scene that is the first frame, then one pixel to the right of it for good: the mean lies 5/6 to the right.
+        scene = cv2.GaussianBlur(photo(size=72), (0, 0), 2.0)
+        first, later = scene[:, 4:68], scene[:, 3:67]
+        memory = remember(None, first, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool))
+        for _ in range(5):
+            memory = remember(memory, later, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool))
+        shift = np.median(measure_flow(first, memory.image)[8:-8, 8:-8, 0])
+        assert abs(shift - 5 / 6) < 0.1
+
+    def test_what_has_changed_passes_at_once(self):
+        scene = photo(size=64)
+        changed = scene.copy()
+        changed[20:44, 20:44] = 1 - changed[20:44, 20:44]
+        frames = [scene] * 12 + [changed]
+        memory = self.remembered(frames, np.zeros((13, 64, 64, 2), np.float32))
+        inside, beyond = np.s_[24:40, 24:40], np.s_[:10]
+        assert np.abs(memory.image - changed)[inside].mean() < 0.01
+        assert memory.held[inside].mean() < 1.5
+        assert memory.held[beyond].min() > 12
+
+    def test_nothing_is_held_where_something_moves_or_the_camera_does(self):
+        frames, flows = [photo(size=64)] * 6, np.zeros((6, 64, 64, 2), np.float32)
+        moving = np.zeros((6, 64, 64), bool)
+        moving[:, :32] = True
+        memory = self.remembered(frames, flows, moving=moving)
+        assert memory.held[:24].max() < 1.1
+        assert memory.held[-16:].min() > 5
+        assert self.remembered(frames, flows, stillness=0.0).held.max() == 1
+
+    def test_an_object_is_not_held_back_by_the_memory(self):
+        # The flow follows the object, and draws the flat background beside it along.
+        frames, flows, masks = [], [], []
+        for number in range(8):
+            frame, flow, mask = (np.zeros((64, 96, *size), np.float32) + 0.5 for size in ((), (2,), ()))
+            left = 20 + 2 * number
+            frame[24:40, left : left + 16] = photo(size=16)
+            mask[24:40, left : left + 16] = 1
+            flow[...] = 0
+            flow[16:48, left - 8 : left + 24, 0] = 2
+            frames.append(frame)
+            flows.append(flow)
+            masks.append(mask > 0.5)
+        memory = self.remembered(frames, flows, moving=masks)
+        assert psnr(memory.image, frames[-1], masks[-1]) > 30
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ n : number of frames that the memory holds, for every pixel (:mod:`turbrestore.s
 the same for every frame, so it adds no flicker.  λ follows the contrast and the noise; a floor of the noise stands for
 what noise does not explain, registration that differs from frame to frame and video compression.
 
-What is remembered has averaged that out: there a second filter has a lower floor and a width of its own, and the result
-is ``u_1 + (1 − 1/√n) (u_2 − u_1)``.
+What is remembered has averaged that out: there a second filter has a lower floor, and the result is
+``u_1 + (1 − 1/√n) (u_2 − u_1)``.
 """
 
 from __future__ import annotations
@@ -34,17 +34,15 @@ _MARGIN = 6.0
 
 
 def deblur(
-    image: FloatArray, widths: tuple[float, float], exponent: float, noise: tuple[float, float], held: FloatArray
+    image: FloatArray, sigma: float, exponent: float, noise: tuple[float, float], held: FloatArray
 ) -> FloatArray:
     """Remove a blur from an image by linear filters.
 
     Parameters
     ----------
     image : ndarray, float32, shape (H, W) or (H, W, 3)
-    widths : tuple of float
-        Width of the blur, pixels, that is removed from a frame and from what is remembered; 0 removes none.
-    exponent : float
-        Shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`.
+    sigma, exponent : float
+        Width, pixels, and shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`; a width of 0 removes none.
     noise : tuple of float
         Standard deviation of the noise of a frame and of what is remembered, intensity.
     held : ndarray, float32, shape (H, W)
@@ -58,24 +56,24 @@ def deblur(
     --------
     >>> edge = np.repeat(np.float32([[0.2, 0.8]]), 16, 1).repeat(8, 0)
     >>> soft = cv2.GaussianBlur(edge, (0, 0), 1.0)
-    >>> sharp = deblur(soft, (1.0, 1.0), 2.0, (0.0, 0.0), np.ones((8, 32), np.float32))
+    >>> sharp = deblur(soft, 1.0, 2.0, (0.0, 0.0), np.ones((8, 32), np.float32))
     >>> bool(np.ptp(sharp[4, 14:18]) > np.ptp(soft[4, 14:18]))
     True
     """
-    if max(widths) == 0:
+    if sigma == 0:
         return image
     height, width = image.shape[:2]
-    margin = min(int(np.ceil(_MARGIN * max(widths))), height - 1, width - 1)
+    margin = min(int(np.ceil(_MARGIN * sigma)), height - 1, width - 1)
     padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
     shape = fft.next_fast_len(padded.shape[0], real=True), fft.next_fast_len(padded.shape[1], real=True)
     below, right = shape[0] - padded.shape[0], shape[1] - padded.shape[1]
     padded = cv2.copyMakeBorder(padded, 0, below, 0, right, cv2.BORDER_REPLICATE)
     planes = fft.rfft2(padded[None] if image.ndim == 2 else np.moveaxis(padded, -1, 0))
+    power, otf, laplacian = _transfer(shape, sigma, exponent)
     contrast, inner = float(image.std()), np.s_[:, margin : margin + height, margin : margin + width]
 
     def filtered(kind: int) -> FloatArray:
         fidelity = max(_FIDELITY * contrast / float(np.hypot(noise[kind], _LEAST_NOISE[kind])), 1.0)
-        power, otf, laplacian = _transfer(shape, widths[kind], exponent)
         return fft.irfft2(planes * (fidelity * otf / (fidelity * power + laplacian)), shape)[inner].astype(np.float32)
 
     result = filtered(0)
@@ -85,7 +83,7 @@ def deblur(
     return result[0] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(result, 0, -1))
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=2)
 def _transfer(shape: tuple[int, int], sigma: float, exponent: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """B², B and L."""
     otf = blur_otf(shape, sigma, exponent)

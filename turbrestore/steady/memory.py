@@ -5,7 +5,8 @@ Symbols
 F : frame k, dewarped and fused within its window
 Z : memory; n : number of frames that it holds, for every pixel, so that its variance is that of a frame over n
 R : flow from Z to F; A its affine part; r = R − A
-w : agreement of ``F ∘ (id + R)`` with Z (:mod:`turbrestore.steady.fusion`), less where r is more than turbulence
+w : agreement of ``F ∘ (id + R)`` with Z (:mod:`turbrestore.steady.fusion`), less where r is more than turbulence, 0 in
+    objects that move (:mod:`turbrestore.steady.motion`)
 g : gain, 1 over the number of frames since the memory began, at least 1/n_max
 s : stillness of the camera, 0 to 1
 
@@ -31,6 +32,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..registration.flow_algebra import invert_flow
@@ -42,6 +44,12 @@ from .fusion import agreement_weight
 _LONGEST = 64
 # Windows, pixels, in which |r|² is averaged, and from which r is filled in.
 _WINDOW, _SURROUNDINGS = 4.0, 12.0
+# Margin of what moves, and its soft edge, pixels.
+_MARGIN, _MARGIN_EDGE = np.ones((5, 5), np.uint8), 1.5
+# Window in which an object draws the flow of a flat background along.
+_BESIDE = np.ones((25, 25), np.uint8)
+# Least weight of the surroundings that a flow is filled in from; with less it fades.
+_LEAST_WEIGHT = 0.05
 # Stillness below which nothing is remembered.
 _LEAST_STILLNESS = 0.1
 
@@ -72,6 +80,7 @@ def remember(
     noise: float,
     largest: float,
     stillness: float,
+    moving: NDArray[np.bool_],
 ) -> Memory:
     """Take a frame into the memory; the image of the memory is then the estimate of this frame.
 
@@ -89,6 +98,8 @@ def remember(
         c, pixels.
     stillness : float
         s.
+    moving : ndarray, bool, shape (H, W)
+        Where something moves against the scene.
 
     Returns
     -------
@@ -98,7 +109,8 @@ def remember(
     --------
     >>> one, other = np.full((9, 9), 0.5, np.float32), np.full((9, 9), 0.51, np.float32)
     >>> none = lambda first, second: np.zeros((9, 9, 2), np.float32)
-    >>> memory = remember(remember(None, one, none, 0.01, 1.0, 1.0), other, none, 0.01, 1.0, 1.0)
+    >>> settings = none, 0.01, 1.0, 1.0, np.zeros((9, 9), bool)
+    >>> memory = remember(remember(None, one, *settings), other, *settings)
     >>> round(float(memory.image[4, 4]), 4), round(float(memory.held[4, 4]), 1)
     (0.5053, 1.9)
     """
@@ -111,7 +123,11 @@ def remember(
     own = flow - affine
     weight = agreement_weight(sample_linear((image,), flow), memory.image, noise)
     weight /= 1 + (cv2.GaussianBlur(np.einsum("yxc,yxc->yx", own, own), (0, 0), _WINDOW) / largest**2) ** 2
-    own = _filled(own, weight)
+    # R follows a slow object from frame to frame, and would hold it back, and with it the flat background beside it.
+    near = cv2.dilate(moving.astype(np.uint8), _MARGIN) > 0
+    weight *= 1 - cv2.GaussianBlur(near.astype(np.float32), (0, 0), _MARGIN_EDGE)
+    trusted = np.where(cv2.dilate(near.astype(np.uint8), _BESIDE) > 0, 0, weight)
+    own = _filled(own, trusted)
     held = 1 + weight * np.minimum(memory.held, _LONGEST - 1)
     innovation = warp(image, own + affine) - memory.image
     estimate = memory.image + innovation / (held if image.ndim == 2 else held[..., None])
@@ -124,6 +140,6 @@ def remember(
 
 def _filled(flow: FloatArray, weight: FloatArray) -> FloatArray:
     """Replace a flow by that of its surroundings where its weight is small."""
-    total = cv2.GaussianBlur(weight, (0, 0), _SURROUNDINGS) + 1e-3
+    total = cv2.GaussianBlur(weight, (0, 0), _SURROUNDINGS) + _LEAST_WEIGHT
     around = cv2.GaussianBlur(flow * weight[..., None], (0, 0), _SURROUNDINGS) / total[..., None]
     return np.asarray(around + weight[..., None] * (flow - around), np.float32)

@@ -33,7 +33,7 @@ from .memory import Memory, remember
 from .settings import SteadyParams
 from .windows import iter_windows
 
-# Share of the estimated width that is removed where little is remembered: on the two videos of docs/steady.md, a width
+# Share of the estimated width that is removed: on the two videos of docs/steady.md, a width
 # too small by 15 % costs 0.1 dB, one too large by as much 0.4 dB, and estimates are too large by up to a third.
 _CAUTION = 0.8
 
@@ -103,16 +103,16 @@ def steady_frames(
     head = list(islice(windows, params.reach // 2 + 1))
     if not head:
         return
-    if params.sigma is None:
-        width = estimate_blur(dewarp_frame(head[-1], params).image, runtime=runtime).removable
-        widths = _CAUTION * width, width
-    else:
-        widths = params.sigma, params.sigma
+    sigma = params.sigma
+    if sigma is None:
+        # Of the shape that is removed: a width is that of one shape.
+        middle = dewarp_frame(head[-1], params)
+        sigma = _CAUTION * estimate_blur(middle.image, exponent=KOLMOGOROV, runtime=runtime).removable
     scenes = _Scenes(params)
     yield from map_in_turns(
         lambda window: dewarp_frame(window, params),
         lambda frame: (frame, scenes.estimate(frame)),
-        lambda pair: _sharpened(*pair, widths),
+        lambda pair: _sharpened(*pair, sigma),
         chain(head, windows),
         runtime.threads,
     )
@@ -132,7 +132,7 @@ class _Scenes:
             self._memory = None
         image, moving = self._locked(frame) if self._lock else (frame.image, frame.moving)
         stillness = 1.0 if self._lock else camera_stillness(frame.cameras, moving.shape)
-        self._memory = remember(self._memory, image, measure_flow, frame.noise, frame.largest, stillness)
+        self._memory = remember(self._memory, image, measure_flow, frame.noise, frame.largest, stillness, moving)
         return self._memory, moving
 
     def _locked(self, frame: DewarpedFrame) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -154,18 +154,16 @@ class _Scenes:
         return warp(frame.image, flow), sample_linear((frame.moving.astype(np.float32),), flow) > 0.5
 
 
-def _sharpened(
-    frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_]], widths: tuple[float, float]
-) -> SteadyFrame:
+def _sharpened(frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_]], sigma: float) -> SteadyFrame:
     memory, moving = estimate
     noise = frame.noise * frame.share
     remembered = noise / float(np.sqrt(memory.held.mean()))
     return SteadyFrame(
         number=frame.number,
-        image=deblur(memory.image, widths, KOLMOGOROV, (noise, remembered), memory.held),
+        image=deblur(memory.image, sigma, KOLMOGOROV, (noise, remembered), memory.held),
         moving=moving,
         displacement=frame.displacement,
-        sigma=widths[1],
+        sigma=sigma,
         starts_scene=frame.starts_scene,
     )
 

@@ -25,7 +25,7 @@ they are mixtures.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -39,6 +39,7 @@ from ..core.errors import require
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_ahead, one_thread_each
 from .atmosphere import PhaseScreenParams
+from .moving_objects import MovingObject, with_objects
 from .phase_screen import Turbulence, draw_turbulence, tilt_flow
 from .pupil import (
     ComplexArray,
@@ -64,6 +65,7 @@ def phase_screen_frames(
     params: PhaseScreenParams | None = None,
     camera: CameraParams | None = None,
     runtime: Runtime = DEFAULT,
+    objects: Sequence[MovingObject] = (),
 ) -> Iterator[SyntheticFrame]:
     """Generate frames of a scene seen through turbulence.
 
@@ -81,6 +83,9 @@ def phase_screen_frames(
         Timing and noise.
     runtime : Runtime, optional
         ``threads`` frames are computed side by side; their number does not change the frames.
+    objects : sequence of MovingObject
+        Objects in front of the scene, behind the air; they stand still during an exposure.
+        :func:`turbrestore.synthesis.moving_objects.with_objects` has the truth of a frame.
 
     Returns
     -------
@@ -105,7 +110,7 @@ def phase_screen_frames(
     params, camera = params or PhaseScreenParams(), camera or CameraParams()
     truth = check_scene(scene)
     require(count >= 1, f"count: expected at least 1 frame, found {count}")
-    return _frames(truth, count, rng, params, camera, runtime)
+    return _frames(truth, count, rng, params, camera, runtime, tuple(objects))
 
 
 def diffraction_limited(scene: ArrayLike, params: PhaseScreenParams | None = None) -> FloatArray:
@@ -151,6 +156,7 @@ class _View:
     pupil: Pupil
     camera: CameraParams
     scene: FloatArray
+    objects: tuple[MovingObject, ...]
     margin: int
     columns: Float64Array
     rows: Float64Array
@@ -169,16 +175,23 @@ def _frames(
     params: PhaseScreenParams,
     camera: CameraParams,
     runtime: Runtime,
+    objects: tuple[MovingObject, ...],
 ) -> Iterator[SyntheticFrame]:
     with one_thread_each():
-        view = _prepare(truth, rng, params, camera)
+        view = _prepare(truth, rng, params, camera, objects)
     # Each frame has a generator of its own, so its noise does not depend on the threads.
     seeds = rng.integers(2**63, size=(count, 2))
     for _, frame in map_ahead(partial(_frame, view, seeds), range(count), runtime.threads):
         yield frame
 
 
-def _prepare(truth: FloatArray, rng: np.random.Generator, params: PhaseScreenParams, camera: CameraParams) -> _View:
+def _prepare(
+    truth: FloatArray,
+    rng: np.random.Generator,
+    params: PhaseScreenParams,
+    camera: CameraParams,
+    objects: tuple[MovingObject, ...],
+) -> _View:
     height, width = truth.shape[:2]
     turbulence = draw_turbulence(params, (height, width), rng)
     pupil = sample_pupil(turbulence)
@@ -199,7 +212,8 @@ def _prepare(truth: FloatArray, rng: np.random.Generator, params: PhaseScreenPar
         turbulence,
         pupil,
         camera,
-        cv2.copyMakeBorder(truth, margin, margin, margin, margin, cv2.BORDER_REFLECT_101),
+        truth,
+        objects,
         margin,
         columns,
         rows,
@@ -216,8 +230,10 @@ def _frame(view: _View, seeds: NDArray[np.int64], number: int) -> SyntheticFrame
     rate = view.camera.frame_rate
     drifts = [view.turbulence.drift((number + share) / rate) for share in view.camera.sub_frame_shares()]
     flows = (tilt_flow(view.turbulence, view.columns, view.rows, drift) for drift in drifts)
-    image, flow = exposed_frame(view.scene, flows, lambda displaced, index: _blurred(view, displaced, drifts[index]))
-    inside = slice(view.margin, -view.margin)
+    scene, margin = with_objects(view.scene, view.objects, number)[0], view.margin
+    padded = cv2.copyMakeBorder(scene, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
+    image, flow = exposed_frame(padded, flows, lambda displaced, index: _blurred(view, displaced, drifts[index]))
+    inside = slice(margin, -margin)
     seen = record(image, view.camera, np.random.default_rng(seeds[number]))
     return SyntheticFrame(seen, np.ascontiguousarray(flow[inside, inside]))
 
