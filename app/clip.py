@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
     from turbrestore.io.source import FrameSource
 
+# Frames of the longest clip that is measured, and shown in a strip, when it is opened.
+LOOKED_THROUGH = 600
+
 
 @dataclass(frozen=True)
 class Clip:

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import TYPE_CHECKING
 
 from nicegui import events, ui
 
+from turbrestore.core.arrays import FloatArray, from_unit
+from turbrestore.display.preview import data_uri, encode_image, shrink
+
+from .clip import LOOKED_THROUGH
 from .elements import set_most
 from .job import one_line
 from .pictures import LONGEST
@@ -14,10 +19,13 @@ from .pictures import LONGEST
 if TYPE_CHECKING:
     from turbrestore.io.source import Roi
 
+    from .clip import Clip
     from .page import Page
 
 # Smaller rectangles are clicks, pixels of the clip.
 _SMALLEST = 16
+# Frames of the strip, and their longest side, pixels.
+_IN_STRIP, _SMALL = 8, 160
 
 
 class ClipView:
@@ -42,6 +50,7 @@ class ClipView:
                     on_mouse=self._mouse, events=["mousedown", "mousemove", "mouseup"], sanitize=False
                 ).props("id=frame")
                 self._image.visible = False
+            self._strip = ui.element("div").classes("strip").props('role=group aria-label="Frames of the clip"')
             with ui.element("div").classes("fields") as self._below:
                 ui.label("Frame").classes("what")
                 self._scrubber = ui.slider(min=0, max=1, value=0, on_change=self._scrubbed).classes("grow")
@@ -63,6 +72,21 @@ class ClipView:
         self._scrubber.value = len(clip.source) // 2
         await self._show(len(clip.source) // 2)
         self.draw(None)
+        await self._fill_strip(clip)
+
+    async def _fill_strip(self, clip: Clip) -> None:
+        """Show small frames of all times; each leads to its frame."""
+        self._strip.clear()
+        if len(clip.source) > LOOKED_THROUGH:
+            return
+        pictures = await asyncio.to_thread(_thumbnails, clip)
+        if clip is not self._page.tab.clip:
+            return
+        with self._strip:
+            for number, picture in pictures.items():
+                button = ui.button(on_click=partial(self._scrubber.set_value, number)).props("flat dense")
+                with button.props(f'aria-label="Frame {number}"'):
+                    ui.html(f'<img src="{picture}" alt="">', sanitize=False)
 
     def draw(self, roi: Roi | None) -> None:
         """Draw the region, or none."""
@@ -131,3 +155,14 @@ class ClipView:
             self._page.tell(one_line(error))
         finally:
             self._busy = False
+
+
+def _small(frame: FloatArray) -> str:
+    return data_uri(encode_image(from_unit(shrink(frame, _SMALL), 8)))
+
+
+def _thumbnails(clip: Clip) -> dict[int, str]:
+    """Encode small frames, by their numbers."""
+    count = len(clip.source)
+    step = max(1, -(-count // _IN_STRIP))
+    return {start: _small(clip.frame(start)) for start in range(step // 2, count, step)}

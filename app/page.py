@@ -13,6 +13,7 @@ from nicegui import ui
 
 from turbrestore.report.comparison import text_file
 
+from .clip import Clip
 from .clip_view import ClipView
 from .compare_view import CompareView
 from .folders import printable
@@ -42,9 +43,7 @@ class Page:
         self.tune_view, self.save_view = TuneView(self), SaveView(self)
 
     async def show(self, file: Path | None) -> None:
-        """Build the page, and open a file once it is seen."""
-        _add_styles_and_scripts()
-        ui.colors(primary="#0b6f8c")
+        """Build the page, and open a file once it is seen; a tab that was loaded again goes on with its clip."""
         with ui.element("div").classes("app"):
             with ui.element("header").classes("bar"):
                 ui.html("turbrestore", tag="h1", sanitize=False)
@@ -59,7 +58,9 @@ class Page:
                     view.build()
         self._refresh()
         ui.timer(_BEAT, self._look)
-        if file is not None:
+        if self.tab.clip is not None:
+            ui.timer(0, self._go_on, once=True)
+        elif file is not None:
             ui.timer(0, lambda: self.open(file.absolute()), once=True)
 
     async def open(self, path: Path) -> None:
@@ -70,15 +71,31 @@ class Page:
                 clip = await asyncio.to_thread(self.tab.open, path)
             finally:
                 self._busy.text = ""
-            self._name.text = printable(clip.name)
-            self.open_view.opened()
-            self.save_view.opened()
-            self.tune_view.opened()
             self.compare_view.clear()
-            self.look_at("clip")
-            self._refresh()
-            await self.clip_view.opened()
-            await self.run_view.opened()
+            await self._opened(clip)
+
+    async def _opened(self, clip: Clip) -> None:
+        self._name.text = printable(clip.name)
+        self.open_view.opened()
+        self.save_view.opened()
+        self.tune_view.opened()
+        self.look_at("clip")
+        self._refresh()
+        await self.clip_view.opened()
+        await self.run_view.opened()
+
+    async def _go_on(self) -> None:
+        """Show again what a page that was loaded anew had open; a run that is at work or has ended is followed."""
+        clip, restored = self.tab.clip, self.tab.restored
+        assert clip is not None
+        with self.catching():
+            await self._opened(clip)
+            if restored is not None:
+                self.run_view.take_over(restored.order)
+                self.tune_view.take_over(restored.order)
+                await self.compare_view.show_result(restored)
+                await self.tune_view.restored()
+                self._refresh()
 
     def look_at(self, what: str) -> None:
         """Show the frames of the clip (``clip``), or the images of the stages (``compare``)."""
@@ -144,9 +161,10 @@ class Page:
             await self.ended()
 
 
-def _add_styles_and_scripts() -> None:
+def add_styles_and_scripts() -> None:
+    """Put into the head of the page what all its parts need; to be called before the browser has the page."""
     here = files(__package__)
-    styles = text_file("compare.css") + here.joinpath("page.css").read_text("utf-8")
+    styles = text_file("palette.css") + text_file("compare.css") + here.joinpath("page.css").read_text("utf-8")
     script = here.joinpath("page.js").read_text("utf-8")
     ui.add_css(styles)
     ui.add_head_html(f"<script>const mountCompare = () => {{{text_file('compare.js')}}};\n{script}</script>")

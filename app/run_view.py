@@ -8,7 +8,7 @@ import html
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from nicegui import ui
+from nicegui import events, ui
 
 from turbrestore.core.errors import require
 from turbrestore.footage.frame_selection import Share, best_frames
@@ -16,6 +16,7 @@ from turbrestore.settings import PRESETS
 from turbrestore_cli.options import Selection
 from turbrestore_cli.progress import TITLES
 
+from .clip import LOOKED_THROUGH
 from .elements import set_most
 from .job import Job
 from .restoring import Order
@@ -30,10 +31,16 @@ if TYPE_CHECKING:
 
 _SIDES = ("x", "y", "width", "height")
 _STATES = {"running": "at work …", "stopped": "stopped", "failed": "failed"}
-# Longer clips would take too long to be measured when they are opened.
-_MEASURED = 600
 # Sides of the graph of the quality, in units of its own.
 _GRAPH = (300, 60)
+# Height of the pointer in the graph while a button is held, as a share.
+_LEVEL = """(event) => {
+  const graph = event.currentTarget.querySelector("svg");
+  if (!graph || !event.buttons) return;
+  event.preventDefault();
+  const box = graph.getBoundingClientRect();
+  emit(Math.min(Math.max(1 - (event.clientY - box.y) / box.height, 0), 1));
+}"""
 
 
 class RunView:
@@ -65,10 +72,12 @@ class RunView:
                 self._frames_text = ui.label("").classes("value")
             with ui.element("div").classes("fields"):
                 ui.label("Keep best").classes("what")
-                self._keep = ui.slider(min=5, max=100, step=5, value=100, on_change=self._kept).classes("grow q-mx-sm")
+                self._keep = ui.slider(min=1, max=100, step=1, value=100, on_change=self._kept).classes("grow q-mx-sm")
                 self._keep.props('aria-label="Share of the frames to keep, percent"')
                 self._keep_text = ui.label("100 %").classes("value")
             self._graph = ui.html("", sanitize=False)
+            for event in ("pointerdown", "pointermove"):
+                self._graph.on(event, self._dragged, throttle=0.05, js_handler=_LEVEL)
             with ui.element("div").classes("fields"):
                 ui.label("Preset").classes("what")
                 self._preset = ui.toggle(list(PRESETS), value="standard").props('dense no-caps aria-label="Preset"')
@@ -96,7 +105,7 @@ class RunView:
         self._clear()
         self._state.text = ""
         self._show_buttons(running=False)
-        if len(clip.source) <= _MEASURED:
+        if len(clip.source) <= LOOKED_THROUGH:
             self._quality = await asyncio.to_thread(clip.quality)
         self._draw_quality()
 
@@ -109,6 +118,14 @@ class RunView:
         """Take over a region that was drawn."""
         for number, value in zip(self._roi, roi or (None,) * 4, strict=True):
             number.value = value
+
+    def take_over(self, order: Order) -> None:
+        """Fill the fields by what a run had."""
+        start, stop, _ = order.selection.frame_range() or (None, None, None)
+        if start is not None and stop is not None:
+            self._frames.value = {"min": start, "max": stop}
+        self.set_region(order.selection.region())
+        self._keep.value = round(100 * order.params.keep_best)
 
     def region(self) -> Roi | None:
         """Return the region in the fields; None if they are not all filled."""
@@ -177,8 +194,16 @@ class RunView:
         self._keep_text.text = f"{self._keep.value:.0f} %"
         self._draw_quality()
 
+    def _dragged(self, event: events.GenericEventArguments) -> None:
+        """Keep the frames above a level to which the line was dragged."""
+        first, last = self._range()
+        if self._quality is None or last > len(self._quality) or first >= last:
+            return
+        above = self._quality[first:last] >= float(event.args) * self._quality.max()
+        self._keep.value = max(1, round(100 * float(above.mean())))
+
     def _draw_quality(self) -> None:
-        """Draw the sharpness of the frames as bars, with the colour of what is kept."""
+        """Draw the sharpness of the frames as bars, those that are kept in colour, and a line at the least of these."""
         first, last = self._range()
         if self._quality is None or last > len(self._quality) or first >= last:
             self._graph.content = ""
@@ -191,10 +216,12 @@ class RunView:
             f'y="{height - value * scale:.1f}" width="{max(step * 0.8, 0.3):.2f}" height="{value * scale:.1f}"/>'
             for number, value in enumerate(self._quality)
         )
+        level = height - min(self._quality[number] for number in kept) * scale
         label = f"Sharpness of the frames; {len(kept)} of {last - first} are kept"
         self._graph.content = (
             f'<svg class="quality" viewBox="0 0 {width} {height}" preserveAspectRatio="none" role="img" '
-            f'aria-label="{label}">{bars}</svg><p class="note">{label}.</p>'
+            f'aria-label="{label}">{bars}<path class="level" d="M0 {level:.1f}H{width}"/></svg>'
+            f'<p class="note">{label}; drag the line to keep others.</p>'
         )
 
     def _start(self, begin: Callable[[Order], Job]) -> None:

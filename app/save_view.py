@@ -16,7 +16,7 @@ from .saving import Outputs, check_outputs, command_line, save
 if TYPE_CHECKING:
     from .page import Page
 
-_DEPTHS: dict[int | None, str] = {None: "as the clip", 8: "8 bits", 16: "16 bits", 32: "float, TIFF"}
+_DEPTHS: dict[int | None, str] = {None: "as the clip", 8: "8 bits", 16: "16 bits", 32: "float, TIFF and FITS"}
 # Seconds between two looks at a run that is waited for.
 _BEAT = 0.05
 
@@ -37,7 +37,7 @@ class SaveView:
         with ui.element("section") as self.place:
             ui.html('<span class="number">4</span> Save', tag="h2", sanitize=False)
             with ui.element("div").classes("fields"):
-                self._path = ui.input("Image, .png or .tif", on_change=self.refresh).props("dense outlined")
+                self._path = ui.input("Image, .png, .tif or .fits", on_change=self.refresh).props("dense outlined")
                 self._path.classes("grow")
             with ui.element("div").classes("fields"):
                 self._depth = ui.select(_DEPTHS, label="Depth", value=None, on_change=self.refresh)

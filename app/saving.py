@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from turbrestore.io.images import write_image
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore_cli.options import Machine
-from turbrestore_cli.output import repeating_command, settings_record, write_settings
+from turbrestore_cli.output import repeating_command, settings_record, write_result, write_settings
 
 from .restoring import Order, Restored
 
@@ -23,7 +22,7 @@ class Outputs:
     Parameters
     ----------
     image : Path
-        .png or .tif.
+        .png, .tif or .fits.
     bit_depth : int, optional
         8, 16 or 32; that of the clip by default.
     report : bool
@@ -105,14 +104,15 @@ def save(restored: Restored, outputs: Outputs, name: Path, shown: Path) -> list[
     check_outputs(outputs, restored.order.path)
     record = settings_of(restored.order, outputs.bit_depth)
     depth = restored.source.bit_depth if outputs.bit_depth is None else outputs.bit_depth
-    write_image(outputs.image, restored.restoration.image, depth, overwrite=outputs.overwrite)
+    command = repeating_command(name, shown, record)
+    write_result(outputs.image, restored.restoration, restored.source, depth, command, outputs.overwrite)
     write_settings(outputs.settings, record)
     written = [outputs.image, outputs.settings]
     if outputs.report:
         from turbrestore.report import write_report
         from turbrestore.runs.run_record import describe_run
 
-        run = describe_run(restored.source, record, repeating_command(name, shown, record))
+        run = describe_run(restored.source, record, command)
         write_report(outputs.page, restored.restoration, run, overwrite=outputs.overwrite)
         written.append(outputs.page)
     return written

@@ -92,18 +92,30 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     from fastapi import FastAPI, Response
     from nicegui import app, ui
 
-    from .page import Page
+    from .page import Page, add_styles_and_scripts
+
+    # Tab and page of every tab of the browser, which keeps its name when the page is loaded again.
+    shown: dict[str, tuple[Tab, str]] = {}
 
     @ui.page("/", title="turbrestore", reconnect_timeout=_ABSENCE)
     async def page() -> None:
-        tab = Tab(folders)
+        add_styles_and_scripts()
+        client = ui.context.client
+        await client.connected()
+        if client.is_deleted:
+            return
+        name = client.tab_id or client.id
+        tab = shown[name][0] if name in shown else Tab(folders)
+        shown[name] = tab, client.id
         tabs.add(tab)
 
         def leave() -> None:
-            tabs.discard(tab)
-            threading.Thread(target=tab.close).start()
+            if shown[name] == (tab, client.id):
+                del shown[name]
+                tabs.discard(tab)
+                threading.Thread(target=tab.close).start()
 
-        ui.context.client.on_delete(leave)
+        client.on_delete(leave)
         await Page(tab).show(file)
 
     @app.get("/pictures/{key}/{name}", response_class=Response)

@@ -51,7 +51,9 @@ class TuneView:
             ui.html('<span class="number">3</span> Tune', tag="h2", sanitize=False)
             self._sigma, self._sigma_text = self._slider("Width", 0, 6, 0.05, "Width of the blur, pixels")
             self._exponent, self._exponent_text = self._slider("Shape", 1, 2, 0.01, "Shape of the blur, exponent")
-            self._fidelity, self._fidelity_text = self._slider("λ", *_FIDELITIES, 0.02, "Weight of the data, logarithm")
+            self._fidelity, self._fidelity_text = self._slider(
+                "Strength", *_FIDELITIES, 0.02, "Strength, the weight λ of the data, logarithm"
+            )
             self._sigma.on_value_change(self._changed)
             self._exponent.on_value_change(self._changed)
             self._fidelity.on_value_change(self._weighed)
@@ -73,6 +75,12 @@ class TuneView:
         self._params, self._automatic = None, True
         self._border.value = "keep"
         self._page.run_view.show_method(None)
+
+    def take_over(self, order: Order) -> None:
+        """Go on with what a run had."""
+        params = order.params.deconvolution
+        self._params = None if params.sigma is None else params
+        self._border.value = order.params.border
 
     async def restored(self) -> None:
         """Show the settings of a run that has ended."""

@@ -157,7 +157,7 @@ def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
     assert changed[middle + 20 :].any()
     assert not changed[: middle - 20].any()
 
-    page.get_by_label("Image, .png or .tif").fill("saved.png")
+    page.get_by_label("Image, .png, .tif or .fits").fill("saved.png")
     press(page, "Copy command")
     page.get_by_text("The command is copied").wait_for()
     command = shlex.split(page.evaluate("navigator.clipboard.readText()"))
@@ -172,6 +172,56 @@ def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
 
     press(page, "Save")
     page.get_by_role("alert").get_by_text("saved.png").wait_for()
+
+
+def test_frames_are_chosen_by_the_strip_and_the_line(open_tab):
+    page = open_tab()
+    page.locator(".strip button").nth(1).click()
+    page.locator(".view .value").get_by_text("9", exact=True).wait_for()
+    graph = page.locator("svg.quality").bounding_box()
+    page.mouse.move(graph["x"] + 40, graph["y"] + graph["height"] - 1)
+    page.mouse.down()
+    page.mouse.move(graph["x"] + 40, graph["y"] + 0.4 * graph["height"], steps=4)
+    page.mouse.up()
+    note = page.get_by_text("are kept; drag the line")
+    page.wait_for_function("!document.body.innerText.includes('48 of 48 are kept')")
+    page.wait_for_timeout(300)
+    kept = int(re.search(r"(\d+) of 48", note.inner_text())[1])
+    assert 0 < kept < 40
+    level = page.locator("svg.quality .level").bounding_box()
+    assert abs(level["y"] - graph["y"] - 0.4 * graph["height"]) < 0.2 * graph["height"]
+
+
+def test_a_page_that_is_loaded_again_goes_on(open_tab, app):
+    page = open_tab()
+    draw(page, 0.25, 0.25, 0.5625, 0.6875)
+    page.wait_for_function("document.querySelector('[aria-label=x]').value !== ''")
+    press(page, "Run")
+    page.get_by_text("s left").first.wait_for(timeout=LONG)
+    page.reload()
+    done = page.get_by_text(" pixels from 48 frames in ")
+    done.wait_for(timeout=LONG)
+    words = done.inner_text()
+    page.reload()
+    done.wait_for()
+    assert done.inner_text() == words
+    page.get_by_text("Apply to the whole").wait_for()
+    page.wait_for_function("document.querySelector('[aria-label=x]').value !== ''")
+    page.get_by_label("Image, .png, .tif or .fits").fill("moon.fits")
+    press(page, "Save")
+    page.get_by_text("Saved: moon.fits, moon.fits.toml").wait_for(timeout=LONG)
+    command = shlex.split(page.get_by_label("Command").inner_text())
+    for name in ("moon.fits", "moon.fits.toml"):
+        (app.folder / name).rename(app.temporary / name)
+    try:
+        with contextlib.chdir(app.folder):
+            assert main([*command[1:], "--quiet"]) == 0
+        for name in ("moon.fits", "moon.fits.toml"):
+            assert (app.folder / name).read_bytes() == (app.temporary / name).read_bytes()
+    finally:
+        for folder in (app.folder, app.temporary):
+            for path in folder.glob("moon.fits*"):
+                path.unlink()
 
 
 def test_a_run_is_stopped_and_another_tab_goes_on(open_tab):

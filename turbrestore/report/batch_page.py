@@ -102,7 +102,7 @@ def render_batch(rows: Sequence[ClipRow], folder: str = "") -> str:
     templates = environment()
     from markupsafe import Markup
 
-    style = files(__package__).joinpath("style.css").read_text("utf-8")
+    style = "".join(files(__package__).joinpath(name).read_text("utf-8") for name in ("palette.css", "style.css"))
     template = templates.from_string(files(__package__).joinpath("batch.html").read_text("utf-8"))
     counts = {state: sum(row.state == state for row in rows) for state in ("done", "failed", "planned")}
     links = {row.output: Path(row.output).name for row in rows}
