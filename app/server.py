@@ -102,9 +102,10 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
         add_styles_and_scripts()
         client = ui.context.client
         await client.connected()
-        if client.is_deleted:
+        name = client.tab_id
+        # The browser may have left before it had the page.
+        if name is None:
             return
-        name = client.tab_id or client.id
         tab = shown[name][0] if name in shown else Tab(folders)
         shown[name] = tab, client.id
         tabs.add(tab)
