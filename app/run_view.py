@@ -125,7 +125,7 @@ class RunView:
         if start is not None and stop is not None:
             self._frames.value = {"min": start, "max": stop}
         self.set_region(order.selection.region())
-        self._keep.value = round(100 * order.params.keep_best)
+        self._keep.value, self._preset.value = round(100 * order.params.keep_best), order.preset
 
     def region(self) -> Roi | None:
         """Return the region in the fields; None if they are not all filled."""

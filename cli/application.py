@@ -27,6 +27,7 @@ COMMANDS = {
     "centroid": ("stages:centroid", "Find the centroid of a video."),
     "flow": ("stages:flow", "Measure the flow from one image to every frame of a video."),
     "identify": ("stages:identify", "Identify the dynamics of flows."),
+    "predict": ("stages:predict", "Predict a frame from the one before, and compare it with what was measured."),
     "filter": ("stages:filter_", "Filter a video with known centroid and dynamics."),
     "deconvolve": ("stages:deconvolve", "Deblur an image."),
     "synthesize": ("synthesis:synthesize", "Make a turbulent video with known truth and flow."),

@@ -7,6 +7,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "restore": (
         "turbrestore restore sample_data/chart.mkv sharp.png",
         "turbrestore restore sample_data/chart.mkv part.png --frames 0:24 --roi 64,32,96,96 --sigma 1.2",
+        "turbrestore restore sample_data/chart.mkv quick.png --preset fast",
         "turbrestore restore sample_data/chart.mkv again.png --config sharp.png.toml",
         "turbrestore restore sample_data/chart.mkv all.png --keep stages --truth sample_data/chart_truth.png --json",
         "turbrestore restore sample_data/chart.mkv later.png --keep kept --resume",
@@ -26,7 +27,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "centroid": ("turbrestore centroid sample_data/chart.mkv centroid.npz --train 40",),
     "flow": ("turbrestore flow centroid.npz sample_data/chart.mkv flows.npy --flow.method farneback",),
-    "identify": ("turbrestore identify centroid.npz dynamics.npz",),
+    "identify": (
+        "turbrestore identify centroid.npz dynamics.npz",
+        "turbrestore identify centroid.npz other.npz --plot prediction.png --dynamics.rank 20",
+    ),
+    "predict": ("turbrestore predict sample_data/chart.mkv centroid.npz dynamics.npz predicted.png",),
     "filter": ("turbrestore filter sample_data/chart.mkv centroid.npz dynamics.npz filtered.npz",),
     "deconvolve": (
         "turbrestore deconvolve filtered.npz deblurred.png --guide centroid.npz",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from cyclopts import Parameter
@@ -12,24 +13,32 @@ from turbrestore.blind.guards import GuardParams
 from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.core.errors import require
 from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
+from turbrestore.display.plots import new_figure, plot_images, plot_prediction
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.dynamics.dynamic_texture import identify as identify_flows
-from turbrestore.dynamics.flow_model import FlowDynamics
+from turbrestore.dynamics.flow_model import FlowDynamics, predict_flow, project_deviation
+from turbrestore.dynamics.prediction import PredictionStudy, flow_error, study_prediction
 from turbrestore.filtering.alternating import Filtered, FilterParams, FilterStep, filter_steps
 from turbrestore.io.images import read_image, write_image
-from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, check_output, check_space
+from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, atomic_write, check_output, check_space
 from turbrestore.io.pixels import check_depth
 from turbrestore.memory_plan import training_share
 from turbrestore.registration.centroid import Centroid, CentroidParams, centroid_steps
-from turbrestore.registration.flow import FlowParams, iterate_flows
+from turbrestore.registration.flow import FlowParams, estimate_flow, iterate_flows
+from turbrestore.registration.flow_algebra import invert_flow
+from turbrestore.registration.warp import warp
 from turbrestore.runs.stage_files import load_artifact, load_flows, save_artifact, save_flows
 from turbrestore.runtime.steps import finish, step_counter
 
 from .inputs import open_input, read_guide, read_input_image
 from .options import Flag, Machine, Selection, known_sigma, limits_of
+from .output import print_json
 from .progress import progress_bars, say
 
-STAGE_FILE = (".npz",)
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+STAGE_FILE, PICTURE = (".npz",), (".png",)
 
 
 def centroid(
@@ -54,7 +63,7 @@ def centroid(
     output : Path
         Stage file to write, .npz; it holds the flows as well.
     train : int
-        Frames to use, from the first on.
+        Frames to use, from the first on; all that --frames names, or by default as many as restore trains on.
     centroid : CentroidParams
         Centroid iteration.
     flow : FlowParams
@@ -66,7 +75,8 @@ def centroid(
     """
     check_output(output, [input], overwrite, STAGE_FILE)
     source = open_input(input, selection, quiet)
-    count = training_share(len(source), source.shape[1:], train)
+    wanted = len(source) if train is None and selection.frames is not None else train
+    count = training_share(len(source), source.shape[1:], wanted)
     check_space(output, _flow_bytes(count, source.shape) + _image_bytes(source.shape))
     with progress_bars(quiet) as progress:
         steps = centroid_steps(source.read(0, count), centroid, flow, machine.runtime())
@@ -124,6 +134,7 @@ def identify(
     output: Path,
     /,
     *,
+    plot: Path | None = None,
     dynamics: DynamicsParams = DynamicsParams(),
     machine: Annotated[Machine, Parameter(name="*")] = Machine(),
     overwrite: Flag = False,
@@ -137,6 +148,9 @@ def identify(
         Centroid stage file (.npz), or flows (.npy).
     output : Path
         Stage file to write, .npz.
+    plot : Path
+        Picture to write, .png: error of one-step prediction, and eigenvalues, by length of the training and number of
+        states (Figure 7 of the paper).  Needs matplotlib.
     dynamics : DynamicsParams
         Dynamic texture of the flow.
     overwrite : bool
@@ -145,6 +159,9 @@ def identify(
         No remarks.
     """
     check_output(output, [flows], overwrite, STAGE_FILE)
+    if plot is not None:
+        check_output(plot, [flows, output], overwrite, PICTURE)
+        new_figure()
     measured = load_flows(flows)
     most = int(len(measured) / dynamics.frames_per_state) if dynamics.rank is None else dynamics.rank
     modes = min(most, dynamics.max_rank if dynamics.rank is None else len(measured))
@@ -152,9 +169,87 @@ def identify(
     check_space(output, _flow_bytes(modes + 1, measured.shape))
     found = identify_flows(measured, dynamics, machine.runtime())
     save_artifact(output, found, overwrite)
+    if plot is not None:
+        _plot_study(plot, study_prediction(measured, dynamics, machine.runtime()), overwrite, quiet)
     for note in found.notes:
         say(f"{output}: {note}", quiet)
     say(f"{output}: {found.rank} states hold {100 * found.energy_share:.0f} % of the motion", quiet)
+
+
+def predict(
+    input: Path,
+    centroid: Path,
+    dynamics: Path,
+    output: Path,
+    /,
+    *,
+    frame: int | None = None,
+    selection: Annotated[Selection, Parameter(name="*")] = Selection(),
+    flow: FlowParams = FlowParams(),
+    machine: Annotated[Machine, Parameter(name="*")] = Machine(),
+    overwrite: Flag = False,
+    json: Flag = False,
+    quiet: Flag = False,
+) -> None:
+    """Predict a frame of a video from the one before, and compare it with what was measured.
+
+    Parameters
+    ----------
+    input : Path
+        Video; its first frames are those that the centroid was found from.
+    centroid : Path
+        Centroid stage file.
+    dynamics : Path
+        Dynamics stage file.
+    output : Path
+        Picture to write, .png: the frame, the predicted one, the centroid, and their differences (Figure 8 of the
+        paper).  Needs matplotlib.
+    frame : int
+        Frame to predict, counted from 0; by default the first after the training.
+    flow : FlowParams
+        Optical flow.
+    overwrite : bool
+        Replace an existing output.
+    json : bool
+        Print the errors as JSON.
+    quiet : bool
+        No remarks.
+    """
+    check_output(output, [input, centroid, dynamics], overwrite, PICTURE)
+    new_figure()
+    start, model = load_artifact(centroid, Centroid), load_artifact(dynamics, FlowDynamics)
+    source = open_input(input, selection, quiet)
+    number = model.frame_count if frame is None else frame
+    require(
+        1 <= number < len(source), f"--frame: expected a frame from 1 to {len(source) - 1} to predict, found {number}"
+    )
+    before, actual = source.read(number - 1, number + 1)
+    last, measured = estimate_flow(start.image, np.stack([before, actual]), flow, machine.runtime())
+    predicted = predict_flow(model, project_deviation(model, last - model.mean_flow))
+    image = warp(start.image, invert_flow(predicted))
+    errors = {
+        "flow": {
+            name: flow_error(found, measured)
+            for name, found in (("predicted", predicted), ("last", last), ("mean", model.mean_flow))
+        },
+        "image": {
+            name: float(np.sqrt(np.mean(np.square(found - actual), dtype=np.float64)))
+            for name, found in (("predicted", image), ("last", before), ("centroid", start.image))
+        },
+    }
+    pictures = {
+        f"frame {number}": actual,
+        "predicted": image,
+        "centroid": start.image,
+        "predicted, difference + 0.5": image - actual + 0.5,
+        "centroid, difference + 0.5": start.image - actual + 0.5,
+    }
+    _write_figure(output, plot_images(pictures), overwrite)
+    if json:
+        print_json({"frame": number, "flow_error": errors["flow"], "image_error": errors["image"]})
+    flows = ", ".join(f"{name} {error:.2f}" for name, error in errors["flow"].items())
+    images = ", ".join(f"{name} {error:.4f}" for name, error in errors["image"].items())
+    say(f"{output}: frame {number}: error of the flow, pixels: {flows}; of the image: {images}", quiet)
 
 
 def filter_(
@@ -267,6 +362,22 @@ def deconvolve(
     _write(output, deblurred.deconvolution, bit_depth, overwrite)
     for decision in deblurred.decisions:
         say(f"{output}: {decision.subject}: {decision.choice} ({decision.reason})", quiet)
+
+
+def _plot_study(plot: Path, study: PredictionStudy, overwrite: bool, quiet: bool) -> None:
+    baselines = {"flow before, repeated": study.repeated, "mean flow": study.mean}
+    figure = plot_prediction(study.lengths, study.ranks, study.errors, study.eigenvalues, baselines)
+    _write_figure(plot, figure, overwrite)
+    row, column = np.unravel_index(np.nanargmin(study.errors), study.errors.shape)
+    best = f"{study.errors[row, column]:.2f} pixels with τ = {study.lengths[row]}, n = {study.ranks[column]}"
+    others = ", ".join(f"{name} {error:.2f}" for name, error in baselines.items())
+    say(f"{plot}: least error of {study.count} predicted flows {best}; {others}", quiet)
+
+
+def _write_figure(path: Path, figure: Figure, overwrite: bool) -> None:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=130, facecolor="white")
+    atomic_write(path, buffer.getvalue(), overwrite)
 
 
 def _flow_bytes(count: int, shape: tuple[int, ...]) -> int:

@@ -14,6 +14,8 @@ from conftest import make_sequence
 from turbrestore.io.images import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.pipeline import restore
+from turbrestore.registration.centroid import Centroid
+from turbrestore.runs.stage_files import load_artifact
 from turbrestore.settings import PRESETS
 from turbrestore_cli.__main__ import main
 
@@ -171,6 +173,37 @@ class TestRestore:
         with np.load(e) as filtered:
             assert np.abs(filtered["mean_flow"]).max() > 0.1
         np.testing.assert_allclose(read_image(chain).image, read_image(whole).image, atol=1e-5)
+
+    def test_prediction_is_drawn_and_measured(self, run, clip, tmp_path):
+        # Frames that are named train, all of them; the last is predicted from the one before.
+        assert run("centroid", clip, tmp_path / "c.npz", "--frames", "0:8", "--centroid.iterations", "1")[0] == 0
+        assert load_artifact(tmp_path / "c.npz", Centroid).flows.shape[0] == 8
+        words = ["identify", tmp_path / "c.npz", tmp_path / "d.npz", "--dynamics.rank", "2", "--plot"]
+        code, _, err = run(*words, tmp_path / "study.png")
+        assert code == 0
+        assert "least error of 2 predicted flows" in err
+        words = ["predict", clip, tmp_path / "c.npz", tmp_path / "d.npz", tmp_path / "predicted.png", "--json"]
+        code, out, err = run(*words, "--frame", "7", "--quiet")
+        assert code == 0, err
+        record = json.loads(out)
+        assert set(record["flow_error"]) == {"predicted", "last", "mean"}
+        assert record["image_error"]["predicted"] > 0
+        for name in ("study.png", "predicted.png"):
+            picture = read_image(tmp_path / name).image
+            assert picture.shape[1] > 500
+            # A white background, and something on it.
+            assert picture.max() == 1
+            assert picture.std() > 0.02
+        fails(run(*words, "--overwrite"), 2, "--frame: expected a frame from 1 to 7 to predict, found 8")
+        fails(run(*words[:2], tmp_path / "d.npz", *words[3:], "--overwrite"), 65)
+
+    def test_all_named_frames_are_used(self, run, tmp_path):
+        frames = make_sequence(seed=5, count=50, size=64, rms=0.5).frames
+        clip = frames_clip(tmp_path / "long.mkv", frames)
+        quick = ["--centroid.iterations", "1", "--flow.method", "farneback", "--quiet"]
+        for words, count in (([], 40), (["--frames", "0:50"], 50), (["--frames", "0:50", "--train", "9"], 9)):
+            assert run("centroid", clip, tmp_path / "c.npz", *words, *quick, "--overwrite")[0] == 0
+            assert load_artifact(tmp_path / "c.npz", Centroid).flows.shape[0] == count
 
     @pytest.mark.parametrize("until", ["centroid", "identify", "filter"])
     def test_until(self, run, clip, tmp_path, until):

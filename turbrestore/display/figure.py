@@ -15,6 +15,7 @@ from ..core.errors import ConfigurationError
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.gridspec import SubplotSpec
 
 # Colours of text and axes, of the data that is shown, and of the data it is compared with.
 INK, ACCENT, REST = "#747c87", "#1786a6", "#a3abb5"
@@ -63,10 +64,10 @@ def new_figure(width: float = WIDTH, height: float = HEIGHT) -> Figure:
 
 
 def add_axes(
-    figure: Figure, title: str = "", x: str = "", y: str = "", place: tuple[int, int, int] = (1, 1, 1)
+    figure: Figure, title: str = "", x: str = "", y: str = "", place: tuple[int, int, int] | SubplotSpec = (1, 1, 1)
 ) -> Axes:
-    """Axes with a light grid; ``place`` is rows, columns and number, as matplotlib counts subplots."""
-    axes = figure.add_subplot(*place, facecolor="none")
+    """Axes with a light grid; ``place`` is rows, columns and number, as matplotlib counts subplots, or of a grid."""
+    axes = figure.add_subplot(*(place if isinstance(place, tuple) else (place,)), facecolor="none")
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(REST)
     axes.tick_params(colors=INK, labelsize=FONT, color=REST)

@@ -3,7 +3,7 @@
 from .curves import plot_blur, plot_convergence, plot_filter, plot_frames, plot_objective
 from .figure import new_figure
 from .maps import plot_displacements, plot_flow, plot_images
-from .spectra import plot_dynamics, plot_eigenvalues, plot_singular_values
+from .spectra import plot_dynamics, plot_eigenvalues, plot_prediction, plot_singular_values
 
 __all__ = [
     "new_figure",
@@ -17,5 +17,6 @@ __all__ = [
     "plot_frames",
     "plot_images",
     "plot_objective",
+    "plot_prediction",
     "plot_singular_values",
 ]

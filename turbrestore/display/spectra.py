@@ -5,12 +5,13 @@ Symbols: ξ and C are states and modes of the flow, A the transition, τ the num
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .figure import ACCENT, HEIGHT, INK, REST, WIDTH, add_axes, new_figure, set_labels, use_integer_ticks
+from .figure import ACCENT, FONT, HEIGHT, INK, REST, WIDTH, add_axes, new_figure, set_labels, use_integer_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -102,6 +103,65 @@ def plot_dynamics(singular_values: ArrayLike, eigenvalues: ArrayLike) -> Figure:
     values = np.asarray(eigenvalues, complex)
     _draw_singular_values(add_axes(figure, place=(1, 2, 1)), np.asarray(singular_values, float), values.size)
     _draw_eigenvalues(add_axes(figure, place=(1, 2, 2)), values)
+    return figure
+
+
+def plot_prediction(
+    lengths: ArrayLike,
+    ranks: ArrayLike,
+    errors: ArrayLike,
+    eigenvalues: Sequence[Sequence[ArrayLike]],
+    baselines: Mapping[str, float],
+) -> Figure:
+    """Show the error of one-step prediction over τ for each n, and eigenvalues of A for each τ (paper 3, Figure 7).
+
+    Parameters
+    ----------
+    lengths : array_like, shape (a,)
+        τ.
+    ranks : array_like, shape (b,)
+        n.
+    errors : array_like, shape (a, b)
+        Pixels; NaN leaves a gap.
+    eigenvalues : sequence of sequence of array_like
+        Of A, by τ and n; those of the largest n that a τ has are drawn.
+    baselines : mapping of str to float
+        Errors without a model, pixels, by what is predicted.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> len(plot_prediction([4, 8], [2], [[0.4], [0.3]], [[np.zeros(2)], [np.zeros(2)]], {"last flow": 0.5}).axes)
+    3
+    """
+    taus, values = np.asarray(lengths), np.asarray(errors, float)
+    columns = len(taus)
+    figure = new_figure(0.55 * WIDTH * columns, 2.1 * HEIGHT)
+    grid = figure.add_gridspec(2, columns, height_ratios=(1.25, 1))
+    axes = add_axes(figure, "One-step prediction of flows that were not trained on", "τ", "error, pixels", grid[0, :])
+    count = len(np.asarray(ranks))
+    for number, rank in enumerate(np.asarray(ranks)):
+        axes.plot(taus, values[:, number], color=ACCENT, alpha=0.3 + 0.7 * (number + 1) / count, linewidth=1.4,
+                  marker="os^Dv"[number % 5], markersize=4, label=f"n = {rank}")  # fmt: skip
+    for style, (name, error) in zip(("--", ":", "-."), baselines.items(), strict=False):
+        axes.axhline(error, color=INK, linewidth=0.9, linestyle=style, label=name)
+    axes.set_ylim(bottom=0)
+    axes.legend(fontsize=FONT, frameon=False, labelcolor=INK, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    use_integer_ticks(axes)
+    for number, (tau, of_length) in enumerate(zip(taus, eigenvalues, strict=True)):
+        found = np.asarray(of_length[-1] if of_length else [], complex)
+        panel = add_axes(figure, place=grid[1, number])
+        _draw_eigenvalues(panel, found)
+        set_labels(panel, f"τ = {tau}, n = {found.size}", "real part", "imaginary part" if number == 0 else "")
     return figure
 
 
