@@ -66,6 +66,7 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
         record["filter"] = {
             "image_noise": restoration.filtered.image_noise,
             "motion_share": restoration.filtered.motion_share,
+            "sharpness_weight": restoration.filtered.sharpness_weight,
             "mean_innovation": float(np.nanmean(restoration.filtered.innovations)),
         }
     if restoration.deconvolution is not None:

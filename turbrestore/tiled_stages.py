@@ -36,6 +36,11 @@ from .runtime.tiling import HaloTile, add_tile, cut_tile, new_mosaic
 # to which it has to pickle closures too.  The tasks should be taken as they are needed, because those of the filter
 # hold arrays.
 TileMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
+# Figures of a filtered tile that are joined or averaged.
+_RECORDED = (
+    *("flow_states", "gains", "innovations", "sharpness", "shares"),
+    *("image_noise", "motion_share", "sharpness_weight"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,7 +342,7 @@ def join_filtered(
     >>> one, tiles = np.ones(2), halo_tiles((40, 64), side=44, halo=8)
     >>> images = (np.ones(tile.shape, np.float32) for tile in tiles)
     >>> parts = (
-    ...     Filtered(image, image, one[:, None], one, one, one, one / 2, 1e-4, 1.0, np.dstack([image, image]))
+    ...     Filtered(image, image, one[:, None], one, one, one, one / 2, 1e-4, 1.0, 2.0, np.dstack([image, image]))
     ...     for image in images
     ... )
     >>> joined = join_filtered(parts, tiles, (40, 64))
@@ -351,7 +356,7 @@ def join_filtered(
         add_tile(image, tile, part.image)
         add_tile(variance, tile, part.variance)
         add_tile(mean_flow, tile, part.mean_flow)
-        for name in ("flow_states", "gains", "innovations", "sharpness", "shares", "image_noise", "motion_share"):
+        for name in _RECORDED:
             records.setdefault(name, []).append(np.asarray(getattr(part, name)))
     areas = _areas(tiles)
 
@@ -368,6 +373,7 @@ def join_filtered(
         shares=average("shares"),
         image_noise=float(average("image_noise")),
         motion_share=float(average("motion_share")),
+        sharpness_weight=float(average("sharpness_weight")),
         mean_flow=mean_flow,
     )
 

@@ -3,13 +3,14 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import DataError
-from turbrestore.filtering.frame_noise import frame_noise_variance, invalid_mask
+from turbrestore.filtering.frame_noise import frame_noise_variance, invalid_mask, local_sharpness, project_gradient
 from turbrestore.filtering.frame_statistics import measure_frame_statistics
 from turbrestore.registration.warp import inside
 from turbrestore.runtime.image_stacks import numpy_ops
 
 SHAPE = (200, 210)
 OPS = numpy_ops()
+INSIDE = np.s_[16:-16, 16:-16]
 
 
 def smooth(image, window):
@@ -120,3 +121,40 @@ def test_what_holds_for_all_frames_does_not_depend_on_threads(model_and_frames, 
         assert one.dtype == np.float32
         assert np.array_equal(one, other)
         assert np.ptp(one) > 0
+
+
+def noisy_statistics(scene, blurs, noise):
+    rng = np.random.default_rng(1)
+    frames = [smooth(scene, 1 + blur) + rng.normal(0, noise, SHAPE).astype(np.float32) for blur in blurs]
+    still = np.zeros((len(frames), *SHAPE, 2), np.float32)
+    return frames, measure_frame_statistics(frames, still, smooth(scene, 1.0), np.ones(SHAPE, np.float32))
+
+
+def test_noise_alone_gives_no_sharpness_and_no_weight(model_and_frames):
+    """The variance of the score that noise explains is all that there is where the blur does not change."""
+    _, scene, _ = model_and_frames
+    _, model = noisy_statistics(scene, np.zeros(60), 0.1)
+    assert model.left_out > 0.2
+    assert model.score_variance[INSIDE].mean() < 0.15
+    assert model.sharpness_weight < 0.7
+
+
+def test_the_weight_of_sharpness_falls_with_the_noise(model_and_frames):
+    _, scene, _ = model_and_frames
+    blurs = np.tile([0.0, 0.2, 0.4], 8)
+    models = [noisy_statistics(scene, blurs, noise)[1] for noise in (0.005, 0.1, 0.4)]
+    weights = [model.sharpness_weight for model in models]
+    assert weights[0] == 2.0 > weights[1] > weights[2]
+    assert models[0].left_out == 0.0 < models[1].left_out < models[2].left_out <= 0.25
+
+
+def test_the_score_hardly_knows_the_noise_of_its_own_pixel(model_and_frames):
+    """By Stein's lemma the weights shift a fused pixel by the covariance of its noise with its score."""
+    model, scene, _ = model_and_frames
+    laplacian, rng, shifts = cv2.Laplacian(scene, cv2.CV_32F), np.random.default_rng(1), np.zeros(2)
+    for _ in range(20):
+        noise = rng.normal(0, 1, SHAPE).astype(np.float32)
+        projection = project_gradient(noise, model.template, OPS)
+        scores = [local_sharpness(projection, 3.0, left_out, OPS) for left_out in (0.0, 0.25)]
+        shifts += [-float((noise * score * laplacian)[INSIDE].sum()) for score in scores]
+    assert 0 < shifts[1] < 0.4 * shifts[0]

@@ -7,7 +7,7 @@ Symbols
 W^meas : measured flow (eq. 17); Ŵ estimated flow
 L, M : gains of the image (eq. 16) and of the flow state (eq. 19)
 G : share of the flow outside the subspace of C that is motion and not noise
-β : weight of sharpness
+β : weight of sharpness, given or chosen by :mod:`turbrestore.filtering.frame_statistics`
 
 Given Ŵ the image is a linear state, given ρ the flow is, so each frame updates one after the other:
 
@@ -214,7 +214,7 @@ def filter_steps(
         at = _Position(start.state, start.records, start.reference, deque(), flows_measured)
     del block
     at = yield from _filter_blocks(at, stream, known, params, settings)
-    filtered = join_records(at.state, at.records, image_noise, motion_share)
+    filtered = join_records(at.state, at.records, image_noise, motion_share, settings.sharpness)
     # The paper leaves the image in the geometry of the training frames.
     unmoved = np.zeros_like(filtered.mean_flow)
     return filtered if params.training == "filter" else replace(filtered, mean_flow=unmoved)
@@ -330,7 +330,7 @@ def _settings(
         dynamics=dynamics,
         statistics=backend.load_statistics(statistics),
         motion_share=backend.load(np.stack([share, share], axis=-1)),
-        sharpness=params.sharpness,
+        sharpness=statistics.sharpness_weight if params.sharpness is None else params.sharpness,
         drift=params.image_drift,
         flow=flow_params,
         runtime=runtime,

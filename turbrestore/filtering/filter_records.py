@@ -47,8 +47,9 @@ class FilterParams:
         state of the last of them, and the image stays in their geometry.
     block : int
         Frames whose flows are measured against the same image; 1 is the paper's, more run side by side.
-    sharpness : float
-        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.
+    sharpness : float, optional
+        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.  By default
+        chosen on the first block, at most 2: it falls with the noise.
     sharpness_window : float
         Standard deviation of the window in which sharpness is measured, pixels.
     image_noise : float, optional
@@ -63,7 +64,7 @@ class FilterParams:
     training: Literal["filter", "skip"] = "filter"
     inner_iterations: int = 2
     block: int = 24
-    sharpness: float = 2.0
+    sharpness: float | None = None
     sharpness_window: float = 3.0
     image_noise: float | None = None
     image_drift: float = 0.0
@@ -80,7 +81,8 @@ class FilterParams:
         )
         require_between("inner_iterations", self.inner_iterations, 1, 100)
         require_between("block", self.block, 1, 10_000, "frames")
-        require_between("sharpness", self.sharpness, 0, 10)
+        if self.sharpness is not None:
+            require_between("sharpness", self.sharpness, 0, 10)
         require_between("sharpness_window", self.sharpness_window, 0.3, 100, "pixels")
         if self.image_noise is not None:
             require_between("image_noise", self.image_noise, 1e-12, 1)
@@ -191,6 +193,8 @@ class Filtered:
         Z₀, squared intensity.
     motion_share : float
         G, mean over the pixels; 0 with ``residual="drop"``.
+    sharpness_weight : float
+        β, given or chosen.
     mean_flow : ndarray, float32, shape (H, W, 2)
         Mean of W^meas over all frames that count, less that over the frames with known flows, pixels: how far the
         centroid of those, in whose geometry frames are fused, lies from the mean geometry of all frames.  Both means
@@ -207,6 +211,7 @@ class Filtered:
     shares: np.ndarray
     image_noise: float
     motion_share: float
+    sharpness_weight: float
     mean_flow: FloatArray
 
     def recentred(self) -> Filtered:
@@ -311,7 +316,11 @@ def mean_flow_over(flow_sum: FloatArray, records: Sequence[FrameRecord]) -> Floa
 
 
 def join_records(
-    state: FilterState, records: Sequence[FrameRecord], image_noise: float, motion_share: float
+    state: FilterState,
+    records: Sequence[FrameRecord],
+    image_noise: float,
+    motion_share: float,
+    sharpness_weight: float,
 ) -> Filtered:
     """Join the last state and the records of all frames.
 
@@ -319,7 +328,7 @@ def join_records(
     ----------
     state : FilterState
     records : sequence of FrameRecord
-    image_noise, motion_share : float
+    image_noise, motion_share, sharpness_weight : float
 
     Returns
     -------
@@ -329,7 +338,7 @@ def join_records(
     --------
     >>> flow, pixels = np.zeros((2, 3, 2), np.float32), PixelGaussian(np.zeros((2, 3)), np.ones((2, 3)))
     >>> state = FilterState(pixels, Gaussian(np.zeros(1), np.eye(1)), flow, flow)
-    >>> join_records(state, [FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0)] * 2, 1e-4, 1.0).shares
+    >>> join_records(state, [FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0)] * 2, 1e-4, 1.0, 2.0).shares
     array([0.5, 0.5])
     """
     information = np.array([record.information for record in records])
@@ -345,6 +354,7 @@ def join_records(
         shares=information / information.sum(),
         image_noise=image_noise,
         motion_share=motion_share,
+        sharpness_weight=sharpness_weight,
         mean_flow=mean_flow_over(state.flow_sum, records) - state.training_flow,
     )
 

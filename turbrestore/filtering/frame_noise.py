@@ -5,6 +5,7 @@ Symbols
 Z : variance of a registered frame about the image
 z : local sharpness of a frame, standardised over the frames; β its weight
 v : variance of z over the frames
+κ : share of the middle of the window that z leaves out, see :func:`local_sharpness`
 d : squared deviation of a frame from the mean frame, in units of its usual variance; e = max(d / 6, 1) the excess
 m : 1 where the frame gives no measurement, because the map id + Ŵ folds or leaves the frame
 
@@ -68,6 +69,10 @@ class FrameStatistics:
         Share of the flow outside the flow model that is motion and not noise, 0 to 1.
     window : float
         Standard deviation of the Gaussian window in which sharpness is measured, pixels.
+    left_out : float
+        κ, 0 to 1/4.
+    sharpness_weight : float
+        β for which the noise that the weights add is worth the sharpness that they gain.
     mean_frame : array, float32, shape (H, W)
         Mean luminance of the registered frames without outliers.
     deviation : array, float32, shape (H, W)
@@ -82,6 +87,8 @@ class FrameStatistics:
     score_variance: Stack
     motion_share: Stack
     window: float
+    left_out: float
+    sharpness_weight: float
     mean_frame: Stack
     deviation: Stack
 
@@ -131,7 +138,8 @@ def frame_noise_variance(
     excess = squared_deviation(grey, statistics.mean_frame, statistics.deviation, ops)
     excess = arrays.clip(excess / OUTLIER, 1, None)
     squared = excess * excess
-    score = (smooth(projection, statistics.window, ops) - statistics.mean_sharpness) * statistics.score_scale
+    local = local_sharpness(projection, statistics.window, statistics.left_out, ops)
+    score = (local - statistics.mean_sharpness) * statistics.score_scale
     score = arrays.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)
     # z / e² where z > 0: something other than the scene may have more contrast than the scene.
     score = arrays.minimum(score, score / squared)
@@ -193,6 +201,42 @@ def project_gradient(grey: Stack, template: tuple[Stack, Stack], ops: StackOps) 
     """
     dx, dy = gradient(grey, ops)
     return dx * template[0] + dy * template[1]
+
+
+def local_sharpness(projection: Stack, window: float, left_out: float, ops: StackOps) -> Stack:
+    """Average of the projected gradient in a Gaussian window, of whose middle a share is left out.
+
+    The noise n of a pixel is part of the score of the window around it.  By Stein's lemma the weights ``exp(β z)``
+    therefore shift the fused pixel by ``β cov(n, z)``, whatever the number of frames.  The shift is proportional to the
+    Laplacian of the template: noise is added that looks like sharpness, and a blind estimate of the blur believes it.
+    ``(g_s − κ g_{s/2}) / (1 − κ)`` with κ = 1/4 is zero in the middle, so that the covariance vanishes.
+
+    Parameters
+    ----------
+    projection : array, float32, shape (H, W)
+        From :func:`project_gradient`.
+    window : float
+        s, pixels.
+    left_out : float
+        κ, 0 to 1/4.
+    ops : StackOps
+
+    Returns
+    -------
+    array, float32, shape (H, W)
+
+    Examples
+    --------
+    >>> from turbrestore.runtime.image_stacks import numpy_ops
+    >>> impulse = np.zeros((33, 33), np.float32)
+    >>> impulse[16, 16] = 1
+    >>> [round(float(local_sharpness(impulse, 3.0, kappa, numpy_ops())[16, 16]), 3) for kappa in (0.0, 0.25)]
+    [0.018, 0.0]
+    """
+    whole = smooth(projection, window, ops)
+    if left_out == 0:
+        return whole
+    return (whole - smooth(projection, window / 2, ops) * left_out) / (1 - left_out)
 
 
 def gradient(image: Stack, ops: StackOps) -> tuple[Stack, Stack]:

@@ -5,6 +5,7 @@ Symbols
 Z₀ : variance of a registered frame about the image before sharpness is taken into account (paper 3, eq. 15)
 G : share of the flow outside the model's subspace that is motion and not noise
 R : variance of that flow (eq. 10)
+β : weight of sharpness; κ what its window leaves out, see :func:`turbrestore.filtering.frame_noise.local_sharpness`
 
 Frames are warped three times: some of them for a median, which what passes through the scene does not change, and all
 of them twice: for mean and variance, and once more to leave out what deviates from all others.
@@ -12,7 +13,8 @@ of them twice: for mean and variance, and once more to leave out what deviates f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -39,13 +41,25 @@ _IMAGE_NOISE_FLOOR = 6e-8
 _LEAST_SPREAD = 0.03
 # Share of the mean variance by which every pixel varies at least.
 _LEAST_DEVIATION = 0.1
-# Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels over which such
-# derivatives correlate.
-_SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
 # Frames of which the median is taken, the rows that it is taken of at once, the factor from a median deviation to a
 # standard deviation, and how many times the variance exceeds its robust estimate where something has passed.
 _RESERVOIR, _ROWS, _MEDIAN_DEVIATION, _HEAVY_TAIL = 25, 64, 1.4826, 4.0
+# κ of pure noise, and the least share of noise for which a window without its middle is worth computing.
+_MIDDLE, _LEAST_SHARE = 0.25, 0.05
+# Largest β, the variance of noise that is worth one unit of squared gradient, and steps of the search for β.
+_LARGEST_WEIGHT, _PRICE, _BISECTIONS = 2.0, 10.0, 12
 _OPS = numpy_ops()
+
+
+@dataclass(frozen=True, eq=False)
+class _SharpnessMoments:
+    """Means over the frames of the local sharpness in the whole window and in its middle, variances and covariance."""
+
+    whole: np.ndarray
+    middle: np.ndarray
+    whole_spread: np.ndarray
+    middle_spread: np.ndarray
+    joint: np.ndarray
 
 
 def measure_frame_statistics(
@@ -110,15 +124,14 @@ def measure_frame_statistics(
     variance *= count / max(count - 1, 1)
     mean, variance, passed = _robust_start(frames, flows, mean, variance, int(count))
 
-    def sharpness_of(registered: FloatArray) -> FloatArray:
-        return smooth(project_gradient(registered, template, _OPS), window, _OPS)
-
-    mean_frame, deviation, sharpness, spread = _without_outliers(frames, flows, mean, variance, sharpness_of, threads)
     # The flattest fifth of the image varies by sensor noise alone; elsewhere blur and misregistration add to it.
     square = template[0] ** 2 + template[1] ** 2
     energy = smooth(square, window, _OPS)
     sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
-    scale = _score_scale(sharpness, spread, energy * np.float32(_SOBEL_NOISE * sensor_noise), window)
+    mean_frame, deviation, moments = _without_outliers(frames, flows, mean, variance, template, window, threads)
+    sharpness, spread, explained, left_out = _leave_middle_out(moments, template, energy, sensor_noise, window)
+    scale = _score_scale(sharpness, spread, explained)
+    weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, sensor_noise / count)
     # Near what passes flow is pulled along, and a frame may be sharp without showing the scene.
     scale *= 1 - smooth(passed.astype(np.float32), window, _OPS)
     return FrameStatistics(
@@ -130,6 +143,8 @@ def measure_frame_statistics(
         score_variance=(scale**2 * spread).astype(np.float32),
         motion_share=_motion_share(energy, sensor_noise, residual_variance, window),
         window=window,
+        left_out=left_out,
+        sharpness_weight=weight,
         mean_frame=mean_frame,
         deviation=deviation,
     )
@@ -180,24 +195,29 @@ def _without_outliers(
     flows: Iterable[FloatArray],
     mean: np.ndarray,
     variance: np.ndarray,
-    sharpness_of: Callable[[FloatArray], FloatArray],
+    template: tuple[FloatArray, FloatArray],
+    window: float,
     threads: int,
-) -> tuple[FloatArray, FloatArray, np.ndarray, np.ndarray]:
-    """Mean and variance of the registered frames and of their sharpness, without pixels that deviate from all others.
+) -> tuple[FloatArray, FloatArray, _SharpnessMoments]:
+    """Mean and variance of the registered frames, and of their sharpness, without pixels that deviate from all others.
 
     What passes through the scene may be sharper than the scene, and would set the standard of sharpness.
     """
     centre, usual = mean.astype(np.float32), _deviation(variance)
 
     def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
-        counts, total, squares, *moments = (np.zeros(mean.shape) for _ in range(5))
+        counts, total, squares, *moments = (np.zeros(mean.shape) for _ in range(8))
         for frame, flow in pairs:
             registered = luminance(warp(frame, flow))
             kept = (squared_deviation(registered, centre, usual, _OPS) <= OUTLIER).view(np.uint8)
             cv2.accumulate(kept, counts)
             cv2.accumulate(registered, total, kept)
             cv2.accumulateSquare(registered - centre, squares, kept)
-            _add_moments(sharpness_of(registered) * kept, *moments)
+            projection = project_gradient(registered, template, _OPS)
+            whole, middle = (smooth(projection, width, _OPS) * kept for width in (window, window / 2))
+            _add_moments(whole, *moments[:2])
+            _add_moments(middle, *moments[2:4])
+            cv2.accumulateProduct(whole, middle, moments[4])
         return counts, total, squares, *moments
 
     pairs = zip(iter_frames(frames), iter_frames(flows), strict=True)
@@ -205,8 +225,10 @@ def _without_outliers(
     some = np.maximum(counts, 1)
     trimmed = np.where(counts > 0, total / some, mean)
     deviation = _deviation(np.maximum(squares / some - (trimmed - centre) ** 2, 0.0))
-    sharpness, squares = moments
-    return trimmed.astype(np.float32), deviation, *_mean_and_variance(sharpness, squares, some)
+    whole, whole_spread = _mean_and_variance(moments[0], moments[1], some)
+    middle, middle_spread = _mean_and_variance(moments[2], moments[3], some)
+    joint = moments[4] / some - whole * middle
+    return trimmed.astype(np.float32), deviation, _SharpnessMoments(whole, middle, whole_spread, middle_spread, joint)
 
 
 def _deviation(variance: np.ndarray) -> FloatArray:
@@ -214,15 +236,58 @@ def _deviation(variance: np.ndarray) -> FloatArray:
     return smooth(variance.astype(np.float32), OUTLIER_WINDOW, _OPS) + np.float32(floor)
 
 
-def _score_scale(sharpness: np.ndarray, spread: np.ndarray, noise: np.ndarray, window: float) -> FloatArray:
+def _leave_middle_out(
+    moments: _SharpnessMoments,
+    template: tuple[FloatArray, FloatArray],
+    energy: FloatArray,
+    noise: float,
+    window: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Mean and variance of the local sharpness, the part of the variance that noise explains, and κ.
+
+    κ grows with that part: without noise the middle of the window is where the sharpness of a pixel shows best.  Noise
+    n of variance ``noise`` adds ``Σ g t · ∇n = −Σ n ∇·(g t)`` to the sharpness, with t the template, g the window.
+    """
+    divergence = smooth(
+        (gradient(template[0], _OPS)[0] + gradient(template[1], _OPS)[1]) ** 2, window / np.sqrt(2), _OPS
+    )
+    # ∫ g² and, along one axis, ∫ (∇g)² of a Gaussian of deviation s are 1 / (4π s²) and 1 / (8π s⁴).
+    inside, border = noise * divergence / (4 * np.pi * window**2), noise * energy / (8 * np.pi * window**4)
+    share = min(float((inside + border).sum() / max(moments.whole_spread.sum(), 1e-18)), 1.0)
+    kappa = _MIDDLE * share if share >= _LEAST_SHARE else 0.0
+    rest = (1 - kappa) ** 2
+    sharpness = (moments.whole - kappa * moments.middle) / (1 - kappa)
+    spread = (moments.whole_spread - 2 * kappa * moments.joint + kappa**2 * moments.middle_spread) / rest
+    # The same of g_s − κ g_{s/2}, in units of those of g_s.
+    explained = inside * (1 - 3.2 * kappa + 4 * kappa**2) + border * (1 - 5.12 * kappa + 16 * kappa**2)
+    return sharpness, np.maximum(spread, 0.0), explained / rest, kappa
+
+
+def _score_scale(sharpness: np.ndarray, spread: np.ndarray, explained: np.ndarray) -> FloatArray:
     """Factor from a deviation of the sharpness to the best estimate of its standardised noise-free part.
 
-    Noise of the gradient, projected on the template, explains ``noise`` over the number of independent pixels in the
-    window of the variance ``spread``; the rest is sharpness.
+    Noise explains a part of the variance ``spread``; the rest is sharpness.
     """
-    explained = noise / (4 * np.pi * window**2 / _SOBEL_AREA)
     deviation = np.sqrt(np.maximum(spread - explained, 0.0))
     return (deviation / np.maximum(spread + (_LEAST_SPREAD * sharpness) ** 2, 1e-18)).astype(np.float32)
+
+
+def _sharpness_weight(sharpness: np.ndarray, spread: np.ndarray, score_variance: np.ndarray, noise: float) -> float:
+    """β at which the noise that the weights add reaches its price, the energy of the gradient that they gain.
+
+    Weights ``exp(β z)`` raise the noise of the fused image, of variance ``noise``, by exp(β² v).  A deviation of the
+    sharpness, of variance ``spread`` without noise, is one of the squared gradient: its square over the sharpness is
+    the energy that blur takes and gives from frame to frame.
+    """
+    gained = max(float(spread.sum() / max(np.abs(sharpness).sum(), 1e-18)), 0.0)
+    allowed = _PRICE * gained / max(noise, 1e-18)
+    low, high = 0.0, _LARGEST_WEIGHT
+    if float(np.expm1(high**2 * score_variance).mean()) <= allowed:
+        return high
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if float(np.expm1(middle**2 * score_variance).mean()) <= allowed else (low, middle)
+    return low
 
 
 def _motion_share(energy: FloatArray, noise: float, residual_variance: np.ndarray, window: float) -> FloatArray:

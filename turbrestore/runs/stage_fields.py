@@ -116,6 +116,7 @@ FIELDS: dict[str, dict[str, Field]] = {
         "shares": Array("f8", "N", low=0, high=1 + _ROUNDING),
         "image_noise": Number(),
         "motion_share": Number(),
+        "sharpness_weight": Number(),
         "mean_flow": Array("f4", "H W 2"),
     },
     "deconvolution": {
