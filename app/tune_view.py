@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from turbrestore.core.arrays import FloatArray
 
     from .page import Page
+    from .restoring import Order
 
 _METHODS = {"nltv": "nonlocal total variation", "tv": "total variation", "wiener": "Wiener", "tikhonov": "Tikhonov"}
 _BOUNDARIES = {"unknown": "unknown", "periodic": "periodic"}

@@ -116,13 +116,11 @@ def write_result(
     if not is_fits(path):
         write_image(path, restoration.image, bit_depth, overwrite)
         return
-    x, y, width, height = restoration.crop
-    uncertainty = None
+    x, y, *_ = restoration.crop
     history = [f"turbrestore {__version__}: {shlex.join(command)}", *source.warnings]
     history += [f"{decision.subject}: {decision.choice}" for decision in restoration.decisions]
-    if restoration.filtered is not None:
-        uncertainty = np.sqrt(restoration.filtered.variance[y : y + height, x : x + width])
-        history.append("UNCERT: standard deviation of each pixel, before deconvolution")
+    if restoration.uncertainty is not None:
+        history.append("UNCERT: standard deviation of each pixel, infinite where nothing is known")
     rows, columns = source.window
     write_fits(
         path,
@@ -132,7 +130,7 @@ def write_result(
         header=source.header,
         history=history,
         origin=(columns.start + x, rows.start + y),
-        uncertainty=uncertainty,
+        uncertainty=restoration.uncertainty,
     )
 
 

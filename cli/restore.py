@@ -12,6 +12,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from turbrestore.core.errors import require
+from turbrestore.io.images import write_map
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.io.source import FrameSource
@@ -62,6 +63,7 @@ class Order:
     resume: bool = False
     checkpoint_every: int = 50
     report: Path | None = None
+    uncertainty: Path | None = None
     truth: Path | None = None
     overwrite: bool = False
     quiet: bool = False
@@ -77,7 +79,7 @@ class Order:
     @property
     def outputs(self) -> list[Path]:
         """Files to write."""
-        return [path for path in (self.output, self.settings_path, self.report) if path is not None]
+        return [path for path in (self.output, self.settings_path, self.report, self.uncertainty) if path is not None]
 
 
 def restore(
@@ -93,6 +95,7 @@ def restore(
     resume: Flag = False,
     checkpoint_every: int = 50,
     report: Path | None = None,
+    uncertainty: Path | None = None,
     truth: Path | None = None,
     bit_depth: int | None = None,
     memory_limit: MemorySize | None = None,
@@ -132,6 +135,9 @@ def restore(
         Frames between two checkpoints of the filter in the ``--keep`` folder.
     report : Path
         HTML file to write, .html: images to compare, what was decided and why, plots.
+    uncertainty : Path
+        Image to write, .tif: the standard deviation of every pixel of the result, in floating point, infinite where
+        nothing is known.
     truth : Path
         Image of the true scene: every stage is compared with it.
     bit_depth : int
@@ -162,7 +168,7 @@ def restore(
         memory_limit = MemorySize(memory_limit / (workers + 1))
     order = Order(
         input, output, selection, settings, machine, bit_depth, memory_limit, preset,
-        config, keep, resume, checkpoint_every, report, truth, overwrite, quiet, tile, scheduler, workers,
+        config, keep, resume, checkpoint_every, report, uncertainty, truth, overwrite, quiet, tile, scheduler, workers,
     )  # fmt: skip
     restoration, _ = restore_clip(order)
     if json:
@@ -204,6 +210,10 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
             order.output, restoration, source, depth, command, order.overwrite or order.output.absolute() in left
         )
         write_settings(order.settings_path, record)
+        if order.uncertainty is not None and restoration.uncertainty is not None:
+            write_map(
+                order.uncertainty, restoration.uncertainty, order.overwrite or order.uncertainty.absolute() in left
+            )
         if order.report is not None and run is not None:
             write_report(order.report, restoration, run, overwrite=order.overwrite or order.report.absolute() in left)
         if stages is not None:
@@ -237,6 +247,14 @@ def _check_outputs(order: Order) -> set[Path]:
     check_output(order.output, inputs, order.overwrite or order.output.absolute() in left)
     of_before = order.config == order.settings_path or order.settings_path.absolute() in left
     check_output(order.settings_path, [order.input], order.overwrite or of_before, suffixes=None)
+    if order.uncertainty is not None:
+        require(
+            order.params.runs("filter"),
+            f"--uncertainty: expected a run of the filter, found until = {order.params.until}",
+        )
+        check_output(
+            order.uncertainty, inputs, order.overwrite or order.uncertainty.absolute() in left, (".tif", ".tiff")
+        )
     if order.report is not None:
         check_report(order.report, inputs, order.overwrite or order.report.absolute() in left)
     check_keep(order.keep, [*inputs, *order.outputs], order.overwrite, order.resume)

@@ -52,6 +52,12 @@ from .tiled_stages import (
     run_filter_task,
     tile_filter_steps,
 )
+from .uncertainty.pixel_deviation import (
+    informed_pixels,
+    pixel_deviation,
+    position_variance,
+    posterior_gain,
+)
 from .wording import (
     explain_border,
     explain_camera,
@@ -157,8 +163,12 @@ def restore(
         restoration = _restored(run)
     if bars is None:
         return restoration
-    image = bars.put_back(restoration.image, *restoration.crop[:2])
-    return replace(restoration, image=image, mean=bars.put_back(restoration.mean))
+    image, uncertainty = bars.put_back(restoration.image, *restoration.crop[:2]), restoration.uncertainty
+    if uncertainty is not None:
+        # What lies under the bars was not seen.
+        hidden = bars.put_back(np.full_like(restoration.image, -1), *restoration.crop[:2]) >= 0
+        uncertainty = np.where(hidden if hidden.ndim == 2 else hidden[..., 0], np.float32(np.inf), uncertainty)
+    return replace(restoration, image=image, mean=bars.put_back(restoration.mean), uncertainty=uncertainty)
 
 
 @dataclass(frozen=True)
@@ -208,9 +218,11 @@ def _restored(run: _Run) -> Restoration:
         deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
-    crop, on_border = _crop(image, centroid.flows, params.border, deblurred)
+    seen = coverage(centroid.flows)
+    crop, on_border = _crop(image, seen, params.border, deblurred)
     run.decide(on_border)
     x, y, width, height = crop
+    uncertainty = _measure_uncertainty(run, image, fused, seen, deblurred)
     return Restoration(
         image=image if params.border == "keep" else image[y : y + height, x : x + width],
         crop=crop,
@@ -226,6 +238,7 @@ def _restored(run: _Run) -> Restoration:
         frame_count=len(run.source) if params.runs("filter") else run.plan.train,
         seconds=run.seconds,
         seeing=fused.seeing,
+        uncertainty=None if uncertainty is None else uncertainty[y : y + height, x : x + width],
     )
 
 
@@ -387,9 +400,28 @@ def _deblur(run: _Run, fused: _Fused) -> Deblurred:
     return replace(deblurred, deconvolution=deconvolution, blur=blur)
 
 
-def _crop(image: FloatArray, flows: FloatArray, border: str, deblurred: Deblurred | None) -> tuple[Rectangle, Decision]:
+def _measure_uncertainty(
+    run: _Run, image: FloatArray, fused: _Fused, seen: FloatArray, deblurred: Deblurred | None
+) -> FloatArray | None:
+    """Measure the standard deviation of every pixel of a filtered image."""
+    filtered, dynamics = fused.filtered, fused.dynamics
+    if filtered is None or dynamics is None:
+        return None
+    begun, sigma, exponent = time.perf_counter(), 0.0, run.params.deconvolution.exponent
+    if deblurred is not None:
+        sigma = deblurred.deconvolution.sigma
+        if exponent is None and deblurred.blur is not None:
+            exponent = deblurred.blur.exponent
+    position = position_variance(dynamics)
+    known = informed_pixels(seen, fused.mean)
+    gain = posterior_gain(filtered.image, sigma, exponent)
+    deviation = pixel_deviation(image, filtered.variance, gain, position, known)
+    run.seconds["uncertainty"] = time.perf_counter() - begun
+    return deviation
+
+
+def _crop(image: FloatArray, seen: FloatArray, border: str, deblurred: Deblurred | None) -> tuple[Rectangle, Decision]:
     """Return the rectangle of the image that is the result."""
-    seen = coverage(flows)
     whole = (0, 0, image.shape[1], image.shape[0])
     if border == "keep":
         return whole, explain_border(float(seen.min()), None)

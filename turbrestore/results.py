@@ -101,6 +101,9 @@ class Restoration:
         Wall time of each stage.
     seeing : Seeing or None
         Strength of the turbulence in the training frames, in pixels and frames; None for fewer than three.
+    uncertainty : ndarray, float32, shape (H, W), or None
+        Standard deviation of every pixel of the image, intensity; infinite where nothing is known; None unless the
+        filter has run.
     """
 
     image: FloatArray
@@ -117,6 +120,7 @@ class Restoration:
     frame_count: int
     seconds: dict[str, float]
     seeing: Seeing | None = None
+    uncertainty: FloatArray | None = None
 
     def plot(self) -> Figure:
         """Draw the temporal mean beside the result.

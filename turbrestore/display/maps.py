@@ -109,6 +109,39 @@ def plot_displacements(flows: ArrayLike, image: ArrayLike | None = None) -> Figu
     return figure
 
 
+def plot_uncertainty(deviation: ArrayLike, image: ArrayLike | None = None) -> Figure:
+    """Show the standard deviation of every pixel as colour; infinite ones have the brightest colour.
+
+    Parameters
+    ----------
+    deviation : array_like, shape (H, W)
+        Intensity, 0 or more.
+    image : array_like, shape (H, W) or (H, W, 3), optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    DataError
+        The image has another size.
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> deviation = np.full((24, 32), 0.01); deviation[:4] = np.inf
+    >>> len(plot_uncertainty(deviation).axes)
+    2
+    """
+    percent = 100 * np.asarray(deviation, np.float32)
+    known = percent[np.isfinite(percent)]
+    top = float(np.quantile(known, _SCALE_QUANTILE)) if known.size else 1.0
+    return _draw_map(np.minimum(percent, np.float32(top)), image, "Standard deviation, % of full scale")[0]
+
+
 def plot_images(images: Mapping[str, ArrayLike]) -> Figure:
     """Show images side by side.
 

@@ -2,7 +2,7 @@
 
 from .curves import plot_blur, plot_convergence, plot_filter, plot_frames, plot_objective
 from .figure import new_figure
-from .maps import plot_displacements, plot_flow, plot_images
+from .maps import plot_displacements, plot_flow, plot_images, plot_uncertainty
 from .spectra import plot_dynamics, plot_eigenvalues, plot_prediction, plot_singular_values
 
 __all__ = [
@@ -19,4 +19,5 @@ __all__ = [
     "plot_objective",
     "plot_prediction",
     "plot_singular_values",
+    "plot_uncertainty",
 ]

@@ -162,6 +162,42 @@ def write_image(
         tifffile.imwrite(temporary, pixels, photometric="minisblack" if pixels.ndim == 2 else "rgb", metadata=None)
 
 
+def write_map(path: str | os.PathLike[str], values: FloatArray, overwrite: bool = False) -> None:
+    """Write numbers that are no intensities as TIFF in floating point; infinite ones stay so.
+
+    Parameters
+    ----------
+    path : path-like
+        Ends in ``.tif`` or ``.tiff``.
+    values : ndarray, float32, shape (H, W)
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    ConfigurationError
+        Unsupported suffix.
+    OutputError
+        The file exists, or its folder is missing or not writable.
+    StorageError
+        Writing failed; nothing is left behind.
+
+    Examples
+    --------
+    >>> import tempfile, tifffile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_map(folder + "/a.tif", np.float32([[0.5, np.inf]]))
+    ...     tifffile.imread(folder + "/a.tif")
+    array([[0.5, inf]], dtype=float32)
+    """
+    import tifffile
+
+    check_output(path, overwrite=overwrite, suffixes=(".tif", ".tiff"))
+    check_space(path, values.nbytes)
+    with atomic_output(path, overwrite) as temporary:
+        tifffile.imwrite(temporary, values.astype(np.float32), photometric="minisblack", metadata=None)
+
+
 def open_animation(
     path: Path, stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
 ) -> FrameSource:

@@ -23,6 +23,7 @@ _STAGE_NAMES = {
     "identify": "Flow model",
     "filter": "Alternating filter",
     "deconvolve": "Deconvolution",
+    "uncertainty": "Uncertainty",
 }
 
 
@@ -122,6 +123,8 @@ def findings(restoration: Restoration) -> list[Fact]:
         *_filter_facts(restoration),
         *_blur_facts(restoration),
         *_guard_facts(restoration),
+        *_seeing_facts(restoration),
+        *_uncertainty_facts(restoration),
     ]
 
 
@@ -238,6 +241,40 @@ def _guard_facts(restoration: Restoration) -> Iterator[Fact]:
         value = f"{shares}, noise ×{reading.noise_gain:.1f}"
         note = "passed" if reading.passed else "failed: less blur is removed"
         yield Fact(f"Guards at {reading.sigma:.2f} px", value, note, not reading.passed)
+
+
+def _seeing_facts(restoration: Restoration) -> Iterator[Fact]:
+    seeing = restoration.seeing
+    if seeing is None:
+        return
+    notes = {
+        "displacement_variance": "per axis, over a long time; 95 % interval",
+        "displacement_by_flow": "over this clip",
+        "displacement_by_blur": "over this clip, from the blur of the mean; a lower bound above 2 px²",
+        "isoplanatic_patch": "separation at which the motion is half correlated",
+        "coherence_time": "until the motion is correlated by 1/e",
+    }
+    for name, (estimate, unit) in seeing.estimates().items():
+        if estimate is not None and name in notes:
+            value = f"{estimate.value:.2f} {unit}, {estimate.low:.2f} to {estimate.high:.2f}"
+            yield Fact(name.replace("_", " ").capitalize(), value, notes[name])
+    for remark in seeing.remarks:
+        yield Fact("Displacement", "to be looked at", remark, True)
+
+
+def _uncertainty_facts(restoration: Restoration) -> Iterator[Fact]:
+    deviation = restoration.uncertainty
+    if deviation is None:
+        return
+    known = np.isfinite(deviation)
+    if known.any():
+        middle, high = (100 * float(value) for value in np.quantile(deviation[known], (0.5, 0.95)))
+        yield Fact(
+            "Standard deviation of a pixel", f"{middle:.2f} %", f"of full scale, median; {high:.2f} % at most for 95 %"
+        )
+    if not known.all():
+        value = f"{100 * (1 - known.mean()):.1f} % of the pixels"
+        yield Fact("Without information", value, "saturated, or seen in no frame", True)
 
 
 def _blur_note(restoration: Restoration) -> str:

@@ -16,6 +16,7 @@ from ..display.plots import (
     plot_frames,
     plot_objective,
     plot_singular_values,
+    plot_uncertainty,
 )
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
@@ -64,6 +65,10 @@ def draw_panels(restoration: Restoration, run: RunRecord) -> list[Panel]:
         panels.append(Panel(inline_svg(figure, "blur", "Cost of every width of the blur"), caption))
     if restoration.deconvolution is not None and restoration.deconvolution.recorded.size:
         panels += _deconvolution(restoration.deconvolution)
+    if restoration.uncertainty is not None:
+        caption = "Where not to trust the result: bright means uncertain, and brightest also where nothing is known."
+        figure = plot_uncertainty(restoration.uncertainty, restoration.image)
+        panels.append(Panel(inline_svg(figure, "uncertainty", "Map of the standard deviation of every pixel"), caption))
     return panels
 
 

@@ -114,7 +114,10 @@ def save_results(folder: Path, restoration: Restoration, run: RunRecord, stored:
         elif f"{name}.npz" not in stored:
             save_artifact(folder / f"{name}.npz", result, overwrite=True)
     with atomic_output(folder / IMAGES, overwrite=True) as temporary, temporary.open("wb") as stream:
-        write_npz(stream, {"frame": run.frame, "mean": restoration.mean, "image": restoration.image})
+        images = {"frame": run.frame, "mean": restoration.mean, "image": restoration.image}
+        if restoration.uncertainty is not None:
+            images["uncertainty"] = restoration.uncertainty
+        write_npz(stream, images)
     described = {item.name: getattr(run, item.name) for item in dataclasses.fields(run) if item.name != "frame"}
     restored = {
         "results": [name for name, result in results.items() if result is not None],
@@ -280,6 +283,7 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
         frame_count=facts.value("frame_count", int),
         seconds=facts.numbers("seconds"),
         seeing=facts.seeing("seeing"),
+        uncertainty=images.get("uncertainty"),
     )
     return restoration, RunRecord(
         name=run.value("name", str),
@@ -320,4 +324,9 @@ def _read_images(path: Path, crop: Rectangle) -> dict[str, FloatArray]:
         raise DataError(f"{path}: expected images of one size, found {[image.shape for image in images.values()]}")
     if x + width > images["mean"].shape[1] or y + height > images["mean"].shape[0]:
         raise DataError(f"{path}: expected the result to lie within the frames, found it at {crop}")
+    uncertainty = found.get("uncertainty")
+    if uncertainty is not None:
+        if uncertainty.shape != (height, width) or uncertainty.dtype.str != "<f4" or not (uncertainty >= 0).all():
+            raise DataError(f"{path}: expected deviations of shape {(height, width)}, found {uncertainty.shape}")
+        images["uncertainty"] = uncertainty
     return images

@@ -1,0 +1,92 @@
+"""Deviation of every pixel against linear systems, and of whole restorations against their scenes."""
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+import turbrestore
+from turbrestore.blur.psf import blur_otf, laplacian_symbol, wiener_fidelity
+from turbrestore.core.noise import estimate_noise
+from turbrestore.io.video import write_video
+from turbrestore.synthesis.scenes import picture
+from turbrestore.synthesis.smooth_flow import distort, smooth_flows
+from turbrestore.uncertainty.pixel_deviation import informed_pixels, pixel_deviation, posterior_gain
+from turbrestore_cli.application import run as run_command
+
+
+def test_gain_is_the_posterior_variance_of_a_linear_gaussian_model():
+    rng, n, sigma = np.random.default_rng(0), 32, 1.2
+    image = picture("camera", n, n)
+    fidelity = wiener_fidelity(image, estimate_noise(image))
+    otf = np.abs(np.fft.fft2(np.fft.irfft2(blur_otf((n, n), sigma), s=(n, n))))
+    symbol = np.fft.fft2(np.fft.irfft2(laplacian_symbol(n, n), s=(n, n))).real
+    # Scenes of the prior, blurred, with noise of unit variance; the mean of the posterior misses them by its deviation.
+    prior = np.sqrt(fidelity / np.maximum(symbol, 1e-9)) * (symbol > 1e-9)
+    errors = []
+    for _ in range(60):
+        scene = prior * np.fft.fft2(rng.normal(size=(n, n)))
+        seen = otf * scene + np.fft.fft2(rng.normal(size=(n, n)))
+        errors.append(np.fft.ifft2(otf * seen / (otf**2 + symbol / fidelity) - scene).real)
+    assert np.mean(np.square(errors)) == pytest.approx(posterior_gain(image, sigma, None), rel=0.05)
+
+
+def test_position_makes_edges_uncertain_and_flat_parts_not():
+    image = np.repeat(np.float32([[0.2, 0.8]]), 16, axis=1).repeat(32, axis=0)
+    flat = np.zeros((32, 32), np.float32)
+    deviation = pixel_deviation(image, flat + 1e-6, 4.0, flat + 0.04, flat == 0)
+    assert deviation[16, 4] == pytest.approx(2e-3)
+    assert deviation[16, 15] > 10 * deviation[16, 4]
+
+
+def test_saturated_and_unseen_pixels_are_infinite():
+    mean = np.full((16, 16, 3), 0.5, np.float32)
+    mean[2, 2, 1] = 1.0
+    seen = np.ones((16, 16), np.float32)
+    seen[5, 5] = 0.0
+    known = informed_pixels(seen, mean)
+    assert not known[2, 2] and not known[5, 5] and known.sum() == 254
+    deviation = pixel_deviation(mean, seen, 1.0, seen, known)
+    assert np.isinf(deviation[~known]).all() and np.isfinite(deviation[known]).all()
+
+
+@pytest.fixture(scope="module")
+def clip():
+    rng = np.random.default_rng(3)
+    scene = picture("camera", 96, 96)
+    flows = smooth_flows(20, 96, 96, rng)
+    # At the mean geometry the scene is as it was drawn.
+    frames = np.stack(list(distort(scene, flows - flows.mean(axis=0), rng, blur=1.0, noise=0.01)))
+    frames[:, 40:48, 40:48] = 1.0
+    return scene, frames.astype(np.float32)
+
+
+def test_deviation_of_a_restoration_ranks_and_bounds_its_error(clip, tmp_path):
+    scene, frames = clip
+    restoration = turbrestore.restore(frames)
+    deviation, error = restoration.uncertainty, np.abs(restoration.image - scene)
+    assert deviation.shape == restoration.image.shape and deviation.dtype == np.float32
+    assert np.isinf(deviation[43:45, 43:45]).all()
+    inside = np.zeros((96, 96), bool)
+    inside[8:-8, 8:-8] = True
+    inside[34:54, 34:54] = False
+    assert spearmanr(error[inside], deviation[inside])[0] >= 0.4
+    assert 0.85 <= np.mean(error[inside] <= 2 * deviation[inside]) <= 0.98
+    turbrestore.save_run(tmp_path / "run", restoration, turbrestore.RunRecord("clip", frames[0]))
+    np.testing.assert_array_equal(turbrestore.load_run(tmp_path / "run")[0].uncertainty, deviation)
+    assert turbrestore.restore(frames, turbrestore.RestoreParams(until="identify")).uncertainty is None
+
+
+def test_the_command_writes_the_map_and_refuses_what_has_none(clip, tmp_path, capsys):
+    tifffile, fits = pytest.importorskip("tifffile"), pytest.importorskip("astropy.io.fits")
+    video = tmp_path / "clip.mkv"
+    write_video(video, clip[1][:8], 30.0)
+    result, path, report = (tmp_path / name for name in ("sharp.fits", "deviation.tif", "report.html"))
+    words = ["restore", str(video), str(result), "--quiet", f"--uncertainty={path}"]
+    assert run_command([*words, f"--report={report}"]) == 0
+    found = tifffile.imread(path)
+    assert found.shape == (96, 96) and (found > 0).all()
+    np.testing.assert_array_equal(fits.getdata(result, "UNCERT"), found)
+    assert "Where not to trust the result" in report.read_text()
+    capsys.readouterr()
+    assert run_command([*words, "--overwrite", "--until=centroid"]) == 2
+    assert "--uncertainty" in capsys.readouterr().err
