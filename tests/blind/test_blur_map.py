@@ -7,10 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blind.blur_map import blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
+from turbrestore.blind.blur_map import _like, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
 from turbrestore.blind.guards import GuardParams
 from turbrestore.blind.remove_blur import remove_blur
-from turbrestore.blur.estimation import choose_blur, estimate_blur, find_candidates
+from turbrestore.blur.estimation import BlurCandidate, BlurEstimate, choose_blur, estimate_blur, find_candidates
+from turbrestore.blur.marginal_likelihood import WIDTHS
 from turbrestore.core.arrays import luminance
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve, deconvolve_steps
 from turbrestore.metrics import psnr
@@ -133,6 +134,19 @@ def test_a_sharp_part_beside_a_blurred_one_stays_sharp():
     assert found.varies
     assert found.sigmas[:, 0].max() < 0.9
     assert found.sigmas[:, 1].min() > 1.2
+
+
+def test_codec_blocks_in_tiles_do_not_pass_for_a_narrow_blur():
+    def one(reduction, sigma, uncertainty):
+        estimate = BlurEstimate(
+            sigma, uncertainty, 1.2, 0.01, reduction, 1.0, WIDTHS, np.array([1.0, 0.9, 0.8, 0.7, 0])
+        )
+        return BlurCandidate(estimate, np.zeros((8, 8), np.float32))
+
+    # (reduction, width): the blocks are seen at full size.
+    tile = one(1, 0.8, 0.1), one(2, 3.2, 0.4), one(4, 3.6, 0.5)
+    for whole, comparable in ((1, (1, 2, 4)), (2, (1, 2, 4)), (4, (2, 4)), (8, (4,)), (16, (1, 2, 4))):
+        assert tuple(found.estimate.reduction for found in _like(tile, one(whole, 3.7, 0.4).estimate)) == comparable
 
 
 def test_small_images_have_no_tiles():

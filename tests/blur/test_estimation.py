@@ -13,6 +13,8 @@ from turbrestore.blur.estimation import (
     _reduce,
     _unreduced_width,
     estimate_blur,
+    find_candidates,
+    removable_width,
 )
 from turbrestore.blur.marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
 from turbrestore.blur.psf import GAUSSIAN, KOLMOGOROV, blur_otf, fused_exponent
@@ -112,6 +114,21 @@ def test_the_uncertainty_is_half_the_difference_between_half_and_twice_the_noise
         both = [width_costs(gradients, shapes, factor * found.noise, 1) for factor in (0.5, 2.0)]
     less, more = (_unreduced_width(likeliest_width(costs), found.reduction) for costs in both)
     assert found.uncertainty == abs(more - less) / 2
+
+
+def test_caution_is_for_narrow_blurs():
+    assert removable_width(1.5, 0.2) == pytest.approx(1.4)
+    assert removable_width(4.0, 1.2) == 4.0
+    assert removable_width(0.3, 1.0) == 0
+    assert removable_width([1.5, 4.0], np.inf).tolist() == [0, 0]
+    # A wider estimate is never removed less.
+    assert (np.diff(removable_width(np.linspace(0.35, 8, 100), 0.5)) > 0).all()
+
+
+def test_reduced_images_are_large_enough():
+    image = blurred("words", 4.0, 0.005, size=250)
+    assert [one.estimate.reduction for one in find_candidates(image)] == [1, 2, 3, 4]
+    assert [one.estimate.reduction for one in find_candidates(image[:239])] == [1, 2, 3]
 
 
 def test_two_threads_find_the_same(monkeypatch):

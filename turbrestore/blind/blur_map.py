@@ -4,8 +4,11 @@ Depth in the scene, or stronger turbulence near the ground, blurs parts of an im
 less certain than that of the whole image, so tiles are used only if their widths differ by clearly more than their
 uncertainties.  A tile without texture is given the width of the whole image.
 
-The uncertainty of a width takes twice as long as the width itself and is computed only if it matters: the width of a
-tile is that of one of its reductions, and if all plausible ones agree, so do the widths that would be chosen.
+A tile is reduced at least half as much as the whole image was, if a blur is found so: less reduced, compressed video
+shows the blocks of its codec, which look like edges with a narrow blur.
+
+The uncertainty of a width takes twice as long as the width itself and is computed only if it matters: if all plausible
+widths of the tiles agree, so do those that would be chosen.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..blur.estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidates
+from ..blur.estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidates, removable_width
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.noise import estimate_noise
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionState
@@ -62,8 +65,8 @@ class BlurMap:
 
     @property
     def removable(self) -> np.ndarray:
-        """Widths that are safe to remove, pixels: half of the uncertainty is left in; 0 if it is infinite."""
-        return np.maximum(self.sigmas - 0.5 * self.uncertainties, 0.0)
+        """Widths that are safe to remove, pixels; 0 if the uncertainty is infinite."""
+        return removable_width(self.sigmas, self.uncertainties)
 
 
 def estimate_blur_map(image: ArrayLike, whole: BlurEstimate, runtime: Runtime = DEFAULT) -> BlurMap | None:
@@ -147,7 +150,7 @@ def blur_map_steps(
     agree = _agree(found.values())
     for number, (place, candidates) in enumerate(found.items(), 1):
         with one_thread_each():
-            chosen = _nearest_reduction(candidates, whole) if agree else choose_blur(candidates, runtime)
+            chosen = _nearest_reduction(candidates, whole) if agree else choose_blur(_like(candidates, whole), runtime)
         sigmas[place], uncertainties[place] = chosen.sigma, chosen.uncertainty
         yield number
     known = tuple(np.array(list(found), int).reshape(-1, 2).T)
@@ -274,6 +277,14 @@ def _nearest_reduction(candidates: tuple[BlurCandidate, ...], whole: BlurEstimat
     """Plausible estimate whose reduction is nearest to that of the whole image."""
     plausible = (one.estimate for one in candidates if one.plausible)
     return min(plausible, key=lambda estimate: abs(estimate.reduction - whole.reduction))
+
+
+def _like(candidates: tuple[BlurCandidate, ...], whole: BlurEstimate) -> tuple[BlurCandidate, ...]:
+    """Plausible candidates of about the reduction of the whole image; all of them if there is none."""
+    return (
+        tuple(one for one in candidates if one.plausible and 2 * one.estimate.reduction >= whole.reduction)
+        or candidates
+    )
 
 
 def _clearly_differ(sigmas: np.ndarray, uncertainties: np.ndarray) -> bool:
