@@ -16,9 +16,9 @@ a side, the one whose width depends least on the assumed noise decides.  The ima
 is small, because a soft scene such as the Moon looks blurred at every reduction; but it is not preferred if its
 evidence is weak, because the block edges of a codec look like scene edges with almost no blur.
 
-Noise.  n is larger than the noise of the image: no real blur follows the assumed shape exactly, the less the higher the
-contrast.  So n² is the sum of the squared noise and of the square of a share of the contrast.  ``uncertainty`` measures
-how much the estimated width depends on n.
+Noise.  n is larger than the noise of the image: no real blur follows the assumed shape exactly, and high contrast makes
+the mismatch larger.  So n² is the sum of the squared noise and of the square of a share of the contrast.  The estimated
+width depends on n; ``uncertainty`` measures by how much.
 
 A fused image is never sharper than its pixels and the interpolation of the registration allow: the smallest width is
 0.35 px, which is also the result if a wider blur is hardly more likely.
