@@ -44,6 +44,8 @@ _FEWEST_IN_NEED = 10
 _TRAINING_BYTES = 1.5e9
 # Interpreter, libraries and readers, bytes.
 _BASE = 1.6e8
+# What is found out before the stages, such as an overlay, bytes a pixel and a pixel and channel.
+_PREPARED, _PREPARED_COLOUR = 22, 34
 # Images and maps that the stages leave, bytes a pixel and bytes a pixel and channel; with tiles most of them lie in
 # scratch files.
 _RESULTS, _RESULTS_COLOUR = 60, 40
@@ -249,8 +251,9 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget
     held = frames + flows + (0.0 if choice.tile is None else 10.5 * _pixels(shape) * _channels(shape))
     flow, side = flow_memory(part, threads), _deconvolution_side(shape, params, choice, budget)
     results = _held_by_deconvolution(shape, params, choice)
+    prepared = _pixels(shape) * float(_PREPARED + _PREPARED_COLOUR * _channels(shape))
     stages = {
-        "centroid": held + flow,
+        "centroid": max(held + flow, prepared),
         "identify": held + modes + identify_memory(part, train),
         "filter": held + modes + flow + filter_memory(part, train, params.filter, threads),
         "deconvolve": results + remove_blur_memory(shape[1:], params.deconvolution, side),

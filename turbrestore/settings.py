@@ -87,7 +87,10 @@ class RestoreParams:
             self.until == STAGES[-1] or self.deconvolution.sigma is None,
             f"deconvolution.sigma: has no effect with until = {self.until}; leave one of them out",
         )
-        require(self.static_mask != "", "static_mask: expected auto, off or the path of an image, found an empty text")
+        require(
+            self.static_mask in ("auto", "off") or "." in self.static_mask,
+            f"static_mask: expected auto, off or an image file, found {self.static_mask!r}",
+        )
         check_share(self.keep_best)
         require(
             self.keep_best == 1 or self.until in STAGES[2:],

@@ -1,4 +1,4 @@
-"""The range of a clip: frames that use a small part of the scale are worked on in units of that part.
+"""The range of a clip: frames that use a part of the scale are worked on in units of that part.
 
 Twelve bits in a file of 16, or counts of a thermal camera from 7000 to 7400, leave most of the scale unused.  The
 thresholds of the stages are shares of full scale, so such frames are stretched first, and results are brought back.
@@ -20,8 +20,8 @@ from ..core.errors import DataError
 from ..core.noise import estimate_noise
 from ..io.source import FrameSource, Window
 
-# Clips that span less than this share of full scale are stretched to that share; a wider span costs 0.2 dB at most.
-_NARROW, _STRETCHED = 0.2, 0.8
+# Clips that span less than this share of full scale are stretched to it, so that their scale does not matter.
+_SPAN = 0.7
 # Frames from which the range is taken.
 _SAMPLES = 16
 # Percentage of the frames at either end whose extremes do not count.
@@ -86,7 +86,7 @@ class Levels:
 
 
 def stretch_levels(source: FrameSource, train: int) -> tuple[FrameSource, Levels, tuple[Decision, ...]]:
-    """Stretch the frames of a clip that uses a small part of the scale.
+    """Stretch the frames of a clip that uses a part of the scale.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def stretch_levels(source: FrameSource, train: int) -> tuple[FrameSource, Levels
     Returns
     -------
     source : FrameSource
-        With intensities of 0.1 to 0.9 where the clip was stretched, else as it was.
+        With intensities of 0.15 to 0.85 where the clip was stretched, else as it was.
     levels : Levels
     decisions : tuple of Decision
 
@@ -115,10 +115,10 @@ def stretch_levels(source: FrameSource, train: int) -> tuple[FrameSource, Levels
     """
     low, high = _range_of(source, train)
     span = high - low
-    if span >= _NARROW:
+    if span >= _SPAN:
         return source, Levels(), ()
-    gain = _STRETCHED / span
-    levels = Levels(low - (1 - _STRETCHED) / 2 / gain, gain)
+    gain = _SPAN / span
+    levels = Levels(low - (1 - _SPAN) / 2 / gain, gain)
     before = source.adjust
 
     def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
