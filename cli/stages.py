@@ -59,7 +59,7 @@ def centroid(
     Parameters
     ----------
     input : Path
-        Video.
+        Video.  Only ``restore`` takes out bars, overlays and changing light, and stretches a small range.
     output : Path
         Stage file to write, .npz; it holds the flows as well.
     train : int
@@ -272,6 +272,7 @@ def filter_(
     ----------
     input : Path
         Video; its first frames are those that the centroid was found from.
+        Only ``restore`` takes out bars, overlays and changing light, and stretches a small range.
     centroid : Path
         Centroid stage file.
     dynamics : Path
