@@ -44,8 +44,11 @@ _LEAST_DEVIATION = 0.1
 # Frames of which the median is taken, the rows that it is taken of at once, the factor from a median deviation to a
 # standard deviation, and how many times the variance exceeds its robust estimate where something has passed.
 _RESERVOIR, _ROWS, _MEDIAN_DEVIATION, _HEAVY_TAIL = 25, 64, 1.4826, 4.0
-# κ of pure noise, and the least share of noise for which a window without its middle is worth computing.
-_MIDDLE, _LEAST_SHARE = 0.25, 0.05
+# Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels over which such
+# derivatives correlate.
+_SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
+# κ of pure noise, and the least share of noise for which a window without its middle is better.
+_MIDDLE, _LEAST_SHARE = 0.25, 0.15
 # Largest β, the variance of noise that is worth one unit of squared gradient, and steps of the search for β.
 _LARGEST_WEIGHT, _PRICE, _BISECTIONS = 2.0, 10.0, 12
 _OPS = numpy_ops()
@@ -254,7 +257,11 @@ def _leave_middle_out(
     # ∫ g² and, along one axis, ∫ (∇g)² of a Gaussian of deviation s are 1 / (4π s²) and 1 / (8π s⁴).
     inside, border = noise * divergence / (4 * np.pi * window**2), noise * energy / (8 * np.pi * window**4)
     share = min(float((inside + border).sum() / max(moments.whole_spread.sum(), 1e-18)), 1.0)
-    kappa = _MIDDLE * share if share >= _LEAST_SHARE else 0.0
+    if share < _LEAST_SHARE:
+        # A bound, as if the gradients of the noise did not cancel: the score still contains the pixel's own noise.
+        bound = noise * energy * (_SOBEL_NOISE * _SOBEL_AREA / (4 * np.pi * window**2))
+        return moments.whole, moments.whole_spread, bound, 0.0
+    kappa = _MIDDLE * share
     rest = (1 - kappa) ** 2
     sharpness = (moments.whole - kappa * moments.middle) / (1 - kappa)
     spread = (moments.whole_spread - 2 * kappa * moments.joint + kappa**2 * moments.middle_spread) / rest
