@@ -3,7 +3,7 @@
     TURBRESTORE_DATA=DIR python benchmarks/ablation.py --write benchmarks/results/ablation.md
 
 prints a Markdown document and writes it.  Clips are those of ``benchmarks/quality.py`` that have a truth; ``--clips``
-takes names or patterns.
+takes names or patterns.  ``--noise`` adds white noise of that standard deviation to the clips.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ VARIANTS = {
     "single centroid": replace(DEFAULT, centroid=CentroidParams(mode="single")),
     "residual dropped": replace(DEFAULT, filter=FilterParams(residual="drop")),
     "no sharpness weights": replace(DEFAULT, filter=FilterParams(sharpness=0.0)),
+    "β = 1": replace(DEFAULT, filter=FilterParams(sharpness=1.0)),
+    "β = 2": replace(DEFAULT, filter=FilterParams(sharpness=2.0)),
 }
 # Run anew from the filtered image, with the blur that the default has found.
 Method = Literal["nltv", "tv", "wiener"]
@@ -52,12 +54,15 @@ def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="names or patterns; all by default")
+    parser.add_argument("--noise", type=float, default=0.0, metavar="SIGMA", help="noise to add, intensity")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
     options = parser.parse_args()
     rows: dict[str, Row] = {}
     try:
         for name, load in find_clips(options.clips).items():
             clip = load()
+            added = np.random.default_rng(0).normal(0.0, options.noise, clip.frames.shape)
+            clip = replace(clip, frames=(clip.frames + added).astype(np.float32))
             if clip.truth is not None:
                 rows[name] = measure(clip, clip.truth)
                 print(f"{name}: {rows[name]}", file=sys.stderr, flush=True)
