@@ -93,7 +93,9 @@ def run(words: list[str]) -> int:
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     try:
         _refuse_empty(words)
-        build()(words, exit_on_error=False, print_error=False)
+        # The parser takes a lone hyphen for an option; as a path, this is the same.
+        paths = ["./-" if word == "-" else word for word in words]
+        build()(paths, exit_on_error=False, print_error=False)
         flush()
     except BrokenPipeError:
         # The reader has seen enough; a second complaint at exit would be about the same.

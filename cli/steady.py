@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, Literal
 
 import numpy as np
 from cyclopts import Parameter
 
 from turbrestore.core.arrays import FloatArray
-from turbrestore.core.errors import require
+from turbrestore.core.errors import ConfigurationError, require
 from turbrestore.footage.content import clean_source, keep_all
+from turbrestore.io.encoding import BY_SUFFIX, Encoding, write_pipe
+from turbrestore.io.live.stream import open_pipe, read_raw, write_raw
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
+from turbrestore.io.source import FrameSource
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, write_video
 from turbrestore.steady.settings import SteadyParams
 from turbrestore.steady.video import SteadyFrame, steady_frames
@@ -30,6 +35,30 @@ from .progress import progress_bars, say
 _USUAL_RATE = 25.0
 
 
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """How the video is written.
+
+    Parameters
+    ----------
+    codec : {"h264", "hevc", "ffv1"}, optional
+        By default H.264 for .mp4 and FFV1, which is lossless, for .mkv.
+    crf : int, optional
+        Quality of H.264 and HEVC, 0 to 51, smaller is better; 14 and 18 by default.  With it .mkv has H.264.
+    bit_depth : int, optional
+        Bits per channel, 8 to 16, or 32 (float, TIFF and .npy only).  Those of the input by default; 8 in H.264, at
+        most 10 in HEVC.
+    """
+
+    codec: Literal["h264", "hevc", "ffv1"] | None = None
+    crf: int | None = None
+    bit_depth: int | None = None
+
+    def encoding(self) -> Encoding:
+        """Codec and quality."""
+        return Encoding(self.codec, self.crf)
+
+
 def steady(
     input: Path,
     output: Path,
@@ -38,7 +67,8 @@ def steady(
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
     config: Path | None = None,
     mask: Path | None = None,
-    bit_depth: int | None = None,
+    raw: str | None = None,
+    written: Annotated[Output, Parameter(name="*")] = Output(),
     machine: Annotated[Machine, Parameter(name="*")] = Machine(),
     overwrite: Flag = False,
     json: Flag = False,
@@ -51,15 +81,19 @@ def steady(
     ----------
     input : Path
         Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, FITS cube, .npy, or folder of
-        images or FITS files.
+        images or FITS files; or ``-`` for Matroska or YUV4MPEG2 on standard input.
     output : Path
-        Video of the same length to write: .mp4 (H.264), .mkv (lossless), .ser, .tif, .npy, .gif or .webp.
+        Video of the same length to write: .mp4 (H.264), .mkv (lossless), .ser, .tif, .npy, .gif or .webp; or ``-`` for
+        lossless Matroska on standard output.  .mp4 and .mkv take over the audio and the time stamps of a video file.
     config : Path
         TOML file with settings; flags win over it.
     mask : Path
         Video to write, of the same kinds: white where something moves against the scene.
-    bit_depth : int
-        Bits per channel of the output, 8 to 16, or 32 (float, TIFF and .npy only).  Those of the input by default.
+    raw : str
+        ``WIDTHxHEIGHT`` or ``WIDTHxHEIGHT:gray``: frames on standard input and output have 8 bits and no container,
+        ``rgb24`` or ``gray`` in FFmpeg's words.
+    written : Output
+        How the video is written.
     overwrite : bool
         Replace existing outputs.
     json : bool
@@ -67,36 +101,90 @@ def steady(
     quiet : bool
         Print neither progress nor remarks.
     """
-    if bit_depth is not None:
-        check_depth(bit_depth)
-    inputs = [path for path in (input, config) if path is not None]
-    check_output(output, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
+    piped_in, piped_out = str(input) == "-", str(output) == "-"
+    if written.bit_depth is not None:
+        check_depth(written.bit_depth)
+    encoding, shape = written.encoding(), _raw_shape(raw)
+    require(raw is None or piped_in, "--raw: has no effect unless the input is -; leave it out")
+    require(not (piped_out and json), "--json: contradicts the output -, which is standard output; leave it out")
+    require(not piped_out or encoding == BY_SUFFIX, "--codec, --crf: have no effect on the output -; leave them out")
+    inputs = [path for path in (None if piped_in else input, config) if path is not None]
     settings_path = output.with_name(output.name + ".toml")
-    check_output(settings_path, [input], overwrite or config == settings_path, suffixes=None)
+    if not piped_out:
+        check_output(output, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
+        check_output(settings_path, [] if piped_in else [input], overwrite or config == settings_path, suffixes=None)
     if mask is not None:
         require(mask.absolute() != output.absolute(), "--mask: is the output; choose another name")
         check_output(mask, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
-    source, report = open_checked(input, selection)
-    source = clean_source(source, keep_all(report))
-    for warning in source.warnings:
-        say(f"{source.name}: {warning}", quiet)
-    fps, depth = source.fps or _USUAL_RATE, source.bit_depth if bit_depth is None else bit_depth
+    source = _from_pipe(selection, shape) if piped_in else _from_file(input, selection, quiet)
+    fps, depth = source.fps or _USUAL_RATE, source.bit_depth if written.bit_depth is None else written.bit_depth
+    companion = source.frames if isinstance(source.frames, FrameSource) else None
     facts, started = _Facts(), time.monotonic()
     with tempfile.TemporaryFile() as masks:
         with progress_bars(quiet) as progress:
-            frames = facts.watch(steady_frames(source, params, machine.runtime()), len(source), progress)
-            write_video(output, _images(frames, None if mask is None else masks), fps, depth, overwrite)
+            total = len(companion) if companion is not None else 0
+            frames = facts.watch(steady_frames(source.frames, params, machine.runtime()), total, progress)
+            images = _images(frames, None if mask is None else masks)
+            if not piped_out:
+                write_video(output, images, fps, depth, overwrite, encoding, companion)
+            elif shape is not None:
+                write_raw(sys.stdout.buffer, images)
+            else:
+                write_pipe(sys.stdout.buffer, images, fps, depth)
         if mask is not None:
-            write_video(mask, _stored_masks(masks, source.shape[1:3]), fps, 8, overwrite)
+            write_video(mask, _stored_masks(masks, source.shape[:2]), fps, 8, overwrite)
     facts.seconds = time.monotonic() - started
-    records = (machine, selection, params)
+    if piped_out:
+        say(f"{source.name}: {facts.text()}", quiet)
+        return
+    records = (machine, selection, params, written)
     settings = {name: value for record in records for name, value in dataclasses.asdict(record).items()}
-    write_settings(settings_path, {"bit_depth": bit_depth, **settings})
+    write_settings(settings_path, settings)
     if json:
         paths = {"input": str(input), "output": str(output), "settings": str(settings_path)}
         print_json({**paths, **facts.record()})
     else:
         say(f"{output}: {facts.text()}", quiet)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Source:
+    """Frames of a file or a pipe, and what is known about them."""
+
+    name: str
+    shape: tuple[int, ...]
+    bit_depth: int
+    fps: float | None
+    frames: FrameSource | Iterator[FloatArray]
+
+
+def _from_file(input: Path, selection: Selection, quiet: bool) -> _Source:
+    source, report = open_checked(input, selection)
+    source = clean_source(source, keep_all(report))
+    for warning in source.warnings:
+        say(f"{source.name}: {warning}", quiet)
+    return _Source(source.name, source.shape[1:], source.bit_depth, source.fps, source)
+
+
+def _from_pipe(selection: Selection, shape: tuple[int, ...] | None) -> _Source:
+    idle = dataclasses.replace(selection, max_pixels=None) == Selection()
+    require(idle, "-: a pipe is read as it comes; leave out the options that select or repair frames")
+    if shape is not None:
+        limits = selection.limits()
+        limits.check_size(shape[1], shape[0], "--raw")
+        return _Source("standard input", shape, 8, None, read_raw(sys.stdin.buffer, shape))
+    stream = open_pipe(sys.stdin.buffer, limits=selection.limits())
+    return _Source(stream.name, stream.shape, stream.bit_depth, stream.fps, stream.frames)
+
+
+def _raw_shape(raw: str | None) -> tuple[int, ...] | None:
+    if raw is None:
+        return None
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?::(gray|rgb24))?", raw)
+    if found is None:
+        raise ConfigurationError(f"--raw: expected WIDTHxHEIGHT or WIDTHxHEIGHT:gray, found {raw!r}")
+    size = int(found[2]), int(found[1])
+    return size if found[3] == "gray" else (*size, 3)
 
 
 class _Facts:

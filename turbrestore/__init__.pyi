@@ -31,6 +31,7 @@ from .footage.scene_cuts import Scene as Scene
 from .io.images import read_image as read_image
 from .io.images import write_image as write_image
 from .io.limits import Limits as Limits
+from .io.live.stream import live_frames as live_frames
 from .io.source import FrameSource as FrameSource
 from .io.video import open_frames as open_frames
 from .io.video import write_video as write_video

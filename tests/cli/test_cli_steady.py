@@ -1,6 +1,8 @@
 """``turbrestore steady`` from the command line."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +65,43 @@ def test_duplicated_and_blank_frames_and_cuts_stay(run, tmp_path):
     assert (code, err) == (0, "")
     assert json.loads(out)["frames"] == 7
     assert np.allclose(np.load(tmp_path / "o.npy")[5], two, atol=0.02)
+
+
+def piped(*words, data=b""):
+    command = [sys.executable, "-m", "turbrestore_cli", "steady", *map(str, words)]
+    return subprocess.run(command, input=data, capture_output=True, timeout=120, check=False)
+
+
+def test_a_pipe_takes_and_gives_raw_frames(tmp_path):
+    scene = np.random.default_rng(0).integers(0, 256, (20, 32, 3), np.uint8)
+    done = piped("-", "-", "--raw", "32x20", "--sigma", "0", "--quiet", data=scene.tobytes() * 4)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert np.abs(np.frombuffer(done.stdout, np.uint8).reshape(4, 20, 32, 3) - scene.astype(float)).max() <= 2
+
+
+def test_pipes_of_matroska_stand_in_a_row(tmp_path):
+    first = piped(SAMPLE, "-", *PART, "--sigma", "0", "--quiet")
+    second = piped("-", tmp_path / "o.mkv", "--sigma", "0", "--quiet", data=first.stdout)
+    assert (first.returncode, second.returncode, second.stderr) == (0, 0, b"")
+    assert open_frames(tmp_path / "o.mkv").shape == (6, 48, 64)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "part"),
+    [
+        (["-", "o.mkv"], 65, "standard input"),
+        (["-", "o.mkv", "--roi", "0,0,9,9"], 2, "pipe"),
+        (["-", "o.mkv", "--raw", "20"], 2, "--raw"),
+        (["-", "-", "--json"], 2, "--json"),
+        (["-", "-", "--crf", "20"], 2, "--crf"),
+    ],
+)
+def test_wrong_words_about_pipes(tmp_path, monkeypatch, words, code, part):
+    monkeypatch.chdir(tmp_path)
+    done = piped(*words, data=b"no video")
+    assert (done.returncode, done.stdout) == (code, b"")
+    assert part in done.stderr.decode()
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

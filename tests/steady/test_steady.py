@@ -103,6 +103,13 @@ class TestMemory:
         assert memory.held[-16:].min() > 5
         assert self.remembered(frames, flows, stillness=0.0).held.max() == 1
 
+    def test_weak_turbulence_leaves_nothing_to_the_memory(self):
+        still = np.zeros((64, 64), bool)
+        memory = remember(None, photo(size=64), measure_flow, 0.02, 1.0, 1.0, still)
+        assert np.array_equal(
+            remember(memory, photo("brick", 64), measure_flow, 0.02, 1.0, 1.0, still).image, photo("brick", 64)
+        )
+
     def test_an_object_is_not_held_back_by_the_memory(self):
         # The flow follows the object, and draws the flat background beside it along.
         frames, flows, masks = [], [], []

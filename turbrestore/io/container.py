@@ -36,7 +36,7 @@ CONTAINER_SUFFIXES = (
     *(".y4m", ".mpg", ".mpeg", ".m2v", ".vob", ".flv", ".f4v", ".ogv", ".dv", ".mxf", ".ivf", ".nut"),
 )
 # Without this list FFmpeg would also open playlists, which refer to other files.
-_OPEN_OPTIONS = {
+OPEN_OPTIONS = {
     "format_whitelist": "matroska,webm,mov,mp4,avi,gif,mpegts,asf,mpeg,mpegvideo,flv,ogg,yuv4mpegpipe,dv,mxf,ivf,nut"
 }
 # Codecs whose packets are decoded independently of each other.
@@ -99,7 +99,7 @@ def open_container(
             frame = next(container.decode(stream), None)
             if frame is None:
                 raise DataError(f"{path}: expected at least one frame, found none")
-            layout = replace(_pixel_format(path, frame.format), orientation=_orientation(frame))
+            layout = replace(native_format(path, frame.format), orientation=_orientation(frame))
             if _has_grey_palette(frame):
                 layout = replace(layout, channels=(), ramp=True)
             notes, interlaced = _notes(frame, layout, stream), frame.interlaced_frame
@@ -150,7 +150,7 @@ def _open(path: Path) -> av.container.InputContainer:
     import av
 
     # Without the prefix FFmpeg would take a name with a colon for a URL.
-    return av.open(f"file:{path}", options=dict(_OPEN_OPTIONS), metadata_errors="replace")
+    return av.open(f"file:{path}", options=dict(OPEN_OPTIONS), metadata_errors="replace")
 
 
 def _video_stream(path: Path, container: av.container.InputContainer, limits: Limits) -> av.VideoStream:
@@ -165,7 +165,8 @@ def _video_stream(path: Path, container: av.container.InputContainer, limits: Li
     return stream
 
 
-def _pixel_format(path: Path, native: av.VideoFormat) -> _PixelFormat:
+def native_format(path: Path | str, native: av.VideoFormat) -> _PixelFormat:
+    """Tell how frames of a pixel format are decoded; DataError for formats of more than 16 bits."""
     name = native.name
     alpha = any(component.is_alpha for component in native.components)
     values = [component for component in native.components if not component.is_alpha]

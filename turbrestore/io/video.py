@@ -28,7 +28,7 @@ from ..core.errors import DataError, require
 from .astronomy.fits import open_fits, open_fits_folder
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .container import CONTAINER_SUFFIXES, is_container, open_container
-from .encoding import write_container
+from .encoding import BY_SUFFIX, Encoding, Soundtrack, write_container
 from .images import (
     ANIMATION_OUTPUT_SUFFIXES,
     ANIMATION_SUFFIXES,
@@ -115,7 +115,13 @@ def open_frames(
 
 
 def write_video(
-    path: str | os.PathLike[str], frames: Iterable[FloatArray], fps: float, bit_depth: int = 8, overwrite: bool = False
+    path: str | os.PathLike[str],
+    frames: Iterable[FloatArray],
+    fps: float,
+    bit_depth: int = 8,
+    overwrite: bool = False,
+    encoding: Encoding = BY_SUFFIX,
+    companion: FrameSource | None = None,
 ) -> None:
     """Write frames as a video, in the format given by the suffix.
 
@@ -133,11 +139,15 @@ def write_video(
         and .npy write 9 to 15 bits as 16, scaled to the full range.
     overwrite : bool
         Replace an existing file.
+    encoding : Encoding
+        Codec and quality of .mkv and .mp4.
+    companion : FrameSource, optional
+        Video file with a frame for each frame that is written, whose audio and time stamps .mkv and .mp4 take over.
 
     Raises
     ------
     ConfigurationError
-        Unsupported suffix, bit depth or frame rate.
+        Unsupported suffix, bit depth, frame rate or codec.
     DataError
         No frames, frames of two sizes, or values that are not finite.
     OutputError, StorageError
@@ -158,8 +168,10 @@ def write_video(
     suffix = path.suffix.lower()
     checked = (check_image(frame, f"frame {number}") for number, frame in enumerate(frames))
     if suffix in (".mkv", ".mp4"):
-        write_container(path, checked, fps, bit_depth, overwrite)
-    elif suffix == ".ser":
+        write_container(path, checked, fps, bit_depth, overwrite, encoding, _soundtrack(companion))
+        return
+    require(encoding == BY_SUFFIX, f"{path}: codec, crf: have an effect on .mkv and .mp4 only; leave them out")
+    if suffix == ".ser":
         write_ser(path, checked, bit_depth, fps, overwrite)
     elif suffix == ".npy":
         write_npy(path, checked, bit_depth, overwrite)
@@ -167,6 +179,14 @@ def write_video(
         write_animation(path, checked, fps, overwrite)
     else:
         write_tiff(path, checked, bit_depth, overwrite)
+
+
+def _soundtrack(companion: FrameSource | None) -> Soundtrack | None:
+    """Audio and times of a video file; None for other sources."""
+    if companion is None or companion.path is None or companion.timestamps is None:
+        return None
+    known = companion.path.is_file() and companion.path.suffix.lower() in CONTAINER_SUFFIXES
+    return Soundtrack(companion.path, companion.timestamps) if known else None
 
 
 def frame_files(folder: Path) -> list[Path]:

@@ -7,14 +7,15 @@ Z : memory; n : number of frames that it holds, for every pixel, so that its var
 R : flow from Z to F; A its affine part; r = R − A
 w : agreement of ``F ∘ (id + R)`` with Z (:mod:`turbrestore.steady.fusion`), less where r is more than turbulence, 0 in
     objects that move (:mod:`turbrestore.steady.motion`)
-g : gain, 1 over the number of frames since the memory began, at least 1/n_max
-s : stillness of the camera, 0 to 1
+g : gain, 1 over the number of frames since the memory began, at least 1/64
+s : stillness, 0 to 1, of the camera, less where turbulence is weak: the window averages that out, and what is left
+    is motion, of leaves or water
 
 Z is a Kalman filter of one value for every pixel, whose image drift a pixel earns: where the innovation
 ``F ∘ (id + R) − Z`` is explained by misregistration and noise (w = 1), n grows and the frame has a weight of 1/n; where
 it is not, the variance is opened, n falls to 1, and the frame passes::
 
-    n ← 1 + w min(n, n_max − 1),      Z ← Z + (F ∘ (id + R) − Z) / n
+    n ← 1 + w min(n, s (1 − g) / (1 − s (1 − g))),      Z ← Z + (F ∘ (id + R) − Z) / n
 
 The geometry is estimated likewise.  R is what F lies away from the mean geometry of the frames before, so that the mean
 moves by g R, and the memory with it: ``Z ← Z ∘ (id + V)`` with V the inverse flow of ``g_r r + g_A A``, and ::
@@ -50,6 +51,8 @@ _MARGIN, _MARGIN_EDGE = np.ones((5, 5), np.uint8), 1.5
 _BESIDE = np.ones((25, 25), np.uint8)
 # Least weight of the surroundings that a flow is filled in from; with less it fades.
 _LEAST_WEIGHT = 0.05
+# What weak turbulence displaces at most, which leaves nothing to the memory, and strong turbulence, pixels.
+_WEAK, _STRONG = 1.2, 1.8
 # Stillness below which nothing is remembered.
 _LEAST_STILLNESS = 0.1
 
@@ -97,7 +100,7 @@ def remember(
     largest : float
         c, pixels.
     stillness : float
-        s.
+        Stillness of the camera, 0 to 1.
     moving : ndarray, bool, shape (H, W)
         Where something moves against the scene.
 
@@ -109,12 +112,13 @@ def remember(
     --------
     >>> one, other = np.full((9, 9), 0.5, np.float32), np.full((9, 9), 0.51, np.float32)
     >>> none = lambda first, second: np.zeros((9, 9, 2), np.float32)
-    >>> settings = none, 0.01, 1.0, 1.0, np.zeros((9, 9), bool)
+    >>> settings = none, 0.01, 2.0, 1.0, np.zeros((9, 9), bool)
     >>> memory = remember(remember(None, one, *settings), other, *settings)
     >>> round(float(memory.image[4, 4]), 4), round(float(memory.held[4, 4]), 1)
     (0.5053, 1.9)
     """
     shape = image.shape[:2]
+    stillness *= float(np.clip((largest - _WEAK) / (_STRONG - _WEAK), 0, 1))
     if memory is None or stillness < _LEAST_STILLNESS:
         return Memory(image, np.ones(shape, np.float32), 1)
     flow = flow_between(memory.image, image)
@@ -128,11 +132,11 @@ def remember(
     weight *= 1 - cv2.GaussianBlur(near.astype(np.float32), (0, 0), _MARGIN_EDGE)
     trusted = np.where(cv2.dilate(near.astype(np.uint8), _BESIDE) > 0, 0, weight)
     own = _filled(own, trusted)
-    held = 1 + weight * np.minimum(memory.held, _LONGEST - 1)
-    innovation = warp(image, own + affine) - memory.image
-    estimate = memory.image + innovation / (held if image.ndim == 2 else held[..., None])
     frames = min(memory.frames + 1, _LONGEST)
     kept = stillness * (1 - 1 / frames)
+    held = 1 + weight * np.minimum(memory.held, kept / (1 - kept))
+    innovation = warp(image, own + affine) - memory.image
+    estimate = memory.image + innovation / (held if image.ndim == 2 else held[..., None])
     trust = 1 / (1 + (camera_size(camera, shape) / (2 * largest)) ** 8)
     inverse = invert_flow((1 - kept) * own + (1 - kept * trust) * affine)
     return Memory(warp(estimate, inverse), sample_linear((held,), inverse), frames)

@@ -1,0 +1,1 @@
+"""Frames that come one by one, and only once."""

@@ -1,0 +1,227 @@
+"""Frames that come one by one, and only once: pipes, cameras and other iterators.
+
+Neither their number is known nor can they be looked through beforehand, so what needs all frames of a video, such as
+the search for damaged frames, is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Any, BinaryIO, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.arrays import FloatArray, from_unit
+from ...core.errors import DataError, StorageError
+from ..container import OPEN_OPTIONS, convert, native_format
+from ..limits import DEFAULT_LIMITS, Limits
+from ..output import frames_of_one_size, size_text
+from ..pixels import PixelArray, full_scale_of, to_unit
+
+
+@runtime_checkable
+class Capture(Protocol):
+    """Source of frames such as ``cv2.VideoCapture``: ``read()`` returns whether there is a frame, and its pixels."""
+
+    def read(self) -> tuple[bool, Any]:
+        """Return the next frame, in OpenCV's order of channels, blue, green, red."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameStream:
+    """Frames that can be iterated over once.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    shape : tuple of int
+        (H, W) or (H, W, 3) of a frame.
+    bit_depth : int
+        Bits per channel of the source.
+    fps : float or None
+        Frames per second.
+    frames : iterator of ndarray, float32
+        Intensities in [0, 1].
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    bit_depth: int
+    fps: float | None
+    frames: Iterator[FloatArray] = field(repr=False)
+
+
+def open_pipe(file: BinaryIO, name: str = "standard input", limits: Limits = DEFAULT_LIMITS) -> FrameStream:
+    """Read video from a pipe: Matroska, YUV4MPEG2, NUT or MPEG-TS.
+
+    Parameters
+    ----------
+    file : binary file
+        Need not be seekable.
+    name : str
+        Its name in messages.
+    limits : Limits
+        Largest frame that is read.
+
+    Returns
+    -------
+    FrameStream
+
+    Raises
+    ------
+    DataError
+        Not a video, damaged, or a frame is larger than the limits; also while iterating.
+
+    Examples
+    --------
+    >>> import io
+    >>> from turbrestore.io.encoding import write_pipe
+    >>> file = io.BytesIO()
+    >>> write_pipe(file, [np.full((4, 6), 0.2, np.float32)] * 3, 25)
+    >>> stream = open_pipe(io.BytesIO(file.getvalue()))
+    >>> stream.shape, stream.fps, len(list(stream.frames))
+    ((4, 6), 25.0, 3)
+    """
+    import av
+
+    try:
+        # The container stays open as long as its frames are read.
+        container = av.open(file, "r", container_options=dict(OPEN_OPTIONS))
+        if not container.streams.video:
+            raise DataError(f"{name}: expected a video stream, found none")
+        stream = container.streams.video[0]
+        limits.check_size(stream.width, stream.height, name)
+        decoded = container.decode(stream)
+        first = next(decoded, None)
+    except (av.error.FFmpegError, EOFError) as error:
+        reason = getattr(error, "strerror", None) or "it is empty"
+        raise DataError(f"{name}: expected video such as Matroska or YUV4MPEG2, cannot read it ({reason})") from error
+    if first is None:
+        raise DataError(f"{name}: expected at least one frame, found none")
+    layout = native_format(name, first.format)
+    rate = stream.average_rate or stream.guessed_rate
+
+    def frames() -> Iterator[FloatArray]:
+        try:
+            for number, frame in enumerate(chain([first], decoded)):
+                pixels: PixelArray = convert(frame, layout.target).to_ndarray()
+                yield to_unit(pixels, layout.full_scale, f"{name}: frame {number}")
+        except av.error.FFmpegError as error:
+            raise DataError(f"{name}: a frame cannot be decoded ({error.strerror})") from error
+
+    shape = (first.height, first.width, *layout.channels)
+    return FrameStream(name, shape, layout.bit_depth, float(rate) if rate else None, frames())
+
+
+def read_raw(file: BinaryIO, shape: tuple[int, ...], name: str = "standard input") -> Iterator[FloatArray]:
+    """Read frames of 8 bits without a container, ``gray`` or ``rgb24`` in FFmpeg's words.
+
+    Parameters
+    ----------
+    file : binary file
+    shape : tuple of int
+        (H, W) or (H, W, 3).
+    name : str
+        Its name in messages.
+
+    Yields
+    ------
+    ndarray, float32, shape ``shape``
+
+    Raises
+    ------
+    DataError
+        The last frame is cut short.
+
+    Examples
+    --------
+    >>> import io
+    >>> [frame.ravel().tolist() for frame in read_raw(io.BytesIO(bytes([0, 255, 51, 0])), (1, 2))]
+    [[0.0, 1.0], [0.20000000298023224, 0.0]]
+    """
+    size = int(np.prod(shape))
+    number = 0
+    while data := file.read(size):
+        if len(data) < size:
+            raise DataError(f"{name}: frame {number}: expected {size} bytes, {size_text(shape)}, found {len(data)}")
+        yield to_unit(np.frombuffer(data, np.uint8).reshape(shape), 255, f"{name}: frame {number}")
+        number += 1
+
+
+def write_raw(file: BinaryIO, frames: Iterable[FloatArray], name: str = "standard output") -> None:
+    r"""Write frames of 8 bits without a container; see :func:`read_raw`.
+
+    Parameters
+    ----------
+    file : binary file
+    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
+        Intensities; values outside [0, 1] are clipped.
+    name : str
+        Its name in messages.
+
+    Raises
+    ------
+    DataError
+        No frames, or frames of two sizes.
+    StorageError
+        The file takes no more.
+
+    Examples
+    --------
+    >>> import io
+    >>> file = io.BytesIO()
+    >>> write_raw(file, [np.float32([[0, 0.2]])])
+    >>> file.getvalue()
+    b'\x003'
+    """
+    for frame in frames_of_one_size(frames, name):
+        data = from_unit(frame, 8).tobytes()
+        try:
+            file.write(data)
+            file.flush()
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise StorageError(f"{name}: cannot be written to ({error.strerror or error})") from error
+
+
+def live_frames(source: Capture | Iterable[ArrayLike]) -> Iterator[FloatArray]:
+    """Frames of a camera, or of any iterator of images, as the functions of this package take them.
+
+    Parameters
+    ----------
+    source : object with ``read()``, or iterable of array_like, shape (H, W) or (H, W, 3)
+        ``cv2.VideoCapture`` or alike, whose colours are in the order blue, green, red; or images of unsigned integers,
+        scaled by the range of their type, or floating point in [0, 1].
+
+    Yields
+    ------
+    ndarray, float32, shape (H, W) or (H, W, 3)
+        Intensities in [0, 1].
+
+    Raises
+    ------
+    DataError
+        Values out of range, or not finite.
+
+    Examples
+    --------
+    >>> [float(frame[0, 0]) for frame in live_frames(np.full((2, 1, 1), 51, np.uint8))]
+    [0.20000000298023224, 0.20000000298023224]
+    """
+    images = _captured(source) if isinstance(source, Capture) else source
+    for number, image in enumerate(images):
+        pixels = np.asanyarray(image)
+        yield to_unit(pixels, full_scale_of(pixels.dtype, f"frame {number}"), f"frame {number}")
+
+
+def _captured(capture: Capture) -> Iterator[PixelArray]:
+    while True:
+        there, pixels = capture.read()
+        if not there:
+            return
+        yield pixels if pixels.ndim == 2 else pixels[..., ::-1]
