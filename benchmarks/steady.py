@@ -1,0 +1,69 @@
+"""Gain of steadied frames: still scenes, and scenes with moving objects, through phase screens.
+
+python benchmarks/steady.py camera chart --frames 80 --size 256
+python benchmarks/steady.py camera --frames 42 --size 192 --moving 3
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from itertools import islice, zip_longest
+
+import cv2
+import numpy as np
+
+from turbrestore.core.arrays import FloatArray
+from turbrestore.runtime.runtime import Runtime
+from turbrestore.steady.video import steady_frames
+from turbrestore.synthesis.anisoplanatic import phase_screen_frames
+from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
+from turbrestore.synthesis.moving_objects import draw_objects, with_objects
+from turbrestore.synthesis.scenes import SCENES
+
+# Pixels around the objects that belong neither to them nor to the background.
+RIM = np.ones((9, 9), np.uint8)
+
+
+def decibels(image: FloatArray, truth: FloatArray, part: np.ndarray) -> float:
+    """PSNR of a part of an image."""
+    return float(-10 * np.log10(np.mean((np.clip(image, 0, 1) - truth)[part] ** 2)))
+
+
+def compare(name: str, options: argparse.Namespace) -> str:
+    """One line: gains in dB, on average and at least, of the whole, the background and the objects; CPU time."""
+    scene, params = SCENES[name](options.size, options.size), PhaseScreenParams(d_over_r0=STRENGTHS[options.strength])
+    objects = draw_objects(options.moving, scene.shape, np.random.default_rng([options.seed, 1]))
+    air = np.random.default_rng(options.seed)
+    frames = [frame.image for frame in phase_screen_frames(scene, options.frames, air, params, objects=objects)]
+    started, gains = time.process_time(), []
+    for frame in steady_frames(frames, runtime=Runtime(threads=1)):
+        truth, mask = with_objects(scene, objects, frame.number)
+        parts = [np.ones_like(mask), cv2.dilate(mask.astype(np.uint8), RIM) == 0, mask]
+        seen = frames[frame.number]
+        pairs = [(decibels(frame.image, truth, part), decibels(seen, truth, part)) for part in parts if part.any()]
+        gains.append([ours - theirs for ours, theirs in pairs])
+    seconds = (time.process_time() - started) / options.frames
+    # An object may be out of sight in some frames.
+    columns = zip_longest(*gains, fillvalue=np.nan)
+    shown = islice(columns, 3 if objects else 1)
+    cells = " | ".join(f"{np.nanmean(column):.2f}, {np.nanmin(column):.2f}" for column in shown)
+    return f"| {name} | {cells} | {seconds:.3f} |"
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", choices=sorted(SCENES))
+    parser.add_argument("--frames", type=int, default=80)
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--moving", type=int, default=0)
+    parser.add_argument("--strength", choices=sorted(STRENGTHS), default="medium")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    for name in options.scenes:
+        print(compare(name, options), flush=True)
+
+
+if __name__ == "__main__":
+    main()
