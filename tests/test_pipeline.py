@@ -193,7 +193,7 @@ def test_a_cropped_border_is_what_the_frames_show(blurred):
 
 def test_every_stage_says_what_it_decided(blurred):
     subjects = [decision.subject for decision in restore(blurred.frames, replace(QUICK, train=14)).decisions]
-    stages = ["training", "centroid", "flow model", "frames", "geometry", "blur", "guards", "border"]
+    stages = ["training", "centroid", "displacement", "flow model", "frames", "geometry", "blur", "guards", "border"]
     assert list(dict.fromkeys(subjects)) == stages
 
 

@@ -153,7 +153,7 @@ class TestPage:
             assert word in text
         assert f"{whole.blur.sigma:.2f} ± {whole.blur.uncertainty:.2f} px" in text
         labels = [a["aria-label"] for tag, a in Elements(page).found if tag == "svg" and "aria-label" in a]
-        assert len(labels) == 8 + bool(whole.deconvolution.recorded.size)
+        assert len(labels) == 9 + bool(whole.deconvolution.recorded.size)
         for stage in whole.seconds.values():
             assert f"{stage:.2f} s" in text
 
