@@ -28,7 +28,7 @@ SIDE, FRAMES = 112, 48
 OPTICS = Optics(pixel_scale=2.75e-6, aperture=0.1, wavelength=550e-9, distance=2000.0)
 ONE = Runtime(threads=1)
 # D/r0 of the clips that have one.
-KNOWN = {"ao_brick_weak": 1.2, "ao_chart_weak": 1.2, "ao_camera_medium": 2.5}
+KNOWN = {"ao_brick_weak": 1.0, "ao_chart_weak": 1.0, "ao_camera_medium": 2.5}
 
 
 def seeing_of(frames: FloatArray) -> Seeing:
