@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _PATIENCE = 10
 # Processes that a piece of work may lose; one that has died may have been the victim of another one.
 _LOST_PROCESSES = 3
+# Dask would look a hundred times a second at what each process is doing.
+_SETTINGS = {"distributed.scheduler.allowed-failures": _LOST_PROCESSES, "distributed.worker.profile.enabled": False}
 
 
 def check_cluster(command: str, scheduler: str | None, workers: int | None) -> None:
@@ -56,7 +58,7 @@ def connected(scheduler: str | None, count: int, quiet: bool) -> Iterator[Client
         return
     with (
         TemporaryDirectory(prefix="turbrestore-", ignore_cleanup_errors=True) as scratch,
-        dask.config.set({"distributed.scheduler.allowed-failures": _LOST_PROCESSES}),
+        dask.config.set(_SETTINGS),
         LocalCluster(
             n_workers=count,
             threads_per_worker=1,
