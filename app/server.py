@@ -92,32 +92,12 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     from fastapi import FastAPI, Response
     from nicegui import app, ui
 
-    from .page import Page, add_styles_and_scripts
-
     # Tab and page of every tab of the browser, which keeps its name when the page is loaded again.
     shown: dict[str, tuple[Tab, str]] = {}
 
     @ui.page("/", title="turbrestore", reconnect_timeout=_ABSENCE)
     async def page() -> None:
-        add_styles_and_scripts()
-        client = ui.context.client
-        await client.connected()
-        name = client.tab_id
-        # The browser may have left before it had the page.
-        if name is None:
-            return
-        tab = shown[name][0] if name in shown else Tab(folders)
-        shown[name] = tab, client.id
-        tabs.add(tab)
-
-        def leave() -> None:
-            if shown[name] == (tab, client.id):
-                del shown[name]
-                tabs.discard(tab)
-                threading.Thread(target=tab.close).start()
-
-        client.on_delete(leave)
-        await Page(tab).show(file)
+        await _show(shown, tabs, folders, file)
 
     @app.get("/pictures/{key}/{name}", response_class=Response)
     def picture(key: str, name: str) -> Response:
@@ -146,6 +126,33 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     guard = Guard(web, token, port, DEFAULT_LIMITS.max_bytes + 4096)
     config = uvicorn.Config(guard, log_level="critical", access_log=False, timeout_graceful_shutdown=_FAREWELL)
     return uvicorn.Server(config)
+
+
+async def _show(shown: dict[str, tuple[Tab, str]], tabs: set[Tab], folders: Folders, file: Path | None) -> None:
+    """Show a tab of the browser what it had before it was loaded again, or a new page."""
+    from nicegui import ui
+
+    from .page import Page, add_styles_and_scripts
+
+    add_styles_and_scripts()
+    client = ui.context.client
+    await client.connected()
+    name = client.tab_id
+    # The browser may have left before it had the page.
+    if name is None:
+        return
+    tab = shown[name][0] if name in shown else Tab(folders)
+    shown[name] = tab, client.id
+    tabs.add(tab)
+
+    def leave() -> None:
+        if shown[name] == (tab, client.id):
+            del shown[name]
+            tabs.discard(tab)
+            threading.Thread(target=tab.close).start()
+
+    client.on_delete(leave)
+    await Page(tab).show(file)
 
 
 def _listen(port: int) -> socket.socket:
