@@ -80,7 +80,9 @@ class RunView:
                 self._graph.on(event, self._dragged, throttle=0.05, js_handler=_LEVEL)
             with ui.element("div").classes("fields"):
                 ui.label("Preset").classes("what")
-                self._preset = ui.toggle(list(PRESETS), value="standard").props('dense no-caps aria-label="Preset"')
+                self._preset = ui.toggle(list(PRESETS), value="standard").props(
+                    'unelevated no-caps padding="4px 12px" aria-label="Preset"'
+                )
             with ui.element("div").classes("fields apart"):
                 self._preview = ui.button("Preview", on_click=lambda: self._start(self._page.tab.preview))
                 self._preview.props("outline")

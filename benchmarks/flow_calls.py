@@ -6,6 +6,11 @@ prints a Markdown document and writes it, with a picture of the curves beside it
 ``benchmarks/quality.py`` that have a truth, cut to their first frames and their middle; ``--clips`` takes names or
 patterns.  Time is the number of flow calls times what one takes, measured on each clip, so that a busy machine changes
 the scale of the curves and not their shape.  It ends with 1 where the default is not at the knee.
+
+    TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --presets --write benchmarks/results/presets.md
+
+instead restores the whole clips by the presets and by what lies around them, and shows PSNR against processor time.  It
+ends with 1 where ``fast`` is less than 2.3 times as fast as ``standard``, or loses more than 0.3 dB on average.
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,8 +33,10 @@ from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
-from turbrestore.registration.flow import iterate_flows
+from turbrestore.registration.flow import FlowParams, iterate_flows
+from turbrestore.registration.opencv_flow import DisParams
 from turbrestore.runtime.runtime import Runtime
+from turbrestore.settings import preset
 
 CLIPS = ("quick_*", "ao_*", "purdue1_*")
 FRAMES, SIDE, THREADS = 48, 160, 2
@@ -36,6 +44,17 @@ CENTROID, INNER = range(1, 7), range(1, 4)
 DEFAULT, RUNTIME = RestoreParams(), Runtime(threads=THREADS)
 # Quality that a default must not cost on any clip, dB.
 TOLERATED = 0.05
+ONE_PASS = FilterParams(inner_iterations=1)
+PRESETS = {
+    "half resolution": RestoreParams(flow=FlowParams(dis=DisParams(finest_scale=1, refinements=4)), filter=ONE_PASS),
+    "**fast**": preset("fast"),
+    "6 pixels, 4 refinements": RestoreParams(
+        flow=FlowParams(dis=DisParams(patch_stride=6, refinements=4)), filter=ONE_PASS
+    ),
+    "**standard**": preset("standard"),
+}
+# Least factor of ``fast`` in speed, and the most that it may lose, dB.
+FASTER, LOST = 2.3, 0.3
 
 
 @dataclass(frozen=True)
@@ -48,6 +67,14 @@ class Point:
     seconds: float
 
 
+@dataclass(frozen=True)
+class Cost:
+    """One preset on one clip: PSNR of the restored image, dB, and the processor time of its restoration, seconds."""
+
+    psnr: float
+    seconds: float
+
+
 # Of one clip: the default, then each setting.
 Curves = dict[str, Point]
 
@@ -57,7 +84,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clips", nargs="+", default=CLIPS, metavar="NAME", help="names or patterns")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the document and a picture")
+    parser.add_argument("--presets", action="store_true", help="restore by the presets, and measure processor time")
     options = parser.parse_args()
+    if options.presets:
+        return compare_presets(options.clips, options.write)
     measured: dict[str, Curves] = {}
     try:
         for name, load in find_clips(options.clips).items():
@@ -74,6 +104,77 @@ def main() -> int:
         atomic_write(options.write, text.encode(), overwrite=True)
         draw(measured, options.write.with_suffix(".png"))
     return int(not at_knee)
+
+
+def compare_presets(patterns: Sequence[str], write: Path | None) -> int:
+    """Restore the clips by every preset and its neighbours; 1 if ``fast`` is too slow, or too bad."""
+    measured: dict[str, dict[str, Cost]] = {}
+    for name, load in find_clips(patterns).items():
+        clip = load()
+        if clip.truth is None:
+            continue
+        measured[name] = {}
+        for setting, params in PRESETS.items():
+            begun = time.process_time()
+            image = restore(clip.frames, params, RUNTIME).image
+            measured[name][setting] = Cost(compare(image, clip.truth).psnr, time.process_time() - begun)
+        print(f"{name}: {measured[name]}", file=sys.stderr, flush=True)
+    text, held = presets_document(measured)
+    print(text, end="")
+    if write is not None:
+        atomic_write(write, text.encode(), overwrite=True)
+        draw_presets(measured, write.with_suffix(".png"))
+    return int(not held)
+
+
+def presets_document(measured: dict[str, dict[str, Cost]]) -> tuple[str, bool]:
+    """Markdown of the curve, and whether ``fast`` keeps its bounds."""
+    lines = [
+        "# Presets: quality against time\n",
+        "What `TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --presets --write benchmarks/results/presets.md` "
+        f"measures on {len(measured)} simulated clips, whole: PSNR of the restored image against the truth, and the "
+        "processor time of the restoration. All but `standard` have one inner pass of the filter; `fast` has patches "
+        "8 pixels apart and 2 refinements, and its neighbours 6 pixels and 4, or 3 pixels at half the resolution and "
+        "4.\n",
+        "![PSNR against processor time](presets.png)\n",
+        f"| setting | CPU, s | times as fast as standard | PSNR, dB | {' | '.join(measured)} |",
+        f"|---|---:|---:|---:|{'---:|' * len(measured)}",
+    ]
+    means = mean_costs(measured)
+    standard = means["**standard**"]
+    for setting, cost in means.items():
+        changes = [f"{costs[setting].psnr - costs['**standard**'].psnr:+.2f}" for costs in measured.values()]
+        factor = standard.seconds / cost.seconds
+        row = f"| {setting} | {cost.seconds:.1f} | {factor:.2f} | {cost.psnr:.2f} | {' | '.join(changes)} |"
+        lines.append(row)
+    fast = means["**fast**"]
+    factor, lost = standard.seconds / fast.seconds, standard.psnr - fast.psnr
+    lines.append(
+        f"\nColumns of clips: change against `standard`, dB. `fast` is {factor:.2f} times as fast as `standard` (bound "
+        f"{FASTER}) and loses {lost:.2f} dB (bound {LOST})."
+    )
+    return "\n".join(lines) + "\n", factor >= FASTER and lost <= LOST
+
+
+def mean_costs(measured: dict[str, dict[str, Cost]]) -> dict[str, Cost]:
+    """Mean over the clips."""
+    return {
+        setting: Cost(*np.mean([(costs[setting].psnr, costs[setting].seconds) for costs in measured.values()], axis=0))
+        for setting in PRESETS
+    }
+
+
+def draw_presets(measured: dict[str, dict[str, Cost]], path: Path) -> None:
+    """Draw the means over the clips."""
+    figure, axis = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
+    for setting, cost in mean_costs(measured).items():
+        named = setting.startswith("*")
+        axis.plot(cost.seconds, cost.psnr, "o", color="C1" if named else "C0")
+        axis.annotate(setting.strip("*"), (cost.seconds, cost.psnr), (5, 4), textcoords="offset points", fontsize=8)
+    axis.set(xlabel="processor time of a restoration, s", ylabel="PSNR, dB")
+    axis.margins(x=0.25, y=0.15)
+    axis.set_xlim(left=0)
+    figure.savefig(path, dpi=110)
 
 
 def settings() -> dict[str, RestoreParams]:

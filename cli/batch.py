@@ -66,7 +66,7 @@ def batch(
     out : Path
         Folder for the results: an image and its settings for each clip, summary.csv, and index.html with pictures.
     preset : str
-        Settings to start from: fast takes a third of the time, paper is the method as published.  Any other setting
+        Settings to start from: fast takes less than half the time, paper is the method as published.  Any other setting
         given wins over those of the preset.
     sigma : float
         Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.

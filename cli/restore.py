@@ -120,7 +120,7 @@ def restore(
         Image to write: .png (8 or 16 bit), .tif (8, 16 bit or float) or .fits (the same, with the header of a FITS
         input and the history of the run).
     preset : str
-        Settings to start from: fast takes a third of the time, paper is the method as published.  Any other setting
+        Settings to start from: fast takes less than half the time, paper is the method as published.  Any other setting
         given wins over those of the preset.
     sigma : float
         Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.

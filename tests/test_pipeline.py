@@ -15,7 +15,7 @@ from turbrestore.memory_plan import training_share
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
 from turbrestore.registration.centroid import CentroidParams
-from turbrestore.settings import RestoreParams
+from turbrestore.settings import RestoreParams, preset
 
 QUICK = RestoreParams(centroid=CentroidParams(iterations=2))
 
@@ -131,6 +131,7 @@ def test_progress_reaches_every_stage(blurred):
 def test_training_share():
     assert training_share(120, (64, 64), wanted=7) == 7
     assert training_share(2, (64, 64)) == 2
+    assert training_share(40, (64, 64), half=True) == 20
     assert 2 <= training_share(300, (4320, 7680, 3)) < 10
 
 
@@ -215,3 +216,15 @@ def test_decisions_are_told_in_the_order_in_which_they_are_recorded(blurred):
     restoration = restore(blurred.frames[:6], replace(QUICK, until="filter"), on_decision=told.append)
     assert tuple(told) == restoration.decisions
     assert told
+
+
+def test_presets_are_sets_of_settings():
+    assert preset("standard") == RestoreParams()
+    assert preset("fast").filter.inner_iterations == 1
+    with pytest.raises(ConfigurationError, match="preset: expected one of fast, standard, paper, found 'best'"):
+        preset("best")
+
+
+def test_frames_that_train_are_not_all_frames_where_they_are_skipped(blurred):
+    with pytest.raises(ConfigurationError, match="train: expected fewer than the 24 frames"):
+        restore(blurred.frames, replace(preset("paper"), train=24))

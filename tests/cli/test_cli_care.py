@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 STEPS = ["--deconvolution.iterations", "3", "--quiet"]
 QUICK = ["--centroid.iterations", "1", "--filter.inner-iterations", "1", *STEPS]
 # Examples as they stand, but on fewer frames and fewer runs.
-SMALLER = {("--frames", "0:24"): "0:4", ("--frames", "120"): "6", ("--frames", "300"): "6", ("--train", "40"): "6"}
+SMALLER = {("--frames", "0:24"): "0:4", ("--frames", "120"): "6", ("--frames", "300"): "6", ("--train", "40"): "5"}
 SMALLER |= {("--seeds", "20"): "2"}
 
 

@@ -64,7 +64,7 @@ def study_prediction(
     Parameters
     ----------
     flows : array_like, shape (T, H, W, 2)
-        Flows from one reference to successive frames, pixels; at least 8.
+        Flows from one reference to successive frames, pixels; at least 5.
     params : DynamicsParams, optional
         ``rank`` is the largest n; by default it is a third of the largest τ, at most ``max_rank``.
     runtime : Runtime
@@ -76,7 +76,7 @@ def study_prediction(
     Raises
     ------
     DataError
-        Fewer than 8 flows, or not flows.
+        Fewer than 5 flows, or not flows.
 
     Examples
     --------
@@ -86,8 +86,8 @@ def study_prediction(
     ([0.615, 0.11, 0.11], 0.48)
     """
     params, stack = params or DynamicsParams(), check_flow(flows, "flows")
-    if stack.ndim != 4 or len(stack) < 8:
-        raise DataError(f"flows: expected at least 8, shape (T, H, W, 2), found {stack.shape}")
+    if stack.ndim != 4 or len(stack) < 5:
+        raise DataError(f"flows: expected at least 5, shape (T, H, W, 2), found {stack.shape}")
     split = len(stack) - max(2, int(_HELD_OUT * len(stack)))
     largest = min(params.max_rank, split // 3) if params.rank is None else min(params.rank, split - 1)
     lengths = np.unique([max(3, round(share * split)) for share in _LENGTHS])
