@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore.core.errors import DataError
+from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.bars import without_bars
 from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.light import steady_light
@@ -150,6 +150,10 @@ class TestOverlays:
         mask[25, 12] = 1
         write_image(tmp_path / "file.png", mask, 8)
         assert np.argwhere(read_static_mask(tmp_path / "file.png", source)).tolist() == [[5, 2]]
+
+    def test_what_is_neither_a_choice_nor_an_image_is_refused(self):
+        with pytest.raises(ConfigurationError, match="static_mask: expected auto, off or an image file, found 'yes'"):
+            RestoreParams(static_mask="yes")
 
     def test_scenes_have_none(self, shaken, clip):
         for frames in (shaken, u8(clip.frames), u8(0.2 + 0 * clip.frames[:1] + 0.3 * clip.frames)):
