@@ -3,7 +3,8 @@
     TURBRESTORE_DATA=DIR python benchmarks/ablation.py --write benchmarks/results/ablation.md
 
 prints a Markdown document and writes it.  Clips are those of ``benchmarks/quality.py`` that have a truth; ``--clips``
-takes names or patterns.  ``--noise`` adds white noise of that standard deviation to the clips.
+takes names or patterns.  ``--noise`` adds white noise of that standard deviation to the clips and cuts
+them to [0, 1].
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def main() -> int:
         for name, load in find_clips(options.clips).items():
             clip = load()
             added = np.random.default_rng(0).normal(0.0, options.noise, clip.frames.shape)
-            clip = replace(clip, frames=(clip.frames + added).astype(np.float32))
+            clip = replace(clip, frames=np.clip(clip.frames + added, 0, 1).astype(np.float32))
             if clip.truth is not None:
                 rows[name] = measure(clip, clip.truth)
                 print(f"{name}: {rows[name]}", file=sys.stderr, flush=True)
