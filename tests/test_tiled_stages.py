@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore import pipeline
+from turbrestore import fusion, pipeline
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
@@ -225,7 +225,7 @@ def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tmp_path, mo
     source = FrameSource.from_array(sequence.frames)
     whole = pipeline.restore(source, QUICK)
     (folder := tmp_path / "kept").mkdir()
-    kept, real = RunFolder(folder, source, QUICK), pipeline._filter_tile
+    kept, real = RunFolder(folder, source, QUICK), fusion._filter_tile
 
     def interrupted(run, centroid, training, counted, number):
         if number == finished:
@@ -233,7 +233,7 @@ def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tmp_path, mo
         return real(run, centroid, training, counted, number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "_filter_tile", interrupted)
+        patch.setattr(fusion, "_filter_tile", interrupted)
         with pytest.raises(KeyboardInterrupt):
             pipeline.restore(source, QUICK, store=kept)
     later = RunFolder(folder, source, QUICK, resume=True)
@@ -251,7 +251,7 @@ def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tmp_path, mo
 
 @pytest.mark.usefixtures("in_tiles")
 def test_a_damaged_tile_is_filtered_again(sequence, tmp_path, monkeypatch):
-    source, real = FrameSource.from_array(sequence.frames), pipeline._filter_tile
+    source, real = FrameSource.from_array(sequence.frames), fusion._filter_tile
     (folder := tmp_path / "kept").mkdir()
 
     def interrupted(run, centroid, training, counted, number):
@@ -260,7 +260,7 @@ def test_a_damaged_tile_is_filtered_again(sequence, tmp_path, monkeypatch):
         return real(run, centroid, training, counted, number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "_filter_tile", interrupted)
+        patch.setattr(fusion, "_filter_tile", interrupted)
         with pytest.raises(KeyboardInterrupt):
             pipeline.restore(source, QUICK, store=RunFolder(folder, source, QUICK))
     damaged = folder / "filtered_tile_0.npz"

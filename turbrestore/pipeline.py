@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from functools import partial
-from itertools import chain
-from typing import TypeVar
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,18 +13,14 @@ from .blind.remove_blur import Deblurred, remove_blur_steps
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.errors import require
-from .dynamics.dynamic_texture import identify
-from .dynamics.flow_model import FlowDynamics
-from .filtering.alternating import Filtered, FilterStep, filter_steps
 from .footage.bars import without_bars
-from .footage.frame_selection import best_frames, frame_quality
 from .footage.levels import Levels, stretch_levels
 from .footage.light import steady_light
 from .footage.overlays import read_static_mask, without_overlay
+from .fusion import Fused, Run, fuse
 from .io.output import check_space
 from .io.source import FrameSource
-from .memory_plan import MemoryPlan, plan_memory
-from .registration.centroid import Centroid, centroid_steps
+from .memory_plan import plan_memory
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
 from .registration.recentring import recentre
@@ -35,48 +28,17 @@ from .results import NoStore, Restoration, Store
 from .runtime.allocator import returning_freed_memory
 from .runtime.device import explain_device
 from .runtime.runtime import DEFAULT, Runtime
-from .runtime.scratch import fill_stack, iter_frames, mean_of
-from .runtime.steps import Progress, finish, step_counter
-from .runtime.tiling import HaloTile, cut_tile, halo_tiles
-from .seeing.displacement import LEAST_FRAMES
-from .seeing.strength import Seeing, measure_seeing
+from .runtime.steps import Progress, finish
+from .runtime.tiling import halo_tiles
 from .settings import RestoreParams
-from .tiled_stages import (
-    TileMap,
-    centroid_tasks,
-    filter_tasks,
-    join_centroids,
-    join_filtered,
-    only_counted,
-    run_centroid_task,
-    run_filter_task,
-    tile_filter_steps,
-)
-from .uncertainty.pixel_deviation import (
-    informed_pixels,
-    pixel_deviation,
-    position_variance,
-    posterior_gain,
-)
-from .wording import (
-    explain_border,
-    explain_camera,
-    explain_centroid,
-    explain_dynamics,
-    explain_frames,
-    explain_geometry,
-    explain_input,
-    explain_motion,
-    explain_seeing,
-    explain_training,
-)
+from .tiled_stages import TileMap
+from .uncertainty.pixel_deviation import informed_pixels, pixel_deviation, position_variance, posterior_gain
+from .wording import explain_border
 
 # Every pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
 # The shorter side of the image is at least this many widths of the blur; a wider blur leaves nothing to restore.
 _SIGMAS_A_SIDE = 8
-
-Result = TypeVar("Result")
 
 
 def restore(
@@ -155,7 +117,7 @@ def restore(
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, plan.train)
     stretched, kept = _stretched_params(params, levels), store or NoStore()
-    run = _Run(source, stretched, plan, tiles, kept, levels, progress, on_decision, map_tiles)
+    run = Run(source, stretched, plan, tiles, kept, levels, progress, on_decision, map_tiles)
     run.seconds["read"] = time.perf_counter() - begun
     run.decide(*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
     run.decide(*on_bars, *on_overlay, *on_light, *on_range)
@@ -171,48 +133,10 @@ def restore(
     return replace(restoration, image=image, mean=bars.put_back(restoration.mean), uncertainty=uncertainty)
 
 
-@dataclass(frozen=True)
-class _Run:
-    """Arguments that every stage shares, what was decided, and the wall time of the stages that have run."""
-
-    source: FrameSource
-    params: RestoreParams
-    plan: MemoryPlan
-    tiles: tuple[HaloTile, ...]
-    store: Store
-    levels: Levels
-    progress: Progress | None
-    on_decision: Callable[[Decision], None] | None
-    map_tiles: TileMap | None = None
-    decisions: list[Decision] = field(default_factory=list)
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def decide(self, *decisions: Decision) -> None:
-        """Record decisions, and tell whoever listens."""
-        self.decisions.extend(decisions)
-        if self.on_decision is not None:
-            for decision in decisions:
-                self.on_decision(decision)
-
-    def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:
-        """Return a result from the store, or compute it, and add the time that this takes to that of the stage.
-
-        Results have the levels of the clip.
-        """
-        begun = time.perf_counter()
-        result = self.store.get(name, lambda: self.levels.original_result(compute()))
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begun
-        return result
-
-    def counter(self, stage: str, total: int) -> Callable[[object], None]:
-        """Return the observer of the steps of one stage, which reports progress."""
-        return step_counter(self.progress, stage, total)
-
-
-def _restored(run: _Run) -> Restoration:
+def _restored(run: Run) -> Restoration:
     """Fuse the frames, deblur the image and crop it."""
     params = run.params
-    fused = _fuse(run)
+    fused = fuse(run)
     image, centroid, deblurred = fused.image, fused.centroid, None
     if params.runs("deconvolve"):
         deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused))
@@ -242,154 +166,7 @@ def _restored(run: _Run) -> Restoration:
     )
 
 
-@dataclass(frozen=True)
-class _Fused:
-    """Results of the stages before the deconvolution."""
-
-    image: FloatArray
-    mean: FloatArray
-    centroid: Centroid
-    seeing: Seeing | None
-    dynamics: FlowDynamics | None = None
-    filtered: Filtered | None = None
-
-
-def _fuse(run: _Run) -> _Fused:
-    """Run the stages up to the filter; the training frames are freed when this function returns."""
-    params, train, stream = run.params, run.plan.train, iter(run.source)
-    begun, levels = time.perf_counter(), run.levels
-    training = fill_stack((train, *run.source.shape[1:]), stream, run.plan.runtime.scratch)
-    run.seconds["read"] += time.perf_counter() - begun
-    run.decide(explain_training(train, len(run.source), params.train), *explain_input(training))
-
-    centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
-    run.decide(explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows))
-    seeing = _measure_seeing(run, training, centroid)
-    if not params.runs("identify"):
-        return _Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing)
-
-    dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
-    run.decide(*explain_dynamics(dynamics))
-    if not params.runs("filter"):
-        return _Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, dynamics)
-
-    start = levels.stretched_result(centroid)
-    filtered = run.stage("filter", "filtered", lambda: _filter(run, start, dynamics, training, stream).recentred())
-    mean = run.stage("filter", "mean", lambda: levels.original(_temporal_mean(run.source)))
-    # The sharpness is NaN for frames that do not count.
-    chosen = int(np.isfinite(filtered.sharpness).sum())
-    run.decide(
-        explain_frames(filtered, None if params.keep_best == 1 else chosen), explain_geometry(filtered, dynamics)
-    )
-    return _Fused(filtered.image, mean, centroid, seeing, dynamics, filtered)
-
-
-def _find_centroid(run: _Run, training: FloatArray) -> Centroid:
-    params, runtime, train = run.params, run.plan.runtime, len(training)
-    if run.tiles:
-        parts = _centroids_here(run, training) if run.map_tiles is None else _centroids_elsewhere(run, train)
-        return join_centroids(parts, run.tiles, training.shape, runtime.scratch)
-    steps = centroid_steps(training, params.centroid, params.flow, runtime)
-    return finish(steps, run.counter("centroid", train * params.centroid.iterations))
-
-
-def _centroids_here(run: _Run, training: FloatArray) -> Iterator[Centroid]:
-    params, runtime = run.params, run.plan.runtime
-    count = run.counter("centroid", len(run.tiles) * len(training) * params.centroid.iterations)
-    for tile in run.tiles:
-        yield finish(
-            centroid_steps(cut_tile(training, tile, runtime.scratch), params.centroid, params.flow, runtime), count
-        )
-
-
-def _centroids_elsewhere(run: _Run, train: int) -> Iterator[Centroid]:
-    params, count = run.params, run.counter("centroid", len(run.tiles))
-    assert run.map_tiles is not None
-    tasks = centroid_tasks(run.source, run.tiles, train, params.centroid, params.flow, run.plan.runtime)
-    for part in run.map_tiles(run_centroid_task, tasks):
-        count(part)
-        yield part
-
-
-def _measure_seeing(run: _Run, training: FloatArray, centroid: Centroid) -> Seeing | None:
-    """Measure the strength of the turbulence, unless there are too few frames."""
-    if len(training) < LEAST_FRAMES:
-        return None
-    begun, image, threads = time.perf_counter(), run.levels.stretched(centroid.image), run.plan.runtime.threads
-    seeing = measure_seeing(training, centroid.flows, image, mean_of(training), threads=threads)
-    run.seconds["seeing"] = time.perf_counter() - begun
-    run.decide(*explain_seeing(seeing))
-    return seeing
-
-
-def _filter(
-    run: _Run, centroid: Centroid, dynamics: FlowDynamics, training: FloatArray, rest: Iterator[FloatArray]
-) -> Filtered:
-    params, source = run.params, run.source
-    counted = np.ones(len(source), bool)
-    if params.keep_best < 1:
-        counted = best_frames(frame_quality(source), params.keep_best)
-    if run.tiles:
-        parts = (_tiles_here if run.map_tiles is None else _tiles_elsewhere)(run, centroid, training, counted)
-        return join_filtered(parts, run.tiles, source.shape[1:], run.plan.runtime.scratch)
-    frames, start = only_counted(chain(iter_frames(training), rest), counted), run.store.filter_start()
-    runtime, flows = run.plan.runtime, centroid.flows
-    steps = filter_steps(frames, centroid.image, dynamics, params.filter, params.flow, flows, runtime, start)
-    return finish(steps, partial(_observe_filter, run, 0))
-
-
-def _tiles_here(run: _Run, centroid: Centroid, training: FloatArray, counted: np.ndarray) -> Iterator[Filtered]:
-    for number in range(len(run.tiles)):
-        yield run.store.get(_tile_name(number), partial(_filter_tile, run, centroid, training, counted, number))
-
-
-def _tiles_elsewhere(run: _Run, centroid: Centroid, training: FloatArray, counted: np.ndarray) -> Iterator[Filtered]:
-    """Filter those tiles in other processes that the store does not have."""
-    params, total = run.params, len(run.tiles)
-    assert run.map_tiles is not None
-    missing = [tile for number, tile in enumerate(run.tiles) if f"{_tile_name(number)}.npz" not in run.store.stored]
-    settings = params.dynamics, params.filter, params.flow, run.plan.runtime
-    tasks = filter_tasks(run.source, missing, centroid, counted, *settings)
-    results = iter(run.map_tiles(run_filter_task, tasks))
-    for number in range(total):
-        part = run.store.get(_tile_name(number), lambda: next(results))
-        if run.progress is not None:
-            run.progress("filter", number + 1, total)
-        yield part
-
-
-def _tile_name(number: int) -> str:
-    return f"filtered_tile_{number}"
-
-
-def _filter_tile(run: _Run, centroid: Centroid, training: FloatArray, counted: np.ndarray, number: int) -> Filtered:
-    """Filter a tile in this process."""
-    tile, params, runtime = run.tiles[number], run.params, run.plan.runtime
-    frames, flows = (cut_tile(stack, tile, runtime.scratch) for stack in (training, centroid.flows))
-    image, source = centroid.image[tile.rows, tile.columns].copy(), run.source.select(roi=tile.roi)
-    settings = params.dynamics, params.filter, params.flow, runtime
-    return finish(
-        tile_filter_steps(source, frames, image, flows, counted, *settings), partial(_observe_filter, run, number)
-    )
-
-
-def _observe_filter(run: _Run, tile: int, step: FilterStep) -> None:
-    """Report progress, and give the store the checkpoints, unless the frames are filtered in tiles."""
-    flows = len(run.source) * run.params.filter.inner_iterations - run.plan.train
-    if run.progress is not None:
-        run.progress("filter", tile * flows + step.flows_measured, max(len(run.tiles), 1) * flows)
-    if step.checkpoint is not None and not run.tiles:
-        run.store.checkpoint(step.checkpoint)
-
-
-def _temporal_mean(source: FrameSource) -> FloatArray:
-    total = np.zeros(source.shape[1:])
-    for frame in source:
-        total += frame
-    return (total / len(source)).astype(np.float32)
-
-
-def _deblur(run: _Run, fused: _Fused) -> Deblurred:
+def _deblur(run: Run, fused: Fused) -> Deblurred:
     params, plan, levels = run.params, run.plan, run.levels
     image, guide = levels.stretched(fused.image), levels.stretched(fused.centroid.image)
     if fused.filtered is not None:
@@ -401,7 +178,7 @@ def _deblur(run: _Run, fused: _Fused) -> Deblurred:
 
 
 def _measure_uncertainty(
-    run: _Run, image: FloatArray, fused: _Fused, seen: FloatArray, deblurred: Deblurred | None
+    run: Run, image: FloatArray, fused: Fused, seen: FloatArray, deblurred: Deblurred | None
 ) -> FloatArray | None:
     """Measure the standard deviation of every pixel of a filtered image."""
     filtered, dynamics = fused.filtered, fused.dynamics

@@ -93,19 +93,20 @@ def spy(monkeypatch):
     """Names of the stages that are computed from now on."""
     called = []
     for name in STAGES:
-        real = getattr(sys.modules["turbrestore.pipeline"], name)
+        module = "turbrestore.pipeline" if name == "remove_blur_steps" else "turbrestore.fusion"
+        real = getattr(sys.modules[module], name)
 
         def counted(*arguments, real=real, name=name, **named):
             called.append(name)
             return real(*arguments, **named)
 
-        monkeypatch.setattr(f"turbrestore.pipeline.{name}", counted)
+        monkeypatch.setattr(f"{module}.{name}", counted)
     return called
 
 
 PLACES = {
-    "centroid": ("turbrestore.pipeline.centroid_steps", 1),
-    "flow model": ("turbrestore.pipeline.identify", 1),
+    "centroid": ("turbrestore.fusion.centroid_steps", 1),
+    "flow model": ("turbrestore.fusion.identify", 1),
     "first block": ("turbrestore.filtering.alternating.pass_over", 1),
     "third block": ("turbrestore.filtering.alternating.pass_over", 4),
     "deconvolution": ("turbrestore.pipeline.remove_blur_steps", 1),
