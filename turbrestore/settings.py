@@ -122,7 +122,7 @@ class RestoreParams:
 PRESETS: Mapping[Preset, RestoreParams] = MappingProxyType(
     {
         "fast": RestoreParams(
-            flow=FlowParams(dis=DisParams(patch_stride=8, refinements=2)),
+            flow=FlowParams(dis=DisParams(finest_scale=1, refinements=4)),
             filter=FilterParams(inner_iterations=1),
         ),
         "standard": RestoreParams(),
