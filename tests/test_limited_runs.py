@@ -69,11 +69,11 @@ def test_the_truth_is_not_in_memory_while_the_stages_run(tmp_path, monkeypatch, 
         truths.append(weakref.ref(image))
         return image
 
-    def run(*words):
+    def run(*words, **more):
         # Readers may leave frames in cycles, which hold the local variables of their callers.
         gc.collect()
         assert [truth() is None for truth in truths] == [True]
-        return pipeline.restore(*words)
+        return pipeline.restore(*words, **more)
 
     monkeypatch.setattr("turbrestore_cli.restore.read_input_image", read)
     monkeypatch.setattr("turbrestore_cli.restore.run_pipeline", run)
