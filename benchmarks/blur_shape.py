@@ -21,7 +21,7 @@ from turbrestore.metrics import align, compare
 
 FREQUENCIES = (1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8)
 DIRECTIONS = (0, 45, 90, 135)
-EXPONENTS = (1.2, 1.5, 5 / 3, 2.0)
+EXPONENTS = (1.0, 1.2, 1.4, 5 / 3)
 # Pixels, about a tenth apart.
 SIGMAS = (0.3, 0.35, 0.42, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.32, 1.46, 1.6, 1.8, 2.0)
 _RINGS = 32

@@ -36,7 +36,9 @@ def explain_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None 
         choice = f"{tiles.removable.min():.2f} to {tiles.removable.max():.2f} pixels removed"
     found = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels found in the whole image"
     where = "" if blur.reduction == 1 else f", reduced by {blur.reduction}"
-    remark = ", part of the uncertainty is left in" if sigma > 0 else ", no more than a sharp image has"
+    remark = ", no more than a sharp image has"
+    if sigma > 0:
+        remark = ", part of the uncertainty is left in" if blur.removable < blur.sigma else ""
     return Decision("blur", choice, found + where + remark)
 
 

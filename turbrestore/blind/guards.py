@@ -16,7 +16,7 @@ hardly leaves the range of a window wider than the blur.  Too large a width does
 Noise gain is the ratio, after to before, of the standard deviation of fine detail in the flattest fifth of f.  Pixels
 near black or white do not count, because clipping takes the noise away; all of them count if few are left.
 
-``docs/decisions/guards.md`` lists both for right and for wrong widths.
+``benchmarks/results/guards.md`` lists all three for right and for wrong widths.
 """
 
 from __future__ import annotations

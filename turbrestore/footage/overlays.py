@@ -172,10 +172,11 @@ def without_overlay(
     def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
         return overlay.without(number, values if before is None else before(number, values, window), window)
 
-    choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show there"
+    choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
     reason = "asked for" if given else "it stands while the scene moves"
     if overlay.hidden >= _REPORTED:
-        reason += f"; {100 * overlay.hidden:.1f} % is shown by no frame, and is filled from around"
+        choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced"
+        reason += f"; {100 * overlay.hidden:.1f} % is shown by no frame and filled from around, the rest by others"
     decision = Decision("overlay", choice, reason)
     return dataclasses.replace(source, adjust=adjust), (decision,)
 

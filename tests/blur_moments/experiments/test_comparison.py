@@ -115,6 +115,12 @@ class TestPrintedProcessNoise:
         assert usual.warnings == ()
         assert usual.lit == 1.0
 
+    def test_an_observer_that_errs_with_all_of_the_light_is_no_case_of_lost_light(self):
+        noisy = mirror(range(2), MirrorParams(noise=1.0, frames=20))
+        assert max(score.ratio for score in noisy.scores.values() if score.of_image) > 2
+        assert noisy.lit == 1.0
+        assert noisy.warnings == ()
+
 
 @pytest.mark.long
 class TestMirror:

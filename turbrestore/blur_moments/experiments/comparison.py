@@ -35,6 +35,8 @@ from .scenarios import (
     wavefront_model,
 )
 
+# Share of the exposures with the spot on the sensor below which light is lost.
+_LIT = 0.99
 # Probability of the consistency band.
 _BAND = 0.95
 # Seeds handled together: enough to amortise the overhead of NumPy, few enough to stay in the cache.
@@ -163,12 +165,12 @@ class Experiment:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One line for each observer of the whole image that errs more than O1, which uses the first moment alone."""
+        """One line for each observer of the whole image that errs more than O1 where the spot leaves the sensor."""
         return tuple(
             f"{name} errs {score.ratio:.2f} times as much as O1: an image without its light misleads it, and the spot "
             f"is on the sensor for {100 * self.lit:.0f} % of the exposures"
             for name, score in self.scores.items()
-            if score.of_image and score.ratio > 1
+            if score.of_image and self.lit < _LIT and score.ratio > 1 + score.ratio_error
         )
 
 
