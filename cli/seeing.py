@@ -10,11 +10,11 @@ from cyclopts import Parameter
 
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.memory_plan import training_share
+from turbrestore.preparation import prepare, seeing_of_picture
 from turbrestore.registration.centroid import CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams
-from turbrestore.runtime.scratch import mean_of
 from turbrestore.runtime.steps import finish, step_counter
-from turbrestore.seeing.strength import Estimate, Seeing, measure_seeing
+from turbrestore.seeing.strength import Estimate, Seeing
 from turbrestore.seeing.tilt_theory import Optics
 
 from .inputs import open_input
@@ -72,11 +72,12 @@ def seeing(
     source = open_input(input, selection, quiet)
     runtime = machine.runtime()
     count = training_share(len(source), source.shape[1:], train)
-    frames = source.read(0, count)
+    prepared = prepare(source, count)
+    frames = prepared.source.read(0, count)
     with progress_bars(quiet) as progress:
         steps = centroid_steps(frames, centroid, flow, runtime)
         found = finish(steps, step_counter(progress, "centroid", count * centroid.iterations))
-    measured = measure_seeing(frames, found.flows, found.image, mean_of(frames), optics, runtime.threads)
+    measured = seeing_of_picture(prepared, frames, found, optics, runtime.threads)
     if json:
         print_json({"input": str(input), "frames": count, **asdict(measured)})
     else:

@@ -20,13 +20,14 @@ from .footage.frame_selection import best_frames, frame_quality
 from .footage.levels import Levels
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan
+from .preparation import Prepared, seeing_of_picture
 from .registration.centroid import Centroid, centroid_steps
 from .results import Store
 from .runtime.scratch import fill_stack, iter_frames, mean_of
 from .runtime.steps import Progress, finish, step_counter
 from .runtime.tiling import HaloTile, cut_tile
 from .seeing.displacement import LEAST_FRAMES
-from .seeing.strength import Seeing, measure_seeing
+from .seeing.strength import Seeing
 from .settings import RestoreParams
 from .tiled_stages import (
     TileMap,
@@ -58,17 +59,26 @@ Result = TypeVar("Result")
 class Run:
     """Arguments that every stage shares, what was decided, and the wall time of the stages that have run."""
 
-    source: FrameSource
+    prepared: Prepared
     params: RestoreParams
     plan: MemoryPlan
     tiles: tuple[HaloTile, ...]
     store: Store
-    levels: Levels
     progress: Progress | None
     on_decision: Callable[[Decision], None] | None
     map_tiles: TileMap | None = None
     decisions: list[Decision] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def source(self) -> FrameSource:
+        """Frames as the stages take them."""
+        return self.prepared.source
+
+    @property
+    def levels(self) -> Levels:
+        """From the levels of the clip to those of the stages."""
+        return self.prepared.levels
 
     def decide(self, *decisions: Decision) -> None:
         """Record decisions, and tell whoever listens."""
@@ -165,8 +175,8 @@ def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seein
     """Measure the strength of the turbulence, unless there are too few frames."""
     if len(training) < LEAST_FRAMES:
         return None
-    begun, image, threads = time.perf_counter(), run.levels.stretched(centroid.image), run.plan.runtime.threads
-    seeing = measure_seeing(training, centroid.flows, image, mean_of(training), threads=threads)
+    begun, stretched = time.perf_counter(), run.levels.stretched_result(centroid)
+    seeing = seeing_of_picture(run.prepared, training, stretched, threads=run.plan.runtime.threads)
     run.seconds["seeing"] = time.perf_counter() - begun
     run.decide(*explain_seeing(seeing))
     return seeing

@@ -13,14 +13,12 @@ from .blind.remove_blur import Deblurred, remove_blur_steps
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.errors import require
-from .footage.bars import without_bars
-from .footage.levels import Levels, stretch_levels
-from .footage.light import steady_light
-from .footage.overlays import read_static_mask, without_overlay
+from .footage.levels import Levels
 from .fusion import Fused, Run, fuse
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import plan_memory
+from .preparation import prepare
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
 from .registration.recentring import recentre
@@ -109,18 +107,12 @@ def restore(
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
     begun = time.perf_counter()
-    automatic = params.static_mask in ("auto", "off")
-    mask = None if automatic else read_static_mask(params.static_mask, source)
-    # Before the light, because a stop would be taken for bands of it.
-    source, bars, on_bars = without_bars(source)
-    source, on_overlay = without_overlay(source, mask) if params.static_mask != "off" else (source, ())
-    source, on_light = steady_light(source)
-    source, levels, on_range = stretch_levels(source, plan.train)
-    stretched, kept = _stretched_params(params, levels), store or NoStore()
-    run = Run(source, stretched, plan, tiles, kept, levels, progress, on_decision, map_tiles)
+    prepared = prepare(source, plan.train, params.static_mask)
+    stretched, bars = _stretched_params(params, prepared.levels), prepared.bars
+    run = Run(prepared, stretched, plan, tiles, store or NoStore(), progress, on_decision, map_tiles)
     run.seconds["read"] = time.perf_counter() - begun
     run.decide(*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
-    run.decide(*on_bars, *on_overlay, *on_light, *on_range)
+    run.decide(*prepared.decisions)
     with returning_freed_memory(runtime.memory_limit is not None):
         restoration = _restored(run)
     if bars is None:
@@ -191,6 +183,8 @@ def _measure_uncertainty(
             exponent = deblurred.blur.exponent
     position = position_variance(dynamics)
     known = informed_pixels(seen, fused.mean)
+    if run.prepared.hidden is not None:
+        known &= ~run.prepared.hidden
     gain = posterior_gain(filtered.image, sigma, exponent)
     deviation = pixel_deviation(image, filtered.variance, gain, position, known)
     run.seconds["uncertainty"] = time.perf_counter() - begun

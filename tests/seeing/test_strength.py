@@ -1,13 +1,18 @@
 """Strength of the turbulence on small synthetic clips, and the remarks."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 import turbrestore
+from turbrestore.footage.bars import Bars
+from turbrestore.footage.levels import Levels
+from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
+from turbrestore.preparation import Prepared, seeing_of_picture
 from turbrestore.registration.centroid import Centroid, find_centroid
 from turbrestore.seeing.strength import Seeing, measure_seeing
 from turbrestore.seeing.tilt_theory import Optics
@@ -87,6 +92,29 @@ def test_a_restoration_has_it_and_keeps_it(clip, tmp_path):
     ]
     turbrestore.save_run(tmp_path / "run", restoration, turbrestore.RunRecord("clip", clip[0][0]))
     assert turbrestore.load_run(tmp_path / "run")[0].seeing == restoration.seeing
+
+
+def test_bars_do_not_count(clip):
+    params = turbrestore.RestoreParams(until="centroid")
+    barred = np.pad(clip[0], ((0, 0), (24, 24), (0, 0)), constant_values=0.06)
+    found, alone = (turbrestore.restore(frames, params).seeing.displacement_variance for frames in (barred, clip[0]))
+    assert found.value == pytest.approx(alone.value, rel=0.1)
+    frames = np.pad(clip[0], ((0, 0), (24, 24), (0, 0)), mode="symmetric")
+    prepared = Prepared(FrameSource.from_array(frames), Levels(), Bars(np.s_[24:-24, :], barred[0]), None, ())
+    flows = np.pad(clip[1].flows, ((0, 0), (24, 24), (0, 0), (0, 0)), constant_values=3.0)
+    image = np.pad(clip[1].image, ((24, 24), (0, 0)), mode="symmetric")
+    within = seeing_of_picture(prepared, frames, replace(clip[1], image=image, flows=flows))
+    assert within == measure(clip)
+
+
+def test_the_command_measures_what_a_restoration_does(clip, tmp_path, capsys):
+    frames = np.rint(65535 * (0.107 + 0.006 * clip[0])).astype(np.uint16)
+    np.save(tmp_path / "faint.npy", frames)
+    assert run_command(["seeing", str(tmp_path / "faint.npy"), "--json", "--quiet"]) == 0
+    printed = json.loads(capsys.readouterr().out)["displacement_variance"]
+    source = FrameSource.from_array(frames)
+    seeing = turbrestore.restore(source, turbrestore.RestoreParams(until="centroid", train=len(frames))).seeing
+    assert printed["value"] == pytest.approx(seeing.displacement_variance.value, rel=1e-3)
 
 
 def test_the_command_prints_every_value_with_its_interval(clip, tmp_path, capsys):

@@ -7,6 +7,7 @@ from scipy.stats import spearmanr
 import turbrestore
 from turbrestore.blur.psf import blur_otf, laplacian_symbol, wiener_fidelity
 from turbrestore.core.noise import estimate_noise
+from turbrestore.io.images import write_image
 from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import picture
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
@@ -74,6 +75,16 @@ def test_deviation_of_a_restoration_ranks_and_bounds_its_error(clip, tmp_path):
     turbrestore.save_run(tmp_path / "run", restoration, turbrestore.RunRecord("clip", frames[0]))
     np.testing.assert_array_equal(turbrestore.load_run(tmp_path / "run")[0].uncertainty, deviation)
     assert turbrestore.restore(frames, turbrestore.RestoreParams(until="identify")).uncertainty is None
+
+
+def test_what_an_overlay_hides_in_every_frame_is_infinite(clip, tmp_path):
+    mask = np.zeros((96, 96), np.float32)
+    mask[60:80, 50:75] = 1
+    write_image(tmp_path / "mask.png", mask, 8)
+    deviation = turbrestore.restore(
+        clip[1][:8], turbrestore.RestoreParams(static_mask=str(tmp_path / "mask.png"))
+    ).uncertainty
+    assert np.isinf(deviation[60:80, 50:75]).all() and np.isfinite(deviation[60:80, 78:]).all()
 
 
 def test_the_command_writes_the_map_and_refuses_what_has_none(clip, tmp_path, capsys):

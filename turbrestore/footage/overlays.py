@@ -58,8 +58,8 @@ class Overlay:
     mask : ndarray, bool, shape (H, W)
     scene : ndarray, float32, shape (H', W') or (H', W', 3)
         Mean of the frames at one place, without the overlay.
-    hidden : float
-        Share of the frame that no frame shows.
+    hidden : ndarray, bool, shape (H, W)
+        Pixels of the scene, at its mean position, that no frame shows.
     origin : tuple of int
         Row and column of the scene at which a frame without shift begins.
     shifts : dict of int to tuple of int
@@ -70,7 +70,7 @@ class Overlay:
 
     mask: NDArray[np.bool_]
     scene: FloatArray
-    hidden: float
+    hidden: NDArray[np.bool_]
     origin: tuple[int, int]
     shifts: dict[int, tuple[int, int]]
     window: Window
@@ -130,7 +130,7 @@ def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArr
 
 def without_overlay(
     source: FrameSource, mask: NDArray[np.bool_] | None = None
-) -> tuple[FrameSource, tuple[Decision, ...]]:
+) -> tuple[FrameSource, NDArray[np.bool_] | None, tuple[Decision, ...]]:
     """Replace what stands in the frames while the scene moves; a source without it is returned as it is.
 
     Parameters
@@ -142,6 +142,8 @@ def without_overlay(
     Returns
     -------
     source : FrameSource
+    hidden : ndarray, bool, shape (H, W), or None
+        Pixels of the scene that no frame shows; None where nothing stands.
     decisions : tuple of Decision
 
     Raises
@@ -154,18 +156,18 @@ def without_overlay(
     >>> scene = cv2.GaussianBlur(np.random.default_rng(0).random((90, 140)).astype(np.float32), (0, 0), 3)
     >>> frames = np.stack([scene[:, k : k + 96] for k in range(0, 40, 4)])
     >>> frames[:, 40:42, 20:44] = 1
-    >>> cleaned, (found,) = without_overlay(FrameSource.from_array(frames))
-    >>> bool(cleaned.read()[5].max() < 0.9), found.subject
-    (True, 'overlay')
+    >>> cleaned, hidden, (found,) = without_overlay(FrameSource.from_array(frames))
+    >>> bool(cleaned.read()[5].max() < 0.9), bool(hidden.any()), found.subject
+    (True, False, 'overlay')
     """
     given = mask is not None
     if mask is None and 3 <= len(source) <= _MOST:
         mask = _standing(source)
     if mask is None:
-        return source, ()
+        return source, None, ()
     shifts = _shifts_of(source, mask)
     if not given and float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _LEAST_MOTION:
-        return source, ()
+        return source, None, ()
     overlay = _overlay(source, mask, np.rint(shifts).astype(int))
     before = source.adjust
 
@@ -174,11 +176,12 @@ def without_overlay(
 
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
     reason = "asked for" if given else "it stands while the scene moves"
-    if overlay.hidden >= _REPORTED:
+    hidden = float(overlay.hidden.mean())
+    if hidden >= _REPORTED:
         choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced"
-        reason += f"; {100 * overlay.hidden:.1f} % is shown by no frame and filled from around, the rest by others"
+        reason += f"; {100 * hidden:.1f} % is shown by no frame and filled from around, the rest by others"
     decision = Decision("overlay", choice, reason)
-    return dataclasses.replace(source, adjust=adjust), (decision,)
+    return dataclasses.replace(source, adjust=adjust), overlay.hidden, (decision,)
 
 
 def _standing(source: FrameSource) -> NDArray[np.bool_] | None:
@@ -243,7 +246,7 @@ def _overlay(source: FrameSource, mask: NDArray[np.bool_], shifts: NDArray[np.in
         total[place][~mask] += frame[~mask]
         count[place][~mask] += 1
     scene = _continued((total.T / np.maximum(count, 1).T).T.astype(np.float32), count > 0)
-    hidden = float(np.mean(count[origin[0] : origin[0] + height, origin[1] : origin[1] + width] == 0))
+    hidden = count[origin[0] : origin[0] + height, origin[1] : origin[1] + width] == 0
     places = {number: (int(dx), int(dy)) for number, (dx, dy) in zip(source.numbers, shifts, strict=True)}
     return Overlay(mask, scene, hidden, origin, places, source.window)
 

@@ -1,0 +1,123 @@
+"""Preparation of the frames: without bars and overlays, under steady light, in units of the range that they use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .core.arrays import FloatArray
+from .core.decision import Decision
+from .footage.bars import Bars, without_bars
+from .footage.levels import Levels, stretch_levels
+from .footage.light import steady_light
+from .footage.overlays import read_static_mask, without_overlay
+from .io.source import FrameSource, Window
+from .registration.centroid import Centroid
+from .runtime.scratch import mean_of
+from .seeing.strength import Seeing, measure_seeing
+from .seeing.tilt_theory import Optics
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Frames as the stages take them, and what was changed.
+
+    Attributes
+    ----------
+    source : FrameSource
+    levels : Levels
+        From the levels of the clip to those of the stages.
+    bars : Bars or None
+    hidden : ndarray, bool, shape (H, W), or None
+        Pixels of the scene that no frame shows, because an overlay covers them; None where there is no overlay.
+    decisions : tuple of Decision
+    """
+
+    source: FrameSource
+    levels: Levels
+    bars: Bars | None
+    hidden: NDArray[np.bool_] | None
+    decisions: tuple[Decision, ...]
+
+    @property
+    def picture(self) -> Window:
+        """Rows and columns between the bars."""
+        return np.s_[:, :] if self.bars is None else self.bars.picture
+
+
+def prepare(source: FrameSource, train: int, static_mask: str = "auto") -> Prepared:
+    """Prepare the frames of a clip.
+
+    Parameters
+    ----------
+    source : FrameSource
+    train : int
+        Number of frames, from the first on, that the range is taken from.
+    static_mask : str
+        ``auto``, ``off`` or the file of a mask, see :class:`turbrestore.RestoreParams`.
+
+    Returns
+    -------
+    Prepared
+
+    Raises
+    ------
+    DataError
+        Frames are damaged or show nothing, or the mask has another size.
+    InputNotFoundError, StorageError
+        The mask does not exist, or cannot be read.
+
+    Examples
+    --------
+    >>> frames = np.random.default_rng(0).uniform(0.3, 0.9, (5, 32, 32)).astype(np.float32)
+    >>> frames[:, :6] = 0.06
+    >>> prepare(FrameSource.from_array(frames), 5).picture
+    (slice(6, 32, None), slice(0, 32, None))
+    """
+    mask = None if static_mask in ("auto", "off") else read_static_mask(static_mask, source)
+    # Before the light, because a stop would be taken for bands of it.
+    source, bars, on_bars = without_bars(source)
+    source, hidden, on_overlay = without_overlay(source, mask) if static_mask != "off" else (source, None, ())
+    source, on_light = steady_light(source)
+    source, levels, on_range = stretch_levels(source, train)
+    return Prepared(source, levels, bars, hidden, (*on_bars, *on_overlay, *on_light, *on_range))
+
+
+def seeing_of_picture(
+    prepared: Prepared, frames: FloatArray, centroid: Centroid, optics: Optics | None = None, threads: int = 0
+) -> Seeing:
+    """Measure the strength of the turbulence between the bars, since what fills them is not the scene.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
+        Prepared frames; at least three.
+    centroid : Centroid
+        Of these frames, with their levels.
+    optics : Optics, optional
+    threads : int
+        0 means one for each core.
+
+    Returns
+    -------
+    Seeing
+
+    Raises
+    ------
+    DataError
+        Fewer than three frames.
+
+    Examples
+    --------
+    >>> from turbrestore.registration.centroid import find_centroid
+    >>> prepared = prepare(FrameSource.from_array(np.random.default_rng(0).uniform(size=(4, 48, 48))), 4)
+    >>> frames = prepared.source.read()
+    >>> seeing_of_picture(prepared, frames, find_centroid(frames)).remarks[0][:24]
+    'too little structure or '
+    """
+    rows, columns = prepared.picture
+    seen, flows = frames[:, rows, columns], centroid.flows[:, rows, columns]
+    return measure_seeing(seen, flows, centroid.image[rows, columns], mean_of(seen), optics, threads)
