@@ -13,6 +13,7 @@ import numpy as np
 
 from .core.arrays import FloatArray
 from .core.decision import Decision
+from .core.noise import estimate_noise
 from .dynamics.dynamic_texture import identify
 from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import Filtered, FilterStep, filter_steps
@@ -40,6 +41,7 @@ from .tiled_stages import (
     run_filter_task,
     tile_filter_steps,
 )
+from .uncertainty.pixel_deviation import saturation_level
 from .wording import (
     explain_camera,
     explain_centroid,
@@ -51,6 +53,9 @@ from .wording import (
     explain_seeing,
     explain_training,
 )
+
+# Files of floating point are taken for those of 16 bits.
+_MOST_BITS = 16
 
 Result = TypeVar("Result")
 
@@ -110,6 +115,7 @@ class Fused:
     mean: FloatArray
     centroid: Centroid
     seeing: Seeing | None
+    saturation: float
     dynamics: FlowDynamics | None = None
     filtered: Filtered | None = None
 
@@ -124,14 +130,14 @@ def fuse(run: Run) -> Fused:
 
     centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
     run.decide(explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows))
-    seeing = _measure_seeing(run, training, centroid)
+    seeing, saturation = _measure_seeing(run, training, centroid), _find_saturation(run, training)
     if not params.runs("identify"):
-        return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing)
+        return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation)
 
     dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
     run.decide(*explain_dynamics(dynamics))
     if not params.runs("filter"):
-        return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, dynamics)
+        return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation, dynamics)
 
     start = levels.stretched_result(centroid)
     filtered = run.stage("filter", "filtered", lambda: _filter(run, start, dynamics, training, stream).recentred())
@@ -141,7 +147,7 @@ def fuse(run: Run) -> Fused:
     run.decide(
         explain_frames(filtered, None if params.keep_best == 1 else chosen), explain_geometry(filtered, dynamics)
     )
-    return Fused(filtered.image, mean, centroid, seeing, dynamics, filtered)
+    return Fused(filtered.image, mean, centroid, seeing, saturation, dynamics, filtered)
 
 
 def _find_centroid(run: Run, training: FloatArray) -> Centroid:
@@ -180,6 +186,13 @@ def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seein
     run.seconds["seeing"] = time.perf_counter() - begun
     run.decide(*explain_seeing(seeing))
     return seeing
+
+
+def _find_saturation(run: Run, training: FloatArray) -> float:
+    """Return the intensity, at the levels of the clip, from which the mean is saturated."""
+    brightest = run.levels.original(np.array([max(frame.max() for frame in iter_frames(training))], np.float32))
+    noise, bits = estimate_noise(training[0]) / run.levels.gain, min(run.source.bit_depth, _MOST_BITS)
+    return saturation_level(float(brightest[0]), noise, 1 / (2**bits - 1))
 
 
 def _filter(

@@ -30,7 +30,13 @@ from .runtime.steps import Progress, finish
 from .runtime.tiling import halo_tiles
 from .settings import RestoreParams
 from .tiled_stages import TileMap
-from .uncertainty.pixel_deviation import informed_pixels, pixel_deviation, position_variance, posterior_gain
+from .uncertainty.pixel_deviation import (
+    informed_pixels,
+    pixel_deviation,
+    position_variance,
+    posterior_gain,
+    quadratic_fidelity,
+)
 from .wording import explain_border
 
 # Every pixel of a cropped image is visible in at least this share of the training frames.
@@ -176,19 +182,23 @@ def _measure_uncertainty(
     filtered, dynamics = fused.filtered, fused.dynamics
     if filtered is None or dynamics is None:
         return None
-    begun, sigma, exponent = time.perf_counter(), 0.0, run.params.deconvolution.exponent
-    if deblurred is not None:
-        sigma = deblurred.deconvolution.sigma
-        if exponent is None and deblurred.blur is not None:
-            exponent = deblurred.blur.exponent
-    position = position_variance(dynamics)
-    known = informed_pixels(seen, fused.mean)
+    begun, position = time.perf_counter(), position_variance(dynamics)
+    known = informed_pixels(seen, fused.mean, fused.saturation)
     if run.prepared.hidden is not None:
         known &= ~run.prepared.hidden
-    gain = posterior_gain(filtered.image, sigma, exponent)
-    deviation = pixel_deviation(image, filtered.variance, gain, position, known)
+    deviation = pixel_deviation(image, filtered.variance, _gain(run, filtered.image, deblurred), position, known)
     run.seconds["uncertainty"] = time.perf_counter() - begun
     return deviation
+
+
+def _gain(run: Run, fused: FloatArray, deblurred: Deblurred | None) -> float:
+    """Return the factor of the variance that the deconvolution has, computed at the levels of the stages."""
+    if deblurred is None:
+        return 1.0
+    params, done, blur = run.params.deconvolution, deblurred.deconvolution, deblurred.blur
+    exponent = blur.exponent if params.exponent is None and blur is not None else params.exponent
+    fidelity = quadratic_fidelity(run.levels.stretched(fused), params.method, done.fidelity)
+    return posterior_gain(fused.shape[:2], fidelity, done.sigma, exponent)
 
 
 def _crop(image: FloatArray, seen: FloatArray, border: str, deblurred: Deblurred | None) -> tuple[Rectangle, Decision]:

@@ -7,18 +7,20 @@ from scipy.stats import spearmanr
 import turbrestore
 from turbrestore.blur.psf import blur_otf, laplacian_symbol, wiener_fidelity
 from turbrestore.core.noise import estimate_noise
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.deconvolution.problem import automatic_fidelity
 from turbrestore.io.images import write_image
+from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import picture
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
-from turbrestore.uncertainty.pixel_deviation import informed_pixels, pixel_deviation, posterior_gain
+from turbrestore.uncertainty.pixel_deviation import informed_pixels, pixel_deviation, posterior_gain, quadratic_fidelity
 from turbrestore_cli.application import run as run_command
 
 
 def test_gain_is_the_posterior_variance_of_a_linear_gaussian_model():
     rng, n, sigma = np.random.default_rng(0), 32, 1.2
-    image = picture("camera", n, n)
-    fidelity = wiener_fidelity(image, estimate_noise(image))
+    fidelity = 1500.0
     otf = np.abs(np.fft.fft2(np.fft.irfft2(blur_otf((n, n), sigma), s=(n, n))))
     symbol = np.fft.fft2(np.fft.irfft2(laplacian_symbol(n, n), s=(n, n))).real
     # Scenes of the prior, blurred, with noise of unit variance; the mean of the posterior misses them by its deviation.
@@ -28,7 +30,26 @@ def test_gain_is_the_posterior_variance_of_a_linear_gaussian_model():
         scene = prior * np.fft.fft2(rng.normal(size=(n, n)))
         seen = otf * scene + np.fft.fft2(rng.normal(size=(n, n)))
         errors.append(np.fft.ifft2(otf * seen / (otf**2 + symbol / fidelity) - scene).real)
-    assert np.mean(np.square(errors)) == pytest.approx(posterior_gain(image, sigma, None), rel=0.05)
+    assert np.mean(np.square(errors)) == pytest.approx(posterior_gain((n, n), fidelity, sigma, None), rel=0.05)
+
+
+def test_gain_of_all_frequencies_is_that_of_a_full_transform():
+    shape, sigma = (12, 10), 1.5
+    otf, symbol = (
+        np.fft.fft2(np.fft.irfft2(half, s=shape)).real for half in (blur_otf(shape, sigma), laplacian_symbol(*shape))
+    )
+    assert posterior_gain(shape, 50.0, sigma, None) == pytest.approx(np.mean(1 / (otf**2 + symbol / 50)), rel=1e-5)
+    assert posterior_gain(shape, 50.0, 0.0, None) == 1.0
+
+
+@pytest.mark.parametrize("method", ["nltv", "tv", "wiener", "tikhonov"])
+def test_the_weight_of_the_data_is_that_which_was_used(method):
+    image = picture("camera", 48, 48)
+    automatic = automatic_fidelity(method, image, estimate_noise(image))
+    usual = quadratic_fidelity(image, method, automatic)
+    assert usual == pytest.approx(wiener_fidelity(image, estimate_noise(image)))
+    assert quadratic_fidelity(image, method, 3 * automatic) == pytest.approx(3 * usual)
+    assert posterior_gain((48, 48), 3 * usual, 1.5, None) > 1.5 * posterior_gain((48, 48), usual, 1.5, None)
 
 
 def test_position_makes_edges_uncertain_and_flat_parts_not():
@@ -44,7 +65,7 @@ def test_saturated_and_unseen_pixels_are_infinite():
     mean[2, 2, 1] = 1.0
     seen = np.ones((16, 16), np.float32)
     seen[5, 5] = 0.0
-    known = informed_pixels(seen, mean)
+    known = informed_pixels(seen, mean, 0.998)
     assert not known[2, 2] and not known[5, 5] and known.sum() == 254
     deviation = pixel_deviation(mean, seen, 1.0, seen, known)
     assert np.isinf(deviation[~known]).all() and np.isfinite(deviation[known]).all()
@@ -75,6 +96,29 @@ def test_deviation_of_a_restoration_ranks_and_bounds_its_error(clip, tmp_path):
     turbrestore.save_run(tmp_path / "run", restoration, turbrestore.RunRecord("clip", frames[0]))
     np.testing.assert_array_equal(turbrestore.load_run(tmp_path / "run")[0].uncertainty, deviation)
     assert turbrestore.restore(frames, turbrestore.RestoreParams(until="identify")).uncertainty is None
+
+
+def deviation_of(frames, **deconvolution):
+    params = turbrestore.RestoreParams(deconvolution=DeconvolutionParams(method="wiener", **deconvolution))
+    found = turbrestore.restore(FrameSource.from_array(np.rint(65535 * frames).astype(np.uint16)), params)
+    return found.uncertainty
+
+
+def test_the_scale_of_the_file_does_not_matter_and_the_fidelity_does(clip):
+    frames = clip[1][:8, :64, :64].copy()
+    frames[:, 40:48, 40:48] = frames[:, :8, :8]
+    whole, faint = (deviation_of(k * (0.1 + 0.8 * frames), sigma=1.5) / k for k in (1, 1 / 16))
+    middle = np.s_[12:-12, 12:-12]
+    assert np.median(faint[middle] / whole[middle]) == pytest.approx(1, abs=0.05)
+    given = deviation_of(0.1 + 0.8 * frames, sigma=1.5, fidelity=10.0)
+    assert np.median(given[middle]) < 0.7 * np.median(whole[middle])
+
+
+def test_a_camera_that_saturates_below_full_scale_is_noticed(clip):
+    bright = np.minimum(clip[1][:8], 0.9) / 16
+    bright[:, 40:48, 40:48] = 0.9 / 16
+    deviation = deviation_of(bright, sigma=0.0)
+    assert np.isinf(deviation[43:45, 43:45]).all() and np.isfinite(deviation).mean() > 0.8
 
 
 def test_what_an_overlay_hides_in_every_frame_is_infinite(clip, tmp_path):

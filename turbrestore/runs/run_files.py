@@ -32,7 +32,7 @@ from .stage_files import load_artifact, save_artifact
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-SCHEMA = 2
+SCHEMA = 3
 RECORD, IMAGES, MEAN = "run.json", "images.npz", "mean.npy"
 RESULTS = ("centroid", "dynamics", "filtered", "blur", "deconvolution")
 # All files of a kept run.

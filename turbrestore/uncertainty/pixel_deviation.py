@@ -4,7 +4,7 @@ Symbols
 -------
 ρ : fused image; Σ : its variance per pixel, from the filter; u : restored image.
 H : transfer function of the blur that was removed; k² : symbol of the negative Laplacian.
-λ : weight of the data in Wiener deconvolution, :func:`turbrestore.blur.psf.wiener_fidelity`.
+λ : weight of the data in a deconvolution with that prior, :func:`quadratic_fidelity`.
 ε² : variance of the position of a pixel along one axis, squared pixels.
 
 Model
@@ -13,7 +13,8 @@ Model
 
 *Deconvolution.*  Near its result, deconvolution is taken for a linear one with a Gaussian prior.  The posterior
 variance of ``min λ/2 ‖Hu − ρ‖² + ½‖∇u‖²`` with noise Σ is ``g Σ`` with ``g = mean 1 / (|H|² + k²/λ)``, a mean over all
-frequencies.  It holds the amplified noise, ``mean |H|² / (…)²``, and detail that the blur has left undetermined.
+frequencies; where no blur is removed, g = 1.  It holds the amplified noise, ``mean |H|² / (…)²``, and detail that the
+blur has left undetermined.
 
 *Registration.*  A position that is uncertain by ε makes an intensity uncertain by ε times the gradient.  The flow
 outside the subspace of its model, of variance R along one axis, is partly motion and partly error of the flow.
@@ -25,8 +26,8 @@ to 98 % of the pixels lie within two deviations of the scene at the mean geometr
 the scene by :func:`turbrestore.dynamics.flow_model.mean_flow_error`; this is a length in pixels, the same error for
 neighbouring pixels, and is reported as one, not as noise of intensities.
 
-What no frame has shown, and what is saturated in all of them, has an infinite deviation.  The chroma of a colour image
-is not considered: the deviation is that of the luminance.
+What no frame has shown, be it beside the frames or under an overlay, and what is saturated in all of them, has an
+infinite deviation.  The chroma of a colour image is not considered: the deviation is that of the luminance.
 """
 
 from __future__ import annotations
@@ -34,13 +35,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol, wiener_fidelity
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import estimate_noise
+from ..deconvolution.problem import automatic_fidelity
 from ..dynamics.flow_model import FlowDynamics
 
-# Intensity from which the mean of all frames is saturated: half a grey level of 8 bits below full scale.
+# Full scale, less half a grey level of 8 bits.
 _SATURATED = 1 - 0.5 / 255
 # Window in which the squared gradient is averaged, pixels.
 _WINDOW = 1.5
@@ -88,13 +91,15 @@ def pixel_deviation(
     return np.where(known, found, np.float32(np.inf)).astype(np.float32)
 
 
-def posterior_gain(fused: FloatArray, sigma: float, exponent: float | None) -> float:
+def posterior_gain(size: tuple[int, int], fidelity: float, sigma: float, exponent: float | None) -> float:
     """Compute the posterior variance of a deconvolved pixel for noise of unit variance: g.
 
     Parameters
     ----------
-    fused : ndarray, float32, shape (H, W) or (H, W, 3)
-        ρ.
+    size : tuple of int
+        (H, W) of the image.
+    fidelity : float
+        λ, from :func:`quadratic_fidelity`.
     sigma : float
         Width of the blur that was removed, pixels; 0 if none was.
     exponent : float or None
@@ -106,15 +111,45 @@ def posterior_gain(fused: FloatArray, sigma: float, exponent: float | None) -> f
 
     Examples
     --------
+    >>> [round(posterior_gain((32, 32), 900.0, sigma, None)) for sigma in (0.0, 1.0, 2.0)]
+    [1, 102, 209]
+    """
+    if sigma == 0:
+        return 1.0
+    shape = (min(size[0], _GRID), min(size[1], _GRID))
+    power = np.abs(blur_otf(shape, sigma, exponent or GAUSSIAN)) ** 2
+    # The first value of the inverse transform is the mean over all frequencies, of which half are stored.
+    return float(fft.irfft2(1 / (power + laplacian_symbol(*shape) / fidelity), s=shape)[0, 0])
+
+
+def quadratic_fidelity(fused: FloatArray, method: str, fidelity: float) -> float:
+    """Return the weight λ with which a quadratic prior stands for that of a deconvolution.
+
+    It is the automatic weight for wiener, times the ratio of the weight that was used to the automatic one; for wiener
+    this is the weight that was used.
+
+    Parameters
+    ----------
+    fused : ndarray, float32, shape (H, W) or (H, W, 3)
+        ρ, with the levels that were deconvolved.
+    method : {"nltv", "tv", "wiener", "tikhonov"}
+        Penalty of the deconvolution.
+    fidelity : float
+        Weight of the data in it.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
     >>> step = np.repeat(np.float32([[0.2, 0.8]]), 16, axis=1).repeat(32, axis=0)
-    >>> [round(posterior_gain(step, sigma, None)) for sigma in (0.0, 1.0, 2.0)]
-    [1, 102, 207]
+    >>> [round(quadratic_fidelity(step, method, 5000.0)) for method in ("wiener", "nltv")]
+    [5000, 900]
     """
     grey = luminance(fused)
-    shape = (min(grey.shape[0], _GRID), min(grey.shape[1], _GRID))
-    fidelity = wiener_fidelity(grey, estimate_noise(grey))
-    power = np.abs(blur_otf(shape, sigma, exponent or GAUSSIAN)) ** 2 if sigma > 0 else 1.0
-    return float(np.mean(1 / (power + laplacian_symbol(*shape) / fidelity)))
+    noise = estimate_noise(grey)
+    return wiener_fidelity(grey, noise) * fidelity / automatic_fidelity(method, grey, noise)
 
 
 def position_variance(dynamics: FlowDynamics) -> FloatArray:
@@ -139,7 +174,34 @@ def position_variance(dynamics: FlowDynamics) -> FloatArray:
     return cv2.GaussianBlur(dynamics.residual_variance, (0, 0), _SMOOTH) * np.float32(_ERROR_SHARE)
 
 
-def informed_pixels(seen: FloatArray, mean: FloatArray) -> NDArray[np.bool_]:
+def saturation_level(brightest: float, noise: float, step: float) -> float:
+    """Return the intensity from which the temporal mean is saturated.
+
+    A camera of 12 bits saturates far below the full scale of a file of 16.  A pixel that has the largest intensity of
+    the clip in every frame is saturated if the frames are noisy, and else may be a white part of the scene.
+
+    Parameters
+    ----------
+    brightest : float
+        Largest intensity of the frames.
+    noise : float
+        Standard deviation of the noise of a frame, intensity.
+    step : float
+        Difference of two neighbouring intensities of the file.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> [round(saturation_level(4095 / 65535, noise, 1 / 65535), 4) for noise in (0.0, 0.001)]
+    [0.998, 0.0625]
+    """
+    return min(_SATURATED, brightest - step / 2) if noise >= step else _SATURATED
+
+
+def informed_pixels(seen: FloatArray, mean: FloatArray, saturation: float) -> NDArray[np.bool_]:
     """Return the pixels that a frame has shown, and that are not saturated in all of them.
 
     Parameters
@@ -148,6 +210,8 @@ def informed_pixels(seen: FloatArray, mean: FloatArray) -> NDArray[np.bool_]:
         Share of the frames that show each pixel.
     mean : ndarray, float32, shape (H, W) or (H, W, 3)
         Temporal mean.
+    saturation : float
+        From :func:`saturation_level`.
 
     Returns
     -------
@@ -155,8 +219,8 @@ def informed_pixels(seen: FloatArray, mean: FloatArray) -> NDArray[np.bool_]:
 
     Examples
     --------
-    >>> informed_pixels(np.float32([[1, 0, 1]]), np.float32([[0.5, 0.5, 1]]))
+    >>> informed_pixels(np.float32([[1, 0, 1]]), np.float32([[0.5, 0.5, 1]]), 0.998)
     array([[ True, False, False]])
     """
-    saturated = mean >= _SATURATED
+    saturated = mean >= saturation
     return (seen > 0) & ~(saturated if saturated.ndim == 2 else saturated.any(axis=-1))
