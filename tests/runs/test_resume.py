@@ -28,7 +28,7 @@ from turbrestore.runs.checkpoint import load_checkpoint, save_checkpoint
 from turbrestore.runs.dependencies import stage_dependencies
 from turbrestore.runs.digests import content_digest
 from turbrestore.runs.folder_lock import LOCK, lock_folder
-from turbrestore.runs.run_files import read_stages
+from turbrestore.runs.run_files import load_run, read_stages
 from turbrestore.runs.run_folder import RunFolder
 from turbrestore.runtime.runtime import DEFAULT
 from turbrestore_cli.__main__ import main
@@ -223,6 +223,21 @@ def test_a_version_with_other_results_starts_again(ended, monkeypatch, capsys):
     assert main([*WORDS, "--resume", "--overwrite"]) == 0
     assert called == list(STAGES)
     assert "results was" in capsys.readouterr().err
+
+
+def test_a_folder_of_an_earlier_layout_starts_again(whole, ended, monkeypatch, capsys):
+    path = ended / "kept" / "run.json"
+    record = json.loads(path.read_text())
+    for reading in record["deblurred"]["readings"]:
+        del reading["ringing"]
+    path.write_text(json.dumps(record | {"schema": 2}))
+    with pytest.raises(DataError, match="layout 3, found layout 2"):
+        load_run("kept")
+    called = spy(monkeypatch)
+    assert main([*WORDS, "--resume", "--overwrite"]) == 0
+    assert called == list(STAGES)
+    assert "starts again: an earlier version of turbrestore kept these stages" in capsys.readouterr().err
+    assert contents(ended) == contents(whole)
 
 
 def test_a_changed_input_starts_again_and_a_touched_one_does_not(ended, monkeypatch, capsys):

@@ -91,7 +91,7 @@ class JsonFields:
         )
 
     def seeing(self, name: str) -> Seeing | None:
-        """Return the strength of the turbulence; None where it is missing, as in older records, or was not measured."""
+        """Return the strength of the turbulence; None where it was not measured."""
         if self.record.get(name) is None:
             return None
         part = self.part(name)

@@ -172,18 +172,14 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     >>> read_record(Path("nowhere")) is None
     True
     """
-    path = folder / RECORD
-    if path.exists() and not path.is_file():
-        raise DataError(f"{path}: expected the record of a run, found no file")
-    try:
-        record = json.loads(path.read_text("utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
+    record = _read_json(folder / RECORD)
+    if record is None:
         return None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: expected the record of a run, found something else or damage") from error
-    found = record.get("schema") if isinstance(record, dict) else "none"
-    if type(found) is not int or found != SCHEMA:
-        raise DataError(f"{path}: expected the record of a run, layout {SCHEMA}, found layout {found!r:.40}")
+    found = _layout_of(record)
+    if found != SCHEMA:
+        raise DataError(
+            f"{folder / RECORD}: expected the record of a run, layout {SCHEMA}, found layout {found or 'none'}"
+        )
     return record
 
 
@@ -197,12 +193,13 @@ def read_stages(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
     Returns
     -------
     dict or None
-        None where there is no such record.
+        None where there is no such record.  A record of an earlier layout counts as one without stages, so that they
+        are run again.
 
     Raises
     ------
     DataError
-        The record is damaged or of another version of the layout.
+        The record is damaged or of a later version of the layout.
 
     Examples
     --------
@@ -211,6 +208,9 @@ def read_stages(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
     """
     place = Path(folder)
     try:
+        kept = _read_json(place / RECORD)
+        if 0 < _layout_of(kept) < SCHEMA and "facts" in kept:
+            return {"facts": {}, "files": {}, "deblurred": {}, "outputs": []}
         record = read_record(place)
         if record is None or "facts" not in record:
             return None
@@ -296,6 +296,25 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
         versions={name: str(text) for name, text in run.value("versions", dict).items()},
         finished=run.value("finished", str),
     )
+
+
+def _read_json(path: Path) -> Any:
+    """Content of a file, None if there is none."""
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path}: expected the record of a run, found no file")
+    try:
+        # A file that holds null is no record either.
+        return json.loads(path.read_text("utf-8")) or {}
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: expected the record of a run, found something else or damage") from error
+
+
+def _layout_of(record: Any) -> int:
+    """Version of the layout of a record, 0 where it states none."""
+    found = record.get("schema") if isinstance(record, dict) else None
+    return found if type(found) is int else 0
 
 
 def _stage(place: Path, names: tuple[str, ...], name: str, kind: type[Stage]) -> Stage | None:

@@ -255,6 +255,9 @@ class RunFolder:
 
     def _take_over(self, record: dict[str, Any]) -> None:
         """Find what still holds, and say where and why something starts again."""
+        if not record["facts"]:
+            self.notes = ("starts again: an earlier version of turbrestore kept these stages",)
+            return
         notes: list[str] = []
         holds = []
         for stage, expected in self._facts.items():
