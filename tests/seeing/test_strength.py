@@ -14,6 +14,7 @@ from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.preparation import Prepared, seeing_of_picture
 from turbrestore.registration.centroid import Centroid, find_centroid
+from turbrestore.seeing.displacement import Displacement
 from turbrestore.seeing.strength import Seeing, measure_seeing
 from turbrestore.seeing.tilt_theory import Optics
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
@@ -92,6 +93,57 @@ def test_a_restoration_has_it_and_keeps_it(clip, tmp_path):
     ]
     turbrestore.save_run(tmp_path / "run", restoration, turbrestore.RunRecord("clip", clip[0][0]))
     assert turbrestore.load_run(tmp_path / "run")[0].seeing == restoration.seeing
+
+
+def moving_blocks(rng, frames, rho, spread=1.0, noise=0.0, side=8):
+    """Displacement of blocks that move as a first-order process."""
+    w = rng.normal(size=(frames, side, side, 2)) * np.sqrt(1 - rho**2)
+    w[0] /= np.sqrt(1 - rho**2)
+    for t in range(1, frames):
+        w[t] += rho * w[t - 1]
+    w = spread * w + noise * rng.normal(size=w.shape)
+    return Displacement(w - w.mean(axis=0), np.ones((side, side), bool), 12, 12.0, noise**2)
+
+
+def measure_blocks(found, monkeypatch) -> Seeing:
+    monkeypatch.setattr("turbrestore.seeing.strength.block_displacement", lambda *_: found)
+    monkeypatch.setattr("turbrestore.seeing.strength.rotation_share", lambda _: 0.1)
+    still = np.full((2, 96, 96), 0.5, np.float32)
+    return measure_seeing(still, np.zeros((2, 96, 96, 2), np.float32), still[0], still[0], OPTICS)
+
+
+@pytest.mark.parametrize("rho", [0.95, 0.2])
+def test_a_clip_of_few_correlation_times_has_no_upper_bound(rho, monkeypatch):
+    inside, rng = 0, np.random.default_rng(6)
+    for _ in range(10):
+        seeing = measure_blocks(moving_blocks(rng, 40, rho), monkeypatch)
+        inside += seeing.displacement_variance.low < 1 < seeing.displacement_variance.high
+        slow = any("spans few correlation times" in remark for remark in seeing.remarks)
+        assert slow is (rho > 0.9)
+        for bounded in (seeing.displacement_variance, seeing.cn2, seeing.d_over_r0):
+            assert np.isinf(bounded.high) == slow
+        assert (seeing.r0.low == 0) is slow
+        assert np.isfinite([seeing.cn2.low, seeing.cn2.value, seeing.r0.high]).all()
+    assert inside >= 9
+
+
+def test_noise_does_not_hide_the_wind(monkeypatch):
+    spread = np.sqrt([3.0, 1.0])
+    found = moving_blocks(np.random.default_rng(7), 60, 0.6, spread, noise=0.7)
+    assert measure_blocks(found, monkeypatch).wind_anisotropy.value == pytest.approx(3.0, rel=0.25)
+
+
+def test_r0_needs_neighbouring_blocks(monkeypatch):
+    found = moving_blocks(np.random.default_rng(8), 40, 0.2)
+    seeing = measure_blocks(found, monkeypatch)
+    assert seeing.d_over_r0 is not None
+    monkeypatch.undo()
+    found.counts[1::2] = False
+    monkeypatch.setattr("turbrestore.seeing.strength.block_displacement", lambda *_: found)
+    still = np.full((2, 96, 96), 0.5, np.float32)
+    seeing = measure_seeing(still, np.zeros((2, 96, 96, 2), np.float32), still[0], still[0], OPTICS)
+    assert seeing.d_over_r0 is None
+    assert "too few neighbouring blocks" in seeing.remarks[-1]
 
 
 def test_bars_do_not_count(clip):

@@ -8,7 +8,7 @@ R : variance of that flow (eq. 10)
 β : weight of sharpness; κ what its window leaves out, see :func:`turbrestore.filtering.frame_noise.local_sharpness`
 
 Frames are warped three times: some of them for a median, which what passes through the scene does not change, and all
-of them twice: for mean and variance, and once more to leave out what deviates from all others.
+of them three times: for the mean, for the variance, and once more to leave out what deviates from all others.
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ def measure_frame_statistics(
     Parameters
     ----------
     frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-        Iterated twice; at least one.
+        Iterated three times; at least one.
     flows : iterable of ndarray, float32, shape (H, W, 2)
-        From the image to each frame, pixels; iterated twice.
+        From the image to each frame, pixels; iterated as often.
     image : ndarray, float32, shape (H, W) or (H, W, 3)
         Image that the frames are registered to.
     residual_variance : ndarray, shape (H, W)

@@ -12,6 +12,9 @@ blurred by the displacement on top of what blurs a frame, and second moments add
 so.  The blur of more than two squared pixels is a lower bound, because the spectrum of the mean vanishes where a larger
 one would be read.
 
+Where the clip spans few correlation times, the variance over a long time is unknown: what the mean over time has taken
+away is put back only for lags within the clip.  The value is then a lower bound, and what follows from it too.
+
 With a distance, V gives Cn²; without one, the whole displacement gives D/r0 for a range of outer scales
 (:mod:`turbrestore.seeing.tilt_theory`).  Neither is given where the displacement rotates as much as it diverges: it is
 then no gradient of a phase.
@@ -19,8 +22,8 @@ then no gradient of a phase.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -48,6 +51,8 @@ _BLUR_ERROR = 0.1
 _LARGEST_BLUR = 2.0
 # Largest part of an image that is compared by blur, pixels a side, and the tiles of it.
 _COMPARED, _TILES = 512, CueParams(tile=64, departure=1.0)
+# Fewest independent frames from which the variance over a long time is known.
+_LEAST_INDEPENDENT = 10
 # Share of rotation from which the displacement is not that of turbulence; without any relation of x and y it is 0.5.
 _ROTATING = 0.4
 _HALF, _E_FOLD = 0.5, float(np.exp(-1))
@@ -138,8 +143,8 @@ class Seeing:
 
 
 def measure_seeing(
-    frames: Iterable[FloatArray],
-    flows: Iterable[FloatArray],
+    frames: Sequence[FloatArray] | FloatArray,
+    flows: Sequence[FloatArray] | FloatArray,
     image: FloatArray,
     mean: FloatArray,
     optics: Optics | None = None,
@@ -186,7 +191,7 @@ def measure_seeing(
     >>> seeing.d_over_r0.low < 2.5 < seeing.d_over_r0.high
     True
     """
-    noise = estimate_noise(next(iter(frames)))
+    noise = estimate_noise(frames[0])
     found = block_displacement(frames, flows, image, noise, threads)
     by_blur = _by_blur(mean, image, noise / np.sqrt(len(found.blocks)))
     if not found.usable:
@@ -196,19 +201,26 @@ def measure_seeing(
     whole = motion_statistics(w, found.noise_variance)
     by_flow = max(float(np.mean(w**2)) - found.noise_variance, 0.0)
     rotation = rotation_share(found)
-    anisotropy, direction = _wind(w, whole)
+    anisotropy, direction = _wind(w, whole, found.noise_variance)
     remarks = _disagreement(by_flow, by_blur)
+    if whole.independent_frames < _LEAST_INDEPENDENT:
+        remarks += (
+            f"the clip spans few correlation times ({whole.independent_frames:.1f} independent frames): the variance "
+            "over a long time is a lower bound, and more frames would tell more",
+        )
     strength: dict[str, Estimate] = {}
-    if optics is not None and rotation > _ROTATING:
+    if optics is not None and np.isnan(rotation):
+        remarks += ("too few neighbouring blocks to tell turbulence from other motion: no r0 is reported",)
+    elif optics is not None and rotation > _ROTATING:
         remarks += (
             f"the displacement rotates as much as it diverges ({rotation:.0%} rotation): it is not that of light "
             "through turbulence, and no r0 is reported",
         )
     elif optics is not None:
         strength = _strength(found, whole, optics)
-    x, y = (chi_square_interval(float(part), whole.freedom / 2, _MODEL_ERROR) for part in whole.variance)
+    x, y = (_interval(float(part), whole, whole.freedom / 2) for part in whole.variance)
     return Seeing(
-        displacement_variance=chi_square_interval(float(whole.variance.mean()), whole.freedom, _MODEL_ERROR),
+        displacement_variance=_interval(float(whole.variance.mean()), whole, whole.freedom),
         displacement_variance_x=x,
         displacement_variance_y=y,
         displacement_by_flow=_with_deviation(by_flow, _MODEL_ERROR * by_flow),
@@ -248,6 +260,12 @@ def chi_square_interval(variance: float, freedom: float, relative: float = 0.0) 
     return Estimate(variance, float(variance * np.exp(-below)), float(variance * np.exp(above)))
 
 
+def _interval(variance: float, motion: MotionStatistics, freedom: float) -> Estimate:
+    """Interval of a variance over a long time, without an upper bound where there are few independent frames."""
+    found = chi_square_interval(variance, freedom, _MODEL_ERROR)
+    return found if motion.independent_frames >= _LEAST_INDEPENDENT else replace(found, high=np.inf)
+
+
 def _unmeasured(by_blur: Estimate | None, remark: str) -> Seeing:
     nothing = float("nan")
     return Seeing(
@@ -269,7 +287,7 @@ def _unmeasured(by_blur: Estimate | None, remark: str) -> Seeing:
 def _strength(found: Displacement, whole: MotionStatistics, optics: Optics) -> dict[str, Estimate]:
     if optics.distance is None:
         usual, least, largest = strength_of_tilt(float(whole.variance.mean()), optics)
-        around = chi_square_interval(1.0, whole.freedom, _MODEL_ERROR)
+        around = _interval(1.0, whole, whole.freedom)
         ratio = Estimate(usual, least * around.low ** (3 / 5), largest * around.high ** (3 / 5))
         return {"d_over_r0": ratio, "r0": _inverse(ratio, optics.aperture)}
     w = found.blocks[:, found.counts]
@@ -279,14 +297,16 @@ def _strength(found: Displacement, whole: MotionStatistics, optics: Optics) -> d
     pairs = differences[abs(rows[:, None] - rows), abs(columns[:, None] - columns)]
     # The variance about the mean of the blocks is half the mean of the difference over all pairs.
     per_cn2 = float(pairs.mean()) / 2
-    cn2 = chi_square_interval(float(among.variance.mean()) / per_cn2, among.freedom, _MODEL_ERROR)
-    value, low, high = (fried_parameter(part, optics) for part in (cn2.value, cn2.low, cn2.high))
+    cn2 = _interval(float(among.variance.mean()) / per_cn2, among, among.freedom)
+    value, low, high = (
+        fried_parameter(part, optics) if np.isfinite(part) else 0.0 for part in (cn2.value, cn2.low, cn2.high)
+    )
     r0 = Estimate(value, high, low)
     return {"d_over_r0": _inverse(r0, optics.aperture), "r0": r0, "cn2": cn2}
 
 
 def _inverse(estimate: Estimate, over: float) -> Estimate:
-    return Estimate(over / estimate.value, over / estimate.high, over / estimate.low)
+    return Estimate(over / estimate.value, over / estimate.high, over / estimate.low if estimate.low > 0 else np.inf)
 
 
 def _by_blur(mean: FloatArray, image: FloatArray, noise: float) -> Estimate | None:
@@ -321,7 +341,7 @@ def _disagreement(by_flow: float, by_blur: Estimate | None) -> tuple[str, ...]:
     return ()
 
 
-def _wind(w: Float64Array, whole: MotionStatistics) -> tuple[Estimate, float]:
+def _wind(w: Float64Array, whole: MotionStatistics, noise_variance: float) -> tuple[Estimate, float]:
     """Anisotropy and direction of the change from frame to frame.
 
     A frozen phase that drifts changes the tilt along the wind three times as much as across, in variance, because of
@@ -329,7 +349,9 @@ def _wind(w: Float64Array, whole: MotionStatistics) -> tuple[Estimate, float]:
     """
     change = np.diff(w, axis=0).reshape(-1, 2)
     values, vectors = np.linalg.eigh(change.T @ change / len(change))
-    ratio = float(values[1] / max(values[0], 1e-12))
+    # The noise of both frames is in the change.
+    values = np.maximum(values - 2 * noise_variance, 1e-12)
+    ratio = float(values[1] / values[0])
     # Each of the two variances has half of the degrees of freedom, and an error of sqrt(2 / that).
     factor = float(np.exp(_DEVIATIONS * np.sqrt(8 / max(whole.freedom, 1.0))))
     direction = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])) % 180)
