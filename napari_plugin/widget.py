@@ -87,16 +87,17 @@ def clip_of(layer: Image) -> FrameSource:
 
 
 def layers_of(restoration: Restoration, name: str, place: tuple[float, ...] = (0.0, 0.0)) -> list[LayerData]:
-    """Return the result, its uncertainty before deconvolution, and the motion of the training frames as layers."""
-    x, y, width, height = restoration.crop
+    """Return the result, its uncertainty, and the motion of the training frames as layers."""
+    x, y = restoration.crop[:2]
     decisions = {decision.subject: decision.choice for decision in restoration.decisions}
     at = {"translate": (place[0] + y, place[1] + x)}
     shown = {"contrast_limits": (0.0, 1.0), "rgb": restoration.image.ndim == 3, "metadata": decisions, **at}
     layers: list[LayerData] = []
-    if restoration.filtered is not None:
-        uncertainty = np.sqrt(restoration.filtered.variance[y : y + height, x : x + width])
-        hidden = {"name": f"{name}, uncertainty", "colormap": "viridis", "visible": False, **at}
-        layers.append((uncertainty, hidden, "image"))
+    if restoration.uncertainty is not None:
+        finite = restoration.uncertainty[np.isfinite(restoration.uncertainty)]
+        limits = (0.0, float(finite.max()) if finite.size else 1.0)
+        hidden = {"name": f"{name}, uncertainty", "colormap": "viridis", "visible": False, "contrast_limits": limits}
+        layers.append((restoration.uncertainty, hidden | at, "image"))
     arrows = {"name": f"{name}, motion", "edge_width": 0.5, "visible": False, "translate": (0.0, *place)}
     layers.append((vectors(restoration.centroid.flows), arrows, "vectors"))
     layers.append((restoration.image, {"name": f"{name}, restored", **shown}, "image"))

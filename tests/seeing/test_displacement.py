@@ -70,6 +70,18 @@ def test_noise_is_taken_out_and_never_more_than_there_is():
     assert (motion_statistics(w, 9.0).variance > 0).all()
 
 
+@pytest.mark.parametrize(("noise", "least"), [(0.01, 0.85), (0.06, 0.3)])
+def test_noise_adds_at_most_what_is_taken_out(noise, least):
+    chart, rng = cv2.GaussianBlur(resolution_chart(96, 96), (0, 0), 1.5), np.random.default_rng(5)
+    flows = np.zeros((40, 96, 96, 2), np.float32) + rng.normal(size=(40, 1, 1, 2)).astype(np.float32)
+    frames = [warp(chart, -flow) for flow in flows]
+    noisy = [frame + noise * rng.standard_normal(frame.shape, np.float32) for frame in frames]
+    clean, found = (block_displacement(clip, flows, chart, noise) for clip in (frames, noisy))
+    assert found.usable
+    added = np.mean((found.blocks - clean.blocks)[:, found.counts] ** 2)
+    assert least * found.noise_variance < added < 1.1 * found.noise_variance
+
+
 def test_gradients_do_not_rotate():
     y, x = np.mgrid[:9, :9] / 3.0
     rng = np.random.default_rng(3)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.seeing.tilt_theory import Optics, displacement_differences, fried_parameter, strength_of_tilt
-from turbrestore.synthesis import atmosphere
+from turbrestore.seeing.tilt_theory import Optics, displacement_differences, strength_of_tilt
 from turbrestore.synthesis.atmosphere import Layer, PhaseScreenParams, tilt_variance
 from turbrestore.synthesis.phase_screen import draw_turbulence, tilt_flow
 
@@ -34,12 +33,6 @@ def test_differences_are_symmetric_in_the_axes_and_larger_for_smaller_windows():
     differences = displacement_differences(OPTICS, 10.0, (3, 3), 10.0)
     np.testing.assert_allclose(differences[..., 0], differences[..., 1].T, rtol=1e-9, atol=1e6)
     assert (displacement_differences(OPTICS, 10.0, (1, 3), 2.0)[0, 1:] > differences[0, 1:]).all()
-
-
-def test_r0_is_that_of_the_synthesizer_and_scales_as_it_should():
-    assert fried_parameter(3e-15, OPTICS) == pytest.approx(atmosphere.fried_parameter(3e-15, 2000.0, 550e-9), rel=1e-9)
-    plane = Optics(2.75e-6, aperture=0.1, wavelength=550e-9, distance=2000.0, path="plane")
-    assert fried_parameter(3e-15, plane) == pytest.approx(fried_parameter(3e-15, OPTICS) * (3 / 8) ** (3 / 5))
 
 
 @pytest.mark.parametrize("scale", [20.0, 100.0, 1000.0])

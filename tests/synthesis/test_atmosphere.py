@@ -53,9 +53,10 @@ def test_spectrum_integrates_to_the_variance():
     assert 2 * variance == pytest.approx(von_karman(500.0, 0.04, 5.0), rel=1e-3)
 
 
-def test_fried_parameter_of_a_spherical_wave():
+def test_fried_parameter_of_a_spherical_and_of_a_plane_wave():
     k = 2 * np.pi / WAVELENGTH
     assert fried_parameter(1e-14, 1000.0, WAVELENGTH) == pytest.approx((0.423 * k**2 * 1e-11 * 3 / 8) ** -0.6)
+    assert fried_parameter(1e-14, 1000.0, WAVELENGTH, 1.0) == pytest.approx((0.423 * k**2 * 1e-11) ** -0.6)
 
 
 @pytest.mark.parametrize("count", [1, 3, 10])

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ..core.arrays import FloatArray
+from ..core.gradient import sobel_gradient
 from ..core.noise import estimate_noise
 
 # Distance up to which edges are followed: widths of the blur, and pixels.
@@ -108,7 +109,7 @@ def _find_edges(image: FloatArray, noise: float) -> _Edges:
     for top in range(0, len(image), _ROWS):
         start = max(top - _AROUND, 0)
         strip = cv2.GaussianBlur(image[start : top + _ROWS + _AROUND], (0, 0), _SMOOTH)
-        across, down = (cv2.Sobel(strip, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1)))
+        across, down = sobel_gradient(strip)
         size = np.hypot(across, down)
         y, x = np.mgrid[: strip.shape[0], : strip.shape[1]].astype(np.float32)
         unit = np.stack([down, across]) / np.maximum(size, np.finfo(np.float32).tiny)
@@ -117,14 +118,16 @@ def _find_edges(image: FloatArray, noise: float) -> _Edges:
         crest[: top - start] = crest[top - start + _ROWS :] = False
         rows, columns = np.nonzero(crest)
         places.append(np.stack([rows + start, columns], axis=1).astype(np.float32))
-        normals.append(unit[:, rows, columns].T)
+        normals.append(unit[:, rows, columns].T.astype(np.float32))
     return _Edges(np.concatenate(places), np.concatenate(normals))
 
 
 def _fewer(edges: _Edges, most: int) -> _Edges:
     """Leave out rows of tiles until no more edges remain than wanted."""
     every = -(-len(edges.places) // most)
-    kept = (edges.places[:, 0] // _TILE) % max(every, 1) == 0
+    # Of the rows that have edges, since those that are kept must not be empty.
+    _, rows = np.unique(edges.places[:, 0] // _TILE, return_inverse=True)
+    kept = rows.ravel() % max(every, 1) == 0
     return _Edges(edges.places[kept], edges.normals[kept])
 
 

@@ -19,7 +19,8 @@ displacement is 0.97 to 1.01.  A block counts if M makes the error from the resi
 * w is a mean weighted by |g|², so b follows from the second moment of these weights within the blocks: b²/12.
 * The mean over time takes the variance m of the mean of T correlated values away: ``ĉ(k) = c(k) − m`` with
   ``m = (1/T) Σ_|k|<T (1 − |k|/T) c(k)``.  Both equations are solved together; c is taken to end at its first zero.
-* Noise adds ``σ² tr M⁻¹ / 2`` to the variance of a block; this is taken out.
+* Noise adds at most ``σ² tr M⁻¹ / 2`` to the variance of a block; this is taken out.  Where it is as large as the
+  gradients it adds less, because it is in g too.
 * T frames are worth ``N = T / (1 + 2 Σ (1 − k/T) ρ(k)²)`` independent ones for a variance.  The blocks of a frame are
   worth ``d = (tr S)² / tr S²`` independent values, S their covariance, whose sample value is lower by 1/d + 1/N.
   ν V / E[V] has a χ² distribution with ν = d N degrees of freedom.
@@ -39,6 +40,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError
+from ..core.gradient import sobel_gradient
 from ..registration.warp import warp
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import map_ahead
@@ -74,7 +76,7 @@ class Displacement:
     window : float
         b, pixels.
     noise_variance : float
-        What noise adds to the variance of w, mean over the blocks that count, squared pixels.
+        What noise adds at most to the variance of w, mean over the blocks that count, squared pixels.
     """
 
     blocks: Float64Array
@@ -150,13 +152,13 @@ def block_displacement(
            [-0.4,  0. ]])
     """
     grey = luminance(image)
-    ix, iy = _gradient(grey)
+    ix, iy = sobel_gradient(grey)
     side = max(min(grey.shape) // _BLOCKS, _SMALLEST)
 
     def solve(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
         frame, flow = pair
         registered = warp(luminance(frame), flow)
-        gx, gy = ((one + other) / 2 for one, other in zip(_gradient(registered), (ix, iy), strict=True))
+        gx, gy = ((one + other) / 2 for one, other in zip(sobel_gradient(registered), (ix, iy), strict=True))
         residual = grey - registered
         target = residual + gx * flow[..., 0] + gy * flow[..., 1]
         xx, xy, yy, bx, by = (
@@ -303,13 +305,6 @@ def block_means(plane: NDArray[np.floating], side: int) -> FloatArray:
     top, left = (plane.shape[0] - rows * side) // 2, (plane.shape[1] - columns * side) // 2
     inside = plane[top : top + rows * side, left : left + columns * side]
     return cv2.resize(np.ascontiguousarray(inside, np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
-
-
-def _gradient(plane: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return (
-        cv2.Sobel(plane, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8),
-        cv2.Sobel(plane, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8),
-    )
 
 
 def _window(energy: FloatArray, side: int, counts: NDArray[np.bool_]) -> float:

@@ -32,6 +32,7 @@ from ..blur_moments.cues import relative_blur
 from ..blur_moments.tile_spectra import CueParams
 from ..core.arrays import FloatArray
 from ..core.noise import estimate_noise
+from ..synthesis.atmosphere import fried_parameter
 from .displacement import (
     Displacement,
     Float64Array,
@@ -41,7 +42,7 @@ from .displacement import (
     rotation_share,
     separation_correlation,
 )
-from .tilt_theory import Optics, displacement_differences, fried_parameter, strength_of_tilt
+from .tilt_theory import MEAN_CONE, Optics, displacement_differences, strength_of_tilt
 
 # Relative error of a variance besides that of finitely many frames: on synthetic clips of D/r0 1 to 6 the variance of
 # blocks is 1 to 8 % too large on photographs and 21 % on a chart, as aberrations other than tilt move a block too.
@@ -298,8 +299,9 @@ def _strength(found: Displacement, whole: MotionStatistics, optics: Optics) -> d
     # The variance about the mean of the blocks is half the mean of the difference over all pairs.
     per_cn2 = float(pairs.mean()) / 2
     cn2 = _interval(float(among.variance.mean()) / per_cn2, among, among.freedom)
+    path = optics.distance, optics.wavelength, MEAN_CONE[optics.path]
     value, low, high = (
-        fried_parameter(part, optics) if np.isfinite(part) else 0.0 for part in (cn2.value, cn2.low, cn2.high)
+        fried_parameter(part, *path) if np.isfinite(part) else 0.0 for part in (cn2.value, cn2.low, cn2.high)
     )
     r0 = Estimate(value, high, low)
     return {"d_over_r0": _inverse(r0, optics.aperture), "r0": r0, "cn2": cn2}

@@ -36,15 +36,13 @@ from numpy.typing import NDArray
 from scipy import special
 
 from ..core.errors import require, require_between
-from ..synthesis.atmosphere import Layer, phase_spectrum, tilt_variance
+from ..synthesis.atmosphere import Layer, fried_parameter, phase_spectrum, tilt_variance
 
 Float64Array = NDArray[np.float64]
 
 PATHS = ("spherical", "plane")
-# The structure function 2.914 k² r^(5/3) ∫ Cn² dz = 6.884 (r/r0)^(5/3) implies r0^(-5/3) = 0.423 k² ∫ Cn² dz.
-_FRIED = 0.423
 # Mean of γ^(5/3) over the path.
-_MEAN_CONE = {"spherical": 3 / 8, "plane": 1.0}
+MEAN_CONE = {"spherical": 3 / 8, "plane": 1.0}
 # Nodes along the path, over the angle of a quarter of the plane, and over log frequency.
 _SLICES, _ANGLES, _FREQUENCIES = 16, 24, 300
 # Larger than any that matters to differences over a field of view, m.
@@ -140,7 +138,7 @@ def displacement_differences(optics: Optics, spacing: float, counts: tuple[int, 
         response = (
             cone / optics.aperture * optics.wavelength * 8 * special.jv(2, np.pi * cone * f) / (np.pi * cone * f) ** 2
         )
-        r0 = (_FRIED * (2 * np.pi / optics.wavelength) ** 2 * thickness) ** (-3 / 5)
+        r0 = fried_parameter(1.0, thickness, optics.wavelength, 1.0)
         # d²f = f df dangle, and df = f d(log f).
         power = response**2 * phase_spectrum(f, r0, _NO_OUTER_SCALE, 0.0) * f**2 * np.log(f[1] / f[0])
         mean = (2 * np.pi / _ANGLES * power)[:, None] * (np.sinc(x * pixel * window) * np.sinc(y * pixel * window)) ** 2
@@ -152,32 +150,6 @@ def displacement_differences(optics: Optics, spacing: float, counts: tuple[int, 
             density = (component**2 * mean).ravel()
             total[..., axis] += 2 * (density.sum() - (rows * density) @ columns.T)
     return total / optics.pixel_scale**2
-
-
-def fried_parameter(cn2: float, optics: Optics) -> float:
-    """Fried parameter of a path of constant Cn²: ``r0 = (0.423 k² Cn² L c)^(-3/5)``.
-
-    c, the mean of γ^(5/3), is 3/8 for a spherical wave and 1 for a plane one (Fried 1966).
-
-    Parameters
-    ----------
-    cn2 : float
-        m^(-2/3), above 0.
-    optics : Optics
-        With a distance.
-
-    Returns
-    -------
-    float
-        m.
-
-    Examples
-    --------
-    >>> round(fried_parameter(1e-15, Optics(2.75e-6, 0.1, 550e-9, 2000.0)), 4)
-    0.1071
-    """
-    wave_number = 2 * np.pi / optics.wavelength
-    return float((_FRIED * wave_number**2 * cn2 * (optics.distance or 0.0) * _MEAN_CONE[optics.path]) ** (-3 / 5))
 
 
 def strength_of_tilt(variance: float, optics: Optics) -> tuple[float, float, float]:

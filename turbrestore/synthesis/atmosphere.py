@@ -235,10 +235,8 @@ class PhaseScreenParams:
         return float(np.sqrt(tilt_variance(self.path(), self.aperture, self.wavelength, *scales))) / self.pixel_angle
 
 
-def fried_parameter(cn2: float, distance: float, wavelength: float) -> float:
-    """Fried parameter of a spherical wave on a path of constant Cn²: ``r0 = (0.423 k² Cn² L · 3/8)^(-3/5)``.
-
-    3/8 is the mean of γ^(5/3) (Fried 1966).
+def fried_parameter(cn2: float, distance: float, wavelength: float, cone: float = 3 / 8) -> float:
+    """Fried parameter of a path of constant Cn²: ``r0 = (0.423 k² Cn² L c)^(-3/5)`` (Fried 1966).
 
     Parameters
     ----------
@@ -248,6 +246,8 @@ def fried_parameter(cn2: float, distance: float, wavelength: float) -> float:
         L, m.
     wavelength : float
         λ, m.
+    cone : float
+        c, mean of γ^(5/3) over the path: 3/8 for a spherical wave, 1 for a plane one.
 
     Returns
     -------
@@ -266,7 +266,7 @@ def fried_parameter(cn2: float, distance: float, wavelength: float) -> float:
     """
     for name, value in (("cn2", cn2), ("distance", distance), ("wavelength", wavelength)):
         _positive(name, value)
-    return float((_FRIED * (2 * np.pi / wavelength) ** 2 * cn2 * distance * 3 / 8) ** (-3 / 5))
+    return float((_FRIED * (2 * np.pi / wavelength) ** 2 * cn2 * distance * cone) ** (-3 / 5))
 
 
 def phase_spectrum(frequency: ArrayLike, r0: float, outer_scale: float, inner_scale: float) -> Float64Array:

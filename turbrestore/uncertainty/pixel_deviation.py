@@ -39,6 +39,7 @@ from scipy import fft
 
 from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol, wiener_fidelity
 from ..core.arrays import FloatArray, luminance
+from ..core.gradient import sobel_gradient
 from ..core.noise import estimate_noise
 from ..deconvolution.problem import automatic_fidelity
 from ..dynamics.flow_model import FlowDynamics
@@ -85,7 +86,7 @@ def pixel_deviation(
     True
     """
     grey = luminance(image)
-    gx, gy = (cv2.Sobel(grey, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    gx, gy = sobel_gradient(grey)
     square = cv2.GaussianBlur(gx * gx + gy * gy, (0, 0), _WINDOW)
     found = np.sqrt(np.float32(gain) * variance + position_variance * square)
     return np.where(known, found, np.float32(np.inf)).astype(np.float32)
