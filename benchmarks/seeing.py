@@ -2,8 +2,8 @@
 
 Run ``python benchmarks/seeing.py``; it takes 5 minutes of one core, and ``--clips 12`` one.  Clips: three scenes of 112
 pixels a side, 48 frames at 30 a second, D/r0 of 1 to 6, wind of 1 to 6 m/s from any side.  With ``TURBRESTORE_DATA``
-the simulated clips of that folder follow; their optics are given to all of them, also to those that have no such
-physics, which should be reported without r0.
+the simulated clips of that folder follow, 48 frames of their middle of 160 pixels a side; their optics are given to all
+of them, also to those that have no such physics, which should be reported without r0.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from turbrestore.synthesis.atmosphere import PhaseScreenParams
 from turbrestore.synthesis.scenes import picture, resolution_chart
 
 SIDE, FRAMES = 112, 48
+RECORDED_SIDE = 160
 OPTICS = Optics(pixel_scale=2.75e-6, aperture=0.1, wavelength=550e-9, distance=2000.0)
 ONE = Runtime(threads=1)
 # D/r0 of the clips that have one.
@@ -77,7 +78,11 @@ def recorded(folder: Path) -> None:
         clip = place / "clip.mkv" if (place / "clip.mkv").exists() else place / "frames"
         if not clip.exists():
             continue
-        seeing = seeing_of(open_frames(clip).read(0, None)[:60])
+        source = open_frames(clip)
+        top, left = (max(size - RECORDED_SIDE, 0) // 2 for size in source.shape[1:3])
+        sides = [min(size, RECORDED_SIDE) for size in source.shape[1:3]]
+        part = source.select((0, min(FRAMES, len(source)), 1), (left, top, sides[1], sides[0]))
+        seeing = seeing_of(part.read())
         found, flow, blur = seeing.d_over_r0, seeing.displacement_by_flow, seeing.displacement_by_blur
         strength = "none" if found is None else f"{found.value:.2f} ({found.low:.2f} to {found.high:.2f})"
         both = ", ".join("none" if part is None else f"{part.value:.2f}" for part in (flow, blur))

@@ -1,8 +1,10 @@
 """How well the stated deviation of every pixel bounds the error, as a Markdown table.
 
-Run ``python benchmarks/uncertainty.py`` with ``TURBRESTORE_DATA``: the simulated clips with ``truth_centroid.png`` are
-restored, their middle of 160 pixels a side.  With ``--halves`` both halves of each clip are restored too: they are
-independent, so their difference has the deviations of both, and the geometry of both besides.
+Run ``python benchmarks/uncertainty.py`` with ``TURBRESTORE_DATA``: the simulated clips are restored, their middle of
+160 pixels a side, and compared with the scene at their mean geometry.  Rows marked "scene itself" are of clips for
+which that is not known (no ``truth_centroid.png``), so their error includes how the mean geometry bends the scene.
+With ``--halves`` both halves of each clip are restored too: they are independent, so their difference has the
+deviations of both, and the geometry of both besides.
 """
 
 from __future__ import annotations
@@ -58,16 +60,18 @@ def main() -> None:
     parser.add_argument("--halves", action="store_true", help="restore both halves too")
     halves, folder = parser.parse_args().halves, os.environ.get("TURBRESTORE_DATA")
     if folder is None:
-        sys.exit("TURBRESTORE_DATA is not set: no clips whose scene at the mean geometry is known")
+        sys.exit("TURBRESTORE_DATA is not set: no clips whose scene is known")
     print("| clip | error, rms | deviation, median | within two | rank correlation | share of the time |")
     print("|---|---|---|---|---|---|")
-    for path in sorted(Path(folder, "simulated").glob("*/truth_centroid.png")):
-        source, place = middle(path.parent / "clip.mkv")
-        truth = luminance(read_image(path).image)[place]
+    for path in sorted(Path(folder, "simulated").glob("*/clip.mkv")):
+        source, place = middle(path)
+        bent = path.with_name("truth_centroid.png")
+        truth = luminance(read_image(bent if bent.exists() else path.with_name("truth.png")).image)[place]
+        name = path.parent.name if bent.exists() else f"{path.parent.name}, scene itself"
         restoration, share = restored(source)
         assert restoration.uncertainty is not None
         row = figures(luminance(restoration.image) - truth, restoration.uncertainty)
-        print(f"| {path.parent.name} | {row} | {share:.3f} |", flush=True)
+        print(f"| {name} | {row} | {share:.3f} |", flush=True)
         if halves:
             half = len(source) // 2
             one, other = (restored(source.select(frames=part))[0] for part in ((0, half), (half, None)))
