@@ -93,7 +93,7 @@ class SaveView:
             outputs = Outputs(image, self._depth.value, bool(self._report.value), bool(self._overwrite.value))
             if tab.restored is None or clip is None:
                 return
-            await asyncio.to_thread(check_outputs, outputs, tab.restored.order.path)
+            await asyncio.to_thread(check_outputs, outputs, tab.restored.order)
             if self._page.tune_view.pending:
                 self._note.text = "applying what was tuned to the whole …"
                 self._page.tune_view.apply()

@@ -9,6 +9,7 @@ from typing import Any
 
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
+from turbrestore_cli.inputs import files_read
 from turbrestore_cli.options import Machine
 from turbrestore_cli.output import repeating_command, settings_record, write_result, write_settings
 
@@ -69,16 +70,17 @@ def command_line(order: Order, bit_depth: int | None, input: Path, output: Path)
     return shlex.join(repeating_command(input, output, settings_of(order, bit_depth)))
 
 
-def check_outputs(outputs: Outputs, input: Path) -> None:
+def check_outputs(outputs: Outputs, order: Order) -> None:
     """Raise an error if something could not be saved."""
+    inputs = files_read(order.selection, order.path, static_mask=order.params.static_mask)
     if outputs.bit_depth is not None:
         check_depth(outputs.bit_depth)
-    check_output(outputs.image, [input], outputs.overwrite)
-    check_output(outputs.settings, [input], outputs.overwrite, suffixes=None)
+    check_output(outputs.image, inputs, outputs.overwrite)
+    check_output(outputs.settings, inputs, outputs.overwrite, suffixes=None)
     if outputs.report:
         from turbrestore.report import check_report
 
-        check_report(outputs.page, [input], outputs.overwrite)
+        check_report(outputs.page, inputs, outputs.overwrite)
 
 
 def save(restored: Restored, outputs: Outputs, name: Path, shown: Path) -> list[Path]:
@@ -101,7 +103,7 @@ def save(restored: Restored, outputs: Outputs, name: Path, shown: Path) -> list[
     OutputError, StorageError, ConfigurationError
         A file exists already, or cannot be written.
     """
-    check_outputs(outputs, restored.order.path)
+    check_outputs(outputs, restored.order)
     record = settings_of(restored.order, outputs.bit_depth)
     depth = restored.source.bit_depth if outputs.bit_depth is None else outputs.bit_depth
     command = repeating_command(name, shown, record)

@@ -81,7 +81,7 @@ def plan(orders: Sequence[Order], out: Path, resume: bool, overwrite: bool) -> t
         An output exists that no earlier batch has made, or is an input.
     """
     earlier = read_journal(out / JOURNAL) if resume else {}
-    clips = {order.input.resolve() for order in orders}
+    read = {path.resolve() for order in orders for path in order.inputs}
     for name in (JOURNAL, TABLE, PAGE):
         check_output(
             out / name, overwrite=overwrite or (resume and (not (out / name).exists() or bool(earlier))), suffixes=None
@@ -91,9 +91,9 @@ def plan(orders: Sequence[Order], out: Path, resume: bool, overwrite: bool) -> t
         row = ClipRow(str(order.input), str(order.output), key=key_of(order))
         before = earlier.get(order.output.name)
         for path in order.outputs:
-            if path.resolve() in clips:
-                raise OutputError(f"{path}: is the input of a clip; choose another folder")
-            check_output(path, [order.input], overwrite or before is not None, suffixes=None)
+            if path.resolve() in read:
+                raise OutputError(f"{path}: is an input; choose another folder")
+            check_output(path, order.inputs, overwrite or before is not None, suffixes=None)
         there = all(path.exists() for path in order.outputs)
         if before is not None and before.state == "done" and before.key == row.key and there:
             row = dataclasses.replace(before, input=row.input, output=row.output)
@@ -106,8 +106,7 @@ def plan(orders: Sequence[Order], out: Path, resume: bool, overwrite: bool) -> t
 def key_of(order: Order) -> str:
     """Stand for the input and all settings that a result depends on."""
     settings = (order.params, order.selection, order.bit_depth, order.memory_limit, order.tile, order.machine.device)
-    named = [order.input, *(Path(name) for name in (order.selection.dark, order.selection.flat) if name is not None)]
-    stamps = [_stamp(file) for path in named for file in (frame_files(path) if path.is_dir() else [path])]
+    stamps = [_stamp(file) for path in order.inputs for file in (frame_files(path) if path.is_dir() else [path])]
     text = f"{__version__}\0{settings!r}\0{stamps!r}\0{order.report is not None}"
     return hashlib.blake2b(text.encode(errors="surrogateescape"), digest_size=12).hexdigest()
 

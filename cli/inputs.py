@@ -53,6 +53,13 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
     return source, check_content(source, ContentParams(strict=selection.strict))
 
 
+def files_read(selection: Selection, *named: Path | None, static_mask: str = "auto") -> list[Path]:
+    """List the files and folders that a command reads, which no output may replace: those it names, and settings do."""
+    calibration = (None if name is None else Path(name) for name in (selection.dark, selection.flat))
+    mask = None if static_mask in ("auto", "off") else Path(static_mask)
+    return [path for path in (*named, *calibration, mask) if path is not None]
+
+
 def read_input_image(input: Path, limits: Limits) -> FloatArray:
     """Read an image file within limits, or the image of a stage file."""
     return load_stage_image(input) if input.suffix.lower() == ".npz" else read_image(input, limits).image

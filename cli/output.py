@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +132,15 @@ def write_result(
         origin=(columns.start + x, rows.start + y),
         uncertainty=restoration.uncertainty,
     )
+
+
+def check_distinct(outputs: Iterable[Path]) -> None:
+    """Refuse two outputs that are one file, under any names: the second would replace the first."""
+    known: set[Path] = set()
+    for path in outputs:
+        if path.resolve() in known:
+            raise OutputError(f"{path}: is named for two outputs; choose another name for one of them")
+        known.add(path.resolve())
 
 
 def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: bool) -> None:

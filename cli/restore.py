@@ -26,10 +26,11 @@ from turbrestore.settings import Preset, RestoreParams
 from turbrestore.tiled_stages import TileMap
 
 from .cluster import check_cluster, connected, over_workers
-from .inputs import open_input, read_input_image
+from .inputs import files_read, open_input, read_input_image
 from .kept import check_room, kept_stages, own_outputs
 from .options import Flag, Machine, Selection, known_sigma
 from .output import (
+    check_distinct,
     check_keep,
     describe,
     print_json,
@@ -75,6 +76,11 @@ class Order:
     def settings_path(self) -> Path:
         """File for the effective settings."""
         return self.output.with_name(self.output.name + ".toml")
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Files and folders to read."""
+        return files_read(self.selection, self.input, self.config, self.truth, static_mask=self.params.static_mask)
 
     @property
     def outputs(self) -> list[Path]:
@@ -242,11 +248,13 @@ def _check_outputs(order: Order) -> set[Path]:
     require(
         order.keep is not None or not order.resume, "--resume: expected --keep with the folder of the run to go on with"
     )
-    inputs = [path for path in (order.input, order.config, order.truth) if path is not None]
+    check_distinct(order.outputs)
+    inputs = order.inputs
     left = own_outputs(order.keep) if order.resume and order.keep is not None else set()
     check_output(order.output, inputs, order.overwrite or order.output.absolute() in left)
     of_before = order.config == order.settings_path or order.settings_path.absolute() in left
-    check_output(order.settings_path, [order.input], order.overwrite or of_before, suffixes=None)
+    others = [path for path in inputs if path != order.config]
+    check_output(order.settings_path, others, order.overwrite or of_before, suffixes=None)
     if order.uncertainty is not None:
         require(
             order.params.runs("filter"),

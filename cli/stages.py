@@ -30,7 +30,7 @@ from turbrestore.registration.warp import warp
 from turbrestore.runs.stage_files import load_artifact, load_flows, save_artifact, save_flows
 from turbrestore.runtime.steps import finish, step_counter
 
-from .inputs import open_input, read_guide, read_input_image
+from .inputs import files_read, open_input, read_guide, read_input_image
 from .options import Flag, Machine, Selection, known_sigma, limits_of
 from .output import print_json
 from .progress import progress_bars, say
@@ -73,7 +73,7 @@ def centroid(
     quiet : bool
         Print neither progress nor remarks.
     """
-    check_output(output, [input], overwrite, STAGE_FILE)
+    check_output(output, files_read(selection, input), overwrite, STAGE_FILE)
     source = open_input(input, selection, quiet)
     wanted = len(source) if train is None and selection.frames is not None else train
     count = training_share(len(source), source.shape[1:], wanted)
@@ -115,7 +115,7 @@ def flow(
     quiet : bool
         Print neither progress nor remarks.
     """
-    check_output(output, [reference, input], overwrite, (".npy",))
+    check_output(output, files_read(selection, reference, input), overwrite, (".npy",))
     image = read_input_image(reference, selection.limits())
     source = open_input(input, selection, quiet)
     check_space(output, _flow_bytes(len(source), source.shape))
@@ -215,7 +215,7 @@ def predict(
     quiet : bool
         No remarks.
     """
-    check_output(output, [input, centroid, dynamics], overwrite, PICTURE)
+    check_output(output, files_read(selection, input, centroid, dynamics), overwrite, PICTURE)
     new_figure()
     start, model = load_artifact(centroid, Centroid), load_artifact(dynamics, FlowDynamics)
     source = open_input(input, selection, quiet)
@@ -288,7 +288,8 @@ def filter_(
     quiet : bool
         Print neither progress nor remarks.
     """
-    check_output(output, [input, centroid, dynamics], overwrite, STAGE_FILE + tuple(IMAGE_OUTPUT_SUFFIXES))
+    inputs = files_read(selection, input, centroid, dynamics)
+    check_output(output, inputs, overwrite, STAGE_FILE + tuple(IMAGE_OUTPUT_SUFFIXES))
     start, model = load_artifact(centroid, Centroid), load_artifact(dynamics, FlowDynamics)
     source = open_input(input, selection, quiet)
     check_space(output, _image_bytes(source.shape))

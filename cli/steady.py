@@ -26,9 +26,9 @@ from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, write_video
 from turbrestore.steady.settings import SteadyParams
 from turbrestore.steady.video import SteadyFrame, steady_frames
 
-from .inputs import open_checked
+from .inputs import files_read, open_checked
 from .options import Flag, Machine, Selection
-from .output import print_json, write_settings
+from .output import check_distinct, print_json, write_settings
 from .progress import progress_bars, say
 
 # Frames per second of inputs that do not say.
@@ -108,13 +108,14 @@ def steady(
     require(raw is None or piped_in, "--raw: has no effect unless the input is -; leave it out")
     require(not (piped_out and json), "--json: contradicts the output -, which is standard output; leave it out")
     require(not piped_out or encoding == BY_SUFFIX, "--codec, --crf: have no effect on the output -; leave them out")
-    inputs = [path for path in (None if piped_in else input, config) if path is not None]
+    inputs = files_read(selection, None if piped_in else input, config)
     settings_path = output.with_name(output.name + ".toml")
     if not piped_out:
         check_output(output, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
-        check_output(settings_path, [] if piped_in else [input], overwrite or config == settings_path, suffixes=None)
+        others = [path for path in inputs if path != config]
+        check_output(settings_path, others, overwrite or config == settings_path, suffixes=None)
     if mask is not None:
-        require(mask.absolute() != output.absolute(), "--mask: is the output; choose another name")
+        check_distinct([mask] if piped_out else [output, mask])
         check_output(mask, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
     source = _from_pipe(selection, shape) if piped_in else _from_file(input, selection, quiet)
     fps, depth = source.fps or _USUAL_RATE, source.bit_depth if written.bit_depth is None else written.bit_depth

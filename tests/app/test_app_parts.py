@@ -214,10 +214,13 @@ class TestSaving:
         with pytest.raises(OutputError, match="a.png.html"):
             save(restored, outputs, Path("clip.mkv"), Path("a.png"))
         assert not (tmp_path / "a.png").exists()
-        check_outputs(replace(outputs, overwrite=True), folder / "clip.mkv")
+        order = Order(folder / "clip.mkv", params=RestoreParams(static_mask=str(tmp_path / "mask.png")))
+        check_outputs(replace(outputs, overwrite=True), order)
         (tmp_path / "clip.png").hardlink_to(folder / "clip.mkv")
-        with pytest.raises(OutputError):
-            check_outputs(Outputs(tmp_path / "clip.png", overwrite=True), folder / "clip.mkv")
+        (tmp_path / "mask.png").touch()
+        for name in ("clip.png", "mask.png"):
+            with pytest.raises(OutputError):
+                check_outputs(Outputs(tmp_path / name, overwrite=True), order)
 
 
 class TestTab:

@@ -402,6 +402,43 @@ def test_outputs_that_cannot_be(run, clip, tmp_path):
     assert copy.read_bytes() == clip.read_bytes()
 
 
+class TestFilesOfOneRun:
+    """No output is another one, or anything that is read, under any name."""
+
+    @pytest.fixture
+    def here(self, clip, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        write_video(Path("dark.npy"), np.zeros((2, 80, 80), np.float32), 25, 32)
+        write_image(Path("mask.png"), np.eye(80, dtype=np.float32), 8)
+        return {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def refuses(self, run, here, words, *parts):
+        fails(run(*words, "--overwrite"), 73, *parts)
+        assert {path.name: path.read_bytes() for path in Path().iterdir()} == here
+
+    @pytest.mark.parametrize("other", ["o.tif", "./o.tif", "none/../o.tif"])
+    def test_outputs_of_restore_differ(self, run, clip, here, other):
+        words = ["restore", clip, "o.tif", "--uncertainty", other, *QUICK]
+        self.refuses(run, here, words, f"{Path(other)}: is named for two outputs")
+
+    def test_a_link_is_no_other_output(self, run, clip, here, tmp_path):
+        Path("link.mkv").symlink_to("o.mkv")
+        fails(run("steady", clip, "o.mkv", "--mask", "link.mkv", "--overwrite"), 73, "is named for two outputs")
+
+    @pytest.mark.parametrize("option", ["--dark", "--flat"])
+    @pytest.mark.parametrize("words", [("steady", "c"), ("flow", "mask.png", "c")])
+    def test_calibration_stays(self, run, clip, here, option, words):
+        words = [clip if word == "c" else word for word in words]
+        self.refuses(run, here, [*words, "dark.npy", option, "dark.npy"], "is the input")
+
+    @pytest.mark.parametrize("output", [["mask.png"], ["o.png", "--keep", "."]])
+    def test_the_mask_of_overlays_stays(self, run, clip, here, output):
+        Path("frame.png").write_bytes(here["mask.png"])
+        here["frame.png"] = here["mask.png"]
+        name = output[0] if len(output) == 1 else "frame.png"
+        self.refuses(run, here, ["restore", clip, *output, "--static-mask", name, *QUICK], name)
+
+
 def test_missing_words_and_unknown_commands(run):
     fails(run("restore"), 2, "INPUT")
     fails(run("resstore"), 2, 'Did you mean "restore"')
