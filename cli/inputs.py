@@ -17,6 +17,7 @@ from turbrestore.io.limits import Limits
 from turbrestore.io.source import FrameSource
 from turbrestore.io.tiff import TIFF_SUFFIXES
 from turbrestore.io.video import open_frames
+from turbrestore.memory_plan import training_share
 from turbrestore.runs.stage_files import load_guide, load_stage_image
 
 from .options import Selection
@@ -58,6 +59,12 @@ def files_read(selection: Selection, *named: Path | None, static_mask: str = "au
     calibration = (None if name is None else Path(name) for name in (selection.dark, selection.flat))
     mask = None if static_mask in ("auto", "off") else Path(static_mask)
     return [path for path in (*named, *calibration, mask) if path is not None]
+
+
+def frames_to_train(source: FrameSource, selection: Selection, train: int | None) -> int:
+    """Return how many frames to use: as many as wanted, all that were named, or as many as ``restore`` trains on."""
+    wanted = len(source) if train is None and selection.frames is not None else train
+    return training_share(len(source), source.shape[1:], wanted)
 
 
 def read_input_image(input: Path, limits: Limits) -> FloatArray:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import math
 import shlex
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tomli_w
@@ -33,6 +34,9 @@ from turbrestore.settings import PRESETS, Preset, RestoreParams
 
 from .options import Machine, Selection
 from .streams import put
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _IMAGES = ("frame", "mean", "centroid", "filtered", "deconvolved")
 
@@ -198,6 +202,13 @@ def settings_record(
     """All settings of a run, nested as in a settings file; None where they are left to be measured."""
     head = {"preset": preset, "bit_depth": bit_depth, "memory_limit": memory_limit, "tile": tile}
     return {**head, **dataclasses.asdict(machine), **dataclasses.asdict(selection), **dataclasses.asdict(params)}
+
+
+def write_figure(path: Path, figure: Figure, overwrite: bool) -> None:
+    """Write a figure as PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=130, facecolor="white")
+    atomic_write(path, buffer.getvalue(), overwrite)
 
 
 def write_settings(path: Path, record: dict[str, Any]) -> None:

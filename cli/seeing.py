@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.memory_plan import training_share
 from turbrestore.preparation import prepare, seeing_of_picture
 from turbrestore.registration.centroid import CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams
@@ -17,7 +16,7 @@ from turbrestore.runtime.steps import finish, step_counter
 from turbrestore.seeing.strength import Estimate, Seeing
 from turbrestore.seeing.tilt_theory import Optics
 
-from .inputs import open_input
+from .inputs import frames_to_train, open_input
 from .options import Flag, Machine, Selection
 from .output import print_json
 from .progress import progress_bars
@@ -58,7 +57,7 @@ def seeing(
     path : {"spherical", "plane"}
         Plane where the scene lies far beyond the turbulence; the distance is then the length of the turbulent path.
     train : int
-        Frames to use, from the first on.
+        Frames to use, from the first on; all that --frames names, or by default as many as restore trains on.
     json : bool
         Print JSON.
     quiet : bool
@@ -71,7 +70,7 @@ def seeing(
     optics = _optics(pixel_scale, aperture, wavelength, distance, path)
     source = open_input(input, selection, quiet)
     runtime = machine.runtime()
-    count = training_share(len(source), source.shape[1:], train)
+    count = frames_to_train(source, selection, train)
     prepared = prepare(source, count)
     frames = prepared.source.read(0, count)
     with progress_bars(quiet) as progress:
@@ -81,7 +80,7 @@ def seeing(
     if json:
         print_json({"input": str(input), "frames": count, **asdict(measured)})
     else:
-        put("\n".join(_lines(measured)))
+        put("\n".join([f"{'frames used':<26}{count} of {len(source)}", *_lines(measured)]))
 
 
 def _optics(

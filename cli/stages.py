@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from cyclopts import Parameter
 
 from turbrestore.blind.guards import GuardParams
 from turbrestore.blind.remove_blur import remove_blur_steps
-from turbrestore.core.errors import require
+from turbrestore.core.errors import DataError, require
 from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
 from turbrestore.display.plots import new_figure, plot_images, plot_prediction
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
@@ -20,9 +19,9 @@ from turbrestore.dynamics.flow_model import FlowDynamics, predict_flow, project_
 from turbrestore.dynamics.prediction import PredictionStudy, flow_error, study_prediction
 from turbrestore.filtering.alternating import Filtered, FilterParams, FilterStep, filter_steps
 from turbrestore.io.images import read_image, write_image
-from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, atomic_write, check_output, check_space
+from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, check_output, check_space, size_text
 from turbrestore.io.pixels import check_depth
-from turbrestore.memory_plan import training_share
+from turbrestore.io.source import FrameSource
 from turbrestore.registration.centroid import Centroid, CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams, estimate_flow, iterate_flows
 from turbrestore.registration.flow_algebra import invert_flow
@@ -30,13 +29,10 @@ from turbrestore.registration.warp import warp
 from turbrestore.runs.stage_files import load_artifact, load_flows, save_artifact, save_flows
 from turbrestore.runtime.steps import finish, step_counter
 
-from .inputs import files_read, open_input, read_guide, read_input_image
+from .inputs import files_read, frames_to_train, open_input, read_guide, read_input_image
 from .options import Flag, Machine, Selection, known_sigma, limits_of
-from .output import print_json
+from .output import print_json, write_figure
 from .progress import progress_bars, say
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 STAGE_FILE, PICTURE = (".npz",), (".png",)
 
@@ -75,8 +71,7 @@ def centroid(
     """
     check_output(output, files_read(selection, input), overwrite, STAGE_FILE)
     source = open_input(input, selection, quiet)
-    wanted = len(source) if train is None and selection.frames is not None else train
-    count = training_share(len(source), source.shape[1:], wanted)
+    count = frames_to_train(source, selection, train)
     check_space(output, _flow_bytes(count, source.shape) + _image_bytes(source.shape))
     with progress_bars(quiet) as progress:
         steps = centroid_steps(source.read(0, count), centroid, flow, machine.runtime())
@@ -205,7 +200,7 @@ def predict(
         Picture to write, .png: the frame, the predicted one, the centroid, and their differences (Figure 8 of the
         paper).  Needs matplotlib.
     frame : int
-        Frame to predict, counted from 0; by default the first after the training.
+        Frame to predict, counted from 0; by default the first after the training, or the last if all were trained on.
     flow : FlowParams
         Optical flow.
     overwrite : bool
@@ -219,10 +214,9 @@ def predict(
     new_figure()
     start, model = load_artifact(centroid, Centroid), load_artifact(dynamics, FlowDynamics)
     source = open_input(input, selection, quiet)
-    number = model.frame_count if frame is None else frame
-    require(
-        1 <= number < len(source), f"--frame: expected a frame from 1 to {len(source) - 1} to predict, found {number}"
-    )
+    _check_shapes(source, start, model)
+    number = min(model.frame_count, len(source) - 1) if frame is None else frame
+    require(1 <= number < len(source), f"--frame: expected a frame from 1 to {len(source) - 1}, found {number}")
     before, actual = source.read(number - 1, number + 1)
     last, measured = estimate_flow(start.image, np.stack([before, actual]), flow, machine.runtime())
     predicted = predict_flow(model, project_deviation(model, last - model.mean_flow))
@@ -237,6 +231,8 @@ def predict(
             for name, found in (("predicted", image), ("last", before), ("centroid", start.image))
         },
     }
+    if number < model.frame_count:
+        say(f"{output}: frame {number} is one that the dynamics were found from, so its flow is fitted better", quiet)
     pictures = {
         f"frame {number}": actual,
         "predicted": image,
@@ -244,7 +240,7 @@ def predict(
         "predicted, difference + 0.5": image - actual + 0.5,
         "centroid, difference + 0.5": start.image - actual + 0.5,
     }
-    _write_figure(output, plot_images(pictures), overwrite)
+    write_figure(output, plot_images(pictures), overwrite)
     if json:
         print_json({"frame": number, "flow_error": errors["flow"], "image_error": errors["image"]})
     flows = ", ".join(f"{name} {error:.2f}" for name, error in errors["flow"].items())
@@ -369,17 +365,19 @@ def deconvolve(
 def _plot_study(plot: Path, study: PredictionStudy, overwrite: bool, quiet: bool) -> None:
     baselines = {"flow before, repeated": study.repeated, "mean flow": study.mean}
     figure = plot_prediction(study.lengths, study.ranks, study.errors, study.eigenvalues, baselines)
-    _write_figure(plot, figure, overwrite)
+    write_figure(plot, figure, overwrite)
     row, column = np.unravel_index(np.nanargmin(study.errors), study.errors.shape)
     best = f"{study.errors[row, column]:.2f} pixels with τ = {study.lengths[row]}, n = {study.ranks[column]}"
     others = ", ".join(f"{name} {error:.2f}" for name, error in baselines.items())
     say(f"{plot}: least error of {study.count} predicted flows {best}; {others}", quiet)
 
 
-def _write_figure(path: Path, figure: Figure, overwrite: bool) -> None:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130, facecolor="white")
-    atomic_write(path, buffer.getvalue(), overwrite)
+def _check_shapes(source: FrameSource, start: Centroid, model: FlowDynamics) -> None:
+    """Refuse stage files of other frames: of another size, or grey where these have colours."""
+    expected = source.shape[1:]
+    if start.image.shape != expected or model.shape != expected[:2]:
+        found = f"a centroid of {size_text(start.image.shape)} and dynamics of {size_text(model.shape)}"
+        raise DataError(f"{source.name}: expected stage files of its frames, {size_text(expected)}, found {found}")
 
 
 def _flow_bytes(count: int, shape: tuple[int, ...]) -> int:

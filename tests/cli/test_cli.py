@@ -194,8 +194,23 @@ class TestRestore:
             # A white background, and something on it.
             assert picture.max() == 1
             assert picture.std() > 0.02
-        fails(run(*words, "--overwrite"), 2, "--frame: expected a frame from 1 to 7 to predict, found 8")
+        fails(run(*words, "--overwrite", "--frame", "8"), 2, "--frame: expected a frame from 1 to 7, found 8")
+        code, out, err = run(*words, "--overwrite")
+        assert (code, json.loads(out)) == (0, record)
+        assert "frame 7 is one that the dynamics were found from" in err
         fails(run(*words[:2], tmp_path / "d.npz", *words[3:], "--overwrite"), 65)
+
+    @pytest.mark.parametrize("colours", ["clip", "centroid"])
+    def test_prediction_needs_frames_as_the_centroid_has_them(self, run, clip, tmp_path, colours):
+        frames = open_frames(clip).read(0, 4)
+        write_video(tmp_path / "colour.npy", np.stack([frames] * 3, axis=-1), 25, 32)
+        other = tmp_path / "colour.npy"
+        first, second = (clip, other) if colours == "clip" else (other, clip)
+        files = [tmp_path / "c.npz", tmp_path / "d.npz"]
+        quick = ["--train", "3", "--centroid.iterations", "1", "--flow.method", "farneback", "--quiet"]
+        assert run("centroid", first, files[0], *quick)[0] == 0
+        assert run("identify", *files, "--quiet")[0] == 0
+        fails(run("predict", second, *files, tmp_path / "p.png"), 65, "80×80 RGB", "80×80 grey")
 
     def test_all_named_frames_are_used(self, run, tmp_path):
         frames = make_sequence(seed=5, count=50, size=64, rms=0.5).frames
@@ -204,6 +219,9 @@ class TestRestore:
         for words, count in (([], 40), (["--frames", "0:50"], 50), (["--frames", "0:50", "--train", "9"], 9)):
             assert run("centroid", clip, tmp_path / "c.npz", *words, *quick, "--overwrite")[0] == 0
             assert load_artifact(tmp_path / "c.npz", Centroid).flows.shape[0] == count
+            code, out, _ = run("seeing", clip, *words, *quick, "--json")
+            assert (code, json.loads(out)["frames"]) == (0, count)
+        assert f"frames used{count:>16} of 50" in run("seeing", clip, *words, *quick)[1]
 
     @pytest.mark.parametrize("until", ["centroid", "identify", "filter"])
     def test_until(self, run, clip, tmp_path, until):
