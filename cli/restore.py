@@ -78,6 +78,13 @@ class Order:
         return self.output.with_name(self.output.name + ".toml")
 
     @property
+    def process_limit(self) -> MemorySize | None:
+        """Most memory that one process takes: this one has its share of the limit, as have the workers."""
+        if self.memory_limit is None or self.workers is None:
+            return self.memory_limit
+        return MemorySize(self.memory_limit / (self.workers + 1))
+
+    @property
     def inputs(self) -> list[Path]:
         """Files and folders to read."""
         return files_read(self.selection, self.input, self.config, self.truth, static_mask=self.params.static_mask)
@@ -169,9 +176,7 @@ def restore(
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
     if scheduler is not None or workers is not None:
         check_cluster("restore", scheduler, workers)
-        tile = tile or TILE
-    if memory_limit is not None and workers is not None:
-        memory_limit = MemorySize(memory_limit / (workers + 1))
+        tile = TILE if tile is None else tile
     order = Order(
         input, output, selection, settings, machine, bit_depth, memory_limit, preset,
         config, keep, resume, checkpoint_every, report, uncertainty, truth, overwrite, quiet, tile, scheduler, workers,
@@ -190,7 +195,7 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     if order.bit_depth is not None:
         check_depth(order.bit_depth)
     left = _check_outputs(order)
-    runtime = dataclasses.replace(order.machine.runtime(order.memory_limit, order.keep), tile=order.tile)
+    runtime = dataclasses.replace(order.machine.runtime(order.process_limit, order.keep), tile=order.tile)
     if order.truth is not None:
         comparable(read_input_image(order.truth, order.selection.limits()), "truth")
     source = open_input(order.input, order.selection, order.quiet)

@@ -19,9 +19,11 @@ if TYPE_CHECKING:
 
 # What a settings file must not decide behind the user's back.
 NOT_SETTINGS = {
-    *("config", "overwrite", "keep", "resume", "checkpoint_every", "truth", "report", "mask", "json", "quiet"),
-    *("out", "format", "reports", "scheduler", "workers"),
+    *("config", "overwrite", "keep", "resume", "checkpoint_every", "truth", "report", "uncertainty", "mask", "json"),
+    *("quiet", "raw", "out", "format", "reports", "scheduler", "workers"),
 }
+# Two names of one setting: where a flag has set either, the file sets neither.
+_SIGMA = ("sigma", "deconvolution.sigma")
 
 
 def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
@@ -35,6 +37,8 @@ def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollec
             path = Path(argument.tokens[0].value)
             record = read_toml(path)
             check_keys(path, record, arguments)
+            if any(other.tokens for other in arguments if _key(other) in _SIGMA):
+                record = _without_sigma(record)
             # Sections are named after stages, and so are commands: under the command's name the two cannot be confused.
             for command in reversed(commands):
                 record = {command: record}
@@ -89,6 +93,15 @@ def _flat(record: dict[str, Any], head: str = "") -> Iterator[tuple[str, Any]]:
         yield head + key, value
         if isinstance(value, dict):
             yield from _flat(value, f"{head}{key}.")
+
+
+def _without_sigma(record: dict[str, Any]) -> dict[str, Any]:
+    """Leave out both names of the width of the blur."""
+    return {
+        key: _without_sigma(value) if key == "deconvolution" else value
+        for key, value in record.items()
+        if key != "sigma"
+    }
 
 
 def _fill_preset(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:

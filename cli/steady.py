@@ -33,6 +33,7 @@ from .progress import progress_bars, say
 
 # Frames per second of inputs that do not say.
 _USUAL_RATE = 25.0
+_MOST_BITS = {"h264": 8, "hevc": 10, ".gif": 8, ".webp": 8}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +47,8 @@ class Output:
     crf : int, optional
         Quality of H.264 and HEVC, 0 to 51, smaller is better; 14 and 18 by default.  With it .mkv has H.264.
     bit_depth : int, optional
-        Bits per channel, 8 to 16, or 32 (float, TIFF and .npy only).  Those of the input by default; 8 in H.264, at
-        most 10 in HEVC.
+        Bits per channel, 8 to 16, or 32 (float, TIFF and .npy only); at most 8 in H.264, .gif and .webp, 10 in
+        HEVC.  Those of the input by default, as far as the output holds them.
     """
 
     codec: Literal["h264", "hevc", "ffv1"] | None = None
@@ -102,12 +103,11 @@ def steady(
         Print neither progress nor remarks.
     """
     piped_in, piped_out = str(input) == "-", str(output) == "-"
-    if written.bit_depth is not None:
-        check_depth(written.bit_depth)
     encoding, shape = written.encoding(), _raw_shape(raw)
     require(raw is None or piped_in, "--raw: has no effect unless the input is -; leave it out")
     require(not (piped_out and json), "--json: contradicts the output -, which is standard output; leave it out")
     require(not piped_out or encoding == BY_SUFFIX, "--codec, --crf: have no effect on the output -; leave them out")
+    _check_depth(written, output, piped_out and raw is not None)
     inputs = files_read(selection, None if piped_in else input, config)
     settings_path = output.with_name(output.name + ".toml")
     if not piped_out:
@@ -178,10 +178,24 @@ def _from_pipe(selection: Selection, shape: tuple[int, ...] | None) -> _Source:
     return _Source(stream.name, stream.shape, stream.bit_depth, stream.fps, stream.frames)
 
 
+def _check_depth(written: Output, output: Path, raw: bool) -> None:
+    """Refuse a depth that the output does not hold, instead of writing another."""
+    depth, suffix = written.bit_depth, output.suffix.lower()
+    if depth is None:
+        return
+    check_depth(depth)
+    require(not raw, "--bit-depth: has no effect on raw frames, which have 8 bits; leave it out")
+    kind = written.encoding().codec_of(suffix) if suffix in (".mkv", ".mp4") else suffix
+    most = _MOST_BITS.get(kind, depth)
+    require(
+        depth <= most, f"--bit-depth: expected at most {most}, as {kind} has, found {depth}; .mkv by default has 16"
+    )
+
+
 def _raw_shape(raw: str | None) -> tuple[int, ...] | None:
     if raw is None:
         return None
-    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?::(gray|rgb24))?", raw)
+    found = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})(?::(gray|rgb24))?", raw)
     if found is None:
         raise ConfigurationError(f"--raw: expected WIDTHxHEIGHT or WIDTHxHEIGHT:gray, found {raw!r}")
     size = int(found[2]), int(found[1])

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import tomllib
 from concurrent.futures import Future
 from pathlib import Path
 
@@ -20,10 +21,12 @@ from turbrestore.core.errors import ConfigurationError, DataError, InputNotFound
 from turbrestore.io.images import write_image
 from turbrestore.io.video import write_video
 from turbrestore.report.batch_page import ClipRow, render_batch
+from turbrestore.runtime.runtime import Runtime
 from turbrestore_cli import batch as command
 from turbrestore_cli import cluster
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.batch_plan import find_clips, journal_line, name_outputs, read_journal
+from turbrestore_cli.options import Machine
 
 QUICK = ["--centroid.iterations", "1", "--filter.inner-iterations", "1", "--sigma", "1", "--threads", "1"]
 
@@ -220,9 +223,18 @@ class TestTiles:
         assert "frames of 448×80 are one tile" in capsys.readouterr().err
 
     def test_usage(self, clips, tmp_path, capsys):
-        for words in (["--workers", "0"], ["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], ["--tile", "100"]):
+        few = [["--tile", "100"], ["--tile", "0", "--workers", "1"]]
+        for words in (["--workers", "0"], ["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], *few):
             assert main(["restore", str(clips / "0.mkv"), str(tmp_path / "a.png"), *words]) == 2
             assert capsys.readouterr().err.count("\n") == 1
+
+    def test_settings_keep_the_limit_of_all_processes(self, clips, tmp_path, monkeypatch):
+        limits = []
+        monkeypatch.setattr(Machine, "runtime", lambda _, *given: limits.extend(given[:1]) or Runtime(*[1, *given[:1]]))
+        words = ["--workers", "1", "--memory-limit", "8GB", *self.WORDS]
+        assert main(["restore", str(clips / "0.mkv"), str(tmp_path / "a.png"), *words]) == 0
+        assert limits[-1] == 4e9
+        assert tomllib.loads((tmp_path / "a.png.toml").read_text())["memory_limit"] == 8e9
 
     @pytest.mark.parametrize("times", [1, 9])
     def test_a_tile_that_loses_its_process_is_sent_again(self, times):

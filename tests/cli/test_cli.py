@@ -88,6 +88,16 @@ class TestRestore:
         assert settings["train"] == 6
         assert settings["filter"]["residual"] == "drop"
 
+    @pytest.mark.parametrize("of_file", ["sigma = 1.5", "[deconvolution]\nsigma = 1.5"])
+    @pytest.mark.parametrize("flag", ["--sigma", "--deconvolution.sigma"])
+    def test_the_blur_by_either_name_wins_over_the_file(self, run, clip, tmp_path, of_file, flag):
+        (tmp_path / "run.toml").write_text(f"train = 4\n{of_file}\n")
+        words = ["--config", tmp_path / "run.toml", flag, "0.8", *QUICK]
+        code, _, err = run("restore", clip, tmp_path / "o.png", *words)
+        assert code == 0, err
+        settings = tomllib.loads((tmp_path / "o.png.toml").read_text())
+        assert (settings["train"], settings["deconvolution"]["sigma"]) == (4, 0.8)
+
     def test_options_win_over_the_preset_and_the_preset_over_the_file(self, run, clip, tmp_path):
         (tmp_path / "run.toml").write_text('preset = "paper"\ntrain = 4\n[filter]\nblock = 3\n')
         words = ["restore", clip, tmp_path / "o.png", "--config", tmp_path / "run.toml", "--sigma", "1", "--quiet"]

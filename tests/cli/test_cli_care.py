@@ -10,6 +10,7 @@ from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args
 
 import pytest
 
@@ -22,6 +23,7 @@ from turbrestore_cli.__main__ import main
 from turbrestore_cli.application import COMMANDS, build
 from turbrestore_cli.examples import EXAMPLES, FIRST_STEPS
 from turbrestore_cli.options import Machine, Selection
+from turbrestore_cli.settings import settings
 
 ROOT = Path(__file__).parents[2]
 STEPS = ["--deconvolution.iterations", "3", "--quiet"]
@@ -226,6 +228,16 @@ class TestSettings:
         assert Path("run.toml").read_text() == "mine"
         assert run("config", "--init", "run.toml", "--overwrite")[0] == 0
         assert run("config", "--check", "none.toml")[0] == 66
+
+
+@pytest.mark.parametrize("command", ["restore", "steady", "batch"])
+def test_no_settings_file_names_a_file_to_write(command):
+    arguments = build()[command].assemble_argument_collection(parse_docstring=True)
+    paths = {argument.name for argument in arguments if Path in (argument.hint, *get_args(argument.hint))}
+    known = {f"--{key.replace('_', '-')}" for key in settings(arguments)}
+    assert len(paths) > 1
+    assert not paths & known
+    assert "--raw" not in known
 
 
 class TestCompletion:

@@ -1,6 +1,7 @@
 """``turbrestore steady`` from the command line."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -94,6 +95,8 @@ def test_pipes_of_matroska_stand_in_a_row(tmp_path):
         (["-", "o.mkv", "--raw", "20"], 2, "--raw"),
         (["-", "-", "--json"], 2, "--json"),
         (["-", "-", "--crf", "20"], 2, "--crf"),
+        (["-", "-", "--raw", "0x64:gray"], 2, "--raw: expected WIDTHxHEIGHT"),
+        (["-", "-", "--raw", "64x4", "--bit-depth", "16"], 2, "--bit-depth: has no effect"),
     ],
 )
 def test_wrong_words_about_pipes(tmp_path, monkeypatch, words, code, part):
@@ -104,13 +107,32 @@ def test_wrong_words_about_pipes(tmp_path, monkeypatch, words, code, part):
     assert not list(tmp_path.iterdir())
 
 
+def test_an_empty_pipe_is_named(tmp_path):
+    done = piped("-", "-", "--raw", "32x20", "--sigma", "0")
+    assert (done.returncode, done.stdout) == (65, b"")
+    assert done.stderr == b"turbrestore: standard input: expected at least one frame, found no data\n"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the words are those of a POSIX shell")
+def test_a_reader_that_has_seen_enough_is_no_failure():
+    words = [sys.executable, "-m", "turbrestore_cli", "steady", str(SAMPLE), "-", "--roi=40,40,64,48", "--sigma=0"]
+    script = '{ "$@"; echo "code $?" >&2; } | head -c 100 >/dev/null'
+    words += ["--quiet"]
+    done = subprocess.run(["sh", "-c", script, "sh", *words], capture_output=True, text=True, timeout=120, check=False)
+    assert done.stderr == "code 0\n"
+
+
 @pytest.mark.parametrize(
     ("words", "code", "part"),
     [
         (["none.mkv", "o.mkv"], 66, "none.mkv"),
         ([SAMPLE, "o.jpg"], 2, ".mkv"),
         ([SAMPLE, "o.mkv", "--camera", "still"], 2, "camera"),
-        ([SAMPLE, "o.mkv", "--mask", "o.mkv"], 2, "--mask"),
+        ([SAMPLE, "o.mkv", "--mask", "o.mkv"], 73, "two outputs"),
+        ([SAMPLE, "o.mp4", "--bit-depth", "16"], 2, "at most 8, as h264 has"),
+        ([SAMPLE, "o.mkv", "--crf", "20", "--bit-depth", "10"], 2, "at most 8, as h264 has"),
+        ([SAMPLE, "o.mkv", "--codec", "hevc", "--bit-depth", "12"], 2, "at most 10, as hevc has"),
+        ([SAMPLE, "o.gif", "--bit-depth", "16"], 2, "at most 8, as .gif has"),
         ([SAMPLE, "no/o.mkv"], 73, "does not exist"),
         ([SAMPLE, "o.mkv", "--roi", "0,0,8,8", "--sigma", "0"], 65, "16×16"),
     ],

@@ -151,6 +151,8 @@ def write_pipe(file: BinaryIO, frames: Iterable[FloatArray], fps: float, bit_dep
 
     Raises
     ------
+    BrokenPipeError
+        Nobody reads the pipe any more.
     StorageError
         The pipe takes no more.
     DataError
@@ -166,11 +168,12 @@ def write_pipe(file: BinaryIO, frames: Iterable[FloatArray], fps: float, bit_dep
     """
     import av
 
-    with _encoding(Path("standard output")):
+    sink = _Sink(file)
+    with _encoding(Path("standard output"), sink):
         iterator = frames_of_one_size(frames, "standard output")
         ready = itertools.chain([next(iterator)], iterator)
         options = {**_WRITE_OPTIONS, "flush_packets": "1", "cluster_time_limit": "1"}
-        with av.open(file, "w", format="matroska", container_options=options) as output:
+        with av.open(sink, "w", format="matroska", container_options=options) as output:
             _encode(output, ready, fps, check_depth(bit_depth), "ffv1", None, None)
 
 
@@ -271,11 +274,32 @@ def _picture(frame: FloatArray, depth: int) -> av.VideoFrame:
     return av.VideoFrame.from_ndarray(from_unit(frame, depth), format=kind)
 
 
+class _Sink:
+    """File that remembers why it takes no more: FFmpeg reports only that a callback has failed."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.error: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        try:
+            written = self._file.write(data)
+            self._file.flush()
+        except OSError as error:
+            self.error = error
+            raise
+        return written
+
+
 @contextmanager
-def _encoding(path: Path) -> Iterator[None]:
+def _encoding(path: Path, sink: _Sink | None = None) -> Iterator[None]:
     import av
 
     try:
         yield
     except av.error.FFmpegError as error:
+        if sink is not None and sink.error is not None:
+            if isinstance(sink.error, BrokenPipeError):
+                raise sink.error from None
+            raise StorageError(f"{path}: cannot be written to ({sink.error.strerror})") from error
         raise StorageError(f"{path}: cannot be written ({error.strerror}); nothing was saved") from error

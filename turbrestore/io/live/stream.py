@@ -135,7 +135,7 @@ def read_raw(file: BinaryIO, shape: tuple[int, ...], name: str = "standard input
     Raises
     ------
     DataError
-        The last frame is cut short.
+        There is no frame, or the last one is cut short.
 
     Examples
     --------
@@ -150,6 +150,8 @@ def read_raw(file: BinaryIO, shape: tuple[int, ...], name: str = "standard input
             raise DataError(f"{name}: frame {number}: expected {size} bytes, {size_text(shape)}, found {len(data)}")
         yield to_unit(np.frombuffer(data, np.uint8).reshape(shape), 255, f"{name}: frame {number}")
         number += 1
+    if number == 0:
+        raise DataError(f"{name}: expected at least one frame, found no data")
 
 
 def write_raw(file: BinaryIO, frames: Iterable[FloatArray], name: str = "standard output") -> None:
