@@ -146,7 +146,7 @@ async def _show(shown: dict[str, tuple[Tab, str]], tabs: set[Tab], folders: Fold
     tabs.add(tab)
 
     def leave() -> None:
-        if shown[name] == (tab, client.id):
+        if shown.get(name) == (tab, client.id):
             del shown[name]
             tabs.discard(tab)
             threading.Thread(target=tab.close).start()

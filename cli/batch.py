@@ -81,8 +81,8 @@ def batch(
     resume : bool
         Do what an earlier batch in this folder has not done, and what has failed or has changed since.
     scheduler : str
-        Address of a running Dask scheduler, tcp://host:port, whose workers see the same files.  By default processes
-        are started on this machine.
+        Address of a running Dask scheduler, tcp://host:port.  Its workers process the clips and must see the same
+        files.  By default processes are started on this machine.
     workers : int
         Processes to start; by default one for each core, and no more than clips or than --memory-limit has gigabytes.
     memory_limit : MemorySize

@@ -163,7 +163,8 @@ def restore(
         Longest side of the tiles that larger frames are processed in, pixels.  By default frames are processed as a
         whole; with --workers or --scheduler it is 1088.
     scheduler : str
-        Address of a running Dask scheduler, tcp://host:port, whose workers see the same files, to work on the tiles.
+        Address of a running Dask scheduler, tcp://host:port.  Its workers process the tiles and must see the same
+        files.
     workers : int
         Processes to start on this machine, to work on the tiles.
     overwrite : bool

@@ -6,6 +6,7 @@ import shlex
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -268,3 +269,28 @@ def test_only_the_newest_pictures_are_kept():
     addresses = [pictures.put(np.zeros((4, 4), np.float32)) for _ in range(30)]
     found = [pictures.get(address.rpartition("/")[2]) is not None for address in addresses]
     assert found == [False] * 6 + [True] * 24
+
+
+def test_pages_of_one_tab_leave_in_any_order(monkeypatch, tmp_path):
+    from nicegui import ui
+
+    from turbrestore_app import page, server
+
+    async def nothing(*_):
+        """Stand in for what needs a browser."""
+
+    left = []
+
+    def show(client_id):
+        client = SimpleNamespace(tab_id="tab", id=client_id, connected=nothing, on_delete=left.append)
+        monkeypatch.setattr(ui, "context", SimpleNamespace(client=client))
+        asyncio.run(server._show(shown, tabs, Folders(tmp_path), None))
+
+    shown, tabs = {}, set()
+    monkeypatch.setattr(page, "add_styles_and_scripts", lambda: None)
+    monkeypatch.setattr(page, "Page", lambda _: SimpleNamespace(show=nothing))
+    show("first")
+    show("second")
+    for leave in reversed(left):
+        leave()
+    assert not shown and not tabs
