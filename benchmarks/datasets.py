@@ -47,7 +47,7 @@ import numpy as np
 from words import can_read, share_read
 
 from turbrestore.core.arrays import FloatArray
-from turbrestore.core.errors import DataError, InputNotFoundError, TurbrestoreError
+from turbrestore.core.errors import DataError, InputNotFoundError, OutputError, TurbrestoreError
 from turbrestore.io.images import read_image, write_image
 from turbrestore.io.output import atomic_write
 from turbrestore.io.video import VIDEO_SUFFIXES, open_frames
@@ -94,9 +94,7 @@ def tmt_static(folder: Path) -> Iterator[Sample]:
 
 def atsyn_dynamic(folder: Path) -> Iterator[Sample]:
     """Videos of ATSyn-dynamic, grouped by the strength that ``test_info.json`` gives where it is there."""
-    information = folder / "test_info.json"
-    listed = json.loads(information.read_text()).values() if information.is_file() else []
-    levels = {entry["video_name"]: entry["turb_level"] for entry in listed if isinstance(entry, dict)}
+    levels = _levels(folder / "test_info.json")
     for path in sorted((folder / "turb").glob("*.mp4")):
         truth = folder / "gt" / path.name
         level = levels.get(path.name, "")
@@ -128,7 +126,7 @@ def without_truth(folder: Path) -> Iterator[Sample]:
     """Videos and folders of images."""
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in VIDEO_SUFFIXES or (path.is_dir() and _images(path)):
-            yield Sample(path.stem, _all(path))
+            yield Sample(path.name, _all(path))
 
 
 DATASETS: dict[str, Callable[[Path], Iterator[Sample]]] = {
@@ -172,6 +170,9 @@ def score_folder(name: str, folder: Path, limit: int | None = None, out: Path | 
     samples = [*DATASETS[name](folder)][:limit]
     if not samples:
         raise DataError(f"{folder}: expected the layout of {name} as in benchmarks/datasets.py, found no sequence")
+    written = (path for sample in samples for path in ((out / sample.name).glob("result_*.png") if out else ()))
+    if (taken := next(written, None)) is not None:
+        raise OutputError(f"{taken}: exists already; choose another folder for the results")
     results: dict[str, Figures] = {}
     for sample in samples:
         results[sample.name] = score(sample, out)
@@ -193,7 +194,7 @@ def score(sample: Sample, out: Path | None = None) -> Figures:
             images = [restore(frames).image]
             truths = [] if sample.truth is None else [sample.truth()]
         if out is not None:
-            _write(out / Path(sample.name).stem, images, number)
+            _write(out / sample.name, images, number)
         if truths:
             found += [{"psnr": psnr(*pair), "ssim": ssim(*pair)} for pair in map(_alike, images, truths)]
         elif sample.words and can_read():
@@ -243,6 +244,18 @@ def _alike(image: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray
     if image.ndim == truth.ndim:
         return image, truth
     return (np.stack([image] * 3, axis=-1), truth) if truth.ndim == 3 else (image.mean(axis=-1), truth)
+
+
+def _levels(path: Path) -> dict[str, str]:
+    """Strength of the turbulence by video, as the authors list them; nothing where there is no list."""
+    if not path.is_file():
+        return {}
+    try:
+        listed = json.loads(path.read_text("utf-8")).values()
+        return {entry["video_name"]: str(entry["turb_level"]) for entry in listed if isinstance(entry, dict)}
+    except (ValueError, AttributeError, KeyError, TypeError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise DataError(f"{path}: expected videos with video_name and turb_level as JSON ({reason})") from error
 
 
 def _folders(folder: Path, *needed: str) -> list[Path]:
@@ -297,7 +310,7 @@ def _image(path: Path) -> Callable[[], FloatArray]:
 def _write(folder: Path, images: Sequence[FloatArray], window: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for number, image in enumerate(images):
-        write_image(folder / f"result_{window + number + 1:04d}.png", image, 8, overwrite=True)
+        write_image(folder / f"result_{window + number + 1:04d}.png", image, 8)
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import shlex
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -31,9 +32,13 @@ VIDEO_FIGURES = (("psnr", 2), ("ssim", 3), ("flicker", 2), ("seconds", 1))
 
 
 def document(
-    results: Results, meanings: Mapping[str, str], skipped: Mapping[str, str], videos: Mapping[str, Results]
+    results: Results,
+    meanings: Mapping[str, str],
+    skipped: Mapping[str, str],
+    videos: Mapping[str, Results],
+    chosen: Sequence[str] = (),
 ) -> str:
-    """Markdown of everything that was measured."""
+    """Markdown of everything that was measured; ``chosen`` are the clips that were asked for, all if it is empty."""
     parts = [
         "# Beside other methods\n",
         "What `TURBRESTORE_DATA=DIR python benchmarks/peers.py --write benchmarks/results/peers.md` measures: the same "
@@ -43,14 +48,17 @@ def document(
         "that merged images are compared with merged ones, and deblurred with deblurred.\n",
         "".join(f"- **{name}**: {meaning}.\n" for name, meaning in meanings.items()),
     ]
+    if chosen:
+        part = f"Only some of the clips were measured: `--clips {shlex.join(chosen)}`.  Without the option all are.\n"
+        parts.insert(2, part)
     if skipped:
         parts.append("Not measured:\n\n" + "".join(f"- {name}: {reason}\n" for name, reason in skipped.items()))
     parts += [
         "## Means\n",
         "PSNR and structural similarity (SSIM, after the best gain and offset) over the clips with known truth, words "
         "over those with text, each after alignment and over the clips on which every method ended.  Processor time is "
-        "that of all threads; packages start an interpreter for each clip, which counts.  Memory is the peak of the "
-        "process over all clips, libraries included.\n",
+        "that of all threads, and high on a busy machine; packages start an interpreter for each clip, which counts.  "
+        "Memory is the peak of the process over all clips, libraries included.\n",
         _means(results),
         "## Where another method is ahead\n",
         _leads(results),

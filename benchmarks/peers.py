@@ -96,7 +96,7 @@ def main() -> int:
     except TurbrestoreError as error:
         print(f"peers: {error}", file=sys.stderr)
         return error.exit_code
-    text = document(results, {name: MEANINGS[name] for name in chosen}, skipped, videos)
+    text = document(results, {name: MEANINGS[name] for name in chosen}, skipped, videos, options.clips)
     print(text, end="")
     if options.write is not None:
         atomic_write(options.write, text.encode(), overwrite=True)

@@ -146,6 +146,25 @@ def test_results_are_written_for_the_recognisers_of_others(clip, tmp_path):
     turbulence_text(tmp_path / "in", clip)
     datasets.score_folder("turbulence-text", tmp_path / "in", out=tmp_path / "out")
     assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.glob("out/*/*")] == ["out/1/result_0001.png"]
+    result = tmp_path / "out/1/result_0001.png"
+    result.write_bytes(b"mine")
+    with pytest.raises(datasets.OutputError, match="exists already"):
+        datasets.score_folder("turbulence-text", tmp_path / "in", out=tmp_path / "out")
+    assert result.read_bytes() == b"mine"
+
+
+def test_clips_of_one_stem_have_a_row_each(clip, tmp_path):
+    for suffix in ("mkv", "npy"):
+        write_video(tmp_path / f"van.{suffix}", clip.frames, fps=25)
+    assert [sample.name for sample in datasets.DATASETS["clear"](tmp_path)] == ["van.mkv", "van.npy"]
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", '{"0": {"video_name": "a.mp4"}}'])
+def test_a_damaged_list_of_videos_is_told(clip, tmp_path, capsys, text):
+    (tmp_path / "test_info.json").write_text(text)
+    assert datasets.main(["atsyn-dynamic", str(tmp_path)]) == 65
+    error = capsys.readouterr().err
+    assert "test_info.json: expected videos" in error and error.count("\n") == 1
 
 
 def test_a_missing_frame_is_told(clip, tmp_path):

@@ -118,4 +118,8 @@ def test_the_script_prints_and_writes_its_document(tmp_path, monkeypatch, capsys
     )
     assert peers.main() == 0
     assert target.read_text() == capsys.readouterr().out
+    assert "--clips" not in target.read_text()
+    monkeypatch.setattr(sys, "argv", ["peers.py", "--without-videos", "--clips", "smooth_*", "tiny"])
+    assert peers.main() == 0
+    assert "Only some of the clips were measured: `--clips 'smooth_*' tiny`." in capsys.readouterr().out
     assert json.loads((tmp_path / "f.json").read_text())["clips"] == figures
