@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Literal, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -281,14 +281,16 @@ class _Sink:
         self._file = file
         self.error: OSError | None = None
 
+    def __getattr__(self, name: str) -> Any:
+        # Matroska goes back to its head where the file can seek.
+        return getattr(self._file, name)
+
     def write(self, data: bytes) -> int:
         try:
-            written = self._file.write(data)
-            self._file.flush()
+            return self._file.write(data)
         except OSError as error:
             self.error = error
             raise
-        return written
 
 
 @contextmanager
