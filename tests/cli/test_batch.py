@@ -173,6 +173,26 @@ class TestBatch:
         assert run(clips / "0.mkv", "--out", tmp_path, "--overwrite", "--reports")[0] == 0
         assert (tmp_path / "0.html").read_text().startswith("<!doctype html>")
 
+    def test_a_static_mask_is_an_input_of_every_clip(self, run, clips, tmp_path):
+        out, mask = tmp_path / "out", np.zeros((64, 64), np.float32)
+        mask[:6] = 1
+        write_image(tmp_path / "mask.png", mask)
+        words = [clips / "0.mkv", clips / "1.mkv", "--out", out, "--static-mask", tmp_path / "mask.png"]
+        assert run(*words)[0] == 0
+        first = contents(out)
+        mask[:12] = 1
+        write_image(tmp_path / "mask.png", mask, overwrite=True)
+        code, _, err = run(*words, "--resume")
+        assert code == 0 and "2 of 2: " in err, err
+        # A clip without it would be the same in both.
+        assert contents(out)["0.png"] != first["0.png"]
+        (tmp_path / "mask.png").replace(out / "0.png")
+        given = (out / "0.png").read_bytes()
+        code, _, err = run(*words[:-1], out / "0.png", "--overwrite")
+        assert code == 73 and "0.png: is the input" in err, err
+        assert main(["restore", str(words[0]), str(out / "0.png"), "--static-mask", str(out / "0.png")]) == 73
+        assert (out / "0.png").read_bytes() == given
+
     def test_reasons(self, monkeypatch, clips):
         monkeypatch.setattr(command, "restore_clip", lambda order: (_ for _ in ()).throw(MemoryError))
         monkeypatch.setattr(command, "key_of", lambda order: "")
