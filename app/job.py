@@ -15,6 +15,8 @@ from turbrestore.core.errors import TurbrestoreError
 from turbrestore_cli.application import explain
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from turbrestore.core.decision import Decision
 
     from .restoring import Restored
@@ -59,7 +61,7 @@ class Job:
     Parameters
     ----------
     work : callable
-        Takes the job, which it reports to, and returns what was restored.
+        Takes the job, which it reports to, and returns what was restored, the video that was written, or None.
 
     Attributes
     ----------
@@ -71,17 +73,17 @@ class Job:
     decisions : list of Decision
     images : dict of str to ndarray
         Image of every stage that is done.
-    result : Restored or None
+    result : Restored, Path or None
     seconds : float
         What it took, once it is done.
     """
 
-    def __init__(self, work: Callable[[Job], Restored]) -> None:
+    def __init__(self, work: Callable[[Job], Restored | Path | None]) -> None:
         self.state, self.message = "running", ""
         self.bars: dict[str, Bar] = {}
         self.decisions: list[Decision] = []
         self.images: dict[str, FloatArray] = {}
-        self.result: Restored | None = None
+        self.result: Restored | Path | None = None
         self.seconds = 0.0
         self._begun = time.monotonic()
         self._stop = threading.Event()
@@ -96,6 +98,11 @@ class Job:
     def join(self, seconds: float) -> None:
         """Wait for the end of the work, at most so long."""
         self._thread.join(seconds)
+
+    def begin_next(self) -> None:
+        """Forget what was reported, before the next of several clips; raises Stopped where the job was stopped."""
+        self.check()
+        self.bars, self.decisions, self.images = {}, [], {}
 
     def progress(self, stage: str, done: int, total: int) -> None:
         """Note the progress of a stage; raises Stopped where the job was stopped."""
@@ -120,7 +127,7 @@ class Job:
         if self._stop.is_set():
             raise Stopped
 
-    def _run(self, work: Callable[[Job], Restored]) -> None:
+    def _run(self, work: Callable[[Job], Restored | Path | None]) -> None:
         try:
             self.result = work(self)
             self.check()

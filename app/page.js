@@ -32,7 +32,7 @@ window.turbrestore = (() => {
     // Middle of what is seen, as shares of the image.
     middle() {
       const stage = byId("stage"), image = stage?.querySelector(".layer.right img");
-      if (!image) return [0.5, 0.5];
+      if (!image?.offsetWidth) return [0.5, 0.5];
       const frame = stage.getBoundingClientRect(), box = image.getBoundingClientRect();
       return [(frame.x + frame.width / 2 - box.x) / box.width, (frame.y + frame.height / 2 - box.y) / box.height];
     },

@@ -17,10 +17,12 @@ from .clip import Clip
 from .clip_view import ClipView
 from .compare_view import CompareView
 from .folders import printable
-from .job import one_line
+from .job import Job, one_line
 from .open_view import OpenView
 from .run_view import RunView
 from .save_view import SaveView
+from .several_view import SeveralView
+from .steady_view import SteadyView
 from .tab import Tab
 from .tune_view import TuneView
 
@@ -38,9 +40,12 @@ class Page:
 
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
+        # Buttons that begin a run; none can be pressed while one is at work.
+        self.starters: list[ui.button] = []
         self.clip_view, self.compare_view = ClipView(self), CompareView(self)
         self.open_view, self.run_view = OpenView(self), RunView(self)
         self.tune_view, self.save_view = TuneView(self), SaveView(self)
+        self.steady_view, self.several_view = SteadyView(self), SeveralView(self)
 
     async def show(self, file: Path | None) -> None:
         """Build the page, and open a file once it is seen; a tab that was loaded again goes on with its clip."""
@@ -54,7 +59,7 @@ class Page:
             with ui.element("main").classes("view"):
                 self._build_viewer()
             with ui.element("aside").classes("side").props('aria-label="Steps"'):
-                for view in (self.open_view, self.run_view, self.tune_view, self.save_view):
+                for view in self._steps():
                     view.build()
         self._refresh()
         ui.timer(_BEAT, self._look)
@@ -62,6 +67,12 @@ class Page:
             ui.timer(0, self._go_on, once=True)
         elif file is not None:
             ui.timer(0, lambda: self.open(file.absolute()), once=True)
+
+    def _steps(self) -> tuple[OpenView, RunView, TuneView, SaveView, SteadyView, SeveralView]:
+        """Return what stands beside what is shown, from above."""
+        return (
+            self.open_view, self.run_view, self.tune_view, self.save_view, self.steady_view, self.several_view,
+        )  # fmt: skip
 
     async def open(self, path: Path) -> None:
         """Open a clip that is allowed, and show it."""
@@ -79,6 +90,8 @@ class Page:
         self.open_view.opened()
         self.save_view.opened()
         self.tune_view.opened()
+        self.steady_view.opened()
+        self.several_view.opened()
         self.look_at("clip")
         self._refresh()
         await self.clip_view.opened()
@@ -92,15 +105,16 @@ class Page:
             await self._opened(clip)
             if restored is not None:
                 self.run_view.take_over(restored.order)
-                self.tune_view.take_over(restored.order)
                 await self.compare_view.show_result(restored)
                 await self.tune_view.restored()
-                self._refresh()
+            self.steady_view.fill()
+            self._refresh()
 
     def look_at(self, what: str) -> None:
-        """Show the frames of the clip (``clip``), or the images of the stages (``compare``)."""
+        """Show the frames of the clip (``clip``), the images of the stages (``compare``), or the ``video``."""
         self.clip_view.place.visible = what == "clip"
         self.compare_view.place.visible = what == "compare"
+        self.steady_view.player.visible = what == "video"
         for name, button in self._tabs.items():
             button.classes(add="chosen" if name == what else "", remove="" if name == what else "chosen")
             button.props(f"aria-pressed={'true' if name == what else 'false'}")
@@ -126,18 +140,32 @@ class Page:
             return
         if job.state == "failed":
             self.tell(job.message)
-        if job.state == "done" and job.result is not None:
+        if job.state == "done":
             with self.catching():
-                await self.compare_view.show_result(job.result)
-                if job.result is self.tab.restored:
-                    await self.tune_view.restored()
+                await self._show_result(job)
         self._refresh()
+
+    async def _show_result(self, job: Job) -> None:
+        """Show what a run has made; after several clips, what there was before."""
+        result = self.tab.restored if job.result is None else job.result
+        if result is None:
+            self.compare_view.clear()
+            self.look_at("clip")
+        elif isinstance(result, Path):
+            self.steady_view.fill()
+            self.look_at("video")
+        else:
+            await self.compare_view.show_result(result)
+            if result is self.tab.restored:
+                await self.tune_view.restored()
 
     def _refresh(self) -> None:
         """Show the steps that can be taken now."""
         self.run_view.place.visible = self.tab.clip is not None
         self.tune_view.place.visible = self.tab.restored is not None
         self.save_view.place.visible = self.tab.restored is not None
+        self.steady_view.place.visible = self.several_view.place.visible = self.tab.clip is not None
+        self._tabs["video"].visible = self.tab.video is not None
         self._tabs["clip"].visible = self.tab.clip is not None
         self._tabs["compare"].visible = self.compare_view.filled
         self._empty.visible = self.tab.clip is None
@@ -147,16 +175,18 @@ class Page:
         with ui.element("div").classes("tabs").props('role=group aria-label="What is shown"'):
             self._tabs = {
                 name: ui.button(words, on_click=partial(self.look_at, name)).props("flat dense padding='4px 12px'")
-                for name, words in (("clip", "Clip"), ("compare", "Compare"))
+                for name, words in (("clip", "Clip"), ("compare", "Compare"), ("video", "Video"))
             }
         self._empty = ui.label("Open a clip on the right: from the list, by its path, or from your files.")
         self._empty.classes("empty")
         self.clip_view.build()
         self.compare_view.build()
+        self.steady_view.build_player()
         self.look_at("clip")
 
     async def _look(self) -> None:
         """Follow the run; called again and again."""
+        self.several_view.follow()
         if await self.run_view.follow():
             await self.ended()
 

@@ -88,6 +88,7 @@ class RunView:
                 self._preview.props("outline")
                 self._run = ui.button("Run", on_click=lambda: self._start(self._page.tab.run)).classes("grow")
                 self._run.props("unelevated")
+                self._page.starters += [self._preview, self._run]
                 self._stop = ui.button("Stop", on_click=self._page.tab.stop).props("outline")
                 self._stop.visible = False
             self._method = ui.label("").classes("note")
@@ -167,6 +168,10 @@ class RunView:
         if job is not self._job:
             self._job, self._images, self._ended = job, 0, False
             self._clear()
+        if self._bars.keys() - job.bars.keys():
+            # The next of several clips.
+            self._images = 0
+            self._clear()
         running = job.state == "running"
         self._show_bars(job)
         self._show_decisions(job)
@@ -235,8 +240,8 @@ class RunView:
 
     def _show_buttons(self, running: bool) -> None:
         self._stop.visible = running
-        self._run.set_enabled(not running)
-        self._preview.set_enabled(not running)
+        for button in self._page.starters:
+            button.set_enabled(not running)
 
     def _clear(self) -> None:
         self._bars.clear()
@@ -266,5 +271,6 @@ class RunView:
         shown = "" if job.state == "done" else " open"
         head = f'<summary class="note">{len(job.decisions)} decisions</summary>'
         content = f'<details class="decisions"{shown}>{head}<dl class="decided">{"".join(lines)}</dl></details>'
+        self._decided.visible = bool(job.decisions)
         if self._decided.content != content:
             self._decided.content = content

@@ -90,6 +90,7 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     """Put the page, its images and the guard together."""
     import uvicorn
     from fastapi import FastAPI, Response
+    from fastapi.responses import FileResponse
     from nicegui import app, ui
 
     # Tab and page of every tab of the browser, which keeps its name when the page is loaded again.
@@ -105,6 +106,13 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
         if data is None:
             return Response(status_code=404)
         return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})
+
+    @app.get("/videos/{key}/{name}", response_class=Response)
+    def video(key: str, name: str) -> Response:
+        path = next((tab.video for tab in tuple(tabs) if secrets.compare_digest(tab.key, key)), None)
+        if path is None or not path.is_file():
+            return Response(status_code=404)
+        return FileResponse(path, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
     def stop_all() -> None:
         for tab in tabs:

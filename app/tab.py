@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import secrets
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 from turbrestore.core.errors import DataError
 from turbrestore.io.video import VIDEO_SUFFIXES
@@ -15,6 +16,11 @@ from .folders import Folders
 from .job import Job
 from .pictures import Pictures
 from .restoring import Order, Restored, preview_order, restore_order
+from .several import Row, Task, restore_all
+from .steadying import SteadyOrder, steady_order
+
+if TYPE_CHECKING:
+    from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 
 # Seconds to wait for the end of a run whose tab is gone.
 _PATIENCE = 2.0
@@ -36,6 +42,14 @@ class Tab:
         The newest run or preview.
     restored : Restored or None
         Result of the newest run that has ended.
+    tuned : DeconvolutionParams or None
+        What the user has chosen of the deconvolution; None leaves it to be measured.
+    border : {"keep", "crop"}
+        What the user has chosen of the border.
+    video : Path or None
+        The newest steadied video of the clip.
+    rows : list of Row
+        What becomes of several clips.
     closed : bool
     """
 
@@ -46,6 +60,10 @@ class Tab:
         self.clip: Clip | None = None
         self.job: Job | None = None
         self.restored: Restored | None = None
+        self.tuned: DeconvolutionParams | None = None
+        self.border: Literal["keep", "crop"] = "keep"
+        self.video: Path | None = None
+        self.rows: list[Row] = []
         self.closed = False
         self._uploads: tempfile.TemporaryDirectory[str] | None = None
 
@@ -66,6 +84,7 @@ class Tab:
         clip = open_clip(path, Path(path.name) if uploaded else self.folders.shown(path))
         self.stop()
         self.clip, self.job, self.restored = clip, None, None
+        self.tuned, self.border, self.video = None, "keep", None
         return clip
 
     def place_for(self, name: str) -> Path:
@@ -95,6 +114,22 @@ class Tab:
         part = preview_order(order, self.clip.source.shape)
         return self._start(lambda job: restore_order(part, job))
 
+    def steady(self, order: SteadyOrder) -> Job:
+        """Steady the clip in a thread; the video becomes that of the tab when it is done."""
+
+        def work(job: Job) -> Path:
+            video = steady_order(order, job)
+            job.check()
+            self.video = video
+            return video
+
+        return self._start(work)
+
+    def restore_all(self, tasks: Sequence[Task]) -> Job:
+        """Restore several clips in a thread, one after the other."""
+        self.rows = [Row(str(task.name)) for task in tasks]
+        return self._start(lambda job: restore_all(tasks, self.rows, job))
+
     def stop(self) -> None:
         """End the run, if there is one."""
         if self.job is not None:
@@ -110,7 +145,7 @@ class Tab:
         if self._uploads is not None:
             self._uploads.cleanup()
 
-    def _start(self, work: Callable[[Job], Restored]) -> Job:
+    def _start(self, work: Callable[[Job], Restored | Path | None]) -> Job:
         self.stop()
         self.job = Job(work)
         return self.job

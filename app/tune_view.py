@@ -6,7 +6,7 @@ import asyncio
 import dataclasses
 import math
 import time
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING
 
 from nicegui import background_tasks, ui
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from turbrestore.core.arrays import FloatArray
 
     from .page import Page
-    from .restoring import Order
 
 _METHODS = {"nltv": "nonlocal total variation", "tv": "total variation", "wiener": "Wiener", "tikhonov": "Tikhonov"}
 _BOUNDARIES = {"unknown": "unknown", "periodic": "periodic"}
@@ -42,8 +41,6 @@ class TuneView:
         self._page = page
         self._setting = False
         self._wanted, self._working = 0, False
-        # What the user has chosen; None leaves it to be measured.
-        self._params: DeconvolutionParams | None = None
         self._automatic = True
 
     def build(self) -> None:
@@ -72,28 +69,27 @@ class TuneView:
             self._note = ui.label("").classes("note").props("role=status")
 
     def opened(self) -> None:
-        """Leave everything to be measured in a new clip."""
-        self._params, self._automatic = None, True
-        self._border.value = "keep"
-        self._page.run_view.show_method(None)
-
-    def take_over(self, order: Order) -> None:
-        """Go on with what a run had."""
-        params = order.params.deconvolution
-        self._params = None if params.sigma is None else params
-        self._border.value = order.params.border
+        """Show what was chosen: nothing for a new clip."""
+        tab = self._page.tab
+        self._automatic = tab.tuned is None or tab.tuned.fidelity is None
+        self._border.value = tab.border
+        self._page.run_view.show_method(tab.tuned)
 
     async def restored(self) -> None:
-        """Show the settings of a run that has ended."""
-        restored = self._page.tab.restored
-        assert restored is not None
-        await self._show(tuned_params(restored))
+        """Show the settings of a run that has ended, or what was chosen since and is not applied yet."""
+        tab = self._page.tab
+        assert tab.restored is not None
+        if tab.tuned is None or not self.pending:
+            await self._show(tuned_params(tab.restored))
+            return
+        await self._show(tab.tuned)
+        self._ask_for_part()
 
     def chosen(self, params: RestoreParams) -> RestoreParams:
         """Put into the settings of a run what was chosen here."""
-        border = cast(Literal["keep", "crop"], self._border.value)
-        deconvolution = params.deconvolution if self._params is None else self._params
-        return dataclasses.replace(params, deconvolution=deconvolution, border=border)
+        tab = self._page.tab
+        deconvolution = params.deconvolution if tab.tuned is None else tab.tuned
+        return dataclasses.replace(params, deconvolution=deconvolution, border=tab.border)
 
     @property
     def pending(self) -> bool:
@@ -142,9 +138,10 @@ class TuneView:
         self._fidelity_text.text = f"{10 ** (self._fidelity.value or 0):.0f}{', auto' if self._automatic else ''}"
         self._apply.set_enabled(self.pending)
         self._page.save_view.refresh()
-        self._page.run_view.show_method(self._params)
+        self._page.run_view.show_method(self._page.tab.tuned)
 
     def _border_changed(self) -> None:
+        self._page.tab.border = self._border.value
         if self._page.tab.restored is not None:
             self._show_values()
 
@@ -159,7 +156,7 @@ class TuneView:
         restored = self._page.tab.restored
         if self._setting or restored is None:
             return
-        self._params = dataclasses.replace(
+        self._page.tab.tuned = dataclasses.replace(
             restored.order.params.deconvolution,
             sigma=round(float(self._sigma.value or 0), 3),
             exponent=round(float(self._exponent.value or GAUSSIAN), 3),
@@ -168,6 +165,11 @@ class TuneView:
             boundary=self._boundary.value,
         )
         self._show_values()
+        self._page.look_at("compare")
+        self._ask_for_part()
+
+    def _ask_for_part(self) -> None:
+        """Have the part shown by what is chosen now."""
         self._wanted += 1
         if not self._working:
             background_tasks.create(self._respond(), name="deblurring of a part")
@@ -177,9 +179,9 @@ class TuneView:
         self._working, answered = True, -1
         try:
             with self.place, self._page.catching():
-                while answered != self._wanted and self._params is not None:
+                while answered != self._wanted and self._page.tab.tuned is not None:
                     answered = self._wanted
-                    await self._show_part(self._params, answered)
+                    await self._show_part(self._page.tab.tuned, answered)
         finally:
             self._working = False
 
@@ -201,7 +203,6 @@ class TuneView:
                 return
             note = self._words(image, time.perf_counter() - begun, count < rounds)
             await self._page.compare_view.show_part(restored, part, image, note)
-            self._page.look_at("compare")
 
     def _words(self, image: FloatArray, seconds: float, more: bool) -> str:
         size = f"{image.shape[1]}×{image.shape[0]} pixels in {seconds:.2f} s"
@@ -209,7 +210,7 @@ class TuneView:
 
     async def _measure(self) -> None:
         """Go back to what is measured."""
-        self._params, self._automatic = None, True
+        self._page.tab.tuned, self._automatic = None, True
         restored = self._page.tab.restored
         if restored is not None and self.pending:
             self.apply()

@@ -32,7 +32,7 @@ from .output import check_distinct, print_json, write_settings
 from .progress import progress_bars, say
 
 # Frames per second of inputs that do not say.
-_USUAL_RATE = 25.0
+USUAL_RATE = 25.0
 _MOST_BITS = {"h264": 8, "hevc": 10, ".gif": 8, ".webp": 8}
 
 
@@ -118,7 +118,7 @@ def steady(
         check_distinct([mask] if piped_out else [output, mask])
         check_output(mask, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
     source = _from_pipe(selection, shape) if piped_in else _from_file(input, selection, quiet)
-    fps, depth = source.fps or _USUAL_RATE, source.bit_depth if written.bit_depth is None else written.bit_depth
+    fps, depth = source.fps or USUAL_RATE, source.bit_depth if written.bit_depth is None else written.bit_depth
     companion = source.frames if isinstance(source.frames, FrameSource) else None
     facts, started = _Facts(), time.monotonic()
     with tempfile.TemporaryFile() as masks:
@@ -138,14 +138,18 @@ def steady(
     if piped_out:
         say(f"{source.name}: {facts.text()}", quiet)
         return
-    records = (machine, selection, params, written)
-    settings = {name: value for record in records for name, value in dataclasses.asdict(record).items()}
-    write_settings(settings_path, settings)
+    write_settings(settings_path, settings_record(machine, selection, params, written))
     if json:
         paths = {"input": str(input), "output": str(output), "settings": str(settings_path)}
         print_json({**paths, **facts.record()})
     else:
         say(f"{output}: {facts.text()}", quiet)
+
+
+def settings_record(machine: Machine, selection: Selection, params: SteadyParams, written: Output) -> dict[str, Any]:
+    """All settings of a run, as in a settings file; None where they are left to be measured."""
+    records = (machine, selection, params, written)
+    return {name: value for record in records for name, value in dataclasses.asdict(record).items()}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

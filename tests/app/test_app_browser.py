@@ -19,6 +19,7 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore.io.images import write_image
+from turbrestore.io.video import write_video
 from turbrestore_cli.__main__ import main
 
 EVIL = "<img src=x onerror=document.title='taken'>.mkv"
@@ -58,6 +59,7 @@ def app(tmp_path_factory):
     folder, temporary = tmp_path_factory.mktemp("start"), tmp_path_factory.mktemp("temporary")
     shutil.copy(SAMPLE, folder)
     (folder / EVIL).write_bytes(SAMPLE.read_bytes()[:3000])
+    write_video(folder / "small.mkv", make_sequence(seed=4, count=8, size=64).frames, 25)
     (folder / "images").mkdir()
     for number, frame in enumerate(make_sequence(seed=3, count=4, size=64).frames):
         write_image(folder / "images" / f"{number}.png", frame, 8)
@@ -205,12 +207,19 @@ def test_a_page_that_is_loaded_again_goes_on(open_tab, app):
     page.reload()
     done.wait_for()
     assert done.inner_text() == words
-    page.get_by_text("Apply to the whole").wait_for()
+    push(page, "Width of the blur, pixels", "PageUp")
+    page.get_by_text("Apply computes the whole").wait_for(timeout=LONG)
+    width = page.locator(".value").get_by_text(" px").inner_text()
+    page.reload()
+    page.get_by_text("Apply computes the whole").wait_for(timeout=LONG)
+    assert page.locator(".value").get_by_text(" px").inner_text() == width
+    assert page.get_by_role("button", name="Apply to the whole").is_enabled()
     page.wait_for_function("document.querySelector('[aria-label=x]').value !== ''")
     page.get_by_label("Image, .png, .tif or .fits").fill("moon.fits")
     press(page, "Save")
     page.get_by_text("Saved: moon.fits, moon.fits.toml").wait_for(timeout=LONG)
-    command = shlex.split(page.get_by_label("Command").inner_text())
+    command = shlex.split(page.get_by_label("Command", exact=True).inner_text())
+    assert f"--deconvolution.sigma={float(width.split()[0])}" in command
     for name in ("moon.fits", "moon.fits.toml"):
         (app.folder / name).rename(app.temporary / name)
     try:
@@ -222,6 +231,36 @@ def test_a_page_that_is_loaded_again_goes_on(open_tab, app):
         for folder in (app.folder, app.temporary):
             for path in folder.glob("moon.fits*"):
                 path.unlink()
+
+
+def test_several_clips_and_a_steadied_video(open_tab, app):
+    page = open_tab((900, 860))
+    press(page, "Restore them")
+    page.get_by_role("alert").get_by_text("choose some in the list").wait_for()
+    for name in (EVIL, "small.mkv"):
+        page.get_by_role("checkbox", name=name, exact=True).click()
+    press(page, "Restore them")
+    rows = page.locator(".rows tr")
+    rows.nth(1).get_by_text("done: restored/small.png, ").wait_for(timeout=LONG)
+    assert rows.nth(0).inner_text().startswith(f"{EVIL}\tfailed: ") and page.title() == "turbrestore"
+    try:
+        assert {path.name for path in (app.folder / "restored").iterdir()} == {"small.png", "small.png.toml"}
+        press(page, "Another clip")
+        page.get_by_label("Path of a clip").fill("small.mkv")
+        press(page, "Open")
+        page.get_by_text("64×64 pixels").wait_for()
+        assert page.get_by_label("Video, .mp4").input_value() == "small.steady.mp4"
+        press(page, "Steady")
+        playing = "document.querySelector('video')?.readyState > 1 && document.querySelector('video').videoWidth"
+        page.wait_for_function(f"({playing}) === 64", timeout=LONG)
+        page.reload()
+        page.wait_for_function(f"({playing}) === 64", timeout=LONG)
+        assert rows.count() == 2
+        assert page.locator("video").is_visible()
+    finally:
+        shutil.rmtree(app.folder / "restored")
+        for path in app.folder.glob("small.steady.*"):
+            path.unlink()
 
 
 def test_a_run_is_stopped_and_another_tab_goes_on(open_tab):
@@ -289,6 +328,8 @@ def test_what_is_uploaded_goes_with_its_tab(open_tab, app):
 def test_fits_in_both_schemes(open_tab, scheme):
     page = open_tab((900, 700), color_scheme=scheme)
     assert page.evaluate("document.documentElement.scrollWidth") <= 900
+    labels = "[...document.querySelectorAll('.four .q-field__label')]"
+    assert page.evaluate(f"{labels}.map((label) => label.scrollWidth - label.clientWidth)") == [0] * 4
     ground, ink = (
         sum(int(part) for part in page.evaluate(f"getComputedStyle(document.body).{name}")[4:-1].split(","))
         for name in ("backgroundColor", "color")
@@ -301,7 +342,7 @@ def test_strangers_are_refused(app):
     assert app.ask() == 200
     assert app.ask("/") == app.ask("/pictures/a/1.png") == 404
     assert app.ask(f"{here.path[:-2]}/") == 404
-    assert app.ask(f"{here.path}pictures/a/1.png") == 404
+    assert app.ask(f"{here.path}pictures/a/1.png") == app.ask(f"{here.path}videos/a/1.mp4") == 404
     assert app.ask(Host="elsewhere.example") == 403
     assert app.ask(Origin="http://elsewhere.example") == 403
     assert app.ask(method="POST", Content_Length=str(8 * 2**30)) == 413

@@ -17,6 +17,7 @@ from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.io.video import write_video
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.settings import RestoreParams
+from turbrestore.steady.settings import SteadyParams
 from turbrestore_app import folders, job, restoring, stage_memory, tuning
 from turbrestore_app.clip import open_clip
 from turbrestore_app.folders import Folders
@@ -25,6 +26,8 @@ from turbrestore_app.job import Job, one_line
 from turbrestore_app.pictures import Pictures
 from turbrestore_app.restoring import Order, preview_order, restore_order
 from turbrestore_app.saving import Outputs, check_outputs, command_line, save
+from turbrestore_app.several import plan_several
+from turbrestore_app.steadying import SteadyOrder
 from turbrestore_app.tab import Tab
 from turbrestore_app.tuning import impressions, part_around, tuned_params
 from turbrestore_cli.__main__ import main
@@ -246,6 +249,79 @@ class TestTab:
         tab.open(folder / "clip.mkv")
         assert ended(job).state in ("stopped", "done")
         assert (tab.restored, tab.job) == (None, None)
+
+
+class TestSeveral:
+    @pytest.fixture
+    def tab(self, folder, tmp_path):
+        for name in ("a.mkv", "b.mkv"):
+            (tmp_path / name).write_bytes((folder / "clip.mkv").read_bytes())
+        (tmp_path / "bad.mkv").write_bytes(b"no video")
+        return Tab(Folders(tmp_path))
+
+    def plan(self, tab, *names, overwrite=False):
+        start = tab.folders.start
+        like = Order(start / "a.mkv", Selection(frames="0:3"), QUICK, "fast")
+        return plan_several([start / name for name in names], "out", like, overwrite, tab.folders)
+
+    def test_a_clip_that_fails_is_a_row(self, tab, tmp_path):
+        job = ended(tab.restore_all(self.plan(tab, "bad.mkv", "a.mkv", "b.mkv")))
+        assert (job.state, job.result, next(iter(job.images))) == ("done", None, "frame")
+        assert [row.state for row in tab.rows] == ["failed", "done", "done"]
+        assert tab.rows[0].words.startswith("cannot be opened as a video")
+        assert tab.rows[1].words.startswith("out/a.png, ")
+        # The frames of the clip that is open are not those of others.
+        command = command_line(
+            Order(tmp_path / "b.mkv", params=QUICK, preset="fast"), None, tmp_path / "b.mkv", tmp_path / "b.png"
+        )
+        assert main([*shlex.split(command)[1:], "--quiet"]) == 0
+        for suffix in (".png", ".png.toml"):
+            assert (tmp_path / f"out/b{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+
+        ended(tab.restore_all(self.plan(tab, "a.mkv")))
+        assert tab.rows[0].state == "failed" and "a.png: exists already" in tab.rows[0].words
+        ended(tab.restore_all(self.plan(tab, "a.mkv", overwrite=True)))
+        assert tab.rows[0].state == "done"
+
+    def test_a_stop_ends_them_all(self, tab, tmp_path):
+        job = tab.restore_all(self.plan(tab, "a.mkv", "b.mkv"))
+        tab.stop()
+        assert ended(job).state == "stopped"
+        assert [row.state for row in tab.rows] == ["stopped", "stopped"]
+        assert list((tmp_path / "out").iterdir()) == []
+
+    def test_what_cannot_be_planned(self, tab, tmp_path):
+        with pytest.raises(ConfigurationError, match="expected at least one"):
+            self.plan(tab)
+        with pytest.raises(ConfigurationError, match="lies outside"):
+            plan_several([tmp_path / "a.mkv"], "../elsewhere", Order(tmp_path / "a.mkv"), False, tab.folders)
+        assert not (tmp_path.parent / "elsewhere").exists()
+
+
+class TestSteady:
+    def test_the_command_gives_the_same_files(self, folder, tmp_path):
+        tab = Tab(Folders(folder))
+        order = SteadyOrder(
+            folder / "clip.mkv", tmp_path / "a.mp4", Selection(roi="0,0,64,48"), SteadyParams(camera="lock")
+        )
+        job = ended(tab.steady(order))
+        assert (job.state, job.result, tab.video) == ("done", tmp_path / "a.mp4", tmp_path / "a.mp4"), job.message
+        assert job.bars["steady"].total == 6
+        command = shlex.split(order.command_line(folder / "clip.mkv", tmp_path / "b.mp4"))
+        assert main([*command[1:], "--quiet"]) == 0
+        for suffix in (".mp4", ".mp4.toml"):
+            assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+        with pytest.raises(OutputError, match="exists already"):
+            order.check()
+        with pytest.raises(ConfigurationError, match=r"ends in \.mp4"):
+            replace(order, output=tmp_path / "a.mkv").check()
+
+    def test_a_stop_leaves_nothing(self, folder, tmp_path):
+        tab = Tab(Folders(folder))
+        job = tab.steady(SteadyOrder(folder / "clip.mkv", tmp_path / "a.mp4"))
+        tab.stop()
+        assert ended(job).state == "stopped"
+        assert (tab.video, list(tmp_path.iterdir())) == (None, [])
 
 
 def test_a_clip_has_the_numbers_of_its_file(tmp_path):
