@@ -109,6 +109,8 @@ class Page:
                 await self.tune_view.restored()
             self.steady_view.fill()
             self._refresh()
+            if self.tab.job is not None and isinstance(self.tab.job.result, Path):
+                self.look_at("video")
 
     def look_at(self, what: str) -> None:
         """Show the frames of the clip (``clip``), the images of the stages (``compare``), or the ``video``."""
