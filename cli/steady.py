@@ -22,7 +22,9 @@ from turbrestore.io.live.stream import open_pipe, read_raw, write_raw
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.io.source import FrameSource
-from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, write_video
+from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video
+from turbrestore.report import SteadyFigures, check_report, write_steady_report
+from turbrestore.runs.run_record import describe_run
 from turbrestore.steady.settings import SteadyParams
 from turbrestore.steady.video import SteadyFrame, steady_frames
 
@@ -68,6 +70,7 @@ def steady(
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
     config: Path | None = None,
     mask: Path | None = None,
+    report: Path | None = None,
     raw: str | None = None,
     written: Annotated[Output, Parameter(name="*")] = Output(),
     machine: Annotated[Machine, Parameter(name="*")] = Machine(),
@@ -90,6 +93,8 @@ def steady(
         TOML file with settings; flags win over it.
     mask : Path
         Video to write, of the same kinds: white where something moves against the scene.
+    report : Path
+        HTML report to write: input, output, their difference and what moves as a film, and plots of every frame.
     raw : str
         ``WIDTHxHEIGHT`` or ``WIDTHxHEIGHT:gray``: frames on standard input and output have 8 bits and no container,
         ``rgb24`` or ``gray`` in FFmpeg's words.
@@ -107,6 +112,7 @@ def steady(
     require(raw is None or piped_in, "--raw: has no effect unless the input is -; leave it out")
     require(not (piped_out and json), "--json: contradicts the output -, which is standard output; leave it out")
     require(not piped_out or encoding == BY_SUFFIX, "--codec, --crf: have no effect on the output -; leave them out")
+    require(not (report and (piped_in or piped_out)), "--report: compares two files, and - is none; leave it out")
     _check_depth(written, output, piped_out and raw is not None)
     inputs = files_read(selection, None if piped_in else input, config)
     settings_path = output.with_name(output.name + ".toml")
@@ -114,9 +120,7 @@ def steady(
         check_output(output, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
         others = [path for path in inputs if path != config]
         check_output(settings_path, others, overwrite or config == settings_path, suffixes=None)
-    if mask is not None:
-        check_distinct([mask] if piped_out else [output, mask])
-        check_output(mask, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
+    _check_companions(mask, report, None if piped_out else output, inputs, overwrite)
     source = _from_pipe(selection, shape) if piped_in else _from_file(input, selection, quiet)
     fps, depth = source.fps or USUAL_RATE, source.bit_depth if written.bit_depth is None else written.bit_depth
     companion = source.frames if isinstance(source.frames, FrameSource) else None
@@ -125,7 +129,7 @@ def steady(
         with progress_bars(quiet) as progress:
             total = len(companion) if companion is not None else 0
             frames = facts.watch(steady_frames(source.frames, params, machine.runtime()), total, progress)
-            images = _images(frames, None if mask is None else masks)
+            images = _images(frames, None if mask is None and report is None else masks)
             if not piped_out:
                 write_video(output, images, fps, depth, overwrite, encoding, companion)
             elif shape is not None:
@@ -134,7 +138,12 @@ def steady(
                 write_pipe(sys.stdout.buffer, images, fps, depth)
         if mask is not None:
             write_video(mask, _stored_masks(masks, source.shape[:2]), fps, 8, overwrite)
-    facts.seconds = time.monotonic() - started
+        facts.figures.seconds = time.monotonic() - started
+        if report is not None and companion is not None:
+            command = ("turbrestore", "steady", str(input), str(output), "--config", str(settings_path))
+            run = describe_run(companion, dataclasses.asdict(params), command)
+            moving = (image > 0 for image in _stored_masks(masks, source.shape[:2]))
+            write_steady_report(report, (companion, open_frames(output)), moving, facts.figures, run, overwrite)
     if piped_out:
         say(f"{source.name}: {facts.text()}", quiet)
         return
@@ -150,6 +159,17 @@ def settings_record(machine: Machine, selection: Selection, params: SteadyParams
     """All settings of a run, as in a settings file; None where they are left to be measured."""
     records = (machine, selection, params, written)
     return {name: value for record in records for name, value in dataclasses.asdict(record).items()}
+
+
+def _check_companions(
+    mask: Path | None, report: Path | None, output: Path | None, inputs: list[Path], overwrite: bool
+) -> None:
+    """Refuse a mask or a report that could not be written, before any work begins."""
+    check_distinct([path for path in (output, mask, report) if path is not None])
+    if mask is not None:
+        check_output(mask, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
+    if report is not None:
+        check_report(report, inputs, overwrite)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -210,40 +230,39 @@ class _Facts:
     """What is worth saying about a run."""
 
     def __init__(self) -> None:
-        self.frames, self.scenes, self.sigma, self.seconds = 0, 0, 0.0, 0.0
-        self._displacement, self._moving = 0.0, 0.0
+        self.figures = SteadyFigures()
 
     def watch(
         self, frames: Iterable[SteadyFrame], total: int, progress: Callable[[str, int, int], None] | None
     ) -> Iterator[SteadyFrame]:
         """Pass frames on, take note of them, and show progress."""
         for frame in frames:
-            self.frames += 1
-            self.scenes += frame.starts_scene
-            self.sigma = frame.sigma
-            self._displacement += frame.displacement
-            self._moving += float(frame.moving.mean())
+            self.figures.scenes += frame.starts_scene
+            self.figures.sigma = frame.sigma
+            self.figures.displacement.append(frame.displacement)
+            self.figures.moving.append(float(frame.moving.mean()))
             if progress is not None:
-                progress("steady", self.frames, total)
+                progress("steady", len(self.figures.moving), total)
             yield frame
 
     def record(self) -> dict[str, Any]:
         """Facts that a script may want: frames, scenes, seconds, pixels, and shares of the image."""
         return {
-            "frames": self.frames,
-            "scenes": self.scenes,
-            "seconds": self.seconds,
-            "sigma": self.sigma,
-            "mean_displacement": self._displacement / self.frames,
-            "moving_share": self._moving / self.frames,
+            "frames": len(self.figures.moving),
+            "scenes": self.figures.scenes,
+            "seconds": self.figures.seconds,
+            "sigma": self.figures.sigma,
+            "mean_displacement": float(np.mean(self.figures.displacement)),
+            "moving_share": float(np.mean(self.figures.moving)),
         }
 
     def text(self) -> str:
         """One line for a person."""
-        blur = f"blur of {self.sigma:.2f} pixels removed" if self.sigma > 0 else "no blur removed"
+        found = self.figures
+        blur = f"blur of {found.sigma:.2f} pixels removed" if found.sigma > 0 else "no blur removed"
         return (
-            f"{self.frames} frames in {self.seconds:.1f} s, displacements of {self._displacement / self.frames:.2f} "
-            f"pixels and {blur}, {100 * self._moving / self.frames:.0f} % of the image moves"
+            f"{len(found.moving)} frames in {found.seconds:.1f} s, displacements of {np.mean(found.displacement):.2f} "
+            f"pixels and {blur}, {100 * np.mean(found.moving):.0f} % of the image moves"
         )
 
 

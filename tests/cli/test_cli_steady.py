@@ -97,6 +97,7 @@ def test_pipes_of_matroska_stand_in_a_row(tmp_path):
         (["-", "-", "--crf", "20"], 2, "--crf"),
         (["-", "-", "--raw", "0x64:gray"], 2, "--raw: expected WIDTHxHEIGHT"),
         (["-", "-", "--raw", "64x4", "--bit-depth", "16"], 2, "--bit-depth: has no effect"),
+        (["-", "o.mkv", "--report", "o.html"], 2, "--report"),
     ],
 )
 def test_wrong_words_about_pipes(tmp_path, monkeypatch, words, code, part):
@@ -133,6 +134,7 @@ def test_a_reader_that_has_seen_enough_is_no_failure():
         ([SAMPLE, "o.mkv", "--crf", "20", "--bit-depth", "10"], 2, "at most 8, as h264 has"),
         ([SAMPLE, "o.mkv", "--codec", "hevc", "--bit-depth", "12"], 2, "at most 10, as hevc has"),
         ([SAMPLE, "o.gif", "--bit-depth", "16"], 2, "at most 8, as .gif has"),
+        ([SAMPLE, "o.mkv", "--report", "o.txt"], 2, ".html"),
         ([SAMPLE, "no/o.mkv"], 73, "does not exist"),
         ([SAMPLE, "o.mkv", "--roi", "0,0,8,8", "--sigma", "0"], 65, "16×16"),
     ],

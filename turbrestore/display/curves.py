@@ -114,11 +114,38 @@ def plot_frames(sharpness: ArrayLike, shares: ArrayLike) -> Figure:
     >>> len(plot_frames([0.9, 1.0, 1.1], [0.2, 0.3, 0.5]).axes)
     2
     """
-    figure = new_figure(WIDTH, WIDTH * 0.84)
     weights = np.asarray(shares, float)
-    rows = {"Sharpness": np.asarray(sharpness, float), "Share of the result, 1 = equal": weights * weights.size}
-    for axes in _draw_rows(figure, rows):
-        axes.axhline(1, color=INK, linewidth=0.9, linestyle="--")
+    return plot_over_frames({"Sharpness": sharpness, "Share of the result, 1 = equal": weights * weights.size}, 1.0)
+
+
+def plot_over_frames(rows: Mapping[str, ArrayLike], reference: float | None = None) -> Figure:
+    """Show values of every frame, a row of the figure for each kind.
+
+    Parameters
+    ----------
+    rows : mapping of str to array_like, shape (N,)
+        Values by their name and unit; NaN leaves a gap.
+    reference : float, optional
+        Value to compare with.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> len(plot_over_frames({"gain": [0.9, 1.0, 1.1]}, 1.0).axes)
+    1
+    """
+    figure = new_figure(WIDTH, WIDTH * 0.42 * len(rows))
+    for axes in _draw_rows(figure, {name: np.asarray(values, float) for name, values in rows.items()}):
+        if reference is not None:
+            axes.axhline(reference, color=INK, linewidth=0.9, linestyle="--")
     return figure
 
 

@@ -1,6 +1,6 @@
 """All plots under one name: each takes plain arrays and returns a matplotlib figure."""
 
-from .curves import plot_blur, plot_convergence, plot_filter, plot_frames, plot_objective
+from .curves import plot_blur, plot_convergence, plot_filter, plot_frames, plot_objective, plot_over_frames
 from .figure import new_figure
 from .maps import plot_displacements, plot_flow, plot_images, plot_uncertainty
 from .spectra import plot_dynamics, plot_eigenvalues, plot_prediction, plot_singular_values
@@ -17,6 +17,7 @@ __all__ = [
     "plot_frames",
     "plot_images",
     "plot_objective",
+    "plot_over_frames",
     "plot_prediction",
     "plot_singular_values",
     "plot_uncertainty",

@@ -11,7 +11,7 @@ from pathlib import Path
 from ..core.arrays import FloatArray, from_unit
 from ..display.preview import data_uri, encode_image, shrink
 from ..io.output import atomic_write
-from .page import _policy, environment
+from .page import environment, policy
 
 # Longest side of a picture, pixels, and its quality as WebP.
 _LONGEST, _QUALITY = 320, 90
@@ -107,7 +107,7 @@ def render_batch(rows: Sequence[ClipRow], folder: str = "") -> str:
     counts = {state: sum(row.state == state for row in rows) for state in ("done", "failed", "planned")}
     links = {row.output: Path(row.output).name for row in rows}
     return template.render(
-        rows=rows, counts=counts, links=links, folder=folder, policy=_policy(style, ""), style=Markup(style)
+        rows=rows, counts=counts, links=links, folder=folder, policy=policy(style), style=Markup(style)
     )
 
 

@@ -103,7 +103,7 @@ def headline(restoration: Restoration) -> list[Fact]:
     if restoration.deconvolution is not None:
         sigma = restoration.deconvolution.sigma
         facts.append(Fact("Blur removed", f"{sigma:.2f} px" if sigma > 0 else "none", _blur_note(restoration)))
-    facts.append(Fact("Time", _duration(sum(restoration.seconds.values())), "all stages"))
+    facts.append(Fact("Time", duration(sum(restoration.seconds.values())), "all stages"))
     return facts
 
 
@@ -144,20 +144,22 @@ def remarks(restoration: Restoration, run: RunRecord) -> list[str]:
     return [*run.warnings, *notes]
 
 
-def settings(run: RunRecord) -> list[Setting]:
+def settings(run: RunRecord, defaults: Mapping[str, Any] | None = None) -> list[Setting]:
     """Return all settings, named as on the command line, with dots between the levels.
 
     Parameters
     ----------
     run : RunRecord
+    defaults : mapping, optional
+        Nested as the settings of the run; by default those of a restoration.
 
     Returns
     -------
     list of Setting
     """
-    defaults = dict(_flat(dataclasses.asdict(RestoreParams())))
+    usual = dict(_flat(dataclasses.asdict(RestoreParams()) if defaults is None else defaults))
     return [
-        Setting(name.replace("_", "-"), _as_written(value), value != defaults.get(name))
+        Setting(name.replace("_", "-"), _as_written(value), value != usual.get(name))
         for name, value in _flat(run.settings)
     ]
 
@@ -293,7 +295,8 @@ def _as_written(value: Any) -> str:
     return "automatic" if value is None else str(value)
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Time in seconds, or in minutes and seconds."""
     return f"{seconds:.1f} s" if seconds < 100 else f"{seconds // 60:.0f} min {seconds % 60:.0f} s"
 
 

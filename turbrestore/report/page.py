@@ -138,7 +138,7 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
     return template.render(
         run=run,
         restoration=restoration,
-        policy=_policy(style, script),
+        policy=policy(style, script),
         style=Markup(style),
         script=Markup(script),
         comparison=Markup(comparison(gallery)),
@@ -152,11 +152,11 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
     )
 
 
-def _policy(style: str, script: str) -> str:
+def policy(style: str, script: str = "", media: str = "'none'") -> str:
     """Content security policy that allows only what the page itself contains."""
     hashes = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script))
     style_hash, script_hash = hashes
     return (
-        f"default-src 'none'; img-src data:; style-src 'sha256-{style_hash}'; script-src 'sha256-{script_hash}'; "
-        "base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; img-src data:; media-src {media}; style-src 'sha256-{style_hash}'; "
+        f"script-src 'sha256-{script_hash}'; base-uri 'none'; form-action 'none'"
     )
