@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.io.encoding import Encoding, write_pipe
+from turbrestore.io.encoding import Encoding, write_container, write_pipe
 from turbrestore.io.live.stream import live_frames, open_pipe, read_raw, write_raw
 from turbrestore.io.video import open_frames, write_video
 
@@ -151,3 +151,9 @@ def test_codecs_that_do_not_fit_are_refused(tmp_path, name, encoding, message):
     for wrong in ({"codec": "av1"}, {"crf": 60}, {"codec": "ffv1", "crf": 10}):
         with pytest.raises(ConfigurationError, match=list(wrong)[-1]):
             Encoding(**wrong)
+
+
+def test_frames_too_small_for_hevc_are_refused_in_one_line(tmp_path):
+    with pytest.raises(DataError, match=r"^HEVC: expected frames of at least 16×16 pixels, found 20×15; [^\n]*$"):
+        write_container(tmp_path / "a.mp4", np.zeros((2, 15, 20), np.float32), 25, encoding=Encoding("hevc"))
+    assert not list(tmp_path.iterdir())

@@ -11,9 +11,9 @@ import skimage.data
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.steady.dewarping import measure_flow
-from turbrestore.steady.memory import remember
+from turbrestore.steady.memory import Memory, remember
 from turbrestore.steady.settings import SteadyParams
-from turbrestore.steady.video import steady_frames
+from turbrestore.steady.video import _Scenes, steady_frames
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
@@ -125,6 +125,19 @@ class TestMemory:
             masks.append(mask > 0.5)
         memory = self.remembered(frames, flows, moving=masks)
         assert psnr(memory.image, frames[-1], masks[-1]) > 30
+
+
+def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
+    soft, short = cv2.GaussianBlur(photo(), (0, 0), 2.0), np.ones((SIZE, SIZE), np.float32)
+    scenes = _Scenes(SteadyParams(), 0.8, Runtime(threads=1))
+    assert scenes._remembered_width(Memory(soft, short, 1)) == 0.8
+    widths = [scenes._remembered_width(Memory(soft, 30 * short, 30)) for _ in range(80)]
+    assert 0 < max(np.diff([0.8, *widths])) < 0.1
+    assert 1.5 < widths[-1] < 2.3
+    given = _Scenes(SteadyParams(sigma=0.8), 0.8, Runtime(threads=1))
+    assert given._remembered_width(Memory(soft, 30 * short, 30)) == 0.8
+    flat = _Scenes(SteadyParams(), 0.8, Runtime(threads=1))
+    assert flat._remembered_width(Memory(0 * soft, 30 * short, 30)) == 0.8
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, from_unit
-from ..core.errors import StorageError, require, require_between
+from ..core.errors import DataError, StorageError, require, require_between
 from .container import convert
 from .output import atomic_output, frames_of_one_size
 from .pixels import check_depth
@@ -35,6 +35,8 @@ _RGB_DEPTHS = {8: "bgr0", 10: "gbrp10le", 12: "gbrp12le", 14: "gbrp14le", 16: "g
 _MOST_FRAMES_PER_SECOND = {".mkv": 1000, ".mp4": 10000}
 _ENCODERS = {"h264": "libx264", "hevc": "libx265", "ffv1": "ffv1"}
 _QUALITY = {"h264": 14, "hevc": 18}
+# x265 refuses smaller frames, and damages its memory when it does.
+_SMALLEST_HEVC = 16
 # Ticks a second of frames at irregular times, and what counts as irregular, in usual intervals.
 _TICKS, _IRREGULAR = 90000, 0.1
 
@@ -189,6 +191,9 @@ def _encode(
     first = next(frames)
     # Rates such as 30000/1001 stay exact.
     rate = Fraction(fps).limit_denominator(1001)
+    if codec == "hevc" and min(first.shape[:2]) < _SMALLEST_HEVC:
+        expected, found = f"{_SMALLEST_HEVC}×{_SMALLEST_HEVC}", f"{first.shape[1]}×{first.shape[0]}"
+        raise DataError(f"HEVC: expected frames of at least {expected} pixels, found {found}; choose another codec")
     depth, pixel_format, options = _layout(first.shape, bit_depth, codec, crf)
     stream = cast("av.VideoStream", output.add_stream(_ENCODERS[codec], rate=rate, options=options))
     stream.height, stream.width = first.shape[:2]

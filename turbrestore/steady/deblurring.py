@@ -1,4 +1,4 @@
-"""Wiener filters of one blur for all frames of a clip.
+"""Wiener filters of one blur for all frames of a clip, and of another for what is remembered.
 
 Symbols
 -------
@@ -10,7 +10,7 @@ n : number of frames that the memory holds, for every pixel (:mod:`turbrestore.s
 the same for every frame, so it adds no flicker.  λ follows the contrast and the noise; a floor of the noise stands for
 what noise does not explain, registration that differs from frame to frame and video compression.
 
-What is remembered has averaged that out: there a second filter has a lower floor, and the result is
+What is remembered has averaged that out: there a second filter has a lower floor and its own width, and the result is
 ``u_1 + (1 − 1/√n) (u_2 − u_1)``.
 """
 
@@ -34,15 +34,17 @@ _MARGIN = 6.0
 
 
 def deblur(
-    image: FloatArray, sigma: float, exponent: float, noise: tuple[float, float], held: FloatArray
+    image: FloatArray, sigma: tuple[float, float], exponent: float, noise: tuple[float, float], held: FloatArray
 ) -> FloatArray:
     """Remove a blur from an image by linear filters.
 
     Parameters
     ----------
     image : ndarray, float32, shape (H, W) or (H, W, 3)
-    sigma, exponent : float
-        Width, pixels, and shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`; a width of 0 removes none.
+    sigma : tuple of float
+        Widths of the blur of a frame and of what is remembered, pixels; 0 for that of a frame removes none.
+    exponent : float
+        Shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`.
     noise : tuple of float
         Standard deviation of the noise of a frame and of what is remembered, intensity.
     held : ndarray, float32, shape (H, W)
@@ -56,23 +58,23 @@ def deblur(
     --------
     >>> edge = np.repeat(np.float32([[0.2, 0.8]]), 16, 1).repeat(8, 0)
     >>> soft = cv2.GaussianBlur(edge, (0, 0), 1.0)
-    >>> sharp = deblur(soft, 1.0, 2.0, (0.0, 0.0), np.ones((8, 32), np.float32))
+    >>> sharp = deblur(soft, (1.0, 1.0), 2.0, (0.0, 0.0), np.ones((8, 32), np.float32))
     >>> bool(np.ptp(sharp[4, 14:18]) > np.ptp(soft[4, 14:18]))
     True
     """
-    if sigma == 0:
+    if sigma[0] == 0:
         return image
     height, width = image.shape[:2]
-    margin = min(int(np.ceil(_MARGIN * sigma)), height - 1, width - 1)
+    margin = min(int(np.ceil(_MARGIN * max(sigma))), height - 1, width - 1)
     padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
     shape = fft.next_fast_len(padded.shape[0], real=True), fft.next_fast_len(padded.shape[1], real=True)
     below, right = shape[0] - padded.shape[0], shape[1] - padded.shape[1]
     padded = cv2.copyMakeBorder(padded, 0, below, 0, right, cv2.BORDER_REPLICATE)
     planes = fft.rfft2(padded[None] if image.ndim == 2 else np.moveaxis(padded, -1, 0))
-    power, otf, laplacian = _transfer(shape, sigma, exponent)
     contrast, inner = float(image.std()), np.s_[:, margin : margin + height, margin : margin + width]
 
     def filtered(kind: int) -> FloatArray:
+        power, otf, laplacian = _transfer(shape, sigma[kind], exponent)
         fidelity = max(_FIDELITY * contrast / float(np.hypot(noise[kind], _LEAST_NOISE[kind])), 1.0)
         return fft.irfft2(planes * (fidelity * otf / (fidelity * power + laplacian)), shape)[inner].astype(np.float32)
 

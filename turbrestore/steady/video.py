@@ -4,9 +4,9 @@
    (:mod:`turbrestore.steady.dewarping`), as soon as the last of them is there.
 2. Where the scene stands still it is fused with the memory of all frames before (:mod:`turbrestore.steady.memory`).
 3. One blur, estimated from an early frame of the clip, is removed from every frame by linear filters
-   (:mod:`turbrestore.steady.deblurring`).
+   (:mod:`turbrestore.steady.deblurring`); from what is remembered, one that is estimated there.
 
-What is carried from frame to frame is the memory, the blur and, where the camera is locked, its path.
+What is carried from frame to frame is the memory, the blurs and, where the camera is locked, its path.
 """
 
 from __future__ import annotations
@@ -36,6 +36,9 @@ from .windows import iter_windows
 # Share of the estimated width that is removed: on the two videos of docs/steady.md, a width
 # too small by 15 % costs 0.1 dB, one too large by as much 0.4 dB, and estimates are too large by up to a third.
 _CAUTION = 0.8
+# Frames that the memory holds on average when the width of its blur is estimated, and frames over which the width that
+# is removed goes there, so that no frame is suddenly sharper.
+_REMEMBERED, _GRADUALLY = 24, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +55,7 @@ class SteadyFrame:
     displacement : float
         Root mean square of the displacement that was removed, pixels.
     sigma : float
-        Width of the blur that was removed, pixels.
+        Width of the blur that was removed from a frame, pixels.
     starts_scene : bool
         Whether a new scene starts here.
     """
@@ -108,7 +111,7 @@ def steady_frames(
         # Of the shape that is removed: a width is that of one shape.
         middle = dewarp_frame(head[-1], params)
         sigma = _CAUTION * estimate_blur(middle.image, exponent=KOLMOGOROV, runtime=runtime).removable
-    scenes = _Scenes(params)
+    scenes = _Scenes(params, sigma, runtime)
     yield from map_in_turns(
         lambda window: dewarp_frame(window, params),
         lambda frame: (frame, scenes.estimate(frame)),
@@ -121,19 +124,32 @@ def steady_frames(
 class _Scenes:
     """What is carried from frame to frame of a scene."""
 
-    def __init__(self, params: SteadyParams) -> None:
+    def __init__(self, params: SteadyParams, sigma: float, runtime: Runtime) -> None:
         self._lock = params.camera == "lock"
         self._memory: Memory | None = None
+        self._given, self._runtime = params.sigma is not None, runtime
+        self._first = self._width = sigma
+        self._found: float | None = None
         self._paths: deque[np.ndarray] = deque(maxlen=params.reach)
 
-    def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_]]:
-        """Estimate of the scene at a frame, and what moves."""
+    def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_], float]:
+        """Estimate of the scene at a frame, what moves, and the width of the blur of what is remembered."""
         if frame.starts_scene:
-            self._memory = None
+            self._memory, self._width, self._found = None, self._first, None
         image, moving = self._locked(frame) if self._lock else (frame.image, frame.moving)
         stillness = 1.0 if self._lock else camera_stillness(frame.cameras, moving.shape)
         self._memory = remember(self._memory, image, measure_flow, frame.noise, frame.largest, stillness, moving)
-        return self._memory, moving
+        return self._memory, moving, self._remembered_width(self._memory)
+
+    def _remembered_width(self, memory: Memory) -> float:
+        """Width of the blur of what is remembered, which gradually becomes that of its own image."""
+        if not self._given and self._found is None and memory.held.mean() >= _REMEMBERED:
+            found = estimate_blur(memory.image, exponent=KOLMOGOROV, runtime=self._runtime)
+            # An image that does not determine its width says nothing against the one that was found before.
+            self._found = max(found.removable, self._first)
+        if self._found is not None:
+            self._width += (self._found - self._width) / _GRADUALLY
+        return self._width
 
     def _locked(self, frame: DewarpedFrame) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Show a frame of a scene from where its steadied first frame was taken.
@@ -154,13 +170,13 @@ class _Scenes:
         return warp(frame.image, flow), sample_linear((frame.moving.astype(np.float32),), flow) > 0.5
 
 
-def _sharpened(frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_]], sigma: float) -> SteadyFrame:
-    memory, moving = estimate
+def _sharpened(frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_], float], sigma: float) -> SteadyFrame:
+    memory, moving, width = estimate
     noise = frame.noise * frame.share
     remembered = noise / float(np.sqrt(memory.held.mean()))
     return SteadyFrame(
         number=frame.number,
-        image=deblur(memory.image, sigma, KOLMOGOROV, (noise, remembered), memory.held),
+        image=deblur(memory.image, (sigma, round(width, 2)), KOLMOGOROV, (noise, remembered), memory.held),
         moving=moving,
         displacement=frame.displacement,
         sigma=sigma,
