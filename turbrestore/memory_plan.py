@@ -29,7 +29,8 @@ from .core.decision import Decision
 from .core.errors import ConfigurationError, DataError, require
 from .dynamics.dynamic_texture import identify_memory, modes_memory
 from .filtering.filter_records import filter_memory
-from .registration.flow import MIN_SIDE, flow_memory
+from .registration.flow import MIN_SIDE
+from .registration.opencv_flow import flow_memory
 from .runtime.device import TORCH_BYTES, find_device, needs_torch
 from .runtime.jit import COMPILER_BYTES
 from .runtime.memory_size import size_text

@@ -5,7 +5,9 @@ import pytest
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.registration.confidence import (
     FlowConfidence,
+    _gradient,
     flow_confidence,
+    noise_share,
     posterior_mean,
     regularise_flow,
     subtract_noise,
@@ -37,13 +39,15 @@ def test_one_window_is_the_posterior_mean():
     assert regularise_flow(flow, confidence, noise) == pytest.approx(expected[..., 0], abs=1e-4)
 
 
-def test_each_window_draws_towards_the_next_wider_one():
-    # Equal tensors and flow everywhere: each window moves what the next wider one expects towards the flow.
+@pytest.mark.parametrize(("noise", "left"), [(0.12, (0.12, 0.06, 0.03)), (0.005, (0.005, 0.005, 0.005))])
+def test_each_window_draws_towards_the_next_wider_one(noise, left):
+    # Equal tensors and flow everywhere: each window moves what the next wider one expects towards the flow.  Noise
+    # averages out in wider windows, but not below 0.01.
     tensors = tuple(np.full((side, side, 3), (1e-5, 0, 2e-5), np.float32).transpose(2, 0, 1) for side in (16, 8, 4))
-    noise = 0.05
     found = regularise_flow(np.ones((16, 16, 2), np.float32), FlowConfidence(tensors), noise)
-    prior, expected = 10 * noise**2 / (16 * np.pi * 0.25) + 0.01 * 1.5e-5, np.zeros(2)
-    for _ in range(3):
+    expected = np.zeros(2)
+    for sigma in reversed(left):
+        prior = 10 * sigma**2 / (16 * np.pi * 0.25) + 0.01 * 1.5e-5
         share = np.array([1e-5, 2e-5]) / (np.array([1e-5, 2e-5]) + prior)
         expected = expected + share * (1 - expected)
     assert found == pytest.approx(np.broadcast_to(expected, (16, 16, 2)), rel=1e-4)
@@ -164,3 +168,11 @@ def test_arguments_are_not_changed():
     tensors = [tensor.copy() for tensor in confidence.tensors]
     regularise_flow(flow, confidence, 0.02)
     assert all(map(np.array_equal, (image, flow, *confidence.tensors), (*before, *tensors)))
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.1])
+def test_the_share_of_noise_in_gradients(noise):
+    rng = np.random.default_rng(27)
+    scene, white = texture(), rng.normal(0, noise, (96, 96)).astype(np.float32)
+    whole, scene_alone = (float(np.square(np.hypot(*_gradient(image))).mean()) for image in (scene + white, scene))
+    assert noise_share(scene + white, noise) == pytest.approx(1 - scene_alone / whole, abs=0.05)

@@ -7,17 +7,16 @@ import pytest
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.metrics import endpoint_error
-from turbrestore.registration.contrast import normalise_contrast
+from turbrestore.registration.contrast import grey_levels, normalise_contrast
 from turbrestore.registration.flow import (
     FLOW_METHODS,
     FlowParams,
     estimate_flow,
-    flow_memory,
     iterate_flows,
     measure_flows,
     prepare_reference,
 )
-from turbrestore.registration.opencv_flow import DisParams, FarnebackParams
+from turbrestore.registration.opencv_flow import DisParams, FarnebackParams, flow_memory
 from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.runtime import Runtime
@@ -309,3 +308,34 @@ def test_memory_of_flow_grows_with_pixels_channels_and_threads():
     assert flow_memory((5, 200, 200), 1) == 2 * grey
     assert grey < colour
     assert flow_memory((9, 100, 200), 3) - flow_memory((9, 100, 200), 2) == flow_memory((9, 100, 200), 2) - grey > 0
+
+
+def noisy_pair(noise, seed=3):
+    reference, frame, flow = pair(seed)
+    return reference, frame + np.random.default_rng(seed).normal(0, noise, frame.shape).astype(np.float32), flow
+
+
+def test_noisy_frames_are_smoothed_for_the_flow():
+    reference, frame, _ = noisy_pair(0.15)
+    prepared = prepare_reference(reference).prepare(frame)
+    assert prepared.noisy
+    smoothed = cv2.GaussianBlur(frame, (0, 0), 1.0)
+    assert np.array_equal(prepared.levels, prepare_reference(reference).prepare(smoothed).levels)
+
+
+def test_clean_frames_are_not_smoothed():
+    reference, frame, _ = noisy_pair(0.01)
+    prepared = prepare_reference(reference).prepare(frame)
+    assert not prepared.noisy
+    assert np.array_equal(
+        prepared.levels, grey_levels(frame, FlowParams().contrast_window, FlowParams().contrast_floor)
+    )
+
+
+def test_noisy_and_clean_frames_of_a_batch_are_each_seen_as_they_are():
+    (reference, noisy, _), (_, clean, _) = noisy_pair(0.15), noisy_pair(0.01)
+    target = prepare_reference(reference)
+    frames = [target.prepare(image) for image in (noisy, clean, noisy)]
+    assert [frame.noisy for frame in frames] == [True, False, True]
+    together = target.solve(frames)
+    assert all(np.array_equal(flow, target.solve([frame])[0]) for flow, frame in zip(together, frames, strict=True))

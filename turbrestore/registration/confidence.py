@@ -14,12 +14,14 @@ all the same; in flat regions dense inverse search matches noise with noise, ove
 Given W̄ and τ, the posterior mean is ``Ŵ = (J + ε)⁻¹ (J W + ε W̄)``, ``ε = m σ² / (A τ²) + κ tr(J) / 2``, where J and
 J W are averages over the window.  W̄ is the same estimate in a window twice as wide, and so on until the window is the
 image, for which it is zero: this is normalised convolution (Knutsson and Westin 1993) with tensors and growing windows.
+A grows fourfold from window to window, so ε is a quarter: what no small window tells in noise, a large one does.
 Texture keeps its flow, an edge takes the component along it from its neighbourhood, and a flat region takes both.
 
-Three things keep the estimate from trusting the measurement too much.  A flow method errs by more than noise explains,
-by a factor m in variance.  Its errors at neighbouring pixels are correlated, so ε is the same for every window.  And
-the direction of an edge is known to a few degrees only: without κ, changes of the tensor's direction from one pixel to
-the next would pass for a measurement along the edge.  Results lie within the range of the measured flow.
+Two things keep the estimate from trusting the measurement too much.  A flow method errs by more than noise explains,
+by a factor m in variance, and the part of its error that is none of noise does not average out, so ε falls with A only
+to that of a noise of 0.01.  And the direction of an edge is known to a few degrees only: without κ, changes of the
+tensor's direction from one pixel to the next would pass for a measurement along the edge.  Results lie within the range
+of the measured flow.
 
 J also contains the noise of the reference, which must not pass for texture, so its eigenvalues are lowered by it.
 """
@@ -43,10 +45,14 @@ _AREA = 4 * np.pi * _TENSOR_WINDOW**2
 # Variance of a derivative, in that window, of white noise of unit variance; noise rarely exceeds three times that.
 _GRADIENT_NOISE = 1 / (8 * np.pi * _GRADIENT_WINDOW**4)
 _NOISE_MARGIN = 3.0
+# The same without margin: Scharr's derivative sees less of the finest noise than a derivative proper.
+_SCHARR_NOISE = 0.0214
 # τ, pixels; m and κ.
 _DEVIATION = 0.5
 _METHOD_ERROR = 10.0
 _TILT = 0.01
+# Noise below which the errors of a flow method do not average out in a wider window, intensity.
+_AVERAGED = 0.01
 # Smallest noise, so that every tensor has an inverse: 1/4096 of full scale.
 _LEAST_NOISE = 1 / 4096
 
@@ -94,8 +100,7 @@ def flow_confidence(reference: ArrayLike) -> FlowConfidence:
     (True, True)
     """
     image = luminance(check_image(reference, "reference"))
-    smooth = cv2.GaussianBlur(image, (0, 0), _GRADIENT_WINDOW)
-    dx, dy = cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32
+    dx, dy = _gradient(image)
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW).ravel() for product in (dx * dx, dx * dy, dy * dy))
     noise = np.float32(_NOISE_MARGIN * _GRADIENT_NOISE * estimate_noise(image) ** 2)
     tensor = np.empty((3, *image.shape), np.float32)
@@ -104,6 +109,38 @@ def flow_confidence(reference: ArrayLike) -> FlowConfidence:
     while min(tensors[-1].shape[1:]) > 1:
         tensors.append(np.stack([cv2.pyrDown(plane) for plane in tensors[-1]]))
     return FlowConfidence(tuple(tensors))
+
+
+def noise_share(image: ArrayLike, noise: float) -> float:
+    """Share of the squared gradient of an image that is noise.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W) or (H, W, 3)
+        Intensities; colour is reduced to luminance.
+    noise : float
+        σ, intensity.
+
+    Returns
+    -------
+    float
+        About 1 for white noise alone, 0 for an image without noise.
+
+    Raises
+    ------
+    DataError
+        Wrong shape, or values are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> white = np.random.default_rng(0).normal(0.5, 0.1, (64, 64))
+    >>> ramp = np.tile(np.arange(64) / 2.0, (64, 1))
+    >>> round(noise_share(white, 0.1), 1), round(noise_share(ramp + white, 0.1), 2)
+    (1.0, 0.0)
+    """
+    squares = sum(float(np.square(part).mean(dtype=np.float64)) for part in _gradient(luminance(check_image(image))))
+    return 2 * _SCHARR_NOISE * noise**2 / max(squares, 1e-18)
 
 
 def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -> FloatArray:
@@ -146,13 +183,15 @@ def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -
     weighted = [_apply(tensors[0], *planes)]
     for _ in tensors[1:]:
         weighted.append((cv2.pyrDown(weighted[-1][0]), cv2.pyrDown(weighted[-1][1])))
-    prior = _METHOD_ERROR * max(noise, _LEAST_NOISE) ** 2 / (_AREA * _DEVIATION**2)
+    noise = max(noise, _LEAST_NOISE)
     u, v = (np.zeros_like(part) for part in weighted[-1])
     for level in range(len(tensors) - 1, -1, -1):
         height, width = tensors[level].shape[1:]
         if u.shape != (height, width):
             u, v = (cv2.pyrUp(part, dstsize=(width, height)) for part in (u, v))
         expected, (u, v) = (u, v), np.empty((2, height, width), np.float32)
+        left = max(noise / 2**level, min(noise, _AVERAGED))
+        prior = _METHOD_ERROR * left**2 / (_AREA * _DEVIATION**2)
         planes_of_level = (*tensors[level], *weighted[level], *expected, u, v)
         posterior_mean(np.float32(prior), *(plane.reshape(-1) for plane in planes_of_level))
     for part, plane in zip((u, v), planes, strict=True):
@@ -191,6 +230,11 @@ def subtract_noise(noise: np.float32, xx: FloatArray, xy: FloatArray, yy: FloatA
         lowered[0, pixel] = mean + kept * tilt
         lowered[1, pixel] = kept * xy[pixel]
         lowered[2, pixel] = mean - kept * tilt
+
+
+def _gradient(image: FloatArray) -> Planes:
+    smooth = cv2.GaussianBlur(image, (0, 0), _GRADIENT_WINDOW)
+    return cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32
 
 
 def _apply(tensor: FloatArray, dx: FloatArray, dy: FloatArray) -> Planes:

@@ -44,7 +44,7 @@ def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> 
     return centred
 
 
-def grey_levels(image: FloatArray, window: float, floor: float) -> NDArray[np.uint8]:
+def grey_levels(image: FloatArray, window: float, floor: float, smoothing: float = 0.0) -> NDArray[np.uint8]:
     """Contrast-normalised image in 8 bits, with 32 levels for each local standard deviation.
 
     Parameters
@@ -52,6 +52,8 @@ def grey_levels(image: FloatArray, window: float, floor: float) -> NDArray[np.ui
     image : ndarray, float32, shape (H, W) or (H, W, 3)
     window, floor : float
         As for :func:`normalise_contrast`; with a window of 0 the luminance is kept as it is.
+    smoothing : float
+        Standard deviation of a Gaussian that the image is smoothed by first, pixels.
 
     Returns
     -------
@@ -62,6 +64,8 @@ def grey_levels(image: FloatArray, window: float, floor: float) -> NDArray[np.ui
     >>> grey_levels(np.full((2, 2), 0.3, np.float32), window=2.0, floor=0.01)[0]
     array([128, 128], dtype=uint8)
     """
+    if smoothing > 0:
+        image = cv2.GaussianBlur(luminance(image), (0, 0), smoothing)
     if window > 0:
         levels = normalise_contrast(image, window, floor)
         levels *= _LEVELS_PER_DEVIATION

@@ -9,7 +9,8 @@ The three methods are ``dis``, the default, and ``farneback`` (:mod:`turbrestore
 surrounds them all:
 
 1. Local contrast is normalised (zero mean, unit deviation in a Gaussian window), so that dark and low-contrast regions
-   register as well as bright ones; ``contrast_floor`` keeps noise in flat regions from being amplified.
+   register as well as bright ones; ``contrast_floor`` keeps noise in flat regions from being amplified.  If much of the
+   gradient of a frame is noise, the method sees frame and reference through a Gaussian of one pixel.
 2. A shift of the whole frame by more than two pixels is measured (:mod:`turbrestore.registration.global_shift`) and
    removed by whole pixels, which needs no interpolation.  The flow is that shift plus the flow to the shifted frame.
    Pixels beyond the edge of the shifted frame are filled from the reference, so that they move with the shift.  If a
@@ -23,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import repeat
+from itertools import groupby, repeat
 from typing import Literal
 
 import cv2
@@ -37,13 +38,15 @@ from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import fill_frames, iter_frames, new_stack
 from ..runtime.threads import in_batches, map_ahead
-from .confidence import flow_confidence, regularise_flow
+from .confidence import flow_confidence, noise_share, regularise_flow
 from .contrast import grey_levels
 from .global_shift import ShiftReference, frame_shift, prepare_shift_reference, shift_frame
 from .opencv_flow import DisParams, FarnebackParams, FlowSolver, GreyImage, dis_solver, farneback_solver
 from .tvl1 import TvL1Params, tvl1_solver
 
 MIN_SIDE = 16
+# Share of the gradients of a frame above which noise makes it one that is smoothed, by so many pixels.
+_NOISY, _SMOOTHING = 0.08, 1.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,9 @@ class FlowFrame:
     levels : ndarray, uint8, shape (H, W)
         The contrast-normalised image that the solvers see.
     noise : float
-        Standard deviation of the noise, intensity; 0 if ``confidence`` is off.
+        Standard deviation of the noise, intensity.
+    noisy : bool
+        Whether the solvers see this frame and the reference smoothed.
     start : ndarray, shape (H, W, 2) or on a coarser grid, or None
         Flow to this frame from a similar reference, pixels, from which the solver starts.
     """
@@ -107,6 +112,7 @@ class FlowFrame:
     image: FloatArray
     levels: GreyImage
     noise: float
+    noisy: bool = False
     start: NDArray[np.floating] | None = None
 
 
@@ -320,19 +326,30 @@ def prepare_reference(
             f"reference: expected at least {MIN_SIDE}×{MIN_SIDE} pixels for optical flow, found "
             f"{target.shape[1]}×{target.shape[0]}"
         )
-    levels = grey_levels(target, params.contrast_window, params.contrast_floor)
+    shape, contrast = target.shape[:2], (params.contrast_window, params.contrast_floor)
     position = prepare_shift_reference(target) if params.global_shift else None
     confidence = flow_confidence(target) if params.confidence else None
     device = find_device(runtime.device) if params.method == "tvl1" else CPU
-    solver = FLOW_METHODS[params.method](params, levels, start_level, device)
+
+    def prepared(noisy: bool) -> tuple[GreyImage, FlowSolver]:
+        levels = grey_levels(target, *contrast, _SMOOTHING * noisy)
+        return levels, FLOW_METHODS[params.method](params, levels, start_level, device)
+
+    solvers = {noisy: prepared(noisy) for noisy in (False, True)}
 
     def prepare(image: FloatArray) -> FlowFrame:
-        if image.shape[:2] != levels.shape:
-            raise DataError(f"frames: expected {levels.shape} pixels, found {image.shape[:2]}")
-        seen = grey_levels(image, params.contrast_window, params.contrast_floor)
-        return FlowFrame(image, seen, estimate_noise(image) if confidence is not None else 0.0)
+        if image.shape[:2] != shape:
+            raise DataError(f"frames: expected {shape} pixels, found {image.shape[:2]}")
+        noise = estimate_noise(image)
+        noisy = noise_share(image, noise) > _NOISY
+        return FlowFrame(image, grey_levels(image, *contrast, _SMOOTHING * noisy), noise, noisy)
 
     def solve(batch: list[FlowFrame]) -> list[FloatArray]:
+        alike = groupby(batch, lambda frame: frame.noisy)
+        return [flow for noisy, frames in alike for flow in solve_alike(noisy, list(frames))]
+
+    def solve_alike(noisy: bool, batch: list[FlowFrame]) -> list[FloatArray]:
+        levels, solver = solvers[noisy]
         # Farneback's method takes no start.
         usable = [replace(frame, start=None) for frame in batch] if params.method == "farneback" else batch
         placed = [_place(frame, levels, position) for frame in usable]
@@ -343,31 +360,7 @@ def prepare_reference(
 
     # A device solves a batch at once while the next one is prepared; on the CPU every frame has a thread.
     batch, threads = (1, runtime.threads) if device == CPU else (params.tvl1.batch, 2)
-    return FlowReference(prepare, solve, target.shape[:2], batch, threads)
-
-
-def flow_memory(shape: tuple[int, ...], threads: int) -> float:
-    """Memory that measuring flow takes beside the frames and their flows.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Of the frames: (T, H, W) or (T, H, W, 3).
-    threads : int
-        Frames solved side by side.
-
-    Returns
-    -------
-    float
-        Bytes, of ``dis``, which takes most; measured, with a twentieth added.
-
-    Examples
-    --------
-    >>> flow_memory((60, 1000, 1000), threads=2) / 1e6
-    515.0
-    """
-    pixels, channels = shape[1] * shape[2], shape[3] if len(shape) > 3 else 1
-    return float(pixels * (120 + 5 * channels + threads * (185 + 10 * channels)))
+    return FlowReference(prepare, solve, shape, batch, threads)
 
 
 @dataclass(frozen=True)

@@ -163,3 +163,27 @@ def farneback_solver(params: FarnebackParams, reference: GreyImage) -> FlowSolve
         )
 
     return lambda frames, _: np.stack([solve(frame) for frame in frames])
+
+
+def flow_memory(shape: tuple[int, ...], threads: int) -> float:
+    """Memory that measuring flow takes beside the frames and their flows.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Of the frames: (T, H, W) or (T, H, W, 3).
+    threads : int
+        Frames solved side by side.
+
+    Returns
+    -------
+    float
+        Bytes, of ``dis``, which takes most; measured, with a twentieth added.
+
+    Examples
+    --------
+    >>> flow_memory((60, 1000, 1000), threads=2) / 1e6
+    515.0
+    """
+    pixels, channels = shape[1] * shape[2], shape[3] if len(shape) > 3 else 1
+    return float(pixels * (120 + 5 * channels + threads * (185 + 10 * channels)))
