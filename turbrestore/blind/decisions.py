@@ -34,7 +34,10 @@ def explain_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None 
         return Decision("blur", choice, "asked for")
     if tiles is not None and tiles.varies:
         choice = f"{tiles.removable.min():.2f} to {tiles.removable.max():.2f} pixels removed"
-    found = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels found in the whole image"
+    width = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels"
+    if blur.edge_limited:
+        return Decision("blur", choice, f"{width}, edges are too steep for the wider blur that is likeliest")
+    found = f"{width} found in the whole image"
     where = "" if blur.reduction == 1 else f", reduced by {blur.reduction}"
     remark = ", no more than a sharp image has"
     if sigma > 0:

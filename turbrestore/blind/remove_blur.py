@@ -182,7 +182,8 @@ def remove_blur_steps(
         return tiled_deconvolution_steps(image, width, params, guide, runtime, in_tiles)
 
     tiles, first = None, None
-    if blur is not None and blur.blurred:
+    # The likelihood of a tile is mistaken wherever that of the image is.
+    if blur is not None and blur.blurred and not blur.edge_limited:
         if runtime.memory_limit is None:
             tiles, first = yield from _map_meanwhile(image, blur, _label(remove(sigma), sigma, next(numbers)))
         else:

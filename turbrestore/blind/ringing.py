@@ -19,43 +19,29 @@ left out, because rings of its strongest edge would be diluted by theirs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
+from ..blur.edges import edge_profiles, fewer_edges, find_edges, largest_fall
 from ..core.arrays import FloatArray
-from ..core.gradient import sobel_gradient
 from ..core.noise import estimate_noise
 
 # Distance up to which edges are followed: widths of the blur, and pixels.
 _REACH_SIGMAS, _SMALLEST_REACH = 4.0, 6
 # Distance within which the step of an edge ends, in widths of the blur and in pixels.
 _STEP_SIGMAS, _SMALLEST_STEP = 2.5, 3
-# Gradients count from this multiple of the noise, steps from this multiple, and from this share of the steps of most
-# edges.
-_GRADIENT, _STEP, _STRONG, _MOST = 4.0, 12.0, 0.3, 90
+# Steps count from this multiple of the noise, and from this share of the steps of most edges.
+_STEP, _STRONG, _MOST = 12.0, 0.3, 90
 # Share of the step, and multiple of the noise, by which q may fall.
 _EVEN, _EVEN_NOISE = 0.03, 2.0
 # Side of a tile, pixels; fewest sides of edges in it; share of its largest step from which an edge counts.
 _TILE, _FEWEST, _ALIKE = 16, 5, 0.6
 # Share of the step from which an overshoot is a ring.
 _RING = 0.12
-# Most samples of all profiles, and rows in which edges are looked for at a time.
-_SAMPLES, _ROWS = 1 << 18, 64
-# Standard deviation of the Gaussian under which gradients are measured, and rows that its filters reach.
-_SMOOTH, _AROUND = 0.7, 6
-
-
-@dataclass(frozen=True, eq=False)
-class _Edges:
-    """Pixels on edges, as rows and columns, and the unit normals towards the brighter side, shape (n, 2)."""
-
-    places: NDArray[np.float32]
-    normals: NDArray[np.float32]
+# Most samples of all profiles.
+_SAMPLES = 1 << 18
 
 
 def ringing(after: FloatArray, before: FloatArray, sigma: float) -> float:
@@ -77,6 +63,7 @@ def ringing(after: FloatArray, before: FloatArray, sigma: float) -> float:
 
     Examples
     --------
+    >>> import cv2
     >>> edge = np.repeat([[0.2] * 24 + [0.8] * 24], 48, axis=0).astype(np.float32)
     >>> blurred = cv2.GaussianBlur(edge, (0, 0), 1.5)
     >>> ringing(edge, blurred, 1.5), ringing(edge + 2 * (edge - blurred), blurred, 1.5)
@@ -84,66 +71,23 @@ def ringing(after: FloatArray, before: FloatArray, sigma: float) -> float:
     """
     reach = max(_SMALLEST_REACH, int(np.ceil(_REACH_SIGMAS * sigma)))
     noise = estimate_noise(before)
-    edges = _fewer(_find_edges(before, noise), _SAMPLES // (2 * reach + 1))
+    edges = fewer_edges(find_edges(before, noise), _SAMPLES // (2 * reach + 1))
     if not len(edges.places):
         return 0.0
-    of_before, of_after = (_profiles(image, edges, reach) for image in (before, after))
+    of_before, of_after = (edge_profiles(image, edges, reach) for image in (before, after))
     within = max(_SMALLEST_STEP, int(np.ceil(_STEP_SIGMAS * sigma)))
     steps = sum(side[:, : within + 1].max(axis=1) for side in of_before)
     strong = steps > max(_STRONG * float(np.percentile(steps, _MOST)), _STEP * noise)
     falls: list[NDArray[Any]] = []
     counts: list[NDArray[Any]] = []
     for q, p, limit in zip(of_before, of_after, (1, 0), strict=True):
-        rises = _falls(q) < np.maximum(_EVEN * steps, _EVEN_NOISE * noise)
+        rises = largest_fall(q) < np.maximum(_EVEN * steps, _EVEN_NOISE * noise)
         chosen = strong & rises & (limit - q.max(axis=1) > _RING * steps)
         fall, count = _falls_by_tile(q[chosen], p[chosen], steps[chosen], edges.places[chosen])
         falls.append(fall)
         counts.append(count)
     number = np.concatenate(counts)
     return float(number[np.concatenate(falls) > _RING].sum() / max(number.sum(), 1))
-
-
-def _find_edges(image: FloatArray, noise: float) -> _Edges:
-    """Pixels at which the gradient is largest along its own direction."""
-    places, normals = [np.zeros((0, 2), np.float32)], [np.zeros((0, 2), np.float32)]
-    for top in range(0, len(image), _ROWS):
-        start = max(top - _AROUND, 0)
-        strip = cv2.GaussianBlur(image[start : top + _ROWS + _AROUND], (0, 0), _SMOOTH)
-        across, down = sobel_gradient(strip)
-        size = np.hypot(across, down)
-        y, x = np.mgrid[: strip.shape[0], : strip.shape[1]].astype(np.float32)
-        unit = np.stack([down, across]) / np.maximum(size, np.finfo(np.float32).tiny)
-        ahead, behind = (cv2.remap(size, x + sign * unit[1], y + sign * unit[0], cv2.INTER_LINEAR) for sign in (1, -1))
-        crest = (size >= ahead) & (size > behind) & (size > _GRADIENT * noise)
-        crest[: top - start] = crest[top - start + _ROWS :] = False
-        rows, columns = np.nonzero(crest)
-        places.append(np.stack([rows + start, columns], axis=1).astype(np.float32))
-        normals.append(unit[:, rows, columns].T.astype(np.float32))
-    return _Edges(np.concatenate(places), np.concatenate(normals))
-
-
-def _fewer(edges: _Edges, most: int) -> _Edges:
-    """Leave out rows of tiles until no more edges remain than wanted."""
-    every = -(-len(edges.places) // most)
-    # Of the rows that have edges, since those that are kept must not be empty.
-    _, rows = np.unique(edges.places[:, 0] // _TILE, return_inverse=True)
-    kept = rows.ravel() % max(every, 1) == 0
-    return _Edges(edges.places[kept], edges.normals[kept])
-
-
-def _profiles(image: FloatArray, edges: _Edges, reach: int) -> tuple[FloatArray, FloatArray]:
-    """Image along the normals on the bright and, negated, on the dark side, each of shape (n, reach + 1)."""
-    distances = np.arange(reach + 1, dtype=np.float32)
-    sides = []
-    for sign in (1, -1):
-        at = edges.places.T[..., None] + sign * edges.normals.T[..., None] * distances
-        sides.append(sign * ndimage.map_coordinates(image, at, np.float32, order=1, mode="mirror"))
-    return sides[0], sides[1]
-
-
-def _falls(profiles: NDArray[Any]) -> NDArray[Any]:
-    """Largest fall of each profile from any sample to a later one."""
-    return (np.maximum.accumulate(profiles, axis=1) - profiles).max(axis=1)
 
 
 def _falls_by_tile(
@@ -161,4 +105,4 @@ def _falls_by_tile(
         np.add.at(total, tiles, profiles[alike] / steps[alike, None])
         means.append(total / counts[:, None])
     enough = counts >= _FEWEST
-    return (_falls(means[0]) - _falls(means[1]))[enough], counts[enough]
+    return (largest_fall(means[0]) - largest_fall(means[1]))[enough], counts[enough]

@@ -42,6 +42,7 @@ from ..display.plots import plot_blur
 from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import ThreadTeam, one_thread_each
+from .edges import limit_to_edges
 from .marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
 from .psf import check_exponent, fused_exponent
 
@@ -60,21 +61,17 @@ _RESOLVED = 0.6
 # 0.22 there, blurred ones begin at 0.35.
 _EVIDENCE, _STRONG_EVIDENCE, _SOFT_EVIDENCE = 0.08, 0.2, 0.23
 _SOFT = 0.8
-# Uncertainty of the width of a sharp image, pixels.
-_PIXEL_UNCERTAINTY = 0.1
-# Side of the part that is analysed, pixels.
-_PART = 128
-# Rows of positions at which detail is measured at a time, and how far its filters reach.
-_STRIP_ROWS, _REACH = 256, 5
+_PIXEL_UNCERTAINTY = 0.1  # of the width of a sharp image, pixels
+# Side of the part that is analysed; rows of positions at which detail is measured at a time, and how far its filters
+# reach, pixels.
+_PART, _STRIP_ROWS, _REACH = 128, 256, 5
 # 125 is a power of five: transforms of this size take almost twice as long as those of 120×120 or of 128×128 pixels.
 _SLOW_SIZE = 125
 # n is this many times the noise, plus (in squares) this share of the contrast.
-_NOISE_FACTOR, _MISFIT = 1.5, 0.025
-_LEAST_NOISE = 1e-4
-# Factor on the relative uncertainty of the image itself if its evidence is strong.
-_PREFERENCE = 0.8
-# Exponent of the preference for stronger reduction.
-_LARGER_REDUCTION = 0.15
+_NOISE_FACTOR, _MISFIT, _LEAST_NOISE = 1.5, 0.025, 1e-4
+# Factor on the relative uncertainty of the image itself if its evidence is strong; exponent of the preference for
+# stronger reduction.
+_PREFERENCE, _LARGER_REDUCTION = 0.8, 0.15
 # Share of the uncertainty that is subtracted from widths up to the first of these; none from the second on, pixels.
 _CAUTION, _NARROW, _WIDE = 0.5, 2.0, 3.0
 
@@ -103,6 +100,8 @@ class BlurEstimate:
         Widths whose cost was computed in the reduced image, in pixels of the image.
     costs : ndarray, float64, shape (k,)
         L of each.
+    edge_limited : bool
+        Whether the edges of the image rule out the likeliest width; see :func:`turbrestore.blur.edges.limit_to_edges`.
     """
 
     sigma: float
@@ -113,6 +112,7 @@ class BlurEstimate:
     evidence: float
     widths: Float64Array
     costs: Float64Array
+    edge_limited: bool = False
 
     def plot(self) -> Figure:
         """Draw the cost of every width.
@@ -216,7 +216,8 @@ def estimate_blur(
         if not candidates:
             nothing, shape = np.zeros(0), exponent or fused_exponent(0.0)
             return BlurEstimate(0.0, float("inf"), shape, noise or 0.0, 1, 0.0, nothing, nothing)
-        return choose_blur(candidates, runtime)
+        found = choose_blur(candidates, runtime)
+        return limit_to_edges(found, luminance(check_image(image))) if found.blurred else found
 
 
 def removable_width(sigma: ArrayLike, uncertainty: ArrayLike) -> Float64Array:

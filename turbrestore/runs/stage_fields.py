@@ -139,6 +139,7 @@ FIELDS: dict[str, dict[str, Field]] = {
         "evidence": Number(low=-_INFINITE, high=_INFINITE),
         "widths": Array("f8", "k", low=0),
         "costs": Array("f8", "k", low=-_INFINITE, high=_INFINITE),
+        "edge_limited": Flag(),
     },
 }
 

@@ -1,0 +1,241 @@
+"""Profiles across edges, and the widest blur that they allow.
+
+A limb that darkens smoothly looks like an edge with a wide blur.  A smooth disc on black has hardly any other
+gradients, so its marginal likelihood is largest at too large a width.  But no scene is steeper behind a blur than a
+step.  Where an image rises through an edge without falling, let R be the share of its rise from −A to A that lies
+between −1 and 1 pixel.  For a Gaussian blur the step has the largest R of all scenes that rise, whatever A: a rising
+scene is a sum of steps, and one at a distance from the edge adds relatively more to the outer rise.  So R bounds the
+width of the blur from above.  Text and texture, whose edges fall again within the blur, have no bound.
+
+Symbols
+-------
+σ, p : width and exponent of the blur, see :func:`turbrestore.blur.psf.blur_otf`
+M(A) : rise of a step behind that blur between −A and A pixels
+R = M(1) / M(A), A = 1.75 σ
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ..core.arrays import FloatArray
+from ..core.gradient import sobel_gradient
+from ..core.noise import estimate_noise
+from .psf import GAUSSIAN, half_frequency
+
+if TYPE_CHECKING:
+    from .estimation import BlurEstimate
+
+# Gradients count from this multiple of the noise; most samples of all profiles; rows in which edges are looked for at a
+# time.
+_GRADIENT, _SAMPLES, _ROWS = 4.0, 1 << 18, 64
+# Standard deviation of the Gaussian under which gradients are measured, and rows that its filters reach.
+_SMOOTH, _AROUND = 0.7, 6
+# Distance up to which edges rise, and A: widths of the blur, and pixels.
+_REACH_SIGMAS, _SMALLEST_REACH = 4.0, 6
+_RISE_SIGMAS, _SMALLEST_RISE = 1.75, 2
+# Steps count from this multiple of the noise, and from this share of the steps of most edges.
+_STEP, _STRONG, _MOST = 12.0, 0.6, 90
+# Share of the step, and multiple of the noise, by which a rising profile may fall.
+_EVEN, _EVEN_NOISE = 0.03, 2.0
+# Fewest edges that rise, their least share of all strong edges, and the share of them that bounds a width.
+_FEWEST, _RISING, _STEEP = 30, 0.7, 0.25
+# Ratio of one width that is tried to the one before it.
+_RATIO = 1.05
+# Photographs are as soft as this, pixels; below it nothing is safe to remove.  Width and uncertainty of a sharp image.
+_SOFT, _SHARP, _PIXEL_UNCERTAINTY = 0.8, 0.35, 0.1
+# Side of a tile, pixels.
+_TILE = 16
+# Frequencies over which M is integrated, cycles per pixel.
+_FREQUENCIES = np.linspace(0, 4, 1001)
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Pixels on edges, as rows and columns, and the unit normals towards the brighter side, shape (n, 2)."""
+
+    places: NDArray[np.float32]
+    normals: NDArray[np.float32]
+
+
+def find_edges(image: FloatArray, noise: float) -> Edges:
+    """Find the pixels at which the gradient is largest along its own direction.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W)
+    noise : float
+        Standard deviation of its noise, intensity.
+
+    Returns
+    -------
+    Edges
+
+    Examples
+    --------
+    >>> find_edges(np.repeat([[0, 0, 0, 0, 1, 1, 1, 1]], 2, axis=0).astype(np.float32), 0.01).normals.tolist()
+    [[0.0, 1.0], [0.0, 1.0]]
+    """
+    places, normals = [np.zeros((0, 2), np.float32)], [np.zeros((0, 2), np.float32)]
+    for top in range(0, len(image), _ROWS):
+        start = max(top - _AROUND, 0)
+        strip = cv2.GaussianBlur(image[start : top + _ROWS + _AROUND], (0, 0), _SMOOTH)
+        across, down = sobel_gradient(strip)
+        size = np.hypot(across, down)
+        y, x = np.mgrid[: strip.shape[0], : strip.shape[1]].astype(np.float32)
+        unit = np.stack([down, across]) / np.maximum(size, np.finfo(np.float32).tiny)
+        ahead, behind = (cv2.remap(size, x + sign * unit[1], y + sign * unit[0], cv2.INTER_LINEAR) for sign in (1, -1))
+        crest = (size >= ahead) & (size > behind) & (size > _GRADIENT * noise)
+        crest[: top - start] = crest[top - start + _ROWS :] = False
+        rows, columns = np.nonzero(crest)
+        places.append(np.stack([rows + start, columns], axis=1).astype(np.float32))
+        normals.append(unit[:, rows, columns].T.astype(np.float32))
+    return Edges(np.concatenate(places), np.concatenate(normals))
+
+
+def fewer_edges(edges: Edges, most: int) -> Edges:
+    """Leave out rows of tiles until about as few edges remain as wanted.
+
+    Parameters
+    ----------
+    edges : Edges
+    most : int
+
+    Returns
+    -------
+    Edges
+
+    Examples
+    --------
+    >>> places = np.array([[0, 0], [16, 0], [32, 0]], np.float32)
+    >>> fewer_edges(Edges(places, places), 2).places.tolist()
+    [[0.0, 0.0], [32.0, 0.0]]
+    """
+    every = -(-len(edges.places) // most)
+    # Of the rows that have edges, since those that are kept must not be empty.
+    _, rows = np.unique(edges.places[:, 0] // _TILE, return_inverse=True)
+    kept = rows.ravel() % max(every, 1) == 0
+    return Edges(edges.places[kept], edges.normals[kept])
+
+
+def edge_profiles(image: FloatArray, edges: Edges, reach: int) -> tuple[FloatArray, FloatArray]:
+    """Follow the image along the normals on either side of edges.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W)
+    edges : Edges
+        n of them.
+    reach : int
+        Distance up to which they are followed, pixels.
+
+    Returns
+    -------
+    bright, dark : ndarray, float32, shape (n, reach + 1)
+        The bright side, and the negated dark side, so that both rise away from the edge.
+
+    Examples
+    --------
+    >>> ramp = np.repeat([[0, 1, 2, 3, 4]], 3, axis=0).astype(np.float32)
+    >>> edge = Edges(np.array([[1, 2]], np.float32), np.array([[0, 1]], np.float32))
+    >>> bright, dark = edge_profiles(ramp, edge, 2)
+    >>> bright.tolist(), dark.tolist()
+    ([[2.0, 3.0, 4.0]], [[-2.0, -1.0, 0.0]])
+    """
+    distances = np.arange(reach + 1, dtype=np.float32)
+    sides = []
+    for sign in (1, -1):
+        at = edges.places.T[..., None] + sign * edges.normals.T[..., None] * distances
+        sides.append(sign * ndimage.map_coordinates(image, at, np.float32, order=1, mode="mirror"))
+    return sides[0], sides[1]
+
+
+def largest_fall(profiles: NDArray[Any]) -> NDArray[Any]:
+    """Return the largest fall of each profile from any sample to a later one.
+
+    Parameters
+    ----------
+    profiles : ndarray, shape (n, k)
+
+    Returns
+    -------
+    ndarray, shape (n,)
+
+    Examples
+    --------
+    >>> largest_fall(np.array([[0.0, 3.0, 1.0, 2.0]])).tolist()
+    [2.0]
+    """
+    return (np.maximum.accumulate(profiles, axis=1) - profiles).max(axis=1)
+
+
+def limit_to_edges(estimate: BlurEstimate, image: FloatArray) -> BlurEstimate:
+    """Correct an estimated width that the edges of the image rule out.
+
+    The width becomes the largest that the edges allow to a Gaussian, since wings of a blur cannot be told from a soft
+    limb; its uncertainty is the difference to the width that they allow to the shape that was assumed.
+
+    Parameters
+    ----------
+    estimate : BlurEstimate
+        Likeliest width.
+    image : ndarray, float32, shape (H, W)
+        Blurred image.
+
+    Returns
+    -------
+    BlurEstimate
+        ``estimate`` itself if the edges allow its width, or if too few edges of the image rise on either side.
+
+    Examples
+    --------
+    >>> from turbrestore.blur.estimation import estimate_blur
+    >>> y, x = np.mgrid[-80:80, -80:80]
+    >>> disc = np.sqrt(np.clip(1 - (x**2 + y**2) / 50**2, 0, 1)).astype(np.float32)
+    >>> estimate_blur(cv2.GaussianBlur(disc, (0, 0), 1.2)).edge_limited
+    True
+    """
+    width = _widest_blur(image, GAUSSIAN, estimate.sigma)
+    if width >= estimate.sigma:
+        return estimate
+    unsure = _widest_blur(image, estimate.exponent, estimate.sigma) - width
+    if width < _SOFT:
+        width, unsure = _SHARP, _PIXEL_UNCERTAINTY
+    return replace(estimate, sigma=width, uncertainty=unsure, exponent=GAUSSIAN, edge_limited=True)
+
+
+def _widest_blur(image: FloatArray, exponent: float, widest: float) -> float:
+    """Smallest width for which a quarter of the rising edges are too steep, at most ``widest``."""
+    noise = estimate_noise(image)
+    farthest = max(_SMALLEST_REACH, int(np.ceil(_REACH_SIGMAS * widest)))
+    edges = fewer_edges(find_edges(image, noise), _SAMPLES // (2 * farthest + 1))
+    if len(edges.places) < _FEWEST:
+        return widest
+    profiles = edge_profiles(image, edges, farthest)
+    for sigma in np.exp(np.arange(np.log(_SHARP), np.log(widest), np.log(_RATIO))):
+        reach = max(_SMALLEST_REACH, int(np.ceil(_REACH_SIGMAS * sigma)))
+        rise = max(_SMALLEST_RISE, int(np.ceil(_RISE_SIGMAS * sigma)))
+        bright, dark = (side[:, : reach + 1] for side in profiles)
+        steps = bright[:, : rise + 1].max(axis=1) + dark[:, : rise + 1].max(axis=1)
+        falls = np.maximum(largest_fall(bright), largest_fall(dark))
+        strong = steps > max(_STRONG * float(np.percentile(steps, _MOST)), _STEP * noise)
+        rising = strong & (falls < np.maximum(_EVEN * steps, _EVEN_NOISE * noise))
+        if rising.sum() < max(_FEWEST, _RISING * strong.sum()):
+            continue
+        shares = (bright[rising, 1] + dark[rising, 1]) / (bright[rising, rise] + dark[rising, rise])
+        step = _step_rise(1, sigma, exponent) / _step_rise(rise, sigma, exponent)
+        if np.mean(shares > step) >= _STEEP:
+            return float(sigma)
+    return widest
+
+
+def _step_rise(distance: int, sigma: float, exponent: float) -> float:
+    """M of a step that is seen through pixels, at places that are exact to a pixel."""
+    otf = np.exp(-np.log(2) * (_FREQUENCIES / half_frequency(sigma)) ** exponent) * np.sinc(_FREQUENCIES)
+    return 4 * distance * float(np.trapezoid(otf * np.sinc(2 * distance * _FREQUENCIES), _FREQUENCIES))
