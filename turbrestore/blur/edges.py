@@ -142,11 +142,11 @@ def edge_profiles(image: FloatArray, edges: Edges, reach: int) -> tuple[FloatArr
 
     Examples
     --------
-    >>> ramp = np.repeat([[0, 1, 2, 3, 4]], 3, axis=0).astype(np.float32)
+    >>> ramp = np.repeat([[1, 2, 3, 4, 5]], 3, axis=0).astype(np.float32)
     >>> edge = Edges(np.array([[1, 2]], np.float32), np.array([[0, 1]], np.float32))
     >>> bright, dark = edge_profiles(ramp, edge, 2)
     >>> bright.tolist(), dark.tolist()
-    ([[2.0, 3.0, 4.0]], [[-2.0, -1.0, 0.0]])
+    ([[3.0, 4.0, 5.0]], [[-3.0, -2.0, -1.0]])
     """
     distances = np.arange(reach + 1, dtype=np.float32)
     sides = []
