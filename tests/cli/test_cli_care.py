@@ -216,6 +216,7 @@ class TestSettings:
             "sigma",
             "bit_depth",
             "memory_limit",
+            "tile",
         }
         assert all(comment.startswith("# ") and len(comment) > 4 for comment in found.values())
         text = "\n".join(lines)
