@@ -118,7 +118,7 @@ def restore_all(tasks: Sequence[Task], rows: list[Row], job: Job) -> None:
 
 def _restore(task: Task, job: Job) -> str:
     """Restore and save one clip; return what to say of it."""
-    check_outputs(task.outputs, task.order.path)
+    check_outputs(task.outputs, task.order)
     restored = restore_order(task.order, job)
     job.check()
     save(restored, task.outputs, task.name, task.shown)

@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import math
+import os
 import shlex
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -140,11 +141,13 @@ def write_result(
 
 def check_distinct(outputs: Iterable[Path]) -> None:
     """Refuse two outputs that are one file, under any names: the second would replace the first."""
-    known: set[Path] = set()
+    known: set[str] = set()
     for path in outputs:
-        if path.resolve() in known:
+        # Path.resolve raises an error for links in a circle.
+        real = os.path.realpath(path)
+        if real in known:
             raise OutputError(f"{path}: is named for two outputs; choose another name for one of them")
-        known.add(path.resolve())
+        known.add(real)
 
 
 def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: bool) -> None:

@@ -189,7 +189,7 @@ class TestBatch:
         (tmp_path / "mask.png").replace(out / "0.png")
         given = (out / "0.png").read_bytes()
         code, _, err = run(*words[:-1], out / "0.png", "--overwrite")
-        assert code == 73 and "0.png: is the input" in err, err
+        assert code == 73 and "0.png: is an input" in err, err
         assert main(["restore", str(words[0]), str(out / "0.png"), "--static-mask", str(out / "0.png")]) == 73
         assert (out / "0.png").read_bytes() == given
 

@@ -84,7 +84,7 @@ def test_the_result_is_finite_and_what_was_done_is_said(case):
 
 def test_ordinary_frames_give_no_cause_for_remarks():
     found = restore(USUAL.frames, RestoreParams(until="centroid"))
-    assert [decision.subject for decision in found.decisions] == ["training", "centroid", "border"]
+    assert [decision.subject for decision in found.decisions] == ["training", "centroid", "displacement", "border"]
 
 
 SYSTEMS = st.tuples(

@@ -53,6 +53,13 @@ def correlated(rng, frames, blocks, rho, spread=1.0):
     return spread * (w - w.mean(axis=0))
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_motion_that_is_new_in_every_frame_is_coherent_for_less_than_one(seed):
+    found = motion_statistics(correlated(np.random.default_rng(seed), 24, 12, 0.0), 0.0)
+    assert found.autocorrelation.min() < np.exp(-1)
+    assert found.independent_frames > 12
+
+
 def test_variance_of_correlated_motion_is_unbiased_and_inside_its_interval():
     rng, inside, values = np.random.default_rng(1), 0, []
     for _ in range(200):

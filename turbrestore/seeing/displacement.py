@@ -57,6 +57,8 @@ LEAST_FRAMES = 3
 # Largest lag at which the autocovariance is used, as a share of the clip.
 _LARGEST_LAG = 0.5
 _SOLVING_STEPS = 20
+# Fewest independent frames of a long clip, and correlation of one frame with the next above which motion is slow.
+_LEAST_INDEPENDENT, _PERSISTENT = 10, 0.5
 # Least determinant of M per pixel, intensity to the fourth per pixel to the fourth.
 _TINY = 1e-12
 
@@ -104,13 +106,19 @@ class MotionStatistics:
     independent_frames : float
         N.
     autocorrelation : ndarray, float64, shape (K,)
-        ρ(k) for k = 0, 1, …, up to its first zero.
+        ρ(k) for k = 0, 1, …, up to its first zero, or to the largest lag that is used.
     """
 
     variance: Float64Array
     freedom: float
     independent_frames: float
     autocorrelation: Float64Array
+
+    @property
+    def slow(self) -> bool:
+        """Whether the clip spans few correlation times, so that its mean takes away what cannot be put back."""
+        persistent = len(self.autocorrelation) > 1 and self.autocorrelation[1] > _PERSISTENT
+        return bool(persistent and self.independent_frames < _LEAST_INDEPENDENT)
 
 
 def block_displacement(
@@ -217,6 +225,8 @@ def motion_statistics(w: Float64Array, noise_variance: float) -> MotionStatistic
         end = int(ends[0]) if ends.size else largest
         taken = float(share[:end] @ true[:end]) / frames
     correlation = true[:end] / true[0] if true[0] > 0 else np.ones(1)
+    if 0 < end < largest:
+        correlation = np.append(correlation, 0.0)
     independent = frames / float(1 + share[1 : len(correlation)] @ correlation[1:] ** 2)
     measured = np.mean(w**2, axis=(0, 1))
     variance = np.maximum(measured * true[0] / max(found[0], _TINY) - noise_variance, 0.01 * measured)

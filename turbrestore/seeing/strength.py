@@ -52,8 +52,6 @@ _BLUR_ERROR = 0.1
 _LARGEST_BLUR = 2.0
 # Largest part of an image that is compared by blur, pixels a side, and the tiles of it.
 _COMPARED, _TILES = 512, CueParams(tile=64, departure=1.0)
-# Fewest independent frames from which the variance over a long time is known.
-_LEAST_INDEPENDENT = 10
 # Share of rotation from which the displacement is not that of turbulence; without any relation of x and y it is 0.5.
 _ROTATING = 0.4
 _HALF, _E_FOLD = 0.5, float(np.exp(-1))
@@ -204,7 +202,7 @@ def measure_seeing(
     rotation = rotation_share(found)
     anisotropy, direction = _wind(w, whole, found.noise_variance)
     remarks = _disagreement(by_flow, by_blur)
-    if whole.independent_frames < _LEAST_INDEPENDENT:
+    if whole.slow:
         remarks += (
             f"the clip spans few correlation times ({whole.independent_frames:.1f} independent frames): the variance "
             "over a long time is a lower bound, and more frames would tell more",
@@ -264,7 +262,7 @@ def chi_square_interval(variance: float, freedom: float, relative: float = 0.0) 
 def _interval(variance: float, motion: MotionStatistics, freedom: float) -> Estimate:
     """Interval of a variance over a long time, without an upper bound where there are few independent frames."""
     found = chi_square_interval(variance, freedom, _MODEL_ERROR)
-    return found if motion.independent_frames >= _LEAST_INDEPENDENT else replace(found, high=np.inf)
+    return replace(found, high=np.inf) if motion.slow else found
 
 
 def _unmeasured(by_blur: Estimate | None, remark: str) -> Seeing:
@@ -367,7 +365,6 @@ def _crossing(correlation: Float64Array, level: float, freedom: float, step: flo
     def first_below(limit: float) -> float:
         below = np.flatnonzero(correlation < limit)
         if not below.size:
-            # The autocorrelation ends at its first zero.
             return np.inf
         at = int(below[0])
         if at == 0:
