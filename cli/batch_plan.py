@@ -46,7 +46,7 @@ def find_clips(inputs: Iterable[Path]) -> list[Path]:
     for path in inputs:
         named = [path]
         if not path.exists() and glob.has_magic(str(path)):
-            # Path.glob refuses absolute patterns, and matches hidden files.
+            # Not Path.glob, which refuses absolute patterns and matches hidden files.
             names = sorted(glob.glob(str(path), recursive=True))  # noqa: PTH207
             named = [Path(name) for name in names]
         if not named:

@@ -105,6 +105,7 @@ def test_in_the_window(clip, monkeypatch, request):
     qtbot = request.getfixturevalue("qtbot")
     from qtpy.QtGui import QOpenGLContext
 
+    # The offscreen platform of Qt draws with OpenGL only where the system has a driver for it.
     if not QOpenGLContext().create():
         pytest.skip("Qt has no OpenGL here, which the window of napari draws with")
     viewer = request.getfixturevalue("make_napari_viewer")()

@@ -41,8 +41,8 @@ def planetary_system_stacker(frames: np.ndarray, folder: Path, deliver: Callable
             image = image[..., ::-1] if frames.ndim == 4 else image.mean(axis=-1)
         deliver(image)
 
-    # The program ends itself in the middle of an event of Qt.
-    builtins.quit = read  # type: ignore[assignment]
+    # The program ends itself by this name in the middle of an event of Qt.
+    vars(builtins)["quit"] = read
     os.environ["QT_QPA_PLATFORM"] = "offscreen"
     sys.argv = ["pss", str(source), "--stack_percent", str(STACKED_PERCENT)]
     from planetary_system_stacker.planetary_system_stacker import main

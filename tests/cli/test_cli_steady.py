@@ -1,7 +1,6 @@
 """``turbrestore steady`` from the command line."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -114,7 +113,6 @@ def test_an_empty_pipe_is_named(tmp_path):
     assert done.stderr == b"turbrestore: standard input: expected at least one frame, found no data\n"
 
 
-@pytest.mark.skipif(os.name == "nt", reason="the words are those of a POSIX shell")
 def test_a_reader_that_has_seen_enough_is_no_failure():
     words = [sys.executable, "-m", "turbrestore_cli", "steady", str(SAMPLE), "-", "--roi=40,40,64,48", "--sigma=0"]
     script = '{ "$@"; echo "code $?" >&2; } | head -c 100 >/dev/null'

@@ -47,6 +47,6 @@ def test_optics_and_a_missing_distance_are_refused():
     with pytest.raises(ConfigurationError, match="pixel_scale"):
         Optics(0.0, 0.1)
     with pytest.raises(ConfigurationError, match="path"):
-        Optics(1e-6, 0.1, path="bent")  # type: ignore[arg-type]
+        Optics(1e-6, 0.1, path="bent")
     with pytest.raises(ConfigurationError, match="distance"):
         displacement_differences(Optics(1e-6, 0.1), 10.0, (2, 2), 10.0)
