@@ -44,6 +44,8 @@ _CLIPPED, _LEAST_SHARE = 0.05, 0.01
 # Standard deviation of the Gaussian that separates fine detail, pixels.
 _DETAIL_WINDOW = 4.0
 _LEAST_DEVIATION = 1e-4
+# Widest blur whose ringing is judged, pixels: behind a wider one, profiles of four widths cross the next letter.
+_WIDEST_RINGS = 3.0
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,11 @@ def evaluate_guards(
         raise DataError(f"result: expected the shape {before.shape} of the blurred image, found {after.shape}")
     # One pair of planes at a time, because those of a large image take a good part of the memory.
     pairs = zip(_planes(after), _planes(before), strict=True)
-    figures = [(ringing(*pair, sigma), _overshoot(*pair, sigma), _noise_gain(*pair)) for pair in pairs]
+    profiles_stay = sigma <= _WIDEST_RINGS
+    figures = [
+        (ringing(*pair, sigma) if profiles_stay else 0.0, _overshoot(*pair, sigma), _noise_gain(*pair))
+        for pair in pairs
+    ]
     rings, overshoot, gain = (max(values) for values in zip(*figures, strict=True))
     passed = rings <= params.ringing and overshoot <= params.overshoot and gain <= params.noise_gain
     return GuardReading(float(sigma), rings, overshoot, gain, passed)
