@@ -42,8 +42,14 @@ def clips(tmp_path_factory):
 @pytest.fixture(scope="module")
 def scheduler():
     """A scheduler with one worker, both of them threads of this process."""
+    # Any free port: without an address the dashboard takes 8787, which another run of the tests may hold.
     with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", host="127.0.0.1", dashboard_address=None
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tcp",
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
     ) as cluster:
         yield cluster.scheduler_address
 

@@ -33,8 +33,8 @@ SHAPES = st.lists(st.integers(1, 7), min_size=1, max_size=4).map(tuple)
 
 
 def resident() -> int:
-    """Bytes of this process that are in memory."""
-    return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    """Bytes of mapped files that are in memory; what other threads of the process allocate does not count."""
+    return int(STATM.read_text().split()[2]) * os.sysconf("SC_PAGE_SIZE")
 
 
 needs_proc = pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")

@@ -2,7 +2,9 @@
 "use strict";
 (() => {
   const byId = (id) => document.getElementById(id);
+  // The app replaces the page's comparison while this one still observes its stage, so every part is looked up once.
   const stage = byId("stage"), line = byId("line"), divider = byId("divider"), zoom = byId("zoom");
+  const zoomIn = byId("in"), zoomOut = byId("out");
   const selects = { left: byId("left"), right: byId("right") };
   const layers = [...stage.querySelectorAll(".layer")];
   const images = layers.map((layer) => layer.querySelector("img"));
@@ -34,8 +36,8 @@
     stage.classList.toggle("large", scale >= 2);
     stage.classList.toggle("zoomed", overflows());
     zoom.textContent = `${Math.round(100 * scale)} %`;
-    byId("in").disabled = scale >= LARGEST;
-    byId("out").disabled = scale <= smallest() * 1.001;
+    zoomIn.disabled = scale >= LARGEST;
+    zoomOut.disabled = scale <= smallest() * 1.001;
     split();
   };
 
@@ -133,8 +135,8 @@
 
   divider.addEventListener("input", split);
   for (const select of Object.values(selects)) select.addEventListener("change", split);
-  byId("in").addEventListener("click", () => zoomTo(scale * STEP));
-  byId("out").addEventListener("click", () => zoomTo(scale / STEP));
+  zoomIn.addEventListener("click", () => zoomTo(scale * STEP));
+  zoomOut.addEventListener("click", () => zoomTo(scale / STEP));
   byId("fit").addEventListener("click", fit);
   byId("actual").addEventListener("click", () => zoomTo(1));
 
