@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import skimage.data
 
+from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
@@ -114,3 +115,24 @@ def varied() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A scene, frames of it whose blur varies in time and space, and the variance of that blur."""
     scene = SCENES["camera"](144)
     return scene, *moving_blur(scene, 40, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="session")
+def clip(tmp_path_factory):
+    """A short video whose frames bend, for tests that read it and leave it as it is."""
+    path = tmp_path_factory.mktemp("clip") / "clip.mkv"
+    write_video(path, make_sequence(seed=31, count=8, size=80, rms=0.8).frames, 25)
+    return path
+
+
+@pytest.fixture
+def run(capsys):
+    """Run a command in this process; what it returned, printed and complained."""
+    from turbrestore_cli.__main__ import main
+
+    def call(*words):
+        code = main([str(word) for word in words])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call

@@ -19,7 +19,6 @@ from turbrestore.io.images import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.pipeline import RestoreParams
 from turbrestore_cli import doctor
-from turbrestore_cli.__main__ import main
 from turbrestore_cli.application import COMMANDS, build
 from turbrestore_cli.examples import EXAMPLES, FIRST_STEPS
 from turbrestore_cli.options import Machine, Selection
@@ -31,16 +30,6 @@ QUICK = ["--centroid.iterations", "1", "--filter.inner-iterations", "1", *STEPS]
 # Examples as they stand, but on fewer frames and fewer runs.
 SMALLER = {("--frames", "0:24"): "0:4", ("--frames", "120"): "6", ("--frames", "300"): "6", ("--train", "40"): "5"}
 SMALLER |= {("--seeds", "20"): "2"}
-
-
-@pytest.fixture
-def run(capsys):
-    def call(*words):
-        code = main([str(word) for word in words])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
 
 
 @pytest.fixture

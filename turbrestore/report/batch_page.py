@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
 from ..core.arrays import FloatArray, from_unit
 from ..display.preview import data_uri, encode_image, shrink
 from ..io.output import atomic_write
-from .page import environment, policy
+from .comparison import environment, text_file
+from .page import policy
 
 # Longest side of a picture, pixels, and its quality as WebP.
 _LONGEST, _QUALITY = 320, 90
@@ -102,11 +102,10 @@ def render_batch(rows: Sequence[ClipRow], folder: str = "") -> str:
     templates = environment()
     from markupsafe import Markup
 
-    style = "".join(files(__package__).joinpath(name).read_text("utf-8") for name in ("palette.css", "style.css"))
-    template = templates.from_string(files(__package__).joinpath("batch.html").read_text("utf-8"))
+    style = "".join(text_file(name) for name in ("palette.css", "style.css"))
     counts = {state: sum(row.state == state for row in rows) for state in ("done", "failed", "planned")}
     links = {row.output: Path(row.output).name for row in rows}
-    return template.render(
+    return templates.get_template("batch.html").render(
         rows=rows, counts=counts, links=links, folder=folder, policy=policy(style), style=Markup(style)
     )
 

@@ -31,16 +31,22 @@ def comparison(gallery: Gallery) -> str:
     ConfigurationError
         Jinja2 is not installed.
     """
-    return environment().from_string(text_file("compare.html")).render(gallery=gallery)
+    return environment().get_template("compare.html").render(gallery=gallery)
 
 
 def environment() -> jinja2.Environment:
-    """Return the settings of all templates: text is escaped, and a name that is not known is an error."""
+    """Return what reads the templates of this folder: text is escaped, and a name that is not known is an error."""
     try:
         import jinja2
     except ImportError as error:
         raise missing("jinja2") from error
-    return jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return jinja2.Environment(
+        loader=jinja2.FunctionLoader(text_file),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
 
 
 def text_file(name: str) -> str:

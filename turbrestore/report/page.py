@@ -131,7 +131,7 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
     """
     from markupsafe import Markup
 
-    template = environment().from_string(text_file("template.html"))
+    template = environment().get_template("template.html")
     style, script = "".join(map(text_file, ("palette.css", "compare.css", "style.css"))), text_file("compare.js")
     gallery = encode_gallery(stages(restoration, run.frame), run.frame_number)
     panels = [(Markup(panel.svg), panel.caption) for panel in draw_panels(restoration, run)]

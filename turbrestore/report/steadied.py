@@ -110,7 +110,7 @@ def write_steady_report(
         write_container(film, panels, sources[0].fps or _USUAL_RATE, encoding=Encoding("h264", _RATE_FACTOR))
         address = "data:video/mp4;base64," + base64.b64encode(film.read_bytes()).decode("ascii")
     style = "".join(map(text_file, ("palette.css", "style.css")))
-    page = environment().from_string(text_file("steadied.html")).render(
+    page = environment().get_template("steadied.html").render(
         run=run,
         policy=policy(style, media="data:"),
         style=Markup(style),
