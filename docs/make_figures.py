@@ -28,25 +28,25 @@ from turbrestore.synthesis.scenes import picture, printed_words, resolution_char
 SIDE = 224
 FILM_SIDE, FILM_HEIGHT = 256, 384
 LARGEST_RECIPE, LARGEST_ROW = 120_000, 180_000
-# Name, scene, strength of the air, and number of frames.
+# Name, scene, strength of the air, number of frames, and noise of the camera.
 GALLERY = {
-    "chart": (lambda: resolution_chart(SIDE, SIDE), "weak", 48),
-    "words": (lambda: printed_words(SIDE, SIDE), "strong", 60),
-    "sign": (lambda: scenes.sign(SIDE, SIDE), "medium", 48),
-    "photographer": (lambda: picture("camera", SIDE, SIDE), "medium", 60),
-    "cat": (lambda: picture("cat", SIDE, SIDE), "medium", 60),
-    "planet": (lambda: scenes.planet(SIDE, SIDE), "medium", 60),
-    "street": (lambda: scenes.street(SIDE, SIDE), "weak", 60),
-    "gravel": (lambda: picture("gravel", SIDE, SIDE), "strong", 48),
+    "chart": (lambda: resolution_chart(SIDE, SIDE), "weak", 48, 0.005),
+    "words": (lambda: printed_words(SIDE, SIDE), "strong", 60, 0.005),
+    "sign": (lambda: scenes.sign(SIDE, SIDE), "medium", 48, 0.005),
+    "photographer": (lambda: picture("camera", SIDE, SIDE), "medium", 60, 0.005),
+    "cat": (lambda: picture("cat", SIDE, SIDE), "medium", 60, 0.005),
+    "planet": (lambda: scenes.planet(SIDE, SIDE), "medium", 120, 0.03),
+    "street": (lambda: scenes.street(SIDE, SIDE), "weak", 60, 0.005),
+    "gravel": (lambda: picture("gravel", SIDE, SIDE), "strong", 48, 0.005),
 }
 
 
 @cache
 def gallery_clip(name: str) -> Clip:
     """Clip of the gallery, made once."""
-    scene, strength, count = GALLERY[name]
+    scene, strength, count, noise = GALLERY[name]
     objects = scenes.traffic(SIDE, SIDE) if name == "street" else ()
-    return clip(scene(), strength, count, objects)
+    return clip(scene(), strength, count, noise, objects)
 
 
 @cache
@@ -113,20 +113,22 @@ def make_recipes() -> None:
     save("recipe_road", row(road, 288), LARGEST_RECIPE)
     text = {"frame": sign.frame, "temporal mean": sign.restoration.mean, "restored": sign.restoration.image}
     save("recipe_text", row(text, 288), LARGEST_RECIPE)
-    save("recipe_planet", row(planet_from_file(), 320), LARGEST_RECIPE)
+    save("recipe_planet", row(planet_from_file(), 288), LARGEST_RECIPE)
     truth = gallery_clip("photographer").truth
     strengths = {f"{name}, D/r0 = {ratio:g}": film(truth, ratio, 1)[0] for name, ratio in STRENGTHS.items()}
     save("recipe_simulate", row({"scene": truth} | strengths), LARGEST_RECIPE)
 
 
 def planet_from_file() -> dict[str, FloatArray]:
-    """Frame and result of a SER file in which a planet is followed."""
+    """Frame and results of a SER file in which a planet is followed, with a width that is estimated and one given."""
+    given = tr.RestoreParams(deconvolution=tr.DeconvolutionParams(sigma=1.2))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "planet.ser"
-        frames = film(scenes.planet(280, 320, radius=83), STRENGTHS["medium"], 60)
+        frames = film(scenes.planet(280, 320), STRENGTHS["medium"], 120, noise=0.03)
         tr.write_video(path, frames, 50, bit_depth=8)
         source = tr.crop_to_object(tr.open_frames(path))
-        return {"frame": source.read(30, 31)[0], "restored": tr.restore(source).image}
+        results = {"restored": tr.restore(source).image, "restored, --sigma 1.2": tr.restore(source, given).image}
+        return {"frame": source.read(60, 61)[0]} | results
 
 
 GROUPS = {"film": make_film, "gallery": make_gallery, "stages": make_stages, "recipes": make_recipes}

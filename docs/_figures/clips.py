@@ -28,15 +28,15 @@ class Clip:
 
 
 def film(
-    scene: FloatArray, strength: float, count: int, seed: int = 7, objects: Sequence[MovingObject] = ()
+    scene: FloatArray, strength: float, count: int, noise: float = 0.005, objects: Sequence[MovingObject] = ()
 ) -> FloatArray:
-    """Frames of a scene through air of a strength D/r0, shape (T, H, W) or (T, H, W, 3)."""
-    air = tr.PhaseScreenParams(d_over_r0=strength)
-    made = tr.phase_screen_frames(scene, count, np.random.default_rng(seed), air, objects=objects)
+    """Synthesize frames of a scene through air of a strength D/r0, shape (T, H, W) or (T, H, W, 3)."""
+    air, camera = tr.PhaseScreenParams(d_over_r0=strength), tr.CameraParams(read_noise=noise)
+    made = tr.phase_screen_frames(scene, count, np.random.default_rng(7), air, camera, objects=objects)
     return np.stack([frame.image for frame in made])
 
 
-def clip(scene: FloatArray, strength: str, count: int, objects: Sequence[MovingObject] = ()) -> Clip:
+def clip(scene: FloatArray, strength: str, count: int, noise: float, objects: Sequence[MovingObject] = ()) -> Clip:
     """Synthesize a clip of a named strength, and restore it with the defaults."""
-    frames = film(scene, STRENGTHS[strength], count, objects=objects)
+    frames = film(scene, STRENGTHS[strength], count, noise, objects)
     return Clip(scene, frames, tr.restore(frames))

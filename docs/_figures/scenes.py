@@ -129,14 +129,10 @@ def planet(height: int, width: int, radius: float = 83) -> FloatArray:
     u, v = x / radius, y / (0.94 * radius)
     distance = np.hypot(u, v)
     depth = np.sqrt(np.clip(1 - distance**2, 0, 1))
-    eddies = sum(
-        weight
-        * cv2.GaussianBlur(
-            rng.standard_normal((height, width)).astype(np.float32), (0, 0), length * 2.4, sigmaY=length * 0.7
-        )
-        * length
-        for length, weight in ((0.8, 0.9), (1.6, 0.9), (4.0, 0.9))
-    )
+    eddies = np.zeros((height, width), np.float32)
+    for length, weight in ((1.2, 1.4), (2.5, 3.5), (5.0, 5.0)):
+        grain = rng.standard_normal((height, width)).astype(np.float32)
+        eddies += weight * cv2.GaussianBlur(grain, (0, 0), 2.2 * length, sigmaY=0.8 * length)
     latitude = np.arcsin(np.clip(v, -1, 1)) + 0.05 * eddies
     belts = 0.16 * np.cos(9.0 * latitude + 0.6) + 0.07 * np.cos(21.0 * latitude) + 0.03 * np.cos(40 * latitude)
     storm = np.exp(-((((u - 0.28) / 0.17) ** 2 + ((v - 0.38) / 0.085) ** 2) ** 2))

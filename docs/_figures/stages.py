@@ -8,7 +8,6 @@ from collections.abc import Mapping
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -29,17 +28,17 @@ _WIDTH, _DPI = 9.2, 100
 
 
 def frames(clip: Clip) -> None:
-    """Three frames, and one row of all of them."""
+    """Show three frames, and one row of all of them."""
     shown = {f"frame {number}": clip.frames[number] for number in (10, 25, 40)}
     save("stage_frames", row(shown | {"row 96 over time": over_time(clip.frames, SHOWN_ROW)}), LARGEST)
 
 
 def flow(clip: Clip) -> None:
-    """Reference, frame, the flow between them, and its length."""
+    """Show reference, frame, the flow between them, and its displacement along x."""
     reference, number = clip.restoration.centroid.image, 25
     found = clip.restoration.centroid.flows[number]
-    figure, axes = plt.subplots(1, 4, figsize=(_WIDTH, 2.45))
-    _images(axes, {"reference": reference, f"frame {number}": clip.frames[number], "flow, × 5": reference})
+    figure, axes = plt.subplots(1, 5, figsize=(_WIDTH, 2.3), width_ratios=(1, 1, 1, 1, 0.06))
+    _images(axes, {"reference": reference, f"frame {number}": clip.frames[number], "flow, × 8": reference})
     step = slice(12, None, 20)
     y, x = np.mgrid[: reference.shape[0], : reference.shape[1]][:, step, step]
     dx, dy = np.moveaxis(found[step, step], -1, 0)
@@ -56,12 +55,12 @@ def flow(clip: Clip) -> None:
         headwidth=3.5,
         headlength=4,
     )
-    _map(figure, axes[3], found[..., 0], "displacement dx", "px", "PuOr", (-3, 3))
+    _map(axes[3:], found[..., 0], "displacement dx", "px", "PuOr", (-3, 3))
     _save("stage_flow", figure)
 
 
 def centroid(clip: Clip) -> None:
-    """Temporal mean, frames registered once, the centroid, and the scene."""
+    """Show a frame, the temporal mean, frames registered once, and the centroid."""
     once = tr.find_centroid(clip.frames[: clip.restoration.train], tr.CentroidParams(iterations=1))
     panels = {
         "one frame": clip.frame,
@@ -73,7 +72,7 @@ def centroid(clip: Clip) -> None:
 
 
 def dynamics(clip: Clip) -> None:
-    """Singular values, eigenvalues, and one step of prediction at one place."""
+    """Plot singular values, eigenvalues, and one step of prediction at one place."""
     model, flows = clip.restoration.dynamics, clip.restoration.centroid.flows
     figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.7), width_ratios=(1, 1, 1.7))
     values = model.singular_values[:-1]
@@ -95,7 +94,7 @@ def dynamics(clip: Clip) -> None:
 
 
 def filtering(clip: Clip) -> None:
-    """Centroid and filtered image, and how much each frame counts."""
+    """Show centroid and filtered image, and how much each frame counts."""
     filtered = clip.restoration.filtered
     panels = {"centroid": clip.restoration.centroid.image, "filtered": filtered.image}
     figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.7), width_ratios=(1, 1, 1.5))
@@ -108,7 +107,7 @@ def filtering(clip: Clip) -> None:
 
 
 def blur(clip: Clip) -> None:
-    """The filtered image, the cost of each width, and the transfer function that is found."""
+    """Show the filtered image, the cost of each width, and the transfer function that is found."""
     estimate = clip.restoration.blur
     figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.7), width_ratios=(1, 1.3, 1.3))
     _images(axes, _details({"filtered": clip.restoration.filtered.image}))
@@ -126,7 +125,7 @@ def blur(clip: Clip) -> None:
 
 
 def deconvolution(clip: Clip) -> None:
-    """Filtered image, linear and nonlocal deconvolution, and the scene."""
+    """Show the filtered image, linear and nonlocal deconvolution, and the scene."""
     filtered, found = clip.restoration.filtered.image, clip.restoration.deconvolution
     linear = tr.DeconvolutionParams(method="wiener", exponent=clip.restoration.blur.exponent)
     panels = {
@@ -139,9 +138,9 @@ def deconvolution(clip: Clip) -> None:
 
 
 def seeing(films: Mapping[float, FloatArray], clip: Clip) -> None:
-    """Strength that is measured beside the true one, and where the clip moves."""
+    """Plot the strength that is measured beside the true one, and show where the clip moves."""
     optics = Optics(pixel_scale=2.75e-6, aperture=0.1, distance=2000.0)
-    figure, axes = plt.subplots(1, 2, figsize=(_WIDTH, 3.0), width_ratios=(1.5, 1))
+    figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.8), width_ratios=(1.7, 1, 0.05))
     for strength, film in films.items():
         found = tr.find_centroid(film)
         value = tr.measure_seeing(film, found.flows, found.image, film.mean(axis=0), optics).d_over_r0
@@ -154,12 +153,12 @@ def seeing(films: Mapping[float, FloatArray], clip: Clip) -> None:
     )
     axes[0].legend(loc="upper left")
     motion = np.sqrt(clip.restoration.centroid.flows.var(axis=0).mean(axis=-1))
-    _map(figure, axes[1], motion, "displacement along an axis", "px rms", "viridis", (0, 2))
+    _map(axes[1:], motion, "displacement along an axis", "px rms", "viridis", (0, 2))
     _save("stage_seeing", figure)
 
 
 def steady(frames_in: FloatArray, frames_out: FloatArray) -> None:
-    """A frame before and after, and one row of all frames before and after."""
+    """Show a frame before and after, and one row of all frames before and after."""
     middle, line = len(frames_in) // 2, round(0.36 * frames_in.shape[1])
     panels = {
         "frame": frames_in[middle],
@@ -197,13 +196,13 @@ def _images(axes: np.ndarray, panels: Mapping[str, FloatArray]) -> None:
 
 
 def _map(
-    figure: Figure, ax: Axes, values: FloatArray, title: str, unit: str, colours: str, limits: tuple[float, float]
+    axes: np.ndarray, values: FloatArray, title: str, unit: str, colours: str, limits: tuple[float, float]
 ) -> None:
-    shown = ax.imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1])
-    ax.set_title(title)
-    ax.axis("off")
-    bar = figure.colorbar(shown, ax=ax, label=unit, location="bottom", shrink=0.8, pad=0.02, aspect=25)
-    bar.ax.tick_params(labelsize=8)
+    """Show a map on the first of two axes, and its scale on the second."""
+    shown = axes[0].imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1])
+    axes[0].set_title(title)
+    axes[0].axis("off")
+    axes[0].figure.colorbar(shown, cax=axes[1], label=unit)
 
 
 def _save(name: str, figure: Figure) -> None:
