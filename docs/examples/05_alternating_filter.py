@@ -30,7 +30,7 @@ plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "f
 
 # %% [markdown]
 # ## A clip, its centroid and the model of its flow
-# Frames of a picture, 48 of them; some are sharper than others, as frames of turbulent air are. The first 24 train. The paper
+# 48 frames of a picture; some are sharper than others, as frames of turbulent air are. The first 24 train. The paper
 # trains on 100 frames and filters 400.
 
 # %%

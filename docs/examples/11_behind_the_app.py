@@ -51,7 +51,9 @@ def show(panels, width=3.2):
 whole = tr.open_frames("../../sample_data/chart.mkv", frames=(0, 40), roi=(0, 96, 256, 96))
 report = tr.check_content(whole)
 source = tr.clean_source(whole, report)
-print(f"{len(source)} of {len(whole)} frames of {source.shape[2]}×{source.shape[1]}; remarks: {report.warnings or 'none'}")
+print(
+    f"{len(source)} of {len(whole)} frames of {source.shape[2]}×{source.shape[1]}; remarks: {report.warnings or 'none'}"
+)
 
 # %% [markdown]
 # ## Run
