@@ -48,7 +48,7 @@ def show(rows, width=2.4):
 # %%
 SIZE, FRAMES, TRAIN = 96, 200, 160
 scene = resolution_chart(SIZE, SIZE)
-air = tr.PhaseScreenParams(d_over_r0=2.0, wind=(0.3,), layers=3, field_spacing=32)
+air = tr.PhaseScreenParams(d_over_r0=2.0, wind=(0.3,), layers=2, field_spacing=48)
 clip = np.stack([frame.image for frame in tr.phase_screen_frames(scene, FRAMES, np.random.default_rng(3), air)])
 centroid = tr.find_centroid(clip[:40]).image
 flows = tr.estimate_flow(centroid, clip)

@@ -83,7 +83,7 @@ show(panels, rows=2)
 # The paper picks σ by hand, 1.45 px in its Figure 10. Here the true one is 1.5 px.
 
 # %%
-widths = (0.6, 1.0, 1.5, 1.8, 2.1)
+widths = (0.6, 1.0, 1.5, 2.1)
 tried = {width: tr.deconvolve(soft["chart"], width).image for width in widths}
 show({f"σ = {width} px": image for width, image in tried.items()}, rows=1, width=2.0)
 

@@ -48,7 +48,7 @@ def show(panels, width=3.2):
 # The app reads the chosen frames and region, checks what is in them, and leaves out duplicates and blank frames.
 
 # %%
-whole = tr.open_frames("../../sample_data/chart.mkv", frames=(0, 40), roi=(0, 96, 256, 96))
+whole = tr.open_frames("../../sample_data/chart.mkv", frames=(0, 30), roi=(76, 96, 180, 96))
 report = tr.check_content(whole)
 source = tr.clean_source(whole, report)
 print(
@@ -101,7 +101,7 @@ print(f"{first.deconvolution.sigma:.2f} and {second.deconvolution.sigma:.2f} px;
 # variation first, then the method itself.
 
 # %%
-part = (slice(0, 96), slice(84, 180))
+part = (slice(0, 96), slice(8, 104))
 filtered, guide = first.filtered.image[part], first.centroid.image[part]
 panels = {"filtered": filtered}
 for factor in (0.7, 1.0, 1.4):
