@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from turbrestore.core.arrays import FloatArray
 
 IMAGES = Path(__file__).parents[1] / "images"
-_GAP, _BAND, _FONT = 6, 26, 16
+_GAP, _BAND, _FONT = 6, 30, 20
 # A band that is readable on light and on dark pages.
 _BACKGROUND, _TEXT = (36, 41, 47), (255, 255, 255)
 

@@ -24,20 +24,20 @@ LARGEST = 150_000
 # The head and the camera of the photographer, and the place whose motion is plotted, row and column.
 DETAIL = (slice(20, 132), slice(72, 184))
 SHOWN_ROW, PLACE = 96, (100, 136)
-_WIDTH, _DPI = 9.2, 100
+_WIDTH, _DPI = 7.6, 120
 
 
 def frames(clip: Clip) -> None:
     """Show three frames, and one row of all of them."""
     shown = {f"frame {number}": clip.frames[number] for number in (10, 25, 40)}
-    save("stage_frames", row(shown | {"row 96 over time": over_time(clip.frames, SHOWN_ROW)}), LARGEST)
+    save("stage_frames", row(shown | {f"row {SHOWN_ROW} over time": over_time(clip.frames, SHOWN_ROW)}), LARGEST)
 
 
 def flow(clip: Clip) -> None:
     """Show reference, frame, the flow between them, and its displacement along x."""
     reference, number = clip.restoration.centroid.image, 25
     found = clip.restoration.centroid.flows[number]
-    figure, axes = plt.subplots(1, 5, figsize=(_WIDTH, 2.3), width_ratios=(1, 1, 1, 1, 0.06))
+    figure, axes = plt.subplots(1, 5, figsize=(_WIDTH, 1.95), width_ratios=(1, 1, 1, 1, 0.06))
     _images(axes, {"reference": reference, f"frame {number}": clip.frames[number], "flow, × 8": reference})
     step = slice(12, None, 20)
     y, x = np.mgrid[: reference.shape[0], : reference.shape[1]][:, step, step]
@@ -74,11 +74,11 @@ def centroid(clip: Clip) -> None:
 def dynamics(clip: Clip) -> None:
     """Plot singular values, eigenvalues, and one step of prediction at one place."""
     model, flows = clip.restoration.dynamics, clip.restoration.centroid.flows
-    figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.7), width_ratios=(1, 1, 1.7))
+    figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.4), width_ratios=(1, 1, 1.7))
     values = model.singular_values[:-1]
     axes[0].semilogy(np.arange(1, len(values) + 1), values, ".-")
-    axes[0].axvline(model.rank + 0.5, color="C1", linestyle="--", label=f"{model.rank} modes kept")
-    axes[0].set(title="singular values of the flows", xlabel="number", ylabel="px")
+    axes[0].axvline(model.rank + 0.5, color="C1", linestyle="--", label=f"{model.rank} kept")
+    axes[0].set(title="singular values", xlabel="number", ylabel="px")
     axes[0].legend()
     circle = np.exp(2j * np.pi * np.linspace(0, 1, 200))
     axes[1].plot(circle.real, circle.imag, color="0.7")
@@ -87,7 +87,7 @@ def dynamics(clip: Clip) -> None:
     measured = flows[:, PLACE[0], PLACE[1], 0]
     predicted = [flow_of(model, model.A @ state)[PLACE[0], PLACE[1], 0] for state in model.states.T[:-1]]
     axes[2].plot(measured, "-", label="measured")
-    axes[2].plot(np.arange(1, len(predicted) + 1), predicted, "--", label="predicted one frame ahead")
+    axes[2].plot(np.arange(1, len(predicted) + 1), predicted, "--", label="predicted")
     axes[2].set(title="displacement of one pixel", xlabel="frame", ylabel="dx, px", ylim=(-3.2, 6))
     axes[2].legend(loc="upper right")
     _save("stage_dynamics", figure)
@@ -97,19 +97,19 @@ def filtering(clip: Clip) -> None:
     """Show centroid and filtered image, and how much each frame counts."""
     filtered = clip.restoration.filtered
     panels = {"centroid": clip.restoration.centroid.image, "filtered": filtered.image}
-    figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.7), width_ratios=(1, 1, 1.5))
+    figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.4), width_ratios=(1, 1, 1.5))
     _images(axes, _details(panels))
     count = len(clip.frames)
     axes[2].bar(np.arange(count), filtered.shares * count)
     axes[2].axhline(1, color="0.4", linewidth=0.8)
-    axes[2].set(title="share of each frame in the image", xlabel="frame", ylabel="relative to the average")
+    axes[2].set(title="share of each frame", xlabel="frame", ylabel="over the average")
     _save("stage_filter", figure)
 
 
 def blur(clip: Clip) -> None:
     """Show the filtered image, the cost of each width, and the transfer function that is found."""
     estimate = clip.restoration.blur
-    figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.7), width_ratios=(1, 1.3, 1.3))
+    figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.4), width_ratios=(1, 1.3, 1.3))
     _images(axes, _details({"filtered": clip.restoration.filtered.image}))
     axes[1].plot(estimate.widths, estimate.costs - estimate.costs.min(), "o-", markersize=4)
     axes[1].axvline(estimate.sigma, color="C1", linestyle="--", label=f"{estimate.sigma:.2f} px")
@@ -119,7 +119,7 @@ def blur(clip: Clip) -> None:
     for label, width, line in (("found", estimate.sigma, "C1-"), ("removed", estimate.removable, "C0--")):
         transfer = blur_otf((1, 400), width, estimate.exponent)[0]
         axes[2].plot(frequency, transfer, line, label=f"{label}, {width:.2f} px")
-    axes[2].set(title="transfer function", xlabel="frequency, cycles a pixel", ylabel="contrast that is left")
+    axes[2].set(title="transfer function", xlabel="cycles a pixel", ylabel="contrast left")
     axes[2].legend()
     _save("stage_blur", figure)
 
@@ -140,7 +140,7 @@ def deconvolution(clip: Clip) -> None:
 def seeing(films: Mapping[float, FloatArray], clip: Clip) -> None:
     """Plot the strength that is measured beside the true one, and show where the clip moves."""
     optics = Optics(pixel_scale=2.75e-6, aperture=0.1, distance=2000.0)
-    figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.8), width_ratios=(1.7, 1, 0.05))
+    figure, axes = plt.subplots(1, 3, figsize=(_WIDTH, 2.5), width_ratios=(1.7, 1, 0.05))
     for strength, film in films.items():
         found = tr.find_centroid(film)
         value = tr.measure_seeing(film, found.flows, found.image, film.mean(axis=0), optics).d_over_r0
@@ -153,7 +153,7 @@ def seeing(films: Mapping[float, FloatArray], clip: Clip) -> None:
     )
     axes[0].legend(loc="upper left")
     motion = np.sqrt(clip.restoration.centroid.flows.var(axis=0).mean(axis=-1))
-    _map(axes[1:], motion, "displacement along an axis", "px rms", "viridis", (0, 2))
+    _map(axes[1:], motion, "displacement", "px rms", "viridis", (0, 2))
     _save("stage_seeing", figure)
 
 
@@ -180,7 +180,7 @@ def style() -> None:
     mpl.use("Agg")
     plt.style.use("tableau-colorblind10")
     plt.rcParams.update(
-        {"figure.dpi": _DPI, "figure.constrained_layout.use": True, "font.size": 10, "axes.titlesize": 11}
+        {"figure.dpi": _DPI, "figure.constrained_layout.use": True, "font.size": 10, "axes.titlesize": 10.5}
     )
 
 
