@@ -37,7 +37,7 @@ def flow(clip: Clip) -> None:
     """Show reference, frame, the flow between them, and its displacement along x."""
     reference, number = clip.restoration.centroid.image, 25
     found = clip.restoration.centroid.flows[number]
-    figure, axes = plt.subplots(1, 5, figsize=(_WIDTH, 1.95), width_ratios=(1, 1, 1, 1, 0.06))
+    figure, axes = plt.subplots(1, 5, figsize=(_WIDTH, 2.15), width_ratios=(1, 1, 1, 1, 0.06))
     _images(axes, {"reference": reference, f"frame {number}": clip.frames[number], "flow, × 8": reference})
     step = slice(12, None, 20)
     y, x = np.mgrid[: reference.shape[0], : reference.shape[1]][:, step, step]
