@@ -24,6 +24,7 @@ extensions = [
 exclude_patterns = [
     "_build",
     "_extensions",
+    "_figures",
     "jupyter_execute",
     "conf.py",
     "make_figures.py",

@@ -1,27 +1,145 @@
-"""Make the picture of the README from the sample clip.
+"""Make the pictures of the README and of the documentation, all from clips that turbrestore synthesizes itself.
 
-Run ``python docs/make_figures.py``.
+Run ``python docs/make_figures.py``; names of groups (``film``, ``gallery``, ``stages``, ``recipes``) make only these.
+
+The photographs come with scikit-image and are in the public domain or under CC0: the photographer by Lav Varshney, the
+cat by Stefan van der Walt, brick and gravel from CC0Textures.  What else is shown is drawn by
+``docs/_figures/scenes.py`` and ``turbrestore.synthesis.scenes``.
 """
 
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
+from _figures import scenes, stages
+from _figures.clips import Clip, clip, film
+from _figures.layout import row, save, save_film
 
 import turbrestore as tr
+from turbrestore.core.arrays import FloatArray
+from turbrestore.synthesis.atmosphere import STRENGTHS
+from turbrestore.synthesis.scenes import picture, printed_words, resolution_chart
 
-ROOT = Path(__file__).parents[1]
-SHOWN_FRAME = 20
+SIDE = 224
+FILM_SIDE, FILM_HEIGHT = 256, 384
+LARGEST_RECIPE, LARGEST_ROW = 120_000, 180_000
+# Name, scene, strength of the air, number of frames, and noise of the camera.
+GALLERY = {
+    "chart": (lambda: resolution_chart(SIDE, SIDE), "weak", 48, 0.005),
+    "words": (lambda: printed_words(SIDE, SIDE), "strong", 60, 0.005),
+    "sign": (lambda: scenes.sign(SIDE, SIDE), "medium", 48, 0.005),
+    "photographer": (lambda: picture("camera", SIDE, SIDE), "medium", 60, 0.005),
+    "cat": (lambda: picture("cat", SIDE, SIDE), "medium", 60, 0.005),
+    "planet": (lambda: scenes.planet(SIDE, SIDE), "medium", 120, 0.03),
+    "street": (lambda: scenes.street(SIDE, SIDE), "weak", 60, 0.005),
+    "gravel": (lambda: picture("gravel", SIDE, SIDE), "strong", 48, 0.005),
+}
+
+
+@cache
+def gallery_clip(name: str) -> Clip:
+    """Clip of the gallery, made once."""
+    scene, strength, count, noise = GALLERY[name]
+    objects = scenes.traffic(SIDE, SIDE) if name == "street" else ()
+    return clip(scene(), strength, count, noise, objects)
+
+
+@cache
+def steadied_street() -> FloatArray:
+    """Frames of the street, steadied."""
+    return np.stack([frame.image for frame in tr.steady_frames(gallery_clip("street").frames)])
+
+
+def make_film() -> None:
+    """Frames of a clip one after the other, beside the image that is restored from them."""
+    frames = film(scenes.street(FILM_SIDE, FILM_SIDE), STRENGTHS["medium"], 60)
+    image = tr.restore(frames).image
+    # Forwards and backwards, so that it has no jump.
+    order = [*range(36), *range(34, 0, -1)]
+    label = f"restored from {len(frames)} frames"
+    pictures = [row({"video through haze": frames[k], label: image}, FILM_HEIGHT) for k in order]
+    save_film("haze", pictures, milliseconds=80, quality=80)
+
+
+def make_gallery() -> None:
+    """Frame, temporal mean, result and truth of every scene, and their PSNR."""
+    print("| scene | frame, dB | temporal mean, dB | restored, dB |\n|---|---:|---:|---:|")
+    for name in GALLERY:
+        shown = gallery_clip(name)
+        panels = {
+            "frame": shown.frame,
+            "temporal mean": shown.restoration.mean,
+            "restored": shown.restoration.image,
+            "truth": shown.truth,
+        }
+        figures = [tr.compare(image, shown.truth).psnr for image in list(panels.values())[:3]]
+        print(f"| {name} | " + " | ".join(f"{value:.1f}" for value in figures) + " |", flush=True)
+        save(f"gallery_{name}", row(panels), LARGEST_ROW)
+
+
+def make_stages() -> None:
+    """One picture for each stage."""
+    stages.style()
+    shown = gallery_clip("photographer")
+    for make in (
+        stages.frames,
+        stages.flow,
+        stages.centroid,
+        stages.dynamics,
+        stages.filtering,
+        stages.blur,
+        stages.deconvolution,
+    ):
+        make(shown)
+    strengths = {STRENGTHS[name]: film(shown.truth, STRENGTHS[name], 40) for name in STRENGTHS}
+    stages.seeing(strengths, shown)
+    stages.steady(gallery_clip("street").frames, steadied_street())
+
+
+def make_recipes() -> None:
+    """Pictures of the recipes of the manual."""
+    street, sign = gallery_clip("street"), gallery_clip("sign")
+    shown = 40
+    road = {
+        "frame": street.frames[shown],
+        "steadied frame": steadied_street()[shown],
+        "still image": street.restoration.image,
+    }
+    save("recipe_road", row(road, 288), LARGEST_RECIPE)
+    text = {"frame": sign.frame, "temporal mean": sign.restoration.mean, "restored": sign.restoration.image}
+    save("recipe_text", row(text, 288), LARGEST_RECIPE)
+    save("recipe_planet", row(planet_from_file(), 288), LARGEST_RECIPE)
+    truth = gallery_clip("photographer").truth
+    strengths = {f"{name}, D/r0 = {ratio:g}": film(truth, ratio, 1)[0] for name, ratio in STRENGTHS.items()}
+    save("recipe_simulate", row({"scene": truth} | strengths), LARGEST_RECIPE)
+
+
+def planet_from_file() -> dict[str, FloatArray]:
+    """Frame and results of a SER file in which a planet is followed, with a width that is estimated and one given."""
+    given = tr.RestoreParams(deconvolution=tr.DeconvolutionParams(sigma=1.2))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "planet.ser"
+        frames = film(scenes.planet(280, 320), STRENGTHS["medium"], 120, noise=0.03)
+        tr.write_video(path, frames, 50, bit_depth=8)
+        source = tr.crop_to_object(tr.open_frames(path))
+        results = {"restored": tr.restore(source).image, "restored, --sigma 1.2": tr.restore(source, given).image}
+        return {"frame": source.read(60, 61)[0]} | results
+
+
+GROUPS = {"film": make_film, "gallery": make_gallery, "stages": make_stages, "recipes": make_recipes}
 
 
 def main() -> None:
-    """Write ``docs/images/before_after.png``: a frame beside the restored image, twice as large."""
-    source = tr.open_frames(ROOT / "sample_data" / "chart.mkv")
-    before = source.read(SHOWN_FRAME, SHOWN_FRAME + 1)[0]
-    after = tr.restore(source).image
-    gap = np.ones((before.shape[0], 8), np.float32)
-    pair = cv2.resize(np.hstack([before, gap, after]), None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
-    tr.write_image(ROOT / "docs" / "images" / "before_after.png", pair, 8, overwrite=True)
+    """Make the groups that the command line names, or all."""
+    begun = time.monotonic()
+    for name in sys.argv[1:] or GROUPS:
+        GROUPS[name]()
+    print(f"{time.monotonic() - begun:.0f} s")
 
 
 if __name__ == "__main__":

@@ -41,12 +41,12 @@ def show(panels, width=3.0):
 
 # %% [markdown]
 # ## Frames
-# Forty frames of a chart, each bent by 2 px along either axis (root mean square), blurred by 1 px and with noise. The
+# Thirty frames of a chart, each bent by 2 px along either axis (root mean square), blurred by 1 px and with noise. The
 # paper takes 200 frames. The mean of the true flows is taken out, so that the centroid has the geometry of the chart
 # and can be compared with it.
 
 # %%
-SIZE, FRAMES = 128, 40
+SIZE, FRAMES = 128, 30
 rng = np.random.default_rng(5)
 scene = resolution_chart(SIZE, SIZE)
 true_flows = smooth_flows(FRAMES, SIZE, SIZE, rng, SmoothFlowParams(rms=2.0, correlation_length=14.0))
@@ -67,8 +67,8 @@ show({f"frame {k}": frames[k] for k in (0, 8, 16, 24)})
 mean = frames.mean(axis=0)
 settings = {
     "registered once": tr.CentroidParams(iterations=1),
-    "centroid, fused": tr.CentroidParams(iterations=10, tolerance=0.0),
-    "centroid, single": tr.CentroidParams(mode="single", iterations=10, tolerance=0.0),
+    "centroid, fused": tr.CentroidParams(iterations=6, tolerance=0.0),
+    "centroid, single": tr.CentroidParams(mode="single", iterations=6, tolerance=0.0),
 }
 centroids = {name: tr.find_centroid(frames, params) for name, params in settings.items()}
 images = {"temporal mean": mean} | {name: centroid.image for name, centroid in centroids.items()}
@@ -109,7 +109,7 @@ left.set(xlabel="iteration", ylabel="mean flow, px", ylim=(0, None))
 left.xaxis.get_major_locator().set_params(integer=True)
 left.legend()
 
-counts = (5, 10, 20, 40)
+counts = (5, 12, 30)
 for label, start in (("temporal mean", None), ("centroid, fused", tr.CentroidParams())):
     quality = []
     for count in counts:
@@ -123,6 +123,6 @@ right.minorticks_off()
 _ = right.legend()
 
 # %% [markdown]
-# The mean flow falls once and then hardly further, some tenths of a pixel from zero. That is the bias of the flow
+# The mean flow falls once and then hardly further, about a tenth of a pixel from zero. That is the bias of the flow
 # method; the iteration stops as soon as the flow no longer shrinks by a fifth, well before the ten iterations that the
 # paper runs. More frames blur the mean further, for they bring other displacements, while the centroid changes little.

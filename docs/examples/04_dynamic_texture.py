@@ -43,12 +43,12 @@ def show(rows, width=2.4):
 # %% [markdown]
 # ## Training flows
 # A chart is seen through phase screens that drift with the wind, 30 times a second. The flows are measured from the
-# centroid of the first 40 frames. The paper has up to 1000 frames; 280 small ones do here.
+# centroid of the first 40 frames. The paper has up to 1000 frames; 200 small ones do here.
 
 # %%
-SIZE, FRAMES, TRAIN = 96, 280, 240
+SIZE, FRAMES, TRAIN = 96, 200, 160
 scene = resolution_chart(SIZE, SIZE)
-air = tr.PhaseScreenParams(d_over_r0=2.0, wind=(0.3,), layers=3, field_spacing=32)
+air = tr.PhaseScreenParams(d_over_r0=2.0, wind=(0.3,), layers=2, field_spacing=48)
 clip = np.stack([frame.image for frame in tr.phase_screen_frames(scene, FRAMES, np.random.default_rng(3), air)])
 centroid = tr.find_centroid(clip[:40]).image
 flows = tr.estimate_flow(centroid, clip)
@@ -63,9 +63,9 @@ print(f"mean length of the flow {np.linalg.norm(flows, axis=-1).mean():.2f} px")
 known = smooth_flows(
     TRAIN, SIZE, SIZE, np.random.default_rng(4), SmoothFlowParams(correlation_length=10, persistence=0.8)
 )
-lengths = (21, 40, 80, 160, 240)
+lengths = (21, 40, 80, 160)
 circle = np.exp(2j * np.pi * np.linspace(0, 1, 200))
-figure, axes = plt.subplots(2, 5, figsize=(11, 4.8), sharex=True, sharey=True)
+figure, axes = plt.subplots(2, 4, figsize=(9, 4.8), sharex=True, sharey=True)
 for row, (name, training) in zip(axes, {"phase screens": flows, "known system": known}.items(), strict=True):
     for ax, length in zip(row, lengths, strict=True):
         values = tr.identify(training[:length], tr.DynamicsParams(rank=20)).eigenvalues
@@ -81,7 +81,7 @@ for ax in axes[1]:
 # %% [markdown]
 # With 21 flows for 20 states the system only repeats them: its eigenvalues are the 21st roots of unity other than 1, as
 # in Figure 7a of the paper. More flows move them inside. Those of the known system gather about the cross, still
-# scattered at τ = 240. Most of those of the phase screens settle near 1, some in pairs off the axis: modes that swing
+# scattered at τ = 160. Most of those of the phase screens settle near 1, some in pairs off the axis: modes that swing
 # while the air drifts by. In the paper they settle at τ = 500 for n = 50.
 
 # %% [markdown]
@@ -109,7 +109,7 @@ print(f"the automatic choice is n = {automatic.rank}, which holds {100 * automat
 
 # %% [markdown]
 # ## One-step prediction
-# The system is identified from the first 240 flows. The prediction bends the centroid by the flow `mean + C A ξ`.
+# The system is identified from the first 160 flows. The prediction bends the centroid by the flow `mean + C A ξ`.
 
 # %%
 dynamics = tr.identify(flows[:TRAIN])
@@ -129,7 +129,7 @@ show(
 
 # %% [markdown]
 # The prediction bends the bars and letters as the frame does, and little is left of the difference, while the centroid
-# differs at every edge. A few pixels among the bars are torn: there the predicted flow folds.
+# differs at every edge.
 
 # %% [markdown]
 # A figure for it: the error of the predicted flow over the 40 frames that were not trained on, one to ten frames ahead.
@@ -156,7 +156,7 @@ _ = ax.legend()
 # %% [markdown]
 # Both predictions are far better than the centroid. One frame ahead, the model does no better than to repeat the last
 # flow, which the paper does not compare with: at 30 frames a second this air moves little in between, and the model
-# loses what its states leave out. From some frames ahead on, the model is better.
+# loses what its states leave out. A few frames ahead the model is better, until both have lost most of what they knew.
 
 # %% [markdown]
 # ## Synthesis
@@ -164,7 +164,7 @@ _ = ax.legend()
 # frames of a row are eight apart.
 
 # %%
-simulated = tr.simulate(dynamics, 300, np.random.default_rng(7))
+simulated = tr.simulate(dynamics, 200, np.random.default_rng(7))
 numbers = (0, 8, 16, 24, 32)
 show(
     [
@@ -196,6 +196,6 @@ for ax in (left, right):
     ax.legend()
 
 # %% [markdown]
-# The synthesized motion is nearly as strong and forgets as fast, for a third of a second. Beyond that the two curves
-# part, which eight seconds of one draw of the air do not decide. The clip has a fast jitter that the simulation lacks:
+# The synthesized motion is about as strong and forgets as fast, for a third of a second. Beyond that the two curves
+# part, which five seconds of one draw of the air do not decide. The clip has a fast jitter that the simulation lacks:
 # the part of the measured flow outside the states. `turbrestore.synthesize_like` puts it back.

@@ -30,11 +30,11 @@ plt.rcParams.update({"figure.dpi": 80, "figure.constrained_layout.use": True, "f
 
 # %% [markdown]
 # ## A clip, its centroid and the model of its flow
-# Sixty frames of a picture; some are sharper than others, as frames of turbulent air are. The first 24 train. The paper
+# 48 frames of a picture; some are sharper than others, as frames of turbulent air are. The first 24 train. The paper
 # trains on 100 frames and filters 400.
 
 # %%
-SIZE, FRAMES, TRAIN = 112, 60, 24
+SIZE, FRAMES, TRAIN = 112, 48, 24
 rng = np.random.default_rng(8)
 scene = picture("camera", SIZE, SIZE)
 true_flows = smooth_flows(FRAMES, SIZE, SIZE, rng, SmoothFlowParams(rms=1.8, correlation_length=12))
@@ -50,11 +50,11 @@ print(f"{dynamics.rank} states hold {100 * dynamics.energy_share:.0f} % of the v
 
 # %% [markdown]
 # ## Through the frames
-# The filter runs over the first 24, 32, 44 and 60 frames. `keep` adds to the flow of the model the share of the
+# The filter runs over the first 24, 36 and 48 frames. `keep` adds to the flow of the model the share of the
 # residual that is motion; `drop` is the paper as printed, `flow = C ξ`.
 
 # %%
-counts = (24, 32, 44, 60)
+counts = (24, 36, 48)
 variants = {
     "keep": tr.FilterParams(),
     "keep, all frames alike": tr.FilterParams(sharpness=0.0),
@@ -79,9 +79,9 @@ for name, run in runs.items():
 _ = ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 # %% [markdown]
-# With the residual kept, the filter gains from further frames and ends far above the centroid. Most of that comes from
-# sharp frames, which it prefers; with all frames alike it stays a little above the centroid. With the residual dropped
-# it ends below the centroid it starts from, and more frames make it worse: the motion that is left out blurs them.
+# With the residual kept, the filter ends far above the centroid. That comes from sharp frames, which it prefers; with
+# all frames alike it stays where the centroid is. With the residual dropped it ends below the centroid it starts from,
+# and more frames make it worse: the motion that is left out blurs them.
 
 # %%
 panels = {

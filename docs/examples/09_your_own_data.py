@@ -135,17 +135,16 @@ show(
 # %% [markdown]
 # ## Parts of a video, and arrays
 # A range of frames and a rectangle are chosen when a file is opened, and nothing else is decoded. Arrays need no file:
-# integers are scaled by the range of their type.
+# integers are scaled by the range of their type, and `tr.restore(array)` takes them as it takes a file.
 
 # %%
 part = tr.open_frames(folder / "clip.tif", frames=(4, 24, 2), roi=(16, 8, 72, 72))
 array = (frames * 65535).round().astype(np.uint16)
-print(f"part: {part.shape}; array: {array.dtype} {array.shape}")
+print(f"part: {part.shape}; array: {array.dtype} {tr.FrameSource.from_array(array).shape}")
 show(
     {
         "first frame of the part": stretch(next(iter(part))),
         "restored part": stretch(tr.restore(part).image),
-        "restored array": stretch(tr.restore(array).image),
     }
 )
 
