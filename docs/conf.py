@@ -25,6 +25,7 @@ exclude_patterns = [
     "_build",
     "_extensions",
     "_figures",
+    "_templates",
     "jupyter_execute",
     "conf.py",
     "make_figures.py",
@@ -63,12 +64,11 @@ html_static_path = ["_static"]
 html_css_files = ["turbrestore.css"]
 html_title = "turbrestore"
 html_show_sourcelink = False
-# Pages without subpages need no list of them.
-_SINGLE = "index getting_started command_line report limits memory device robustness interruptions"
-html_sidebars = {name: [] for name in _SINGLE.split()}
+# Every page shows the whole table of contents, with its captions.
+html_sidebars = {"**": ["manual.html"]}
+templates_path = ["_templates"]
 html_theme_options = {
-    "navbar_align": "left",
-    "header_links_before_dropdown": 8,
+    "navbar_center": [],
     "show_toc_level": 2,
     "navigation_with_keys": False,
     "footer_start": ["copyright"],

@@ -3,7 +3,7 @@
 ``<!-- command-line -->`` becomes a section for every command, taken from the application itself; ``<!-- gallery -->``
 becomes a list of the notebooks in ``examples/``, with the first paragraph of each; ``<!-- api: centroid flow -->``
 becomes the reference of all public names that these modules define, and ``<!-- api-table -->`` a table of all of them.
-Links to the tables in ``benchmarks/``, which are not pages of the site, become links to copies of these files.
+Links to modules and to tables of ``benchmarks/``, which are not pages of the site, become links to copies of them.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 DOCS = Path(__file__).parents[1]
 EXAMPLES_FOLDER = DOCS / "examples"
-BENCHMARKS = re.compile(r"\]\((?=(?:\.\./)+benchmarks/[\w/]+\.md\))")
+COPIED = re.compile(r"\]\((?=(?:\.\./)+(?:benchmarks/[\w/]+\.md|turbrestore/[\w/]+\.py)\))")
 API_MARK = re.compile(r"<!-- api: ([\w. ]+) -->")
 KINDS = {bool: "", int: "INT", float: "NUMBER", str: "TEXT", Path: "PATH"}
 
 
 def fill(app: Sphinx, name: str, source: list[str]) -> None:
-    """Replace the marks of a page that is being read, and its links to benchmarks."""
-    source[0] = BENCHMARKS.sub("](path:", filled(source[0]))
+    """Replace the marks of a page that is being read, and its links to files that are copied."""
+    source[0] = COPIED.sub("](path:", filled(source[0]))
 
 
 def filled(text: str) -> str:
