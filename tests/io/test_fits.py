@@ -314,12 +314,12 @@ def test_the_pattern_of_a_header_agrees_with_ser(written, tmp_path):
 @pytest.mark.parametrize("height", [8, 9])
 def test_offsets_and_rows_from_the_bottom_up_shift_the_pattern(written, height):
     sensor = mosaic_of("RGGB", (2, 13, 14), np.uint8)
-    read = {
-        "offsets": open_frames(written(sensor[:, 3:11, 5:], XBAYROFF=5, YBAYROFF=3, BAYERPAT="RGGB")),
-        "bottom up": open_frames(written(sensor[:, :height][:, ::-1], ROWORDER="BOTTOM-UP", BAYERPAT="RGGB")),
+    shifted = {
+        "offsets": (sensor[:, 3:11, 5:], {"XBAYROFF": 5, "YBAYROFF": 3}),
+        "bottom up": (sensor[:, :height][:, ::-1], {"ROWORDER": "BOTTOM-UP"}),
     }
-    for source in read.values():
-        inner = source.select(roi=(2, 2, 4, 4)).read() * 255
+    for mosaic, cards in shifted.values():
+        inner = open_frames(written(mosaic, BAYERPAT="RGGB", **cards), roi=(2, 2, 4, 4)).read() * 255
         np.testing.assert_allclose(inner, np.broadcast_to([200, 120, 30], (2, 4, 4, 3)), atol=0.01)
 
 

@@ -22,6 +22,7 @@ from ..core.arrays import CHANNELS, FloatArray
 from ..core.errors import DataError
 from ..runtime.scratch import iter_parts, new_stack
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
+from .mapped import MappedFrames
 from .output import atomic_output, frames_of_one_size
 from .pixels import from_unit_to_type
 from .source import FrameSource
@@ -119,7 +120,7 @@ def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     other more than its rows do.  A warning says how such an array was read.
     """
     array, order = _frames_first(path, map_npy(path))
-    source = FrameSource.from_array(array, path.name)
+    source = dataclasses.replace(FrameSource.from_array(array, path.name), pixels=MappedFrames.of(array))
     limits.check_size(source.shape[2], source.shape[1], str(path))
     limits.check_count(len(source), str(path))
     remark = (f"its axes are taken for {order}; save it as (T, H, W) or (T, H, W, 3) if that is wrong",)
