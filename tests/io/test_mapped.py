@@ -8,7 +8,7 @@ import pytest
 from astropy.io import fits
 
 from turbrestore.core.errors import DataError, InputNotFoundError
-from turbrestore.io.mapped import MappedFrames
+from turbrestore.io.npy import MappedFrames
 from turbrestore.io.video import open_frames, write_video
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (5, 200, 210), np.uint8)

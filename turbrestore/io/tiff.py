@@ -24,7 +24,7 @@ from ..core.arrays import FloatArray
 from ..core.errors import DataError
 from ..runtime.jit import jit
 from .limits import DEFAULT_LIMITS, Limits, first_line, format_errors, input_errors
-from .mapped import MappedFrames
+from .npy import MappedFrames
 from .output import atomic_output, frames_of_one_size
 from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, upright
 from .source import FrameSource

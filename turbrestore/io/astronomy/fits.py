@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from ...core.errors import DataError
 from ...runtime.scratch import iter_frames
 from ..limits import DEFAULT_LIMITS, Limits
-from ..mapped import MappedFrames
+from ..npy import MappedFrames
 from ..pixels import FLOAT_MARGIN, PixelArray, demosaic, depth_of, full_scale_of
 from ..source import FrameSource
 from .fits_header import FitsImage, find_image
