@@ -117,7 +117,7 @@ def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
 class MappedFrames:
     """Where the frames of a video lie in a file; called with numbers of frames, it yields them.
 
-    A mapped array travels to another process as all its bytes; this travels as the name of the file and the place in it.
+    A mapped array travels to another process as all its bytes; this travels as the name of the file and a place in it.
 
     Attributes
     ----------
