@@ -21,6 +21,7 @@ from turbrestore.settings import Preset, RestoreParams
 
 from .batch_plan import JOURNAL, TABLE, figures, find_clips, journal_line, key_of, name_outputs, plan, write_summary
 from .cluster import check_cluster, connected
+from .inputs import with_absolute_paths
 from .options import Flag, Machine, Selection, known_sigma
 from .output import print_json
 from .progress import progress_bars, say
@@ -103,6 +104,8 @@ def batch(
     count = 1 if scheduler else processes(len(clips), memory_limit, workers)
     each = MemorySize(memory_limit / count) if memory_limit is not None else None
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
+    # A worker of another machine has another folder to work in.
+    selection, settings = with_absolute_paths(selection, settings)
     shared = Machine(machine.threads or max(1, available_cores() // count), machine.device)
     orders = [
         Order(

@@ -19,6 +19,7 @@ from turbrestore.io.tiff import TIFF_SUFFIXES
 from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
 from turbrestore.runs.stage_files import load_guide, load_stage_image
+from turbrestore.settings import RestoreParams
 
 from .options import Selection
 from .progress import say
@@ -59,6 +60,15 @@ def files_read(selection: Selection, *named: Path | None, static_mask: str = "au
     calibration = (None if name is None else Path(name) for name in (selection.dark, selection.flat))
     mask = None if static_mask in ("auto", "off") else Path(static_mask)
     return [path for path in (*named, *calibration, mask) if path is not None]
+
+
+def with_absolute_paths(selection: Selection, params: RestoreParams) -> tuple[Selection, RestoreParams]:
+    """Make the paths that settings name independent of the folder that a process works in."""
+    dark, flat = (None if name is None else str(Path(name).absolute()) for name in (selection.dark, selection.flat))
+    mask = params.static_mask
+    if mask not in ("auto", "off"):
+        mask = str(Path(mask).absolute())
+    return dataclasses.replace(selection, dark=dark, flat=flat), dataclasses.replace(params, static_mask=mask)
 
 
 def frames_to_train(source: FrameSource, selection: Selection, train: int | None) -> int:

@@ -19,7 +19,7 @@ from turbrestore import __version__
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import OutputError
 from turbrestore.io.astronomy.fits_header import is_fits
-from turbrestore.io.astronomy.fits_output import write_fits
+from turbrestore.io.astronomy.fits_output import FITS_OUTPUT_SUFFIX, write_fits
 from turbrestore.io.images import write_image
 from turbrestore.io.output import atomic_write, check_output
 from turbrestore.io.source import FrameSource
@@ -29,6 +29,7 @@ from turbrestore.runs.folder_lock import LOCK
 from turbrestore.runs.run_files import REPORT, RUN_FILES, read_stages
 from turbrestore.runs.run_folder import CHECKPOINT, RunFolder, is_part
 from turbrestore.runs.run_record import RunRecord
+from turbrestore.runs.stage_files import save_flows
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.scratch import iter_frames
 from turbrestore.settings import PRESETS, Preset, RestoreParams
@@ -39,6 +40,7 @@ from .streams import put
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+FLOW_FILE = (".npy", FITS_OUTPUT_SUFFIX)
 _IMAGES = ("frame", "mean", "centroid", "filtered", "deconvolved")
 
 
@@ -137,6 +139,21 @@ def write_result(
         origin=(columns.start + x, rows.start + y),
         uncertainty=restoration.uncertainty,
     )
+
+
+def write_flows(
+    path: Path, flows: FloatArray, image: FloatArray, source: FrameSource, reference: Path, overwrite: bool
+) -> None:
+    """Write the flows from an image to the frames of a video; a FITS file also has the image and the header."""
+    if not is_fits(path):
+        save_flows(path, flows, overwrite)
+        return
+    command = shlex.join(("turbrestore", "flow", str(reference), str(source.path), str(path)))
+    meaning = "FLOW: displacements (dx, dy) from the image to each frame, pixels; dy along the rows as they are stored"
+    history = [f"turbrestore {__version__}: {command}", *source.warnings, meaning]
+    rows, columns = source.window
+    origin = (columns.start, rows.start)
+    write_fits(path, image, 32, overwrite, header=source.header, history=history, origin=origin, flows=flows)
 
 
 def check_distinct(outputs: Iterable[Path]) -> None:

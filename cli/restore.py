@@ -199,7 +199,9 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     runtime = dataclasses.replace(order.machine.runtime(order.process_limit, order.keep), tile=order.tile)
     if order.truth is not None:
         comparable(read_input_image(order.truth, order.selection.limits()), "truth")
-    source = open_input(order.input, order.selection, order.quiet)
+    # A worker of another machine has another folder to work in.
+    place = order.input if order.scheduler is None else order.input.absolute()
+    source = open_input(place, order.selection, order.quiet)
     if order.truth is not None:
         comparable(source.read(0, 1)[0], source.name)
     check_room(source, order.params, runtime, order.output, order.keep)

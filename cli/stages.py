@@ -26,12 +26,12 @@ from turbrestore.registration.centroid import Centroid, CentroidParams, centroid
 from turbrestore.registration.flow import FlowParams, estimate_flow, iterate_flows
 from turbrestore.registration.flow_algebra import invert_flow
 from turbrestore.registration.warp import warp
-from turbrestore.runs.stage_files import load_artifact, load_flows, save_artifact, save_flows
+from turbrestore.runs.stage_files import load_artifact, load_flows, save_artifact
 from turbrestore.runtime.steps import finish, step_counter
 
 from .inputs import files_read, frames_to_train, open_input, read_guide, read_input_image
 from .options import Flag, Machine, Selection, known_sigma, limits_of
-from .output import print_json, write_figure
+from .output import FLOW_FILE, print_json, write_figure, write_flows
 from .progress import progress_bars, say
 
 STAGE_FILE, PICTURE = (".npz",), (".png",)
@@ -102,7 +102,8 @@ def flow(
     input : Path
         Video.
     output : Path
-        Flows to write, .npy of shape (T, H, W, 2), pixels.
+        Flows to write, pixels: .npy of shape (T, H, W, 2), or .fits with the reference as its image and the extension
+        FLOW of shape (T, 2, H, W).
     flow : FlowParams
         Optical flow.
     overwrite : bool
@@ -110,7 +111,7 @@ def flow(
     quiet : bool
         Print neither progress nor remarks.
     """
-    check_output(output, files_read(selection, reference, input), overwrite, (".npy",))
+    check_output(output, files_read(selection, reference, input), overwrite, FLOW_FILE)
     image = read_input_image(reference, selection.limits())
     source = open_input(input, selection, quiet)
     check_space(output, _flow_bytes(len(source), source.shape))
@@ -120,7 +121,7 @@ def flow(
         for measured, (_, found) in zip(flows, iterate_flows(image, source, flow, machine.runtime()), strict=True):
             measured[...] = found
             count(found)
-    save_flows(output, flows, overwrite)
+    write_flows(output, flows, image, source, reference, overwrite)
     say(f"{output}: {len(flows)} flows, root mean square {float(np.sqrt(np.mean(flows**2))):.2f} pixels", quiet)
 
 

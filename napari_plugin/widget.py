@@ -21,19 +21,21 @@ from turbrestore.settings import RestoreParams
 from .reader import PATH, LayerData
 
 if TYPE_CHECKING:
-    from napari.layers import Image
-    from napari.qt.threading import FunctionWorker
-    from napari.types import LayerDataTuple
+    import napari
+    import napari.layers
+    import napari.qt.threading
+    import napari.types
 
 # Arrows along the longer side of a frame.
 _ARROWS = 40
 
 
+# The window resolves annotations by importing the first part of their names.
 def restore_layer(
-    clip: Image,
+    clip: napari.layers.Image,
     remove_blur: bool = True,
     keep_best: Annotated[float, {"min": 0.05, "max": 1.0, "step": 0.05}] = 1.0,
-) -> FunctionWorker[list[LayerDataTuple]]:
+) -> napari.qt.threading.FunctionWorker[list[napari.types.LayerDataTuple]]:
     """Restore the clip of a layer in another thread.
 
     Parameters
@@ -52,6 +54,7 @@ def restore_layer(
     """
     from napari.qt.threading import create_worker
     from napari.utils.notifications import show_error
+    from qtpy.QtCore import QTimer
 
     if clip is None:
         raise DataError("restore: expected a layer with a clip, found none; open one first")
@@ -65,10 +68,13 @@ def restore_layer(
             show_error(str(error))
             return []
 
-    return create_worker(work, _start_thread=False)
+    worker = create_worker(work, _start_thread=False)
+    # The window asks for the layers only after this function has returned.
+    QTimer.singleShot(0, worker.start)
+    return worker
 
 
-def clip_of(layer: Image) -> FrameSource:
+def clip_of(layer: napari.layers.Image) -> FrameSource:
     """Return the frames of a layer: those of the file that it shows, or its array.
 
     Raises

@@ -82,7 +82,7 @@ def test_the_manifest_names_what_there_is():
 @needs_napari
 def test_without_a_window(clip, monkeypatch, request):
     monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")
-    request.getfixturevalue("qapp")
+    qtbot = request.getfixturevalue("qtbot")
     from napari.components import ViewerModel
     from napari.layers import Layer
     from npe2 import PluginManager
@@ -92,7 +92,7 @@ def test_without_a_window(clip, monkeypatch, request):
     (layer,) = viewer.open(str(clip), plugin="turbrestore")
     worker, added = restore_layer(layer, remove_blur=False), []
     worker.returned.connect(added.extend)
-    worker.run()
+    qtbot.waitUntil(lambda: len(added) > 0, timeout=60_000)
     layers = [viewer.add_layer(Layer.create(*data)) for data in added]
     assert [layer.name for layer in layers] == [f"clip, {name}" for name in ("uncertainty", "motion", "restored")]
     expected = restore(open_frames(clip), RestoreParams(until="filter")).image
@@ -105,7 +105,8 @@ def test_in_the_window(clip, monkeypatch, request):
     qtbot = request.getfixturevalue("qtbot")
     from qtpy.QtGui import QOpenGLContext
 
-    # The offscreen platform of Qt draws with OpenGL only where the system has a driver for it.
+    # The offscreen platform of Qt draws with OpenGL only where the system has a driver for it, and an X server, such as
+    # that of xvfb-run.
     if not QOpenGLContext().create():
         pytest.skip("Qt has no OpenGL here, which the window of napari draws with")
     viewer = request.getfixturevalue("make_napari_viewer")()

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -24,8 +25,10 @@ from turbrestore.report.batch_page import ClipRow, render_batch
 from turbrestore.runtime.runtime import Runtime
 from turbrestore_cli import batch as command
 from turbrestore_cli import cluster
+from turbrestore_cli import restore as command_restore
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.batch_plan import find_clips, journal_line, name_outputs, read_journal
+from turbrestore_cli.inputs import open_input
 from turbrestore_cli.options import Machine
 
 QUICK = ["--centroid.iterations", "1", "--filter.inner-iterations", "1", "--sigma", "1", "--threads", "1"]
@@ -199,6 +202,26 @@ class TestBatch:
         assert main(["restore", str(words[0]), str(out / "0.png"), "--static-mask", str(out / "0.png")]) == 73
         assert (out / "0.png").read_bytes() == given
 
+    def test_paths_of_settings_hold_where_the_worker_has_another_folder(self, run, clips, tmp_path, monkeypatch):
+        (tmp_path / "elsewhere").mkdir()
+        (tmp_path / "0.mkv").write_bytes((clips / "0.mkv").read_bytes())
+        for name, level in (("dark", 0.02), ("flat", 0.5), ("mask", np.arange(64) < 6)):
+            write_image(tmp_path / f"{name}.png", np.full((64, 64), level, np.float32), 8)
+        real = command.work
+
+        def elsewhere(order):
+            os.chdir(tmp_path / "elsewhere")
+            return real(order)
+
+        monkeypatch.setattr(command, "work", elsewhere)
+        words = ["--dark", "dark.png", "--flat", "flat.png", "--static-mask", "mask.png"]
+        for more, count in (([], "1 of 1: "), (["--resume"], "")):
+            monkeypatch.chdir(tmp_path)
+            code, _, err = run("0.mkv", "--out", tmp_path / "out", *words, *more)
+            assert code == 0 and count in err, err
+        assert "1 of 1: " not in err
+        assert tomllib.loads((tmp_path / "out" / "0.png.toml").read_text())["dark"] == str(tmp_path / "dark.png")
+
     def test_reasons(self, monkeypatch, clips):
         monkeypatch.setattr(command, "restore_clip", lambda order: (_ for _ in ()).throw(MemoryError))
         monkeypatch.setattr(command, "key_of", lambda order: "")
@@ -234,18 +257,25 @@ class TestTiles:
 
     WORDS = ("--until", "filter", "--centroid.iterations", "1", "--filter.inner-iterations", "1", "--threads", "1")
 
-    def test_tiles_are_the_same_bytes_in_other_processes(self, scheduler, tmp_path, capsys):
+    def test_tiles_are_the_same_bytes_in_other_processes(self, scheduler, tmp_path, capsys, monkeypatch):
         frames = make_sequence(seed=3, count=3, size=448, rms=0.8).frames[:, 100:180]
         write_video(tmp_path / "a.npy", frames, 25)
+        opened = []
+        monkeypatch.setattr(
+            command_restore, "open_input", lambda path, *rest: opened.append(path) or open_input(path, *rest)
+        )
+        monkeypatch.chdir(tmp_path)
         for name, words in {
             "here": ["--tile", "384"],
             "there": ["--tile", "384", "--scheduler", scheduler],
             "one": ["--scheduler", scheduler],
         }.items():
-            assert main(["restore", str(tmp_path / "a.npy"), str(tmp_path / f"{name}.png"), *self.WORDS, *words]) == 0
+            assert main(["restore", "a.npy", str(tmp_path / f"{name}.png"), *self.WORDS, *words]) == 0
         found = contents(tmp_path)
         assert found["here.png"] == found["there.png"] and found["here.png"] != found["one.png"]
         assert found["here.png.toml"] == found["there.png.toml"] and b"tile = 384" in found["there.png.toml"]
+        # A worker may have another folder to work in.
+        assert opened[1] == tmp_path / "a.npy"
         assert "frames of 448×80 are one tile" in capsys.readouterr().err
 
     def test_usage(self, clips, tmp_path, capsys):

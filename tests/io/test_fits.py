@@ -283,6 +283,27 @@ def test_restore_gives_the_bytes_of_the_array(sequence, tmp_path, written, capsy
         assert importlib.util.find_spec("astropy") and np.all(file["UNCERT"].data > 0)
 
 
+def test_flows_stand_behind_the_image_that_they_begin_at(sequence, tmp_path, written):
+    data = np.uint16(np.clip(sequence.frames[:3, :48, :64], 0, 1) * 65535)
+    clip = written(data, OBJECT="Chart", CRPIX1=10.0)
+    write_image(tmp_path / "still.fits", data[0, 2:42, 4:] / np.float32(65535))
+    words = ["flow", str(tmp_path / "still.fits"), str(clip), "--roi", "4,2,60,40", "--quiet", "--threads", "1"]
+    for name in ("flows.npy", "flows.fits"):
+        assert main([*words[:3], str(tmp_path / name), *words[3:]]) == 0
+    flows = np.load(tmp_path / "flows.npy")
+    with fits.open(tmp_path / "flows.fits") as file:
+        assert [image.name for image in file] == ["PRIMARY", "FLOW"]
+        assert (file[0].header["OBJECT"], file[0].header["CRPIX1"], file["FLOW"].header["BUNIT"]) == (
+            "Chart",
+            6,
+            "pixel",
+        )
+        assert "turbrestore flow" in "".join(file[0].header["HISTORY"])
+        np.testing.assert_allclose(file[0].data, data[0, 2:42, 4:] / 65535, atol=1e-6)
+        assert flows.shape == (3, 40, 60, 2) and np.abs(flows[1]).max() > 0.1
+        np.testing.assert_array_equal(np.moveaxis(file["FLOW"].data, 1, -1), flows)
+
+
 def mosaic_of(pattern, shape, kind):
     level = {"R": 200, "G": 120, "B": 30}
     mosaic = np.empty(shape, kind)
@@ -314,12 +335,12 @@ def test_the_pattern_of_a_header_agrees_with_ser(written, tmp_path):
 @pytest.mark.parametrize("height", [8, 9])
 def test_offsets_and_rows_from_the_bottom_up_shift_the_pattern(written, height):
     sensor = mosaic_of("RGGB", (2, 13, 14), np.uint8)
-    read = {
-        "offsets": open_frames(written(sensor[:, 3:11, 5:], XBAYROFF=5, YBAYROFF=3, BAYERPAT="RGGB")),
-        "bottom up": open_frames(written(sensor[:, :height][:, ::-1], ROWORDER="BOTTOM-UP", BAYERPAT="RGGB")),
+    shifted = {
+        "offsets": (sensor[:, 3:11, 5:], {"XBAYROFF": 5, "YBAYROFF": 3}),
+        "bottom up": (sensor[:, :height][:, ::-1], {"ROWORDER": "BOTTOM-UP"}),
     }
-    for source in read.values():
-        inner = source.select(roi=(2, 2, 4, 4)).read() * 255
+    for mosaic, cards in shifted.values():
+        inner = open_frames(written(mosaic, BAYERPAT="RGGB", **cards), roi=(2, 2, 4, 4)).read() * 255
         np.testing.assert_allclose(inner, np.broadcast_to([200, 120, 30], (2, 4, 4, 3)), atol=0.01)
 
 

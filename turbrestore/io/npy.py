@@ -11,7 +11,8 @@ import dataclasses
 import math
 import os
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -112,6 +113,67 @@ def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
                     np.lib.format.write_array(member, array, allow_pickle=False)
 
 
+@dataclass(frozen=True)
+class MappedFrames:
+    """Where the frames of a video lie in a file; called with numbers of frames, it yields them.
+
+    A mapped array travels to another process as all its bytes; this travels as the name of the file and a place in it.
+
+    Attributes
+    ----------
+    path : Path
+        Absolute.
+    start : int
+        Place of the first number, bytes.
+    shape, strides : tuple of int
+        Of all frames; strides in bytes.
+    dtype : dtype
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     np.save(folder + "/a.npy", np.arange(12).reshape(2, 3, 2))
+    ...     frames = MappedFrames.of(np.moveaxis(np.load(folder + "/a.npy", mmap_mode="r"), 2, 0))
+    ...     frames.shape, [frame.tolist() for frame in frames([1])]
+    ((2, 2, 3), [[[1, 3, 5], [7, 9, 11]]])
+    """
+
+    path: Path
+    start: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    @staticmethod
+    def of(array: NDArray[Any]) -> MappedFrames:
+        """Return the frames along the first axis of a mapped file, or of a view of one."""
+        whole = array
+        while isinstance(whole.base, np.memmap):
+            whole = whole.base
+        assert isinstance(whole, np.memmap)
+        start = whole.offset + array.__array_interface__["data"][0] - whole.__array_interface__["data"][0]
+        return MappedFrames(Path(str(whole.filename)), start, array.shape, array.strides, array.dtype)
+
+    def __call__(self, chosen: Sequence[int]) -> Iterator[NDArray[Any]]:
+        """Map one frame after the other.
+
+        Raises
+        ------
+        InputNotFoundError, StorageError
+            The file has gone, or cannot be read.
+        DataError
+            The file has become shorter.
+        """
+        shape, strides = self.shape[1:], self.strides[1:]
+        last = sum((length - 1) * stride for length, stride in zip(shape, strides, strict=True))
+        for number in chosen:
+            place = self.start + number * self.strides[0]
+            with input_errors(self.path), format_errors(self.path, "the file has changed"):
+                piece = np.memmap(self.path, np.uint8, "r", place, (last + self.dtype.itemsize,))
+            yield np.ndarray(shape, self.dtype, piece, strides=strides)
+
+
 def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     """Open an array of shape (T, H, W) or (T, H, W, 3) as a video; the errors are those of :func:`map_npy`.
 
@@ -119,7 +181,7 @@ def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     other more than its rows do.  A warning says how such an array was read.
     """
     array, order = _frames_first(path, map_npy(path))
-    source = FrameSource.from_array(array, path.name)
+    source = dataclasses.replace(FrameSource.from_array(array, path.name), pixels=MappedFrames.of(array))
     limits.check_size(source.shape[2], source.shape[1], str(path))
     limits.check_count(len(source), str(path))
     remark = (f"its axes are taken for {order}; save it as (T, H, W) or (T, H, W, 3) if that is wrong",)

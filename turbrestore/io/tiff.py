@@ -24,6 +24,7 @@ from ..core.arrays import FloatArray
 from ..core.errors import DataError
 from ..runtime.jit import jit
 from .limits import DEFAULT_LIMITS, Limits, first_line, format_errors, input_errors
+from .npy import MappedFrames
 from .output import atomic_output, frames_of_one_size
 from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, upright
 from .source import FrameSource
@@ -242,7 +243,7 @@ def _packed_stack(path: Path, tiff: tifffile.TiffFile) -> FrameSource | None:
     if series.axes in ("TCYX", "ZCYX") and series.shape[1] == 3:
         array = np.moveaxis(array, 1, -1)
     source = FrameSource.from_array(array, path.name)
-    return dataclasses.replace(source, format=f"tiff/{series.dtype}", path=path)
+    return dataclasses.replace(source, format=f"tiff/{series.dtype}", path=path, pixels=MappedFrames.of(array))
 
 
 def _is_decodable(page: tifffile.TiffPage) -> bool:

@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from ...core.errors import DataError
 from ...runtime.scratch import iter_frames
 from ..limits import DEFAULT_LIMITS, Limits
+from ..npy import MappedFrames
 from ..pixels import FLOAT_MARGIN, PixelArray, demosaic, depth_of, full_scale_of
 from ..source import FrameSource
 from .fits_header import FitsImage, find_image
@@ -100,8 +101,10 @@ def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, sin
     limits.check_count(len(frames), str(path))
     levels, notes = _levels(image, iter_frames(frames))
 
+    read = MappedFrames.of(frames) if isinstance(frames, np.memmap) else lambda chosen: (frames[n] for n in chosen)
+
     def pixels(chosen: Sequence[int]) -> Iterator[PixelArray]:
-        return (levels.pixels(frame, image) for frame in iter_frames(frames[number] for number in chosen))
+        return (levels.pixels(frame, image) for frame in iter_frames(read(chosen)))
 
     return _source(image, levels, frames.shape, pixels, notes)
 

@@ -40,6 +40,7 @@ def write_fits(
     history: Iterable[str] = (),
     origin: tuple[int, int] = (0, 0),
     uncertainty: FloatArray | None = None,
+    flows: FloatArray | None = None,
 ) -> None:
     """Write an image as FITS; the same image and header give the same bytes.
 
@@ -62,6 +63,8 @@ def write_fits(
         x and y of the image in the frames of the input; CRPIX1 and CRPIX2 move by them.
     uncertainty : ndarray, float32, shape (H, W), optional
         Standard deviation of every pixel, stored as the extension ``UNCERT``.
+    flows : ndarray, float32, shape (T, H, W, 2), optional
+        Displacements (dx, dy) from the image to frames, pixels, stored as the extension ``FLOW`` of shape (T, 2, H, W).
 
     Raises
     ------
@@ -87,7 +90,7 @@ def write_fits(
     check_output(path, overwrite=overwrite, suffixes=(FITS_OUTPUT_SUFFIX,))
     fits = astropy_fits()
     pixels = from_unit_to_type(check_image(image, "image"), check_depth(32 if bit_depth is None else bit_depth))
-    check_space(path, pixels.nbytes + (0 if uncertainty is None else uncertainty.nbytes))
+    check_space(path, pixels.nbytes + sum(array.nbytes for array in (uncertainty, flows) if array is not None))
     with warnings.catch_warnings():
         # Cards of the input that break rules are written as they are, or repaired.
         warnings.simplefilter("ignore")
@@ -96,6 +99,9 @@ def write_fits(
             images[0].header.add_history(_ascii(line))
         if uncertainty is not None:
             images.append(fits.ImageHDU(uncertainty.astype(np.float32), name="UNCERT"))
+        if flows is not None:
+            images.append(fits.ImageHDU(np.moveaxis(flows, -1, 1).astype(np.float32), name="FLOW"))
+            images[-1].header["BUNIT"] = "pixel"
         with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
             fits.HDUList(images).writeto(file, output_verify="silentfix+ignore")
 
