@@ -113,6 +113,7 @@ def summary(output: Path, restoration: Restoration) -> str:
     if restoration.deconvolution is not None:
         sigma = restoration.deconvolution.sigma
         words.append(f"blur of {sigma:.2f} pixels removed" if sigma > 0 else "no blur removed")
+    words += [f"{one.choice}: {one.reason}" for one in restoration.decisions if one.subject == "structure"]
     return ", ".join(words)
 
 

@@ -11,7 +11,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from .core.arrays import FloatArray
+from .blind.structure import StructureReading, compare_structure
+from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
 from .core.noise import estimate_noise
 from .dynamics.dynamic_texture import identify
@@ -23,6 +24,9 @@ from .io.source import FrameSource
 from .memory_plan import MemoryPlan
 from .preparation import Prepared, seeing_of_picture
 from .registration.centroid import Centroid, centroid_steps
+from .registration.flow_algebra import invert_flow
+from .registration.recentring import recentring_flow
+from .registration.warp import warp
 from .results import Store
 from .runtime.scratch import fill_stack, iter_frames, mean_of
 from .runtime.steps import Progress, finish, step_counter
@@ -51,6 +55,7 @@ from .wording import (
     explain_input,
     explain_motion,
     explain_seeing,
+    explain_structure,
     explain_training,
 )
 
@@ -109,7 +114,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Fused:
-    """Results of the stages before the deconvolution."""
+    """Results of the stages before the deconvolution.
+
+    ``is_mean`` says that the image is the mean of the frames, because the filtered one has structure that they lack.
+    """
 
     image: FloatArray
     mean: FloatArray
@@ -118,6 +126,7 @@ class Fused:
     saturation: float
     dynamics: FlowDynamics | None = None
     filtered: Filtered | None = None
+    is_mean: bool = False
 
 
 def fuse(run: Run) -> Fused:
@@ -147,7 +156,10 @@ def fuse(run: Run) -> Fused:
     run.decide(
         explain_frames(filtered, None if params.keep_best == 1 else chosen), explain_geometry(filtered, dynamics)
     )
-    return Fused(filtered.image, mean, centroid, seeing, saturation, dynamics, filtered)
+    structure = _compare_structure(levels.stretched(filtered.image), training, centroid, filtered.mean_flow)
+    run.decide(*explain_structure(structure))
+    image = filtered.image if structure.passed else mean
+    return Fused(image, mean, centroid, seeing, saturation, dynamics, filtered, is_mean=not structure.passed)
 
 
 def _find_centroid(run: Run, training: FloatArray) -> Centroid:
@@ -175,6 +187,16 @@ def _centroids_elsewhere(run: Run, train: int) -> Iterator[Centroid]:
     for part in run.map_tiles(run_centroid_task, tasks):
         count(part)
         yield part
+
+
+def _compare_structure(
+    image: FloatArray, training: FloatArray, centroid: Centroid, mean_flow: FloatArray
+) -> StructureReading:
+    """Compare a recentred image with the training frames, in the geometry of the centroid."""
+    image = luminance(image)
+    if mean_flow.any():
+        image = warp(image, invert_flow(recentring_flow(mean_flow)))
+    return compare_structure(image, training, centroid.flows)
 
 
 def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:

@@ -136,7 +136,7 @@ def _restored(run: Run) -> Restoration:
     params = run.params
     fused = fuse(run)
     image, centroid, deblurred = fused.image, fused.centroid, None
-    if params.runs("deconvolve"):
+    if params.runs("deconvolve") and not fused.is_mean:
         deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
@@ -182,6 +182,8 @@ def _measure_uncertainty(
     filtered, dynamics = fused.filtered, fused.dynamics
     if filtered is None or dynamics is None:
         return None
+    if fused.is_mean:
+        return np.full(image.shape[:2], np.inf, np.float32)
     begun, position = time.perf_counter(), position_variance(dynamics)
     known = informed_pixels(seen, fused.mean, fused.saturation)
     if run.prepared.hidden is not None:

@@ -102,8 +102,8 @@ class Restoration:
     seeing : Seeing or None
         Strength of the turbulence in the training frames, in pixels and frames; None for fewer than three.
     uncertainty : ndarray, float32, shape (H, W), or None
-        Standard deviation of every pixel of the image, intensity; infinite where nothing is known; None unless the
-        filter has run.
+        Standard deviation of every pixel of the image, intensity; infinite where nothing is known, and everywhere
+        where the mean of the frames is the result; None unless the filter has run.
     """
 
     image: FloatArray

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from .blind.structure import LEFT, UNSEEN, StructureReading
 from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
 from .dynamics.flow_model import FlowDynamics, mean_flow_error
@@ -265,6 +266,34 @@ def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
     error = mean_flow_error(dynamics, int(np.isfinite(filtered.sharpness).sum()))
     reason = f"mean flow to all frames, root mean square; its standard error is {error:.2f} pixels"
     return Decision("geometry", f"moved by {moved:.2f} pixels", reason)
+
+
+def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
+    """Say that the filtered image is not the result, if it has edges that few frames have.
+
+    Parameters
+    ----------
+    reading : StructureReading
+
+    Returns
+    -------
+    tuple of Decision
+        Empty if there is nothing to report.
+
+    Examples
+    --------
+    >>> explain_structure(StructureReading(0.02, 0.05))
+    ()
+    >>> explain_structure(StructureReading(0.25, 0.6))[0].choice
+    'the mean of the frames is the result'
+    """
+    if reading.passed:
+        return ()
+    reason = (
+        f"{reading.unseen:.0%} of the edges of the filtered image are in fewer than half of the frames "
+        f"(bound {UNSEEN:.0%}), which differ by {reading.left:.0%} as much as before registration (bound {LEFT:.0%})"
+    )
+    return (Decision("structure", "the mean of the frames is the result", reason),)
 
 
 def explain_seeing(seeing: Seeing) -> tuple[Decision, ...]:
