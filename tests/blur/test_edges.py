@@ -34,6 +34,16 @@ def test_the_blur_of_a_planet_is_not_taken_for_a_wider_one(diameter, sigma):
     assert estimate.edge_limited
 
 
+@pytest.mark.parametrize("sigma", [1.2, 2.0])
+def test_the_limb_bounds_the_width_where_most_edges_are_those_of_soft_bands(sigma):
+    """The likeliest width is several times too large, and few of the edges rise on both sides."""
+    y, x = np.mgrid[-128:128, -128:128] / 80
+    bands = 0.55 + 0.2 * np.sin(14 * y + 1.7 * np.sin(6 * x))
+    estimate = estimate_blur(seen((bands * np.sqrt(np.clip(1 - x**2 - y**2, 0, 1))).astype(np.float32), sigma))
+    assert sigma <= estimate.sigma < 1.75 * sigma
+    assert estimate.edge_limited
+
+
 @pytest.mark.parametrize("diameter", [60, 100, 150])
 def test_nothing_is_removed_from_a_sharp_planet(diameter):
     assert estimate_blur(seen(planet(diameter), 0)).removable < 0.35

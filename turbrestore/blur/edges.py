@@ -46,6 +46,11 @@ _STEP, _STRONG, _MOST = 12.0, 0.6, 90
 _EVEN, _EVEN_NOISE = 0.03, 2.0
 # Fewest edges that rise, their least share of all strong edges, and the share of them that bounds a width.
 _FEWEST, _RISING, _STEEP = 30, 0.7, 0.25
+# Least share of edges that rise out of a black background, and least share of the image that is one.
+_LIMB, _BACKGROUND = 0.2, 0.2
+# Black and white are these percentiles.  What exceeds black by less than this multiple of the noise, or by this share of
+# the range, which blurs with long tails spread around a body, is black.
+_BLACK, _WHITE, _BLACK_NOISE, _TAILS = 1, 99, 4.0, 0.02
 # Ratio of one width that is tried to the one before it.
 _RATIO = 1.05
 # Photographs are as soft as this, pixels; below it nothing is safe to remove.  Width and uncertainty of a sharp image.
@@ -218,6 +223,7 @@ def _widest_blur(image: FloatArray, exponent: float, widest: float) -> float:
     if len(edges.places) < _FEWEST:
         return widest
     profiles = edge_profiles(image, edges, farthest)
+    darkest = _background(image, noise)
     for sigma in np.exp(np.arange(np.log(_SHARP), np.log(widest), np.log(_RATIO))):
         reach = max(_SMALLEST_REACH, int(np.ceil(_REACH_SIGMAS * sigma)))
         rise = max(_SMALLEST_RISE, int(np.ceil(_RISE_SIGMAS * sigma)))
@@ -226,13 +232,22 @@ def _widest_blur(image: FloatArray, exponent: float, widest: float) -> float:
         falls = np.maximum(largest_fall(bright), largest_fall(dark))
         strong = steps > max(_STRONG * float(np.percentile(steps, _MOST)), _STEP * noise)
         rising = strong & (falls < np.maximum(_EVEN * steps, _EVEN_NOISE * noise))
-        if rising.sum() < max(_FEWEST, _RISING * strong.sum()):
+        if rising.sum() < _RISING * strong.sum():
+            rising &= -dark[:, -1] < darkest
+        if rising.sum() < max(_FEWEST, _LIMB * strong.sum()):
             continue
         shares = (bright[rising, 1] + dark[rising, 1]) / (bright[rising, rise] + dark[rising, rise])
         step = _step_rise(1, sigma, exponent) / _step_rise(rise, sigma, exponent)
         if np.mean(shares > step) >= _STEEP:
             return float(sigma)
     return widest
+
+
+def _background(image: FloatArray, noise: float) -> float:
+    """Level below which pixels are black, or that of no pixel if there is no black background."""
+    black, white = np.percentile(image, (_BLACK, _WHITE))
+    level = float(black + max(_BLACK_NOISE * noise, _TAILS * (white - black)))
+    return level if np.mean(image < level) >= _BACKGROUND else -np.inf
 
 
 def _step_rise(distance: int, sigma: float, exponent: float) -> float:
