@@ -48,8 +48,8 @@ _EVEN, _EVEN_NOISE = 0.03, 2.0
 _FEWEST, _RISING, _STEEP = 30, 0.7, 0.25
 # Least share of edges that rise out of a black background, and least share of the image that is one.
 _LIMB, _BACKGROUND = 0.2, 0.2
-# Black and white are these percentiles.  What exceeds black by less than this multiple of the noise, or by this share of
-# the range, which blurs with long tails spread around a body, is black.
+# Black and white are these percentiles.  What exceeds black by less than this multiple of the noise, or by this share
+# of the range, which blurs with long tails spread around a body, is black.
 _BLACK, _WHITE, _BLACK_NOISE, _TAILS = 1, 99, 4.0, 0.02
 # Ratio of one width that is tried to the one before it.
 _RATIO = 1.05
