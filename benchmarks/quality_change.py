@@ -86,7 +86,7 @@ def _changes(patterns: Sequence[str], tree: Path | None) -> Iterator[tuple[str, 
         if clip.truth is None and not readable:
             continue
         print(name, file=sys.stderr)
-        yield name, _change(clip, _restored_by(clip.frames, tree), _restored_by(clip.frames, None), readable)
+        yield name, _change(clip, restored_by(clip.frames, tree), restored_by(clip.frames, None), readable)
 
 
 def _change(clip: Clip, old: dict[str, FloatArray], new: dict[str, FloatArray], readable: bool) -> Change:
@@ -106,7 +106,7 @@ def _row(name: str, change: Change) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _restored_by(frames: FloatArray, tree: Path | None) -> dict[str, FloatArray]:
+def restored_by(frames: FloatArray, tree: Path | None) -> dict[str, FloatArray]:
     """Return the filtered image and the result of frames by the package in a folder, or by the present one.
 
     Frames are handed over: a synthesizer that rounds otherwise draws other noise.

@@ -72,7 +72,6 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
     if restoration.filtered is not None:
         record["filter"] = {
             "image_noise": restoration.filtered.image_noise,
-            "motion_share": restoration.filtered.motion_share,
             "sharpness_weight": restoration.filtered.sharpness_weight,
             "mean_innovation": float(np.nanmean(restoration.filtered.innovations)),
         }

@@ -69,7 +69,7 @@ def test_figures_of_the_filter_are_means_over_tiles():
         image, flow = np.full(tile.shape, 0.5, np.float32), np.full((*tile.shape, 2), 0.25, np.float32)
         one = np.array([value, np.nan])
         share = np.array([0.25, 0.75])
-        return Filtered(image, 2 * image, np.ones((2, 3)), one, one, one, share, value, value, value, flow)
+        return Filtered(image, 2 * image, np.ones((2, 3)), one, one, one, share, value, value, flow)
 
     filtered = join_filtered(map(part, tiles, (1.0, 2.0, 6.0)), tiles, (40, 80))
     weights = [tile.row_weights.sum() * tile.column_weights.sum() for tile in tiles]
@@ -78,7 +78,7 @@ def test_figures_of_the_filter_are_means_over_tiles():
         assert getattr(filtered, name)[0] == pytest.approx(expected)
         assert np.isnan(getattr(filtered, name)[1])
     assert filtered.innovations[0] == pytest.approx(np.average([1, 4, 36], weights=weights) ** 0.5)
-    assert filtered.image_noise == filtered.motion_share == pytest.approx(expected)
+    assert filtered.image_noise == filtered.sharpness_weight == pytest.approx(expected)
     assert filtered.shares == pytest.approx([0.25, 0.75])
     assert filtered.flow_states.shape == (2, 9)
     for image, level in ((filtered.image, 0.5), (filtered.variance, 1.0), (filtered.mean_flow, 0.25)):

@@ -39,7 +39,7 @@ TileMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
 # Figures of a filtered tile that are joined or averaged.
 _RECORDED = (
     *("flow_states", "gains", "innovations", "sharpness", "shares"),
-    *("image_noise", "motion_share", "sharpness_weight"),
+    *("image_noise", "sharpness_weight"),
 )
 
 
@@ -372,7 +372,6 @@ def join_filtered(
         sharpness=average("sharpness"),
         shares=average("shares"),
         image_noise=float(average("image_noise")),
-        motion_share=float(average("motion_share")),
         sharpness_weight=float(average("sharpness_weight")),
         mean_flow=mean_flow,
     )

@@ -178,12 +178,14 @@ def explain_centroid(centroid: Centroid) -> Decision:
     )
 
 
-def explain_dynamics(dynamics: FlowDynamics) -> tuple[Decision, ...]:
-    """Say which rank the flow model has, and how it was adjusted.
+def explain_dynamics(dynamics: FlowDynamics, modelled: bool = False) -> tuple[Decision, ...]:
+    """Say which rank the flow model has, how it was adjusted, and whether it changes the image.
 
     Parameters
     ----------
     dynamics : FlowDynamics
+    modelled : bool
+        Whether frames are registered by the flow of the model and not by the measured one.
 
     Returns
     -------
@@ -201,7 +203,8 @@ def explain_dynamics(dynamics: FlowDynamics) -> tuple[Decision, ...]:
     modes = Decision(
         "flow model",
         f"{dynamics.rank} modes",
-        f"{dynamics.energy_share:.0%} of the energy of the motion, largest eigenvalue {largest:.2f}",
+        f"{dynamics.energy_share:.0%} of the energy of the motion, largest eigenvalue {largest:.2f}; frames are "
+        f"registered by {'the flow of the model' if modelled else 'the measured flow'}",
     )
     return modes, *(Decision("flow model", "adjusted", note) for note in dynamics.notes)
 

@@ -119,12 +119,10 @@ figure.colorbar(shown, ax=axes[:2], label="px rms")
 sizes = dynamics.singular_values / np.sqrt(TRAIN * SIZE * SIZE)
 axes[2].bar(np.arange(1, TRAIN), sizes[:-1], color=["C0" if k < dynamics.rank else "C1" for k in range(TRAIN - 1)])
 axes[2].set(xlabel="singular value", ylabel="px rms", title=f"{dynamics.rank} states, and the rest")
-print(f"share of the residual that the filter takes for motion: {kept.motion_share:.2f}")
 
 # %% [markdown]
 # The residual is smaller than the flow but spread over the whole image, about half a pixel. The singular values fall
-# smoothly past the last state: with 24 training frames the rest is no noise, and the filter takes most of it for
-# motion.
+# smoothly past the last state: with 24 training frames the rest is not noise but motion, and is kept.
 
 # %% [markdown]
 # ## Gain, innovation, share

@@ -8,7 +8,7 @@ from flow_systems import uneven_flows
 
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import flow_of
-from turbrestore.filtering.flow_state import blend_flows, predict_state, project_measured, update_state
+from turbrestore.filtering.flow_state import predict_state, project_measured, update_state
 from turbrestore.filtering.kalman import Gaussian, predict, update
 
 
@@ -72,10 +72,3 @@ def test_a_model_without_states_learns_nothing(dynamics):
         Gaussian(np.zeros(0), np.zeros((0, 0))), project_measured(np.ones((2, 2, 2), np.float32), still), still
     )
     assert state.mean.size == 0 and innovation == pytest.approx(1.0)
-
-
-def test_the_estimate_lies_between_model_and_measurement(rng):
-    modelled, measured = rng.random((2, 3, 4, 2), np.float32)
-    for share, expected in ((0, modelled), (1, measured), (0.25, 0.75 * modelled + 0.25 * measured)):
-        found = blend_flows(modelled, measured, np.full((3, 4, 2), share, np.float32))
-        np.testing.assert_allclose(found, expected, atol=1e-6)

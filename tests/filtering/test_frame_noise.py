@@ -2,7 +2,6 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.core.errors import DataError
 from turbrestore.filtering.frame_noise import frame_noise_variance, invalid_mask, local_sharpness, project_gradient
 from turbrestore.filtering.frame_statistics import measure_frame_statistics
 from turbrestore.registration.warp import inside
@@ -33,7 +32,7 @@ def model_and_frames():
     scene = 0.5 + 0.5 * smooth(rng.normal(0, 1, SHAPE).astype(np.float32), 1.5)
     frames = [smooth(scene, 0.5 + k / 8) + rng.normal(0, 0.01, SHAPE).astype(np.float32) for k in range(8)]
     still = np.zeros((8, *SHAPE, 2), np.float32)
-    return measure_frame_statistics(frames, still, scene, np.ones(SHAPE, np.float32)), scene, frames
+    return measure_frame_statistics(frames, still, scene), scene, frames
 
 
 def noise_of(frame, flow, statistics, sharpness):
@@ -104,19 +103,13 @@ def test_what_holds_for_all_frames_is_their_mean_and_variance(model_and_frames):
     assert np.median(np.abs(model.deviation / spread - 1)) < 0.02
 
 
-def test_residuals_of_another_shape_are_refused(model_and_frames):
-    _, scene, frames = model_and_frames
-    with pytest.raises(DataError, match=r"residual_variance: expected shape \(200, 210\), found \(200,\)"):
-        measure_frame_statistics(frames, np.zeros((8, *SHAPE, 2), np.float32), scene, np.ones(200, np.float32))
-
-
 @pytest.mark.parametrize("threads", [1, 3])
 def test_what_holds_for_all_frames_does_not_depend_on_threads(model_and_frames, threads):
     model, scene, frames = model_and_frames
     still = np.zeros((8, *SHAPE, 2), np.float32)
-    again = measure_frame_statistics(frames, still, scene, np.ones(SHAPE, np.float32), threads=threads)
+    again = measure_frame_statistics(frames, still, scene, threads=threads)
     assert again.image_noise == model.image_noise
-    for name in ("mean_sharpness", "score_scale", "score_variance", "motion_share", "mean_frame", "deviation"):
+    for name in ("mean_sharpness", "score_scale", "score_variance", "mean_frame", "deviation"):
         one, other = getattr(again, name), getattr(model, name)
         assert one.dtype == np.float32
         assert np.array_equal(one, other)
@@ -127,7 +120,7 @@ def noisy_statistics(scene, blurs, noise):
     rng = np.random.default_rng(1)
     frames = [smooth(scene, 1 + blur) + rng.normal(0, noise, SHAPE).astype(np.float32) for blur in blurs]
     still = np.zeros((len(frames), *SHAPE, 2), np.float32)
-    return frames, measure_frame_statistics(frames, still, smooth(scene, 1.0), np.ones(SHAPE, np.float32))
+    return frames, measure_frame_statistics(frames, still, smooth(scene, 1.0))
 
 
 def test_noise_alone_gives_no_sharpness_and_no_weight(model_and_frames):

@@ -4,9 +4,8 @@ Symbols
 -------
 ρ̂, Σ : image and its variance per pixel; S drift of the image, Z noise of a registered frame (eqs. 13a, 15)
 ξ̂, P : state of the flow and its covariance; A, C, Q, R from :mod:`turbrestore.dynamics.flow_model` (eqs. 10, 13b)
-W^meas : measured flow (eq. 17); Ŵ estimated flow
+W^meas : measured flow (eq. 17); Ŵ flow that frames are registered by
 L, M : gains of the image (eq. 16) and of the flow state (eq. 19)
-G : share of the flow outside the subspace of C that is motion and not noise
 β : weight of sharpness, given or chosen by :mod:`turbrestore.filtering.frame_statistics`
 
 Given Ŵ the image is a linear state, given ρ the flow is, so each frame updates one after the other:
@@ -22,9 +21,10 @@ Eqs. 14b, 14d, 17 and 19 are in :mod:`turbrestore.filtering.flow_state`, eqs. 14
 
 Departures from the paper, each with its reason:
 
-* The flow outside the subspace is kept (``residual="keep"``): by eq. 10 the flow is ``C ξ + r``, and where r is
-  motion its mean is ``Ŵ = C ξ̂ + G (W^meas − C ξ̂)``.  With ``Ŵ = C ξ̂`` alone (``"drop"``, as printed) that motion
-  stays in the frames and blurs the image, below the centroid that the filter starts from.
+* Frames are registered by the measured flow, ``Ŵ = W^meas`` (``residual="keep"``): by eq. 10 the flow is ``C ξ + r``,
+  and r is mostly motion.  With ``Ŵ = C ξ̂`` (``"drop"``, as printed) that motion stays in the frames and blurs the
+  image, below the centroid that the filter starts from.  Whatever share of r is taken for noise, the image gets worse
+  (``docs/decisions/filter.md``).  So the flow state describes and predicts the motion, and does not change the image.
 * The measurement equation 13c is nonlinear in image and flow together.  Eqs. 15 and 17, with which the paper replaces
   it, are used alone.  The mean flow W̄ is part of eq. 17 here.
 * The paper first updates the image by the predicted flow (its step 2).  Here the flow is measured first, because the
@@ -203,7 +203,7 @@ def filter_steps(
         measured = (flow for _, flow in iterate_flows(image, counted, flow_params, runtime))
         known = [None if frame is None else next(measured) for frame in block]
     settings = _settings(block, known, image, dynamics, params, flow_params, runtime)
-    image_noise, motion_share = settings.statistics.image_noise, float(settings.motion_share.mean())
+    image_noise = settings.statistics.image_noise
     if start is None and params.training == "skip":
         start = after_training(_prior(image, image_noise, dynamics, params), image, dynamics, len(known))
     if start is None:
@@ -214,7 +214,7 @@ def filter_steps(
         at = _Position(start.state, start.records, start.reference, deque(), flows_measured)
     del block
     at = yield from _filter_blocks(at, stream, known, params, settings)
-    filtered = join_records(at.state, at.records, image_noise, motion_share, settings.sharpness)
+    filtered = join_records(at.state, at.records, image_noise, settings.sharpness)
     # The paper leaves the image in the geometry of the training frames.
     unmoved = np.zeros_like(filtered.mean_flow)
     return filtered if params.training == "filter" else replace(filtered, mean_flow=unmoved)
@@ -318,18 +318,15 @@ def _settings(
         [frame for frame, _ in pairs],
         [flow for _, flow in pairs],
         image,
-        dynamics.residual_variance,
         params.sharpness_window,
         params.image_noise,
         runtime.threads,
     )
-    share = np.zeros_like(statistics.motion_share) if params.residual == "drop" else statistics.motion_share
-    statistics = replace(statistics, motion_share=share)
     backend = array_backend(runtime.device)
     return PassSettings(
         dynamics=dynamics,
         statistics=backend.load_statistics(statistics),
-        motion_share=backend.load(np.stack([share, share], axis=-1)),
+        modelled=params.residual == "drop",
         sharpness=statistics.sharpness_weight if params.sharpness is None else params.sharpness,
         drift=params.image_drift,
         flow=flow_params,

@@ -39,7 +39,8 @@ class FilterParams:
     Parameters
     ----------
     residual : {"keep", "drop"}
-        Whether measured flow outside the subspace of the flow model is kept; ``"drop"`` is the paper as printed.
+        Whether frames are registered by the measured flow, or by its estimate in the subspace of the flow model alone;
+        ``"drop"`` is the paper as printed.
     inner_iterations : int
         Times that flow is measured, and image and flow updated, for each block of frames.
     training : {"filter", "skip"}
@@ -191,8 +192,6 @@ class Filtered:
         Share of the information that each frame brought, mean over the pixels; they sum to 1.
     image_noise : float
         Z₀, squared intensity.
-    motion_share : float
-        G, mean over the pixels; 0 with ``residual="drop"``.
     sharpness_weight : float
         β, given or chosen.
     mean_flow : ndarray, float32, shape (H, W, 2)
@@ -210,7 +209,6 @@ class Filtered:
     sharpness: np.ndarray
     shares: np.ndarray
     image_noise: float
-    motion_share: float
     sharpness_weight: float
     mean_flow: FloatArray
 
@@ -319,7 +317,6 @@ def join_records(
     state: FilterState,
     records: Sequence[FrameRecord],
     image_noise: float,
-    motion_share: float,
     sharpness_weight: float,
 ) -> Filtered:
     """Join the last state and the records of all frames.
@@ -328,7 +325,7 @@ def join_records(
     ----------
     state : FilterState
     records : sequence of FrameRecord
-    image_noise, motion_share, sharpness_weight : float
+    image_noise, sharpness_weight : float
 
     Returns
     -------
@@ -338,7 +335,7 @@ def join_records(
     --------
     >>> flow, pixels = np.zeros((2, 3, 2), np.float32), PixelGaussian(np.zeros((2, 3)), np.ones((2, 3)))
     >>> state = FilterState(pixels, Gaussian(np.zeros(1), np.eye(1)), flow, flow)
-    >>> join_records(state, [FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0)] * 2, 1e-4, 1.0, 2.0).shares
+    >>> join_records(state, [FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0)] * 2, 1e-4, 2.0).shares
     array([0.5, 0.5])
     """
     information = np.array([record.information for record in records])
@@ -353,7 +350,6 @@ def join_records(
         sharpness=np.array([record.sharpness for record in records]),
         shares=information / information.sum(),
         image_noise=image_noise,
-        motion_share=motion_share,
         sharpness_weight=sharpness_weight,
         mean_flow=mean_flow_over(state.flow_sum, records) - state.training_flow,
     )

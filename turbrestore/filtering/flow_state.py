@@ -4,10 +4,9 @@ Symbols
 -------
 ξ̂, P : state of the flow and its covariance, :class:`turbrestore.filtering.kalman.Gaussian`
 A, C, Q, R, W̄ : flow model of :mod:`turbrestore.dynamics.flow_model` (eqs. 10, 13b)
-W^meas : measured flow (eq. 17); Ŵ estimated flow
+W^meas : measured flow (eq. 17)
 M : gain (eq. 19)
 z : Cᵀ(W^meas − W̄)
-G : share of the flow outside the subspace of C that is motion and not noise
 
 As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R = P (P + R I)⁻¹ Cᵀ``: a measured flow enters the
 update only through z, which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the
@@ -25,7 +24,6 @@ import numpy as np
 
 from ..core.arrays import FloatArray
 from ..dynamics.flow_model import Float64Array, FlowDynamics, project_deviation
-from ..runtime.image_stacks import Stack
 from .kalman import Gaussian, predict
 
 # Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
@@ -140,25 +138,3 @@ def update_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDyn
     # |W − W̄ − C ξ̂|² without the product C ξ̂, by CᵀC = I.
     squared = measured.squared - float(predicted.mean @ (2 * measured.state - predicted.mean))
     return state, (max(squared, 0.0) / measured.size) ** 0.5
-
-
-def blend_flows(modelled: Stack, measured: Stack, motion_share: Stack) -> Stack:
-    """Estimated flow ``Ŵ = W̄ + C ξ̂ + G (W^meas − W̄ − C ξ̂)``, the mean of the flow ``W̄ + C ξ + r`` (eq. 10).
-
-    Parameters
-    ----------
-    modelled, measured : array, float32, shape (H, W, 2)
-        W̄ + C ξ̂ and W^meas, pixels.
-    motion_share : array, float32, shape (H, W, 2)
-        G for both components; with 0, Ŵ is the flow of the model, as printed in the paper.
-
-    Returns
-    -------
-    array, float32, shape (H, W, 2)
-
-    Examples
-    --------
-    >>> float(blend_flows(np.float32(1), np.float32(2), np.float32(0.75)))
-    1.75
-    """
-    return modelled + motion_share * (measured - modelled)

@@ -65,8 +65,6 @@ class FrameStatistics:
         Factor from a deviation of the local sharpness to z; 0 where something has passed.
     score_variance : array, float32, shape (H, W)
         v, variance of z over the frames.
-    motion_share : array, float32, shape (H, W)
-        Share of the flow outside the flow model that is motion and not noise, 0 to 1.
     window : float
         Standard deviation of the Gaussian window in which sharpness is measured, pixels.
     left_out : float
@@ -85,7 +83,6 @@ class FrameStatistics:
     mean_sharpness: Stack
     score_scale: Stack
     score_variance: Stack
-    motion_share: Stack
     window: float
     left_out: float
     sharpness_weight: float
@@ -125,7 +122,7 @@ def frame_noise_variance(
     >>> from turbrestore.runtime.image_stacks import numpy_ops
     >>> image = np.tile(np.sin(np.arange(16.0)), (16, 1)).astype(np.float32)
     >>> still, ones = np.zeros((2, 16, 16, 2), np.float32), np.ones((16, 16), np.float32)
-    >>> statistics = measure_frame_statistics([image, image], still, image, ones)
+    >>> statistics = measure_frame_statistics([image, image], still, image)
     >>> noise, sharp = frame_noise_variance(0.5 * image, still[0], ones, statistics, 0.0, numpy_ops())
     >>> bool((noise == np.float32(statistics.image_noise)).all()), round(sharp, 3)
     (True, 0.5)

@@ -24,7 +24,7 @@ from ..runtime.runtime import Runtime
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import in_batches, map_in_turns
 from .array_backend import ArrayBackend
-from .flow_state import ProjectedFlow, blend_flows, predict_state, project_measured, update_state
+from .flow_state import ProjectedFlow, predict_state, project_measured, update_state
 from .frame_noise import FrameStatistics, frame_noise_variance
 from .kalman import Gaussian
 
@@ -41,8 +41,8 @@ class PassSettings:
     dynamics : FlowDynamics
     statistics : FrameStatistics
         Its arrays are on the backend.
-    motion_share : array, float32, shape (H, W, 2)
-        G, repeated for both components, on the backend; arrays of equal shape are multiplied several times as fast.
+    modelled : bool
+        Whether frames are registered by C ξ̂ + W̄ and not by W^meas.
     sharpness, drift : float
         β, and S in squared intensity.
     flow : FlowParams
@@ -52,7 +52,7 @@ class PassSettings:
 
     dynamics: FlowDynamics
     statistics: FrameStatistics
-    motion_share: Stack
+    modelled: bool
     sharpness: float
     drift: float
     flow: FlowParams
@@ -187,8 +187,7 @@ def _register(image: FloatArray, measured: FloatArray, state: Gaussian, settings
     RegisteredFrame
     """
     backend = settings.backend
-    modelled = flow_of(settings.dynamics, state.mean)
-    flow = blend_flows(backend.ops.load(modelled), backend.ops.load(measured), settings.motion_share)
+    flow = backend.ops.load(flow_of(settings.dynamics, state.mean) if settings.modelled else measured)
     channels, grey, seen = backend.warp(image, flow)
     noise, sharpness = frame_noise_variance(grey, flow, seen, settings.statistics, settings.sharpness, backend.ops)
     return RegisteredFrame(channels, noise, sharpness)

@@ -3,8 +3,6 @@
 Symbols
 -------
 Z₀ : variance of a registered frame about the image before sharpness is taken into account (paper 3, eq. 15)
-G : share of the flow outside the model's subspace that is motion and not noise
-R : variance of that flow (eq. 10)
 β : weight of sharpness; κ what its window leaves out, see :func:`turbrestore.filtering.frame_noise.local_sharpness`
 
 Frames are warped three times: some of them for a median, which what passes through the scene does not change, and all
@@ -20,7 +18,6 @@ import cv2
 import numpy as np
 
 from ..core.arrays import FloatArray, luminance
-from ..core.errors import DataError
 from ..registration.warp import warp
 from ..runtime.image_stacks import numpy_ops
 from ..runtime.scratch import iter_frames
@@ -69,7 +66,6 @@ def measure_frame_statistics(
     frames: Iterable[FloatArray],
     flows: Iterable[FloatArray],
     image: FloatArray,
-    residual_variance: FloatArray,
     window: float = 3.0,
     image_noise: float | None = None,
     threads: int = 0,
@@ -84,8 +80,6 @@ def measure_frame_statistics(
         From the image to each frame, pixels; iterated as often.
     image : ndarray, float32, shape (H, W) or (H, W, 3)
         Image that the frames are registered to.
-    residual_variance : ndarray, shape (H, W)
-        R, squared pixels.
     window : float
         Standard deviation of the window in which sharpness is measured, pixels.
     image_noise : float, optional
@@ -107,11 +101,9 @@ def measure_frame_statistics(
     >>> import numpy as np
     >>> frames = list(np.random.default_rng(0).normal(0.5, 0.1, (50, 16, 16)).astype(np.float32))
     >>> still, image = np.zeros((50, 16, 16, 2), np.float32), np.full((16, 16), 0.5, np.float32)
-    >>> round(measure_frame_statistics(frames, still, image, np.ones((16, 16), np.float32)).image_noise, 3)
+    >>> round(measure_frame_statistics(frames, still, image).image_noise, 3)
     0.01
     """
-    if residual_variance.shape != image.shape[:2]:
-        raise DataError(f"residual_variance: expected shape {image.shape[:2]}, found {residual_variance.shape}")
     template = gradient(luminance(image), _OPS)
 
     def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
@@ -144,7 +136,6 @@ def measure_frame_statistics(
         mean_sharpness=sharpness.astype(np.float32),
         score_scale=scale,
         score_variance=(scale**2 * spread).astype(np.float32),
-        motion_share=_motion_share(energy, sensor_noise, residual_variance, window),
         window=window,
         left_out=left_out,
         sharpness_weight=weight,
@@ -295,15 +286,3 @@ def _sharpness_weight(sharpness: np.ndarray, spread: np.ndarray, score_variance:
         middle = (low + high) / 2
         low, high = (middle, high) if float(np.expm1(middle**2 * score_variance).mean()) <= allowed else (low, middle)
     return low
-
-
-def _motion_share(energy: FloatArray, noise: float, residual_variance: np.ndarray, window: float) -> FloatArray:
-    """G = R_motion / (R_motion + R_noise), with R_noise the Cramér–Rao bound of a shift seen through the window.
-
-    A shift of a patch with gradients ∇ρ in noise of variance σ² cannot be measured better than
-    σ² / (½ Σ |∇ρ|²) per axis; what the residual varies beyond that is motion.
-    """
-    area = 4 * np.pi * window**2
-    noise_variance = noise / np.maximum(area * 0.5 * energy, 1e-12)
-    total = np.maximum(residual_variance, 0.0)
-    return (1.0 - np.minimum(noise_variance / np.maximum(total, 1e-12), 1.0)).astype(np.float32)

@@ -213,7 +213,6 @@ def _filter_facts(restoration: Restoration) -> Iterator[Fact]:
     yield Fact(
         "Noise of a frame", f"{100 * math.sqrt(filtered.image_noise):.2f} %", "of full scale, deviation from the image"
     )
-    yield Fact("Motion outside the model", f"{100 * filtered.motion_share:.0f} %", "kept as motion, the rest is noise")
     effective = 1 / float(np.square(filtered.shares).sum())
     yield Fact(
         "Effective frames",

@@ -115,7 +115,6 @@ FIELDS: dict[str, dict[str, Field]] = {
         "sharpness": Array("f8", "N", gaps=True),
         "shares": Array("f8", "N", low=0, high=1 + _ROUNDING),
         "image_noise": Number(),
-        "motion_share": Number(),
         "sharpness_weight": Number(),
         "mean_flow": Array("f4", "H W 2"),
     },

@@ -1,0 +1,138 @@
+"""What the flow of a frame is worth to the image: measured, of the flow model, or true; and since a revision.
+
+    python benchmarks/dynamics.py --before 7b5207f --write benchmarks/results/dynamics.md
+
+PSNR after deblurring against the scene at the mean geometry, of clips made here by phase screens: three scenes at
+medium and at strong turbulence, with noise, and with 30 % of the frames black or half of the scene flat.  The true flow
+is a bound on what any model of the motion could give to the image.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from quality_change import restored_by
+from revisions import revision
+
+from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import TurbrestoreError
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.dynamics.dynamic_texture import identify
+from turbrestore.filtering.alternating import FilterParams, filter_frames
+from turbrestore.io.output import atomic_write
+from turbrestore.metrics import compare
+from turbrestore.pipeline import RestoreParams, restore
+from turbrestore.registration.flow_algebra import compose_flows, invert_flow
+from turbrestore.registration.warp import warp
+from turbrestore.synthesis.anisoplanatic import phase_screen_frames
+from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
+from turbrestore.synthesis.scenes import SCENES
+
+NAMES, COUNT, SIDE, BORDER = ("camera", "brick", "chart"), 60, 160, 8
+NOISES = (0.01, 0.05, 0.12)
+KINDS = ("as is", "missing", "half flat")
+MISSING = 0.3
+COLUMNS = ("now", "before", "flow of the model", "true flow")
+
+Row = dict[str, float]
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--before", metavar="REVISION", default="HEAD", help="revision to compare with")
+    parser.add_argument("--strength", nargs="+", choices=STRENGTHS, default=["medium", "strong"])
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
+    options = parser.parse_args()
+    rows: dict[tuple[str, ...], Row] = {}
+    try:
+        with revision(options.before) as tree:
+            for strength, kind, noise, name in product(options.strength, KINDS, NOISES, NAMES):
+                rows[strength, kind, f"{noise:g}", name] = measure(strength, kind, noise, name, tree)
+                print(
+                    strength, kind, noise, name, rows[strength, kind, f"{noise:g}", name], file=sys.stderr, flush=True
+                )
+    except TurbrestoreError as error:
+        print(f"dynamics: {error}", file=sys.stderr)
+        return error.exit_code
+    text = document(rows, options.before)
+    print(text, end="")
+    if options.write is not None:
+        atomic_write(options.write, text.encode(), overwrite=True)
+    return 0
+
+
+def measure(strength: str, kind: str, noise: float, name: str, tree: Path | None) -> Row:
+    """PSNR, dB, of each column."""
+    frames, flows, truth = clip(strength, kind, noise, name)
+    whole = restore(frames)
+    # One width for all flows, so that they alone make the difference.
+    blur = DeconvolutionParams(sigma=whole.deconvolution.sigma, exponent=whole.blur.exponent)
+    drop, once = FilterParams(residual="drop"), FilterParams(inner_iterations=1)
+    seen = [frame if frame.any() else None for frame in frames]
+    fused = filter_frames(seen, whole.centroid.image, identify(flows), once, known_flows=flows).image
+    images = {
+        "now": whole.image,
+        "before": restored_by(frames, tree)["result"],
+        "flow of the model": restore(frames, RestoreParams(filter=drop, deconvolution=blur)).image,
+        "true flow": remove_blur(fused, whole.centroid.image, blur).deconvolution.image,
+    }
+    inner = np.s_[BORDER:-BORDER, BORDER:-BORDER]
+    return {column: compare(image[inner], truth[inner]).psnr for column, image in images.items()}
+
+
+def clip(strength: str, kind: str, noise: float, name: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Frames, the flows to them from the scene at their mean geometry, and that scene."""
+    scene = SCENES[name](SIDE, SIDE)
+    if kind == "half flat":
+        scene[:, SIDE // 2 :] = scene[:, SIDE // 2 :].mean()
+    seen = list(phase_screen_frames(scene, COUNT, np.random.default_rng(7), PhaseScreenParams(STRENGTHS[strength])))
+    rng = np.random.default_rng(8)
+    frames = np.stack([frame.image for frame in seen])
+    frames = np.clip(frames + rng.normal(0, noise, frames.shape), 0, 1).astype(np.float32)
+    if kind == "missing":
+        frames[rng.permutation(COUNT)[: round(MISSING * COUNT)]] = 0
+    back = invert_flow(np.mean([frame.flow for frame in seen], axis=0))
+    flows = np.stack([compose_flows(frame.flow, back) for frame in seen])
+    return frames, flows, warp(scene, back)
+
+
+def document(rows: dict[tuple[str, ...], Row], before: str) -> str:
+    """Markdown of all rows and of their means."""
+    lines = [
+        "# Dynamics\n",
+        f"What `python benchmarks/dynamics.py --before {before} --write benchmarks/results/dynamics.md` measures: PSNR "
+        f"after deblurring, dB, against the scene at the mean geometry; {COUNT} frames of {SIDE} pixels a side, "
+        "phase screens.  'Now' registers frames by the flow that it measures.  The other columns are differences to "
+        "it: of the revision, of the flow of the model as the paper prints it, and of the true flow, which no model "
+        "of the motion can surpass.  The last two are deblurred by the width of 'now'.\n",
+        "| turbulence | frames | noise | scene | now | before | flow of the model | true flow |",
+        "|---|---|---:|---|---:|---:|---:|---:|",
+        *(f"| {' | '.join(key)} | {_cells(row)} |" for key, row in rows.items()),
+        "\n## Means\n",
+        "| turbulence | frames | noise | now | before | flow of the model | true flow |",
+        "|---|---|---:|---:|---:|---:|---:|",
+        *_means(rows),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _means(rows: dict[tuple[str, ...], Row]) -> Iterator[str]:
+    for group in dict.fromkeys(key[:-1] for key in rows):
+        inside = [row for key, row in rows.items() if key[:-1] == group]
+        mean = {column: float(np.mean([row[column] for row in inside])) for column in COLUMNS}
+        yield f"| {' | '.join(group)} | {_cells(mean)} |"
+
+
+def _cells(row: Row) -> str:
+    return " | ".join([f"{row['now']:.2f}", *(f"{row[column] - row['now']:+.2f}" for column in COLUMNS[1:])])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
