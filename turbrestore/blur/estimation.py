@@ -16,9 +16,8 @@ a side, the one whose width depends least on the assumed noise decides.  The ima
 is small, because a soft scene such as the Moon looks blurred at every reduction; but it is not preferred if its
 evidence is weak, because the block edges of a codec look like scene edges with almost no blur.
 
-Noise.  n is larger than the noise of the image: no real blur follows the assumed shape exactly, and high contrast makes
-the mismatch larger.  So n² is the sum of the squared noise and of the square of a share of the contrast.  The estimated
-width depends on n; ``uncertainty`` measures by how much.
+Noise.  The estimated width depends on the noise that is assumed, n of :mod:`turbrestore.blur.assumed_noise`;
+``uncertainty`` measures by how much.
 
 A fused image is never sharper than its pixels and the interpolation of the registration allow: the smallest width is
 0.35 px, which is also the result if a wider blur is hardly more likely.
@@ -37,11 +36,11 @@ from scipy import fft
 
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import require
-from ..core.noise import estimate_noise
 from ..display.plots import plot_blur
 from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import ThreadTeam, one_thread_each
+from .assumed_noise import LEAST_NOISE, assumed_noise, noise_multiple
 from .edges import limit_to_edges
 from .marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
 from .psf import check_exponent, fused_exponent
@@ -67,8 +66,6 @@ _PIXEL_UNCERTAINTY = 0.1  # of the width of a sharp image, pixels
 _PART, _STRIP_ROWS, _REACH = 128, 256, 5
 # 125 is a power of five: transforms of this size take almost twice as long as those of 120×120 or of 128×128 pixels.
 _SLOW_SIZE = 125
-# n is this many times the noise, plus (in squares) this share of the contrast.
-_NOISE_FACTOR, _MISFIT, _LEAST_NOISE = 1.5, 0.025, 1e-4
 # Factor on the relative uncertainty of the image itself if its evidence is strong; exponent of the preference for
 # stronger reduction.
 _PREFERENCE, _LARGER_REDUCTION = 0.8, 0.15
@@ -279,10 +276,11 @@ def find_candidates(
     require(usable, f"noise: expected a finite number of 0 or more, found {noise}")
     if exponent is not None:
         check_exponent(exponent)
-    if min(grey.shape) < _SMALLEST_IMAGE or np.ptp(grey) <= _LEAST_NOISE:
+    if min(grey.shape) < _SMALLEST_IMAGE or np.ptp(grey) <= LEAST_NOISE:
         return ()
     factors = [factor for factor in _REDUCTIONS if factor == 1 or min(grey.shape) >= factor * _SMALLEST_SIDE]
-    return tuple(_find_candidate(grey, factor, exponent, noise) for factor in factors)
+    multiple = noise_multiple(grey)
+    return tuple(_find_candidate(grey, factor, exponent, noise, multiple) for factor in factors)
 
 
 def choose_blur(candidates: tuple[BlurCandidate, ...], runtime: Runtime = DEFAULT) -> BlurEstimate:
@@ -327,10 +325,13 @@ def _preference(estimate: BlurEstimate) -> float:
     return weight * estimate.uncertainty / estimate.sigma
 
 
-def _find_candidate(grey: FloatArray, factor: int, exponent: float | None, noise: float | None) -> BlurCandidate:
+def _find_candidate(
+    grey: FloatArray, factor: int, exponent: float | None, noise: float | None, multiple: float
+) -> BlurCandidate:
     reduced = _reduce(grey, factor)
     # A copy, so that the reduced image is freed.
-    part, level = _most_detailed(reduced).copy(), _effective_noise(reduced, factor, noise)
+    part = _most_detailed(reduced).copy()
+    level = assumed_noise(reduced, multiple=multiple) if noise is None else assumed_noise(reduced, noise / factor)
     costs = width_costs(image_gradients(part), _exponents(exponent, factor), level, rises=2)
     evidence, width = float(costs[0] - costs.min()), _unreduced_width(likeliest_width(costs), factor)
     widths = factor * WIDTHS[: len(costs)]
@@ -351,12 +352,6 @@ def _with_uncertainty(candidate: BlurCandidate, team: ThreadTeam) -> BlurEstimat
 def _exponents(exponent: float | None, factor: int) -> Sequence[float]:
     """Exponents of the widths of an image that is reduced by a factor."""
     return [fused_exponent(factor * width) if exponent is None else exponent for width in WIDTHS]
-
-
-def _effective_noise(reduced: FloatArray, factor: int, noise: float | None) -> float:
-    """Compute n of the reduced image."""
-    level = estimate_noise(reduced) if noise is None else noise / factor
-    return max(float(np.hypot(_NOISE_FACTOR * level, _MISFIT * reduced.std())), _LEAST_NOISE)
 
 
 def _unreduced_width(width: float, factor: int) -> float:
