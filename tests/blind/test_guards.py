@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blind.guards import GuardParams, evaluate_guards
+from turbrestore.blind.guards import GuardParams, GuardReading, evaluate_guards
 from turbrestore.blind.ringing import ringing
 from turbrestore.blur.psf import blur_otf
 from turbrestore.core.arrays import luminance
@@ -134,3 +134,11 @@ def test_edges_in_one_row_of_tiles_are_not_all_left_out(monkeypatch):
     edge = np.repeat([0.2] * 24 + [0.8] * 24, 48).reshape(48, 48).astype(np.float32)
     blurred = cv2.GaussianBlur(edge, (0, 0), 1.5)
     assert ringing(edge + 2 * (edge - blurred), blurred, 1.5) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("reading", "factor"),
+    [((0.2, 0.0, 1.0), 0.9), ((0.24, 0.0, 1.0), 0.81), ((0.0, 0.17, 1.0), 0.9), ((0.0, 0.0, 12.0), 0.81)],
+)
+def test_the_width_is_lowered_less_where_a_bound_is_hardly_exceeded(reading, factor):
+    assert GuardParams(back_off=0.81).back_off_from(GuardReading(2.0, *reading, passed=False)) == pytest.approx(factor)

@@ -44,6 +44,8 @@ _CLIPPED, _LEAST_SHARE = 0.05, 0.01
 # Standard deviation of the Gaussian that separates fine detail, pixels.
 _DETAIL_WINDOW = 4.0
 _LEAST_DEVIATION = 1e-4
+# Slight excess over a bound, as a factor, and the least bound that it is a factor of.
+_SLIGHT, _LEAST_BOUND = 1.5, 1e-6
 # Widest blur whose ringing is judged, pixels: behind a wider one, profiles of four widths cross the next letter.
 _WIDEST_RINGS = 3.0
 
@@ -61,7 +63,7 @@ class GuardParams:
     noise_gain : float
         Largest ratio, after to before, of the standard deviation in the flattest fifth of the image.
     back_off : float
-        Factor on the width of the blur after a failed attempt.
+        Factor on the width of the blur after a failed attempt; its square root where a bound is hardly exceeded.
     tries : int
         Largest number of attempts; if the last one fails, no blur is removed.
     """
@@ -78,6 +80,31 @@ class GuardParams:
         require_between("noise_gain", self.noise_gain, 1, 1000)
         require_between("back_off", self.back_off, 0.1, 0.99)
         require_between("tries", self.tries, 1, 100)
+
+    def back_off_from(self, reading: GuardReading) -> float:
+        """Return the factor on the width after an attempt that failed.
+
+        Parameters
+        ----------
+        reading : GuardReading
+            Of that attempt.
+
+        Returns
+        -------
+        float
+            ``back_off``, or its square root if no bound is exceeded by more than a half.
+
+        Examples
+        --------
+        >>> GuardParams(back_off=0.81).back_off_from(GuardReading(2.0, 0.2, 0.1, 1.5, passed=False))
+        0.9
+        """
+        excess = max(
+            reading.ringing / max(self.ringing, _LEAST_BOUND),
+            reading.overshoot / max(self.overshoot, _LEAST_BOUND),
+            reading.noise_gain / self.noise_gain,
+        )
+        return self.back_off**0.5 if excess <= _SLIGHT else self.back_off
 
 
 @dataclass(frozen=True)
