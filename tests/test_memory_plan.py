@@ -1,5 +1,6 @@
 """The plan of a restoration within a memory limit."""
 
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 
@@ -25,10 +26,22 @@ def plan_of(shape, limit=None, threads=2, **params):
     return plan_memory(shape, RestoreParams(**params), Runtime(threads=threads, memory_limit=limit))
 
 
-def test_without_a_limit_nothing_changes():
-    plan = plan_of(FULL_HD, threads=3)
-    assert (plan.train, plan.runtime, plan.tile, plan.decisions) == (60, Runtime(threads=3), None, ())
-    assert plan.train == training_share(300, FULL_HD[1:])
+def test_without_a_limit_what_fits_stays_in_memory():
+    plan = plan_of((300, 480, 640), threads=3)
+    assert (plan.train, plan.runtime, plan.tile, plan.decisions) == (100, Runtime(threads=3), None, ())
+
+
+def test_without_a_limit_large_frames_go_to_a_file_where_the_disk_has_room(monkeypatch, tmp_path):
+    def plan():
+        return plan_memory(FULL_HD, RestoreParams(), Runtime(threads=3, scratch=tmp_path))
+
+    kept = plan()
+    assert kept.train == training_share(300, FULL_HD[1:])
+    assert kept.runtime == Runtime(threads=3, scratch=tmp_path) and kept.tile is None
+    assert [decision.choice for decision in kept.decisions] == ["training frames in a scratch file"]
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=2 * kept.scratch_bytes))
+    assert (plan().runtime, plan().decisions) == (Runtime(threads=3), ())
 
 
 def test_what_changes_no_result_comes_first():

@@ -4,7 +4,7 @@ Every stage says beside its code how many bytes it takes; the peak of a restorat
 and what one stage takes.  The plan is the first of these that fits:
 
 1. all in memory, on all threads;
-2. training frames and their flows in a scratch file;
+2. training frames and their flows in a scratch file, without a limit too where memory would take more than 2.2 GB;
 3. fewer threads;
 4. fewer training frames, down to ten, unless their number was given;
 5. frames in tiles that overlap (:mod:`turbrestore.tiled_stages`), as large as fit.
@@ -16,6 +16,7 @@ tiles change the result, slightly; nothing else does, and neither depends on the
 from __future__ import annotations
 
 import math
+import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -43,6 +44,8 @@ _FEWEST_TRAINED, _MOST_TRAINED = 40, 100
 _FEWEST_IN_NEED = 10
 # Most that training frames and their flows take where no limit is given, bytes.
 _TRAINING_BYTES = 1.5e9
+# Peak without a limit from which training frames go to a scratch file, bytes, and how often it has to fit on the disk.
+_MUCH, _ROOM = 2.2e9, 3
 # Interpreter, libraries and readers, bytes.
 _BASE = 1.6e8
 # What is found out before the stages, such as an overlay, bytes a pixel and a pixel and channel.
@@ -134,9 +137,9 @@ def plan_memory(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime)
     folder = runtime.scratch or Path(tempfile.gettempdir())
     most = runtime.workers
     tile = runtime.tile if runtime.tile is not None and max(shape[1:3]) > runtime.tile else None
-    if runtime.memory_limit is None and tile is None:
-        return MemoryPlan(train, replace(runtime, scratch=None))
     base = _BASE + COMPILER_BYTES + (TORCH_BYTES if needs_torch(runtime.device) else 0)
+    if runtime.memory_limit is None and tile is None:
+        return _without_limit(shape, params, _Choice(train, most), replace(runtime, scratch=folder), base)
     limit = math.inf if runtime.memory_limit is None else runtime.memory_limit
     budget = limit - base
     for choice in _choices(shape, train, most, params, tile):
@@ -155,6 +158,19 @@ def plan_memory(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime)
         _deconvolution_side(shape, params, choice, budget),
         tuple(_decisions(shape, params, choice, _Choice(train, most, tile=tile), base, limit)),
     )
+
+
+def _without_limit(
+    shape: tuple[int, ...], params: RestoreParams, choice: _Choice, runtime: Runtime, base: float
+) -> MemoryPlan:
+    """Keep the training frames in a scratch file if memory takes much and the disk has room; no result changes."""
+    in_file, folder = replace(choice, in_scratch=True), runtime.scratch
+    size = _scratch_bytes(shape, params, in_file)
+    much = base + _peak(shape, params, choice, math.inf) > _MUCH
+    if not much or folder is None or not folder.is_dir() or shutil.disk_usage(folder).free < _ROOM * size:
+        return MemoryPlan(choice.train, replace(runtime, scratch=None))
+    decisions = tuple(_decisions(shape, params, in_file, choice, base, math.inf))
+    return MemoryPlan(choice.train, runtime, scratch_bytes=size, decisions=decisions)
 
 
 def training_share(
