@@ -48,8 +48,8 @@ _TRAINING_BYTES = 1.5e9
 _MUCH, _ROOM = 2.2e9, 3
 # Interpreter, libraries and readers, bytes.
 _BASE = 1.6e8
-# What is found out before the stages, such as an overlay, bytes a pixel and a pixel and channel.
-_PREPARED, _PREPARED_COLOUR = 22, 34
+# What is found out before the stages, such as what passes, bytes a pixel and a pixel and channel.
+_PREPARED, _PREPARED_COLOUR = 44, 34
 # Images and maps that the stages leave, bytes a pixel and bytes a pixel and channel; with tiles most of them lie in
 # scratch files.
 _RESULTS, _RESULTS_COLOUR = 60, 40

@@ -1,4 +1,4 @@
-"""Preparation of the frames: without bars and overlays, under steady light, in units of the range that they use."""
+"""Preparation of the frames: without bars, overlays and what passes, under steady light, in units of their range."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from .footage.bars import Bars, without_bars
 from .footage.levels import Levels, stretch_levels
 from .footage.light import steady_light
 from .footage.overlays import read_static_mask, without_overlay
+from .footage.passers import without_passers
 from .io.source import FrameSource, Window
 from .registration.centroid import Centroid
 from .runtime.scratch import mean_of
@@ -82,7 +83,8 @@ def prepare(source: FrameSource, train: int, static_mask: str = "auto") -> Prepa
     source, hidden, on_overlay = without_overlay(source, mask) if static_mask != "off" else (source, None, ())
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, train)
-    return Prepared(source, levels, bars, hidden, (*on_bars, *on_overlay, *on_light, *on_range))
+    source, on_passers = without_passers(source)
+    return Prepared(source, levels, bars, hidden, (*on_bars, *on_overlay, *on_light, *on_range, *on_passers))
 
 
 def seeing_of_picture(

@@ -1,0 +1,91 @@
+"""What passes through a scene is replaced by the background, and nothing else is."""
+
+import cv2
+import numpy as np
+import pytest
+
+from turbrestore.footage.passers import without_passers
+from turbrestore.io.source import FrameSource
+from turbrestore.metrics import compare
+from turbrestore.pipeline import restore
+from turbrestore.synthesis.anisoplanatic import phase_screen_frames
+from turbrestore.synthesis.atmosphere import PhaseScreenParams
+from turbrestore.synthesis.moving_objects import draw_objects
+from turbrestore.synthesis.scenes import SCENES
+
+COUNT, SIDE = 40, 128
+
+
+def clip(scene, objects=0, channels=1, d_over_r0=2.5):
+    """Frames with and without objects."""
+    truth = SCENES[scene](SIDE, SIDE)
+    if channels == 3:
+        truth = truth[..., None] * np.float32([1.0, 0.8, 0.6])
+    passing = draw_objects(objects, truth.shape, np.random.default_rng(5))
+    params = PhaseScreenParams(d_over_r0)
+
+    def seen(some):
+        frames = phase_screen_frames(truth, COUNT, np.random.default_rng(7), params, objects=some)
+        return np.stack([frame.image for frame in frames])
+
+    return seen(passing), seen(())
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_frames_show_the_background_where_objects_pass(channels):
+    frames, empty = clip("brick", 3, channels)
+    cleaned, (decision,) = without_passers(FrameSource.from_array(frames))
+    cleaned = cleaned.read()
+    covered = np.abs(frames - empty).reshape(*empty.shape[:3], -1).max(axis=3) > 0.1
+    assert covered.mean() > 0.03
+    before, after = (np.sqrt(np.mean((some - empty)[covered] ** 2)) for some in (frames, cleaned))
+    assert after < 0.4 * before
+    far = cv2.dilate(covered.any(axis=0).astype(np.uint8), np.ones((21, 21))) == 0
+    assert np.array_equal(cleaned[:, far], frames[:, far])
+    assert decision.subject == "passers"
+
+
+def test_the_image_is_that_of_the_clip_without_objects():
+    frames, empty = clip("brick", 3)
+    with_objects, without = (restore(some).image for some in (frames, empty))
+    assert compare(with_objects, without).psnr > 30
+
+
+def test_a_window_of_a_frame_is_cleaned_as_the_whole_frame_is():
+    cleaned, _ = without_passers(FrameSource.from_array(clip("brick", 3)[0]))
+    whole, part = cleaned.read(), cleaned.select(roi=(20, 10, 90, 100)).read()
+    # Discs and windows reach a few pixels beyond what they decide on.
+    inner = np.s_[:, 24:-24, 24:-24]
+    assert np.abs(whole[:, 10:110, 20:110][inner] - part[inner]).max() < 1e-6
+
+
+@pytest.mark.parametrize("scene", ["camera", "chart", "brick"])
+def test_turbulence_passes_for_nothing(scene):
+    source = FrameSource.from_array(clip(scene, d_over_r0=5.0)[1])
+    assert without_passers(source) == (source, ())
+
+
+def test_a_planet_that_drifts_is_the_scene():
+    y, x = np.mgrid[:96, :160]
+    frames = np.float32([0.8 * (np.hypot(x - 30 - 4 * k, y - 48) < 20) for k in range(25)])
+    frames += 0.05 * (np.random.default_rng(0).random((96, 160)) > 0.998)  # Stars, which the planet covers.
+    source = FrameSource.from_array(cv2.GaussianBlur(frames.transpose(1, 2, 0), (0, 0), 1.5).transpose(2, 0, 1))
+    assert without_passers(source) == (source, ())
+
+
+def test_nothing_passes_while_the_camera_moves():
+    scene = SCENES["camera"](160, 240)
+    source = FrameSource.from_array(np.stack([scene[:, 4 * k : 4 * k + 140] for k in range(25)]))
+    assert without_passers(source) == (source, ())
+
+
+def test_a_black_frame_is_left_as_it_is():
+    frames, _ = clip("brick", 3)
+    frames[[5, 20]] = 0
+    cleaned, _ = without_passers(FrameSource.from_array(frames))
+    assert not cleaned.read()[[5, 20]].any()
+
+
+def test_few_frames_tell_nothing():
+    source = FrameSource.from_array(clip("brick", 3)[0][:8])
+    assert without_passers(source) == (source, ())
