@@ -30,8 +30,8 @@ SIDE = 256
 NAMES = ("camera", "brick", "grass", "gravel", "chart", "words", "page", "coins", "moon", "astronaut")
 WIDTHS = (0.0, 0.8, 1.4, 2.2, 3.5, 6.0)
 NOISES = (0.002, 0.02)
-# Relative errors of the blurred cases: median and 90th percentile of the size, and largest overestimate, which is that
-# of white noise in fine detail: it looks like the smooth noise of fused frames.
+# Relative errors of the blurred cases: median and 90th percentile of the size, and largest overestimate.  The last is
+# found in fine detail with white noise, which looks like the smooth noise of fused frames.
 BOUNDS = (0.10, 0.25, 0.45)
 
 

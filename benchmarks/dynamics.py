@@ -72,8 +72,9 @@ def measure(strength: str, kind: str, noise: float, name: str, tree: Path | None
     """PSNR, dB, of each column."""
     frames, flows, truth = clip(strength, kind, noise, name)
     whole = restore(frames)
-    # One width for all flows, so that they alone make the difference.
-    blur = DeconvolutionParams(sigma=whole.deconvolution.sigma, exponent=whole.blur.exponent)
+    # One width for all flows, so that they alone make the difference; none where the mean is the result.
+    sigma = 0.0 if whole.deconvolution is None else whole.deconvolution.sigma
+    blur = DeconvolutionParams(sigma=sigma, exponent=None if whole.blur is None else whole.blur.exponent)
     drop, once = FilterParams(residual="drop"), FilterParams(inner_iterations=1)
     seen = [frame if frame.any() else None for frame in frames]
     fused = filter_frames(seen, whole.centroid.image, identify(flows), once, known_flows=flows).image

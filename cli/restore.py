@@ -156,9 +156,9 @@ def restore(
     bit_depth : int
         Bits per channel of the output, 8, 16 or 32 (float, TIFF and FITS).  Those of the input by default.
     memory_limit : MemorySize
-        Most memory to take, such as 2GB.  To keep it, training frames go to a scratch file, fewer threads work, fewer
-        frames are trained on, and frames are processed in tiles that overlap, in this order.  With --workers, what all
-        processes together take; with --scheduler, what each takes.
+        Most memory to take, such as 2GB; by default there is no limit.  To keep it, training frames go to a scratch
+        file, fewer threads work, fewer frames are trained on, and frames are processed in tiles that overlap, in this
+        order.  With --workers, what all processes together take; with --scheduler, what each takes.
     tile : int
         Longest side of the tiles that larger frames are processed in, pixels.  By default frames are processed as a
         whole; with --workers or --scheduler it is 1088.

@@ -144,7 +144,7 @@ def fuse(run: Run) -> Fused:
         return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation)
 
     dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
-    run.decide(*explain_dynamics(dynamics, run.params.filter.residual == "drop"))
+    run.decide(*explain_dynamics(dynamics, params.filter.residual == "drop"))
     if not params.runs("filter"):
         return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation, dynamics)
 

@@ -1,4 +1,4 @@
-"""How a restoration keeps within a memory limit.
+"""How a restoration keeps within a memory limit, and takes no more than it has to without one.
 
 Every stage says beside its code how many bytes it takes; the peak of a restoration is the largest sum of what is held
 and what one stage takes.  The plan is the first of these that fits:
@@ -16,6 +16,7 @@ tiles change the result, slightly; nothing else does, and neither depends on the
 from __future__ import annotations
 
 import math
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -81,7 +82,7 @@ class MemoryPlan:
     deconvolution_side : int or None
         Longest side of the tiles in which the image is deconvolved, pixels; None for the whole image.
     decisions : tuple of Decision
-        What the limit has caused, in words.
+        What is done to save memory, in words.
     """
 
     train: int
@@ -167,10 +168,17 @@ def _without_limit(
     in_file, folder = replace(choice, in_scratch=True), runtime.scratch
     size = _scratch_bytes(shape, params, in_file)
     much = base + _peak(shape, params, choice, math.inf) > _MUCH
-    if not much or folder is None or not folder.is_dir() or shutil.disk_usage(folder).free < _ROOM * size:
+    if not much or folder is None or not _has_room(folder, _ROOM * size):
         return MemoryPlan(choice.train, replace(runtime, scratch=None))
     decisions = tuple(_decisions(shape, params, in_file, choice, base, math.inf))
     return MemoryPlan(choice.train, runtime, scratch_bytes=size, decisions=decisions)
+
+
+def _has_room(folder: Path, size: int) -> bool:
+    try:
+        return os.access(folder, os.W_OK) and shutil.disk_usage(folder).free >= size
+    except OSError:
+        return False
 
 
 def training_share(

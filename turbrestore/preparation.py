@@ -83,7 +83,7 @@ def prepare(source: FrameSource, train: int, static_mask: str = "auto") -> Prepa
     source, hidden, on_overlay = without_overlay(source, mask) if static_mask != "off" else (source, None, ())
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, train)
-    source, on_passers = without_passers(source)
+    source, on_passers = without_passers(source) if static_mask != "off" else (source, ())
     return Prepared(source, levels, bars, hidden, (*on_bars, *on_overlay, *on_light, *on_range, *on_passers))
 
 

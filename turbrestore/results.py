@@ -78,8 +78,8 @@ class Restoration:
     crop : tuple of int
         x, y, width and height of the image within the frames, pixels.
     mean : ndarray, float32, shape (H, W) or (H, W, 3)
-        Temporal mean of the frames that were read, in their size: all of them once the filter has run, else the
-        training frames.
+        Temporal mean of the prepared frames, in their size: all of them once the filter has run, else the training
+        frames.  What passes through the scene is not in it.
     centroid : Centroid
     dynamics : FlowDynamics or None
         Where frames are processed in tiles it is for the record: the filter has a model of each tile.

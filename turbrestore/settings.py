@@ -42,7 +42,8 @@ class RestoreParams:
         Keep the border, where fewer frames show the scene, or crop it to what nine frames in ten show.
     static_mask : str
         What stands in the frame while the scene moves (a field stop, a reticle, a clock) is replaced by the scene
-        behind it: auto finds it, off leaves it, and else it is the path of an image that is not black there.
+        behind it: auto finds it, off leaves it, and else it is the path of an image that is not black there.  What
+        passes through the scene is replaced too, unless it is off.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -127,6 +128,7 @@ PRESETS: Mapping[Preset, RestoreParams] = MappingProxyType(
         ),
         "standard": RestoreParams(),
         "paper": RestoreParams(
+            static_mask="off",
             centroid=CentroidParams(mode="single", iterations=10),
             filter=FilterParams(residual="drop", training="skip", block=1, sharpness=0.0, prior_frames=1.0),
             deconvolution=DeconvolutionParams(exponent=GAUSSIAN, sharpen_guide=False),

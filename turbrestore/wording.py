@@ -228,7 +228,7 @@ def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
     >>> shares = np.array([0.45, 0.05, 0.5])
     >>> none = np.zeros(3)
     >>> black, still = np.zeros((4, 4)), np.zeros((4, 4, 2))
-    >>> filtered = Filtered(black, black, none, none, none, none, shares, 1e-4, 1.0, 2.0, still)
+    >>> filtered = Filtered(black, black, none, none, none, none, shares, 1e-4, 2.0, still)
     >>> explain_frames(filtered, None).choice
     '2 of 3 frames count'
     """
@@ -258,7 +258,7 @@ def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
     >>> import numpy as np
     >>> from turbrestore.dynamics.dynamic_texture import identify
     >>> black, none, flows = np.zeros((4, 4)), np.zeros(8), np.zeros((8, 4, 4, 2), np.float32)
-    >>> filtered = Filtered(black, black, none, none, none, none, none, 1e-4, 1.0, 2.0, flows[0] + np.float32(0.3))
+    >>> filtered = Filtered(black, black, none, none, none, none, none, 1e-4, 2.0, flows[0] + np.float32(0.3))
     >>> decision = explain_geometry(filtered, identify(flows))
     >>> decision.choice
     'moved by 0.42 pixels'

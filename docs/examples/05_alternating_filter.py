@@ -50,8 +50,8 @@ print(f"{dynamics.rank} states hold {100 * dynamics.energy_share:.0f} % of the v
 
 # %% [markdown]
 # ## Through the frames
-# The filter runs over the first 24, 36 and 48 frames. `keep` adds to the flow of the model the share of the
-# residual that is motion; `drop` is the paper as printed, `flow = C ξ`.
+# The filter runs over the first 24, 36 and 48 frames. `keep` registers the frames by the measured
+# flow; `drop` is the paper as printed, `flow = C ξ`.
 
 # %%
 counts = (24, 36, 48)
@@ -118,7 +118,7 @@ for ax, (title, values) in zip(axes, maps.items(), strict=False):
 figure.colorbar(shown, ax=axes[:2], label="px rms")
 sizes = dynamics.singular_values / np.sqrt(TRAIN * SIZE * SIZE)
 axes[2].bar(np.arange(1, TRAIN), sizes[:-1], color=["C0" if k < dynamics.rank else "C1" for k in range(TRAIN - 1)])
-axes[2].set(xlabel="singular value", ylabel="px rms", title=f"{dynamics.rank} states, and the rest")
+_ = axes[2].set(xlabel="singular value", ylabel="px rms", title=f"{dynamics.rank} states, and the rest")
 
 # %% [markdown]
 # The residual is smaller than the flow but spread over the whole image, about half a pixel. The singular values fall
@@ -140,7 +140,7 @@ axes[1].axvline(TRAIN - 0.5, color="0.5", linestyle=":")
 axes[1].set(xlabel="frame; training ends at the line", ylabel="innovation, px rms", ylim=(0, None))
 axes[2].plot(blurs, kept.shares * FRAMES, "o")
 axes[2].axhline(1, color="0.6", linewidth=0.8)
-axes[2].set(xlabel="true blur of the frame, σ in px", ylabel="share of the frame × frames")
+_ = axes[2].set(xlabel="true blur of the frame, σ in px", ylabel="share of the frame × frames")
 _ = axes[0].legend()
 
 # %% [markdown]

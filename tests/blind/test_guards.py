@@ -141,4 +141,4 @@ def test_edges_in_one_row_of_tiles_are_not_all_left_out(monkeypatch):
     [((0.2, 0.0, 1.0), 0.9), ((0.24, 0.0, 1.0), 0.81), ((0.0, 0.17, 1.0), 0.9), ((0.0, 0.0, 12.0), 0.81)],
 )
 def test_the_width_is_lowered_less_where_a_bound_is_hardly_exceeded(reading, factor):
-    assert GuardParams(back_off=0.81).back_off_from(GuardReading(2.0, *reading, passed=False)) == pytest.approx(factor)
+    assert GuardParams(back_off=0.81).first_back_off(GuardReading(2.0, *reading, passed=False)) == pytest.approx(factor)

@@ -63,7 +63,8 @@ class GuardParams:
     noise_gain : float
         Largest ratio, after to before, of the standard deviation in the flattest fifth of the image.
     back_off : float
-        Factor on the width of the blur after a failed attempt; its square root where a bound is hardly exceeded.
+        Factor on the width of the blur after a failed attempt; its square root after the first if no bound is exceeded
+        by more than a half.
     tries : int
         Largest number of attempts; if the last one fails, no blur is removed.
     """
@@ -81,8 +82,8 @@ class GuardParams:
         require_between("back_off", self.back_off, 0.1, 0.99)
         require_between("tries", self.tries, 1, 100)
 
-    def back_off_from(self, reading: GuardReading) -> float:
-        """Return the factor on the width after an attempt that failed.
+    def first_back_off(self, reading: GuardReading) -> float:
+        """Return the factor on the width after the first attempt, if that failed.
 
         Parameters
         ----------
@@ -96,7 +97,7 @@ class GuardParams:
 
         Examples
         --------
-        >>> GuardParams(back_off=0.81).back_off_from(GuardReading(2.0, 0.2, 0.1, 1.5, passed=False))
+        >>> GuardParams(back_off=0.81).first_back_off(GuardReading(2.0, 0.2, 0.1, 1.5, passed=False))
         0.9
         """
         excess = max(

@@ -323,7 +323,7 @@ def guarded_steps(
         readings.append(evaluate_guards(result.image, blurred, sigma, guards))
         if readings[-1].passed:
             return result, tuple(readings)
-        sigma *= guards.back_off_from(readings[-1])
+        sigma *= guards.back_off if len(readings) > 1 else guards.first_back_off(readings[0])
     result = yield from attempt(0.0)
     return result, tuple(readings)
 

@@ -279,7 +279,7 @@ def find_candidates(
     if min(grey.shape) < _SMALLEST_IMAGE or np.ptp(grey) <= LEAST_NOISE:
         return ()
     factors = [factor for factor in _REDUCTIONS if factor == 1 or min(grey.shape) >= factor * _SMALLEST_SIDE]
-    multiple = noise_multiple(grey)
+    multiple = 1.0 if noise is not None else noise_multiple(grey)
     return tuple(_find_candidate(grey, factor, exponent, noise, multiple) for factor in factors)
 
 

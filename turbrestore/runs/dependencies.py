@@ -17,7 +17,7 @@ from .digests import content_digest, file_digest
 from .run_record import versions
 
 # Raised where the same frames and settings begin to give another image.
-_RESULTS = 9
+_RESULTS = 10
 
 
 def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryPlan) -> dict[str, dict[str, Any]]:

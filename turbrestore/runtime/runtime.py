@@ -30,7 +30,8 @@ class Runtime:
         sees one.
     scratch : Path, optional
         Folder of the files that hold stacks of frames and flows.  A stage without it keeps them in memory; a whole
-        restoration uses files only where a memory limit or tiles ask for them, by default among the temporary files.
+        restoration uses files where a memory limit or tiles ask for them, or memory would take more than 2.2 GB; by
+        default among the temporary files.
     tile : int, optional
         Longest side of the tiles in which a restoration processes larger frames, pixels; at least 384.  By default
         frames are processed as a whole, if that keeps the memory limit.
