@@ -3,7 +3,8 @@
     python benchmarks/dynamics.py --before 7b5207f --write benchmarks/results/dynamics.md
 
 PSNR after deblurring against the scene at the mean geometry, of clips made here by phase screens: three scenes at
-medium turbulence, with noise, and with 30 % of the frames missing or half of the scene flat.  The true flow is a bound on what any model of the motion could give to the image.
+medium turbulence, with noise, and with 30 % of the frames missing or half of the scene flat.  The true flow is a bound
+on what any model of the motion could give to the image.
 """
 
 from __future__ import annotations
@@ -107,9 +108,8 @@ def document(rows: dict[tuple[str, ...], Row], before: str) -> str:
     lines = [
         "# Dynamics\n",
         f"What `python benchmarks/dynamics.py --before {before} --write benchmarks/results/dynamics.md` measures: PSNR "
-        f"after deblurring, dB, against the scene at the mean geometry; {COUNT} frames of {SIDE} pixels a side, of which "
-        f"{MISSING:.0%} may be missing, "
-        "phase screens.  'Now' registers frames by the flow that it measures.  The other columns are differences to "
+        f"after deblurring, dB, against the scene at the mean geometry; phase screens, {COUNT} frames of {SIDE} pixels a "
+        f"side, of which 'missing' lacks {100 * MISSING:.0f} %.  'Now' registers frames by the flow that it measures.  The other columns are differences to "
         "it: of the revision, of the flow of the model as the paper prints it, and of the true flow, which no model "
         "of the motion can surpass.  The last two are deblurred by the width of 'now'.\n",
         "| turbulence | frames | noise | scene | now | before | flow of the model | true flow |",
