@@ -108,10 +108,11 @@ def document(rows: dict[tuple[str, ...], Row], before: str) -> str:
     lines = [
         "# Dynamics\n",
         f"What `python benchmarks/dynamics.py --before {before} --write benchmarks/results/dynamics.md` measures: PSNR "
-        f"after deblurring, dB, against the scene at the mean geometry; phase screens, {COUNT} frames of {SIDE} pixels a "
-        f"side, of which 'missing' lacks {100 * MISSING:.0f} %.  'Now' registers frames by the flow that it measures.  The other columns are differences to "
-        "it: of the revision, of the flow of the model as the paper prints it, and of the true flow, which no model "
-        "of the motion can surpass.  The last two are deblurred by the width of 'now'.\n",
+        f"after deblurring, dB, against the scene at the mean geometry; phase screens, {COUNT} frames of {SIDE} pixels "
+        f"a side, of which 'missing' lacks {100 * MISSING:.0f} %.  'Now' registers frames by the measured flow.  "
+        "The other columns are differences to it: of the revision, of the flow of the model as the paper prints it, "
+        "and of the true flow, which no model of the motion can surpass.  The last two are deblurred by the width of "
+        "'now'.\n",
         "| turbulence | frames | noise | scene | now | before | flow of the model | true flow |",
         "|---|---|---:|---|---:|---:|---:|---:|",
         *(f"| {' | '.join(key)} | {_cells(row)} |" for key, row in rows.items()),
