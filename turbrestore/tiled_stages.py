@@ -342,7 +342,7 @@ def join_filtered(
     >>> one, tiles = np.ones(2), halo_tiles((40, 64), side=44, halo=8)
     >>> images = (np.ones(tile.shape, np.float32) for tile in tiles)
     >>> parts = (
-    ...     Filtered(image, image, one[:, None], one, one, one, one / 2, 1e-4, 1.0, 2.0, np.dstack([image, image]))
+    ...     Filtered(image, image, one[:, None], one, one, one, one / 2, 1e-4, 2.0, np.dstack([image, image]))
     ...     for image in images
     ... )
     >>> joined = join_filtered(parts, tiles, (40, 64))
