@@ -77,9 +77,9 @@ def test_a_source_is_read_front_to_back_for_the_filter_and_for_the_mean(blurred)
             yield from array.pixels(range(number, number + 1))
 
     restore(replace(array, pixels=pixels), replace(QUICK, train=4, until="filter"))
-    # Before them all frames are looked at for bars, overlays and changes of the light, and the training frames for
-    # their range.
-    assert reads == [*range(8), *range(8), *range(8), *range(4), *range(8), *range(8)]
+    # Before them all frames are looked at for blank ones, bars, overlays and changes of the light, and the training
+    # frames for their range.
+    assert reads == [*range(8), *range(8), *range(8), *range(8), *range(4), *range(8), *range(8)]
 
 
 def test_the_result_is_the_same_every_time(blurred):
@@ -228,3 +228,12 @@ def test_presets_are_sets_of_settings():
 def test_frames_that_train_are_not_all_frames_where_they_are_skipped(blurred):
     with pytest.raises(ConfigurationError, match="train: expected fewer than the 24 frames"):
         restore(blurred.frames, replace(preset("paper"), train=24))
+
+
+def test_blank_frames_change_nothing():
+    frames = make_sequence(5, count=12, size=64, scene="camera", noise=0.01).frames
+    gappy = np.insert(frames, [0, 4, 4, 12], 0.02, axis=0)
+    whole, left = restore(frames), restore(gappy)
+    np.testing.assert_array_equal(left.image, whole.image)
+    assert left.frame_count == 12
+    assert left.decisions[0].choice == "frames 0, 5, 6, 15 left out"

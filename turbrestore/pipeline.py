@@ -13,6 +13,7 @@ from .blind.remove_blur import Deblurred, remove_blur_steps
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.errors import require
+from .footage.content import without_blank
 from .footage.levels import Levels
 from .fusion import Fused, Run, fuse
 from .io.output import check_space
@@ -56,7 +57,8 @@ def restore(
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
-    Frames are read in order.  Only the training frames are kept, in memory or, if they do not fit, in a scratch file.
+    Frames are read in order, and those that show nothing are left out.  Only the training frames are kept, in memory
+    or, if they do not fit, in a scratch file.
 
     Parameters
     ----------
@@ -104,7 +106,8 @@ def restore(
     ((64, 64), 6)
     """
     params = params or RestoreParams()
-    source = frames if isinstance(frames, FrameSource) else FrameSource.from_array(frames)
+    begun = time.perf_counter()
+    source, on_blank = without_blank(frames if isinstance(frames, FrameSource) else FrameSource.from_array(frames))
     plan = plan_memory(source.shape, params, runtime)
     _check_sigma(params.deconvolution.sigma, source.shape)
     _check_training(params, plan.train, len(source))
@@ -112,12 +115,11 @@ def restore(
         check_space(plan.runtime.scratch, plan.scratch_bytes)
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
-    begun = time.perf_counter()
     prepared = prepare(source, plan.train, params.static_mask)
     stretched, bars = _stretched_params(params, prepared.levels), prepared.bars
     run = Run(prepared, stretched, plan, tiles, store or NoStore(), progress, on_decision, map_tiles)
     run.seconds["read"] = time.perf_counter() - begun
-    run.decide(*plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
+    run.decide(*on_blank, *plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
     run.decide(*prepared.decisions)
     with returning_freed_memory(runtime.memory_limit is not None):
         restoration = _restored(run)

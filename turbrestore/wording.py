@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .blind.structure import LEFT, UNSEEN, StructureReading
-from .core.arrays import FloatArray, luminance
+from .core.arrays import FloatArray
 from .core.decision import Decision
 from .dynamics.flow_model import FlowDynamics, mean_flow_error
 from .filtering.alternating import Filtered
@@ -22,8 +22,6 @@ _COUNTS = 0.2
 _SATURATED = 1 - 0.5 / 255
 # Share of saturated pixels above which they are reported.
 _REPORTED_SHARE = 0.01
-# A frame is flat if its contrast is below this share of that of the best frame.
-_FLAT = 0.1
 # Motion beyond this share of the shorter side is too large for optical flow in some places.
 _LARGE_MOTION = 1 / 12
 
@@ -60,7 +58,7 @@ def explain_training(train: int, frame_count: int, wanted: int | None) -> Decisi
 
 
 def explain_input(training: FloatArray) -> tuple[Decision, ...]:
-    """Report frames with little information: saturated pixels, and frames without texture.
+    """Report saturated pixels.
 
     Parameters
     ----------
@@ -75,26 +73,15 @@ def explain_input(training: FloatArray) -> tuple[Decision, ...]:
     --------
     >>> import numpy as np
     >>> frames = np.random.default_rng(0).uniform(0.2, 0.8, (4, 16, 16)).astype(np.float32)
-    >>> frames[2] = 0.5; frames[:, :4] = 1
+    >>> frames[:, :4] = 1
     >>> [(decision.subject, decision.choice) for decision in explain_input(frames)]
-    [('saturation', 'left as it is'), ('flat frames', '1 of 4, kept')]
+    [('saturation', 'left as it is')]
     """
-    decisions = []
-    saturated, contrast = 0.0, np.zeros(len(training))
-    for index, frame in enumerate(iter_frames(training)):
-        saturated += float(np.mean(frame >= _SATURATED)) / len(training)
-        grey = luminance(frame)
-        # Saturated pixels are not texture.
-        textured = grey[grey < _SATURATED]
-        contrast[index] = textured.std() if textured.size else 0.0
-    if saturated > _REPORTED_SHARE:
-        reason = f"{saturated:.0%} of the pixels are at full scale: detail is lost there, and edges may ring"
-        decisions.append(Decision("saturation", "left as it is", reason))
-    flat = int(np.sum(contrast < _FLAT * contrast.max()))
-    if flat:
-        reason = "hardly any contrast: their flow follows noise; their sharpness determines their weight"
-        decisions.append(Decision("flat frames", f"{flat} of {len(training)}, kept", reason))
-    return tuple(decisions)
+    saturated = float(np.mean([np.mean(frame >= _SATURATED) for frame in iter_frames(training)]))
+    if saturated <= _REPORTED_SHARE:
+        return ()
+    reason = f"{saturated:.0%} of the pixels are at full scale: detail is lost there, and edges may ring"
+    return (Decision("saturation", "left as it is", reason),)
 
 
 def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:

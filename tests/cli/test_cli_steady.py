@@ -1,5 +1,6 @@
 """``turbrestore steady`` from the command line."""
 
+import io
 import json
 import subprocess
 import sys
@@ -99,11 +100,12 @@ def test_pipes_of_matroska_stand_in_a_row(tmp_path):
         (["-", "o.mkv", "--report", "o.html"], 2, "--report"),
     ],
 )
-def test_wrong_words_about_pipes(tmp_path, monkeypatch, words, code, part):
+def test_wrong_words_about_pipes(run, tmp_path, monkeypatch, words, code, part):
     monkeypatch.chdir(tmp_path)
-    done = piped(*words, data=b"no video")
-    assert (done.returncode, done.stdout) == (code, b"")
-    assert part in done.stderr.decode()
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"no video")))
+    found, out, err = run("steady", *words)
+    assert (found, out) == (code, "")
+    assert part in err
     assert not list(tmp_path.iterdir())
 
 

@@ -56,9 +56,9 @@ CASES = {
         "flow model",
         "8 states asked for, 3 independent flows found",
     ),
-    "one frame without texture": (without_texture, "flat frames", "1 of 10, kept"),
+    "one frame without texture": (without_texture, "blank frames", "frame 5 left out"),
     "saturated parts": (saturated, "saturation", "left as it is"),
-    "white frames": (white_frames, "flat frames", "2 of 10, kept"),
+    "white frames": (white_frames, "blank frames", "frames 4, 7 left out"),
     "motion of a fifth of the image": (far, "motion", "taken as measured"),
     "16 by 16 pixels": (lambda: USUAL.frames[:6, 10:26, 10:26], "blur", "removed"),
 }
@@ -103,9 +103,9 @@ def test_covariances_stay_symmetric_and_positive(system):
 
 
 @pytest.mark.long
-def test_covariances_stay_symmetric_and_positive_over_a_hundred_thousand_steps():
+def test_covariances_stay_symmetric_and_positive_over_many_steps():
     # An update takes longer than a step, so few are measured.
-    walk(1, 0.9999, [-12.0, -3.0, 0.0], seen=0.1, steps=100_000, every=1000)
+    walk(1, 0.9999, [-12.0, -3.0, 0.0], seen=0.1, steps=20_000, every=200)
 
 
 def walk(seed, radius, noises, seen, steps, every):
@@ -129,11 +129,11 @@ def walk(seed, radius, noises, seen, steps, every):
 
 
 @pytest.mark.long
-def test_pixel_variances_stay_positive_over_a_hundred_thousand_steps():
+def test_pixel_variances_stay_positive_over_many_steps():
     rng = np.random.default_rng(2)
     state = PixelStacks(np.zeros((1, 2, 3), np.float32), np.ones((2, 3), np.float32))
     noises = (10.0 ** rng.uniform(-8, 8, (1000, 2, 3))).astype(np.float32)
-    for step in range(100_000):
+    for step in range(20_000):
         state, gain = update_pixels(state, state.mean, noises[step % 1000], drift=1e-9)
     assert (state.variance > 0).all()
     assert ((gain >= 0) & (gain <= 1)).all()

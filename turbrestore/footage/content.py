@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
+from ..core.decision import Decision
 from ..core.errors import ConfigurationError, DataError, require_between
 from ..io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ..io.source import FrameSource, numbers_text
@@ -37,6 +38,7 @@ _MOST_MISSING = 0.01
 _WIDEST_HOLE = 32
 _LEAST_CONTRAST = 1 / 510
 _SATURATED = 0.5
+_BLANK_CONTRAST = 0.1
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class ContentParams:
     """
 
     strict: bool = False
-    blank_contrast: float = 0.1
+    blank_contrast: float = _BLANK_CONTRAST
     cut_similarity: float = 0.5
     stuck_excess: float = 0.05
 
@@ -180,6 +182,40 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
     )
 
 
+def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
+    """Leave out frames that show nothing; a source without any is returned as it is.
+
+    Parameters
+    ----------
+    source : FrameSource
+
+    Returns
+    -------
+    source : FrameSource
+    decisions : tuple of Decision
+        What was left out, if anything.
+
+    Raises
+    ------
+    DataError
+        Frames are damaged.
+
+    Examples
+    --------
+    >>> frames = np.random.default_rng(0).random((4, 20, 20))
+    >>> frames[1] = 0
+    >>> source, (found,) = without_blank(FrameSource.from_array(frames))
+    >>> len(source), found.choice
+    (3, 'frame 1 left out')
+    """
+    contrasts = np.array([thumbnail(frame).std() for frame in source], np.float64)
+    blank = np.asarray(source.numbers)[_are_blank(contrasts, _BLANK_CONTRAST)].tolist()
+    if not blank:
+        return source, ()
+    choice, reason = f"{numbers_text(blank)} left out", f"at most {_BLANK_CONTRAST:.0%} of the usual contrast"
+    return source.without(blank, f"{choice}: {reason}"), (Decision("blank frames", choice, reason),)
+
+
 def keep_all(report: ContentReport) -> ContentReport:
     """Return the report for a use that keeps every frame: defects are repaired, and nothing is left out.
 
@@ -232,8 +268,7 @@ class _ContentScan:
     def report(self) -> ContentReport:
         numbers = np.asarray(self._source.numbers)
         contrasts = np.frombuffer(self._contrasts)
-        blank = contrasts <= self._params.blank_contrast * np.median(contrasts)
-        blank &= ~blank.all()
+        blank = _are_blank(contrasts, self._params.blank_contrast)
         duplicated = np.isin(numbers, self._duplicated)
         labels = np.where(blank, -1, self._scenes.labels())
         scenes, used = group_scenes(numbers, labels)
@@ -312,6 +347,12 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     if report.saturated >= _SATURATED:
         lines.append(f"{100 * report.saturated:.0f} % of the values are at white: detail there is lost")
     return lines
+
+
+def _are_blank(contrasts: NDArray[np.float64], share: float) -> NDArray[np.bool_]:
+    """Tell which frames are blank by their contrasts; none where all would be."""
+    blank = contrasts <= share * np.median(contrasts)
+    return np.asarray(blank & ~blank.all())
 
 
 def fill_holes(pixels: PixelArray) -> PixelArray:

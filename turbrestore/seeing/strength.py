@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from ..blur_moments.cues import relative_blur
 from ..blur_moments.tile_spectra import CueParams
@@ -55,7 +55,7 @@ _COMPARED, _TILES = 512, CueParams(tile=64, departure=1.0)
 # Share of rotation from which the displacement is not that of turbulence; without any relation of x and y it is 0.5.
 _ROTATING = 0.4
 _HALF, _E_FOLD = 0.5, float(np.exp(-1))
-_DEVIATIONS = float(stats.norm.ppf(0.975))
+_DEVIATIONS = float(special.ndtri(0.975))
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ def chi_square_interval(variance: float, freedom: float, relative: float = 0.0) 
     >>> round(found.low, 2), round(found.high, 2)
     (0.77, 1.35)
     """
-    upper, lower = (max(float(stats.chi2.ppf(share, freedom)) / freedom, 1e-12) for share in (0.975, 0.025))
+    upper, lower = (max(float(special.chdtri(freedom, share)) / freedom, 1e-12) for share in (0.025, 0.975))
     below, above = (np.hypot(np.log(quantile), _DEVIATIONS * relative) for quantile in (upper, lower))
     return Estimate(variance, float(variance * np.exp(-below)), float(variance * np.exp(above)))
 
