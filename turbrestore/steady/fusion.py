@@ -4,7 +4,8 @@ Symbols
 -------
 J : the frame, dewarped; J_i its neighbours, warped onto it
 e : difference J_i − J, averaged in a small window and squared
-t : difference that misregistration and noise explain, intensity
+t : difference that misregistration and noise explain, intensity; it grows with the gradient of J, because a
+    registration that is wrong by a fraction of a pixel, and a blur that changes, show at edges
 w : weight of a neighbour, ``exp(−e / 2t²)``
 
 Where a neighbour shows something else than the frame, because an object or the background it uncovers has moved, or
@@ -19,12 +20,13 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, luminance
+from ..core.gradient import sobel_gradient
 
 # Windows, pixels, in which the difference and its square are averaged.
 _DIFFERENCE_WINDOW, _SQUARE_WINDOW = 1.5, 2.0
-# Difference that misregistration leaves at edges, intensity; share of the noise that the windows leave.
-_MISREGISTRATION, _NOISE_SHARE = 0.02, 0.5
+# Difference that always passes, intensity; misregistration, pixels; share of the noise that the windows leave.
+_DIFFERENCE, _MISREGISTRATION, _NOISE_SHARE = 0.02, 1.0, 0.5
 
 
 def fuse(frame: FloatArray, neighbours: Iterable[FloatArray], noise: float) -> tuple[FloatArray, FloatArray]:
@@ -53,8 +55,9 @@ def fuse(frame: FloatArray, neighbours: Iterable[FloatArray], noise: float) -> t
     (0.5, 0.5)
     """
     total, weights, count = frame.copy(), np.ones(frame.shape[:2], np.float32), 0
+    tolerance = explained_difference(frame, noise)
     for neighbour in neighbours:
-        weight = agreement_weight(neighbour, frame, noise)
+        weight = agreement_weight(neighbour, frame, tolerance)
         total += weight * neighbour if frame.ndim == 2 else weight[..., None] * neighbour
         weights += weight
         count += 1
@@ -62,15 +65,41 @@ def fuse(frame: FloatArray, neighbours: Iterable[FloatArray], noise: float) -> t
     return total / (weights if frame.ndim == 2 else weights[..., None]), agreement
 
 
-def agreement_weight(neighbour: FloatArray, frame: FloatArray, noise: float) -> FloatArray:
+def explained_difference(frame: FloatArray, noise: float) -> FloatArray:
+    """Squared difference that misregistration and noise explain.
+
+    Parameters
+    ----------
+    frame : ndarray, float32, shape (H, W) or (H, W, 3)
+        J.
+    noise : float
+        Standard deviation of the noise of a frame, intensity.
+
+    Returns
+    -------
+    ndarray, float32, shape (H, W)
+        t², squared intensity.
+
+    Examples
+    --------
+    >>> edge = np.float32([[0.2] * 8 + [0.8] * 8]).repeat(9, 0)
+    >>> np.sqrt(explained_difference(edge, 0.0)[4, [0, 8]]).round(2)
+    array([0.02, 0.11], dtype=float32)
+    """
+    along_x, along_y = sobel_gradient(cv2.GaussianBlur(luminance(frame), (0, 0), _DIFFERENCE_WINDOW))
+    steepness = cv2.GaussianBlur(along_x**2 + along_y**2, (0, 0), _SQUARE_WINDOW)
+    return np.asarray(_MISREGISTRATION**2 * steepness + _DIFFERENCE**2 + (_NOISE_SHARE * noise) ** 2, np.float32)
+
+
+def agreement_weight(neighbour: FloatArray, frame: FloatArray, tolerance: FloatArray) -> FloatArray:
     """Weight of a registered image beside another.
 
     Parameters
     ----------
     neighbour, frame : ndarray, float32, shape (H, W) or (H, W, 3)
         J_i and J.
-    noise : float
-        Standard deviation of the noise of a frame, intensity.
+    tolerance : ndarray, float32, shape (H, W)
+        t², see :func:`explained_difference`.
 
     Returns
     -------
@@ -80,11 +109,11 @@ def agreement_weight(neighbour: FloatArray, frame: FloatArray, noise: float) -> 
     Examples
     --------
     >>> frame = np.full((9, 9), 0.5, np.float32)
-    >>> float(agreement_weight(frame, frame, 0.0)[4, 4]), float(agreement_weight(frame + 0.4, frame, 0.0)[4, 4])
-    (1.0, 0.0)
+    >>> tolerance = explained_difference(frame, 0.0)
+    >>> [float(agreement_weight(other, frame, tolerance)[4, 4]) for other in (frame, frame + 0.4)]
+    [1.0, 0.0]
     """
-    tolerance = 2 * (_MISREGISTRATION**2 + (_NOISE_SHARE * noise) ** 2)
     difference = cv2.GaussianBlur(neighbour - frame, (0, 0), _DIFFERENCE_WINDOW)
     np.square(difference, out=difference)
     square = difference if frame.ndim == 2 else difference.mean(-1)
-    return np.asarray(np.exp(cv2.GaussianBlur(square, (0, 0), _SQUARE_WINDOW) / -tolerance), np.float32)
+    return np.asarray(np.exp(cv2.GaussianBlur(square, (0, 0), _SQUARE_WINDOW) / (-2 * tolerance)), np.float32)

@@ -39,7 +39,7 @@ from ..core.arrays import FloatArray
 from ..registration.flow_algebra import invert_flow
 from ..registration.warp import sample_linear, warp
 from .camera import camera_flow, camera_size, fit_camera
-from .fusion import agreement_weight
+from .fusion import agreement_weight, explained_difference
 
 # Longest memory, frames: a change of the light is followed as fast.
 _LONGEST = 64
@@ -125,7 +125,8 @@ def remember(
     camera = fit_camera(flow)
     affine = camera_flow(camera, shape)
     own = flow - affine
-    weight = agreement_weight(sample_linear((image,), flow), memory.image, noise)
+    tolerance = explained_difference(memory.image, noise)
+    weight = agreement_weight(sample_linear((image,), flow), memory.image, tolerance)
     weight /= 1 + (cv2.GaussianBlur(np.einsum("yxc,yxc->yx", own, own), (0, 0), _WINDOW) / largest**2) ** 2
     # R follows a slow object from frame to frame, and would hold it back, and with it the flat background beside it.
     near = cv2.dilate(moving.astype(np.uint8), _MARGIN) > 0
