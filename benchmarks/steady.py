@@ -1,6 +1,7 @@
 """Gain of steadied frames: still scenes, and scenes with moving objects, through phase screens.
 
-For a still scene it says as well how much nearer to the truth the image of ``restore`` is than the frames from 60 on.
+For a still scene it says as well how much nearer to the truth the image of ``restore`` is than the frames from 60 on,
+and for one with objects, how much nearer the background of the same clip without them is.
 
 python benchmarks/steady.py camera chart --frames 80 --size 256
 python benchmarks/steady.py camera --frames 42 --size 192 --moving 3
@@ -21,7 +22,7 @@ from turbrestore.runtime.runtime import Runtime
 from turbrestore.steady.video import steady_frames
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
-from turbrestore.synthesis.moving_objects import draw_objects, with_objects
+from turbrestore.synthesis.moving_objects import MovingObject, draw_objects, with_objects
 from turbrestore.synthesis.scenes import SCENES
 
 # Pixels around the objects that belong neither to them nor to the background.
@@ -36,12 +37,17 @@ def decibels(image: FloatArray, truth: FloatArray, part: np.ndarray) -> float:
 
 
 def compare(name: str, options: argparse.Namespace) -> str:
-    """One line: gains in dB, on average and at least, of the whole, the background and the objects; gap; CPU time."""
+    """One line: gains, dB, on average and at least, of all, background and objects; what is missing, dB; CPU time."""
     scene, params = SCENES[name](options.size, options.size), PhaseScreenParams(d_over_r0=STRENGTHS[options.strength])
     objects = draw_objects(options.moving, scene.shape, np.random.default_rng([options.seed, 1]))
-    air = np.random.default_rng(options.seed)
-    frames = [frame.image for frame in phase_screen_frames(scene, options.frames, air, params, objects=objects)]
-    started, gains, late = time.process_time(), [], []
+
+    def filmed(passing: tuple[MovingObject, ...]) -> list[FloatArray]:
+        air = np.random.default_rng(options.seed)
+        return [frame.image for frame in phase_screen_frames(scene, options.frames, air, params, objects=passing)]
+
+    frames = filmed(objects)
+    empty = steady_frames(filmed(()), runtime=Runtime(threads=1)) if objects else ()
+    started, gains, late, losses = time.process_time(), [], [], []
     for frame in steady_frames(frames, runtime=Runtime(threads=1)):
         truth, mask = with_objects(scene, objects, frame.number)
         parts = [np.ones_like(mask), cv2.dilate(mask.astype(np.uint8), RIM) == 0, mask]
@@ -50,12 +56,15 @@ def compare(name: str, options: argparse.Namespace) -> str:
         if frame.number >= FILLED:
             late.append(pairs[0][0])
         gains.append([ours - theirs for ours, theirs in pairs])
-    seconds = (time.process_time() - started) / options.frames
+        losses += [decibels(still.image, truth, parts[1]) - pairs[1][0] for still in islice(empty, 1)]
+    seconds = (time.process_time() - started) / options.frames / (2 if objects else 1)
     # An object may be out of sight in some frames.
     columns = zip_longest(*gains, fillvalue=np.nan)
     shown = islice(columns, 3 if objects else 1)
     cells = " | ".join(f"{np.nanmean(column):.2f}, {np.nanmin(column):.2f}" for column in shown)
-    if late and not objects:
+    if objects:
+        cells += f" | {np.mean(losses):.2f}"
+    elif late:
         still = decibels(restore(np.stack(frames)).image, scene, np.ones(scene.shape, bool))
         cells += f" | {still - float(np.mean(late)):.2f}"
     return f"| {name} | {cells} | {seconds:.3f} |"

@@ -16,6 +16,7 @@ from turbrestore.steady.settings import SteadyParams
 from turbrestore.steady.video import _Scenes, steady_frames
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
+from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 SIZE = 128
@@ -133,7 +134,7 @@ def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
     assert scenes._remembered_width(Memory(soft, short, 1)) == 0.8
     widths = [scenes._remembered_width(Memory(soft, 30 * short, 30)) for _ in range(80)]
     assert 0 < max(np.diff([0.8, *widths])) < 0.1
-    assert 1.5 < widths[-1] < 2.3
+    assert 1.65 < widths[-1] < 2.45
     given = _Scenes(SteadyParams(sigma=0.8), 0.8, Runtime(threads=1))
     assert given._remembered_width(Memory(soft, 30 * short, 30)) == 0.8
     flat = _Scenes(SteadyParams(), 0.8, Runtime(threads=1))
@@ -285,3 +286,10 @@ def test_bad_frames_and_settings_are_refused():
     for wrong in ({"camera": "still"}, {"reach": 0}, {"sigma": -1}, {"largest": 0}):
         with pytest.raises(ConfigurationError, match=next(iter(wrong))):
             SteadyParams(**wrong)
+
+
+def test_edges_of_a_still_scene_pass_for_no_motion():
+    scene = resolution_chart(128, 128)
+    air = phase_screen_frames(scene, 20, np.random.default_rng(0), PhaseScreenParams(d_over_r0=2.5))
+    moving = [frame.moving.mean() for frame in steady_frames([frame.image for frame in air], SteadyParams(sigma=0))]
+    assert np.mean(moving[4:]) < 0.15
