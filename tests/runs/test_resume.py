@@ -173,7 +173,7 @@ def test_a_checkpoint_is_as_far_back_as_asked_for_at_most(place, monkeypatch):
         (["--dynamics.rank=2"], 1, "flow model: dynamics.rank was None and is 2"),
         (["--filter.sharpness=1"], 2, "filter: filter.sharpness was None and is 1"),
         (["--keep-best=50%"], 2, "filter: keep_best was 1"),
-        (["--frames=0:20"], 2, "filter: frames was [0, 28, 1] and is [0, 20, 1]"),
+        (["--frames=0:20"], 0, "centroid: frames was [0, 28, 1] and is [0, 20, 1]"),
         (["--sigma=1"], 3, "deconvolution: deconvolution.sigma was None and is 1"),
         (["--threads=1", "--border=crop"], 4, "continues after the deconvolution"),
     ],

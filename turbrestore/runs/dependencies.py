@@ -42,7 +42,7 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
     >>> from turbrestore.runtime.runtime import DEFAULT
     >>> source, params = FrameSource.from_array(np.zeros((5, 16, 16))), RestoreParams()
     >>> facts = stage_dependencies(source, params, plan_memory(source.shape, params, DEFAULT))
-    >>> list(facts), facts["filtered"]["frames"]
+    >>> list(facts), facts["centroid"]["frames"]
     (['centroid', 'dynamics', 'filtered', 'deblurred'], [0, 5, 1])
     """
     settings = dataclasses.asdict(params)
@@ -52,8 +52,9 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
             "input": content_digest(source),
             "format": source.format,
             "training_frames": _span(source.numbers[: plan.train]),
-            # What is repaired is found by looking at all frames.
-            "repaired": None if source.repair is None else [_span(source.numbers), *source.warnings],
+            # What is repaired, masked or evened out is found by looking at all frames.
+            "frames": _span(source.numbers),
+            "repaired": None if source.repair is None else list(source.warnings),
             **({} if plan.tile is None else {"tile": plan.tile}),
             "region": [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start],
             "device": plan.runtime.device,
@@ -64,7 +65,7 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
             "results": _RESULTS,
         },
         "dynamics": {"dynamics": settings["dynamics"]},
-        "filtered": {"frames": _span(source.numbers), **{name: settings[name] for name in ("keep_best", "filter")}},
+        "filtered": {name: settings[name] for name in ("keep_best", "filter")},
         "deblurred": {
             **({} if plan.deconvolution_side is None else {"tile": plan.deconvolution_side}),
             **{name: settings[name] for name in ("deconvolution", "guards")},
