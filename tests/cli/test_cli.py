@@ -81,6 +81,7 @@ class TestRestore:
         assert "exponent" not in of_flag["deconvolution"]
         assert of_flag["train"] == 4
 
+    @pytest.mark.long
     @pytest.mark.parametrize("preset", PRESETS)
     def test_a_preset_is_what_python_has_by_that_name(self, run, clip, tmp_path, preset):
         words = ["--preset", preset, "--report", tmp_path / "o.html"]
@@ -188,6 +189,7 @@ class TestRestore:
         assert run("identify", *files, "--quiet")[0] == 0
         fails(run("predict", second, *files, tmp_path / "p.png"), 65, "80×80 RGB", "80×80 grey")
 
+    @pytest.mark.long
     def test_all_named_frames_are_used(self, run, tmp_path):
         frames = make_sequence(seed=5, count=50, size=64, rms=0.5).frames
         clip = frames_clip(tmp_path / "long.mkv", frames)

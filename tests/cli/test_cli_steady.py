@@ -115,6 +115,7 @@ def test_an_empty_pipe_is_named(tmp_path):
     assert done.stderr == b"turbrestore: standard input: expected at least one frame, found no data\n"
 
 
+@pytest.mark.long
 def test_a_reader_that_has_seen_enough_is_no_failure():
     words = [sys.executable, "-m", "turbrestore_cli", "steady", str(SAMPLE), "-", "--roi=40,40,64,48", "--sigma=0"]
     script = '{ "$@"; echo "code $?" >&2; } | head -c 100 >/dev/null'

@@ -33,6 +33,7 @@ def call(place, words, redirections):
     return subprocess.run(shell, cwd=place, capture_output=True, text=True, check=False, timeout=100)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
 def test_closed_streams_hold_nothing_up(place, closed):
     done = call(place, RESTORE, closed)
