@@ -28,7 +28,7 @@ from ..core.arrays import FloatArray
 # Weight of contrast over noise as in psf.wiener_fidelity.
 _FIDELITY = 6.0
 # Floors of the noise, of a frame and of what is remembered.
-_LEAST_NOISE = 0.015, 0.0025
+_LEAST_NOISE = 0.015, 0.005
 # Margin of the reflection, in widths of the blur.
 _MARGIN = 6.0
 
