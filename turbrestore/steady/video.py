@@ -36,8 +36,8 @@ from .windows import iter_windows
 # Share of the estimated width that is removed: on the two videos of docs/steady.md, a width
 # too small by 15 % costs 0.1 dB, one too large by as much 0.4 dB, and estimates are too large by up to a third.
 _CAUTION = 0.8
-# What is added to the estimated width of what is remembered, pixels, because a quadratic prior keeps some blur.  It gains
-# 0.1 to 0.6 dB on six still scenes through phase screens, and loses 0.1 dB on one whose blur is 3 pixels wide.
+# What is added to the estimated width of what is remembered, pixels, because a quadratic prior keeps some blur.  It
+# gains 0.1 to 0.6 dB on six still scenes through phase screens, and loses 0.1 dB on one whose blur is 3 pixels wide.
 _ADDED = 0.15
 # Frames that the memory holds on average when the width of its blur is estimated, and frames over which the width that
 # is removed goes there, so that no frame is suddenly sharper.
