@@ -37,7 +37,7 @@ def decibels(image: FloatArray, truth: FloatArray, part: np.ndarray) -> float:
 
 
 def compare(name: str, options: argparse.Namespace) -> str:
-    """One line: gains, dB, on average and at least, of all, background and objects; what is missing, dB; CPU time."""
+    """One row of the table."""
     scene, params = SCENES[name](options.size, options.size), PhaseScreenParams(d_over_r0=STRENGTHS[options.strength])
     objects = draw_objects(options.moving, scene.shape, np.random.default_rng([options.seed, 1]))
 
@@ -80,6 +80,10 @@ def main() -> None:
     parser.add_argument("--strength", choices=sorted(STRENGTHS), default="medium")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
+    parts = ("whole", "background", "objects") if options.moving else ("whole",)
+    lacking = "behind a clip without objects" if options.moving else "behind restore"
+    names = [*(f"{part}: mean and least gain, dB" for part in parts), f"{lacking}, dB", "seconds of CPU a frame"]
+    print(f"| scene | {' | '.join(names)} |\n|---|{'---|' * len(names)}")
     for name in options.scenes:
         print(compare(name, options), flush=True)
 

@@ -57,13 +57,13 @@ def restore(
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
-    Frames are read in order, and those that show nothing are left out.  Only the training frames are kept, in memory
-    or, if they do not fit, in a scratch file.
+    Frames are read in order.  Only the training frames are kept, in memory or, if they do not fit, in a scratch file.
 
     Parameters
     ----------
     frames : FrameSource or array_like, shape (T, H, W) or (T, H, W, 3)
-        At least two frames of at least 16×16 pixels.
+        At least two frames of at least 16×16 pixels.  Frames of an array that show nothing are left out; a source is
+        taken as it is, and :func:`turbrestore.clean_source` repairs it.
     params : RestoreParams, optional
         Settings of every stage.
     runtime : Runtime
@@ -107,7 +107,9 @@ def restore(
     """
     params = params or RestoreParams()
     begun = time.perf_counter()
-    source, on_blank = without_blank(frames if isinstance(frames, FrameSource) else FrameSource.from_array(frames))
+    source, on_blank = (
+        (frames, ()) if isinstance(frames, FrameSource) else without_blank(FrameSource.from_array(frames))
+    )
     plan = plan_memory(source.shape, params, runtime)
     _check_sigma(params.deconvolution.sigma, source.shape)
     _check_training(params, plan.train, len(source))

@@ -1,5 +1,6 @@
 """What frames show: defects that are put in are found and repaired, and clean clips come back bit for bit."""
 
+import dataclasses
 from pathlib import Path
 
 import cv2
@@ -10,9 +11,11 @@ from hypothesis import strategies as st
 
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.footage.content import ContentParams, check_content, clean_source
+from turbrestore.footage.content import ContentParams, check_content, clean_source, without_blank
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
+from turbrestore.pipeline import restore
+from turbrestore.settings import RestoreParams
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
 
@@ -288,3 +291,32 @@ def test_damaged_frames_are_refused_and_strictness_changes_nothing():
     source = FrameSource("a", "test", (5, 2, 2), 255, 8, lambda chosen: iter([np.zeros((2, 2), np.uint8)] * 3))
     with pytest.raises(DataError, match="expected 5 frames, found 3"):
         check_content(source)
+
+
+class TestBlankFrames:
+    def test_numbers_are_those_of_the_file(self, frames):
+        stack = np.insert(frames, [3, 5], 0.3, axis=0)
+        source, (found,) = without_blank(FrameSource.from_array(stack).select(frames=(2, None)))
+        assert found.choice == "frames 3, 6 left out"
+        np.testing.assert_array_equal(source.read(), frames[2:])
+
+    def test_times_go_with_the_frames(self, frames):
+        stack = np.insert(frames, 1, 0.3, axis=0)
+        timed = dataclasses.replace(FrameSource.from_array(stack), timestamps=np.arange(15.0))
+        assert without_blank(timed)[0].timestamps.tolist() == [0, *range(2, 15)]
+
+    def test_a_clip_without_any_is_the_same_source(self, frames):
+        source = FrameSource.from_array(frames)
+        assert without_blank(source) == (source, ())
+
+    def test_where_all_are_blank_all_stay(self):
+        source = FrameSource.from_array(np.full((4, 32, 32), 0.3))
+        assert without_blank(source)[0] is source
+
+
+def test_a_cleaned_clip_is_restored_as_it_is(elsewhere):
+    fading = np.concatenate([np.zeros_like(elsewhere[:7]), 0.05 * elsewhere[:1], elsewhere[:7]])
+    source = FrameSource.from_array(fading)
+    cleaned = clean_source(source, check_content(source))
+    found = restore(cleaned, RestoreParams(until="centroid"))
+    assert found.train == len(cleaned) and "blank frames" not in {one.subject for one in found.decisions}

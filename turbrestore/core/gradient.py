@@ -7,16 +7,16 @@ import cv2
 from .arrays import FloatArray
 
 
-def sobel_gradient(plane: FloatArray) -> tuple[FloatArray, FloatArray]:
+def sobel_gradient(image: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Compute Sobel's derivatives along x and y, divided by 8.
 
     Parameters
     ----------
-    plane : ndarray, float32, shape (H, W)
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
 
     Returns
     -------
-    along_x, along_y : ndarray, float32, shape (H, W)
+    along_x, along_y : ndarray, float32, shape of ``image``
         Intensity per pixel.
 
     Examples
@@ -27,6 +27,6 @@ def sobel_gradient(plane: FloatArray) -> tuple[FloatArray, FloatArray]:
     (0.25, 0.0)
     """
     return (
-        cv2.Sobel(plane, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8),
-        cv2.Sobel(plane, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8),
+        cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8),
+        cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8),
     )

@@ -11,6 +11,7 @@ cuts                  two frames are not similar under any shift                
 saturation            half of the values or more are white                               only warns
 ====================  =================================================================  =============================
 
+:func:`without_blank` finds blank frames alone, and leaves them out.
 :mod:`turbrestore.footage.scene_cuts` detects cuts, :mod:`turbrestore.footage.stuck_pixels` stuck pixels.
 """
 
@@ -210,10 +211,9 @@ def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...
     """
     contrasts = np.array([thumbnail(frame).std() for frame in source], np.float64)
     blank = np.asarray(source.numbers)[_are_blank(contrasts, _BLANK_CONTRAST)].tolist()
-    if not blank:
-        return source, ()
     choice, reason = f"{numbers_text(blank)} left out", f"at most {_BLANK_CONTRAST:.0%} of the usual contrast"
-    return source.without(blank, f"{choice}: {reason}"), (Decision("blank frames", choice, reason),)
+    found = Decision("blank frames", choice, reason)
+    return (source.without(blank, f"{choice}: {reason}"), (found,)) if blank else (source, ())
 
 
 def keep_all(report: ContentReport) -> ContentReport:

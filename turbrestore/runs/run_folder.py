@@ -7,7 +7,8 @@ written:
 ==========  =========================================================================================================
 stage       depends on
 ==========  =========================================================================================================
-centroid    content of the input, all selected frames, region, settings of flow and centroid, versions of all packages
+centroid    content of the input, all selected and the training frames, region, static mask, settings of flow and
+            centroid, versions of all packages
 dynamics    the centroid, settings of the dynamics
 filtered    the dynamics, settings of the filter, the share of best frames
 deblurred   the filtered image, settings of deconvolution and guards

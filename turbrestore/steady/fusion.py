@@ -4,8 +4,8 @@ Symbols
 -------
 J : the frame, dewarped; J_i its neighbours, warped onto it
 e : difference J_i − J, averaged in a small window and squared
-t : difference that misregistration and noise explain, intensity; it grows with the gradient of J, because a
-    registration that is wrong by a fraction of a pixel, and a blur that changes, show at edges
+t : difference that misregistration and noise explain, intensity, ``t² = m² |∇J|² + d² + (s n)²`` with n the noise:
+    at edges, registration that is wrong by a fraction of a pixel and a blur that changes leave a difference
 w : weight of a neighbour, ``exp(−e / 2t²)``
 
 Where a neighbour shows something else than the frame, because an object or the background it uncovers has moved, or
@@ -20,12 +20,12 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import FloatArray
 from ..core.gradient import sobel_gradient
 
 # Windows, pixels, in which the difference and its square are averaged.
 _DIFFERENCE_WINDOW, _SQUARE_WINDOW = 1.5, 2.0
-# Difference that always passes, intensity; misregistration, pixels; share of the noise that the windows leave.
+# d, the tolerance of flat regions, intensity; m, pixels; s, the share of the noise that the windows leave.
 _DIFFERENCE, _MISREGISTRATION, _NOISE_SHARE = 0.02, 1.0, 0.5
 
 
@@ -71,7 +71,7 @@ def explained_difference(frame: FloatArray, noise: float) -> FloatArray:
     Parameters
     ----------
     frame : ndarray, float32, shape (H, W) or (H, W, 3)
-        J.
+        The image that others are compared with.
     noise : float
         Standard deviation of the noise of a frame, intensity.
 
@@ -86,8 +86,9 @@ def explained_difference(frame: FloatArray, noise: float) -> FloatArray:
     >>> np.sqrt(explained_difference(edge, 0.0)[4, [0, 8]]).round(2)
     array([0.02, 0.11], dtype=float32)
     """
-    along_x, along_y = sobel_gradient(cv2.GaussianBlur(luminance(frame), (0, 0), _DIFFERENCE_WINDOW))
-    steepness = cv2.GaussianBlur(along_x**2 + along_y**2, (0, 0), _SQUARE_WINDOW)
+    along_x, along_y = sobel_gradient(cv2.GaussianBlur(frame, (0, 0), _DIFFERENCE_WINDOW))
+    square = along_x**2 + along_y**2
+    steepness = cv2.GaussianBlur(square if frame.ndim == 2 else square.mean(-1), (0, 0), _SQUARE_WINDOW)
     return np.asarray(_MISREGISTRATION**2 * steepness + _DIFFERENCE**2 + (_NOISE_SHARE * noise) ** 2, np.float32)
 
 

@@ -145,11 +145,11 @@ class _Scenes:
         return self._memory, moving, self._remembered_width(self._memory)
 
     def _remembered_width(self, memory: Memory) -> float:
-        """Width of the blur of what is remembered, which gradually becomes that of its own image."""
+        """Width to remove from what is remembered, which gradually becomes the one that its own image needs."""
         if not self._given and self._found is None and memory.held.mean() >= _REMEMBERED:
             found = estimate_blur(memory.image, exponent=KOLMOGOROV, runtime=self._runtime)
             # An image that does not determine its width says nothing against the one that was found before.
-            self._found = max(found.removable + _ADDED, self._first)
+            self._found = max(found.removable + _ADDED if found.removable else 0.0, self._first)
         if self._found is not None:
             self._width += (self._found - self._width) / _GRADUALLY
         return self._width
