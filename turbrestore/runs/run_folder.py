@@ -7,8 +7,7 @@ written:
 ==========  =========================================================================================================
 stage       depends on
 ==========  =========================================================================================================
-centroid    content of the input, all selected and the training frames, region, static mask, settings of flow and
-            centroid, versions of all packages
+centroid    input, all selected and training frames, region, static mask, settings of flow and centroid, all versions
 dynamics    the centroid, settings of the dynamics
 filtered    the dynamics, settings of the filter, the share of best frames
 deblurred   the filtered image, settings of deconvolution and guards
