@@ -18,7 +18,7 @@ from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.errors import DataError
 from ..core.noise import estimate_noise
-from ..io.source import FrameSource, Window
+from ..io.source import FrameSource
 
 # Clips that span less than this share of full scale are stretched to it, so that their scale does not matter.
 _SPAN = 0.7
@@ -119,14 +119,9 @@ def stretch_levels(source: FrameSource, train: int) -> tuple[FrameSource, Levels
         return source, Levels(), ()
     gain = _SPAN / span
     levels = Levels(low - (1 - _SPAN) / 2 / gain, gain)
-    before = source.adjust
-
-    def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
-        return levels.stretched(values if before is None else before(number, values, window))
-
     reason = f"the scene spans {low:.4g} to {high:.4g} of full scale, and results come back to these levels"
     decision = Decision("range", f"stretched {gain:.3g} times", reason)
-    return dataclasses.replace(source, adjust=adjust), levels, (decision,)
+    return source.adjusted(lambda _, values, window: levels.stretched(values)), levels, (decision,)
 
 
 def _range_of(source: FrameSource, train: int) -> tuple[float, float]:

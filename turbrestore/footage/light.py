@@ -12,7 +12,6 @@ average, row by row, so that the mean of the frames stays.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import cv2
@@ -120,12 +119,7 @@ def steady_light(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]
     light, decisions = _measure_light(source)
     if light is None:
         return source, ()
-    before = source.adjust
-
-    def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
-        return light.steady(number, values if before is None else before(number, values, window), window)
-
-    return dataclasses.replace(source, adjust=adjust), decisions
+    return source.adjusted(light.steady), decisions
 
 
 def _measure_light(source: FrameSource) -> tuple[Light | None, tuple[Decision, ...]]:

@@ -13,7 +13,6 @@ of the scene.  Flow, fusion and deconvolution then see the scene alone.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from dataclasses import dataclass
 
@@ -169,11 +168,6 @@ def without_overlay(
     if not given and float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _LEAST_MOTION:
         return source, None, ()
     overlay = _overlay(source, mask, np.rint(shifts).astype(int))
-    before = source.adjust
-
-    def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
-        return overlay.without(number, values if before is None else before(number, values, window), window)
-
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
     reason = "asked for" if given else "it stands while the scene moves"
     hidden = float(overlay.hidden.mean())
@@ -181,7 +175,7 @@ def without_overlay(
         choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced"
         reason += f"; {100 * hidden:.1f} % is shown by no frame and filled from around, the rest by others"
     decision = Decision("overlay", choice, reason)
-    return dataclasses.replace(source, adjust=adjust), overlay.hidden, (decision,)
+    return source.adjusted(overlay.without), overlay.hidden, (decision,)
 
 
 def _standing(source: FrameSource) -> NDArray[np.bool_] | None:

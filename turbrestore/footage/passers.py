@@ -135,14 +135,9 @@ def without_passers(source: FrameSource) -> tuple[FrameSource, tuple[Decision, .
     if usual is None:
         return source, ()
     background, share, touched = _background(source, *usual)
-    before = source.adjust
-
-    def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
-        return background.shown(number, values if before is None else before(number, values, window), window)
-
     reason = f"they cover {share:.1%} of the frames, and {touched:.0%} of the scene at some time"
     decision = Decision("passers", "replaced by the background", reason)
-    return dataclasses.replace(source, adjust=adjust), (decision,)
+    return source.adjusted(background.shown), (decision,)
 
 
 def _usual_of(source: FrameSource) -> tuple[FloatArray, FloatArray] | None:

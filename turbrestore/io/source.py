@@ -196,6 +196,22 @@ class FrameSource:
             warnings=(*self.warnings, warning),
         )
 
+    def adjusted(self, adjust: Callable[[int, FloatArray, Window], FloatArray]) -> FrameSource:
+        """Adjust the intensities of frames, after what adjusts them already.
+
+        Examples
+        --------
+        >>> source = FrameSource.from_array(np.full((1, 1, 1), 0.5)).adjusted(lambda _, values, window: values / 2)
+        >>> float(source.adjusted(lambda _, values, window: values + 1).read()[0, 0, 0])
+        1.25
+        """
+        before = self.adjust
+        if before is None:
+            return dataclasses.replace(self, adjust=adjust)
+        return dataclasses.replace(
+            self, adjust=lambda number, values, window: adjust(number, before(number, values, window), window)
+        )
+
     def select(self, frames: FrameRange | None = None, roi: Roi | None = None) -> FrameSource:
         """Select a range of frames and a rectangle.
 
