@@ -333,7 +333,7 @@ def _find_candidate(
     part = _most_detailed(reduced).copy()
     level = assumed_noise(reduced, multiple=multiple) if noise is None else assumed_noise(reduced, noise / factor)
     costs = width_costs(image_gradients(part), _exponents(exponent, factor), level, rises=2)
-    evidence, width = float(costs[0] - costs.min()), _unreduced_width(likeliest_width(costs), factor)
+    evidence, width = float(costs[0] - costs.min()), unreduced_width(likeliest_width(costs), factor)
     widths = factor * WIDTHS[: len(costs)]
     shape = fused_exponent(width) if exponent is None else exponent
     estimate = BlurEstimate(width, float("inf"), shape, level, factor, evidence, widths, costs)
@@ -345,7 +345,7 @@ def _with_uncertainty(candidate: BlurCandidate, team: ThreadTeam) -> BlurEstimat
     levels = found.noise / 2, 2 * found.noise
     shapes = _exponents(candidate.asked, found.reduction)
     both = team.map(lambda level: width_costs(gradients, shapes, level, rises=1), levels)
-    less, more = (_unreduced_width(likeliest_width(costs), found.reduction) for costs in both)
+    less, more = (unreduced_width(likeliest_width(costs), found.reduction) for costs in both)
     return replace(found, uncertainty=abs(more - less) / 2)
 
 
@@ -354,7 +354,7 @@ def _exponents(exponent: float | None, factor: int) -> Sequence[float]:
     return [fused_exponent(factor * width) if exponent is None else exponent for width in WIDTHS]
 
 
-def _unreduced_width(width: float, factor: int) -> float:
+def unreduced_width(width: float, factor: int) -> float:
     """Width in the image of a blur found in the reduced image, without the box of the averaged pixels."""
     return float(np.sqrt(max((factor * width) ** 2 - (factor**2 - 1) / 12, WIDTHS[0] ** 2)))
 
