@@ -3,9 +3,9 @@
 ``python benchmarks/blur_calibration.py --table`` computes the mean and the variation of short exposures through
 Kolmogorov turbulence, and writes ``turbrestore/blur/short_exposure.csv``.
 
-``python benchmarks/blur_calibration.py FOLDER [--write benchmarks/results/blur_calibration.md]`` synthesizes clips into a
-folder, those that are there are kept: scenes through phase screens of random D/r0, diffraction, noise, codec, lens and
-number of frames; photographs that smooth flows move behind lenses of 0 to 2.5 px; and clips that stand still.  It
+``python benchmarks/blur_calibration.py FOLDER [--write benchmarks/results/blur_calibration.md]`` synthesizes clips into
+a folder, those that are there are kept: scenes through phase screens of random D/r0, diffraction, noise, codec, lens
+and number of frames; photographs that smooth flows move behind lenses of 0 to 2.5 px; and clips that stand still.  It
 compares the widths that every witness finds, and the width that is removed, with the true transfer function of the
 filtered image, and the images before and after.  Constants were set on the scenes CHOSEN; the table is of the others.
 """

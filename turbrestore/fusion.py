@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from .blind.structure import StructureReading, compare_structure
+from .blur.posterior import BlurWitnesses, measure_witnesses
 from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
 from .core.noise import estimate_noise
@@ -127,6 +128,7 @@ class Fused:
     dynamics: FlowDynamics | None = None
     filtered: Filtered | None = None
     is_mean: bool = False
+    witnesses: BlurWitnesses | None = None
 
 
 def fuse(run: Run) -> Fused:
@@ -159,7 +161,8 @@ def fuse(run: Run) -> Fused:
     structure = _compare_structure(levels.stretched(filtered.image), training, centroid, filtered.mean_flow)
     run.decide(*explain_structure(structure))
     image = filtered.image if structure.passed else mean
-    return Fused(image, mean, centroid, seeing, saturation, dynamics, filtered, is_mean=not structure.passed)
+    witnesses = _find_witnesses(run, training, centroid, seeing)
+    return Fused(image, mean, centroid, seeing, saturation, dynamics, filtered, not structure.passed, witnesses)
 
 
 def _find_centroid(run: Run, training: FloatArray) -> Centroid:
@@ -208,6 +211,20 @@ def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seein
     run.seconds["seeing"] = time.perf_counter() - begun
     run.decide(*explain_seeing(seeing))
     return seeing
+
+
+def _find_witnesses(run: Run, training: FloatArray, centroid: Centroid, seeing: Seeing | None) -> BlurWitnesses | None:
+    """Measure what the frames say about their blur, if it is to be estimated."""
+    if not run.params.runs("deconvolve") or run.params.deconvolution.sigma is not None:
+        return None
+    begun, known = time.perf_counter(), None if seeing is None else seeing.displacement_variance
+    flow_variance = float(np.mean([np.square(flow).mean() for flow in iter_frames(centroid.flows)]))
+    frames = float(len(training)) if seeing is None else seeing.independent_frames
+    rows, columns = run.prepared.picture
+    seen, flows = training[:, rows, columns], centroid.flows[:, rows, columns]
+    witnesses = measure_witnesses(seen, flows, flow_variance if known is None else known.value, frames)
+    run.seconds["witnesses"] = time.perf_counter() - begun
+    return witnesses
 
 
 def _find_saturation(run: Run, training: FloatArray) -> float:

@@ -157,6 +157,7 @@ def _restored(run: Run) -> Restoration:
         dynamics=fused.dynamics,
         filtered=fused.filtered,
         blur=None if deblurred is None else deblurred.blur,
+        posterior=None if deblurred is None else deblurred.posterior,
         deconvolution=None if deblurred is None else deblurred.deconvolution,
         guard_readings=() if deblurred is None else deblurred.readings,
         decisions=tuple(run.decisions),
@@ -173,7 +174,8 @@ def _deblur(run: Run, fused: Fused) -> Deblurred:
     image, guide = levels.stretched(fused.image), levels.stretched(fused.centroid.image)
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
-    steps = remove_blur_steps(image, guide, params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side)
+    settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
+    steps = remove_blur_steps(image, guide, *settings, fused.witnesses)
     deblurred = finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
     deconvolution, blur = levels.original_result(deblurred.deconvolution), levels.original_result(deblurred.blur)
     return replace(deblurred, deconvolution=deconvolution, blur=blur)
@@ -201,7 +203,8 @@ def _gain(run: Run, fused: FloatArray, deblurred: Deblurred | None) -> float:
     """Return the factor of the variance that the deconvolution has, computed at the levels of the stages."""
     if deblurred is None:
         return 1.0
-    params, done, blur = run.params.deconvolution, deblurred.deconvolution, deblurred.blur
+    params, done = run.params.deconvolution, deblurred.deconvolution
+    blur = deblurred.posterior or deblurred.blur
     exponent = blur.exponent if params.exponent is None and blur is not None else params.exponent
     fidelity = quadratic_fidelity(run.levels.stretched(fused), params.method, done.fidelity)
     return posterior_gain(fused.shape[:2], fidelity, done.sigma, exponent)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from .blind.guards import GuardReading
 from .blur.estimation import BlurEstimate
+from .blur.posterior import BlurPosterior
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .deconvolution.deconvolve import Deconvolution
@@ -121,6 +122,7 @@ class Restoration:
     seconds: dict[str, float]
     seeing: Seeing | None = None
     uncertainty: FloatArray | None = None
+    posterior: BlurPosterior | None = None
 
     def plot(self) -> Figure:
         """Draw the temporal mean beside the result.

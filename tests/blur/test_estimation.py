@@ -11,7 +11,7 @@ from turbrestore.blur.estimation import (
     _most_detailed,
     _preference,
     _reduce,
-    _unreduced_width,
+    unreduced_width,
     estimate_blur,
     find_candidates,
     removable_width,
@@ -112,7 +112,7 @@ def test_the_uncertainty_is_half_the_difference_between_half_and_twice_the_noise
     with one_thread_each():
         shapes = [fused_exponent(found.reduction * width) for width in WIDTHS]
         both = [width_costs(gradients, shapes, factor * found.noise, 1) for factor in (0.5, 2.0)]
-    less, more = (_unreduced_width(likeliest_width(costs), found.reduction) for costs in both)
+    less, more = (unreduced_width(likeliest_width(costs), found.reduction) for costs in both)
     assert found.uncertainty == abs(more - less) / 2
 
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from ..blur.estimation import BlurEstimate
+from ..blur.posterior import BlurPosterior
 from ..core.decision import Decision
 from .blur_map import BlurMap
 from .guards import GuardParams, GuardReading
+
+# Probability from which the air is said to have blurred the image.
+_MOSTLY = 0.8
 
 
 def explain_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None = None) -> Decision:
@@ -43,6 +47,28 @@ def explain_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None 
     if sigma > 0:
         remark = ", part of the uncertainty is left in" if blur.removable < blur.sigma else ""
     return Decision("blur", choice, found + where + remark)
+
+
+def explain_posterior(posterior: BlurPosterior) -> Decision:
+    """Explain which width is removed, and what each witness says."""
+    choice = f"{posterior.removed:.2f} pixels removed" if posterior.removed > 0 else "none removed"
+    low, width, high = posterior.width
+    witnesses = {
+        "the displacement": posterior.by_displacement,
+        "the variation of the frames": posterior.by_variation,
+        "the edges of the image": posterior.by_image,
+    }
+    said = ", ".join(f"{name} {found[0]:.2f} to {found[2]:.2f}" for name, found in witnesses.items())
+    cause = "mostly by the air" if posterior.air > _MOSTLY else "by the air or the lens"
+    if posterior.air < 1 - _MOSTLY:
+        cause = "not by the air"
+    reason = f"{width:.2f} pixels, {low:.2f} to {high:.2f}, {cause}; expected from {said}"
+    if posterior.removed == 0:
+        reason = f"no blur is certain enough; {reason}"
+    outside = [name for name, found in witnesses.items() if found[0] > high or found[2] < low]
+    if outside:
+        reason += f"; {' and '.join(outside)} contradict{'s' if len(outside) == 1 else ''} the others"
+    return Decision("blur", choice, reason)
 
 
 def explain_blur_map(tiles: BlurMap | None) -> tuple[Decision, ...]:

@@ -15,7 +15,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from ..blur.estimation import BlurEstimate, estimate_blur
+from ..blur.estimation import BlurEstimate
+from ..blur.posterior import BlurPosterior, BlurWitnesses
 from ..core.arrays import FloatArray
 from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, DeconvolutionState
@@ -25,7 +26,8 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.tiling import halo_tiles, largest_tile
 from .blur_map import BlurMap, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
-from .decisions import explain_blur, explain_blur_map, explain_guards
+from .blur_to_remove import find_blur
+from .decisions import explain_blur, explain_blur_map, explain_guards, explain_posterior
 from .guards import GuardParams, GuardReading, evaluate_guards
 from .tiled_deconvolution import MOST_THREADS, tiled_deconvolution_steps
 
@@ -74,6 +76,8 @@ class Deblurred:
         One for each width that was removed; empty if no blur was removed.
     decisions : tuple of Decision
         On the blur and on the guards.
+    posterior : BlurPosterior or None
+        None if the width was given, or nothing is known but the image.
     """
 
     deconvolution: Deconvolution
@@ -81,6 +85,7 @@ class Deblurred:
     tiles: BlurMap | None
     readings: tuple[GuardReading, ...]
     decisions: tuple[Decision, ...]
+    posterior: BlurPosterior | None = None
 
 
 Steps = Generator[DeblurState, None, Result]
@@ -142,6 +147,7 @@ def remove_blur_steps(
     guards: GuardParams | None = None,
     runtime: Runtime = DEFAULT,
     side: int | None = None,
+    witnesses: BlurWitnesses | None = None,
 ) -> Steps[Deblurred]:
     """Remove a blur step by step; see :func:`remove_blur`.
 
@@ -149,6 +155,8 @@ def remove_blur_steps(
     ----------
     image, guide, deconvolution, guards, runtime, side
         See :func:`remove_blur`.
+    witnesses : BlurWitnesses, optional
+        What the frames say about their blur; by default the image alone tells it.
 
     Yields
     ------
@@ -172,8 +180,11 @@ def remove_blur_steps(
     [DeblurState(sigma=1.5, attempt=1, iteration=1)]
     """
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
-    blur = estimate_blur(image, exponent=params.exponent, runtime=runtime) if params.sigma is None else None
-    sigma, params = blur_to_remove(blur, params)
+    blur, posterior = find_blur(image, params, runtime, witnesses)
+    if posterior is None:
+        sigma, params = blur_to_remove(blur, params)
+    else:
+        sigma, params = posterior.removed, replace(params, exponent=params.exponent or posterior.exponent)
     size = image.shape[0], image.shape[1]
     in_tiles = () if side is None or find_device(runtime.device) != CPU else halo_tiles(size, side)
     numbers = itertools.count(1)
@@ -182,8 +193,8 @@ def remove_blur_steps(
         return tiled_deconvolution_steps(image, width, params, guide, runtime, in_tiles)
 
     tiles, first = None, None
-    # The likelihood of a tile is mistaken wherever that of the image is.
-    if blur is not None and blur.blurred and not blur.edge_limited:
+    # The likelihood of a tile is unreliable where that of the image is, and where frames tell the blur they decide.
+    if posterior is None and blur is not None and blur.blurred and not blur.edge_limited:
         if runtime.memory_limit is None:
             tiles, first = yield from _map_meanwhile(image, blur, _label(remove(sigma), sigma, next(numbers)))
         else:
@@ -207,8 +218,9 @@ def remove_blur_steps(
     else:
         result, readings = yield from guarded_steps(attempt, image, sigma, guards, first)
     on_guards = explain_guards(result.sigma, readings, guards)
-    decisions = (explain_blur(blur, sigma, tiles), *explain_blur_map(tiles), *on_guards)
-    return Deblurred(result, blur, tiles, readings, decisions)
+    on_blur = explain_blur(blur, sigma, tiles) if posterior is None else explain_posterior(posterior)
+    decisions = (on_blur, *explain_blur_map(tiles), *on_guards)
+    return Deblurred(result, blur, tiles, readings, decisions, posterior)
 
 
 def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side: int | None = None) -> float:

@@ -2,8 +2,8 @@
 
 Symbols
 -------
-D/r0, λ/D : strength of the air, and diffraction in pixels; σ_l : width of a Gaussian, which stands for the lens, the pixels,
-    the codec and what registration leaves, pixels
+D/r0, λ/D : strength of the air, and diffraction, pixels
+σ_l : width of a Gaussian, which stands for the lens, the pixels, the codec and what registration leaves, pixels
 H : transfer function, ``H_air(ν; D/r0, λ/D) exp(−2π² σ_l² ν²)`` (:mod:`turbrestore.blur.short_exposure`)
 V : variance of the displacement along one axis, squared pixels
 s, s_4, ε : variation of the spectra, and stretch by the registration (:mod:`turbrestore.blur.spectral_variation`)
@@ -13,23 +13,23 @@ L : cost of a width for the image (:mod:`turbrestore.blur.image_evidence`)
 
 Witnesses
 ---------
-Each gives the likelihood of every hypothesis (D/r0, λ/D, σ_l).  One hypothesis more is air that moves the image and does
-not blur it.
+Each gives the likelihood of every hypothesis (D/r0, λ/D, σ_l).  One more hypothesis is air that moves the image and
+does not blur it.
 
 1. The displacement: V is that of the hypothesis (Fried 1966), within a factor that the outer scale leaves open.
-2. The variation of the spectra.  Expected are ``g s + ε² ln² H + 4π² τ² ν²`` and ``g s_4 + 1.7 ε² ln² H + π² τ² ν²``: the
-   air, the static blur that registration stretches, and what it misses, of which a shift of the window does not change
-   the powers.
-3. The image: ``exp(−κ_m (L − min L))``.  L is a mean over gradients that are neither independent nor exactly modelled, so it
-   counts as that of only κ_m of them.  Scenes are soft themselves, which adds to the width in squares.
+2. The variation of the spectra.  Expected are ``g s + 0.8 ε² ln² H + j`` and ``g s_4 + 1.4 ε² ln² H + j/4`` with
+   ``j = exp(4π² τ² ν²) − 1``: the air, the static blur that registration stretches, and displacement that it misses.
+3. The image: ``exp(−κ_m (L − min L))``.  L is a mean over gradients that are neither independent nor exactly modelled,
+   so it counts as that of only κ_m of them.  Scenes are soft themselves, which adds to the width in squares.
 
 The air and the lens look alike in 1 and 3, and the air alone varies.
 
 Removal
 -------
-The mean of ln H under the posterior is the shape.  Its width is multiplied by the factor, 1.1 at most, that loses least on
-average over the hypotheses: ``Σ_ν ν^(1 − 2.2) (W Ĥ H − 1)²`` after a Wiener filter, for a scene whose power falls as ν^(−2.2).
-Too wide a blur amplifies what is left and costs more than too narrow a one.
+The mean of ln H under the posterior is the shape.  Its width is multiplied by the factor, 1.1 at most, that loses least
+on average over the hypotheses, in decibels: the loss is ``Σ_ν ν^(1 − 2.2) (W H − 1)²`` after the Wiener filter W of the
+blur that is removed, for a scene whose power falls as ν^(−2.2).  Too wide a blur amplifies what is left and costs more
+than too narrow a one.
 
 Constants of the likelihoods were set on simulated clips; ``benchmarks/results/blur_calibration.md`` is of others.
 """
@@ -42,10 +42,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import FloatArray
 from .image_evidence import EXPONENTS, ImageEvidence
 from .psf import half_frequency
 from .short_exposure import TILT_SPREAD, displacement_variance, short_exposures
-from .spectral_variation import RINGS, SpectralVariation
+from .spectral_variation import RINGS, SpectralVariation, measure_variation
 
 Float64Array = NDArray[np.float64]
 
@@ -54,9 +55,9 @@ _STRENGTHS = np.geomspace(0.5, 7, 11)
 _DIFFRACTIONS = np.geomspace(0.35, 4.5, 11)
 _LENSES = np.array([0.2, 0.35, 0.5, 0.7, 0.9, 1.1, 1.35, 1.6, 1.9, 2.3, 2.8, 3.4, 4.2])
 # Prior: usual λ/D and the standard deviation of its logarithm; share of air that does not blur; weights of the σ_l.
-_USUAL_DIFFRACTION, _DIFFRACTION_SPREAD, _NO_BLUR = 1.4, 0.6, 0.2
+_USUAL_DIFFRACTION, _DIFFRACTION_SPREAD, _NO_BLUR = 1.4, 0.6, 0.05
 _LENS_PRIOR = np.array([22, 16, 12, 7, 7, 6, 6, 6, 5, 4.5, 4, 3, 1.5])
-# Logarithms of V over which air that does not blur is equally likely; below the second, squared pixels, it stands still.
+# Logarithms of V over which air that does not blur is equally likely; it stands still below the second, squared pixels.
 _RANGE_OF_V, _STILL, _LEAST_V = 7.0, 0.03, 1e-3
 # g and τ: values, and mean and standard deviation of the logarithm.
 _SHARES, _SHARE_PRIOR = np.exp([-2.2, -1.6, -1.1, -0.7, -0.3]), (-1.1, 0.5)
@@ -67,24 +68,29 @@ _STRETCH, _SHIFT, _NOISE_ERROR = (0.8, 1.36), (1.0, 0.25), (0.15, 0.3)
 _MODEL_ERROR, _LEAST_ERROR, _RING_WEIGHT = 0.3, 1e-3, 0.35
 # Rings that count, as long as the signal exceeds the noise by this factor.
 _FIRST_RING, _LAST_RING, _CLEAR = 2, 25, 2.0
-# κ_m, and the logarithm at which no hypothesis is excluded further; softness of scenes, pixels, with weights.
-_GRADIENTS, _EXCLUDED = 40.0, 12.0
-_SOFTNESS = ((0.25, 0.35), (0.5, 0.33), (0.8, 0.2), (1.15, 0.09), (1.6, 0.03))
+# κ_m; softness of scenes, pixels, with weights.
+_GRADIENTS = 40.0
+_SOFTNESS = ((0.25, 0.36), (0.5, 0.35), (0.8, 0.2), (1.15, 0.07), (1.6, 0.02))
+# A witness whose model does not hold must not outvote the others: the most that displacement, variation and image count
+# against a hypothesis, as logarithms.  The two of the frames together outvote the image, and it each of them.
+_EXCLUDED = (6.0, 8.0, 10.0)
 # Fidelity of the Wiener filter and exponent of the power of a scene; factors on the width that are tried.
 _FIDELITY, _SCENE = 1500.0, 2.2
+# Share of the energy of the scene that is lost whatever is removed.
+_LEAST_LOSS = 1e-3
 _FACTORS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
 # Widths below this are those of the pixels and of the interpolation, and are not removed, pixels.
 _LEAST_REMOVED = 0.5
 _LEAST_TRANSFER = 1e-5
+# Widest blur of frames that are not reduced, pixels, and the factors of the others.
+_WIDEST, _REDUCTIONS = 3.0, (2, 4)
 # Widths that are reported.
 _QUANTILES = (0.16, 0.5, 0.84)
 
 
 @dataclass(frozen=True, eq=False)
 class BlurWitnesses:
-    """What the frames say about their blur: variation of their spectra, if it could be measured, V, and the number of
-    independent frames that V was measured from.
-    """
+    """What the frames say about their blur: s and s_4, if they could be measured, V, and the frames that V is from."""
 
     variation: SpectralVariation | None
     displacement: float
@@ -99,9 +105,9 @@ class BlurPosterior:
     ----------
     removed, exponent : float
         Width and shape of the blur to remove, pixels; see :func:`turbrestore.blur.psf.blur_otf`.
-    width : tuple of float
+    width : ndarray, float64, shape (3,)
         16 %, 50 % and 84 % quantiles of the width, pixels.
-    by_displacement, by_variation, by_image : tuple of float
+    by_displacement, by_variation, by_image : ndarray, float64, shape (3,)
         The same by each witness alone.
     air : float
         Probability that the air has blurred the image.
@@ -117,10 +123,10 @@ class BlurPosterior:
 
     removed: float
     exponent: float
-    width: tuple[float, float, float]
-    by_displacement: tuple[float, float, float]
-    by_variation: tuple[float, float, float]
-    by_image: tuple[float, float, float]
+    width: Float64Array
+    by_displacement: Float64Array
+    by_variation: Float64Array
+    by_image: Float64Array
     air: float
     frequencies: Float64Array
     transfer: Float64Array
@@ -136,8 +142,9 @@ class BlurPosterior:
 
 @dataclass(frozen=True, eq=False)
 class _Hypotheses:
-    """Air (a, the last one does not blur) and lens (l): transfer functions (a, l, rings), their widths and exponents (a, l),
-    s and s_4 of the air (a, rings), and logarithms of the prior (a, l).
+    """Transfer functions (a, l, rings) of airs and lenses, with their widths and exponents (a, l).
+
+    The last air does not blur.  ``amplitude`` and ``power`` are s and s_4 (a, rings), ``prior`` its logarithm (a, l), ``expected_v`` V (a − 1).
     """
 
     transfer: Float64Array
@@ -147,6 +154,22 @@ class _Hypotheses:
     power: Float64Array
     prior: Float64Array
     expected_v: Float64Array
+
+
+def measure_witnesses(frames: FloatArray, flows: FloatArray, displacement: float, independent: float) -> BlurWitnesses:
+    """Measure what frames (T, H, W[, 3]) say that are registered by flows (T, H, W, 2), pixels.
+
+    Windows of 64 pixels resolve blurs of up to three pixels; for wider ones, frames are reduced.
+    """
+    witnesses = BlurWitnesses(measure_variation(frames, flows), displacement, independent)
+    for reduction in _REDUCTIONS:
+        if blur_posterior(None, witnesses).width[1] <= _WIDEST * reduction / 2:
+            break
+        reduced = measure_variation(frames, flows, reduction)
+        if reduced is None:
+            break
+        witnesses = BlurWitnesses(reduced, displacement, independent)
+    return witnesses
 
 
 def blur_posterior(
@@ -160,12 +183,13 @@ def blur_posterior(
     scale = 1 if variation is None else variation.reduction
     of_v = _displacement_likelihood(witnesses.displacement / scale**2, witnesses.frames)[:, None] + 0 * known.width
     of_s = 0 * known.width if variation is None else _variation_likelihood(variation)
+    of_v, of_s = (np.maximum(one, one.max() - most) for one, most in ((of_v, _EXCLUDED[0]), (of_s, _EXCLUDED[1])))
     kappa = _sharper(known, _normalised(known.prior + of_v + of_s), ratio)
     of_image = 0 * known.width if evidence is None else _image_likelihood(evidence, kappa, scale)
     weights = _normalised(known.prior + of_v + of_s + of_image)
     kappa = _sharper(known, weights, ratio)
 
-    def quantiles(likelihood: Float64Array) -> tuple[float, float, float]:
+    def quantiles(likelihood: Float64Array) -> Float64Array:
         return _quantiles(kappa * scale * known.width, _normalised(known.prior + likelihood))
 
     curves = np.array([np.interp(RINGS * kappa, RINGS, curve) for curve in known.transfer.reshape(-1, len(RINGS))])
@@ -218,8 +242,9 @@ def _shapes(transfer: Float64Array) -> tuple[Float64Array, Float64Array]:
     last = np.maximum(last, 1)
     high = np.take_along_axis(depth, last[..., None], -1)[..., 0]
     low = np.take_along_axis(depth, np.maximum(last - 1, 1)[..., None], -1)[..., 0]
-    slope = np.log(high / low) / np.log(RINGS[last] / RINGS[np.maximum(last - 1, 1)].clip(1e-9))
-    slope = np.where((last > 1) & below.any(axis=-1), np.clip(slope, 0.8, 2.5), 2.0)
+    apart = np.maximum(np.log(last / np.maximum(last - 1, 1)), 1e-9)
+    slope = np.clip(np.log(high / low) / apart, 0.8, 2.5)
+    slope = np.where((last > 1) & below.any(axis=-1), slope, 2.0)
     half = RINGS[last] * high ** (-1 / slope)
     usable = (transfer > 0.08) & (transfer < 0.93) & (RINGS > 0)
     x = np.log(np.maximum(RINGS, RINGS[1]) / half[..., None])
@@ -262,7 +287,7 @@ def _variation_likelihood(measured: SpectralVariation) -> Float64Array:
 
 
 def _expected(kind: int, rings: NDArray[np.int_], share: float, shift: float, stretch: float) -> Float64Array:
-    """s (kind 0) or s_4 (kind 1) of every hypothesis in some rings."""
+    """Return s (kind 0) or s_4 (kind 1) of every hypothesis in some rings."""
     known = _hypotheses()
     air = (known.amplitude, known.power)[kind][:, None, rings]
     stretched = _STRETCH[kind] * stretch**2 * np.log(np.maximum(known.transfer[..., rings], 1e-4)) ** 2
@@ -279,14 +304,14 @@ def _clear_rings(measured: SpectralVariation) -> NDArray[np.int_]:
 def _image_likelihood(evidence: ImageEvidence, kappa: float, scale: int) -> Float64Array:
     """Log likelihood of the image for every hypothesis, mean over the softness of the scene."""
     known = _hypotheses()
-    curves = -np.minimum(_GRADIENTS * (evidence.costs - evidence.costs.min()), _EXCLUDED)
+    curves = -np.minimum(_GRADIENTS * (evidence.costs - evidence.costs.min()), _EXCLUDED[2])
     place = np.interp(known.exponent, EXPONENTS, np.arange(len(EXPONENTS)))
     low = np.minimum(place.astype(int), len(EXPONENTS) - 2)
     share, logs = place - low, np.log(evidence.widths)
     total = np.full(known.width.shape, -np.inf)
     for softness, weight in _SOFTNESS:
         seen = np.log(np.hypot(kappa * scale * known.width, softness))
-        by_shape = np.array([np.interp(seen, logs, curve, right=-_EXCLUDED) for curve in curves])
+        by_shape = np.array([np.interp(seen, logs, curve, right=-_EXCLUDED[2]) for curve in curves])
         below, above = (np.take_along_axis(by_shape, (low + step)[None], 0)[0] for step in (0, 1))
         total = np.logaddexp(total, np.log(weight) + (1 - share) * below + share * above)
     return total
@@ -309,7 +334,8 @@ def _least_loss(curves: Float64Array, weights: Float64Array, mean: Float64Array)
     (width,), (exponent,) = _shapes(mean[None])
 
     def loss(wiener: Float64Array | float) -> float:
-        return float(weights @ (scene * (wiener * curves - 1) ** 2).sum(axis=1))
+        left = (scene * (wiener * curves - 1) ** 2).sum(axis=1)
+        return float(weights @ np.log(left + _LEAST_LOSS * scene.sum()))
 
     best, chosen = loss(1.0), 0.0
     for factor in _FACTORS:
@@ -325,22 +351,18 @@ def _normalised(logs: Float64Array) -> Float64Array:
     return weights / weights.sum()
 
 
-def _quantiles(widths: Float64Array, weights: Float64Array) -> tuple[float, float, float]:
+def _quantiles(widths: Float64Array, weights: Float64Array) -> Float64Array:
     order = np.argsort(widths, axis=None)
-    sums = np.cumsum(weights.ravel()[order])
-    low, middle, high = np.interp(_QUANTILES, sums, widths.ravel()[order])
-    return float(low), float(middle), float(high)
+    return np.interp(_QUANTILES, np.cumsum(weights.ravel()[order]), widths.ravel()[order])
 
 
 def _curve_quantiles(curves: Float64Array, weights: Float64Array) -> tuple[Float64Array, Float64Array]:
-    pairs = [_quantiles(column, weights) for column in curves.T]
-    return np.array([low for low, _, _ in pairs]), np.array([high for _, _, high in pairs])
+    low, _, high = np.array([_quantiles(column, weights) for column in curves.T]).T
+    return low, high
 
 
-def _measured_and_expected(
-    measured: SpectralVariation | None, weights: Float64Array
-) -> dict[str, Float64Array]:
-    """s and s_4 as measured and as the posterior expects them, for the usual g and τ."""
+def _measured_and_expected(measured: SpectralVariation | None, weights: Float64Array) -> dict[str, Float64Array]:
+    """Return s and s_4 as measured and as the posterior expects them, for the usual g and τ."""
     gaps = np.full(len(RINGS), np.nan)
     names = ("variation", "power_variation")
     found = {key: gaps for name in names for key in (name, f"{name}_error", f"expected_{name}")}

@@ -16,7 +16,6 @@ highest frequencies, at which no signal is left.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -129,9 +128,7 @@ def _reduced(stack: FloatArray, top: int, left: int, side: int, factor: int) -> 
     return cv2.resize(part, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
 
 
-def _around(
-    frame: FloatArray, flow: FloatArray, top: int, left: int, factor: int
-) -> tuple[FloatArray, FloatArray]:
+def _around(frame: FloatArray, flow: FloatArray, top: int, left: int, factor: int) -> tuple[FloatArray, FloatArray]:
     """Luminance of a frame and its flow in and around a window, both in reduced pixels."""
     moved = _reduced(flow, top, left, SIDE, factor) / np.float32(factor)
     return luminance(_reduced(frame, top, left, SIDE, factor)), moved
@@ -165,7 +162,7 @@ def _mean_square_derivative(flow: FloatArray) -> float:
 
 
 def _sums(spectra: NDArray[np.complex64]) -> Float64Array:
-    """Sums of one window, from which the ratios follow once the noise is known, as rows of values by ring."""
+    """Sum up one window, so that the ratios follow once the noise is known; rows of values by ring."""
     count, power = len(spectra), np.square(np.abs(spectra))
     mean_power, spread = power.mean(axis=0), power.var(axis=0, ddof=1)
     variance = spectra.var(axis=0, ddof=1)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..blur.estimation import BlurEstimate
+from ..blur.posterior import BlurPosterior
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, InputNotFoundError, OutputError
 from ..deconvolution.deconvolve import Deconvolution
@@ -32,9 +33,9 @@ from .stage_files import load_artifact, save_artifact
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-SCHEMA = 3
+SCHEMA = 4
 RECORD, IMAGES, MEAN = "run.json", "images.npz", "mean.npy"
-RESULTS = ("centroid", "dynamics", "filtered", "blur", "deconvolution")
+RESULTS = ("centroid", "dynamics", "filtered", "blur", "posterior", "deconvolution")
 # All files of a kept run.
 RUN_FILES = (*(f"{name}.npz" for name in RESULTS), MEAN, IMAGES, RECORD)
 _ANEW = "start anew without resuming, or keep the stages in another folder"
@@ -223,6 +224,7 @@ def read_stages(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
         verdict = fields.part("deblurred")
         if verdict.record:
             verdict.flag("estimated")
+            verdict.flag("measured")
             verdict.guard_readings("readings")
             verdict.decisions("decisions")
     except DataError as error:
@@ -276,6 +278,7 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
         dynamics=_stage(place, names, "dynamics", FlowDynamics),
         filtered=_stage(place, names, "filtered", Filtered),
         blur=_stage(place, names, "blur", BlurEstimate),
+        posterior=_stage(place, names, "posterior", BlurPosterior),
         deconvolution=_stage(place, names, "deconvolution", Deconvolution),
         guard_readings=facts.guard_readings("guard_readings"),
         decisions=facts.decisions("decisions"),

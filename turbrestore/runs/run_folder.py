@@ -31,6 +31,7 @@ import numpy as np
 
 from ..blind.remove_blur import Deblurred
 from ..blur.estimation import BlurEstimate
+from ..blur.posterior import BlurPosterior
 from ..core.arrays import check_image
 from ..core.errors import DataError, OutputError, require
 from ..deconvolution.deconvolve import Deconvolution
@@ -57,7 +58,7 @@ FILES = {
     "centroid": ("centroid.npz",),
     "dynamics": ("dynamics.npz",),
     "filtered": ("filtered.npz", MEAN),
-    "deblurred": ("deconvolution.npz", "blur.npz"),
+    "deblurred": ("deconvolution.npz", "blur.npz", "posterior.npz"),
 }
 TITLES = {"centroid": "centroid", "dynamics": "flow model", "filtered": "filter", "deblurred": "deconvolution"}
 _KINDS: dict[str, type] = {"centroid": Centroid, "dynamics": FlowDynamics, "filtered": Filtered}
@@ -295,12 +296,17 @@ class RunFolder:
         return load_artifact(self.folder / f"{name}.npz", _KINDS[_kind(name)], self._scratch)
 
     def _load_deblurred(self) -> Deblurred | None:
-        if "deconvolution.npz" not in self._files or self._verdict.get("estimated") is not ("blur.npz" in self._files):
+        parts = (("estimated", "blur.npz"), ("measured", "posterior.npz"))
+        whole = all(self._verdict.get(flag) is (name in self._files) for flag, name in parts)
+        if "deconvolution.npz" not in self._files or not whole:
             return None
         result = load_artifact(self.folder / "deconvolution.npz", Deconvolution, self._scratch)
         blur = load_artifact(self.folder / "blur.npz", BlurEstimate) if "blur.npz" in self._files else None
+        measured = "posterior.npz" in self._files
+        posterior = load_artifact(self.folder / "posterior.npz", BlurPosterior) if measured else None
         fields = JsonFields(self.folder / RECORD, self._verdict)
-        return Deblurred(result, blur, None, fields.guard_readings("readings"), fields.decisions("decisions"))
+        readings, decisions = fields.guard_readings("readings"), fields.decisions("decisions")
+        return Deblurred(result, blur, None, readings, decisions, posterior)
 
     def _save(self, name: str, result: Any) -> None:
         """Write the files of a result, and then the record that they are there."""
@@ -311,7 +317,7 @@ class RunFolder:
             self._files[MEAN] = file_digest(self.folder / MEAN)
             results = {}
         elif name == "deblurred":
-            results = {"deconvolution": result.deconvolution, "blur": result.blur}
+            results = {"deconvolution": result.deconvolution, "blur": result.blur, "posterior": result.posterior}
             self._verdict = _verdict(result)
         for part, value in results.items():
             self._files.pop(f"{part}.npz", None)
@@ -395,6 +401,7 @@ def _verdict(deblurred: Deblurred) -> dict[str, Any]:
     """List the fields of a deblurred image that have no stage file."""
     return {
         "estimated": deblurred.blur is not None,
+        "measured": deblurred.posterior is not None,
         "readings": [dataclasses.asdict(item) for item in deblurred.readings],
         "decisions": [dataclasses.asdict(item) for item in deblurred.decisions],
     }

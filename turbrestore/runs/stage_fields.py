@@ -140,6 +140,18 @@ FIELDS: dict[str, dict[str, Field]] = {
         "costs": Array("f8", "k", low=-_INFINITE, high=_INFINITE),
         "edge_limited": Flag(),
     },
+    "posterior": {
+        "removed": Number(),
+        "exponent": Number(),
+        **dict.fromkeys(("width", "by_displacement", "by_variation", "by_image"), Array("f8", "3", low=0)),
+        "air": Number(high=1 + _ROUNDING),
+        **dict.fromkeys(("frequencies", "transfer", "lowest", "highest"), Array("f8", "k", low=0)),
+        **{
+            f"{prefix}{name}{suffix}": Array("f8", "k", gaps=True)
+            for name in ("variation", "power_variation")
+            for prefix, suffix in (("", ""), ("", "_error"), ("expected_", ""))
+        },
+    },
 }
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..blur.estimation import BlurEstimate
+from ..blur.posterior import BlurPosterior
 from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import DataError, InputNotFoundError
 from ..deconvolution.deconvolve import Deconvolution
@@ -39,6 +40,7 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "filtered": Filtered,
     "deconvolution": Deconvolution,
     "blur": BlurEstimate,
+    "posterior": BlurPosterior,
 }
 _HEADER = "header"
 

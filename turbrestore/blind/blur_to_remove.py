@@ -1,0 +1,37 @@
+"""The blur of a fused image, by what its frames and the image itself say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ..blur.edges import limit_to_edges
+from ..blur.estimation import BlurEstimate, estimate_blur
+from ..blur.image_evidence import image_evidence
+from ..blur.posterior import BlurPosterior, BlurWitnesses, blur_posterior
+from ..core.arrays import FloatArray, luminance
+from ..deconvolution.deconvolve import DeconvolutionParams
+from ..runtime.runtime import Runtime
+
+
+def find_blur(
+    image: FloatArray, params: DeconvolutionParams, runtime: Runtime, witnesses: BlurWitnesses | None
+) -> tuple[BlurEstimate | None, BlurPosterior | None]:
+    """Estimate the blur by the image, and by the frames where there are witnesses."""
+    if params.sigma is not None:
+        return None, None
+    if witnesses is None:
+        return estimate_blur(image, exponent=params.exponent, runtime=runtime), None
+    grey = luminance(image)
+    evidence = image_evidence(grey, runtime)
+    ratio = None if witnesses.variation is None else witnesses.variation.with_power(grey)
+    posterior = blur_posterior(evidence, witnesses, ratio)
+    if evidence is None:
+        return estimate_blur(image, exponent=params.exponent, runtime=runtime), replace(posterior, removed=0.0)
+    if posterior.removed == 0:
+        return evidence.estimate, posterior
+    # No scene is steeper behind a blur than a step.
+    limited = limit_to_edges(replace(evidence.estimate, sigma=posterior.removed, exponent=posterior.exponent), grey)
+    if not limited.edge_limited:
+        return evidence.estimate, posterior
+    removed = limited.sigma if limited.blurred else 0.0
+    return evidence.estimate, replace(posterior, removed=removed, exponent=limited.exponent)
