@@ -45,7 +45,7 @@ QUICK = {
     "steady": ["--frames", "0:4", "--quiet"],
     "moments": ["--seeds", "2"],
 }
-SMALLER = {"--frames": "0:6", "--roi": "0,0,48,48", "--train": "5", "--seeds": "2", "--size": "64x64", "--reach": "2"}
+SMALLER = {"--frames": "0:6", "--roi": "0,0,48,48", "--train": "5", "--seeds": "2", "--size": "72x72", "--reach": "2"}
 # What serves until it is interrupted, or needs a machine that is not there: tests/app and tests/cli start the like.
 ELSEWHERE = re.compile(r"turbrestore (app|--install-completion)\b|--scheduler|--workers|cuda|\||\[")
 
@@ -71,7 +71,7 @@ def smaller(line, reports):
         taken = drop(taken, "--report")
     if words[0] == "synthesize":
         is_scene = words[1].isalpha() and words[1] != "centroid"
-        taken += ["--size", "64x64"] if is_scene and "--size" not in words else []
+        taken += ["--size", "72x72"] if is_scene and "--size" not in words else []
         taken = drop(taken, "--frames")
     if words[0] in ("steady", "moments"):
         taken = drop(taken, "--frames" if words[0] == "steady" else "--seeds")
@@ -103,7 +103,7 @@ def provide(words, frames):
             for index, frame in enumerate(frames):
                 write_image(path / f"{index}.png", frame, 8)
         elif name in IMAGES:
-            write_image(path, np.pad(np.ones((40, 40), np.float32), 12), 8)
+            write_image(path, np.pad(np.ones((48, 48), np.float32), 12), 8)
 
 
 def save(path, frames):
@@ -119,7 +119,7 @@ def save(path, frames):
 
 @pytest.fixture(scope="module")
 def frames():
-    return open_frames(ROOT / "sample_data" / "chart.mkv", roi=(32, 32, 64, 64)).read(0, 6)
+    return open_frames(ROOT / "sample_data" / "chart.mkv", roi=(32, 32, 72, 72)).read(0, 6)
 
 
 @pytest.fixture
@@ -128,7 +128,7 @@ def folder(tmp_path, monkeypatch, frames):
     samples = tmp_path / "sample_data"
     samples.mkdir()
     write_video(samples / "chart.mkv", frames, 25)
-    write_image(samples / "chart_truth.png", read_image(ROOT / "sample_data/chart_truth.png").image[32:96, 32:96], 16)
+    write_image(samples / "chart_truth.png", read_image(ROOT / "sample_data/chart_truth.png").image[32:104, 32:104], 16)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
     return tmp_path
