@@ -45,7 +45,7 @@ QUICK = {
     "steady": ["--frames", "0:4", "--quiet"],
     "moments": ["--seeds", "2"],
 }
-SMALLER = {"--frames": "0:6", "--roi": "0,0,48,48", "--train": "5", "--seeds": "2", "--size": "72x72", "--reach": "2"}
+SMALLER = {"--frames": "0:6", "--roi": "0,0,48,48", "--train": "5", "--seeds": "2", "--size": "96x96", "--reach": "2"}
 # What serves until it is interrupted, or needs a machine that is not there: tests/app and tests/cli start the like.
 ELSEWHERE = re.compile(r"turbrestore (app|--install-completion)\b|--scheduler|--workers|cuda|\||\[")
 
@@ -71,7 +71,7 @@ def smaller(line, reports):
         taken = drop(taken, "--report")
     if words[0] == "synthesize":
         is_scene = words[1].isalpha() and words[1] != "centroid"
-        taken += ["--size", "72x72"] if is_scene and "--size" not in words else []
+        taken += ["--size", "96x96"] if is_scene and "--size" not in words else []
         taken = drop(taken, "--frames")
     if words[0] in ("steady", "moments"):
         taken = drop(taken, "--frames" if words[0] == "steady" else "--seeds")
