@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+from typing import NoReturn
 
 from .signals import INTERRUPTED, termination_raises
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command.
+    """Run one command, and leave the handling of signals as it was before.
 
     Parameters
     ----------
@@ -20,15 +21,24 @@ def main(arguments: list[str] | None = None) -> int:
     int
         Exit code, see :func:`turbrestore_cli.application.run`; 130 interrupted, 143 terminated.
     """
+    return _command(sys.argv[1:] if arguments is None else arguments, ends_process=False)
+
+
+def program() -> NoReturn:
+    """Run the command that this process was started for, and end the process."""
+    sys.exit(_command(sys.argv[1:], ends_process=True))
+
+
+def _command(arguments: list[str], ends_process: bool) -> int:
     heard: list[KeyboardInterrupt] = []
     try:
-        with termination_raises(heard):
+        with termination_raises(heard, ends_process):
             from .streams import open_closed
 
             open_closed()
             from .application import run
 
-            return run(sys.argv[1:] if arguments is None else arguments)
+            return run(arguments)
     except BaseException:
         # Libraries may turn an interruption of their import into an error of their own.
         if not heard:
@@ -38,4 +48,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

@@ -28,11 +28,12 @@ class Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def termination_raises(heard: list[KeyboardInterrupt]) -> Iterator[None]:
+def termination_raises(heard: list[KeyboardInterrupt], ends_process: bool = False) -> Iterator[None]:
     """Raise :class:`Terminated` on the first signal within the block, and note it in ``heard``.
 
-    Those that follow within a few seconds would disturb the saving that the first one has set off, and those after the
-    block the end of the interpreter: they are ignored.  What is ignored from the start (``nohup``) stays ignored.
+    Those that follow within a few seconds would disturb the saving that the first one has set off, and are ignored.
+    So are those after an interrupted block that ends the process: they would disturb the end of the interpreter.  Any
+    other block leaves the handlers as they were.  What is ignored from the start (``nohup``) stays ignored.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -55,4 +56,4 @@ def termination_raises(heard: list[KeyboardInterrupt]) -> Iterator[None]:
         yield
     finally:
         for number in caught:
-            signal.signal(number, signal.SIG_IGN if heard else before[number])
+            signal.signal(number, signal.SIG_IGN if heard and ends_process else before[number])

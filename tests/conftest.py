@@ -29,6 +29,16 @@ def browser():
         browser.close()
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Give all tests of a module to one process, which then makes what they share once."""
+    from xdist.scheduler import LoadFileScheduling
+
+    # As they are collected: the examples in docstrings come last, and are over soon in every module.
+    config.option.loadscopereorder = False
+    return LoadFileScheduling(config, log)
+
+
 @dataclass(frozen=True)
 class Sequence:
     scene: np.ndarray

@@ -73,7 +73,7 @@ def test_the_size_of_tiles_does_not_follow_from_the_number_of_threads(limit):
 
 @pytest.mark.long
 def test_limits_with_the_same_tiles_have_the_same_side():
-    plans = [plan_of(FOUR_K, limit) for limit in np.arange(1.2e9, 4e9, 4e7)]
+    plans = [plan_of(FOUR_K, limit) for limit in np.arange(1.2e9, 4e9, 1e8)]
     sides = {}
     for plan in plans:
         sides.setdefault(plan.decisions[0].choice, set()).add(plan.tile)
@@ -103,7 +103,7 @@ def test_room_for_a_report_is_for_the_images_that_it_shows():
     st.sampled_from(STAGES),
     st.none() | st.integers(2, 3000),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_a_plan_keeps_the_limit_or_names_one_that_can_be_kept(count, height, width, colour, limit, until, wanted):
     shape, wanted = (count, height, width, *colour), wanted if wanted is None else min(wanted, count)
     try:
@@ -136,13 +136,15 @@ def test_torch_counts(monkeypatch):
 
 
 @pytest.mark.parametrize("channels", ["luminance", "each"])
-@pytest.mark.parametrize("limit", np.arange(1.6e9, 3.4e9, 1.5e8))
-def test_the_tiles_of_the_deconvolution_do_not_follow_from_the_number_of_threads(limit, channels):
-    params = {"deconvolution": DeconvolutionParams(channels=channels)}
-    plans = [plan_of((25, 1080, 1920, 3), limit, threads, **params) for threads in (1, 2, 8)]
-    assert len({plan.deconvolution_side for plan in plans}) == 1
-    said = [any("deconvolution in tiles" in item.choice for item in plan.decisions) for plan in plans]
-    assert said == [plan.deconvolution_side is not None for plan in plans]
+def test_the_tiles_of_the_deconvolution_do_not_follow_from_the_number_of_threads(channels):
+    params, sides = {"deconvolution": DeconvolutionParams(channels=channels)}, set()
+    for limit in np.arange(1.6e9, 3.4e9, 3e8):
+        plans = [plan_of((25, 1080, 1920, 3), limit, threads, **params) for threads in (1, 2, 8)]
+        assert len({plan.deconvolution_side for plan in plans}) == 1, limit
+        said = [any("deconvolution in tiles" in item.choice for item in plan.decisions) for plan in plans]
+        assert said == [plan.deconvolution_side is not None for plan in plans], limit
+        sides.add(plans[0].deconvolution_side)
+    assert len(sides) > 1
 
 
 def test_more_memory_is_never_worse():

@@ -4,7 +4,6 @@ import re
 import tomllib
 from pathlib import Path
 
-import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
 
@@ -27,15 +26,19 @@ def pins(name):
     return {package: Version(version) for package, version in lines}
 
 
-@pytest.mark.parametrize("requirement", [item for item in OLDEST if item.name not in CHECKERS | {OURSELVES}], ids=str)
-def test_every_floor_is_tested(requirement):
-    floor = next(item.version for item in requirement.specifier if item.operator == ">=")
-    assert pins("constraints-lowest.txt")[requirement.name] == Version(floor)
+def test_every_floor_is_tested():
+    pinned = pins("constraints-lowest.txt")
+    for requirement in OLDEST:
+        if requirement.name not in CHECKERS | {OURSELVES}:
+            floor = next(item.version for item in requirement.specifier if item.operator == ">=")
+            assert pinned[requirement.name] == Version(floor), requirement
 
 
-@pytest.mark.parametrize("requirement", [item for item in ALL if item.name != OURSELVES], ids=str)
-def test_the_newest_version_is_pinned_and_allowed(requirement):
-    assert requirement.specifier.contains(pins("constraints.txt")[requirement.name])
+def test_the_newest_version_is_pinned_and_allowed():
+    pinned = pins("constraints.txt")
+    for requirement in ALL:
+        if requirement.name != OURSELVES:
+            assert requirement.specifier.contains(pinned[requirement.name]), requirement
 
 
 def test_both_are_installed_from_wheels_and_tested():

@@ -339,7 +339,8 @@ def start(words):
 
 @pytest.mark.long
 def test_an_interrupted_batch_whose_processes_are_killed_loses_no_clip(clips, tmp_path):
-    words = ["batch", str(clips), "--out", str(tmp_path / "out"), *QUICK]
+    chosen = [str(clips / f"{number}.mkv") for number in range(3)]
+    words = ["batch", *chosen, "--out", str(tmp_path / "out"), *QUICK]
     process, timer = start(words)
     family = children(process)
     assert len(family) == 2
@@ -355,10 +356,10 @@ def test_an_interrupted_batch_whose_processes_are_killed_loses_no_clip(clips, tm
     _, err = process.communicate()
     timer.cancel()
     assert process.returncode == 0, err
-    assert [row["state"] for row in rows(tmp_path / "out")] == ["done"] * 5
+    assert [row["state"] for row in rows(tmp_path / "out")] == ["done"] * 3
     singly = tmp_path / "singly"
     singly.mkdir()
-    for clip in sorted(Path(clips).iterdir()):
-        assert main(["restore", str(clip), str(singly / f"{clip.stem}.png"), *QUICK, "--quiet"]) == 0
+    for clip in chosen:
+        assert main(["restore", clip, str(singly / f"{Path(clip).stem}.png"), *QUICK, "--quiet"]) == 0
     assert contents(tmp_path / "out") == contents(singly)
     assert not list((tmp_path / "out").glob(".*"))

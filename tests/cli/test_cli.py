@@ -84,14 +84,17 @@ class TestRestore:
     @pytest.mark.long
     @pytest.mark.parametrize("preset", PRESETS)
     def test_a_preset_is_what_python_has_by_that_name(self, run, clip, tmp_path, preset):
-        words = ["--preset", preset, "--report", tmp_path / "o.html"]
+        # The report takes longer than the rest; that of one preset is enough.
+        report = ["--report", tmp_path / "o.html"] if preset == "fast" else []
+        words = ["--preset", preset, *report, "--roi", "8,8,48,48"]
         assert run("restore", clip, tmp_path / "o.png", *words, "--quiet")[0] == 0
         image = read_image(tmp_path / "o.png").image
-        assert np.abs(image - restore(open_frames(clip), PRESETS[preset]).image).max() <= 0.5 / 255 + 1e-6
+        part = open_frames(clip, roi=(8, 8, 48, 48))
+        assert np.abs(image - restore(part, PRESETS[preset]).image).max() <= 0.5 / 255 + 1e-6
         again = tmp_path / "again.png"
         assert run("restore", clip, again, "--config", tmp_path / "o.png.toml", "--quiet")[0] == 0
         assert again.read_bytes() == (tmp_path / "o.png").read_bytes()
-        assert f"--preset={preset}" in (tmp_path / "o.html").read_text() or preset == "standard"
+        assert not report or "--preset=fast" in (tmp_path / "o.html").read_text()
 
     def test_a_settings_file_starts_from_a_preset(self, run, tmp_path):
         assert run("config", "--init", tmp_path / "run.toml", "--preset", "fast")[0] == 0

@@ -49,9 +49,12 @@ def folder(tmp_path, monkeypatch):
 def smaller(words):
     """Words of an example with the numbers in ``SMALLER``, and settings that take less time."""
     quick = [SMALLER.get(pair, pair[1]) for pair in pairwise(["", *words])]
-    quick += {"restore": QUICK, "batch": QUICK, "deconvolve": STEPS, "synthesize": ["--size", "64x64"]}.get(
-        words[0], []
-    )
+    quick += {
+        "restore": QUICK,
+        "batch": [*QUICK, "--workers", "1"],
+        "deconvolve": STEPS,
+        "synthesize": ["--size", "64x64"],
+    }.get(words[0], [])
     blurred = words[0] in ("restore", "deconvolve") and "--sigma" not in words
     return [*quick, "--sigma", "1"] if blurred else quick
 
@@ -79,7 +82,6 @@ class TestHelp:
 
         assert run("--version") == (0, f"{turbrestore.__version__}\n", "")
 
-    @pytest.mark.long
     def test_examples_run(self, run, folder):
         # The app serves until it is interrupted: tests/app starts it.
         for words in (name for name in EXAMPLES if name != "app"):

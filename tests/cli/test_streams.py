@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore_cli import signals
+from turbrestore_cli import application, signals
 from turbrestore_cli.__main__ import main
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="streams are closed and signals sent as POSIX has it")
@@ -34,7 +34,7 @@ def call(place, words, redirections):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-"])
 def test_closed_streams_hold_nothing_up(place, closed):
     done = call(place, RESTORE, closed)
     assert done.returncode == 0, done.stderr
@@ -61,7 +61,7 @@ def test_nobody_can_be_told_that_standard_error_is_full(place):
 
 @pytest.mark.long
 @full
-@pytest.mark.parametrize("words", [["info", "clip.npy"], ["info", "clip.npy", "--json"], ["doctor"], ["--help"]])
+@pytest.mark.parametrize("words", [["info", "clip.npy"], ["info", "clip.npy", "--json"], ["--help"]])
 def test_a_full_standard_output_is_named(place, words):
     done = call(place, words, ">/dev/full")
     assert done.returncode == 74
@@ -111,9 +111,9 @@ def test_an_interruption_of_the_start_is_one_line(place, module, kind):
 
 
 ENDING = """
-import os, signal, sys, time
+import atexit, os, signal, time
 from turbrestore_cli import application
-from turbrestore_cli.__main__ import main
+from turbrestore_cli.__main__ import program
 def slow(words):
     try:
         os.kill(os.getpid(), signal.SIGINT)
@@ -123,11 +123,12 @@ def slow(words):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.05)
         print("saved", flush=True)
+def late():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.05)
 application.run = slow
-code = main([])
-os.kill(os.getpid(), signal.SIGINT)
-time.sleep(0.05)
-sys.exit(code)
+atexit.register(late)
+program()
 """
 
 
@@ -140,15 +141,20 @@ def test_more_signals_do_not_disturb_the_saving():
 
 def test_a_saving_that_hangs_can_be_ended(monkeypatch):
     monkeypatch.setattr(signals, "PATIENCE", 0.0)
-    before = signal.getsignal(signal.SIGINT)
     heard = []
-    try:
-        with pytest.raises(signals.Terminated), signals.termination_raises(heard):
-            with pytest.raises(signals.Terminated):
-                signal.raise_signal(signal.SIGINT)
-            time.sleep(0.001)
-            signal.raise_signal(signal.SIGTERM)
-    finally:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, before if number == signal.SIGINT else signal.SIG_DFL)
+    with pytest.raises(signals.Terminated), signals.termination_raises(heard):
+        with pytest.raises(signals.Terminated):
+            signal.raise_signal(signal.SIGINT)
+        time.sleep(0.001)
+        signal.raise_signal(signal.SIGTERM)
     assert [stop.exit_code for stop in heard] == [130, 143]
+
+
+def test_an_interrupted_command_leaves_the_handlers_of_its_caller(monkeypatch, capsys):
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    before = [signal.getsignal(number) for number in numbers]
+    for number, code, word in zip(numbers, [130, 143, 129], ["interrupted", "terminated", "terminated"], strict=True):
+        monkeypatch.setattr(application, "run", lambda _, number=number: signal.raise_signal(number))
+        assert main(["info", "clip.npy"]) == code
+        assert capsys.readouterr().err == f"turbrestore: {word}\n"
+        assert [signal.getsignal(number) for number in numbers] == before

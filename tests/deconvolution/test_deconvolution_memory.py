@@ -22,9 +22,8 @@ def peak(image: np.ndarray, params: DeconvolutionParams, threads: int) -> int:
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("threads", [1, 8])
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("channels", ["grey", "luminance", "each"])
+@pytest.mark.parametrize(("channels", "threads"), [("grey", 1), ("luminance", 8), ("each", 8)])
 def test_every_method_keeps_what_is_stated(monkeypatch, threads, method, channels):
     shape = (400, 500) if channels == "grey" else (400, 500, 3)
     image = np.random.default_rng(0).random(shape, np.float32)

@@ -243,12 +243,11 @@ def test_a_tile_agrees_with_the_whole_away_from_its_border():
     exact = dataclasses.replace(with_whole_image_settings(image, guide), sharpen_guide=False, tolerance=1e-3)
     for settings, share, guide_of in ((params, 99, None), (exact, 100, guide)):
         whole = deconvolve(image, 1.5, settings, guide_of).image
-        for left in (0, 96):
-            part = np.s_[:, left : left + 256]
-            tile = deconvolve(image[part], 1.5, settings, None if guide_of is None else guide_of[part]).image
-            difference = np.abs(tile - whole[part])[:, halo:-halo]
-            assert np.percentile(difference, share) < 1e-2
-            assert np.sqrt(np.mean(difference**2)) < 2e-3
+        part = np.s_[:, 96:]
+        tile = deconvolve(image[part], 1.5, settings, None if guide_of is None else guide_of[part]).image
+        difference = np.abs(tile - whole[part])[:, halo:-halo]
+        assert np.percentile(difference, share) < 1e-2
+        assert np.sqrt(np.mean(difference**2)) < 2e-3
 
 
 def with_whole_image_settings(image, guide):

