@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from .blind.structure import LEFT, UNSEEN, StructureReading
@@ -14,7 +16,7 @@ from .registration.coverage import Rectangle
 from .registration.global_shift import DEAD_ZONE
 from .registration.recentring import recentring_flow
 from .runtime.scratch import iter_frames
-from .seeing.strength import Seeing
+from .seeing.strength import LARGEST_BLUR, Seeing
 
 # A frame counts if its weight is at least this share of the average weight.
 _COUNTS = 0.2
@@ -310,7 +312,14 @@ def explain_seeing(seeing: Seeing) -> tuple[Decision, ...]:
     by_flow, by_blur = seeing.displacement_by_flow, seeing.displacement_by_blur
     if remarks or by_flow is None or by_blur is None:
         return remarks
-    reason = f"variance {by_flow.value:.2f} and {by_blur.value:.2f} squared pixels agree within their errors"
+    if not by_flow.overlaps(by_blur):
+        reason = f"variance {by_flow.value:.2f} squared pixels; no more than {LARGEST_BLUR:g} can be told by blur"
+        return (Decision("displacement", "by flow alone", reason),)
+    bound = "at least " if math.isinf(by_blur.high) else ""
+    reason = (
+        f"variance {by_flow.value:.2f} squared pixels by flow and {bound}{by_blur.value:.2f} by blur: "
+        "their 95 % intervals overlap"
+    )
     return (Decision("displacement", "by blur as by flow", reason),)
 
 
