@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import make_sequence
 
+from conftest import make_sequence
 from turbrestore.core.decision import Decision
 from turbrestore.pipeline import restore
 from turbrestore.seeing.strength import Estimate
@@ -54,7 +54,7 @@ def test_every_doubt_is_named(restoration):
         "motion that the flow has missed": {"seeing": missed},
         "noise of 1.0 frames averaged": {"filtered": replace(restoration.filtered, shares=np.eye(24)[0])},
         "100% of the pixels are saturated or seen in no frame": {"uncertainty": restoration.uncertainty + np.inf},
-        "3% of the pixels are at full scale": {"decisions": (Decision("saturation", "", "3% of the pixels are at full scale"),)},
+        "3% are at full scale": {"decisions": (Decision("saturation", "", "3% are at full scale"),)},
         "the frames contradict the filtered image": {"decisions": (Decision("structure", "", ""),)},
     }  # fmt: skip
     for words, change in doubts.items():

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -239,7 +240,7 @@ def measure_seeing(
             f"the clip spans few correlation times ({whole.independent_frames:.1f} independent frames): the variance "
             "over a long time is a lower bound, and more frames would tell more",
         )
-    strength: dict[str, Estimate] = {}
+    strength: dict[str, Any] = {}
     if optics is not None and np.isnan(rotation):
         remarks += ("too few neighbouring blocks to tell turbulence from other motion: no r0 is reported",)
     elif optics is not None and rotation > _ROTATING:
