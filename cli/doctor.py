@@ -21,6 +21,7 @@ from cyclopts import Parameter
 
 from turbrestore import __version__
 from turbrestore.core.errors import TurbrestoreError
+from turbrestore.core.extras import install_command
 
 from .streams import put
 
@@ -153,7 +154,7 @@ def check_cores() -> Iterator[Finding]:
 def check_extras() -> Iterator[Finding]:
     """Libraries that add something and may be missing."""
     for module, extra in EXTRAS.items():
-        install = f"pip install 'turbrestore[{extra}]'"
+        install = install_command(extra)
         try:
             library = importlib.import_module(module)
         except ModuleNotFoundError:
