@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 
-from cyclopts import App, CycloptsError, UnusedCliTokensError
+from cyclopts import App, CycloptsError, MissingArgumentError, UnknownCommandError, UnusedCliTokensError
 
 from turbrestore import __version__
 from turbrestore.core.errors import ConfigurationError, StorageError, TurbrestoreError
@@ -31,6 +31,7 @@ COMMANDS = {
     "filter": ("stages:filter_", "Filter a video with known centroid and dynamics."),
     "deconvolve": ("stages:deconvolve", "Deblur an image."),
     "synthesize": ("synthesis:synthesize", "Make a turbulent video with known truth and flow."),
+    "sample": ("sample:sample", "Write a small clip to try, with its truth."),
     "info": ("inspection:info", "Say what a video is."),
     "evaluate": ("inspection:evaluate", "Compare a result with the truth."),
     "app": ("app:app", "Choose, restore and tune a clip in the browser, on this machine alone."),
@@ -102,7 +103,7 @@ def run(words: list[str]) -> int:
         silence(sys.stdout)
     except (CycloptsError, TurbrestoreError, KeyboardInterrupt, OSError, MemoryError) as error:
         message, code = explain(error)
-        tell(f"turbrestore: {' '.join(message.split())}")
+        tell(f"turbrestore: {' '.join(as_typed(message, words).split())}")
         return code
     return 0
 
@@ -121,6 +122,13 @@ def explain(error: BaseException) -> tuple[str, int]:
     if isinstance(error, UnusedCliTokensError):
         words = " ".join(error.unused_tokens or [])
         return f"{words}: one word too many; --help says what is expected", ConfigurationError.exit_code
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
+        command = " ".join(["turbrestore", *(error.command_chain or ())])
+        return f"{error.argument.name}: expected a value, found none; {command} --help says what is expected", (
+            ConfigurationError.exit_code
+        )
+    if isinstance(error, UnknownCommandError) and error.unused_tokens and "Did you mean" not in str(error):
+        return f"{error.unused_tokens[0]}: no such command; turbrestore --help lists them", ConfigurationError.exit_code
     if isinstance(error, CycloptsError):
         return str(error), ConfigurationError.exit_code
     if isinstance(error, OSError):
@@ -131,6 +139,17 @@ def explain(error: BaseException) -> tuple[str, int]:
             BUG,
         )
     return str(error) or "interrupted", getattr(error, "exit_code", INTERRUPTED)
+
+
+def as_typed(message: str, words: list[str]) -> str:
+    """Name options in a message as they were typed; the library names the setting, such as keep_best."""
+    name, colon, rest = message.partition(": ")
+    typed = dict.fromkeys(word.partition("=")[0] for word in words if word.startswith("--"))
+    wanted = name.replace("_", "-").rpartition(".")[2]
+    fitting = [option for option in typed if option.removeprefix("--").rpartition(".")[2] == wanted]
+    if len(fitting) == 1:
+        message = f"{fitting[0]}{colon}{rest}"
+    return message.replace("allow overwriting", "add --overwrite")
 
 
 def _full_output() -> str:

@@ -1,6 +1,7 @@
 """Examples that ``--help`` and the documentation show; the tests run them, in this order, in one folder."""
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
+    "sample": ("turbrestore sample sample_data --overwrite",),
     "info": ("turbrestore info sample_data/chart.mkv", "turbrestore info sample_data/chart.mkv --json"),
     "app": ("turbrestore app sample_data/chart.mkv", "turbrestore app --allow results --port 8123 --no-browser"),
     "config": ("turbrestore config --init run.toml", "turbrestore config --check run.toml"),
@@ -54,9 +55,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
 }
 FIRST_STEPS = (
-    "turbrestore restore haze.mp4 sharp.png",
+    "turbrestore sample sample_data",
+    "turbrestore restore sample_data/chart.mkv sharp.png --report sharp.html",
     "turbrestore restore --help",
-    "turbrestore synthesize chart haze.mkv --strength medium",
     "turbrestore doctor",
 )
 

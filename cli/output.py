@@ -193,8 +193,10 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: 
     rest = [path for path in folder.iterdir() if path.name != LOCK and not is_part(path)]
     if not overwrite and not known and rest:
         if resume:
-            raise OutputError(f"{folder}: holds no run to go on with; choose another folder or allow overwriting")
-        raise OutputError(f"{folder}: is not empty; choose another folder, allow overwriting, or resume the run in it")
+            raise OutputError(f"{folder}: holds no run to go on with; choose another folder or add --overwrite")
+        raise OutputError(
+            f"{folder}: is not empty; choose another folder, add --overwrite, or go on with the run in it by --resume"
+        )
 
 
 def save_stages(stages: RunFolder, restoration: Restoration, run: RunRecord, bit_depth: int) -> None:
