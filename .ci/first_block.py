@@ -1,4 +1,4 @@
-"""Run the first block of README.md as a newcomer does: in a fresh clone of what is committed, with nothing installed."""
+"""Run the first block of README.md as a newcomer does: in a fresh clone, with nothing installed."""
 
 import os
 import re

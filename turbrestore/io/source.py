@@ -240,8 +240,7 @@ class FrameSource:
         count = len(self)
         start = wanted.start or 0
         stop = count if wanted.stop is None else wanted.stop
-        found = ":".join("" if end is None else str(end) for end in (wanted.start, wanted.stop))
-        require(0 <= start < stop <= count, f"frames: expected a range within 0:{count}, found {found}")
+        require(0 <= start < stop <= count, f"frames: expected a range within 0:{count}, found {start}:{stop}")
         chosen = slice(start, stop, wanted.step)
         return dataclasses.replace(
             self,
