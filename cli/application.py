@@ -119,18 +119,8 @@ def explain(error: BaseException) -> tuple[str, int]:
     """One line and an exit code for a failure that is no bug."""
     if isinstance(error, TurbrestoreError):
         return str(error), error.exit_code
-    if isinstance(error, UnusedCliTokensError):
-        words = " ".join(error.unused_tokens or [])
-        return f"{words}: one word too many; --help says what is expected", ConfigurationError.exit_code
-    if isinstance(error, MissingArgumentError) and error.argument is not None:
-        command = " ".join(["turbrestore", *(error.command_chain or ())])
-        return f"{error.argument.name}: expected a value, found none; {command} --help says what is expected", (
-            ConfigurationError.exit_code
-        )
-    if isinstance(error, UnknownCommandError) and error.unused_tokens and "Did you mean" not in str(error):
-        return f"{error.unused_tokens[0]}: no such command; turbrestore --help lists them", ConfigurationError.exit_code
     if isinstance(error, CycloptsError):
-        return str(error), ConfigurationError.exit_code
+        return _misuse(error), ConfigurationError.exit_code
     if isinstance(error, OSError):
         return f"{error.filename or _full_output() or 'system'}: {error.strerror or error}", StorageError.exit_code
     if isinstance(error, MemoryError):
@@ -139,6 +129,18 @@ def explain(error: BaseException) -> tuple[str, int]:
             BUG,
         )
     return str(error) or "interrupted", getattr(error, "exit_code", INTERRUPTED)
+
+
+def _misuse(error: CycloptsError) -> str:
+    """Say what is wrong with the words of a command, and where to look."""
+    if isinstance(error, UnusedCliTokensError):
+        return f"{' '.join(error.unused_tokens or [])}: one word too many; --help says what is expected"
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
+        command = " ".join(["turbrestore", *(error.command_chain or ())])
+        return f"{error.argument.name}: expected a value, found none; {command} --help says what is expected"
+    if isinstance(error, UnknownCommandError) and error.unused_tokens and "Did you mean" not in str(error):
+        return f"{error.unused_tokens[0]}: no such command; turbrestore --help lists them"
+    return str(error)
 
 
 def as_typed(message: str, words: list[str]) -> str:

@@ -194,9 +194,7 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: 
     if not overwrite and not known and rest:
         if resume:
             raise OutputError(f"{folder}: holds no run to go on with; choose another folder or add --overwrite")
-        raise OutputError(
-            f"{folder}: is not empty; choose another folder, add --overwrite, or go on with the run in it by --resume"
-        )
+        raise OutputError(f"{folder}: is not empty; choose another folder, add --overwrite, or --resume the run in it")
 
 
 def save_stages(stages: RunFolder, restoration: Restoration, run: RunRecord, bit_depth: int) -> None:
