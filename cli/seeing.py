@@ -13,8 +13,9 @@ from turbrestore.preparation import prepare, seeing_of_picture
 from turbrestore.registration.centroid import CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams
 from turbrestore.runtime.steps import finish, step_counter
-from turbrestore.seeing.strength import Estimate, Seeing
+from turbrestore.seeing.strength import Seeing
 from turbrestore.seeing.tilt_theory import Optics
+from turbrestore.wording import interval_words
 
 from .inputs import frames_to_train, open_input
 from .options import Flag, Machine, Selection
@@ -100,7 +101,7 @@ def _optics(
 
 def _lines(seeing: Seeing) -> list[str]:
     lines = [
-        f"{name.replace('_', ' '):<26}{_words(estimate, unit)}"
+        f"{name.replace('_', ' '):<26}{interval_words(estimate, '.3g')} {unit}".rstrip()
         for name, (estimate, unit) in seeing.estimates().items()
         if estimate is not None
     ]
@@ -108,7 +109,3 @@ def _lines(seeing: Seeing) -> list[str]:
         lines.append(f"{'wind direction':<26}{seeing.wind_direction:.0f}° from right downwards")
         lines.append(f"{'independent frames':<26}{seeing.independent_frames:.1f}")
     return [*lines, *(f"remark: {remark}" for remark in seeing.remarks)]
-
-
-def _words(estimate: Estimate, unit: str) -> str:
-    return f"{estimate.value:.3g} ({estimate.low:.3g} to {estimate.high:.3g}) {unit}".rstrip()

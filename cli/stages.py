@@ -169,7 +169,7 @@ def identify(
         _plot_study(plot, study_prediction(measured, dynamics, machine.runtime()), overwrite, quiet)
     for note in found.notes:
         say(f"{output}: {note}", quiet)
-    say(f"{output}: {found.rank} states hold {100 * found.energy_share:.0f} % of the motion", quiet)
+    say(f"{output}: {found.rank} states hold {100 * found.energy_share:.1f} % of the motion", quiet)
 
 
 def predict(
