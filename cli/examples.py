@@ -64,4 +64,4 @@ FIRST_STEPS = (
 
 def epilogue(commands: tuple[str, ...]) -> str:
     """Commands as a block at the end of a help page."""
-    return "\n".join(["Examples:", "```", *commands, "```"])
+    return "\n".join(["Examples:", *(f"  {command}" for command in commands)])

@@ -137,7 +137,8 @@ def synthesize(
     for name in outputs.values():
         check_output(name, inputs, overwrite, suffixes=None)
     rng = np.random.default_rng(seed)
-    with progress_bars(quiet) as progress:
+    stages = {"synthesize": 1.0} if model == "phase-screen" else {"centroid": 1.0, "synthesize": 1.0}
+    with progress_bars(quiet, stages) as progress:
         if model == "phase-screen":
             require(like is None and train is None, "--like, --train: have no effect on phase screens; leave them out")
             idle = dynamic_texture == DynamicTextureParams()
