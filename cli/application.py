@@ -43,6 +43,7 @@ COMMANDS = {
     "--install-completion": ("completion:install_completion", "Complete words in bash, zsh or fish."),
 }
 
+USAGES = {"batch": "Usage: turbrestore batch [OPTIONS] INPUT... FOLDER"}
 BUG = 1
 
 
@@ -72,7 +73,8 @@ def build(explain_all: bool = False) -> App:
     for words, (place, summary) in COMMANDS.items():
         group, _, name = words.rpartition(" ")
         shown = EXAMPLES[words] if explain_all else EXAMPLES[words][:3]
-        groups[group].command(f"{package}.{place}", name=name, help=summary, help_epilogue=epilogue(shown))
+        texts = {"help": summary, "usage": USAGES.get(words), "help_epilogue": epilogue(shown)}
+        groups[group].command(f"{package}.{place}", name=name, **texts)
     return app
 
 

@@ -44,6 +44,7 @@ EXTRAS = {
     "astropy": "fits",
     "distributed": "distributed",
     "nicegui": "app",
+    "napari": "napari",
 }
 READ = ("h264", "ffv1", "hevc", "vp9", "mjpeg", "gif")
 WRITTEN = ("ffv1", "libx264")

@@ -18,8 +18,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore steady sample_data/chart.mkv still.mkv --camera lock --mask moving.mkv --json",
     ),
     "batch": (
-        "turbrestore batch sample_data/chart.mkv --out results",
-        "turbrestore batch sample_data 'sample_data/*.mkv' --out results --resume",
+        "turbrestore batch sample_data/chart.mkv results",
+        "turbrestore batch sample_data 'sample_data/*.mkv' results --resume",
     ),
     "report": ("turbrestore report stages", "turbrestore report stages report.html"),
     "seeing": (
@@ -39,7 +39,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore deconvolve filtered.npz tv.png --sigma 1.2 --deconvolution.method tv",
     ),
     "evaluate": (
-        "turbrestore evaluate sharp.png sample_data/chart_truth.png",
+        "turbrestore evaluate sharp.png sample_data/chart_truth.png --clip sample_data/chart.mkv",
         "turbrestore evaluate sharp.png --reference stages/mean.png --json",
     ),
     "synthesize": (
@@ -50,7 +50,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "moments mirror": ("turbrestore moments mirror --seeds 20 --deviation 3 --json",),
     "doctor": ("turbrestore doctor", "turbrestore doctor --json"),
     "--install-completion": (
-        "turbrestore --install-completion",
+        "turbrestore --install-completion --yes",
         "turbrestore --install-completion --shell bash --output turbrestore.bash",
     ),
 }

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from turbrestore.core.errors import ConfigurationError
+from turbrestore.memory_plan import frames_in_memory, training_share
 from turbrestore.preparation import prepare, seeing_of_picture
 from turbrestore.registration.centroid import CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams
@@ -17,7 +18,7 @@ from turbrestore.seeing.strength import Seeing
 from turbrestore.seeing.tilt_theory import Optics
 from turbrestore.wording import interval_words
 
-from .inputs import frames_to_train, open_input
+from .inputs import open_input
 from .options import Flag, Machine, Selection
 from .output import print_json
 from .progress import progress_bars
@@ -58,7 +59,7 @@ def seeing(
     path : {"spherical", "plane"}
         Plane where the scene lies far beyond the turbulence; the distance is then the length of the turbulent path.
     train : int
-        Frames to use, from the first on; all that --frames names, or by default as many as restore trains on.
+        Frames to use, from the first on.  By default all, up to what 1.5 GB hold.
     json : bool
         Print JSON.
     quiet : bool
@@ -71,7 +72,8 @@ def seeing(
     optics = _optics(pixel_scale, aperture, wavelength, distance, path)
     source = open_input(input, selection, quiet)
     runtime = machine.runtime()
-    count = frames_to_train(source, selection, train)
+    most = min(len(source), frames_in_memory(source.shape[1:]))
+    count = training_share(len(source), source.shape[1:], most if train is None else train)
     prepared = prepare(source, count)
     frames = prepared.source.read(0, count)
     with progress_bars(quiet) as progress:
@@ -81,7 +83,14 @@ def seeing(
     if json:
         print_json({"input": str(input), "frames": count, **asdict(measured)})
     else:
-        put("\n".join([f"{'frames used':<26}{count} of {len(source)}", *_lines(measured)]))
+        put("\n".join([f"{'frames used':<26}{count} of {len(source)}", *_lines(measured), *_missing(optics)]))
+
+
+def _missing(optics: Optics | None) -> list[str]:
+    """Name the options that the strength of the turbulence needs and has not got."""
+    if optics is None:
+        return [f"{'D/r0, r0':<26}need --pixel-scale and --aperture", f"{'Cn²':<26}needs --distance as well"]
+    return [f"{'Cn²':<26}needs --distance"] if optics.distance is None else []
 
 
 def _optics(

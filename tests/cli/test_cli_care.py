@@ -262,6 +262,17 @@ class TestCompletion:
         assert (code, out, err.count("\n")) == (2, "", 1)
         assert "--shell" in err
 
+    def test_files_are_named_before_they_are_edited(self, run, folder, monkeypatch):
+        code, _, err = run("--install-completion", "--shell", "bash")
+        assert code == 2 and str(folder / ".bashrc") in err and "--yes" in err
+        assert not (folder / ".bashrc").exists()
+        monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+        for answer, edited in (("n", False), ("y", True)):
+            monkeypatch.setattr("builtins.input", lambda _, answer=answer: answer)
+            code, _, err = run("--install-completion", "--shell", "bash")
+            assert (code, (folder / ".bashrc").exists()) == ((0, True) if edited else (2, False))
+            assert f"adds a line to {folder / '.bashrc'}" in err
+
 
 class TestDoctor:
     def test_this_installation_is_healthy(self, run):
