@@ -30,7 +30,7 @@ COMMANDS = {
     "identify": ("stages:identify", "Identify the dynamics of flows."),
     "predict": ("stages:predict", "Predict a frame from the one before."),
     "filter": ("stages:filter_", "Filter with known centroid and dynamics."),
-    "deconvolve": ("stages:deconvolve", "Deblur an image."),
+    "deconvolve": ("deblurring:deconvolve", "Deblur an image, or compare widths."),
     "synthesize": ("synthesis:synthesize", "Make a turbulent video with known truth."),
     "sample": ("sample:sample", "Write a small clip to try, with its truth."),
     "info": ("inspection:info", "Say what a video is."),

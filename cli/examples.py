@@ -35,6 +35,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "predict": ("turbrestore predict sample_data/chart.mkv centroid.npz dynamics.npz predicted.png",),
     "filter": ("turbrestore filter sample_data/chart.mkv centroid.npz dynamics.npz filtered.npz",),
     "deconvolve": (
+        "turbrestore deconvolve stages --sweep 1,1.4,2",
         "turbrestore deconvolve filtered.npz deblurred.png --guide centroid.npz",
         "turbrestore deconvolve filtered.npz tv.png --sigma 1.2 --deconvolution.method tv",
     ),

@@ -59,7 +59,7 @@ def smaller(words):
 class TestHelp:
     @pytest.mark.parametrize("words", [*EXAMPLES, "moments"])
     def test_every_command_shows_its_examples(self, run, words):
-        code, out, _ = run(*words.split(), "--help")
+        code, out, _ = run(*words.split(), "--help-all")
         assert code == 0
         shown = " ".join(out.split("Examples:")[1].split())
         for name in (words,) if words in EXAMPLES else ("moments wavefront", "moments mirror"):
