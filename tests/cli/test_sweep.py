@@ -46,10 +46,10 @@ def test_an_image_has_its_sheet_beside_it(run, tmp_path):
 def test_titles_say_what_the_guards_object_to():
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     image = blurred(SCENES["chart"](128), 1.2, np.random.default_rng(0))
-    sheet = contact_sheet(image, image, (0.0, 1.0, 3.5), DeconvolutionParams(iterations=60), GuardParams(), DEFAULT)
+    sheet = contact_sheet(image, image, (0.0, 1.0, 2.0), DeconvolutionParams(iterations=60), GuardParams(), DEFAULT)
     titles = [axes.get_title(loc="left") for axes in sheet.axes]
     assert titles[:3] == ["not deblurred", "0 px", "1 px"]
-    assert titles[3].startswith("3.5 px: rings")
+    assert titles[3] == "2 px: rings, overshoots"
 
 
 def test_the_part_shown_is_the_one_with_edges():
