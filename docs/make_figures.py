@@ -4,7 +4,7 @@ Run ``python docs/make_figures.py``; names of groups (``film``, ``gallery``, ``s
 
 The photographs come with scikit-image and are in the public domain or under CC0: the photographer by Lav Varshney, the
 cat by Stefan van der Walt, brick and gravel from CC0Textures.  What else is shown is drawn by
-``docs/_figures/scenes.py`` and ``turbrestore.synthesis.scenes``.
+``turbrestore.synthesis.drawn_scenes`` and ``turbrestore.synthesis.scenes``.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from _figures.layout import row, save, save_film
 import turbrestore as tr
 from turbrestore.core.arrays import FloatArray
 from turbrestore.synthesis.atmosphere import STRENGTHS
+from turbrestore.synthesis.drawn_scenes import planet, road_sign, street
 from turbrestore.synthesis.scenes import picture, printed_words, resolution_chart
 
 SIDE = 224
@@ -32,11 +33,11 @@ LARGEST_RECIPE, LARGEST_ROW = 120_000, 180_000
 GALLERY = {
     "chart": (lambda: resolution_chart(SIDE, SIDE), "weak", 48, 0.005),
     "words": (lambda: printed_words(SIDE, SIDE), "strong", 60, 0.005),
-    "sign": (lambda: scenes.sign(SIDE, SIDE), "medium", 48, 0.005),
+    "sign": (lambda: road_sign(SIDE, SIDE), "medium", 48, 0.005),
     "photographer": (lambda: picture("camera", SIDE, SIDE), "medium", 60, 0.005),
     "cat": (lambda: picture("cat", SIDE, SIDE), "medium", 60, 0.005),
-    "planet": (lambda: scenes.planet(SIDE, SIDE), "medium", 120, 0.03),
-    "street": (lambda: scenes.street(SIDE, SIDE), "weak", 60, 0.005),
+    "planet": (lambda: planet(SIDE, SIDE), "medium", 120, 0.03),
+    "street": (lambda: street(SIDE, SIDE), "weak", 60, 0.005),
     "gravel": (lambda: picture("gravel", SIDE, SIDE), "strong", 48, 0.005),
 }
 
@@ -57,7 +58,7 @@ def steadied_street() -> FloatArray:
 
 def make_film() -> None:
     """Frames of a clip one after the other, beside the image that is restored from them."""
-    frames = film(scenes.street(FILM_SIDE, FILM_SIDE), STRENGTHS["medium"], 60)
+    frames = film(street(FILM_SIDE, FILM_SIDE), STRENGTHS["medium"], 60)
     image = tr.restore(frames).image
     # Forwards and backwards, so that it has no jump.
     order = [*range(36), *range(34, 0, -1)]
