@@ -52,7 +52,7 @@ def smaller(words):
     quick += {"restore": QUICK, "batch": QUICK, "deconvolve": STEPS, "synthesize": ["--size", "64x64"]}.get(
         words[0], []
     )
-    blurred = words[0] in ("restore", "deconvolve") and "--sigma" not in words
+    blurred = words[0] in ("restore", "deconvolve") and not {"--sigma", "--sweep"} & set(words)
     return [*quick, "--sigma", "1"] if blurred else quick
 
 
