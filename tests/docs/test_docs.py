@@ -145,7 +145,8 @@ def test_every_table_of_the_benchmarks_is_linked_and_made_by_a_script():
 
 def test_options_that_pages_name_exist(generated):
     app = build()
-    known = {name for words in COMMANDS for name in options(app, words)} | {"--help", "--help-all", "--version", *COMMANDS}
+    known = {name for words in COMMANDS for name in options(app, words)}
+    known |= {"--help", "--help-all", "--version", *COMMANDS}
     sections = {name.rsplit(".", 1)[0] for name in known if "." in name}
     for path in [*PAGES, *NOTEBOOKS, ROOT / "README.md", ROOT / "CHANGELOG.md"]:
         text = text_of(path)
