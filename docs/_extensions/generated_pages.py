@@ -1,9 +1,9 @@
 """Sphinx extension: parts of pages that are generated when they are read, so that they are always up to date.
 
 ``<!-- command-line -->`` becomes a table of the commands, and ``<!-- command: restore -->`` the description of one,
-both taken from the application itself; ``<!-- gallery -->`` becomes the notebooks in ``examples/`` to download, with their
-pages in the contents; ``<!-- api: centroid flow -->``
-becomes the reference of all public names that these modules define, and ``<!-- api-table -->`` a table of all of them.
+both taken from the application itself; ``<!-- gallery -->`` becomes the notebooks in ``examples/``, to download and in
+the contents; ``<!-- api: centroid flow -->`` becomes the reference of all public names that these modules define, and
+``<!-- api-table -->`` a table of all of them.
 Links to modules and to tables of ``benchmarks/``, which are not pages of the site, become links to copies of them.
 """
 
