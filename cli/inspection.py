@@ -16,6 +16,7 @@ from turbrestore.footage.content import ContentReport, clean_source
 from turbrestore.fusion import temporal_mean
 from turbrestore.io.images import read_image
 from turbrestore.io.limits import DEFAULT_LIMITS, check_input, input_errors
+from turbrestore.io.npy import map_npy
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
@@ -108,7 +109,7 @@ def evaluate(
     result : Path
         Image, or stage file with an image (.npz); flows (.npy, centroid .npz, .flo) where the truth is flows.
     truth : Path
-        Image of the true scene, or true flows.
+        Image of the true scene, or true flows.  An array of .npy is flows if its last axis has two numbers.
     reference : Path
         Image of the same size, such as a frame or the temporal mean: sharpness and overshoot are measured against it.
     clip : Path
@@ -121,7 +122,7 @@ def evaluate(
     figures: dict[str, float] = {}
     mean: dict[str, float] = {}
     limits = limits_of(max_pixels)
-    if truth is not None and truth.suffix.lower() in FLOW_SUFFIXES:
+    if truth is not None and _holds_flows(truth):
         require(reference is None, "--reference: has no effect on flows; leave it out")
         require(clip is None, "--clip: has no effect on flows; leave it out")
         figures |= dataclasses.asdict(compare_flows(_read_flows(result), _read_flows(truth)))
@@ -130,7 +131,7 @@ def evaluate(
         image = read_input_image(result, limits)
         require(clip is None or truth is not None, "--clip: has no effect without a truth; leave it out")
         if truth is not None:
-            scene = read_image(truth, limits).image
+            scene = read_input_image(truth, limits)
             figures |= dataclasses.asdict(compare(image, scene))
             if clip is not None:
                 mean = dataclasses.asdict(compare(temporal_mean(open_frames(clip, limits=limits)), scene))
@@ -145,6 +146,12 @@ def evaluate(
     for name, value in rounded.items():
         row = [f"{name.replace('_', ' '):<24}{_plain(value):>8}", f"{_plain(of_mean[name]):>9}" if of_mean else ""]
         put(f"{''.join(row)}  {MEANINGS[name]}")
+
+
+def _holds_flows(path: Path) -> bool:
+    """Tell flows from an image by the name, and arrays by their last axis."""
+    suffix = path.suffix.lower()
+    return suffix in FLOW_SUFFIXES and (suffix != ".npy" or map_npy(path).shape[-1:] == (2,))
 
 
 def _read_flows(path: Path) -> FloatArray:

@@ -28,3 +28,14 @@ def test_the_mean_of_the_clip_stands_beside_the_result(run, tmp_path, sequence):
     assert all(", higher is better" in row or ", lower is better" in row or "is best" in row for row in rows[1:])
     code, _, err = run("evaluate", tmp_path / "result.tif", "--reference", tmp_path / "truth.tif", "--clip", words[-1])
     assert code == 2 and "--clip: has no effect without a truth" in err
+
+
+def test_the_truth_may_be_an_array(run, tmp_path, sequence):
+    np.save(tmp_path / "truth.npy", sequence.scene)
+    write_image(tmp_path / "truth.tif", sequence.scene, 32)
+    write_image(tmp_path / "result.tif", sequence.frames[0], 32)
+    figures = [run("evaluate", tmp_path / "result.tif", tmp_path / f"truth.{kind}")[1] for kind in ("npy", "tif")]
+    assert figures[0] == figures[1] != ""
+    np.save(tmp_path / "clip.npy", sequence.frames)
+    code, _, err = run("evaluate", tmp_path / "result.tif", tmp_path / "clip.npy")
+    assert code == 65 and "clip.npy: expected an image of shape (H, W) or (H, W, 3)" in err
