@@ -84,7 +84,8 @@ def read_input_image(input: Path, limits: Limits) -> FloatArray:
         pixels = map_npy(input)
         if pixels.ndim != 2 and pixels.shape[2:] != (3,):
             raise DataError(f"{input}: expected an image of shape (H, W) or (H, W, 3), found shape {pixels.shape}")
-        limits.check_size(*pixels.shape[1::-1], str(input))
+        height, width = pixels.shape[:2]
+        limits.check_size(width, height, str(input))
         return check_image(pixels, str(input))
     return load_stage_image(input) if input.suffix.lower() == ".npz" else read_image(input, limits).image
 
