@@ -55,6 +55,7 @@ def test_every_doubt_is_named(restoration):
         "noise of 1.0 frames averaged": {"filtered": replace(restoration.filtered, shares=np.eye(24)[0])},
         "100% of the pixels are saturated or seen in no frame": {"uncertainty": restoration.uncertainty + np.inf},
         "3% are at full scale": {"decisions": (Decision("saturation", "", "3% are at full scale"),)},
+        "may have left traces": {"decisions": (Decision("passers", "", ""),)},
         "the frames contradict the filtered image": {"decisions": (Decision("structure", "", ""),)},
     }  # fmt: skip
     for words, change in doubts.items():

@@ -237,6 +237,8 @@ def _checks(restoration: Restoration, motion: float, gain: float) -> Iterator[st
     if not restoration.centroid.converged:
         yield "the centroid has not converged"
     yield from (decision.reason for decision in restoration.decisions if decision.subject in _DOUBTS)
+    if any(decision.subject == "passers" for decision in restoration.decisions):
+        yield "what passed was replaced by the background, and may have left traces"
     if restoration.seeing is not None and (doubt := restoration.seeing.disagreement):
         yield doubt
     if restoration.filtered is not None and not restoration.is_mean:
