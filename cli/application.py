@@ -43,7 +43,10 @@ COMMANDS = {
     "--install-completion": ("completion:install_completion", "Complete words in bash, zsh or fish."),
 }
 
-USAGES = {"batch": "Usage: turbrestore batch [OPTIONS] INPUT... FOLDER"}
+USAGES = {
+    "batch": "Usage: turbrestore batch [OPTIONS] INPUT... FOLDER",
+    "deconvolve": "Usage: turbrestore deconvolve [OPTIONS] INPUT [OUTPUT]",
+}
 BUG = 1
 
 

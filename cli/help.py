@@ -18,6 +18,8 @@ EVERYTHING = "--help-all"
 RARE = {
     *("--strict", "--skip-damaged", "--max-pixels", "--checkpoint-every", "--uncertainty", "--truth", "--until"),
     *("--tile", "--scheduler", "--workers", "--threads", "--static-mask"),
+    *("--inner-scale", "--outer-scale", "--layers", "--pupil-samples", "--field-spacing", "--sub-frames"),
+    *("--channel-wavelengths", "--nyquist"),
 }
 # Columns for the names of options, and for the text if the terminal does not say.
 _NAMES, _WIDEST = 30, 110
@@ -92,7 +94,12 @@ def _cut(text: str, room: int) -> str:
     text = text.removesuffix(".")
     if len(text) <= room:
         return text
-    ends = [at for end in _ENDS for at in range(len(text)) if text.startswith(end, at) and at <= room]
+    ends = [
+        at
+        for end in _ENDS
+        for at in range(room + 1)
+        if text.startswith(end, at) and text[:at].count("(") == text[:at].count(")")
+    ]
     sentence = next((at for at in ends if text.startswith(". ", at)), None)
     if sentence is not None:
         return text[:sentence]
