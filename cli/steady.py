@@ -89,7 +89,7 @@ def steady(
         input.
     output : Path
         Video to write, of the same length.  .mp4 (H.264), .mkv (lossless), .ser, .tif, .npy, .gif or .webp; or ``-``
-        for lossless Matroska on standard output.  .mp4 and .mkv take over the audio and the time stamps of a video file.
+        for lossless Matroska on standard output.  .mp4 and .mkv take over audio and time stamps of a video file.
     config : Path
         File with settings, .toml; options win over it.
     mask : Path
