@@ -228,7 +228,7 @@ def training_share(
         require(wanted <= frame_count, f"train: expected at most the {frame_count} frames there are, found {wanted}")
         return wanted
     share = min(max(frame_count // 2, 0 if half else _FEWEST_TRAINED), _MOST_TRAINED)
-    return min(frame_count, share, frames_in_memory(frame_shape))
+    return min(frame_count, max(share, 2), frames_in_memory(frame_shape))
 
 
 def frames_in_memory(frame_shape: tuple[int, ...]) -> int:
