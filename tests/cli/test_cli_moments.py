@@ -119,7 +119,7 @@ class TestRefusals:
             (["wavefront", "--params.frames", 5], 2, "frames"),
             (["wavefront", "--params.noise", 0], 2, "noise"),
             (["wavefront", "--params.pixels", 2], 2, "pixels"),
-            (["wavefront", "--params.kernel-width", 1e-6], 2, "kernel_width"),
+            (["wavefront", "--params.kernel-width", 1e-6], 2, "kernel-width"),
             (["wavefront", "--params.amplitude", "inf"], 2, "amplitude"),
         ],
     )
