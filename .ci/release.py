@@ -1,6 +1,7 @@
 """Build source archive and wheel into dist/, twice, and keep them if both times gave the same bytes.
 
-The wheel is then installed alone into a new environment, where a clip is synthesized and restored. ``--tag v0.2.0``
+The wheel is then installed alone into a new environment, where a clip is synthesized and restored, and the source
+archive after it. ``--tag v0.2.0``
 checks that the tag is the version; ``--no-trial`` leaves the installation out.
 """
 
@@ -36,7 +37,7 @@ def main() -> None:
         (ROOT / "dist").mkdir(exist_ok=True)
         kept = [Path(shutil.copy(path, ROOT / "dist")) for path in first]
         if not options.no_trial:
-            try_out(Path(folder, "trial"), next(path for path in kept if path.suffix == ".whl"))
+            try_out(Path(folder, "trial"), *sorted(kept, key=lambda path: path.suffix != ".whl"))
     print("\n".join(str(path.relative_to(ROOT)) for path in kept))
 
 
@@ -71,8 +72,8 @@ def settle(path: Path, time: int) -> None:
     path.write_bytes(gzip.compress(settled.getvalue(), mtime=time))
 
 
-def try_out(folder: Path, wheel: Path) -> None:
-    """Install the wheel alone, with what it asks for, and restore a clip as the README does."""
+def try_out(folder: Path, wheel: Path, archive: Path) -> None:
+    """Install the wheel alone, with what it asks for, and restore a clip; then the source archive in its place."""
     venv.create(folder, with_pip=True)
     scripts = folder / ("Scripts" if sys.platform == "win32" else "bin")
     subprocess.run([scripts / "python", "-m", "pip", "install", "--quiet", f"{wheel}[report]"], check=True)
@@ -82,6 +83,10 @@ def try_out(folder: Path, wheel: Path) -> None:
     ):
         subprocess.run([scripts / "turbrestore", *words], cwd=folder, check=True)
     assert (folder / "sharp.html").stat().st_size > 10_000
+    words = ["install", "--quiet", "--no-deps", "--force-reinstall", str(archive)]
+    subprocess.run([scripts / "python", "-m", "pip", *words], check=True)
+    subprocess.run([scripts / "turbrestore", "sample", "sample"], cwd=folder, check=True)
+    assert (folder / "sample" / "chart.mkv").exists()
 
 
 def output(*words: str) -> str:

@@ -14,7 +14,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from turbrestore.core.errors import ConfigurationError, StorageError
+from turbrestore.core.errors import StorageError
+from turbrestore.core.extras import missing_package
 from turbrestore.io.limits import DEFAULT_LIMITS
 
 from .folders import Folders
@@ -62,9 +63,7 @@ def serve(
         # The library would keep a file in the folder of the start.
         os.environ["NICEGUI_STORAGE_PATH"] = storage
         if find_spec("nicegui") is None:
-            raise ConfigurationError(
-                "app: expected nicegui, which is not installed; run pip install 'turbrestore[app]'"
-            )
+            raise missing_package("app", "nicegui", "app")
         with closing(_listen(port)) as listener:
             _serve(listener, folders, file, browser, announce)
 

@@ -7,44 +7,50 @@ import logging
 import os
 import sys
 
-from cyclopts import App, CycloptsError, UnusedCliTokensError
+from cyclopts import App, CycloptsError, MissingArgumentError, UnknownCommandError, UnusedCliTokensError
 
 from turbrestore import __version__
 from turbrestore.core.errors import ConfigurationError, StorageError, TurbrestoreError
 
 from .examples import EXAMPLES, FIRST_STEPS, epilogue
+from .help import EVERYTHING, Formatter
 from .settings import settings_file
 from .signals import INTERRUPTED
 from .streams import flush, silence, tell
 
 # Where each command lives, and what it says in one line.
 COMMANDS = {
-    "restore": ("restore:restore", "Restore a video: the whole chain, input first, output last."),
-    "steady": ("steady:steady", "Steady and sharpen a video; what moves keeps moving."),
+    "restore": ("restore:restore", "Restore one sharp image from a video."),
+    "steady": ("steady:steady", "Steady and sharpen a video."),
     "batch": ("batch:batch", "Restore many videos side by side."),
-    "report": ("report:report", "Write the report of a run that restore --keep has kept."),
-    "seeing": ("seeing:seeing", "Measure how strong the turbulence in a video is."),
+    "report": ("report:report", "Write the report of a kept run."),
+    "seeing": ("seeing:seeing", "Measure the strength of the turbulence."),
     "centroid": ("stages:centroid", "Find the centroid of a video."),
-    "flow": ("stages:flow", "Measure the flow from one image to every frame of a video."),
+    "flow": ("stages:flow", "Measure the flow from an image to all frames."),
     "identify": ("stages:identify", "Identify the dynamics of flows."),
-    "predict": ("stages:predict", "Predict a frame from the one before, and compare it with what was measured."),
-    "filter": ("stages:filter_", "Filter a video with known centroid and dynamics."),
-    "deconvolve": ("stages:deconvolve", "Deblur an image."),
-    "synthesize": ("synthesis:synthesize", "Make a turbulent video with known truth and flow."),
+    "predict": ("stages:predict", "Predict a frame from the one before."),
+    "filter": ("stages:filter_", "Filter with known centroid and dynamics."),
+    "deconvolve": ("deblurring:deconvolve", "Deblur an image, or compare widths."),
+    "synthesize": ("synthesis:synthesize", "Make a turbulent video with known truth."),
+    "sample": ("sample:sample", "Write a small clip to try, with its truth."),
     "info": ("inspection:info", "Say what a video is."),
     "evaluate": ("inspection:evaluate", "Compare a result with the truth."),
-    "app": ("app:app", "Choose, restore and tune a clip in the browser, on this machine alone."),
-    "config": ("config:config", "Write a settings file with every setting explained, or check one."),
+    "app": ("app:app", "Choose, restore and tune a clip in the browser."),
+    "config": ("config:config", "Write or check a settings file."),
     "doctor": ("doctor:doctor", "Check what this installation can do."),
     "moments wavefront": ("moments:wavefront", "A wavefront sensor that is exposed all the time."),
     "moments mirror": ("moments:mirror", "A steered mirror seen by a slow camera."),
-    "--install-completion": ("completion:install_completion", "Install completion for bash, zsh or fish."),
+    "--install-completion": ("completion:install_completion", "Complete words in bash, zsh or fish."),
 }
 
+USAGES = {
+    "batch": "Usage: turbrestore batch [OPTIONS] INPUT... FOLDER",
+    "deconvolve": "Usage: turbrestore deconvolve [OPTIONS] INPUT [OUTPUT]",
+}
 BUG = 1
 
 
-def build() -> App:
+def build(explain_all: bool = False) -> App:
     """Assemble the application; commands are imported when they run."""
     app = App(
         name="turbrestore",
@@ -52,6 +58,8 @@ def build() -> App:
         help_epilogue=epilogue(FIRST_STEPS),
         version=__version__,
         config=settings_file,
+        help_formatter=Formatter(explain_all),
+        help_format="plaintext",
         result_action="return_value",
         suppress_keyboard_interrupt=False,
     )
@@ -59,7 +67,7 @@ def build() -> App:
         "": app,
         "moments": App(
             name="moments",
-            help="Compare estimators for slow sensors of fast motion, on simulated frames.",
+            help="Estimate fast motion from slow sensors.",
             help_epilogue=epilogue(EXAMPLES["moments wavefront"] + EXAMPLES["moments mirror"]),
         ),
     }
@@ -67,7 +75,9 @@ def build() -> App:
     package = __package__ or "turbrestore_cli"
     for words, (place, summary) in COMMANDS.items():
         group, _, name = words.rpartition(" ")
-        groups[group].command(f"{package}.{place}", name=name, help=summary, help_epilogue=epilogue(EXAMPLES[words]))
+        shown = EXAMPLES[words] if explain_all else EXAMPLES[words][:3]
+        texts = {"help": summary, "usage": USAGES.get(words), "help_epilogue": epilogue(shown)}
+        groups[group].command(f"{package}.{place}", name=name, **texts)
     return app
 
 
@@ -95,14 +105,16 @@ def run(words: list[str]) -> int:
         _refuse_empty(words)
         # The parser takes a lone hyphen for an option; as a path, this is the same.
         paths = ["./-" if word == "-" else word for word in words]
-        build()(paths, exit_on_error=False, print_error=False)
+        explain_all = EVERYTHING in paths
+        paths = ["--help" if word == EVERYTHING else word for word in paths]
+        build(explain_all)(paths, exit_on_error=False, print_error=False)
         flush()
     except BrokenPipeError:
         # The reader has seen enough; a second complaint at exit would be about the same.
         silence(sys.stdout)
     except (CycloptsError, TurbrestoreError, KeyboardInterrupt, OSError, MemoryError) as error:
         message, code = explain(error)
-        tell(f"turbrestore: {' '.join(message.split())}")
+        tell(f"turbrestore: {' '.join(as_typed(message, words).split())}")
         return code
     return 0
 
@@ -118,11 +130,8 @@ def explain(error: BaseException) -> tuple[str, int]:
     """One line and an exit code for a failure that is no bug."""
     if isinstance(error, TurbrestoreError):
         return str(error), error.exit_code
-    if isinstance(error, UnusedCliTokensError):
-        words = " ".join(error.unused_tokens or [])
-        return f"{words}: one word too many; --help says what is expected", ConfigurationError.exit_code
     if isinstance(error, CycloptsError):
-        return str(error), ConfigurationError.exit_code
+        return _misuse(error), ConfigurationError.exit_code
     if isinstance(error, OSError):
         return f"{error.filename or _full_output() or 'system'}: {error.strerror or error}", StorageError.exit_code
     if isinstance(error, MemoryError):
@@ -131,6 +140,29 @@ def explain(error: BaseException) -> tuple[str, int]:
             BUG,
         )
     return str(error) or "interrupted", getattr(error, "exit_code", INTERRUPTED)
+
+
+def _misuse(error: CycloptsError) -> str:
+    """Say what is wrong with the words of a command, and where to look."""
+    if isinstance(error, UnusedCliTokensError):
+        return f"{' '.join(error.unused_tokens or [])}: one word too many; --help says what is expected"
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
+        command = " ".join(["turbrestore", *(error.command_chain or ())])
+        return f"{error.argument.name}: expected a value, found none; {command} --help says what is expected"
+    if isinstance(error, UnknownCommandError) and error.unused_tokens and "Did you mean" not in str(error):
+        return f"{error.unused_tokens[0]}: no such command; turbrestore --help lists them"
+    return str(error)
+
+
+def as_typed(message: str, words: list[str]) -> str:
+    """Name options in a message as they were typed; the library names the setting, such as keep_best."""
+    name, colon, rest = message.partition(": ")
+    typed = dict.fromkeys(word.partition("=")[0] for word in words if word.startswith("--"))
+    wanted = name.replace("_", "-").rpartition(".")[2]
+    fitting = [option for option in typed if option.removeprefix("--").rpartition(".")[2] == wanted]
+    if len(fitting) == 1:
+        message = f"{fitting[0]}{colon}{rest}"
+    return message.replace("allow overwriting", "add --overwrite")
 
 
 def _full_output() -> str:

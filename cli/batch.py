@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from turbrestore.core.errors import TurbrestoreError
+from turbrestore.core.errors import TurbrestoreError, require
 from turbrestore.io.limits import first_line
 from turbrestore.report.batch_page import ClipRow, thumbnail_uri
 from turbrestore.runs.folder_lock import lock_folder
@@ -36,7 +36,7 @@ _LEAST_MEMORY = 1e9
 
 def batch(
     *inputs: Path,
-    out: Path,
+    out: Annotated[Path | None, Parameter(show=False)] = None,
     preset: Preset = "standard",
     sigma: float | None = None,
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
@@ -62,25 +62,27 @@ def batch(
     Parameters
     ----------
     inputs : Path
-        Videos, folders and patterns such as 'night/*.ser'.  Every video in a folder is a clip; a folder of images or
-        FITS files is one clip.
+        Clips, and last the folder for the results.  Clips are videos, folders and patterns such as 'night/*.ser'.
+        Every video in a folder is a clip; a folder of images or FITS files is one clip.  The results are an image and
+        its settings for each clip, summary.csv, and index.html with pictures.
     out : Path
-        Folder for the results: an image and its settings for each clip, summary.csv, and index.html with pictures.
+        The folder for the results, in place of the last word.
     preset : str
-        Settings to start from: fast takes less than half the time, paper is the method as published.  Any other setting
-        given wins over those of the preset.
+        Settings to start from.  fast measures flow on frames of half the size and once a frame, in less than half the
+        time; paper is the method as published.  Any other setting given wins over those of the preset.
     sigma : float
-        Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.
+        Width of the blur to remove, pixels.  Its standard deviation; 0 removes none.  Estimated by default.
     config : Path
-        TOML file with settings; flags win over it.
+        File with settings, .toml; options win over it.
     format : str
         Kind of the images to write.
     bit_depth : int
-        Bits per channel of the results, 8, 16 or 32 (float, TIFF and FITS).  Those of the input by default.
+        Bits per channel of the results: 8, 16 or 32.  32 is floating point, in TIFF and FITS only.  Those of the input
+        by default.
     reports : bool
         Write an HTML report for each clip as well.
     resume : bool
-        Do what an earlier batch in this folder has not done, and what has failed or has changed since.
+        Do what an earlier batch has not done.  And what has failed in this folder, or has changed since.
     scheduler : str
         Address of a running Dask scheduler, tcp://host:port.  Its workers process the clips and must see the same
         files.  By default processes are started on this machine.
@@ -94,11 +96,12 @@ def batch(
     overwrite : bool
         Replace existing outputs.
     json : bool
-        Print what was done, as JSON, on standard output.
+        Print the facts of the run as JSON.  They go to standard output.
     quiet : bool
         Print neither progress nor remarks.
     """
     check_cluster("batch", scheduler, workers)
+    inputs, out = _folder_last(inputs, out)
     clips = find_clips(inputs)
     outputs = name_outputs(clips, out, f".{format}")
     count = 1 if scheduler else processes(len(clips), memory_limit, workers)
@@ -123,6 +126,16 @@ def batch(
     say(f"{out}: {len(rows) - len(failed)} of {len(rows)} clips restored", quiet)
     if failed:
         raise TurbrestoreError(f"batch: {len(failed)} of {len(rows)} clips failed; {out / TABLE} says why")
+
+
+def _folder_last(paths: tuple[Path, ...], out: Path | None) -> tuple[tuple[Path, ...], Path]:
+    """Split the words of the command into the clips and the folder for the results."""
+    if out is not None:
+        return paths, out
+    require(len(paths) >= 2, "batch: expected clips, and last the folder for the results")
+    *clips, folder = paths
+    require(not folder.is_file(), f"batch: expected the folder for the results last, found the file {folder}")
+    return tuple(clips), folder
 
 
 def processes(clips: int, memory_limit: float | None, workers: int | None) -> int:
@@ -150,7 +163,7 @@ def work(order: Order) -> ClipRow:
             height=height,
             blur=0.0 if restoration.deconvolution is None else float(restoration.deconvolution.sigma),
             seconds=float(sum(restoration.seconds.values())),
-            remarks="; ".join(source.warnings),
+            remarks="; ".join((*source.warnings, *restoration.verdict.checks)),
             before=thumbnail_uri(source.read(middle, middle + 1)[0][y : y + height, x : x + width]),
             after=thumbnail_uri(restoration.image),
         )

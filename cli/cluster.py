@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from turbrestore.core.errors import ConfigurationError, TurbrestoreError, require
+from turbrestore.core.extras import missing_package
 from turbrestore.io.limits import first_line
 from turbrestore.tiled_stages import TileMap
 
@@ -36,9 +37,7 @@ def check_cluster(command: str, scheduler: str | None, workers: int | None) -> N
     """Refuse options that make no sense, and say which package is missing."""
     for package in ("distributed", "jinja2"):
         if find_spec(package) is None:
-            raise ConfigurationError(
-                f"{command}: expected {package}, which is not installed; run pip install 'turbrestore[distributed]'"
-            )
+            raise missing_package(command, package, "distributed")
     require(workers is None or workers >= 1, f"--workers: expected at least 1, found {workers}")
     require(workers is None or scheduler is None, "--workers: has no effect with --scheduler; leave it out")
 

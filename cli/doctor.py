@@ -21,6 +21,7 @@ from cyclopts import Parameter
 
 from turbrestore import __version__
 from turbrestore.core.errors import TurbrestoreError
+from turbrestore.core.extras import install_command
 
 from .streams import put
 
@@ -43,6 +44,7 @@ EXTRAS = {
     "astropy": "fits",
     "distributed": "distributed",
     "nicegui": "app",
+    "napari": "napari",
 }
 READ = ("h264", "ffv1", "hevc", "vp9", "mjpeg", "gif")
 WRITTEN = ("ffv1", "libx264")
@@ -153,7 +155,7 @@ def check_cores() -> Iterator[Finding]:
 def check_extras() -> Iterator[Finding]:
     """Libraries that add something and may be missing."""
     for module, extra in EXTRAS.items():
-        install = f"pip install 'turbrestore[{extra}]'"
+        install = install_command(extra)
         try:
             library = importlib.import_module(module)
         except ModuleNotFoundError:

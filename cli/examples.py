@@ -1,6 +1,7 @@
 """Examples that ``--help`` and the documentation show; the tests run them, in this order, in one folder."""
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
+    "sample": ("turbrestore sample sample_data --overwrite",),
     "info": ("turbrestore info sample_data/chart.mkv", "turbrestore info sample_data/chart.mkv --json"),
     "app": ("turbrestore app sample_data/chart.mkv", "turbrestore app --allow results --port 8123 --no-browser"),
     "config": ("turbrestore config --init run.toml", "turbrestore config --check run.toml"),
@@ -17,8 +18,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore steady sample_data/chart.mkv still.mkv --camera lock --mask moving.mkv --json",
     ),
     "batch": (
-        "turbrestore batch sample_data/chart.mkv --out results",
-        "turbrestore batch sample_data 'sample_data/*.mkv' --out results --resume",
+        "turbrestore batch sample_data/chart.mkv results",
+        "turbrestore batch sample_data 'sample_data/*.mkv' results --resume",
     ),
     "report": ("turbrestore report stages", "turbrestore report stages report.html"),
     "seeing": (
@@ -34,11 +35,12 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "predict": ("turbrestore predict sample_data/chart.mkv centroid.npz dynamics.npz predicted.png",),
     "filter": ("turbrestore filter sample_data/chart.mkv centroid.npz dynamics.npz filtered.npz",),
     "deconvolve": (
+        "turbrestore deconvolve stages --sweep 1,1.4,2",
         "turbrestore deconvolve filtered.npz deblurred.png --guide centroid.npz",
         "turbrestore deconvolve filtered.npz tv.png --sigma 1.2 --deconvolution.method tv",
     ),
     "evaluate": (
-        "turbrestore evaluate sharp.png sample_data/chart_truth.png",
+        "turbrestore evaluate sharp.png sample_data/chart_truth.png --clip sample_data/chart.mkv",
         "turbrestore evaluate sharp.png --reference stages/mean.png --json",
     ),
     "synthesize": (
@@ -49,18 +51,18 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "moments mirror": ("turbrestore moments mirror --seeds 20 --deviation 3 --json",),
     "doctor": ("turbrestore doctor", "turbrestore doctor --json"),
     "--install-completion": (
-        "turbrestore --install-completion",
+        "turbrestore --install-completion --yes",
         "turbrestore --install-completion --shell bash --output turbrestore.bash",
     ),
 }
 FIRST_STEPS = (
-    "turbrestore restore haze.mp4 sharp.png",
+    "turbrestore sample sample_data",
+    "turbrestore restore sample_data/chart.mkv sharp.png --report sharp.html",
     "turbrestore restore --help",
-    "turbrestore synthesize chart haze.mkv --strength medium",
     "turbrestore doctor",
 )
 
 
 def epilogue(commands: tuple[str, ...]) -> str:
     """Commands as a block at the end of a help page."""
-    return "\n".join(["Examples:", "```", *commands, "```"])
+    return "\n".join(["Examples:", *(f"  {command}" for command in commands)])

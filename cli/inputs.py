@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from turbrestore.core.arrays import FloatArray
+from turbrestore.core.arrays import FloatArray, check_image
 from turbrestore.core.errors import DataError, require
 from turbrestore.footage.calibration import calibrated, make_calibration
 from turbrestore.footage.content import ContentParams, ContentReport, check_content, clean_source
@@ -14,6 +14,7 @@ from turbrestore.io.astronomy.fits import open_fits
 from turbrestore.io.astronomy.fits_header import is_fits
 from turbrestore.io.images import IMAGE_SUFFIXES, read_image, read_pixels
 from turbrestore.io.limits import Limits
+from turbrestore.io.npy import map_npy
 from turbrestore.io.source import FrameSource
 from turbrestore.io.tiff import TIFF_SUFFIXES
 from turbrestore.io.video import open_frames
@@ -78,7 +79,14 @@ def frames_to_train(source: FrameSource, selection: Selection, train: int | None
 
 
 def read_input_image(input: Path, limits: Limits) -> FloatArray:
-    """Read an image file within limits, or the image of a stage file."""
+    """Read an image file within limits, the image of a stage file, or an array of one image."""
+    if input.suffix.lower() == ".npy":
+        pixels = map_npy(input)
+        if pixels.ndim != 2 and pixels.shape[2:] != (3,):
+            raise DataError(f"{input}: expected an image of shape (H, W) or (H, W, 3), found shape {pixels.shape}")
+        height, width = pixels.shape[:2]
+        limits.check_size(width, height, str(input))
+        return check_image(pixels, str(input))
     return load_stage_image(input) if input.suffix.lower() == ".npz" else read_image(input, limits).image
 
 

@@ -13,9 +13,12 @@ from cyclopts import Parameter
 from turbrestore.core.arrays import FloatArray, check_flow
 from turbrestore.core.errors import DataError, require
 from turbrestore.footage.content import ContentReport, clean_source
+from turbrestore.fusion import temporal_mean
 from turbrestore.io.images import read_image
 from turbrestore.io.limits import DEFAULT_LIMITS, check_input, input_errors
+from turbrestore.io.npy import map_npy
 from turbrestore.io.source import FrameSource
+from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import appearance, compare, compare_flows
 from turbrestore.runs.stage_files import load_flows
@@ -26,6 +29,17 @@ from .output import print_json
 from .streams import put
 
 FLOW_SUFFIXES = (".npy", ".npz", ".flo")
+# Unit and direction of every figure.
+MEANINGS = {
+    "psnr": "dB, higher is better",
+    "psnr_fit": "dB after the best gain and offset, higher is better",
+    "ssim": "structural similarity, 1 is best",
+    "sharpness": "times that compared with, 1 is best against the truth",
+    "overshoot": "share of the pixels, lower is better",
+    "endpoint_error": "pixels, lower is better",
+    "endpoint_error_centred": "pixels about the mean error, lower is better",
+    "true_length": "pixels, mean length of the true flows",
+}
 # First bytes of a Middlebury flow file: 202021.25 as a float.
 FLO_MAGIC = b"PIEH"
 
@@ -62,7 +76,8 @@ def describe_clip(source: FrameSource, content: ContentReport) -> dict[str, obje
         "height": height,
         "channels": 3 if len(source.shape) == 4 else 1,
         "bit_depth": source.bit_depth,
-        "frames_per_second": source.fps,
+        "frames_per_second": None if source.fps is None else round(source.fps, 3),
+        "duration_seconds": None if not source.fps else round(len(content.numbers) / source.fps, 2),
         "train": training_share(count, source.shape[1:]) if count >= 2 else None,
         "filled_values": content.filled_values,
         "stuck_pixels": len(content.stuck),
@@ -80,6 +95,7 @@ def evaluate(
     /,
     *,
     reference: Path | None = None,
+    clip: Path | None = None,
     max_pixels: int | None = None,
     json: Flag = False,
 ) -> None:
@@ -93,27 +109,49 @@ def evaluate(
     result : Path
         Image, or stage file with an image (.npz); flows (.npy, centroid .npz, .flo) where the truth is flows.
     truth : Path
-        Image of the true scene, or true flows.
+        Image of the true scene, or true flows.  An array of .npy is flows if its last axis has two numbers.
     reference : Path
         Image of the same size, such as a frame or the temporal mean: sharpness and overshoot are measured against it.
+    clip : Path
+        Video, to compare its temporal mean as well.  What the result gained over the mean is what the restoration did.
     max_pixels : int
         Largest image to read, pixels; by default 67 million.
     json : bool
         Print JSON.
     """
     figures: dict[str, float] = {}
+    mean: dict[str, float] = {}
     limits = limits_of(max_pixels)
-    if truth is not None and truth.suffix.lower() in FLOW_SUFFIXES:
+    if truth is not None and _holds_flows(truth):
         require(reference is None, "--reference: has no effect on flows; leave it out")
+        require(clip is None, "--clip: has no effect on flows; leave it out")
         figures |= dataclasses.asdict(compare_flows(_read_flows(result), _read_flows(truth)))
     else:
         require(truth is not None or reference is not None, "evaluate: expected a truth or --reference, found neither")
         image = read_input_image(result, limits)
+        require(clip is None or truth is not None, "--clip: has no effect without a truth; leave it out")
         if truth is not None:
-            figures |= dataclasses.asdict(compare(image, read_image(truth, limits).image))
+            scene = read_input_image(truth, limits)
+            figures |= dataclasses.asdict(compare(image, scene))
+            if clip is not None:
+                mean = dataclasses.asdict(compare(temporal_mean(open_frames(clip, limits=limits)), scene))
         if reference is not None:
             figures |= dataclasses.asdict(appearance(image, read_image(reference, limits).image))
-    _report({name: _rounded(value) for name, value in figures.items()}, json)
+    rounded, of_mean = ({name: _rounded(value) for name, value in some.items()} for some in (figures, mean))
+    if json:
+        print_json(rounded | ({"temporal_mean": of_mean} if of_mean else {}))
+        return
+    if of_mean:
+        put(f"{'':<24}{'result':>8}{'mean':>9}")
+    for name, value in rounded.items():
+        row = [f"{name.replace('_', ' '):<24}{_plain(value):>8}", f"{_plain(of_mean[name]):>9}" if of_mean else ""]
+        put(f"{''.join(row)}  {MEANINGS[name]}")
+
+
+def _holds_flows(path: Path) -> bool:
+    """Tell flows from an image by the name, and arrays by their last axis."""
+    suffix = path.suffix.lower()
+    return suffix in FLOW_SUFFIXES and (suffix != ".npy" or map_npy(path).shape[-1:] == (2,))
 
 
 def _read_flows(path: Path) -> FloatArray:
@@ -128,6 +166,10 @@ def _read_flows(path: Path) -> FloatArray:
     if data[:4] != FLO_MAGIC or len(data) != 12 + 8 * width * height or width < 1:
         raise DataError(f"{path}: expected a flow in a .flo file, found something else or damage")
     return check_flow(np.frombuffer(data, "<f4", offset=12).reshape(1, height, width, 2), str(path))
+
+
+def _plain(value: float | None) -> str:
+    return "–" if value is None else f"{value:g}"
 
 
 def _rounded(value: float) -> float | None:

@@ -29,9 +29,9 @@ class Selection:
     Parameters
     ----------
     frames : str, optional
-        Range of frames, ``start:stop`` or ``start:stop:step``, as ``0:200``; either end may be left out.
+        Range of frames, such as ``0:200``.  ``start:stop`` or ``start:stop:step``; either end may be left out.
     roi : str, optional
-        Region ``x,y,width,height`` in pixels.
+        Region: ``x,y,width,height``, pixels.
     strict : bool
         Refuse what is otherwise repaired or left out: NaN, stuck pixels, duplicated and blank frames, cuts.
     skip_damaged : bool
@@ -39,13 +39,14 @@ class Selection:
     max_pixels : int, optional
         Largest frame or image to read, pixels; by default 67 million.
     bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
-        Take grey frames for raw frames of a colour camera whose first pixels have these colours.
+        Colours of the first pixels of a raw camera.  Grey frames are then taken for its raw frames.
     dark : str, optional
-        Video, image or folder of frames with the lens covered: their mean is subtracted, hot pixels are filled.
+        Frames taken with the lens covered.  A video, an image or a folder; their mean is subtracted, and hot pixels
+        are filled.
     flat : str, optional
-        Video, image or folder of frames of an even surface: their mean is divided out.
+        Frames of an even surface.  A video, an image or a folder; their mean is divided out.
     crop_to_object : bool
-        Follow a bright object on a dark field, such as a planet, with a window that just holds it.
+        Follow a planet on a dark field.  Any bright object there will do; the window just holds it.
     """
 
     frames: str | None = None
@@ -92,8 +93,8 @@ class Machine:
     threads : int
         Frames that are worked on side by side; 0 means one for each core.
     device : str
-        Where flow by tvl1, warps, fusion and deconvolution are computed: cpu, cuda, or auto for a GPU where torch sees
-        one.
+        Where to compute: cpu, cuda or auto.  auto takes a GPU where torch sees one.  A GPU computes flow by tvl1,
+        warps, fusion and deconvolution.
     """
 
     threads: int = 0

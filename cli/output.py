@@ -87,6 +87,7 @@ def describe(restoration: Restoration, truth: FloatArray | None) -> dict[str, An
         record["blur"] = {name: getattr(restoration.blur, name) for name in names}
     record["guards"] = [dataclasses.asdict(reading) for reading in restoration.guard_readings]
     record["crop"] = list(restoration.crop)
+    record["verdict"] = dataclasses.asdict(restoration.verdict)
     record["decisions"] = [dataclasses.asdict(decision) for decision in restoration.decisions]
     if truth is not None:
         images = stage_images(restoration)
@@ -106,14 +107,8 @@ def stage_images(restoration: Restoration) -> dict[str, FloatArray]:
 
 
 def summary(output: Path, restoration: Restoration) -> str:
-    """One line for a person."""
-    seconds = sum(restoration.seconds.values())
-    words = [f"{output}: {restoration.frame_count} frames in {seconds:.1f} s"]
-    if restoration.deconvolution is not None:
-        sigma = restoration.deconvolution.sigma
-        words.append(f"blur of {sigma:.2f} pixels removed" if sigma > 0 else "no blur removed")
-    words += [f"{one.choice}: {one.reason}" for one in restoration.decisions if one.subject == "structure"]
-    return ", ".join(words)
+    """One line for a person: what was gained, and what to look at."""
+    return f"{output} ({sum(restoration.seconds.values()):.1f} s): {restoration.verdict}"
 
 
 def write_result(
@@ -193,8 +188,8 @@ def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: 
     rest = [path for path in folder.iterdir() if path.name != LOCK and not is_part(path)]
     if not overwrite and not known and rest:
         if resume:
-            raise OutputError(f"{folder}: holds no run to go on with; choose another folder or allow overwriting")
-        raise OutputError(f"{folder}: is not empty; choose another folder, allow overwriting, or resume the run in it")
+            raise OutputError(f"{folder}: holds no run to go on with; choose another folder or add --overwrite")
+        raise OutputError(f"{folder}: is not empty; choose another folder, add --overwrite, or --resume the run in it")
 
 
 def save_stages(stages: RunFolder, restoration: Restoration, run: RunRecord, bit_depth: int) -> None:

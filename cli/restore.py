@@ -11,11 +11,13 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from turbrestore.core.decision import Decision
 from turbrestore.core.errors import require
 from turbrestore.io.images import write_map
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.io.source import FrameSource
+from turbrestore.memory_plan import training_share
 from turbrestore.metrics import comparable
 from turbrestore.pipeline import restore as run_pipeline
 from turbrestore.report import check_report, write_report
@@ -45,6 +47,8 @@ from .progress import progress_bars, say
 
 # Longest side of the tiles that are shared among processes, pixels: halos of a fifth on either side.
 TILE = 1088
+# Iterations that a centroid usually takes, and flows that are measured in the time of a deconvolution.
+_ITERATIONS, _FLOWS_A_DECONVOLUTION = 2, 60
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,7 @@ class Order:
     truth: Path | None = None
     overwrite: bool = False
     quiet: bool = False
+    verbose: bool = False
     tile: int | None = None
     scheduler: str | None = None
     workers: int | None = None
@@ -119,6 +124,7 @@ def restore(
     overwrite: Flag = False,
     json: Flag = False,
     quiet: Flag = False,
+    verbose: Flag = False,
     # Last, so that the help lists what is often used before the settings of every stage.
     params: Annotated[RestoreParams, Parameter(name="*")] = RestoreParams(),
 ) -> None:
@@ -127,36 +133,37 @@ def restore(
     Parameters
     ----------
     input : Path
-        Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, FITS cube, .npy, or folder of
-        images or FITS files.
+        Video, SER, FITS, TIFF, .npy or folder of images.  A video is what FFmpeg reads (mp4, mkv, mov, avi, mts, wmv,
+        …) or an animated PNG or WebP; a FITS file is a cube; a folder may hold FITS files.
     output : Path
-        Image to write: .png (8 or 16 bit), .tif (8, 16 bit or float) or .fits (the same, with the header of a FITS
-        input and the history of the run).
+        Image to write: .png, .tif or .fits.  PNG has 8 or 16 bits, TIFF and FITS have floating point as well, and FITS
+        has the header of a FITS input and the history of the run.
     preset : str
-        Settings to start from: fast takes less than half the time, paper is the method as published.  Any other setting
-        given wins over those of the preset.
+        Settings to start from.  fast measures flow on frames of half the size and once a frame, in less than half the
+        time; paper is the method as published.  Any other setting given wins over those of the preset.
     sigma : float
-        Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.
+        Width of the blur to remove, pixels.  Its standard deviation; 0 removes none.  Estimated by default.
     config : Path
-        TOML file with settings; flags win over it.
+        File with settings, .toml; options win over it.
     keep : Path
-        Folder for the result of every stage, written as it is done.
+        Folder for the result of every stage.  Each is written as it is done.
     resume : bool
-        Continue an interrupted run with this ``--keep`` folder.  Stages that a changed input or setting affects are
+        Continue the run in the folder of ``--keep``.  Stages that a changed input or setting affects are
         computed again.
     checkpoint_every : int
         Frames between two checkpoints of the filter in the ``--keep`` folder.
     report : Path
-        HTML file to write, .html: images to compare, what was decided and why, plots.
+        Page to write, .html: images, reasons, plots.
     uncertainty : Path
         Image to write, .tif: the standard deviation of every pixel of the result, in floating point, infinite where
         nothing is known.
     truth : Path
         Image of the true scene: every stage is compared with it.
     bit_depth : int
-        Bits per channel of the output, 8, 16 or 32 (float, TIFF and FITS).  Those of the input by default.
+        Bits per channel of the image: 8, 16 or 32.  32 is floating point, in TIFF and FITS only.  Those of the input by
+        default.
     memory_limit : MemorySize
-        Most memory to take, such as 2GB; by default there is no limit.  To keep it, training frames go to a scratch
+        Most memory to take, such as 2GB.  By default there is no limit.  To keep it, training frames go to a scratch
         file, fewer threads work, fewer frames are trained on, and frames are processed in tiles that overlap, in this
         order.  With --workers, what all processes together take; with --scheduler, what each takes.
     tile : int
@@ -170,17 +177,21 @@ def restore(
     overwrite : bool
         Replace existing outputs.
     json : bool
-        Print what was done, as JSON, on standard output.
+        Print the facts of the run as JSON.  They go to standard output.
     quiet : bool
         Print neither progress nor remarks.
+    verbose : bool
+        Print every decision as it is made.
     """
+    require(not (quiet and verbose), "--verbose: contradicts --quiet; leave one of them out")
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
     if scheduler is not None or workers is not None:
         check_cluster("restore", scheduler, workers)
         tile = TILE if tile is None else tile
     order = Order(
         input, output, selection, settings, machine, bit_depth, memory_limit, preset,
-        config, keep, resume, checkpoint_every, report, uncertainty, truth, overwrite, quiet, tile, scheduler, workers,
+        config, keep, resume, checkpoint_every, report, uncertainty, truth, overwrite, quiet, verbose, tile,
+        scheduler, workers,
     )  # fmt: skip
     restoration, _ = restore_clip(order)
     if json:
@@ -208,8 +219,12 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     with kept_stages(
         order.keep, source, order.params, runtime, order.resume, order.checkpoint_every, order.quiet
     ) as stages:
-        with _elsewhere(order, source) as map_tiles, progress_bars(order.quiet) as progress:
-            restoration = run_pipeline(source, order.params, runtime, stages, progress, map_tiles=map_tiles)
+        with (
+            _elsewhere(order, source) as map_tiles,
+            progress_bars(order.quiet, _expected_times(source, order.params)) as progress,
+        ):
+            tell_decision = _say_decision if order.verbose else None
+            restoration = run_pipeline(source, order.params, runtime, stages, progress, tell_decision, map_tiles)
         record = settings_record(
             order.params, order.selection, order.bit_depth, order.machine, order.memory_limit, order.preset, order.tile
         )
@@ -233,6 +248,18 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
         if stages is not None:
             stages.expect()
     return restoration, source
+
+
+def _say_decision(decision: Decision) -> None:
+    say(f"{decision.subject}: {decision.choice} ({decision.reason})", quiet=False)
+
+
+def _expected_times(source: FrameSource, params: RestoreParams) -> dict[str, float]:
+    """Expect times of the stages, in flows: those that they measure, and what deconvolution takes."""
+    train = training_share(len(source), source.shape[1:], params.train, params.filter.training == "skip")
+    filtered = max(len(source) * params.filter.inner_iterations - train, 1)
+    times = {"centroid": _ITERATIONS * train, "filter": filtered, "deconvolve": _FLOWS_A_DECONVOLUTION}
+    return {stage: float(time) for stage, time in times.items() if params.runs(stage)}
 
 
 @contextmanager

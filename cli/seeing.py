@@ -9,14 +9,16 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from turbrestore.core.errors import ConfigurationError
+from turbrestore.memory_plan import frames_in_memory, training_share
 from turbrestore.preparation import prepare, seeing_of_picture
 from turbrestore.registration.centroid import CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams
 from turbrestore.runtime.steps import finish, step_counter
-from turbrestore.seeing.strength import Estimate, Seeing
+from turbrestore.seeing.strength import Seeing
 from turbrestore.seeing.tilt_theory import Optics
+from turbrestore.wording import interval_words
 
-from .inputs import frames_to_train, open_input
+from .inputs import open_input
 from .options import Flag, Machine, Selection
 from .output import print_json
 from .progress import progress_bars
@@ -57,7 +59,7 @@ def seeing(
     path : {"spherical", "plane"}
         Plane where the scene lies far beyond the turbulence; the distance is then the length of the turbulent path.
     train : int
-        Frames to use, from the first on; all that --frames names, or by default as many as restore trains on.
+        Frames to use, from the first on.  By default all, up to what 1.5 GB hold.
     json : bool
         Print JSON.
     quiet : bool
@@ -70,7 +72,8 @@ def seeing(
     optics = _optics(pixel_scale, aperture, wavelength, distance, path)
     source = open_input(input, selection, quiet)
     runtime = machine.runtime()
-    count = frames_to_train(source, selection, train)
+    most = min(len(source), frames_in_memory(source.shape[1:]))
+    count = training_share(len(source), source.shape[1:], most if train is None else train)
     prepared = prepare(source, count)
     frames = prepared.source.read(0, count)
     with progress_bars(quiet) as progress:
@@ -80,7 +83,14 @@ def seeing(
     if json:
         print_json({"input": str(input), "frames": count, **asdict(measured)})
     else:
-        put("\n".join([f"{'frames used':<26}{count} of {len(source)}", *_lines(measured)]))
+        put("\n".join([f"{'frames used':<26}{count} of {len(source)}", *_lines(measured), *_missing(optics)]))
+
+
+def _missing(optics: Optics | None) -> list[str]:
+    """Name the options that the strength of the turbulence needs and has not got."""
+    if optics is None:
+        return [f"{'D/r0, r0':<26}need --pixel-scale and --aperture", f"{'Cn²':<26}needs --distance as well"]
+    return [f"{'Cn²':<26}needs --distance"] if optics.distance is None else []
 
 
 def _optics(
@@ -100,7 +110,7 @@ def _optics(
 
 def _lines(seeing: Seeing) -> list[str]:
     lines = [
-        f"{name.replace('_', ' '):<26}{_words(estimate, unit)}"
+        f"{name.replace('_', ' '):<26}{interval_words(estimate, '.3g')} {unit}".rstrip()
         for name, (estimate, unit) in seeing.estimates().items()
         if estimate is not None
     ]
@@ -108,7 +118,3 @@ def _lines(seeing: Seeing) -> list[str]:
         lines.append(f"{'wind direction':<26}{seeing.wind_direction:.0f}° from right downwards")
         lines.append(f"{'independent frames':<26}{seeing.independent_frames:.1f}")
     return [*lines, *(f"remark: {remark}" for remark in seeing.remarks)]
-
-
-def _words(estimate: Estimate, unit: str) -> str:
-    return f"{estimate.value:.3g} ({estimate.low:.3g} to {estimate.high:.3g}) {unit}".rstrip()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # What a settings file must not decide behind the user's back.
 NOT_SETTINGS = {
     *("config", "overwrite", "keep", "resume", "checkpoint_every", "truth", "report", "uncertainty", "mask", "json"),
-    *("quiet", "raw", "out", "format", "reports", "scheduler", "workers"),
+    *("quiet", "verbose", "raw", "out", "format", "reports", "scheduler", "workers"),
 }
 # Two names of one setting: where a flag has set either, the file sets neither.
 _SIGMA = ("sigma", "deconvolution.sigma")

@@ -8,19 +8,16 @@ from typing import Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from turbrestore.blind.guards import GuardParams
-from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.core.errors import DataError, require
-from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
+from turbrestore.deconvolution.deconvolve import Deconvolution
 from turbrestore.display.plots import new_figure, plot_images, plot_prediction
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.dynamics.dynamic_texture import identify as identify_flows
 from turbrestore.dynamics.flow_model import FlowDynamics, predict_flow, project_deviation
 from turbrestore.dynamics.prediction import PredictionStudy, flow_error, study_prediction
 from turbrestore.filtering.alternating import Filtered, FilterParams, FilterStep, filter_steps
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images import write_image
 from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, check_output, check_space, size_text
-from turbrestore.io.pixels import check_depth
 from turbrestore.io.source import FrameSource
 from turbrestore.registration.centroid import Centroid, CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams, estimate_flow, iterate_flows
@@ -29,8 +26,8 @@ from turbrestore.registration.warp import warp
 from turbrestore.runs.stage_files import load_artifact, load_flows, save_artifact
 from turbrestore.runtime.steps import finish, step_counter
 
-from .inputs import files_read, frames_to_train, open_input, read_guide, read_input_image
-from .options import Flag, Machine, Selection, known_sigma, limits_of
+from .inputs import files_read, frames_to_train, open_input, read_input_image
+from .options import Flag, Machine, Selection
 from .output import FLOW_FILE, print_json, write_figure, write_flows
 from .progress import progress_bars, say
 
@@ -169,7 +166,7 @@ def identify(
         _plot_study(plot, study_prediction(measured, dynamics, machine.runtime()), overwrite, quiet)
     for note in found.notes:
         say(f"{output}: {note}", quiet)
-    say(f"{output}: {found.rank} states hold {100 * found.energy_share:.0f} % of the motion", quiet)
+    say(f"{output}: {found.rank} states hold {100 * found.energy_share:.1f} % of the motion", quiet)
 
 
 def predict(
@@ -299,68 +296,8 @@ def filter_(
 
         steps = filter_steps(source, start.image, model, filter, flow, start.flows, machine.runtime())
         filtered = finish(steps, observe).recentred()
-    _write(output, filtered, source.bit_depth, overwrite)
+    write_stage(output, filtered, source.bit_depth, overwrite)
     say(f"{output}: {len(source)} frames filtered", quiet)
-
-
-def deconvolve(
-    input: Path,
-    output: Path,
-    /,
-    *,
-    sigma: float | None = None,
-    guide: Path | None = None,
-    deconvolution: DeconvolutionParams = DeconvolutionParams(),
-    guards: GuardParams = GuardParams(),
-    bit_depth: int | None = None,
-    max_pixels: int | None = None,
-    machine: Annotated[Machine, Parameter(name="*")] = Machine(),
-    overwrite: Flag = False,
-    quiet: Flag = False,
-) -> None:
-    """Deblur an image.
-
-    Parameters
-    ----------
-    input : Path
-        Image, or stage file of the filter or the centroid.
-    output : Path
-        Image (.png, .tif) or stage file (.npz) to write.
-    sigma : float
-        Width of the blur, pixels; a Gaussian unless --deconvolution.exponent says otherwise.  Estimated by default.
-    guide : Path
-        Image or stage file that the nonlocal weights are taken from; the input by default, the centroid in the paper,
-        which is moved onto the geometry of a filtered image.
-    deconvolution : DeconvolutionParams
-        Method and its settings.
-    guards : GuardParams
-        What the result must not exceed where the width is estimated.
-    bit_depth : int
-        Bits per channel of an image that is written: 8, 16 or 32; by default those of the input, 16 for stage files.
-    max_pixels : int
-        Largest image to read, pixels; by default 67 million.
-    overwrite : bool
-        Replace an existing output.
-    quiet : bool
-        Print neither progress nor remarks.
-    """
-    deconvolution = known_sigma(sigma, deconvolution)
-    if bit_depth is not None:
-        check_depth(bit_depth)
-        require(output.suffix.lower() not in STAGE_FILE, "--bit-depth: has no effect on a stage file; leave it out")
-    inputs = [path for path in (input, guide) if path is not None]
-    check_output(output, inputs, overwrite, STAGE_FILE + tuple(IMAGE_OUTPUT_SUFFIXES))
-    limits = limits_of(max_pixels)
-    image = read_input_image(input, limits)
-    guide_image = image if guide is None else read_guide(guide, input, limits)
-    with progress_bars(quiet) as progress:
-        steps = remove_blur_steps(image, guide_image, deconvolution, guards, machine.runtime())
-        deblurred = finish(steps, step_counter(progress, "deconvolve", deconvolution.iterations))
-    if bit_depth is None:
-        bit_depth = 16 if input.suffix.lower() in STAGE_FILE else read_image(input, limits).bit_depth
-    _write(output, deblurred.deconvolution, bit_depth, overwrite)
-    for decision in deblurred.decisions:
-        say(f"{output}: {decision.subject}: {decision.choice} ({decision.reason})", quiet)
 
 
 def _plot_study(plot: Path, study: PredictionStudy, overwrite: bool, quiet: bool) -> None:
@@ -391,7 +328,8 @@ def _image_bytes(shape: tuple[int, ...]) -> int:
     return 4 * shape[1] * shape[2]
 
 
-def _write(output: Path, result: Filtered | Deconvolution, bit_depth: int, overwrite: bool) -> None:
+def write_stage(output: Path, result: Filtered | Deconvolution, bit_depth: int, overwrite: bool) -> None:
+    """Write the result of a stage, or its image alone, as the suffix says."""
     if output.suffix.lower() in STAGE_FILE:
         save_artifact(output, result, overwrite)
     else:

@@ -45,12 +45,12 @@ class Output:
     Parameters
     ----------
     codec : {"h264", "hevc", "ffv1"}, optional
-        By default H.264 for .mp4 and FFV1, which is lossless, for .mkv.
+        Codec of the video.  By default H.264 for .mp4 and FFV1, which is lossless, for .mkv.
     crf : int, optional
         Quality of H.264 and HEVC, 0 to 51, smaller is better; 14 and 18 by default.  With it .mkv has H.264.
     bit_depth : int, optional
-        Bits per channel, 8 to 16, or 32 (float, TIFF and .npy only); at most 8 in H.264, .gif and .webp, 10 in
-        HEVC.  Those of the input by default, as far as the output holds them.
+        Bits per channel: 8 to 16, or 32.  32 is floating point, in TIFF and .npy only; at most 8 in H.264, .gif and
+        .webp, 10 in HEVC.  Those of the input by default, as far as the output holds them.
     """
 
     codec: Literal["h264", "hevc", "ffv1"] | None = None
@@ -84,26 +84,28 @@ def steady(
     Parameters
     ----------
     input : Path
-        Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, FITS cube, .npy, or folder of
-        images or FITS files; or ``-`` for Matroska or YUV4MPEG2 on standard input.
+        Video, SER, FITS, TIFF, .npy or folder of images.  A video is what FFmpeg reads (mp4, mkv, mov, avi, mts, wmv,
+        …) or an animated PNG or WebP; a folder may hold FITS files; or ``-`` for Matroska or YUV4MPEG2 on standard
+        input.
     output : Path
-        Video of the same length to write: .mp4 (H.264), .mkv (lossless), .ser, .tif, .npy, .gif or .webp; or ``-`` for
-        lossless Matroska on standard output.  .mp4 and .mkv take over the audio and the time stamps of a video file.
+        Video to write, of the same length.  .mp4 (H.264), .mkv (lossless), .ser, .tif, .npy, .gif or .webp; or ``-``
+        for lossless Matroska on standard output.  .mp4 and .mkv take over audio and time stamps of a video file.
     config : Path
-        TOML file with settings; flags win over it.
+        File with settings, .toml; options win over it.
     mask : Path
-        Video to write, of the same kinds: white where something moves against the scene.
+        Video to write, white where something moves.  Against the scene; of the same kinds as the output.
     report : Path
-        HTML report to write: input, output, their difference and what moves as a film, and plots of every frame.
+        Page to write, .html: a film and plots.  The film shows input, output, their difference and what moves.
     raw : str
-        ``WIDTHxHEIGHT`` or ``WIDTHxHEIGHT:gray``: frames on standard input and output have 8 bits and no container,
+        Size of raw frames in a pipe.  ``WIDTHxHEIGHT`` or ``WIDTHxHEIGHT:gray``: frames on standard input and output
+        have 8 bits and no container,
         ``rgb24`` or ``gray`` in FFmpeg's words.
     written : Output
         How the video is written.
     overwrite : bool
         Replace existing outputs.
     json : bool
-        Print what was done, as JSON, on standard output.
+        Print the facts of the run as JSON.  They go to standard output.
     quiet : bool
         Print neither progress nor remarks.
     """

@@ -27,6 +27,7 @@ from turbrestore.memory_plan import training_share
 from turbrestore.runtime.steps import Progress, step_counter
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
+from turbrestore.synthesis.drawn_scenes import DRAWN
 from turbrestore.synthesis.dynamic_texture import DynamicTextureParams, synthesize_like
 from turbrestore.synthesis.moving_objects import MovingObject, draw_objects, with_objects
 from turbrestore.synthesis.scenes import SCENES
@@ -48,6 +49,7 @@ VIDEO, TRUTH, DIFFRACTION, FLOW, PARAMETERS = "", ".truth.png", ".truth_diffract
 # Written with moving objects only.
 FRAMES_TRUTH, MASK = ".truth.mkv", ".mask.mkv"
 CENTROID = "centroid"
+INCLUDED = {**SCENES, **DRAWN}
 MOST_FRAMES = 1_000_000
 SIGN = "before blur truth(x, y) = frame(x + dx, y + dy), pixels; mean over the exposure"
 
@@ -93,8 +95,9 @@ def synthesize(
     Parameters
     ----------
     scene : str
-        Image file; or an included scene: chart, words, camera, brick, grass, gravel, coins, moon, page, astronaut,
-        cat, coffee, rocket; or ``centroid``, the clean image of the video that ``--like`` names.
+        Image file, or name of an included scene.  These are chart, words, street, sign, plate, planet, camera, brick,
+        grass, gravel, coins, moon, page, astronaut, cat, coffee, rocket; or ``centroid``, the clean image of the
+        video that ``--like`` names.
     output : Path
         Video to write: .mkv, .mp4, .ser, .tif or .npy.
     model : {"phase-screen", "dynamic-texture"}
@@ -131,13 +134,14 @@ def synthesize(
     require_between("--frames", frames, 1, MOST_FRAMES)
     limits = limits_of(max_pixels)
     require(seed >= 0, f"--seed: expected a whole number from 0, found {seed}")
-    inputs = [item for item in (None if scene in (*SCENES, CENTROID) else Path(scene), like) if item is not None]
+    inputs = [item for item in (None if scene in (*INCLUDED, CENTROID) else Path(scene), like) if item is not None]
     check_output(output, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
     outputs = _outputs(output, model == "phase-screen", moving > 0)
     for name in outputs.values():
         check_output(name, inputs, overwrite, suffixes=None)
     rng = np.random.default_rng(seed)
-    with progress_bars(quiet) as progress:
+    stages = {"synthesize": 1.0} if model == "phase-screen" else {"centroid": 1.0, "synthesize": 1.0}
+    with progress_bars(quiet, stages) as progress:
         if model == "phase-screen":
             require(like is None and train is None, "--like, --train: have no effect on phase screens; leave them out")
             idle = dynamic_texture == DynamicTextureParams()
@@ -178,11 +182,11 @@ def _outputs(output: Path, has_diffraction: bool, has_objects: bool) -> dict[str
 
 
 def _scene(scene: str, size: str | None, limits: Limits) -> FloatArray:
-    if scene not in SCENES:
+    if scene not in INCLUDED:
         require(size is None, f"--size: has no effect on {scene}, which has a size; leave it out")
         require(scene != CENTROID, "centroid: needs --model dynamic-texture and --like")
         if not Path(scene).suffix:
-            raise ConfigurationError(f"{scene}: expected an image file or one of {', '.join(sorted(SCENES))}")
+            raise ConfigurationError(f"{scene}: expected an image file or one of {', '.join(sorted(INCLUDED))}")
         return read_image(scene, limits).image
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", "256x256" if size is None else size)
     if found is None:
@@ -190,7 +194,7 @@ def _scene(scene: str, size: str | None, limits: Limits) -> FloatArray:
     width, height = int(found[1]), int(found[2])
     most = limits.max_pixels
     require(width * height <= most, f"--size: expected at most {most} pixels, found {width}×{height}")
-    return SCENES[scene](height, width)
+    return INCLUDED[scene](height, width)
 
 
 def _training_frames(like: Path | None, train: int | None, limits: Limits) -> FloatArray:

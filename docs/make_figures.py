@@ -4,14 +4,18 @@ Run ``python docs/make_figures.py``; names of groups (``film``, ``gallery``, ``s
 
 The photographs come with scikit-image and are in the public domain or under CC0: the photographer by Lav Varshney, the
 cat by Stefan van der Walt, brick and gravel from CC0Textures.  What else is shown is drawn by
-``docs/_figures/scenes.py`` and ``turbrestore.synthesis.scenes``.
+``turbrestore.synthesis.drawn_scenes`` and ``turbrestore.synthesis.scenes``.
 """
 
 from __future__ import annotations
 
+import re
+import shlex
+import subprocess
 import sys
 import tempfile
 import time
+from contextlib import chdir
 from functools import cache
 from pathlib import Path
 
@@ -23,6 +27,7 @@ from _figures.layout import row, save, save_film
 import turbrestore as tr
 from turbrestore.core.arrays import FloatArray
 from turbrestore.synthesis.atmosphere import STRENGTHS
+from turbrestore.synthesis.drawn_scenes import planet, road_sign, street
 from turbrestore.synthesis.scenes import picture, printed_words, resolution_chart
 
 SIDE = 224
@@ -32,11 +37,11 @@ LARGEST_RECIPE, LARGEST_ROW = 120_000, 180_000
 GALLERY = {
     "chart": (lambda: resolution_chart(SIDE, SIDE), "weak", 48, 0.005),
     "words": (lambda: printed_words(SIDE, SIDE), "strong", 60, 0.005),
-    "sign": (lambda: scenes.sign(SIDE, SIDE), "medium", 48, 0.005),
+    "sign": (lambda: road_sign(SIDE, SIDE), "medium", 48, 0.005),
     "photographer": (lambda: picture("camera", SIDE, SIDE), "medium", 60, 0.005),
     "cat": (lambda: picture("cat", SIDE, SIDE), "medium", 60, 0.005),
-    "planet": (lambda: scenes.planet(SIDE, SIDE), "medium", 120, 0.03),
-    "street": (lambda: scenes.street(SIDE, SIDE), "weak", 60, 0.005),
+    "planet": (lambda: planet(SIDE, SIDE), "medium", 120, 0.03),
+    "street": (lambda: street(SIDE, SIDE), "weak", 60, 0.005),
     "gravel": (lambda: picture("gravel", SIDE, SIDE), "strong", 48, 0.005),
 }
 
@@ -57,7 +62,7 @@ def steadied_street() -> FloatArray:
 
 def make_film() -> None:
     """Frames of a clip one after the other, beside the image that is restored from them."""
-    frames = film(scenes.street(FILM_SIDE, FILM_SIDE), STRENGTHS["medium"], 60)
+    frames = film(street(FILM_SIDE, FILM_SIDE), STRENGTHS["medium"], 60)
     image = tr.restore(frames).image
     # Forwards and backwards, so that it has no jump.
     order = [*range(36), *range(34, 0, -1)]
@@ -102,35 +107,51 @@ def make_stages() -> None:
 
 
 def make_recipes() -> None:
-    """Pictures of the recipes of the manual."""
-    street, sign = gallery_clip("street"), gallery_clip("sign")
-    shown = 40
-    road = {
-        "frame": street.frames[shown],
-        "steadied frame": steadied_street()[shown],
-        "still image": street.restoration.image,
-    }
-    save("recipe_road", row(road, 288), LARGEST_RECIPE)
-    text = {"frame": sign.frame, "temporal mean": sign.restoration.mean, "restored": sign.restoration.image}
-    save("recipe_text", row(text, 288), LARGEST_RECIPE)
-    save("recipe_planet", row(planet_from_file(), 288), LARGEST_RECIPE)
+    """Pictures of the recipes, from the files that the commands of each page write."""
+    for page, shown in RECIPES.items():
+        with tempfile.TemporaryDirectory() as folder, chdir(folder):
+            for command in commands_before(page, [name for name, _ in shown.values()]):
+                print(command, flush=True)
+                subprocess.run(shlex.split(command), check=True)
+            panels = {title: picture_of(Path(name), frame) for title, (name, frame) in shown.items()}
+        save(f"recipe_{page}", row(panels, 288), LARGEST_RECIPE)
     truth = gallery_clip("photographer").truth
     strengths = {f"{name}, D/r0 = {ratio:g}": film(truth, ratio, 1)[0] for name, ratio in STRENGTHS.items()}
     save("recipe_simulate", row({"scene": truth} | strengths), LARGEST_RECIPE)
 
 
-def planet_from_file() -> dict[str, FloatArray]:
-    """Frame and results of a SER file in which a planet is followed, with a width that is estimated and one given."""
-    given = tr.RestoreParams(deconvolution=tr.DeconvolutionParams(sigma=1.2))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "planet.ser"
-        frames = film(scenes.planet(280, 320), STRENGTHS["medium"], 120, noise=0.03)
-        tr.write_video(path, frames, 50, bit_depth=8)
-        source = tr.crop_to_object(tr.open_frames(path))
-        results = {"restored": tr.restore(source).image, "restored, --sigma 1.2": tr.restore(source, given).image}
-        return {"frame": source.read(60, 61)[0]} | results
+def commands_before(page: str, files: list[str]) -> list[str]:
+    """Commands of a recipe up to the last that writes one of the files."""
+    text = (Path(__file__).parent / "recipes" / f"{page}.md").read_text("utf-8")
+    commands = re.findall(r"(?m)^ *(turbrestore .*)$", text)
+    last = max(index for index, command in enumerate(commands) if set(files) & set(shlex.split(command)[3:4]))
+    # The Moon of the page for planets, and files of the reader's own, are not shown.
+    return [command for command in commands[: last + 1] if not re.search(r"moon|night|sweep|evaluate", command)]
 
 
+def picture_of(path: Path, frame: int | None) -> FloatArray:
+    """Read an image, or a frame of a video."""
+    return tr.read_image(path).image if frame is None else tr.open_frames(path).read(frame, frame + 1)[0]
+
+
+# Page, and for each panel the file that shows it and the frame of a video.
+RECIPES: dict[str, dict[str, tuple[str, int | None]]] = {
+    "road": {
+        "frame": ("road.mp4", 40),
+        "steadied frame": ("steady.mp4", 40),
+        "still image": ("street.png", None),
+    },
+    "text": {
+        "frame": ("plate.mkv", 50),
+        "temporal mean": ("stages/mean.png", None),
+        "restored": ("plate.png", None),
+    },
+    "planet": {
+        "frame": ("planet.ser", 60),
+        "restored": ("planet.png", None),
+        "restored, --sigma 1.6": ("planet_sharp.png", None),
+    },
+}
 GROUPS = {"film": make_film, "gallery": make_gallery, "stages": make_stages, "recipes": make_recipes}
 
 

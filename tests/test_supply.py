@@ -45,5 +45,5 @@ def test_both_are_installed_from_wheels_and_tested():
     script = (ROOT / ".ci" / "run").read_text()
     assert "export PIP_ONLY_BINARY=:all:" in script
     for environment, constraints in ((".venv-ci", "constraints.txt"), (".venv-lowest", "constraints-lowest.txt")):
-        assert re.search(rf"{environment}/bin/pip install .*-c {constraints} ", script)
-        assert f"{environment}/bin/python -m pytest" in script
+        assert f".ci/test {environment} {constraints} --version" in script
+        assert re.search(rf"(?m)^\.ci/test {environment} {constraints}( -m .*)?$", script)

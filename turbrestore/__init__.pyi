@@ -49,6 +49,7 @@ from .registration.flow_algebra import invert_flow as invert_flow
 from .registration.global_shift import global_shifts as global_shifts
 from .report import write_report as write_report
 from .results import Restoration as Restoration
+from .results import Verdict as Verdict
 from .runs.run_files import load_run as load_run
 from .runs.run_files import save_run as save_run
 from .runs.run_record import RunRecord as RunRecord

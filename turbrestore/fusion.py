@@ -152,7 +152,7 @@ def fuse(run: Run) -> Fused:
 
     start = levels.stretched_result(centroid)
     filtered = run.stage("filter", "filtered", lambda: _filter(run, start, dynamics, training, stream).recentred())
-    mean = run.stage("filter", "mean", lambda: levels.original(_temporal_mean(run.source)))
+    mean = run.stage("filter", "mean", lambda: levels.original(temporal_mean(run.source)))
     # The sharpness is NaN for frames that do not count.
     chosen = int(np.isfinite(filtered.sharpness).sum())
     run.decide(
@@ -294,7 +294,8 @@ def _observe_filter(run: Run, tile: int, step: FilterStep) -> None:
         run.store.checkpoint(step.checkpoint)
 
 
-def _temporal_mean(source: FrameSource) -> FloatArray:
+def temporal_mean(source: FrameSource) -> FloatArray:
+    """Mean of the frames, read one after the other."""
     total = np.zeros(source.shape[1:])
     for frame in source:
         total += frame

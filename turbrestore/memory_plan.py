@@ -228,8 +228,13 @@ def training_share(
         require(wanted <= frame_count, f"train: expected at most the {frame_count} frames there are, found {wanted}")
         return wanted
     share = min(max(frame_count // 2, 0 if half else _FEWEST_TRAINED), _MOST_TRAINED)
+    return min(frame_count, max(share, 2), frames_in_memory(frame_shape))
+
+
+def frames_in_memory(frame_shape: tuple[int, ...]) -> int:
+    """Return how many frames, each with its flow, 1.5 GB hold, and at least two."""
     frame_bytes = 4 * (int(np.prod(frame_shape)) + 2 * frame_shape[0] * frame_shape[1])
-    return min(frame_count, max(2, min(share, int(_TRAINING_BYTES // frame_bytes))))
+    return max(2, int(_TRAINING_BYTES // frame_bytes))
 
 
 def _choices(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, TypeVar
+
+import numpy as np
 
 from .blind.guards import GuardReading
 from .blur.estimation import BlurEstimate
@@ -16,14 +19,25 @@ from .display.plots import plot_images
 from .display.preview import preview
 from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import FilterCheckpoint, Filtered
+from .metrics import sharpness
 from .registration.centroid import Centroid
 from .registration.coverage import Rectangle
+from .runtime.scratch import variance_of
 from .seeing.strength import Seeing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Result = TypeVar("Result")
+
+# Frames that move less have little to undo, pixels; an image that gains less is no sharper than the mean.
+_STILL, _NO_GAIN = 0.05, 1.02
+# An image of fewer frames, if all had equal weight, is about as noisy as one of them.
+_FEW_FRAMES = 4
+# Share of pixels without information that is worth a look.
+_UNKNOWN = 0.01
+# Decisions that are a doubt about the image, whatever they choose.
+_DOUBTS = ("motion", "saturation")
 
 
 class Store(Protocol):
@@ -69,6 +83,30 @@ class NoStore:
 
 
 @dataclass(frozen=True)
+class Verdict:
+    """What a restoration gained, and what a person should look at.
+
+    Attributes
+    ----------
+    gained : str
+        One sentence without a full stop.
+    checks : tuple of str
+        One clause each; empty where nothing is doubtful.
+
+    Examples
+    --------
+    >>> str(Verdict("1.50 times as sharp as the mean of 48 frames", ()))
+    '1.50 times as sharp as the mean of 48 frames; looks right'
+    """
+
+    gained: str
+    checks: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.gained}; " + (f"check: {'; '.join(self.checks)}" if self.checks else "looks right")
+
+
+@dataclass(frozen=True, repr=False)
 class Restoration:
     """The restored image and everything it came from.
 
@@ -124,6 +162,29 @@ class Restoration:
     uncertainty: FloatArray | None = None
     posterior: BlurPosterior | None = None
 
+    @property
+    def motion(self) -> float:
+        """Displacement of the training frames about its mean, root mean square over pixels and frames, pixels."""
+        return math.sqrt(float(variance_of(self.centroid.flows).sum(axis=-1).mean()))
+
+    @property
+    def sharpening(self) -> float:
+        """Sharpness of the image relative to the temporal mean; NaN where the mean has no contrast."""
+        x, y, width, height = self.crop
+        mean = self.mean[y : y + height, x : x + width]
+        return sharpness(self.image, mean) if np.ptp(mean) > 0 else math.nan
+
+    @property
+    def is_mean(self) -> bool:
+        """Whether the mean of the frames is the result, because they contradict the filtered image."""
+        return any(decision.subject == "structure" for decision in self.decisions)
+
+    @property
+    def verdict(self) -> Verdict:
+        """What was gained, and what to look at; computed from the images at every call."""
+        motion, gain = self.motion, self.sharpening
+        return Verdict(_gained(self, motion, gain), tuple(_checks(self, motion, gain)))
+
     def plot(self) -> Figure:
         """Draw the temporal mean beside the result.
 
@@ -139,12 +200,69 @@ class Restoration:
         x, y, width, height = self.crop
         return plot_images({"mean": self.mean[y : y + height, x : x + width], "result": self.image})
 
+    def __repr__(self) -> str:
+        height, width = self.image.shape[:2]
+        lines = [f"Restoration: {width}×{height} pixels", *(f"{name}: {value}" for name, value in self._facts())]
+        return "\n".join([*lines, f"verdict: {self.verdict}"])
+
     def _repr_html_(self) -> str:
+        choices = [(decision.subject, decision.choice) for decision in self.decisions]
+        return preview("Restoration", [*self._facts(), *choices], self.image)
+
+    def _facts(self) -> list[tuple[str, str]]:
         sigma = 0.0 if self.deconvolution is None else self.deconvolution.sigma
-        facts = [
+        return [
             ("frames", f"{self.frame_count}, {self.train} to train"),
             ("blur removed", f"{sigma:.2f} pixels" if sigma > 0 else "none"),
             ("time", f"{sum(self.seconds.values()):.1f} s"),
-            *((decision.subject, decision.choice) for decision in self.decisions),
         ]
-        return preview("Restoration", facts, self.image)
+
+
+def _gained(restoration: Restoration, motion: float, gain: float) -> str:
+    count = f"{restoration.frame_count} frames"
+    if restoration.is_mean:
+        return f"the mean of {count} is the result"
+    removed = [f"{motion:.2f} pixels of motion"]
+    if restoration.deconvolution is not None and restoration.deconvolution.sigma > 0:
+        removed.append(f"{restoration.deconvolution.sigma:.2f} pixels of blur")
+    sharper = "" if math.isnan(gain) else f"{gain:.2f} times as sharp as the mean of "
+    return f"{sharper}{count}, with {' and '.join(removed)} removed"
+
+
+def _checks(restoration: Restoration, motion: float, gain: float) -> Iterator[str]:
+    if restoration.is_mean:
+        yield "the frames contradict the filtered image, as where the scene itself moves"
+    elif motion < _STILL:
+        yield f"the frames hardly move ({motion:.2f} pixels), so there was little to undo"
+    elif gain < _NO_GAIN:
+        yield "the image is no sharper than the mean of the frames"
+    if not restoration.centroid.converged:
+        yield "the centroid has not converged"
+    yield from (decision.reason for decision in restoration.decisions if decision.subject in _DOUBTS)
+    if any(decision.subject == "passers" for decision in restoration.decisions):
+        yield "what passed was replaced by the background, and may have left traces"
+    if restoration.seeing is not None and (doubt := restoration.seeing.disagreement):
+        yield doubt
+    if restoration.filtered is not None and not restoration.is_mean:
+        effective = 1 / float(np.square(restoration.filtered.shares).sum())
+        if effective < _FEW_FRAMES:
+            yield f"the image has the noise of {effective:.1f} frames averaged"
+    yield from _checks_of_blur(restoration)
+    deviation = restoration.uncertainty
+    if deviation is not None and not restoration.is_mean and (unknown := np.isinf(deviation).mean()) > _UNKNOWN:
+        yield f"{unknown:.0%} of the pixels are saturated or seen in no frame"
+
+
+def _checks_of_blur(restoration: Restoration) -> Iterator[str]:
+    done, readings = restoration.deconvolution, restoration.guard_readings
+    if done is None:
+        return
+    if readings and not readings[-1].passed:
+        if done.sigma > 0:
+            yield "edges ring, overshoot or carry noise at the width that was given"
+        else:
+            yield "no blur is removed, because every width made edges ring or overshoot"
+    if restoration.blur is not None and not math.isfinite(restoration.blur.uncertainty):
+        yield "the width of the blur could not be measured"
+    if done.sigma > 0 and not done.converged:
+        yield "the deconvolution has not converged"

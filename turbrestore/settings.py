@@ -32,14 +32,15 @@ class RestoreParams:
     Parameters
     ----------
     train : int, optional
-        Number of frames, from the first on, from which the centroid and the dynamics of the flow are found.  By
+        Frames that the motion is learnt from.  Their number, from the first on; the centroid and the dynamics of the
+        flow are found from them.  By
         default all of up to 40 frames, else half of them but at most 100.
     until : {"centroid", "identify", "filter", "deconvolve"}
         Last stage to run.
     keep_best : float
-        Lucky imaging: the share of the frames, the sharpest ones, from which the image is made, such as 0.3 or 30%.
+        Share of the frames to use, such as 30%.  The sharpest ones make the image, as in lucky imaging.
     border : {"keep", "crop"}
-        Keep the border, where fewer frames show the scene, or crop it to what nine frames in ten show.
+        Keep the border, or crop it.  Fewer frames show the scene there; what nine frames in ten show is left.
     static_mask : str
         What stands in the frame while the scene moves (a field stop, a reticle, a clock) is replaced by the scene
         behind it: auto finds it, off leaves it, and else it is the path of an image that is not black there.  What

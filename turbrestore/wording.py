@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from .blind.structure import LEFT, UNSEEN, StructureReading
@@ -14,7 +16,7 @@ from .registration.coverage import Rectangle
 from .registration.global_shift import DEAD_ZONE
 from .registration.recentring import recentring_flow
 from .runtime.scratch import iter_frames
-from .seeing.strength import Seeing
+from .seeing.strength import LARGEST_BLUR, Estimate, Seeing
 
 # A frame counts if its weight is at least this share of the average weight.
 _COUNTS = 0.2
@@ -52,8 +54,10 @@ def explain_training(train: int, frame_count: int, wanted: int | None) -> Decisi
         reason = "the whole clip"
     elif train == half:
         reason = "half of the clip"
+    elif train > half:
+        reason = "more than half of a short clip"
     else:
-        reason = "more than half of a short clip" if train > half else "enough for a long clip, or limited by memory"
+        reason = "half of the clip would be more than trains by default, or than memory holds"
     return Decision("training", f"first {train} of {frame_count} frames", reason)
 
 
@@ -190,8 +194,8 @@ def explain_dynamics(dynamics: FlowDynamics, modelled: bool = False) -> tuple[De
     modes = Decision(
         "flow model",
         f"{dynamics.rank} modes",
-        f"{dynamics.energy_share:.0%} of the energy of the motion, largest eigenvalue {largest:.2f}; frames are "
-        f"registered by {'the flow of the model' if modelled else 'the measured flow'}",
+        f"{100 * dynamics.energy_share:.1f} % of the energy of the motion, largest eigenvalue {largest:.3f}; frames "
+        f"are registered by {'the flow of the model' if modelled else 'the measured flow'}",
     )
     return modes, *(Decision("flow model", "adjusted", note) for note in dynamics.notes)
 
@@ -223,7 +227,8 @@ def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
     mean = 1 / (count if chosen is None else chosen)
     counting = int(np.sum(filtered.shares >= _COUNTS * mean))
     reason = f"weighted by sharpness (β = {filtered.sharpness_weight:.1f}), registration and outliers"
-    largest = f"the largest weight is {filtered.shares.max() / mean:.1f} times the average"
+    reason += f"; a frame counts if its weight is at least {_COUNTS:g} times the average"
+    largest = f"the largest is {filtered.shares.max() / mean:.1f} times the average"
     asked = "" if chosen is None else f"; only the {chosen} sharpest were asked for"
     return Decision("frames", f"{counting} of {count} frames count", f"{reason}; {largest}{asked}")
 
@@ -300,7 +305,6 @@ def explain_seeing(seeing: Seeing) -> tuple[Decision, ...]:
 
     Examples
     --------
-    >>> from turbrestore.seeing.strength import Estimate
     >>> nothing = [None] * 3
     >>> same = Estimate(1.0, 0.8, 1.2)
     >>> explain_seeing(Seeing(*nothing, same, same, *nothing, 0.0, 9.0, 0.1))[0].choice
@@ -310,8 +314,38 @@ def explain_seeing(seeing: Seeing) -> tuple[Decision, ...]:
     by_flow, by_blur = seeing.displacement_by_flow, seeing.displacement_by_blur
     if remarks or by_flow is None or by_blur is None:
         return remarks
-    reason = f"variance {by_flow.value:.2f} and {by_blur.value:.2f} squared pixels agree within their errors"
+    if not by_flow.overlaps(by_blur):
+        reason = f"variance {by_flow.value:.2f} squared pixels; no more than {LARGEST_BLUR:g} can be told by blur"
+        return (Decision("displacement", "by flow alone", reason),)
+    bound = "at least " if math.isinf(by_blur.high) else ""
+    reason = (
+        f"variance {by_flow.value:.2f} squared pixels by flow and {bound}{by_blur.value:.2f} by blur: "
+        "their 95 % intervals overlap"
+    )
     return (Decision("displacement", "by blur as by flow", reason),)
+
+
+def interval_words(estimate: Estimate, spec: str = ".2f") -> str:
+    """Write an estimate and its 95 % interval, which may have no upper end.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    spec : str
+        Format of the numbers.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> interval_words(Estimate(2.5, 2.1, 2.9)), interval_words(Estimate(2.5, 2.1, math.inf))
+    ('2.50 (2.10 to 2.90)', '2.50 (at least 2.10)')
+    """
+    bounded = math.isfinite(estimate.high)
+    ends = f"{estimate.low:{spec}} to {estimate.high:{spec}}" if bounded else f"at least {estimate.low:{spec}}"
+    return f"{estimate.value:{spec}} ({ends})"
 
 
 def explain_border(least_seen: float, crop: Rectangle | None) -> Decision:

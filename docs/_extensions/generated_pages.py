@@ -1,8 +1,9 @@
 """Sphinx extension: parts of pages that are generated when they are read, so that they are always up to date.
 
-``<!-- command-line -->`` becomes a section for every command, taken from the application itself; ``<!-- gallery -->``
-becomes a list of the notebooks in ``examples/``, with the first paragraph of each; ``<!-- api: centroid flow -->``
-becomes the reference of all public names that these modules define, and ``<!-- api-table -->`` a table of all of them.
+``<!-- command-line -->`` becomes a table of the commands, and ``<!-- command: restore -->`` the description of one,
+both taken from the application itself; ``<!-- gallery -->`` becomes the notebooks in ``examples/``, to download and in
+the contents; ``<!-- api: centroid flow -->`` becomes the reference of all public names that these modules define, and
+``<!-- api-table -->`` a table of all of them.
 Links to modules and to tables of ``benchmarks/``, which are not pages of the site, become links to copies of them.
 """
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 DOCS = Path(__file__).parents[1]
 EXAMPLES_FOLDER = DOCS / "examples"
 COPIED = re.compile(r"\]\((?=(?:\.\./)+(?:benchmarks/[\w/]+\.md|turbrestore/[\w/]+\.py)\))")
+COMMAND_MARK = re.compile(r"<!-- command: ([\w -]+?) -->")
 API_MARK = re.compile(r"<!-- api: ([\w. ]+) -->")
 KINDS = {bool: "", int: "INT", float: "NUMBER", str: "TEXT", Path: "PATH"}
 
@@ -43,13 +45,24 @@ def filled(text: str) -> str:
     ):
         if mark in text:
             text = text.replace(mark, make())
+    text = COMMAND_MARK.sub(lambda found: command(found[1]), text)
     return API_MARK.sub(lambda found: reference(found[1].split()), text)
 
 
 def command_line() -> str:
-    """Describe every command in Markdown: what it does, its usage, examples, and all options."""
-    app = build()
-    return "\n".join(line for words in COMMANDS for line in _command(app, words))
+    """List the commands, each with its page and what it does."""
+    rows = (f"| [{words}](commands/{command_page(words)}) | {summary} |" for words, (_, summary) in COMMANDS.items())
+    return "\n".join(["| command | what it does |", "|---|---|", *rows])
+
+
+def command_page(words: str) -> str:
+    """Name of the page of a command."""
+    return f"{words.strip('-').replace(' ', '_')}.md"
+
+
+def command(words: str) -> str:
+    """Describe a command in Markdown: what it does, its usage, examples, and all options."""
+    return "\n".join(_command(build(), words))
 
 
 def _command(app: Any, words: str) -> Iterator[str]:
@@ -59,7 +72,6 @@ def _command(app: Any, words: str) -> Iterator[str]:
     arguments = [item for item in command.assemble_argument_collection(parse_docstring=True) if item.show]
     places = [item for item in arguments if not item.name.startswith("-")]
     options = [item for item in arguments if item.name.startswith("-")]
-    yield f"## {words}\n" if words[0].isalpha() else f"## `{words}`\n"
     yield _description(command.default_command.__doc__)
     usage = " ".join(["turbrestore", words, *(_place(item) for item in places), "[OPTIONS]"])
     yield f"```text\n{usage}\n```\n"
@@ -159,16 +171,11 @@ def api_table() -> str:
 
 
 def gallery() -> str:
-    """List the notebooks in order, each with its title as a link and its first paragraph."""
+    """Offer the notebooks to download, and put their pages into the contents."""
     found = sorted(path for path in EXAMPLES_FOLDER.glob("*.py") if path.name[:2].isdigit())
-    items = []
-    for path in found:
-        cell = re.search(r"# %% \[markdown\]\n((?:#.*\n)+)", path.read_text("utf-8"))
-        paragraphs = re.sub(r"(?m)^# ?", "", cell[1] if cell else "").strip().split("\n\n")
-        title, about = paragraphs[0].lstrip("# "), " ".join(paragraphs[1].split()) if len(paragraphs) > 1 else ""
-        items.append(f"**[{title}](examples/{path.name})**\n: {about}\n")
+    files = ", ".join(f"{{download}}`{path.name} <examples/{path.name}>`" for path in found)
     tree = "\n".join(f"examples/{path.stem}" for path in found)
-    return "\n".join(items) + f"\n```{{toctree}}\n:hidden:\n\n{tree}\n```\n"
+    return f"Download: {files}.\n\n```{{toctree}}\n:hidden:\n\n{tree}\n```\n"
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -55,14 +55,14 @@ def smaller(words):
         "deconvolve": STEPS,
         "synthesize": ["--size", "64x64"],
     }.get(words[0], [])
-    blurred = words[0] in ("restore", "deconvolve") and "--sigma" not in words
+    blurred = words[0] in ("restore", "deconvolve") and not {"--sigma", "--sweep"} & set(words)
     return [*quick, "--sigma", "1"] if blurred else quick
 
 
 class TestHelp:
     @pytest.mark.parametrize("words", [*EXAMPLES, "moments"])
     def test_every_command_shows_its_examples(self, run, words):
-        code, out, _ = run(*words.split(), "--help")
+        code, out, _ = run(*words.split(), "--help-all")
         assert code == 0
         shown = " ".join(out.split("Examples:")[1].split())
         for name in (words,) if words in EXAMPLES else ("moments wavefront", "moments mirror"):
@@ -264,6 +264,17 @@ class TestCompletion:
         assert (code, out, err.count("\n")) == (2, "", 1)
         assert "--shell" in err
 
+    def test_files_are_named_before_they_are_edited(self, run, folder, monkeypatch):
+        code, _, err = run("--install-completion", "--shell", "bash")
+        assert code == 2 and str(folder / ".bashrc") in err and "--yes" in err
+        assert not (folder / ".bashrc").exists()
+        monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+        for answer, edited in (("n", False), ("y", True)):
+            monkeypatch.setattr("builtins.input", lambda _, answer=answer: answer)
+            code, _, err = run("--install-completion", "--shell", "bash")
+            assert (code, (folder / ".bashrc").exists()) == ((0, True) if edited else (2, False))
+            assert f"adds a line to {folder / '.bashrc'}" in err
+
 
 class TestDoctor:
     def test_this_installation_is_healthy(self, run):
@@ -286,7 +297,7 @@ class TestDoctor:
         assert code == 0
         lines = out.splitlines()
         at = next(index for index, line in enumerate(lines) if line.startswith("missing  matplotlib"))
-        assert "pip install 'turbrestore[report]'" in lines[at + 1]
+        assert "pip install 'matplotlib" in lines[at + 1]
         assert "GPU" not in out
 
     def test_what_every_run_needs_is(self, run, monkeypatch):

@@ -85,7 +85,7 @@ class TestPlots:
         monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
         code, _, err = run("wavefront", *SHORT, "--plot", tmp_path / "figures.png")
         assert code == 2
-        assert err.endswith("not installed; run pip install 'turbrestore[plot]'\n") and err.count("\n") == 1
+        assert "not installed; run pip install 'matplotlib" in err and err.count("\n") == 1
 
     def test_nothing_is_written_by_a_run_that_fails_later(self, run, tmp_path, monkeypatch):
         def fails_unless_known(seeds, params=None):
@@ -113,7 +113,7 @@ class TestRefusals:
             (["wavefront", "--params.frames", 5], 2, "frames"),
             (["wavefront", "--params.noise", 0], 2, "noise"),
             (["wavefront", "--params.pixels", 2], 2, "pixels"),
-            (["wavefront", "--params.kernel-width", 1e-6], 2, "kernel_width"),
+            (["wavefront", "--params.kernel-width", 1e-6], 2, "kernel-width"),
             (["wavefront", "--params.amplitude", "inf"], 2, "amplitude"),
         ],
     )

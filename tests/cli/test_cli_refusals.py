@@ -102,10 +102,10 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, make, code, par
         (["--sigma", "60"], 2, "sigma"),
         (["--until", "filter", "--deconvolution.sigma", "1"], 2, "until"),
         (["--flow.dis.smoothness", "inf"], 2, "smoothness"),
-        (["--flow.contrast-window", "inf"], 2, "contrast_window"),
-        (["--filter.image-noise", "1e300"], 2, "image_noise"),
-        (["--filter.sharpness-window", "nan"], 2, "sharpness_window"),
-        (["--dynamics.frames-per-state", "inf"], 2, "frames_per_state"),
+        (["--flow.contrast-window", "inf"], 2, "contrast-window"),
+        (["--filter.image-noise", "1e300"], 2, "image-noise"),
+        (["--filter.sharpness-window", "nan"], 2, "sharpness-window"),
+        (["--dynamics.frames-per-state", "inf"], 2, "frames-per-state"),
         (["--bit-depth", "20"], 2, "bit"),
         (["--sigma", "1", "--until", "filter"], 2, "until = filter"),
         (["--sigma", "1", "--deconvolution.sigma", "2"], 2, "contradicts"),
@@ -203,3 +203,22 @@ class TestFilesOfOneRun:
         here["frame.png"] = here["mask.png"]
         name = output[0] if len(output) == 1 else "frame.png"
         self.refuses(run, here, ["restore", clip, *output, "--static-mask", name, *QUICK], name)
+
+
+def test_errors_name_options_as_they_were_typed(run, clip, tmp_path):
+    taken = tmp_path / "taken.png"
+    taken.write_text("")
+    new = tmp_path / "new.png"
+    for words, expected in {
+        ("restore", clip, new, "--train", "1"): "--train: expected 2 frames or more, found 1",
+        ("restore", clip, new, "--frames=100:200"): "--frames: expected a range within 0:8, found 100:200",
+        ("restore", clip, new, "--keep-best", "200%"): "--keep-best: expected a share",
+        ("restore", clip, new, "--centroid.iterations", "0"): "--centroid.iterations: expected 1 to 1000, found 0",
+        ("restore", clip, new, "--until", "filter", "--sigma", "1"): "--sigma: has no effect with until = filter",
+        ("restore", clip, taken): "choose another name or add --overwrite",
+        ("restore", clip): "OUTPUT: expected a value, found none; turbrestore restore --help",
+        ("sharp", clip): "sharp: no such command; turbrestore --help",
+        ("restor", clip): 'Did you mean "restore"?',
+    }.items():
+        fails(run(*words), 73 if words[2:] == (taken,) else 2, expected)
+    assert not new.exists()

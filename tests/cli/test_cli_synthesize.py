@@ -168,7 +168,7 @@ def test_dynamic_texture_of_the_centroid(run, clip, tmp_path):
 def test_progress_counts_the_flows_of_the_clip_and_the_frames(run, clip, tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(
-        "turbrestore_cli.synthesis.progress_bars", lambda _: nullcontext(lambda *call: calls.append(call))
+        "turbrestore_cli.synthesis.progress_bars", lambda *_: nullcontext(lambda *call: calls.append(call))
     )
     assert run("chart", tmp_path / "a.npy", *QUICK)[0] == 0
     assert calls == [("synthesize", done, 3) for done in (1, 2, 3)]

@@ -47,7 +47,7 @@ QUICK = {
 }
 SMALLER = {"--frames": "0:6", "--roi": "0,0,48,48", "--train": "5", "--seeds": "2", "--size": "96x96", "--reach": "2"}
 # What serves until it is interrupted, or needs a machine that is not there: tests/app and tests/cli start the like.
-ELSEWHERE = re.compile(r"turbrestore (app|--install-completion)\b|--scheduler|--workers|cuda|\||\[")
+ELSEWHERE = re.compile(r"turbrestore (app|sample|--install-completion)\b|--scheduler|--workers|cuda|\||\[")
 
 
 def parts(page):
@@ -162,8 +162,8 @@ def test_the_pages_have_commands():
 def test_extras_that_pages_name_exist():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
     for page in PAGES:
-        for names in re.findall(r"turbrestore\[([\w,]+)\]|'\.\[([\w,]+)\]'", page.read_text("utf-8")):
-            assert set("".join(names).split(",")) <= set(extras), page
+        for names in re.findall(r"'\.\[([\w,]+)\]'", page.read_text("utf-8")):
+            assert set(names.split(",")) <= set(extras), page
 
 
 def test_benchmarks_that_pages_name_exist_with_their_options():

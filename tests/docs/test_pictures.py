@@ -24,5 +24,5 @@ def test_gallery_shows_every_scene_and_stage() -> None:
 def test_readme_opens_with_a_moving_picture_and_two_commands() -> None:
     opening = (ROOT / "README.md").read_text("utf-8").split("\n## ")[0]
     assert "(docs/images/haze.webp)" in opening
-    commands = re.search(r"```\n(.*?)```", opening, re.DOTALL)[1].splitlines()
-    assert [command.split()[0] for command in commands] == ["pip", "turbrestore"]
+    commands = re.search(r"```bash\n(.*?)```", opening, re.DOTALL)[1].splitlines()
+    assert [command.split()[0] for command in commands] == ["python3", "turbrestore"]

@@ -33,7 +33,7 @@ class TestChoice:
     def test_missing_torch_is_named(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "torch", None)
         with pytest.raises(
-            ConfigurationError, match=r"^device: torch is not installed, found 'cuda'; install .* 'cpu'$"
+            ConfigurationError, match=r"^device: expected torch for 'cuda', .*pip install .*torch.* or use cpu$"
         ):
             find_device("cuda")
 

@@ -65,20 +65,18 @@ class DeconvolutionParams:
     method : {"nltv", "tv", "wiener", "tikhonov"}
         Penalty: nonlocal TV, TV, squared gradient, squared deviation from the mean.
     sigma : float, optional
-        Width of the blur, pixels.  :func:`deconvolve` uses it if it is called without a blur;
-        :func:`turbrestore.blind.remove_blur.remove_blur` estimates the width if it is not given.
+        Width of the blur, pixels.  It is estimated if it is not given, except by :func:`deconvolve`, which needs it.
     exponent : float, optional
-        Shape of the blur: 2 is a Gaussian, 5/3 a long exposure through turbulence; see
-        ``turbrestore.blur.psf.blur_otf``.  By default 2 if the width is given, and that of fused frames,
-        ``turbrestore.blur.psf.fused_exponent``, if it is estimated.
+        Shape of the blur: 2 is a Gaussian, 5/3 a long exposure through turbulence.  By
+        default 2 if the width is given, and that of fused frames if it is estimated.
     fidelity : float, optional
         Weight λ of the data: a larger one gives a sharper and noisier image.  By default it is chosen from the noise
-        of the image, see ``turbrestore.deconvolution.problem.automatic_fidelity``.
+        of the image.
     iterations : int
         Largest number of iterations.
     tolerance : float
         Stop when every tile of 64×64 pixels is predicted to change by at most this from then on, relative to the
-        brightest tile; see ``turbrestore.deconvolution.stopping``.  nltv and tv, whose images oscillate, also stop when
+        brightest tile.  nltv and tv, whose images oscillate, also stop when
         no tile has changed by more than this for 50 iterations.
     boundary : {"unknown", "periodic"}
         What lies beyond the border: unknown pixels, which are estimated too, or the image repeated periodically.

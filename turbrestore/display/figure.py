@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 from typing import TYPE_CHECKING
 
-from ..core.errors import ConfigurationError
+from ..core.extras import missing_package
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,9 +49,7 @@ def new_figure(width: float = WIDTH, height: float = HEIGHT) -> Figure:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ConfigurationError(
-            "plot: expected matplotlib, which is not installed; run pip install 'turbrestore[report]'"
-        ) from error
+        raise missing_package("plot", "matplotlib", "plot") from error
 
     class _NotebookFigure(Figure):
         # Without this method notebooks show only the figures of pyplot.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -142,13 +143,15 @@ def plot_uncertainty(deviation: ArrayLike, image: ArrayLike | None = None) -> Fi
     return _draw_map(np.minimum(percent, np.float32(top)), image, "Standard deviation, % of full scale")[0]
 
 
-def plot_images(images: Mapping[str, ArrayLike]) -> Figure:
+def plot_images(images: Mapping[str, ArrayLike], columns: int | None = None) -> Figure:
     """Show images side by side.
 
     Parameters
     ----------
     images : mapping of str to array_like, shape (H, W) or (H, W, 3)
         Title and intensities, 0 to 1.
+    columns : int, optional
+        Most images in a row; by default all.
 
     Returns
     -------
@@ -169,9 +172,11 @@ def plot_images(images: Mapping[str, ArrayLike]) -> Figure:
     """
     checked = {title: np.clip(check_image(image, title), 0, 1) for title, image in images.items()}
     height, width = next(iter(checked.values())).shape[:2]
-    figure = new_figure(WIDTH * len(checked), WIDTH * height / width + 0.3)
+    across = min(columns or len(checked), len(checked))
+    down = math.ceil(len(checked) / across)
+    figure = new_figure(WIDTH * across, down * (WIDTH * height / width + 0.3))
     for number, (title, image) in enumerate(checked.items(), 1):
-        axes = figure.add_subplot(1, len(checked), number)
+        axes = figure.add_subplot(down, across, number)
         axes.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="none")
         axes.set_title(title, color=INK, fontsize=FONT + 1, loc="left")
         axes.set_axis_off()

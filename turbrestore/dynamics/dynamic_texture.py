@@ -56,7 +56,7 @@ class DynamicsParams:
     Parameters
     ----------
     rank : int or None
-        Number of states n. If None, n is the smallest number of modes that hold the share ``energy`` of the variance,
+        Number of states n. By default the smallest number of modes that hold the share ``energy`` of the variance,
         but at most the number of singular values above the optimal hard threshold for white noise of unknown level
         (Gavish and Donoho, 2014), at most ``max_rank``, and at most one for every ``frames_per_state`` flows.
     energy : float

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from ..core.arrays import FloatArray
 from ..core.errors import ConfigurationError, DataError, OutputError, StorageError
+from ..core.extras import missing_package
 
 IMAGE_OUTPUT_SUFFIXES = (".png", ".tif", ".tiff", ".fits")
 # Bytes that must stay free beside the file.
@@ -47,9 +48,7 @@ def check_output(
         names = f"{', '.join(others)} or {last}" if others else last
         raise ConfigurationError(f"{path}: expected a name that ends in {names}, found {suffix or 'no suffix'}")
     if suffixes is not None and suffix == ".fits" and find_spec("astropy") is None:
-        raise ConfigurationError(
-            f"{path}: expected astropy, which is not installed; run pip install 'turbrestore[fits]'"
-        )
+        raise missing_package(str(path), "astropy", "fits")
     try:
         folder = Path(os.path.realpath(path)).parent
         if path.is_dir():

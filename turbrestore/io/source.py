@@ -234,13 +234,13 @@ class FrameSource:
         >>> FrameSource.from_array(np.zeros((5, 4, 6))).select(frames=(3, 9))
         Traceback (most recent call last):
         ...
-        turbrestore.core.errors.ConfigurationError: frames: expected 0 <= start < stop <= 5, found (3, 9)
+        turbrestore.core.errors.ConfigurationError: frames: expected a range within 0:5, found 3:9
         """
         wanted = check_frame_range(frames)
         count = len(self)
         start = wanted.start or 0
         stop = count if wanted.stop is None else wanted.stop
-        require(0 <= start < stop <= count, f"frames: expected 0 <= start < stop <= {count}, found {frames}")
+        require(0 <= start < stop <= count, f"frames: expected a range within 0:{count}, found {start}:{stop}")
         chosen = slice(start, stop, wanted.step)
         return dataclasses.replace(
             self,

@@ -66,7 +66,7 @@ class CentroidParams:
         The mean flow that remains is the bias of the flow method; correcting it would bend the image.
     start : int
         Frame that ``single`` warps; ``fused`` starts from the temporal mean, of stabilised frames if
-        ``FlowParams.global_shift`` is on.
+        large shifts are removed first.
     """
 
     mode: Literal["fused", "single"] = "fused"

@@ -73,7 +73,7 @@ class TvL1Params:
     ----------
     attachment : float
         Weight of the data term (λ), per unit of intensity; smaller is smoother.  The default is for 8-bit grey levels
-        with 32 of them for each local standard deviation (:func:`turbrestore.registration.contrast.grey_levels`).
+        with 32 of them for each local standard deviation.
     huber : float
         Gradient of the flow (α), pixels per pixel, up to which smoothness is quadratic; 0 is the total variation.
     warps : int

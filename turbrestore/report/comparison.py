@@ -6,6 +6,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigurationError
+from ..core.extras import missing_package
 
 if TYPE_CHECKING:
     import jinja2
@@ -56,6 +57,4 @@ def text_file(name: str) -> str:
 
 def missing(package: str) -> ConfigurationError:
     """Return the error for a package of the extra ``report`` that is not installed."""
-    return ConfigurationError(
-        f"report: expected {package}, which is not installed; run pip install 'turbrestore[report]'"
-    )
+    return missing_package("report", package, "report")

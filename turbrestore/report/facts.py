@@ -15,6 +15,7 @@ from ..results import Restoration
 from ..runs.run_record import RunRecord
 from ..runtime.scratch import variance_of
 from ..settings import RestoreParams
+from ..wording import interval_words
 
 _STAGE_NAMES = {
     "read": "Reading",
@@ -24,6 +25,13 @@ _STAGE_NAMES = {
     "filter": "Alternating filter",
     "deconvolve": "Deconvolution",
     "uncertainty": "Uncertainty",
+}
+
+
+# What a run takes of its input and of the machine unless told otherwise; what is not named here is left open.
+_USUAL_RUN = {
+    **{"preset": "standard", "threads": 0, "device": "cpu"},
+    **dict.fromkeys(("strict", "skip_damaged", "crop_to_object"), False),
 }
 
 
@@ -157,7 +165,7 @@ def settings(run: RunRecord, defaults: Mapping[str, Any] | None = None) -> list[
     -------
     list of Setting
     """
-    usual = dict(_flat(dataclasses.asdict(RestoreParams()) if defaults is None else defaults))
+    usual = dict(_flat({**_USUAL_RUN, **dataclasses.asdict(RestoreParams())} if defaults is None else defaults))
     return [
         Setting(name.replace("_", "-"), _as_written(value), value != usual.get(name))
         for name, value in _flat(run.settings)
@@ -238,7 +246,7 @@ def _blur_facts(restoration: Restoration) -> Iterator[Fact]:
 
 def _guard_facts(restoration: Restoration) -> Iterator[Fact]:
     for reading in restoration.guard_readings:
-        shares = f"{100 * reading.ringing:.1f} % of edges ring, {100 * reading.overshoot:.1f} % overshoots"
+        shares = f"{reading.ringing:.0%} of edges ring, {reading.overshoot:.0%} overshoots"
         value = f"{shares}, noise ×{reading.noise_gain:.1f}"
         note = "passed" if reading.passed else "failed: less blur is removed"
         yield Fact(f"Guards at {reading.sigma:.2f} px", value, note, not reading.passed)
@@ -257,7 +265,7 @@ def _seeing_facts(restoration: Restoration) -> Iterator[Fact]:
     }
     for name, (estimate, unit) in seeing.estimates().items():
         if estimate is not None and name in notes:
-            value = f"{estimate.value:.2f} {unit}, {estimate.low:.2f} to {estimate.high:.2f}"
+            value = f"{interval_words(estimate)} {unit}"
             yield Fact(name.replace("_", " ").capitalize(), value, notes[name])
     for remark in seeing.remarks:
         yield Fact("Displacement", "to be looked at", remark, True)

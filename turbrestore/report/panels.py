@@ -89,7 +89,7 @@ def _motion(restoration: Restoration, run: RunRecord) -> Iterator[Panel]:
 
 def _dynamics(dynamics: FlowDynamics) -> Iterator[Panel]:
     figure = plot_singular_values(dynamics.singular_values, dynamics.rank)
-    caption = f"Coloured: the states of the flow model, which hold {100 * dynamics.energy_share:.0f} % of the variance."
+    caption = f"Coloured: the states of the flow model, which hold {100 * dynamics.energy_share:.1f} % of the variance."
     yield Panel(inline_svg(figure, "singular", "Singular values of the flows"), caption)
     figure = plot_eigenvalues(dynamics.eigenvalues)
     caption = "Inside the circle motion decays. If all lie on it, the model only repeats the training flows."

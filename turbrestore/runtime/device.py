@@ -22,13 +22,13 @@ from pathlib import Path
 
 from ..core.decision import Decision
 from ..core.errors import ConfigurationError, require
+from ..core.extras import install_command
 
 CPU = "cpu"
 # Memory of the process that torch 2.13 takes once it is imported and has computed something on the CPU, bytes:
 # 200 MB, and 270 MB the first time, when its modules are compiled as well.  Builds with CUDA take more.
 TORCH_BYTES = 2.8e8
 _NAME = re.compile(r"[a-z]+(:\d+)?")
-_INSTALL = "install turbrestore[torch] or use 'cpu'"
 # What a system with a GPU that torch can use has among its devices: NVIDIA's, those of its boards, AMD's, and that of
 # the Windows Subsystem for Linux.  torch has no GPU of this kind under macOS; of other systems nothing is known.
 _NODES = {"linux": ("nvidia*", "nvhost*", "nvmap", "kfd", "dxg"), "darwin": ()}
@@ -94,7 +94,9 @@ def find_device(wanted: str) -> str:
     try:
         import torch
     except ImportError as error:
-        raise ConfigurationError(f"device: torch is not installed, found {wanted!r}; {_INSTALL}") from error
+        raise ConfigurationError(
+            f"device: expected torch for {wanted!r}, which is not installed; run {install_command('torch')}, or use cpu"
+        ) from error
     if wanted.startswith("cuda") and not torch.cuda.is_available():
         raise ConfigurationError(f"device: torch sees no CUDA device here, found {wanted!r}; use 'cpu' or 'auto'")
     try:

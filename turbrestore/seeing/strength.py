@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -49,7 +50,7 @@ from .tilt_theory import MEAN_CONE, Optics, displacement_differences, strength_o
 _MODEL_ERROR = 0.12
 _BLUR_ERROR = 0.1
 # Blur by displacement above which it is a lower bound, squared pixels.
-_LARGEST_BLUR = 2.0
+LARGEST_BLUR = 2.0
 # Largest part of an image that is compared by blur, pixels a side, and the tiles of it.
 _COMPARED, _TILES = 512, CueParams(tile=64, departure=1.0)
 # Share of rotation from which the displacement is not that of turbulence; without any relation of x and y it is 0.5.
@@ -71,6 +72,24 @@ class Estimate:
     value: float
     low: float
     high: float
+
+    def overlaps(self, other: Estimate) -> bool:
+        """Whether the intervals of two estimates have a value in common.
+
+        Parameters
+        ----------
+        other : Estimate
+
+        Returns
+        -------
+        bool
+
+        Examples
+        --------
+        >>> Estimate(1.0, 0.8, 1.2).overlaps(Estimate(1.5, 1.1, 1.9))
+        True
+        """
+        return self.low <= other.high and other.low <= self.high
 
 
 @dataclass(frozen=True)
@@ -117,6 +136,19 @@ class Seeing:
     r0: Estimate | None = None
     cn2: Estimate | None = None
     remarks: tuple[str, ...] = ()
+
+    @property
+    def disagreement(self) -> str:
+        """What it means that the displacements by flow and by blur differ by more than their errors; empty else."""
+        by_flow, by_blur = self.displacement_by_flow, self.displacement_by_blur
+        if by_flow is None or by_blur is None or by_flow.overlaps(by_blur):
+            return ""
+        if by_blur.low > by_flow.high:
+            return "motion that the flow has missed, such as a moving scene or a failed registration"
+        # A mean that is blurred by more than the limit is no longer told apart from one that is blurred by the limit.
+        if by_flow.value >= LARGEST_BLUR:
+            return ""
+        return "the flow has more motion than the mean shows, or the exposure itself has blurred the frames"
 
     def estimates(self) -> dict[str, tuple[Estimate | None, str]]:
         """Return the estimates by name, each with its unit.
@@ -198,16 +230,17 @@ def measure_seeing(
         return _unmeasured(by_blur, remark)
     w = found.blocks[:, found.counts]
     whole = motion_statistics(w, found.noise_variance)
-    by_flow = max(float(np.mean(w**2)) - found.noise_variance, 0.0)
+    variance = max(float(np.mean(w**2)) - found.noise_variance, 0.0)
+    by_flow = _with_deviation(variance, _MODEL_ERROR * variance)
     rotation = rotation_share(found)
     anisotropy, direction = _wind(w, whole, found.noise_variance)
-    remarks = _disagreement(by_flow, by_blur)
+    remarks: tuple[str, ...] = ()
     if whole.slow:
         remarks += (
             f"the clip spans few correlation times ({whole.independent_frames:.1f} independent frames): the variance "
             "over a long time is a lower bound, and more frames would tell more",
         )
-    strength: dict[str, Estimate] = {}
+    strength: dict[str, Any] = {}
     if optics is not None and np.isnan(rotation):
         remarks += ("too few neighbouring blocks to tell turbulence from other motion: no r0 is reported",)
     elif optics is not None and rotation > _ROTATING:
@@ -218,11 +251,11 @@ def measure_seeing(
     elif optics is not None:
         strength = _strength(found, whole, optics)
     x, y = (_interval(float(part), whole, whole.freedom / 2) for part in whole.variance)
-    return Seeing(
+    seeing = Seeing(
         displacement_variance=_interval(float(whole.variance.mean()), whole, whole.freedom),
         displacement_variance_x=x,
         displacement_variance_y=y,
-        displacement_by_flow=_with_deviation(by_flow, _MODEL_ERROR * by_flow),
+        displacement_by_flow=by_flow,
         displacement_by_blur=by_blur,
         isoplanatic_patch=_crossing(separation_correlation(found), _HALF, whole.freedom, float(found.spacing)),
         coherence_time=_crossing(whole.autocorrelation, _E_FOLD, whole.freedom, 1.0),
@@ -230,9 +263,12 @@ def measure_seeing(
         wind_direction=direction,
         independent_frames=whole.independent_frames,
         rotation=rotation,
-        remarks=remarks,
         **strength,
     )
+    if by_blur is not None and seeing.disagreement:
+        figures = f"displacement variance {by_flow.value:.2f} px² by flow and {by_blur.value:.2f} px² by blur"
+        remarks = (f"{figures}: {seeing.disagreement}", *remarks)
+    return replace(seeing, remarks=remarks)
 
 
 def chi_square_interval(variance: float, freedom: float, relative: float = 0.0) -> Estimate:
@@ -318,27 +354,11 @@ def _by_blur(mean: FloatArray, image: FloatArray, noise: float) -> Estimate | No
         return None
     value = max(blur.variance, 0.0)
     found = _with_deviation(value, float(np.hypot(blur.deviation, _BLUR_ERROR * value)))
-    return found if value < _LARGEST_BLUR else Estimate(value, found.low, np.inf)
+    return found if value < LARGEST_BLUR else Estimate(value, found.low, np.inf)
 
 
 def _with_deviation(value: float, deviation: float) -> Estimate:
     return Estimate(value, max(value - _DEVIATIONS * deviation, 0.0), value + _DEVIATIONS * deviation)
-
-
-def _disagreement(by_flow: float, by_blur: Estimate | None) -> tuple[str, ...]:
-    """Remark where the displacements by flow and by blur differ by more than their errors."""
-    if by_blur is None:
-        return ()
-    flow = _with_deviation(by_flow, _MODEL_ERROR * by_flow)
-    words = f"displacement variance {by_flow:.2f} px² by flow and {by_blur.value:.2f} px² by blur"
-    if by_blur.low > flow.high:
-        return (f"{words}: motion that the flow has missed, such as a moving scene or a failed registration",)
-    # A mean that is blurred by more than the limit is no longer told apart from one that is blurred by the limit.
-    if by_blur.high < flow.low and by_flow < _LARGEST_BLUR:
-        return (
-            f"{words}: the flow has more motion than the mean shows, or the exposure itself has blurred the frames",
-        )
-    return ()
 
 
 def _wind(w: Float64Array, whole: MotionStatistics, noise_variance: float) -> tuple[Estimate, float]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import ConfigurationError
+from ...core.extras import missing_package
 from .comparison import Experiment
 
 # Colour and dash of every observer, the same in all panels.
@@ -33,9 +33,7 @@ def new_figure() -> Any:
         # Loading the optional package by name lets type checkers run without it.
         return importlib.import_module("matplotlib.figure").Figure(figsize=(12, 8), layout="constrained")
     except ImportError as error:
-        raise ConfigurationError(
-            "plot: expected matplotlib, which is not installed; run pip install 'turbrestore[plot]'"
-        ) from error
+        raise missing_package("plot", "matplotlib", "plot") from error
 
 
 def draw_wavefront(experiment: Experiment) -> bytes:

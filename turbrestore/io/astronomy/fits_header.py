@@ -19,7 +19,8 @@ from typing import IO, TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import ConfigurationError, DataError
+from ...core.errors import DataError
+from ...core.extras import missing_package
 from ..limits import Limits, check_input, format_errors, input_errors
 from ..pixels import BAYER_CODES
 
@@ -113,9 +114,7 @@ def astropy_fits() -> Any:
     try:
         from astropy.io import fits
     except ImportError as error:
-        raise ConfigurationError(
-            "FITS: expected astropy, which is not installed; run pip install 'turbrestore[fits]'"
-        ) from error
+        raise missing_package("FITS", "astropy", "fits") from error
     return fits
 
 

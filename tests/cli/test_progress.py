@@ -1,0 +1,53 @@
+"""One bar for the whole command, the verdict at its end, and decisions as they are made."""
+
+from command_line import QUICK
+
+from turbrestore.pipeline import restore
+from turbrestore.settings import PRESETS, RestoreParams
+from turbrestore_cli.progress import TITLES, share_done
+from turbrestore_cli.restore import _expected_times
+
+
+def test_the_bar_only_moves_on_and_ends_full(sequence):
+    for params in (RestoreParams(), RestoreParams(until="filter"), PRESETS["fast"]):
+        calls = []
+        restore(sequence.frames, params, progress=lambda *call, calls=calls: calls.append(call))
+        weights = _expected_times(_Source(sequence.frames), params)
+        shares = [share_done(weights, *call) for call in calls]
+        assert {stage for stage, *_ in calls} <= set(weights) <= set(TITLES)
+        assert shares == sorted(shares)
+        assert 0 < shares[0] < 0.1 and 0.5 < shares[-1] <= 1
+        # No stage counts as done before the next begins.
+        assert len({round(share, 3) for share in shares}) > len(weights)
+
+
+class _Source:
+    """Length and shape of a clip, which is all that the times depend on."""
+
+    def __init__(self, frames):
+        self.shape, self.frames = frames.shape, frames
+
+    def __len__(self):
+        return len(self.frames)
+
+
+def test_a_stage_without_steps_is_done_and_an_unknown_length_is_none():
+    assert share_done({"centroid": 1.0, "filter": 3.0}, "filter", 0, 0) == 1.0
+    assert share_done({"centroid": 1.0, "filter": 3.0}, "filter", 1, 2) == 0.625
+    assert share_done({"steady": 1.0}, "steady", 12, 0) is None
+
+
+def test_the_last_line_is_the_verdict_and_verbose_tells_decisions(run, clip, tmp_path):
+    words = [word for word in QUICK if word != "--quiet"]
+    code, _, err = run("restore", clip, tmp_path / "a.png", *words, "--sigma", "1", "--verbose")
+    assert code == 0
+    *decisions, last = err.splitlines()
+    assert last.startswith(f"turbrestore: {tmp_path / 'a.png'} (")
+    assert "times as sharp as the mean of 8 frames" in last
+    assert last.endswith("; looks right") or "; check: " in last
+    told = [line.split(": ")[1] for line in decisions]
+    assert {"training", "centroid", "frames", "blur", "border"} <= set(told)
+    code, _, err = run("restore", clip, tmp_path / "b.png", *words, "--sigma", "1")
+    assert (code, len(err.splitlines())) == (0, 1)
+    code, _, err = run("restore", clip, tmp_path / "c.png", "--quiet", "--verbose")
+    assert code == 2 and "--verbose: contradicts --quiet" in err
