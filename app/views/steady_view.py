@@ -67,7 +67,7 @@ class SteadyView:
         usual = SteadyParams()
         with ui.element("div").classes("fields pair"):
             self._sigma = ui.number("Blur to remove, pixels", min=0, max=20, step=0.1, placeholder="estimated")
-            self._largest = ui.number("Largest displacement, pixels", min=0.1, step=0.5, placeholder="measured")
+            self._largest = ui.number("Largest shift, pixels", min=0.1, step=0.5, placeholder="measured")
         with ui.element("div").classes("fields pair"):
             self._reach = ui.number("Reach, frames", min=1, max=60, step=1, value=usual.reach, format="%d")
             self._crf = ui.number("Quality, 0 best to 51", min=0, max=51, step=1, placeholder="14", format="%d")
