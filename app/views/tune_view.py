@@ -188,9 +188,9 @@ class TuneView:
 
     def _words(self, image: FloatArray, seconds: float, more: bool) -> str:
         size = f"{image.shape[1]}×{image.shape[0]} pixels in {seconds:.2f} s"
-        return (
-            f"Quick preview of {size}; the exact one follows …" if more else f"{size}; press Apply for the whole image"
-        )
+        if more:
+            return f"Quick preview of {size}; the exact one follows …"
+        return f"{size}; press Apply for the whole image"
 
     async def _measure(self) -> None:
         """Go back to what is measured."""

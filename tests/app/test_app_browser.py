@@ -309,7 +309,7 @@ def test_several_clips_and_a_steadied_video(open_tab, app):
         page.wait_for_function(f"({playing}) === 128", timeout=LONG)
         assert rows.count() == 2
         press(page, "Clip")
-        assert page.locator("#stage").count() == 0
+        page.locator("#stage").wait_for(state="detached")
         press(page, "Video")
         page.wait_for_function(f"({playing}) === 128", timeout=LONG)
     finally:
