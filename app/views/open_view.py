@@ -86,7 +86,8 @@ class OpenView:
         self._list = ui.element("div").classes("files").props('role=group aria-label="Clips of the folder"')
         self._enter(self._folder)
         with ui.element("div").classes("fields"):
-            self._path = ui.input("Path of a clip", placeholder="clip.mkv").props("dense outlined").classes("grow")
+            self._path = ui.input("Path of a clip", placeholder="clip.mkv").classes("grow")
+            self._path.props("dense outlined stack-label")
             self._path.on("keydown.enter", self._open_path)
             ui.button("Open", on_click=self._open_path).props("outline no-wrap")
         with ui.element("div").classes("fields"):

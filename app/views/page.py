@@ -83,7 +83,7 @@ class Page:
             await self._opened(clip)
 
     def look_at(self, what: str) -> None:
-        """Show the frames of the clip (``clip``), the images of the stages (``compare``), or the ``video``."""
+        """Show the frames of the clip (``clip``), the images of the stages (``compare``), the ``video``, or nothing."""
         self.clip_view.place.visible = what == "clip"
         self.compare_view.place.visible = what == "compare"
         self.video_view.place.visible = what == "video"
@@ -178,7 +178,7 @@ class Page:
         self.clip_view.build()
         self.compare_view.build()
         self.video_view.build()
-        self.look_at("clip")
+        self.look_at("")
 
     async def _look(self) -> None:
         """Follow the run; called again and again."""

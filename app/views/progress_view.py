@@ -38,8 +38,7 @@ class ProgressView:
 
     def build(self, starters: Sequence[ui.button]) -> None:
         """Make the elements, after the buttons that start such a run; to be called in their row."""
-        for button in starters:
-            button.bind_enabled_from(self._tab, "busy", backward=lambda busy: not busy)
+        self._starters = starters
         self._stop = ui.button("Stop", on_click=self._tab.stop).props("outline")
         self._stop.visible = False
 
@@ -53,6 +52,8 @@ class ProgressView:
     def follow(self) -> Job[object] | None:
         """Show how the run goes; return it when it has just ended."""
         job = self._tab.job
+        for button in self._starters:
+            button.set_enabled(not self._tab.busy)
         if job is None or job.kind != self._kind:
             if self._job is not None:
                 self._job = None

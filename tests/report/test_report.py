@@ -35,7 +35,7 @@ from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.scratch import new_stack
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.application import build
-from turbrestore_cli.options import Machine, Selection
+from turbrestore_cli.options import Machine, Selection, known_sigma
 from turbrestore_cli.output import repeating_command, settings_record
 
 EVIL = "<script>alert(1)</script>\"'&.mkv"
@@ -269,7 +269,8 @@ class TestPictures:
 
     def test_shadows_are_lifted_only_where_most_of_the_scene_lies_in_them(self):
         ramp = np.tile(np.linspace(0, 1, 256, dtype=np.float32), (40, 1))
-        plain, dark = (pictures.encode_gallery({"result": image}, 0).stretch for image in (ramp, ramp**4))
+        night = np.where(ramp > 0.98, np.float32(1), 0.12 * ramp)
+        plain, dark = (pictures.encode_gallery({"result": image}, 0).stretch for image in (ramp, night))
         assert plain.exponent == 1.0
         # Of a ramp that reaches from .2 to .7 both ends become full.
         level = pictures.encode_gallery({"result": 0.2 + 0.5 * ramp}, 0).stretch
@@ -512,7 +513,10 @@ class TestCommand:
         words = repeating_command(tmp_path / "-in put.mkv", tmp_path / "o.png", record)
         assert len(words) == 4 + 11
         _, bound, _ = build().parse_args(words[1:], exit_on_error=False, print_error=False)
-        assert bound.arguments["params"] == params
+        read = bound.arguments["params"]
+        deconvolution = known_sigma(bound.arguments["sigma"], read.deconvolution)
+        assert dataclasses.replace(read, deconvolution=deconvolution) == params
+        assert "--sigma=1e-07" in words
         assert bound.arguments["selection"] == selection
         assert bound.arguments["machine"] == machine
         assert bound.arguments["memory_limit"] == 2e9

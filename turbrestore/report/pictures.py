@@ -28,9 +28,9 @@ _LONGEST = 2048
 # brighter than the second; the percentage of pixels at either end that may be clipped, and the margin beyond them, as a
 # share of the span.
 _NARROW, _DARK, _CLIPPED, _MARGIN = 0.2, 0.5, 0.2, 0.1
-# What the switch of the page does: it clips this percentage of the pixels at either end, and lifts shadows until the
-# median of what is not black reaches a brightness, with an exponent of at least the last number.
-_STRETCHED, _BLACK, _MEDIAN, _LEAST_EXPONENT = 0.5, 0.05, 0.3, 0.45
+# What the switch of the page does: it clips this percentage of the pixels at either end. Where the median of what is
+# not black is dim, as in a night scene with lamps, shadows are lifted until it is brighter, by at least this exponent.
+_STRETCHED, _BLACK, _DIM, _BRIGHTER, _LEAST_EXPONENT = 0.5, 0.05, 0.15, 0.3, 0.45
 _TITLES = {
     "frame": "Frame",
     "mean": "Mean",
@@ -157,7 +157,7 @@ def stretch_of(levels: NDArray[np.unsignedinteger]) -> Stretch:
     slope = 1 / max(high - low, 1 / 255)
     lit = (shown[shown > low + _BLACK * (high - low)] - low) * slope
     median = float(np.median(lit)) if lit.size else 1.0
-    exponent = 1.0 if median >= _MEDIAN else max(float(np.log(_MEDIAN) / np.log(median)), _LEAST_EXPONENT)
+    exponent = 1.0 if median >= _DIM else max(float(np.log(_BRIGHTER) / np.log(median)), _LEAST_EXPONENT)
     return Stretch(slope, -low * slope, exponent)
 
 
