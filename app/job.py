@@ -1,4 +1,4 @@
-"""A restoration in a thread of its own: the page watches it and may stop it."""
+"""Work in a thread of its own: the page watches it and may stop it."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore_cli.application import explain
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from turbrestore.core.decision import Decision
 
-    from .restoring import Restored
+Result_co = TypeVar("Result_co", covariant=True)
+Kind = Literal["restore", "steady", "several"]
 
 
 class Stopped(BaseException):
@@ -55,13 +54,14 @@ class Bar:
         return (time.monotonic() - self.begun) * (self.total - self.done) / self.done
 
 
-class Job:
+class Job(Generic[Result_co]):
     """Work in a thread of its own.
 
     Parameters
     ----------
     work : callable
-        Takes the job, which it reports to, and returns what was restored, the video that was written, or None.
+        Takes the job, which it reports to, and returns its result.
+    kind : {"restore", "steady", "several"}
 
     Attributes
     ----------
@@ -73,17 +73,19 @@ class Job:
     decisions : list of Decision
     images : dict of str to ndarray
         Image of every stage that is done.
-    result : Restored, Path or None
+    result : object or None
+        What the work returned, once it is done.
     seconds : float
         What it took, once it is done.
     """
 
-    def __init__(self, work: Callable[[Job], Restored | Path | None]) -> None:
+    def __init__(self, work: Callable[[Job[Result_co]], Result_co], kind: Kind = "restore") -> None:
+        self.kind = kind
         self.state, self.message = "running", ""
         self.bars: dict[str, Bar] = {}
         self.decisions: list[Decision] = []
         self.images: dict[str, FloatArray] = {}
-        self.result: Restored | Path | None = None
+        self.result: Result_co | None = None
         self.seconds = 0.0
         self._begun = time.monotonic()
         self._stop = threading.Event()
@@ -127,7 +129,7 @@ class Job:
         if self._stop.is_set():
             raise Stopped
 
-    def _run(self, work: Callable[[Job], Restored | Path | None]) -> None:
+    def _run(self, work: Callable[[Job[Result_co]], Result_co]) -> None:
         try:
             self.result = work(self)
             self.check()

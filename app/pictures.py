@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-from turbrestore.core.arrays import FloatArray, from_unit
-from turbrestore.display.preview import encode_image, shrink
+from turbrestore.core.arrays import FloatArray
+from turbrestore.display.preview import encode_image
+from turbrestore.report.pictures import to_levels
 
 # Longest side that the browser gets, pixels.
 LONGEST = 4096
@@ -27,11 +28,11 @@ class Pictures:
         self._files: OrderedDict[str, bytes] = OrderedDict()
         self._count = 0
 
-    def put(self, image: FloatArray) -> str:
-        """Encode an image, and return its address."""
+    def put(self, image: FloatArray, shown: tuple[float, float] = (0.0, 1.0)) -> str:
+        """Encode an image, with the intensities that are black and white, and return its address."""
         self._count += 1
         name = f"{self._count}.png"
-        self._files[name] = encode_image(from_unit(shrink(image, LONGEST), 8))
+        self._files[name] = encode_image(to_levels(image, *shown, LONGEST))
         while len(self._files) > _KEPT:
             self._files.popitem(last=False)
         return f"{self._address}/{name}"
@@ -41,5 +42,5 @@ class Pictures:
         return self._files.get(name)
 
     def clear(self) -> None:
-        """Let all go."""
+        """Discard all."""
         self._files.clear()

@@ -81,7 +81,7 @@ class Restored:
         return self.source.numbers[len(self.source) // 2]
 
 
-def restore_order(order: Order, job: Job, earlier: Restored | None = None) -> Restored:
+def restore_order(order: Order, job: Job[object], earlier: Restored | None = None) -> Restored:
     """Run the chain as ``turbrestore restore`` does.
 
     Parameters
@@ -114,6 +114,8 @@ def restore_order(order: Order, job: Job, earlier: Restored | None = None) -> Re
 def preview_order(order: Order, shape: tuple[int, ...]) -> Order:
     """Reduce an order to a small part of the region and to few frames, so that it takes seconds.
 
+    Where an object is followed, which may be anywhere in the region, the region stays as it is.
+
     Parameters
     ----------
     order : Order
@@ -132,9 +134,12 @@ def preview_order(order: Order, shape: tuple[int, ...]) -> Order:
     start, stop, step = order.selection.frame_range() or (0, None, None)
     first, every = start or 0, step or 1
     last = min(shape[0] if stop is None else stop, first + PREVIEW_FRAMES * every)
+    frames = f"{first}:{last}" if step is None else f"{first}:{last}:{step}"
+    if order.selection.crop_to_object:
+        return dataclasses.replace(order, selection=dataclasses.replace(order.selection, frames=frames))
     x, y, width, height = order.selection.region() or (0, 0, shape[2], shape[1])
     w, h = min(width, PREVIEW_SIDE), min(height, PREVIEW_SIDE)
-    region: Roi = (x + (width - w) // 2, y + (height - h) // 2, w, h)
-    frames = f"{first}:{last}" if step is None else f"{first}:{last}:{step}"
+    # The mosaic of a raw clip repeats every two pixels.
+    region: Roi = (x + (width - w) // 4 * 2, y + (height - h) // 4 * 2, w, h)
     selection = dataclasses.replace(order.selection, frames=frames, roi=",".join(map(str, region)))
     return dataclasses.replace(order, selection=selection)

@@ -108,10 +108,10 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
 
     @app.get("/videos/{key}/{name}", response_class=Response)
     def video(key: str, name: str) -> Response:
-        path = next((tab.video for tab in tuple(tabs) if secrets.compare_digest(tab.key, key)), None)
-        if path is None or not path.is_file():
+        found = next((tab.steadied for tab in tuple(tabs) if secrets.compare_digest(tab.key, key)), None)
+        if found is None or not found.film_path.is_file():
             return Response(status_code=404)
-        return FileResponse(path, media_type="video/mp4", headers={"Cache-Control": "no-store"})
+        return FileResponse(found.film_path, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
     def stop_all() -> None:
         for tab in tabs:
@@ -139,7 +139,7 @@ async def _show(shown: dict[str, tuple[Tab, str]], tabs: set[Tab], folders: Fold
     """Show a tab of the browser what it had before it was loaded again, or a new page."""
     from nicegui import ui
 
-    from .page import Page, add_styles_and_scripts
+    from .views.page import Page, add_styles_and_scripts
 
     add_styles_and_scripts()
     client = ui.context.client

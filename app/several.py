@@ -10,7 +10,7 @@ from pathlib import Path
 from turbrestore.core.errors import ConfigurationError
 from turbrestore_cli.batch_plan import name_outputs
 
-from .folders import Folders
+from .folders import Entry, Folders
 from .job import Job, Stopped, one_line
 from .restoring import Order, restore_order
 from .saving import Outputs, check_outputs, save
@@ -23,13 +23,13 @@ class Row:
     Attributes
     ----------
     name : str
-    state : {"waits", "at work", "done", "failed", "stopped"}
+    state : {"waiting", "running", "done", "failed", "stopped"}
     words : str
         Where the result is, or why there is none.
     """
 
     name: str
-    state: str = "waits"
+    state: str = "waiting"
     words: str = ""
 
 
@@ -92,7 +92,16 @@ def plan_several(clips: Sequence[Path], folder: str, like: Order, overwrite: boo
     ]
 
 
-def restore_all(tasks: Sequence[Task], rows: list[Row], job: Job) -> None:
+def inputs_of(entries: Sequence[Entry]) -> list[Entry]:
+    """Leave out folders, and videos that turbrestore itself has written: their settings lie beside them."""
+    return [
+        entry
+        for entry in entries
+        if not entry.is_folder and not entry.path.with_name(f"{entry.path.name}.toml").exists()
+    ]
+
+
+def restore_all(tasks: Sequence[Task], rows: list[Row], job: Job[None]) -> None:
     """Restore clips one after the other, as ``turbrestore restore`` does, and save each at once.
 
     Parameters
@@ -106,7 +115,7 @@ def restore_all(tasks: Sequence[Task], rows: list[Row], job: Job) -> None:
     for place, task in enumerate(tasks):
         try:
             job.begin_next()
-            rows[place] = dataclasses.replace(rows[place], state="at work")
+            rows[place] = dataclasses.replace(rows[place], state="running")
             rows[place] = dataclasses.replace(rows[place], state="done", words=_restore(task, job))
         except Stopped:
             rows[place:] = [dataclasses.replace(row, state="stopped") for row in rows[place:]]
@@ -116,7 +125,7 @@ def restore_all(tasks: Sequence[Task], rows: list[Row], job: Job) -> None:
             rows[place] = dataclasses.replace(rows[place], state="failed", words=reason)
 
 
-def _restore(task: Task, job: Job) -> str:
+def _restore(task: Task, job: Job[None]) -> str:
     """Restore and save one clip; return what to say of it."""
     check_outputs(task.outputs, task.order)
     restored = restore_order(task.order, job)

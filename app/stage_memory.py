@@ -54,4 +54,4 @@ class StageMemory:
         """Return None: an interrupted filter starts anew."""
 
     def checkpoint(self, state: object) -> None:
-        """Let the state go."""
+        """Discard the checkpoint."""

@@ -1,4 +1,4 @@
-"""A steadied video as the page orders it: what ``turbrestore steady`` writes, while the page watches."""
+"""A steadied video as the page orders it: what ``turbrestore steady`` writes, and a film of it beside its input."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ from typing import TYPE_CHECKING
 from turbrestore.core.arrays import FloatArray
 from turbrestore.footage.content import clean_source, keep_all
 from turbrestore.io.output import check_output
-from turbrestore.io.video import write_video
+from turbrestore.io.video import open_frames, write_video
+from turbrestore.report.film import Film, film_length, write_film
 from turbrestore.steady.settings import SteadyParams
-from turbrestore_cli.inputs import open_checked
+from turbrestore_cli.inputs import files_read, open_checked
 from turbrestore_cli.options import Machine, Selection
-from turbrestore_cli.output import write_settings
+from turbrestore_cli.output import changed_flags, write_settings
 from turbrestore_cli.steady import USUAL_RATE, Output, settings_record
 
 if TYPE_CHECKING:
     from turbrestore.io.source import FrameSource
 
     from .job import Job
+
+# Quality of the film as a rate factor of H.264.
+_RATE_FACTOR = 17
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,8 @@ class SteadyOrder:
     selection : Selection
         Range of frames and region.
     params : SteadyParams
+    written : Output
+        Codec and quality.
     overwrite : bool
         Replace existing files.
     """
@@ -44,6 +50,7 @@ class SteadyOrder:
     output: Path
     selection: Selection = field(default_factory=Selection)
     params: SteadyParams = field(default_factory=SteadyParams)
+    written: Output = field(default_factory=Output)
     overwrite: bool = False
 
     @property
@@ -53,17 +60,27 @@ class SteadyOrder:
 
     def check(self) -> None:
         """Raise an error if something could not be written."""
-        check_output(self.output, [self.path], self.overwrite, (".mp4",))
-        check_output(self.settings, [self.path], self.overwrite, suffixes=None)
+        inputs = files_read(self.selection, self.path)
+        check_output(self.output, inputs, self.overwrite, (".mp4",))
+        check_output(self.settings, inputs, self.overwrite, suffixes=None)
 
     def command_line(self, input: Path, output: Path) -> str:
         """Return the command that repeats the order, with the paths as it is to name them."""
-        chosen = {"camera": self.params.camera, "frames": self.selection.frames, "roi": self.selection.roi}
-        flags = [f"--{name}={value}" for name, value in chosen.items() if value not in (None, SteadyParams().camera)]
-        return shlex.join(["turbrestore", "steady", str(input), str(output), *flags])
+        usual = settings_record(Machine(), Selection(), SteadyParams(), Output())
+        flags = changed_flags(settings_record(Machine(), self.selection, self.params, self.written), usual)
+        return shlex.join(["turbrestore", "steady", *map(str, (input, output)), *flags])
 
 
-def steady_order(order: SteadyOrder, job: Job) -> Path:
+@dataclass(frozen=True)
+class Steadied:
+    """A video that was written, and the film of it and its input that the page plays."""
+
+    video: Path
+    film: Film
+    film_path: Path
+
+
+def steady_order(order: SteadyOrder, job: Job[object], film_path: Path) -> Steadied:
     """Steady a video as ``turbrestore steady`` does, and write it with its settings.
 
     Parameters
@@ -71,11 +88,12 @@ def steady_order(order: SteadyOrder, job: Job) -> Path:
     order : SteadyOrder
     job : Job
         Hears of every frame.
+    film_path : Path
+        Where the film goes, .mp4; an earlier one is replaced.
 
     Returns
     -------
-    Path
-        The video.
+    Steadied
 
     Raises
     ------
@@ -85,16 +103,26 @@ def steady_order(order: SteadyOrder, job: Job) -> Path:
     order.check()
     source, report = open_checked(order.path, order.selection)
     source = clean_source(source, keep_all(report))
-    machine, written = Machine(), Output()
+    machine, fps = Machine(), source.fps or USUAL_RATE
     images = _images(source, order.params, machine, job)
-    write_video(order.output, images, source.fps or USUAL_RATE, source.bit_depth, order.overwrite, companion=source)
-    write_settings(order.settings, settings_record(machine, order.selection, order.params, written))
-    return order.output
+    encoding = order.written.encoding()
+    write_video(order.output, images, fps, source.bit_depth, order.overwrite, encoding, companion=source)
+    write_settings(order.settings, settings_record(machine, order.selection, order.params, order.written))
+    count = film_length(len(source), *source.shape[1:3])
+    film_path.unlink(missing_ok=True)
+    film = write_film(film_path, _pairs(source, order.output, count, job), count, fps, _RATE_FACTOR)
+    return Steadied(order.output, film, film_path)
 
 
-def _images(source: FrameSource, params: SteadyParams, machine: Machine, job: Job) -> Iterator[FloatArray]:
+def _images(source: FrameSource, params: SteadyParams, machine: Machine, job: Job[object]) -> Iterator[FloatArray]:
     from turbrestore.steady.video import steady_frames
 
     for number, frame in enumerate(steady_frames(source, params, machine.runtime()), 1):
         job.progress("steady", number, len(source))
         yield frame.image
+
+
+def _pairs(source: FrameSource, output: Path, count: int, job: Job[object]) -> Iterator[tuple[FloatArray, FloatArray]]:
+    for number, pair in zip(range(1, count + 1), zip(source, open_frames(output), strict=True), strict=False):
+        job.progress("film", number, count)
+        yield pair

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 import secrets
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from turbrestore.core.errors import DataError
 from turbrestore.io.video import VIDEO_SUFFIXES
 
 from .clip import Clip, open_clip
 from .folders import Folders
-from .job import Job
+from .job import Job, Kind
 from .pictures import Pictures
 from .restoring import Order, Restored, preview_order, restore_order
 from .several import Row, Task, restore_all
-from .steadying import SteadyOrder, steady_order
+from .steadying import Steadied, SteadyOrder, steady_order
 
 if TYPE_CHECKING:
     from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+    from turbrestore.settings import RestoreParams
+
+Result = TypeVar("Result")
 
 # Seconds to wait for the end of a run whose tab is gone.
 _PATIENCE = 2.0
@@ -46,7 +50,7 @@ class Tab:
         What the user has chosen of the deconvolution; None leaves it to be measured.
     border : {"keep", "crop"}
         What the user has chosen of the border.
-    video : Path or None
+    steadied : Steadied or None
         The newest steadied video of the clip.
     rows : list of Row
         What becomes of several clips.
@@ -58,14 +62,14 @@ class Tab:
         self.key = secrets.token_urlsafe(12)
         self.pictures = Pictures(f"pictures/{self.key}")
         self.clip: Clip | None = None
-        self.job: Job | None = None
+        self.job: Job[object] | None = None
         self.restored: Restored | None = None
         self.tuned: DeconvolutionParams | None = None
         self.border: Literal["keep", "crop"] = "keep"
-        self.video: Path | None = None
+        self.steadied: Steadied | None = None
         self.rows: list[Row] = []
         self.closed = False
-        self._uploads: tempfile.TemporaryDirectory[str] | None = None
+        self._own: tempfile.TemporaryDirectory[str] | None = None
 
     @property
     def busy(self) -> bool:
@@ -80,11 +84,11 @@ class Tab:
         TurbrestoreError
             It cannot be used.
         """
-        uploaded = self._uploads is not None and path.is_relative_to(self._uploads.name)
+        uploaded = self._own is not None and path.is_relative_to(self._own.name)
         clip = open_clip(path, Path(path.name) if uploaded else self.folders.shown(path))
         self.stop()
         self.clip, self.job, self.restored = clip, None, None
-        self.tuned, self.border, self.video = None, "keep", None
+        self.tuned, self.border, self.steadied = None, "keep", None
         return clip
 
     def place_for(self, name: str) -> Path:
@@ -92,43 +96,66 @@ class Tab:
         clean = "".join(sign for sign in Path(name.replace("\\", "/")).name if sign.isprintable())[-100:].lstrip(".-")
         if Path(clean).suffix.lower() not in VIDEO_SUFFIXES:
             raise DataError(f"{clean or 'upload'}: expected one of {', '.join(VIDEO_SUFFIXES)}")
-        if self._uploads is None:
-            self._uploads = tempfile.TemporaryDirectory(prefix="turbrestore-")
-        return Path(self._uploads.name) / clean
+        return self._folder() / clean
 
-    def run(self, order: Order) -> Job:
+    def chosen(self, params: RestoreParams) -> RestoreParams:
+        """Put into the settings of a run what was tuned."""
+        deconvolution = params.deconvolution if self.tuned is None else self.tuned
+        return dataclasses.replace(params, deconvolution=deconvolution, border=self.border)
+
+    @property
+    def tuned_order(self) -> Order | None:
+        """The order of the result with what was tuned since; None where there is no result."""
+        if self.restored is None:
+            return None
+        order = self.restored.order
+        return dataclasses.replace(order, params=self.chosen(order.params))
+
+    @property
+    def pending(self) -> bool:
+        """Whether something was tuned that the result does not have yet."""
+        return self.restored is not None and self.tuned_order != self.restored.order
+
+    def apply(self) -> None:
+        """Deconvolve the whole image by what was tuned."""
+        order = self.tuned_order
+        if order is not None and not self.busy:
+            self.run(order)
+
+    def run(self, order: Order) -> Job[Restored]:
         """Restore in a thread; the result becomes that of the tab when it is done."""
         earlier = self.restored
 
-        def work(job: Job) -> Restored:
+        def work(job: Job[Restored]) -> Restored:
             restored = restore_order(order, job, earlier)
             job.check()
             self.restored = restored
             return restored
 
-        return self._start(work)
+        return self._start("restore", work)
 
-    def preview(self, order: Order) -> Job:
+    def preview(self, order: Order) -> Job[Restored]:
         """Restore a small part in a thread."""
         assert self.clip is not None
         part = preview_order(order, self.clip.source.shape)
-        return self._start(lambda job: restore_order(part, job))
+        return self._start("restore", lambda job: restore_order(part, job))
 
-    def steady(self, order: SteadyOrder) -> Job:
+    def steady(self, order: SteadyOrder) -> Job[Steadied]:
         """Steady the clip in a thread; the video becomes that of the tab when it is done."""
+        film = self._folder() / ".film.mp4"
 
-        def work(job: Job) -> Path:
-            video = steady_order(order, job)
+        def work(job: Job[Steadied]) -> Steadied:
+            steadied = steady_order(order, job, film)
             job.check()
-            self.video = video
-            return video
+            self.steadied = steadied
+            return steadied
 
-        return self._start(work)
+        return self._start("steady", work)
 
-    def restore_all(self, tasks: Sequence[Task]) -> Job:
+    def restore_all(self, tasks: Sequence[Task]) -> Job[None]:
         """Restore several clips in a thread, one after the other."""
         self.rows = [Row(str(task.name)) for task in tasks]
-        return self._start(lambda job: restore_all(tasks, self.rows, job))
+        return self._start("several", lambda job: restore_all(tasks, self.rows, job))
 
     def stop(self) -> None:
         """End the run, if there is one."""
@@ -136,16 +163,23 @@ class Tab:
             self.job.stop()
 
     def close(self) -> None:
-        """End the run and remove what was uploaded."""
+        """End the run and remove what was uploaded, and the film."""
         self.closed = True
         self.stop()
         if self.job is not None:
             self.job.join(_PATIENCE)
         self.pictures.clear()
-        if self._uploads is not None:
-            self._uploads.cleanup()
+        if self._own is not None:
+            self._own.cleanup()
 
-    def _start(self, work: Callable[[Job], Restored | Path | None]) -> Job:
+    def _folder(self) -> Path:
+        """Return the folder of files that go with the tab."""
+        if self._own is None:
+            self._own = tempfile.TemporaryDirectory(prefix="turbrestore-")
+        return Path(self._own.name)
+
+    def _start(self, kind: Kind, work: Callable[[Job[Result]], Result]) -> Job[Result]:
         self.stop()
-        self.job = Job(work)
-        return self.job
+        job = Job(work, kind)
+        self.job = job
+        return job

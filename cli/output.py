@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FLOW_FILE = (".npy", FITS_OUTPUT_SUFFIX)
+_SHORT = {"deconvolution.sigma": "sigma"}
 _IMAGES = ("frame", "mean", "centroid", "filtered", "deconvolved")
 
 
@@ -237,20 +238,21 @@ def repeating_command(input: Path, output: Path, record: dict[str, Any]) -> tupl
     paths = (str(path) if not str(path).startswith("-") else f"./{path}" for path in (input, output))
     preset: Preset = record["preset"]
     usual = settings_record(PRESETS[preset], Selection(), None, Machine(), None)
-    return ("turbrestore", "restore", *paths, *_flags(record, usual, ""))
+    return ("turbrestore", "restore", *paths, *changed_flags(record, usual))
 
 
-def _flags(record: dict[str, Any], usual: dict[str, Any], prefix: str) -> Iterator[str]:
+def changed_flags(record: dict[str, Any], usual: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yield the flags of all settings that differ from the usual ones, in their short form."""
     for name, value in record.items():
         flag = name.replace("_", "-")
         if isinstance(value, dict):
-            yield from _flags(value, usual[name], f"{prefix}{flag}.")
+            yield from changed_flags(value, usual[name], f"{prefix}{flag}.")
         elif value == usual[name]:
             continue
         elif isinstance(value, bool):
             yield f"--{prefix}{flag if value else f'no-{flag}'}"
         else:
-            yield f"--{prefix}{flag}={value}"
+            yield f"--{_SHORT.get(prefix + flag, prefix + flag)}={value}"
 
 
 def _without_none(record: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import pytest
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError, OutputError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
-from turbrestore.io.video import write_video
+from turbrestore.io.video import open_frames, write_video
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.settings import RestoreParams
 from turbrestore.steady.settings import SteadyParams
@@ -26,12 +26,13 @@ from turbrestore_app.job import Job, one_line
 from turbrestore_app.pictures import Pictures
 from turbrestore_app.restoring import Order, preview_order, restore_order
 from turbrestore_app.saving import Outputs, check_outputs, command_line, save
-from turbrestore_app.several import plan_several
+from turbrestore_app.several import inputs_of, plan_several
 from turbrestore_app.steadying import SteadyOrder
 from turbrestore_app.tab import Tab
 from turbrestore_app.tuning import impressions, part_around, tuned_params
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.options import Selection
+from turbrestore_cli.steady import Output
 
 QUICK = RestoreParams(centroid=CentroidParams(iterations=1), deconvolution=DeconvolutionParams(sigma=1.0, iterations=5))
 
@@ -182,6 +183,8 @@ class TestOrders:
         assert (selection.frames, selection.roi) == ("10:58:2", "220,50,160,100")
         selection = preview_order(Order(Path("a.mkv")), (9, 100, 64)).selection
         assert (selection.frames, selection.roi) == ("0:9", "0,0,64,100")
+        order = Order(Path("a.ser"), Selection(crop_to_object=True))
+        assert preview_order(order, (99, 100, 640)).selection == Selection(frames="0:24", crop_to_object=True)
 
 
 class TestTuning:
@@ -297,6 +300,13 @@ class TestSeveral:
             plan_several([tmp_path / "a.mkv"], "../elsewhere", Order(tmp_path / "a.mkv"), False, tab.folders)
         assert not (tmp_path.parent / "elsewhere").exists()
 
+    def test_what_turbrestore_has_written_is_no_input(self, tab, tmp_path):
+        (tmp_path / "a.steady.mp4").touch()
+        (tmp_path / "a.steady.mp4.toml").touch()
+        entries = tab.folders.listing(tmp_path)
+        assert "a.steady.mp4" in [entry.name for entry in entries]
+        assert [entry.name for entry in inputs_of(entries)] == ["a.mkv", "b.mkv", "bad.mkv"]
+
 
 class TestSteady:
     def test_the_command_gives_the_same_files(self, folder, tmp_path):
@@ -305,8 +315,11 @@ class TestSteady:
             folder / "clip.mkv", tmp_path / "a.mp4", Selection(roi="0,0,64,48"), SteadyParams(camera="lock")
         )
         job = ended(tab.steady(order))
-        assert (job.state, job.result, tab.video) == ("done", tmp_path / "a.mp4", tmp_path / "a.mp4"), job.message
-        assert job.bars["steady"].total == 6
+        assert (job.state, job.result, tab.steadied.video) == ("done", tab.steadied, tmp_path / "a.mp4"), job.message
+        assert [bar.total for bar in job.bars.values()] == [6, 6]
+        read = [open_frames(path).read() for path in (tab.steadied.film_path, folder / "clip.mkv", order.output)]
+        film, clip, video = (frames if frames.ndim == 3 else frames.mean(axis=3) for frames in read)
+        assert np.abs(film - np.concatenate([clip[:, :48, :64], video], axis=2)).mean() < 0.03
         command = shlex.split(order.command_line(folder / "clip.mkv", tmp_path / "b.mp4"))
         assert main([*command[1:], "--quiet"]) == 0
         for suffix in (".mp4", ".mp4.toml"):
@@ -315,13 +328,24 @@ class TestSteady:
             order.check()
         with pytest.raises(ConfigurationError, match=r"ends in \.mp4"):
             replace(order, output=tmp_path / "a.mkv").check()
+        tab.close()
+        assert not tab.steadied.film_path.exists()
 
     def test_a_stop_leaves_nothing(self, folder, tmp_path):
         tab = Tab(Folders(folder))
         job = tab.steady(SteadyOrder(folder / "clip.mkv", tmp_path / "a.mp4"))
         tab.stop()
         assert ended(job).state == "stopped"
-        assert (tab.video, list(tmp_path.iterdir())) == (None, [])
+        assert (tab.steadied, list(tmp_path.iterdir())) == (None, [])
+        tab.close()
+
+    def test_options_are_those_of_the_command(self, folder, tmp_path):
+        params = SteadyParams(camera="steady", sigma=0.8, reach=6, largest=3.5)
+        selection, written = Selection(frames="0:4"), Output("hevc", 20)
+        order = SteadyOrder(folder / "clip.mkv", tmp_path / "a.mp4", selection, params, written)
+        flags = order.command_line(Path("clip.mkv"), Path("a.mp4")).split()[4:]
+        expected = "--camera=steady --codec=hevc --crf=20 --frames=0:4 --largest=3.5 --reach=6 --sigma=0.8"
+        assert " ".join(sorted(flags)) == expected
 
 
 def test_a_clip_has_the_numbers_of_its_file(tmp_path):
@@ -350,7 +374,8 @@ def test_only_the_newest_pictures_are_kept():
 def test_pages_of_one_tab_leave_in_any_order(monkeypatch, tmp_path):
     from nicegui import ui
 
-    from turbrestore_app import page, server
+    from turbrestore_app import server
+    from turbrestore_app.views import page
 
     async def nothing(*_):
         """Stand in for what needs a browser."""

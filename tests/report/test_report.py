@@ -21,12 +21,13 @@ from turbrestore.blind.guards import GuardReading
 from turbrestore.core.arrays import from_unit
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, OutputError
-from turbrestore.display.plots import plot_flow
+from turbrestore.display.plots import plot_convergence, plot_eigenvalues, plot_filter, plot_flow
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.report import check_report, facts, pictures, render_report, write_report
+from turbrestore.report.alignment import align_curves, align_map, take_title
 from turbrestore.report.vector import inline_svg
 from turbrestore.runs.run_files import MEAN, RUN_FILES, load_run, save_run
 from turbrestore.runs.run_record import RunRecord, describe_run
@@ -34,7 +35,7 @@ from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.scratch import new_stack
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.application import build
-from turbrestore_cli.options import Machine, Selection
+from turbrestore_cli.options import Machine, Selection, known_sigma
 from turbrestore_cli.output import repeating_command, settings_record
 
 EVIL = "<script>alert(1)</script>\"'&.mkv"
@@ -183,6 +184,15 @@ class TestPage:
         assert (fact.value, fact.note, fact.doubtful) == ("0.00 px", "cannot be measured", True)
         assert "could not be estimated" in [fact.note for fact in facts.headline(unknown)]
 
+    def test_doubts_stand_at_the_top(self, whole, run):
+        sure = render_report(dataclasses.replace(whole, guard_readings=()), run)
+        doubted = dataclasses.replace(run, warnings=("1 duplicated: frame 3 left out",))
+        page = render_report(whole, doubted)
+        assert page.index("frame 3 left out") < page.index('<dl class="headline">')
+        assert page.count("frame 3 left out") == 1
+        assert "times as sharp as their mean" in sure
+        assert facts.verdict(whole, doubted).checks[0] == doubted.warnings[0]
+
     def test_settings_that_differ_are_marked(self, run):
         found = facts.settings(run)
         assert [setting.name for setting in found if setting.changed] == ["centroid.iterations"]
@@ -254,11 +264,45 @@ class TestPictures:
         gallery = pictures.encode_gallery({"mean": ramp, "result": ramp}, 0)
         assert "black is 0.09" in gallery.encoding and "white 0.11" in gallery.encoding
         assert pictures.encode_gallery({"result": 50 * ramp - 4.9}, 0).encoding == "8 bits, lossless"
+        # A dark scene keeps its black, so that a background of zero stays black.
+        assert "black is 0 and white 0.3" in pictures.encode_gallery({"result": 30 * ramp - 3}, 0).encoding
+
+    def test_shadows_are_lifted_only_where_most_of_the_scene_lies_in_them(self):
+        ramp = np.tile(np.linspace(0, 1, 256, dtype=np.float32), (40, 1))
+        night = np.where(ramp > 0.98, np.float32(1), 0.12 * ramp)
+        plain, dark = (pictures.encode_gallery({"result": image}, 0).stretch for image in (ramp, night))
+        assert plain.exponent == 1.0
+        # Of a ramp that reaches from .2 to .7 both ends become full.
+        level = pictures.encode_gallery({"result": 0.2 + 0.5 * ramp}, 0).stretch
+        assert level.slope * 0.2 + level.intercept == pytest.approx(0, abs=0.02)
+        assert level.slope * 0.7 + level.intercept == pytest.approx(1, abs=0.02)
+        # A bright disc on black is no scene in shadows.
+        disc = np.where(ramp > 0.9, np.float32(0.8), np.float32(0))
+        assert pictures.encode_gallery({"result": disc}, 0).stretch.exponent == 1.0
+        assert 0.45 <= dark.exponent < 1
 
     def test_result_stands_once(self, whole, run):
         assert list(pictures.stages(whole, run.frame)) == ["frame", "mean", "centroid", "filtered", "result"]
         kept = dataclasses.replace(whole, image=whole.filtered.image.copy())
         assert list(pictures.stages(kept, run.frame)) == ["frame", "mean", "centroid", "result"]
+
+
+def test_axes_of_all_figures_line_up():
+    curves = [
+        plot_convergence([0.8, 0.2], 0.1),
+        plot_filter([1.0, 0.5], [0.2, 1200.0]),
+        plot_eigenvalues(np.array([0.5 + 0.5j, 0.5 - 0.5j])),
+    ]
+    maps = [plot_flow(np.full((24, 32, 2), size)) for size in (1.0, 1e-3)]
+    for figures, align in ((curves, align_curves), (maps, align_map)):
+        for figure in figures:
+            assert "\n" not in take_title(figure)
+            align(figure)
+            figure.draw_without_rendering()
+        boxes = [axes.get_window_extent() for figure in figures for axes in (figure.axes[-1], figure.axes[0])]
+        heights = {figure.get_size_inches()[1] for figure in figures}
+        assert len(heights) == 1
+        assert len({round(box.x0, 3) for box in boxes[1::2]}) == len({round(box.y0, 3) for box in boxes[::2]}) == 1
 
 
 def test_svg_has_no_styles_and_scoped_names():
@@ -469,7 +513,10 @@ class TestCommand:
         words = repeating_command(tmp_path / "-in put.mkv", tmp_path / "o.png", record)
         assert len(words) == 4 + 11
         _, bound, _ = build().parse_args(words[1:], exit_on_error=False, print_error=False)
-        assert bound.arguments["params"] == params
+        read = bound.arguments["params"]
+        deconvolution = known_sigma(bound.arguments["sigma"], read.deconvolution)
+        assert dataclasses.replace(read, deconvolution=deconvolution) == params
+        assert "--sigma=1e-07" in words
         assert bound.arguments["selection"] == selection
         assert bound.arguments["machine"] == machine
         assert bound.arguments["memory_limit"] == 2e9

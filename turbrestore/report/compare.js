@@ -4,10 +4,10 @@
   const byId = (id) => document.getElementById(id);
   // The app replaces the page's comparison while this one still observes its stage, so every part is looked up once.
   const stage = byId("stage"), line = byId("line"), divider = byId("divider"), zoom = byId("zoom");
-  const zoomIn = byId("in"), zoomOut = byId("out");
+  const zoomIn = byId("in"), zoomOut = byId("out"), stretch = byId("stretch");
   const selects = { left: byId("left"), right: byId("right") };
   const layers = [...stage.querySelectorAll(".layer")];
-  const images = layers.map((layer) => layer.querySelector("img"));
+  const images = layers.map((layer) => layer.querySelector("img, canvas"));
   // The property would be the width on the page.
   const [width, height] = ["width", "height"].map((name) => Number(images[0].getAttribute(name)));
   const LARGEST = 32, STEP = 1.25, REACH = 18, NUDGE = 40;
@@ -133,6 +133,8 @@
     KEYS[event.key]();
   });
 
+  const showStretch = () => stage.classList.toggle("stretched", stretch.checked);
+  stretch.addEventListener("change", showStretch);
   divider.addEventListener("input", split);
   for (const select of Object.values(selects)) select.addEventListener("change", split);
   zoomIn.addEventListener("click", () => zoomTo(scale * STEP));
@@ -146,6 +148,7 @@
   stage.setAttribute("role", "group");
   stage.setAttribute("aria-label", "Two images, split by the divider. Plus and minus zoom, arrows pan, 0 fits.");
   for (const part of [line, byId("choice"), byId("view")]) part.hidden = false;
+  showStretch();
   new ResizeObserver(() => fitted ? fit() : draw()).observe(stage);
   fit();
 })();

@@ -1,7 +1,8 @@
-"""Two images split by a divider, with zoom: a part of the report and of the app."""
+"""Two images, or two panels of a film, split by a divider, with zoom: a part of the reports and of the app."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,10 @@ from ..core.extras import missing_package
 if TYPE_CHECKING:
     import jinja2
 
-    from .pictures import Gallery
+    from .film import Film, Layer
+    from .pictures import Gallery, Picture, Stretch
+
+_KEYS = "Drag to pan; arrow keys, + and − work on the image."
 
 
 def comparison(gallery: Gallery) -> str:
@@ -32,7 +36,27 @@ def comparison(gallery: Gallery) -> str:
     ConfigurationError
         Jinja2 is not installed.
     """
-    return environment().get_template("compare.html").render(gallery=gallery)
+    pictures = gallery.pictures
+    return _markup(pictures, pictures[-1].key, gallery.stretch, f"{_KEYS} {gallery.encoding}.")
+
+
+def film_comparison(film: Film, address: str) -> str:
+    """Return the markup for comparing the panels of a film while it plays; it needs ``film.js`` besides."""
+    hint = f"{_KEYS} Space plays, comma and full stop show single frames. This film is compressed."
+    return _markup(film.layers, "output", film.stretch, hint, film=film, address=address)
+
+
+def _markup(
+    layers: Sequence[Picture | Layer],
+    right: str,
+    stretch: Stretch,
+    hint: str,
+    film: Film | None = None,
+    address: str = "",
+) -> str:
+    """Fill the template that images and films share."""
+    template = environment().get_template("compare.html")
+    return template.render(layers=layers, right=right, stretch=stretch, hint=hint, film=film, address=address)
 
 
 def environment() -> jinja2.Environment:

@@ -54,6 +54,14 @@ class Fact:
 
 
 @dataclass(frozen=True)
+class Verdict:
+    """What a run gained, in a sentence without its full stop, and what a person should check."""
+
+    gained: str
+    checks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Setting:
     """One setting.
 
@@ -103,11 +111,9 @@ def headline(restoration: Restoration) -> list[Fact]:
         Fact("Frames", str(restoration.frame_count), f"{restoration.train} of them for training"),
         Fact("Motion", f"{deviation:.2f} px", "root mean square"),
     ]
-    x, y, width, height = restoration.crop
-    mean = restoration.mean[y : y + height, x : x + width]
-    contrast = np.ptp(mean)
-    if contrast > 0:
-        facts.append(Fact("Sharpness", f"×{sharpness(restoration.image, mean):.2f}", "relative to the mean"))
+    gain = _sharpness_gain(restoration)
+    if gain is not None:
+        facts.append(Fact("Sharpness", f"×{gain:.2f}", "relative to the mean"))
     if restoration.deconvolution is not None:
         sigma = restoration.deconvolution.sigma
         facts.append(Fact("Blur removed", f"{sigma:.2f} px" if sigma > 0 else "none", _blur_note(restoration)))
@@ -136,20 +142,16 @@ def findings(restoration: Restoration) -> list[Fact]:
     ]
 
 
-def remarks(restoration: Restoration, run: RunRecord) -> list[str]:
-    """Return the warnings of the reader and the notes of the stages.
-
-    Parameters
-    ----------
-    restoration : Restoration
-    run : RunRecord
-
-    Returns
-    -------
-    list of str
-    """
+def verdict(restoration: Restoration, run: RunRecord) -> Verdict:
+    """Say what was gained, and list all doubts: of the reader, of the stages, and of what they measured."""
+    gained = f"{restoration.frame_count} frames became one image"
+    gain = _sharpness_gain(restoration)
+    if gain is not None:
+        gained += f", {gain:.2f} times as sharp as their mean"
+    mean = [f"{one.choice}: {one.reason}" for one in restoration.decisions if one.subject == "structure"]
     notes = () if restoration.dynamics is None else restoration.dynamics.notes
-    return [*run.warnings, *notes]
+    doubts = [f"{fact.name}: {fact.note}" for fact in findings(restoration) if fact.doubtful]
+    return Verdict(gained, (*mean, *run.warnings, *notes, *doubts))
 
 
 def settings(run: RunRecord, defaults: Mapping[str, Any] | None = None) -> list[Setting]:
@@ -189,6 +191,13 @@ def laps(restoration: Restoration) -> list[Lap]:
         found.append(Lap(_STAGE_NAMES.get(name, name), seconds, 100 * start / total, 100 * seconds / total))
         start += seconds
     return found
+
+
+def _sharpness_gain(restoration: Restoration) -> float | None:
+    """Sharpness of the image relative to the mean of the frames; None where the mean has no contrast."""
+    x, y, width, height = restoration.crop
+    mean = restoration.mean[y : y + height, x : x + width]
+    return sharpness(restoration.image, mean) if np.ptp(mean) > 0 else None
 
 
 def _motion_facts(restoration: Restoration) -> Iterator[Fact]:

@@ -17,7 +17,7 @@ from ..io.output import atomic_write, check_output
 from ..results import Restoration
 from ..runs.run_record import RunRecord
 from .comparison import comparison, environment, missing, text_file
-from .facts import findings, headline, laps, remarks, settings
+from .facts import findings, headline, laps, settings, verdict
 from .panels import draw_panels
 from .pictures import encode_gallery, stages
 
@@ -134,7 +134,7 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
     template = environment().get_template("template.html")
     style, script = "".join(map(text_file, ("palette.css", "compare.css", "style.css"))), text_file("compare.js")
     gallery = encode_gallery(stages(restoration, run.frame), run.frame_number)
-    panels = [(Markup(panel.svg), panel.caption) for panel in draw_panels(restoration, run)]
+    panels = draw_panels(restoration, run)
     return template.render(
         run=run,
         restoration=restoration,
@@ -142,10 +142,10 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
         style=Markup(style),
         script=Markup(script),
         comparison=Markup(comparison(gallery)),
-        panels=panels,
+        groups=[[panel for panel in panels if panel.is_map == wanted] for wanted in (True, False)],
         headline=headline(restoration),
         findings=findings(restoration),
-        remarks=remarks(restoration, run),
+        verdict=verdict(restoration, run),
         settings=settings(run),
         laps=laps(restoration),
         command=shlex.join(run.command),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from ..deconvolution.deconvolve import Deconvolution
 from ..display.plots import (
@@ -22,7 +23,12 @@ from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
 from ..results import Restoration
 from ..runs.run_record import RunRecord
+from .alignment import align_curves, align_map, take_title
 from .vector import inline_svg
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -31,28 +37,47 @@ class Panel:
 
     Attributes
     ----------
-    svg : str
+    title : str
+    svg : Markup
         The ``<svg>`` element.
     caption : str
         What the plot shows, and what to look for.
+    is_map : bool
+        Whether it has the shape of the image; maps stand before the curves.
     """
 
-    svg: str
+    title: str
+    svg: Markup
     caption: str
+    is_map: bool
 
 
-def draw_panels(restoration: Restoration, run: RunRecord) -> list[Panel]:
-    """Draw the plots of all stages that have run.
+def make_panel(figure: Figure, name: str, description: str, caption: str) -> Panel:
+    """Prepare a figure for the page: its axes are aligned with those of the others, its title becomes text that wraps.
 
     Parameters
     ----------
-    restoration : Restoration
-    run : RunRecord
+    figure : matplotlib.figure.Figure
+    name : str
+        Unique on the page.
+    description : str
+        What the figure shows, for screen readers.
+    caption : str
 
     Returns
     -------
-    list of Panel
+    Panel
     """
+    from markupsafe import Markup
+
+    title = take_title(figure) or description
+    is_map = bool(figure.axes[0].images)
+    (align_map if is_map else align_curves)(figure)
+    return Panel(title, Markup(inline_svg(figure, name, description)), caption, is_map)
+
+
+def draw_panels(restoration: Restoration, run: RunRecord) -> list[Panel]:
+    """Draw the plots of all stages that have run."""
     panels = [*_motion(restoration, run)]
     if restoration.dynamics is not None:
         panels += _dynamics(restoration.dynamics)
@@ -60,15 +85,15 @@ def draw_panels(restoration: Restoration, run: RunRecord) -> list[Panel]:
         panels += _filter(restoration.filtered)
     if restoration.blur is not None:
         blur = restoration.blur
-        caption = "The minimum is the estimated width; the band shows its uncertainty."
         figure = plot_blur(blur.widths, blur.costs, blur.sigma, blur.uncertainty)
-        panels.append(Panel(inline_svg(figure, "blur", "Cost of every width of the blur"), caption))
+        caption = "The minimum is the estimated width; the band shows its uncertainty."
+        panels.append(make_panel(figure, "blur", "Cost of every width of the blur", caption))
     if restoration.deconvolution is not None and restoration.deconvolution.recorded.size:
         panels += _deconvolution(restoration.deconvolution)
     if restoration.uncertainty is not None:
-        caption = "Where not to trust the result: bright means uncertain, and brightest also where nothing is known."
         figure = plot_uncertainty(restoration.uncertainty, restoration.image)
-        panels.append(Panel(inline_svg(figure, "uncertainty", "Map of the standard deviation of every pixel"), caption))
+        caption = "Where not to trust the result: bright means uncertain, and brightest also where nothing is known."
+        panels.append(make_panel(figure, "uncertainty", "Map of the standard deviation of every pixel", caption))
     return panels
 
 
@@ -77,35 +102,35 @@ def _motion(restoration: Restoration, run: RunRecord) -> Iterator[Panel]:
     number = len(centroid.flows) // 2
     figure = plot_flow(centroid.flows[number], centroid.image, f"Displacement of training frame {number}")
     caption = "Flow from the centroid to one frame, over the faint image."
-    yield Panel(inline_svg(figure, "flow", "Map of the displacement of one frame"), caption)
+    yield make_panel(figure, "flow", "Map of the displacement of one frame", caption)
     figure = plot_displacements(centroid.flows, centroid.image)
     caption = "Over the training frames. Strokes show the direction of the largest motion."
-    yield Panel(inline_svg(figure, "spread", "Map of the standard deviation of the displacement"), caption)
+    yield make_panel(figure, "spread", "Map of the standard deviation of the displacement", caption)
     tolerance = run.settings.get("centroid", {}).get("tolerance")
     figure = plot_convergence(centroid.mean_flow_sizes, tolerance)
     caption = "At the centroid the mean flow should vanish; what remains is the bias of the flow method."
-    yield Panel(inline_svg(figure, "convergence", "Mean flow in each iteration of the centroid"), caption)
+    yield make_panel(figure, "convergence", "Mean flow in each iteration of the centroid", caption)
 
 
 def _dynamics(dynamics: FlowDynamics) -> Iterator[Panel]:
     figure = plot_singular_values(dynamics.singular_values, dynamics.rank)
     caption = f"Coloured: the states of the flow model, which hold {100 * dynamics.energy_share:.1f} % of the variance."
-    yield Panel(inline_svg(figure, "singular", "Singular values of the flows"), caption)
+    yield make_panel(figure, "singular", "Singular values of the flows", caption)
     figure = plot_eigenvalues(dynamics.eigenvalues)
     caption = "Inside the circle motion decays. If all lie on it, the model only repeats the training flows."
-    yield Panel(inline_svg(figure, "eigen", "Eigenvalues of the transition matrix and the unit circle"), caption)
+    yield make_panel(figure, "eigen", "Eigenvalues of the transition matrix and the unit circle", caption)
 
 
 def _filter(filtered: Filtered) -> Iterator[Panel]:
     figure = plot_filter(filtered.gains, filtered.innovations)
     caption = "How much each frame changed the image, and the motion that the model did not predict."
-    yield Panel(inline_svg(figure, "filter", "Gain and innovation of each frame"), caption)
+    yield make_panel(figure, "filter", "Gain and innovation of each frame", caption)
     figure = plot_frames(filtered.sharpness, filtered.shares)
     caption = "Sharp frames have more weight. Dashed: the sharpness of the centroid, and equal weights."
-    yield Panel(inline_svg(figure, "frames", "Sharpness and share of each frame"), caption)
+    yield make_panel(figure, "frames", "Sharpness and share of each frame", caption)
 
 
 def _deconvolution(deconvolution: Deconvolution) -> Iterator[Panel]:
     figure = plot_objective(deconvolution.recorded, deconvolution.objective)
     caption = "The energy that the deconvolution minimises."
-    yield Panel(inline_svg(figure, "objective", "Energy of the deconvolution in each iteration"), caption)
+    yield make_panel(figure, "objective", "Energy of the deconvolution in each iteration", caption)

@@ -24,9 +24,13 @@ _LOSSLESS_BYTES = 1_050_000
 _QUALITY = 95
 # Longest side of an image, pixels.
 _LONGEST = 2048
-# An image that spans less than this share of full scale is stretched; its percentage of pixels at either end that may
-# be clipped, and the margin beyond them, as a share of the span.
-_NARROW, _CLIPPED, _MARGIN = 0.2, 0.2, 0.1
+# An image is shown over its own range where it spans less than the first share of full scale, or where nothing in it is
+# brighter than the second; the percentage of pixels at either end that may be clipped, and the margin beyond them, as a
+# share of the span.
+_NARROW, _DARK, _CLIPPED, _MARGIN = 0.2, 0.5, 0.2, 0.1
+# What the switch of the page does: it clips this percentage of the pixels at either end. Where the median of what is
+# not black is dim, as in a night scene with lamps, shadows are lifted until it is brighter, by at least this exponent.
+_STRETCHED, _BLACK, _DIM, _BRIGHTER, _LEAST_EXPONENT = 0.5, 0.05, 0.15, 0.3, 0.45
 _TITLES = {
     "frame": "Frame",
     "mean": "Mean",
@@ -58,18 +62,24 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Gallery:
-    """All images of a report, and their encoding.
+class Stretch:
+    """Display of an image with more contrast: ``(slope · value + intercept) ** exponent``.
 
-    Attributes
-    ----------
-    pictures : tuple of Picture
-    encoding : str
-        Description that is shown.
+    The exponent is below 1 for scenes with most of their content in the shadows.
     """
+
+    slope: float = 1.0
+    intercept: float = 0.0
+    exponent: float = 1.0
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """All images of a report, their encoding in words, and how a switch of the page stretches their contrast."""
 
     pictures: tuple[Picture, ...]
     encoding: str
+    stretch: Stretch = Stretch()
 
 
 def stages(restoration: Restoration, frame: FloatArray) -> dict[str, FloatArray]:
@@ -112,8 +122,8 @@ def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
     -------
     Gallery
     """
-    low, high = _shown_range(images["result"])
-    shown = {key: _levels(image, low, high) for key, image in zip(images, iter_frames(images.values()), strict=True)}
+    low, high = shown_range(images["result"])
+    shown = {key: to_levels(image, low, high) for key, image in zip(images, iter_frames(images.values()), strict=True)}
     encoding = "8 bits, lossless"
     files = {key: encode_image(levels, "webp") for key, levels in shown.items()}
     if sum(map(len, files.values())) > _LOSSLESS_BYTES:
@@ -128,16 +138,30 @@ def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
         Picture(key, titles[key], data_uri(data, "webp"), shown[key].shape[1], shown[key].shape[0])
         for key, data in files.items()
     )
-    return Gallery(tuple(pictures), encoding)
+    return Gallery(tuple(pictures), encoding, stretch_of(shown["result"]))
 
 
-def _shown_range(image: FloatArray) -> tuple[float, float]:
-    """Intensities that are shown black and white: 0 and 1, or those of an image that uses a small part of the scale."""
+def shown_range(image: FloatArray) -> tuple[float, float]:
+    """Intensities shown black and white: 0 and 1, or the image's own where it is dark or uses little of the scale."""
     low, high = (float(value) for value in np.percentile(image, (_CLIPPED, 100 - _CLIPPED)))
     margin = _MARGIN * (high - low)
-    return (low - margin, high + margin) if 0 < high - low < _NARROW else (0.0, 1.0)
+    if 0 < high - low < _NARROW:
+        return low - margin, high + margin
+    return (0.0, high + margin) if 0 < high < _DARK else (0.0, 1.0)
 
 
-def _levels(image: FloatArray, low: float, high: float) -> NDArray[np.unsignedinteger]:
-    small = shrink(image, _LONGEST)
+def stretch_of(levels: NDArray[np.unsignedinteger]) -> Stretch:
+    """Choose the stretch of an image of 8 bits as it is shown."""
+    shown = levels.astype(np.float32) / 255
+    low, high = (float(value) for value in np.percentile(shown, (_STRETCHED, 100 - _STRETCHED)))
+    slope = 1 / max(high - low, 1 / 255)
+    lit = (shown[shown > low + _BLACK * (high - low)] - low) * slope
+    median = float(np.median(lit)) if lit.size else 1.0
+    exponent = 1.0 if median >= _DIM else max(float(np.log(_BRIGHTER) / np.log(median)), _LEAST_EXPONENT)
+    return Stretch(slope, -low * slope, exponent)
+
+
+def to_levels(image: FloatArray, low: float, high: float, longest: int = _LONGEST) -> NDArray[np.unsignedinteger]:
+    """Reduce an image for the page, with 8 bits from ``low`` to ``high``."""
+    small = shrink(image, longest)
     return from_unit(small if (low, high) == (0, 1) else (small - np.float32(low)) / np.float32(high - low), 8)

@@ -1,7 +1,7 @@
 """The page of a steadied video: a player, plots of every frame, and how to repeat the run.
 
-The player is one film of four panels (input, output, their difference, what moves), so that they cannot get out of
-step, and the page needs no script.
+The player is one film of four panels (input, output, their difference, what moves), of which it shows two, split by a
+divider; without scripts it shows all four.
 """
 
 from __future__ import annotations
@@ -19,23 +19,20 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..display.plots import plot_over_frames
-from ..display.preview import shrink
-from ..io.encoding import Encoding, write_container
 from ..io.output import atomic_write
 from ..io.source import FrameSource
 from ..metrics import sharpness
 from ..runs.run_record import RunRecord
 from ..steady.settings import SteadyParams
-from .comparison import environment, text_file
+from .comparison import environment, film_comparison, text_file
 from .facts import Fact, duration, settings
+from .film import film_length, write_film
 from .page import check_report, policy
-from .vector import inline_svg
+from .panels import Panel, make_panel
 
-# Most frames of the film, longest side of a panel, pixels, and its rate factor: half a minute of 640×360 takes 5 MB.
-_MOST_FRAMES, _LONGEST, _RATE_FACTOR = 750, 640, 24
+# Quality of the film as a rate factor of H.264.
+_RATE_FACTOR = 22
 _USUAL_RATE = 25.0
-# The difference is shown so many times enlarged, around grey; what does not move is shown so bright.
-_ENLARGED, _DIMMED = 2.0, 0.3
 
 
 @dataclass(eq=False)
@@ -72,7 +69,7 @@ def write_steady_report(
 ) -> None:
     """Write a steadied video as one HTML file.
 
-    Memory does not grow with the length of the video but by the film, of at most 750 frames.
+    Memory does not grow with the length of the video but by the film, see :func:`film_length`.
 
     Parameters
     ----------
@@ -105,21 +102,24 @@ def write_steady_report(
     sharp: list[float] = []
     change: list[float] = []
     with tempfile.TemporaryDirectory() as folder:
-        film = Path(folder, "film.mp4")
-        panels = _panels(_compared(sources, sharp, change), masks)
-        write_container(film, panels, sources[0].fps or _USUAL_RATE, encoding=Encoding("h264", _RATE_FACTOR))
-        address = "data:video/mp4;base64," + base64.b64encode(film.read_bytes()).decode("ascii")
-    style = "".join(map(text_file, ("palette.css", "style.css")))
+        path_of_film = Path(folder, "film.mp4")
+        count = film_length(len(sources[0]), *sources[0].shape[1:3])
+        pairs = _compared(sources, sharp, change)
+        film = write_film(path_of_film, pairs, count, sources[0].fps or _USUAL_RATE, _RATE_FACTOR, masks)
+        address = "data:video/mp4;base64," + base64.b64encode(path_of_film.read_bytes()).decode("ascii")
+    style = "".join(map(text_file, ("palette.css", "compare.css", "style.css")))
+    script = "".join(map(text_file, ("film.js", "compare.js")))
     page = environment().get_template("steadied.html").render(
         run=run,
-        policy=policy(style, media="data:"),
+        policy=policy(style, script, media="data:"),
         style=Markup(style),
-        film=address,
-        shown=min(len(sources[0]), _MOST_FRAMES),
+        script=Markup(script),
+        comparison=Markup(film_comparison(film, address)),
+        shown=count,
         frames=len(sources[0]),
+        scenes=figures.scenes,
         size=sources[0].shape[1:3],
-        enlarged=f"{_ENLARGED:g}",
-        plots=[(Markup(svg), caption) for svg, caption in _plots(figures, sharp, change)],
+        panels=_plots(figures, sharp, change),
         headline=_headline(figures, sharp, change),
         settings=settings(run, asdict(SteadyParams())),
         command=shlex.join(run.command),
@@ -141,29 +141,18 @@ def _compared(
         yield pair
 
 
-def _panels(pairs: Iterable[tuple[FloatArray, FloatArray]], masks: Iterable[NDArray[np.bool_]]) -> Iterator[FloatArray]:
-    """Frames of the film: input and output above, difference and what moves below."""
-    for number, (pair, mask) in enumerate(zip(pairs, masks, strict=True)):
-        if number >= _MOST_FRAMES:
-            continue
-        seen, ours = (shrink(frame if frame.ndim == 3 else frame[..., None].repeat(3, -1), _LONGEST) for frame in pair)
-        light = _DIMMED + (1 - _DIMMED) * shrink(mask.astype(np.float32), _LONGEST)[..., None]
-        yield np.block([[[seen], [ours]], [[0.5 + _ENLARGED * (ours - seen)], [light * ours]]])
-
-
-def _plots(figures: SteadyFigures, sharp: list[float], change: list[float]) -> Iterator[tuple[str, str]]:
-    rows = {"Displacement, pixels": figures.displacement, "What moves, %": [100 * share for share in figures.moving]}
+def _plots(figures: SteadyFigures, sharp: list[float], change: list[float]) -> list[Panel]:
+    removed = {"Displacement, pixels": figures.displacement, "What moves, %": [100 * share for share in figures.moving]}
     caption = "Displacement that was removed, root mean square, and share of the image that moves."
-    yield inline_svg(plot_over_frames(rows), "motion", "Displacement and moving share of every frame"), caption
+    motion = make_panel(plot_over_frames(removed), "motion", "Displacement and moving share of every frame", caption)
     rows = {"Sharpness, input = 1": sharp, "Change since the frame before, input = 1": change}
     caption = "The output should be sharper than the input, and change less from frame to frame."
-    yield inline_svg(plot_over_frames(rows, 1.0), "quality", "Sharpness and change of every frame"), caption
+    quality = make_panel(plot_over_frames(rows, 1.0), "quality", "Sharpness and change of every frame", caption)
+    return [motion, quality]
 
 
 def _headline(figures: SteadyFigures, sharp: list[float], change: list[float]) -> list[Fact]:
-    scenes = f"{figures.scenes} scenes" if figures.scenes > 1 else "one scene"
     facts = [
-        Fact("Frames", str(len(sharp)), scenes),
         Fact("Displacement", f"{np.mean(figures.displacement):.2f} px", "removed, on average"),
         Fact("Blur removed", f"{figures.sigma:.2f} px" if figures.sigma > 0 else "none", "standard deviation"),
         Fact("Moves", f"{100 * np.mean(figures.moving):.0f} %", "of the image"),
@@ -172,4 +161,5 @@ def _headline(figures: SteadyFigures, sharp: list[float], change: list[float]) -
         facts.append(Fact("Sharpness", f"×{np.nanmean(sharp):.2f}", "relative to the input"))
     if np.isfinite(change).any():
         facts.append(Fact("Change", f"×{np.nanmean(change):.2f}", "from frame to frame"))
-    return [*facts, Fact("Time", duration(figures.seconds), f"{len(sharp) / max(figures.seconds, 1e-3):.1f} a second")]
+    rate = len(sharp) / max(figures.seconds, 1e-3)
+    return [*facts, Fact("Time", duration(figures.seconds), f"{rate:.1f} frames a second")]

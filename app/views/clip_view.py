@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
 from nicegui import events, ui
 
-from turbrestore.core.arrays import FloatArray, from_unit
-from turbrestore.display.preview import data_uri, encode_image, shrink
+from turbrestore.core.arrays import FloatArray
+from turbrestore.display.preview import data_uri, encode_image
+from turbrestore.report.pictures import shown_range, to_levels
 
-from .clip import LOOKED_THROUGH
-from .elements import set_most
-from .job import one_line
-from .pictures import LONGEST
+from ..clip import LOOKED_THROUGH
+from ..job import one_line
+from ..pictures import LONGEST
+from ..tab import Tab
+from .elements import Notices, set_most
 
 if TYPE_CHECKING:
     from turbrestore.io.source import Roi
 
-    from .clip import Clip
-    from .page import Page
+    from ..clip import Clip
 
 # Smaller rectangles are clicks, pixels of the clip.
 _SMALLEST = 16
@@ -33,22 +35,31 @@ class ClipView:
 
     Parameters
     ----------
-    page : Page
+    tab : Tab
+    notices : Notices
+    on_region : callable
+        Called with the region that was drawn, or None.
     """
 
-    def __init__(self, page: Page) -> None:
-        self._page = page
+    def __init__(self, tab: Tab, notices: Notices, on_region: Callable[[Roi | None], None]) -> None:
+        self._tab, self._notices, self._on_region = tab, notices, on_region
+        # Intensities that are shown black and white.
+        self._levels = (0.0, 1.0)
         self._roi: Roi | None = None
         self._from: tuple[float, float] | None = None
         self._wanted, self._shown, self._busy = 0, -1, False
 
     def build(self) -> None:
         """Make the elements."""
-        with ui.element("div") as self.place:
+        with ui.element("div").classes("place") as self.place:
             with ui.element("div").classes("clip") as self._frame:
-                self._image = ui.interactive_image(
-                    on_mouse=self._mouse, events=["mousedown", "mousemove", "mouseup"], sanitize=False
-                ).props("id=frame")
+                self._image = (
+                    ui.interactive_image(
+                        on_mouse=self._mouse, events=["mousedown", "mousemove", "mouseup"], sanitize=False
+                    )
+                    .props("id=frame")
+                    .classes("picture")
+                )
                 self._image.visible = False
             self._strip = ui.element("div").classes("strip").props('role=group aria-label="Frames of the clip"')
             with ui.element("div").classes("fields") as self._below:
@@ -56,21 +67,26 @@ class ClipView:
                 self._scrubber = ui.slider(min=0, max=1, value=0, on_change=self._scrubbed).classes("grow")
                 self._scrubber.props('aria-label="Frame"')
                 self._number = ui.label("0").classes("value")
-            self._hint = ui.label("Draw a rectangle to restore that part alone; a click takes it away.").classes("note")
+            self._hint = ui.label("").classes("note")
             self._below.visible = self._hint.visible = False
 
     async def opened(self) -> None:
         """Show the middle frame of a clip."""
-        clip = self._page.tab.clip
+        clip = self._tab.clip
         assert clip is not None
         width, height = clip.size
+        middle = len(clip.source) // 2
+        self._levels = shown_range(await asyncio.to_thread(clip.frame, middle))
+        brighter = "" if self._levels == (0, 1) else f" Shown brighter: white is {self._levels[1]:.3g} of full scale."
+        self._hint.text = f"Drag a rectangle to restore that part alone; a click removes it.{brighter}"
         # The frame is not wider than its height on the page allows.
         self._frame.style(f"--ratio: {width / height}")
         self._image.visible = self._below.visible = self._hint.visible = True
         set_most(self._scrubber, len(clip.source) - 1)
+        ui.run_javascript('document.querySelector("#frame img").alt = "Frame of the clip"')
         self._shown = -1
-        self._scrubber.value = len(clip.source) // 2
-        await self._show(len(clip.source) // 2)
+        self._scrubber.value = middle
+        await self._show(middle)
         self.draw(None)
         await self._fill_strip(clip)
 
@@ -79,8 +95,8 @@ class ClipView:
         self._strip.clear()
         if len(clip.source) > LOOKED_THROUGH:
             return
-        pictures = await asyncio.to_thread(_thumbnails, clip)
-        if clip is not self._page.tab.clip:
+        pictures = await asyncio.to_thread(_thumbnails, clip, self._levels)
+        if clip is not self._tab.clip:
             return
         with self._strip:
             for number, picture in pictures.items():
@@ -91,7 +107,7 @@ class ClipView:
     def draw(self, roi: Roi | None) -> None:
         """Draw the region, or none."""
         self._roi = roi
-        clip = self._page.tab.clip
+        clip = self._tab.clip
         if roi is None or clip is None:
             self._image.content = ""
             return
@@ -106,7 +122,7 @@ class ClipView:
 
     def _scale(self) -> float:
         """Pixels of the clip for one of the picture."""
-        clip = self._page.tab.clip
+        clip = self._tab.clip
         return 1.0 if clip is None else max(max(clip.size) / LONGEST, 1.0)
 
     def _mouse(self, event: events.MouseEventArguments) -> None:
@@ -117,12 +133,12 @@ class ClipView:
             roi = self._rectangle(self._from, (x, y))
             if event.type == "mouseup" or not event.buttons:
                 self._from = None
-                self._page.run_view.set_region(roi)
+                self._on_region(roi)
             self.draw(roi)
 
     def _rectangle(self, one: tuple[float, float], two: tuple[float, float]) -> Roi | None:
         """Return the rectangle between two points of the picture, in pixels of the clip."""
-        clip = self._page.tab.clip
+        clip = self._tab.clip
         assert clip is not None
         scale = self._scale()
         (left, right), (top, bottom) = (
@@ -139,7 +155,7 @@ class ClipView:
 
     async def _show(self, number: int) -> None:
         """Show a frame; of those that are asked for while one is decoded, the last."""
-        clip = self._page.tab.clip
+        clip = self._tab.clip
         self._number.text = str(number)
         self._wanted = number
         if clip is None or self._busy:
@@ -149,20 +165,20 @@ class ClipView:
             while self._shown != self._wanted:
                 number = self._wanted
                 image = await asyncio.to_thread(clip.frame, number)
-                self._image.set_source(await asyncio.to_thread(self._page.tab.pictures.put, image))
+                self._image.set_source(await asyncio.to_thread(self._tab.pictures.put, image, self._levels))
                 self._shown = number
         except Exception as error:
-            self._page.tell(one_line(error))
+            self._notices.tell(one_line(error))
         finally:
             self._busy = False
 
 
-def _small(frame: FloatArray) -> str:
-    return data_uri(encode_image(from_unit(shrink(frame, _SMALL), 8)))
+def _small(frame: FloatArray, levels: tuple[float, float]) -> str:
+    return data_uri(encode_image(to_levels(frame, *levels, _SMALL)))
 
 
-def _thumbnails(clip: Clip) -> dict[int, str]:
+def _thumbnails(clip: Clip, levels: tuple[float, float]) -> dict[int, str]:
     """Encode small frames, by their numbers."""
     count = len(clip.source)
     step = max(1, -(-count // _IN_STRIP))
-    return {start: _small(clip.frame(start)) for start in range(step // 2, count, step)}
+    return {start: _small(clip.frame(start), levels) for start in range(step // 2, count, step)}

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import html
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from nicegui import ui
 
 from turbrestore.core.errors import TurbrestoreError
 
-from .folders import Entry, printable
-from .several import plan_several
-
-if TYPE_CHECKING:
-    from .page import Page
+from ..folders import Entry, printable
+from ..job import Job
+from ..restoring import Order
+from ..several import inputs_of, plan_several
+from ..tab import Tab
+from .elements import Notices
+from .progress_view import ProgressView
 
 
 class SeveralView:
@@ -21,11 +23,15 @@ class SeveralView:
 
     Parameters
     ----------
-    page : Page
+    tab : Tab
+    notices : Notices
+    like : callable
+        Returns the order whose settings all clips are restored by.
     """
 
-    def __init__(self, page: Page) -> None:
-        self._page = page
+    def __init__(self, tab: Tab, notices: Notices, like: Callable[[], Order]) -> None:
+        self._tab, self._notices, self._like = tab, notices, like
+        self._progress = ProgressView(tab, "several")
         self._boxes: list[tuple[Entry, ui.checkbox]] = []
         self._drawn = ""
 
@@ -33,45 +39,47 @@ class SeveralView:
         """Make the elements."""
         with ui.element("section") as self.place:
             ui.html("Several clips", tag="h2", sanitize=False)
+            ui.label("Whole clips, restored with the preset, share of frames and blur chosen above.").classes("note")
             self._list = ui.element("div").classes("files choice")
             self._list.props('role=group aria-label="Clips to restore"')
             with ui.element("div").classes("fields"):
                 self._folder = ui.input("Folder for the results", value="restored").props("dense outlined")
                 self._folder.classes("grow")
+            self._overwrite = ui.checkbox("Replace existing files").props("dense").classes("q-mt-sm")
             with ui.element("div").classes("fields"):
                 ui.button("Choose all", on_click=self._choose_all).props("outline no-wrap")
                 button = ui.button("Restore them", on_click=self._start).props("unelevated").classes("grow")
-            self._page.starters.append(button)
-            self._overwrite = ui.checkbox("Replace existing files").props("dense").classes("q-mt-sm")
-            ui.label("Whole clips, by the preset, share of frames and blur that are chosen above.").classes("note")
+                self._progress.build((button,))
             self._rows = ui.html("", sanitize=False).props("role=status")
+            self._progress.build_bars()
 
     def opened(self) -> None:
         """List the clips in the folder of the one that is open."""
-        tab = self._page.tab
+        tab = self._tab
         assert tab.clip is not None
         try:
             entries = tab.folders.listing(tab.clip.path.parent)
         except TurbrestoreError:
             # What was uploaded, or named when the app was started, lies elsewhere.
             entries = tab.folders.listing(tab.folders.start)
+        clips = inputs_of(entries)
         self._list.clear()
         with self._list:
-            clips = [entry for entry in entries if not entry.is_folder]
             self._boxes = [(entry, ui.checkbox(printable(entry.name)).props("dense")) for entry in clips]
             if not clips:
-                ui.label("no clips here").classes("note q-pa-sm")
+                ui.label("There are no clips in this folder.").classes("note q-pa-sm")
 
-    def follow(self) -> None:
-        """Show what becomes of the clips."""
+    def follow(self) -> Job[object] | None:
+        """Show what becomes of the clips; return the run when it has just ended."""
         rows = "".join(
-            f'<tr class="{row.state.replace(" ", "-")}"><th scope="row">{html.escape(printable(row.name))}</th>'
+            f'<tr class="{row.state}"><th scope="row">{html.escape(printable(row.name))}</th>'
             f"<td>{row.state}{html.escape(printable(f': {row.words}' if row.words else ''))}</td></tr>"
-            for row in tuple(self._page.tab.rows)
+            for row in tuple(self._tab.rows)
         )
         if rows != self._drawn:
             self._drawn = rows
             self._rows.content = f'<table class="rows">{rows}</table>'
+        return self._progress.follow()
 
     def _choose_all(self) -> None:
         """Choose all clips, or none where all are chosen."""
@@ -80,9 +88,7 @@ class SeveralView:
             box.value = wanted
 
     def _start(self) -> None:
-        page = self._page
-        with page.catching():
+        with self._notices.catching():
             clips = [entry.path for entry, box in self._boxes if box.value]
-            overwrite = bool(self._overwrite.value)
-            like = page.run_view.order()
-            page.tab.restore_all(plan_several(clips, self._folder.value or "", like, overwrite, page.tab.folders))
+            overwrite, folders = bool(self._overwrite.value), self._tab.folders
+            self._tab.restore_all(plan_several(clips, self._folder.value or "", self._like(), overwrite, folders))

@@ -6,25 +6,25 @@ import asyncio
 import dataclasses
 import math
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from nicegui import background_tasks, ui
 
 from turbrestore.blur.psf import GAUSSIAN
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
-from turbrestore.settings import RestoreParams
 
-from .elements import set_most
-from .tuning import SLOW, automatic_fidelity, impressions, part_around, tuned_params
+from ..tab import Tab
+from ..tuning import SLOW, automatic_fidelity, impressions, part_around, tuned_params
+from .compare_view import CompareView
+from .elements import Notices, named_slider, set_most
 
 if TYPE_CHECKING:
     from turbrestore.core.arrays import FloatArray
 
-    from .page import Page
-
 _METHODS = {"nltv": "nonlocal total variation", "tv": "total variation", "wiener": "Wiener", "tikhonov": "Tikhonov"}
-_BOUNDARIES = {"unknown": "unknown", "periodic": "periodic"}
-_BORDERS = {"keep": "keep", "crop": "crop"}
+_BOUNDARIES = {"unknown": "unknown", "periodic": "repeats the image"}
+_BORDERS = {"keep": "keep it", "crop": "crop what few frames show"}
 # Logarithms of the smallest and the largest λ of the slider.
 _FIDELITIES = (1.0, 5.0)
 
@@ -34,11 +34,16 @@ class TuneView:
 
     Parameters
     ----------
-    page : Page
+    tab : Tab
+    notices : Notices
+    compare_view : CompareView
+        Shows the part that is deblurred anew.
+    on_change : callable
+        Called when something was tuned.
     """
 
-    def __init__(self, page: Page) -> None:
-        self._page = page
+    def __init__(self, tab: Tab, notices: Notices, compare_view: CompareView, on_change: Callable[[], None]) -> None:
+        self._tab, self._notices, self._compare, self._on_change = tab, notices, compare_view, on_change
         self._setting = False
         self._wanted, self._working = 0, False
         self._automatic = True
@@ -47,9 +52,9 @@ class TuneView:
         """Make the elements."""
         with ui.element("section") as self.place:
             ui.html('<span class="number">3</span> Tune', tag="h2", sanitize=False)
-            self._sigma, self._sigma_text = self._slider("Width", 0, 6, 0.05, "Width of the blur, pixels")
-            self._exponent, self._exponent_text = self._slider("Shape", 1, 2, 0.01, "Shape of the blur, exponent")
-            self._fidelity, self._fidelity_text = self._slider(
+            self._sigma, self._sigma_text = named_slider("Width", 0, 6, 0.05, "Width of the blur, pixels")
+            self._exponent, self._exponent_text = named_slider("Shape", 1, 2, 0.01, "Shape of the blur, exponent")
+            self._fidelity, self._fidelity_text = named_slider(
                 "Strength", *_FIDELITIES, 0.02, "Strength, the weight λ of the data, logarithm"
             )
             self._sigma.on_value_change(self._changed)
@@ -59,10 +64,15 @@ class TuneView:
                 self._method = ui.select(_METHODS, label="Method", value="nltv", on_change=self._changed)
                 self._method.props("dense outlined options-dense").classes("grow")
             with ui.element("div").classes("fields"):
-                self._boundary = ui.select(_BOUNDARIES, label="Beyond it", value="unknown", on_change=self._changed)
-                self._border = ui.select(_BORDERS, label="Border", value="keep", on_change=self._border_changed)
-                for select in (self._boundary, self._border):
-                    select.props("dense outlined options-dense").classes("grow")
+                self._boundary = ui.select(
+                    _BOUNDARIES, label="Scene beyond the border", value="unknown", on_change=self._changed
+                )
+            with ui.element("div").classes("fields"):
+                self._border = ui.select(
+                    _BORDERS, label="Border of the image", value="keep", on_change=self._border_changed
+                )
+            for select in (self._boundary, self._border):
+                select.props("dense outlined options-dense").classes("grow")
             with ui.element("div").classes("fields apart"):
                 self._apply = ui.button("Apply to the whole", on_click=self.apply).props("unelevated").classes("grow")
                 self._reset = ui.button("As measured", on_click=self._measure).props("outline no-wrap")
@@ -70,56 +80,30 @@ class TuneView:
 
     def opened(self) -> None:
         """Show what was chosen: nothing for a new clip."""
-        tab = self._page.tab
+        tab = self._tab
         self._automatic = tab.tuned is None or tab.tuned.fidelity is None
         self._border.value = tab.border
-        self._page.run_view.show_method(tab.tuned)
+        self._on_change()
 
     async def restored(self) -> None:
         """Show the settings of a run that has ended, or what was chosen since and is not applied yet."""
-        tab = self._page.tab
+        tab = self._tab
         assert tab.restored is not None
-        if tab.tuned is None or not self.pending:
+        if tab.tuned is None or not tab.pending:
             await self._show(tuned_params(tab.restored))
             return
         await self._show(tab.tuned)
         self._ask_for_part()
 
-    def chosen(self, params: RestoreParams) -> RestoreParams:
-        """Put into the settings of a run what was chosen here."""
-        tab = self._page.tab
-        deconvolution = params.deconvolution if tab.tuned is None else tab.tuned
-        return dataclasses.replace(params, deconvolution=deconvolution, border=tab.border)
-
-    @property
-    def pending(self) -> bool:
-        """Whether something was chosen that the result does not have yet."""
-        restored = self._page.tab.restored
-        if restored is None:
-            return False
-        return self.chosen(restored.order.params) != restored.order.params
-
     def apply(self) -> None:
         """Deconvolve the whole image by what was chosen."""
-        restored = self._page.tab.restored
-        if restored is None or self._page.tab.busy:
-            return
         self._wanted += 1
-        order = restored.order
-        with self._page.catching():
-            self._page.tab.run(dataclasses.replace(order, params=self.chosen(order.params)))
-
-    def _slider(self, name: str, low: float, high: float, step: float, label: str) -> tuple[ui.slider, ui.label]:
-        with ui.element("div").classes("fields"):
-            ui.label(name).classes("what")
-            slider = ui.slider(min=low, max=high, step=step, value=low).classes("grow")
-            slider.props(f'aria-label="{label}"')
-            value = ui.label("").classes("value")
-        return slider, value
+        with self._notices.catching():
+            self._tab.apply()
 
     async def _show(self, params: DeconvolutionParams) -> None:
         """Set the sliders without taking that for a wish of the user."""
-        restored = self._page.tab.restored
+        restored = self._tab.restored
         assert restored is not None
         self._automatic = params.fidelity is None
         measured = await asyncio.to_thread(automatic_fidelity, restored, params)
@@ -136,13 +120,12 @@ class TuneView:
         self._sigma_text.text = f"{self._sigma.value:.2f} px"
         self._exponent_text.text = f"{self._exponent.value:.2f}"
         self._fidelity_text.text = f"{10 ** (self._fidelity.value or 0):.0f}{', auto' if self._automatic else ''}"
-        self._apply.set_enabled(self.pending)
-        self._page.save_view.refresh()
-        self._page.run_view.show_method(self._page.tab.tuned)
+        self._apply.set_enabled(self._tab.pending)
+        self._on_change()
 
     def _border_changed(self) -> None:
-        self._page.tab.border = self._border.value
-        if self._page.tab.restored is not None:
+        self._tab.border = self._border.value
+        if self._tab.restored is not None:
             self._show_values()
 
     def _weighed(self) -> None:
@@ -153,10 +136,10 @@ class TuneView:
 
     def _changed(self) -> None:
         """Take over what the sliders say, and show what comes of it."""
-        restored = self._page.tab.restored
+        restored = self._tab.restored
         if self._setting or restored is None:
             return
-        self._page.tab.tuned = dataclasses.replace(
+        self._tab.tuned = dataclasses.replace(
             restored.order.params.deconvolution,
             sigma=round(float(self._sigma.value or 0), 3),
             exponent=round(float(self._exponent.value or GAUSSIAN), 3),
@@ -165,7 +148,6 @@ class TuneView:
             boundary=self._boundary.value,
         )
         self._show_values()
-        self._page.look_at("compare")
         self._ask_for_part()
 
     def _ask_for_part(self) -> None:
@@ -178,41 +160,43 @@ class TuneView:
         """Show the part by the newest settings; those that have changed meanwhile are not waited for."""
         self._working, answered = True, -1
         try:
-            with self.place, self._page.catching():
-                while answered != self._wanted and self._page.tab.tuned is not None:
+            with self.place, self._notices.catching():
+                while answered != self._wanted and self._tab.tuned is not None:
                     answered = self._wanted
-                    await self._show_part(self._page.tab.tuned, answered)
+                    await self._show_part(self._tab.tuned, answered)
         finally:
             self._working = False
 
     async def _show_part(self, params: DeconvolutionParams, number: int) -> None:
-        restored = self._page.tab.restored
-        if restored is None or self._page.tab.busy:
+        restored = self._tab.restored
+        if restored is None or self._tab.busy:
             return
         if self._automatic:
             await self._show(params)
         x, y, width, height = restored.restoration.crop
-        across, down = await self._page.compare_view.middle()
+        across, down = await self._compare.middle()
         part = part_around(restored.frame.shape, x + across * width, y + down * height)
         begun = time.perf_counter()
-        images = impressions(restored, params, part, lambda: number != self._wanted or self._page.tab.closed)
+        images = impressions(restored, params, part, lambda: number != self._wanted or self._tab.closed)
         rounds = 2 if params.method in SLOW else 1
         for count in range(1, rounds + 1):
             image = await asyncio.to_thread(next, images, None)
             if image is None:
                 return
             note = self._words(image, time.perf_counter() - begun, count < rounds)
-            await self._page.compare_view.show_part(restored, part, image, note)
+            await self._compare.show_part(restored, part, image, note)
 
     def _words(self, image: FloatArray, seconds: float, more: bool) -> str:
         size = f"{image.shape[1]}×{image.shape[0]} pixels in {seconds:.2f} s"
-        return f"First impression of {size}; the end follows …" if more else f"{size}; Apply computes the whole"
+        if more:
+            return f"Quick preview of {size}; the exact one follows …"
+        return f"{size}; press Apply for the whole image"
 
     async def _measure(self) -> None:
         """Go back to what is measured."""
-        self._page.tab.tuned, self._automatic = None, True
-        restored = self._page.tab.restored
-        if restored is not None and self.pending:
+        self._tab.tuned, self._automatic = None, True
+        restored = self._tab.restored
+        if restored is not None and self._tab.pending:
             self.apply()
         elif restored is not None:
             await self._show(tuned_params(restored))

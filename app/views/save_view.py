@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from .folders import printable
-from .restoring import Order
-from .saving import Outputs, check_outputs, command_line, save
-
-if TYPE_CHECKING:
-    from .page import Page
+from ..folders import printable
+from ..saving import Outputs, check_outputs, command_line, save
+from ..tab import Tab
+from .elements import Command, Notices
 
 _DEPTHS: dict[int | None, str] = {None: "as the clip", 8: "8 bits", 16: "16 bits", 32: "float, TIFF and FITS"}
 # Seconds between two looks at a run that is waited for.
@@ -26,11 +22,13 @@ class SaveView:
 
     Parameters
     ----------
-    page : Page
+    tab : Tab
+    notices : Notices
     """
 
-    def __init__(self, page: Page) -> None:
-        self._page = page
+    def __init__(self, tab: Tab, notices: Notices) -> None:
+        self._tab, self._notices = tab, notices
+        self._command = Command()
 
     def build(self) -> None:
         """Make the elements."""
@@ -47,60 +45,39 @@ class SaveView:
                 self._overwrite = ui.checkbox("Replace existing files").props("dense")
             with ui.element("div").classes("fields"):
                 ui.button("Save", on_click=self._save).props("unelevated").classes("grow")
-                ui.button("Copy command", on_click=self._copy).props("outline no-wrap")
             self._note = ui.label("").classes("note").props("role=status")
-            self._command = ui.html("", tag="pre", sanitize=False).classes("command").props('aria-label="Command"')
+            self._command.build("Command")
 
     def opened(self) -> None:
         """Suggest a name for the image of a new clip."""
-        clip = self._page.tab.clip
+        clip = self._tab.clip
         assert clip is not None
         self._path.value = printable(f"{clip.name.stem}.restored.png")
         self._note.text = ""
 
     def refresh(self) -> None:
         """Show the command of the result, with what has been tuned since."""
-        import html
-
-        order = self._order()
-        if order is not None:
-            self._command.content = html.escape(self._words(order))
-
-    def _order(self) -> Order | None:
-        """Return what would give the image that is to be saved."""
-        restored = self._page.tab.restored
-        if restored is None:
-            return None
-        params = self._page.tune_view.chosen(restored.order.params)
-        return dataclasses.replace(restored.order, params=params)
-
-    def _words(self, order: Order) -> str:
-        clip = self._page.tab.clip
-        assert clip is not None
-        return printable(command_line(order, self._depth.value, clip.name, Path(self._path.value or "image.png")))
-
-    async def _copy(self) -> None:
-        order = self._order()
-        if order is not None:
-            ui.clipboard.write(self._words(order))
-            self._note.text = "The command is copied; run it in the folder where the app was started."
+        order, clip = self._tab.tuned_order, self._tab.clip
+        if order is not None and clip is not None:
+            image = Path(self._path.value or "image.png")
+            self._command.show(command_line(order, self._depth.value, clip.name, image))
 
     async def _save(self) -> None:
         """Save what is seen: what was tuned is applied to the whole first."""
-        tab = self._page.tab
-        with self._page.catching():
+        tab = self._tab
+        with self._notices.catching():
             clip, image = tab.clip, tab.folders.output(self._path.value or "")
             outputs = Outputs(image, self._depth.value, bool(self._report.value), bool(self._overwrite.value))
             if tab.restored is None or clip is None:
                 return
             await asyncio.to_thread(check_outputs, outputs, tab.restored.order)
-            if self._page.tune_view.pending:
-                self._note.text = "applying what was tuned to the whole …"
-                self._page.tune_view.apply()
+            if tab.pending:
+                self._note.text = "Applying what was tuned to the whole …"
+                tab.apply()
             while tab.busy:
                 await asyncio.sleep(_BEAT)
-            if self._page.tune_view.pending:
-                self._note.text = "nothing was saved"
+            if tab.pending:
+                self._note.text = "Nothing was saved."
                 return
             written = await asyncio.to_thread(save, tab.restored, outputs, clip.name, Path(self._path.value or ""))
             self._note.text = f"Saved: {', '.join(str(tab.folders.shown(path.resolve())) for path in written)}"

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
-import numpy as np
 from nicegui import ui
 
 from turbrestore.core.arrays import FloatArray
-from turbrestore.display.preview import shrink
 from turbrestore.report.comparison import comparison
-from turbrestore.report.pictures import Gallery, Picture, stages
+from turbrestore.report.pictures import Gallery, Picture, shown_range, stages, stretch_of, to_levels
 
-from .pictures import LONGEST
+from ..pictures import LONGEST
+from ..restoring import Restored
+from ..tab import Tab
 
-if TYPE_CHECKING:
-    from .page import Page
-    from .restoring import Restored
-
-# Quantiles of the intensity that are black and white where the contrast is stretched.
-_ENDS = (0.005, 0.995)
 _TITLES = {
     "frame": "Frame",
     "mean": "Mean",
@@ -37,50 +31,52 @@ class CompareView:
 
     Parameters
     ----------
-    page : Page
+    tab : Tab
+    on_show : callable
+        Called when there is something new to be looked at.
     """
 
-    def __init__(self, page: Page) -> None:
-        self._page = page
+    def __init__(self, tab: Tab, on_show: Callable[[], None]) -> None:
+        self._tab, self._on_show = tab, on_show
         self.filled = False
         self._shown: Restored | None = None
+        # Intensities that are shown black and white.
+        self._levels = (0.0, 1.0)
 
     def build(self) -> None:
         """Make the elements."""
-        with ui.element("div") as self.place:
-            ui.html('<div id="compare"></div>', sanitize=False)
-            self._stretch = ui.checkbox("Stretch the contrast, on this page alone", on_change=self._display).props(
-                "dense"
-            )
-            self._stretch.visible = False
+        with ui.element("div").classes("place") as self.place:
+            ui.html('<div id="compare" class="player"></div>', sanitize=False).classes("holder")
             self._note = ui.label("").classes("note")
 
     def clear(self) -> None:
-        """Forget the images."""
+        """Discard the images."""
         self.filled, self._shown = False, None
-        self._stretch.visible = False
-        ui.run_javascript('document.getElementById("compare").replaceChildren()')
+        ui.run_javascript('turbrestore.fill("compare", "")')
 
     async def show(self, images: dict[str, FloatArray], note: str) -> None:
         """Show the images that there are, the last one on the right."""
-        pictures = [await asyncio.to_thread(self._picture, key, images[key]) for key in _TITLES if key in images]
-        markup = comparison(Gallery(tuple(pictures), "8 bits, lossless"))
-        ui.run_javascript(f"turbrestore.compare({json.dumps(markup)})")
+        known = [key for key in _TITLES if key in images]
+        self._levels = await asyncio.to_thread(shown_range, images[known[-1]])
+        pictures = [await asyncio.to_thread(self._picture, key, images[key]) for key in known]
+        stretch = stretch_of(await asyncio.to_thread(to_levels, images[known[-1]], *self._levels))
+        low, high = self._levels
+        scale = "" if (low, high) == (0, 1) else f", black is {low:.4g} and white {high:.4g} of full scale"
+        markup = comparison(Gallery(tuple(pictures), f"8 bits{scale}", stretch))
+        ui.run_javascript(f'turbrestore.fill("compare", {json.dumps(markup)})')
         self._note.text = note
         self.filled, self._shown = True, None
-        self._page.look_at("compare")
+        self._on_show()
 
     async def show_result(self, restored: Restored) -> None:
         """Show the stages of a run that has ended, cropped like its result."""
         found = restored.restoration
         height, width = found.image.shape[:2]
-        whole = restored is self._page.tab.restored
+        whole = restored is self._tab.restored
         what = f"{width}×{height} pixels from {found.frame_count} frames in {sum(found.seconds.values()):.1f} s"
         note = what if whole else f"Preview of a part: {what}"
         await self.show(stages(found, restored.frame), note)
         self._shown = restored
-        self._stretch.visible = True
-        self._display()
 
     async def show_part(self, restored: Restored, part: tuple[slice, slice], image: FloatArray, note: str) -> None:
         """Put a part that was deblurred anew into the result that is shown."""
@@ -94,7 +90,7 @@ class CompareView:
             for span, whole, offset in zip((rows, columns), part, (y, x), strict=True)
         )
         result[rows, columns] = image[inside]
-        address = await asyncio.to_thread(self._page.tab.pictures.put, result)
+        address = await asyncio.to_thread(self._tab.pictures.put, result, self._levels)
         ui.run_javascript(f'turbrestore.replace("result", {json.dumps(address)})')
         self._note.text = note
 
@@ -106,19 +102,10 @@ class CompareView:
             return 0.5, 0.5
         return float(x), float(y)
 
-    def _display(self) -> None:
-        """Stretch the contrast of what is shown, or not."""
-        style = "none"
-        if self._stretch.value and self._shown is not None:
-            low, high = (float(value) for value in np.quantile(self._shown.restoration.image, _ENDS))
-            slope = 1 / max(high - low, 1 / 255)
-            contrast = 1 + 2 * low * slope
-            style = f"brightness({slope / contrast:.4f}) contrast({contrast:.4f})"
-        ui.run_javascript(f'document.getElementById("compare").style.setProperty("--display", "{style}")')
-
     def _picture(self, key: str, image: FloatArray) -> Picture:
-        height, width = shrink(image, LONGEST).shape[:2]
-        return Picture(key, _TITLES[key], self._page.tab.pictures.put(image), width, height)
+        scale = min(LONGEST / max(image.shape[:2]), 1.0)
+        height, width = (max(round(side * scale), 1) for side in image.shape[:2])
+        return Picture(key, _TITLES[key], self._tab.pictures.put(image, self._levels), width, height)
 
 
 def _within(span: slice, offset: int, size: int) -> slice:
