@@ -40,6 +40,8 @@ class Selection:
         Largest frame or image to read, pixels; by default 67 million.
     bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
         Take grey frames for raw frames of a colour camera whose first pixels have these colours.
+    hdr : {"sdr", "keep"}
+        Read HDR video (HLG, PQ) as the SDR picture, or keep its codes; ``steady`` then writes tagged HDR.
     dark : str, optional
         Video, image or folder of frames with the lens covered: their mean is subtracted, hot pixels are filled.
     flat : str, optional
@@ -54,6 +56,7 @@ class Selection:
     skip_damaged: Flag = False
     max_pixels: int | None = None
     bayer: Literal["rggb", "grbg", "gbrg", "bggr"] | None = None
+    hdr: Literal["sdr", "keep"] = "sdr"
     dark: str | None = None
     flat: str | None = None
     crop_to_object: Flag = False
