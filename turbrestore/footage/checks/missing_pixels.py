@@ -90,7 +90,7 @@ class BackdropSum:
         """Divide the sum, and continue it smoothly to where no frame shows anything."""
         mean = (self._total / np.maximum(self._count, 1)).astype(np.float32)
         known = self._count > 0
-        unseen = ~known if known.ndim == 2 else ~known.all(axis=2)
+        unseen = np.asarray(~known if known.ndim == 2 else ~known.all(axis=2))
         return Backdrop(_continued(mean, known.astype(np.float32)), unseen)
 
 

@@ -28,8 +28,8 @@ PQ, HLG = 16, 18
 _LOG = {9: "logarithmic codes", 10: "logarithmic codes"}
 _WHITE, _PEAK, _KNEE = 203.0, 1000.0 / 203.0, 0.75
 _GAMMA = 2.2
-_LUMINANCE_2020 = np.float32([0.2627, 0.6780, 0.0593])
-_TO_BT709 = np.float32([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
+_LUMINANCE_2020 = np.array([0.2627, 0.6780, 0.0593], np.float32)
+_TO_BT709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32)
 # Curves that cameras record for grading, as metadata name them.
 _LOG_NAMES = re.compile(r"\b([sv]-?log\s?\d?|c-?log\s?\d?|[nfdl]-?log\s?\d?|apple ?log\s?\d?|logc\d?)\b", re.IGNORECASE)
 CURVES = {PQ: "PQ", HLG: "HLG"}
@@ -74,10 +74,10 @@ def remark_on_curve(transfer: int, metadata: Mapping[str, str], kept: bool) -> t
             return (f"HDR ({name}) is kept: images hold its codes, which viewers show too flat",)
         return (f"HDR ({name}) is read as the SDR picture, with highlights rolled off; --hdr keep keeps its codes",)
     found = next((match[1] for text in metadata.values() if (match := _LOG_NAMES.search(str(text)))), None)
-    name = _LOG.get(transfer) or found
-    if name is None:
+    curve = _LOG.get(transfer) or found
+    if curve is None:
         return ()
-    return (f"values are {name}, which looks flat; convert the video, or grade the result as you would grade it",)
+    return (f"values are {curve}, which looks flat; convert the video, or grade the result as you would grade it",)
 
 
 @cache
