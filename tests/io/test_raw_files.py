@@ -15,10 +15,11 @@ MOSAIC = np.full((96, 128), 1000)
 MOSAIC[::2, ::2], MOSAIC[1::2, 1::2] = 500, 600
 
 
-def test_a_grey_sensor_is_grey_at_the_curve_of_bt709(tmp_path):
-    write_dng(tmp_path / "a.dng", MOSAIC)
+@pytest.mark.parametrize("level", [1000, 3600])
+def test_a_grey_sensor_is_grey_at_the_curve_of_bt709(tmp_path, level):
+    write_dng(tmp_path / "a.dng", MOSAIC * (level // 100) // 10)
     image = read_image(tmp_path / "a.dng").image
-    expected = 1.099 * (1000 / 4095) ** 0.45 - 0.099
+    expected = 1.099 * (level / 4095) ** 0.45 - 0.099
     assert image.shape == (96, 128, 3)
     np.testing.assert_allclose(image, expected, atol=2e-3)
 

@@ -52,6 +52,8 @@ def read_raw_file(path: Path, limits: Limits = DEFAULT_LIMITS, like: Path | None
                     user_wb=balance,
                     use_camera_wb=balance is None,
                     no_auto_bright=True,
+                    # LibRaw would take the brightest value of a bright file for white.
+                    adjust_maximum_thr=0,
                     output_bps=16,
                 )
             )
