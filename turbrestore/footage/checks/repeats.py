@@ -25,6 +25,8 @@ _PIXELS, _EDGES = 1 << 18, 0.1
 _PERCENTILE, _DEVIATIONS = 80, 1.2816
 # Largest d of a repeat: in units of σ, relative to the contrast of the frame, and relative to the usual d.
 _OF_NOISE, _OF_CONTRAST, _OF_USUAL = 0.7, 0.03, 1 / 3
+# Shortest side of frames that are compared; fewer pixels are alike by chance.
+_SMALLEST = 16
 # Least share of frames that are no repeats.
 _LEAST_LIVE = 0.1
 
@@ -39,7 +41,7 @@ class RepeatDetector:
 
     def update(self, values: FloatArray) -> None:
         """Take the next frame, intensities of shape (H, W) or (H, W, 3)."""
-        step = max(1, values.size // _PIXELS)
+        step = max(1, min(values.size // _PIXELS, len(values) // _SMALLEST))
         noise = estimate_noise(values)
         grey = luminance(np.ascontiguousarray(values[::step]))
         before, self._previous = self._previous, grey
@@ -68,7 +70,7 @@ class RepeatDetector:
 
 def _difference(grey: FloatArray, before: FloatArray) -> float:
     """Deviation of the difference where rows of the frame before are steepest."""
-    if grey.shape[1] < 3:
+    if min(grey.shape) < _SMALLEST:
         return np.inf
     slope = np.abs(before[:, 2:] - before[:, :-2])
     steep = slope >= np.quantile(slope, 1 - _EDGES)
