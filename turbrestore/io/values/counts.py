@@ -123,6 +123,10 @@ def range_of_counts(frames: Iterable[PixelArray], name: str, kind: str | None = 
 
 def _ends(frame: PixelArray) -> tuple[float, float, float, float]:
     """Lowest number, lowest and highest that have a neighbour as low or as high, and highest number."""
+    bottom, top = float(frame.min()), float(frame.max())
+    if frame.dtype.kind == "f" and bottom >= -FLOAT_MARGIN and top <= 1 + FLOAT_MARGIN:
+        # Intensities need no closer look.
+        return bottom, bottom, top, top
     values = np.asarray(frame, np.float64)
     known = np.isfinite(values)
     up, down = np.where(known, values, -np.inf), np.where(known, values, np.inf)
