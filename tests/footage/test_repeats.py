@@ -31,6 +31,11 @@ def test_frames_behind_moving_air_are_no_repeats(live):
     assert repeats(live * 0.02) == []
 
 
+def test_air_that_calms_down_gives_no_repeats():
+    frames = [make_sequence(11, 10, 96, "camera", blur=0.8, noise=0.004, rms=rms).frames for rms in (1.5, 0.15)]
+    assert repeats(np.concatenate(frames)) == []
+
+
 def test_a_picture_that_stops_is_found_under_noise(live):
     frozen = live.copy()
     frozen[5:15] = live[5]

@@ -120,7 +120,7 @@ class TestFits:
 
     def test_scene_before_errors_whatever_the_order(self, tmp_path):
         data = SCENE.astype(np.float32)
-        for order in (("ERR", "SCI", "DQ"), ("DQ", "ERR", "SCI"), ("SCI", "ERR", "DQ")):
+        for order in (("ERR", "SCI", "DQ"), ("DQ", "SKY", "SCI"), ("SCI", "ERR", "DQ")):
             units = [fits.ImageHDU(data if name == "SCI" else data / 9, name=name) for name in order]
             found = self.units(tmp_path / "a.fits", *units)
             np.testing.assert_array_equal(found.read(), data)
