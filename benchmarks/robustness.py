@@ -126,8 +126,21 @@ def round_trips() -> list[Row]:
     return [Row(title, len(pairs.PAIRS), "every array and field comes back, bit for bit", passed, tuple(failures))]
 
 
+def usual_files() -> list[Row]:
+    """Files of benchmarks/usual_files.py."""
+    files = importlib.import_module("usual_files")
+    found = list(files.figures())
+    failures = tuple(f"{item.name}: {'; '.join(item.faults)}" for item in found if item.faults)
+    rule = (
+        f"all frames at one level, a remark, a result no more than {files.SLACK} dB worse than the temporal mean, "
+        f"colours within {files.LEVELS:g} grey levels"
+    )
+    title = "files as programs and cameras write them: counts, FITS, twins, raw, HDR, tints, pictures that freeze"
+    return [Row(title, len(found), rule, len(found) - len(failures), failures)]
+
+
 def recordings() -> list[Row]:
-    """Clips of benchmarks/recordings.py."""
+    """Clips of benchmarks/recordings.py, and files of benchmarks/usual_files.py."""
     clips = importlib.import_module("recordings")
     rows = list(clips.figures())
     worse = tuple(
@@ -135,7 +148,7 @@ def recordings() -> list[Row]:
     )
     rule = f"the result is no more than {clips.SLACK} dB worse than the temporal mean"
     title = "clips as people record them: light, walkers, overlays, range"
-    return [Row(title, len(rows), rule, len(rows) - len(worse), worse)]
+    return [Row(title, len(rows), rule, len(rows) - len(worse), worse), *usual_files()]
 
 
 GROUPS: dict[str, Callable[[], list[Row]]] = {

@@ -42,6 +42,7 @@ EXTRAS = {
     "matplotlib": "report",
     "jinja2": "report",
     "astropy": "fits",
+    "rawpy": "raw",
     "distributed": "distributed",
     "nicegui": "app",
     "napari": "napari",

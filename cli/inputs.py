@@ -50,6 +50,7 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
         limits=selection.limits(),
         skip_damaged=selection.skip_damaged,
         bayer=selection.bayer,
+        hdr=selection.hdr,
     )
     source = _calibrated(source, selection)
     source = crop_to_object(source) if selection.crop_to_object else source

@@ -40,6 +40,8 @@ class Selection:
         Largest frame or image to read, pixels; by default 67 million.
     bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
         Colours of the first pixels of a raw camera.  Grey frames are then taken for its raw frames.
+    hdr : {"sdr", "keep"}
+        Read HDR video (HLG, PQ) as the SDR picture, or keep its codes.  ``steady`` writes kept codes as tagged HDR.
     dark : str, optional
         Frames taken with the lens covered.  A video, an image or a folder; their mean is subtracted, and hot pixels
         are filled.
@@ -55,6 +57,7 @@ class Selection:
     skip_damaged: Flag = False
     max_pixels: int | None = None
     bayer: Literal["rggb", "grbg", "gbrg", "bggr"] | None = None
+    hdr: Literal["sdr", "keep"] = "sdr"
     dark: str | None = None
     flat: str | None = None
     crop_to_object: Flag = False

@@ -117,7 +117,7 @@ def write_result(
 ) -> None:
     """Write the restored image; a FITS file also has the header of the input, the history of the run and UNCERT."""
     if not is_fits(path):
-        write_image(path, restoration.image, bit_depth, overwrite)
+        write_image(path, restoration.image, bit_depth, overwrite, source.levels)
         return
     x, y, *_ = restoration.crop
     history = [f"turbrestore {__version__}: {shlex.join(command)}", *source.warnings]
@@ -134,6 +134,7 @@ def write_result(
         history=history,
         origin=(columns.start + x, rows.start + y),
         uncertainty=restoration.uncertainty,
+        levels=source.levels,
     )
 
 
@@ -149,7 +150,17 @@ def write_flows(
     history = [f"turbrestore {__version__}: {command}", *source.warnings, meaning]
     rows, columns = source.window
     origin = (columns.start, rows.start)
-    write_fits(path, image, 32, overwrite, header=source.header, history=history, origin=origin, flows=flows)
+    write_fits(
+        path,
+        image,
+        32,
+        overwrite,
+        header=source.header,
+        history=history,
+        origin=origin,
+        levels=source.levels,
+        flows=flows,
+    )
 
 
 def check_distinct(outputs: Iterable[Path]) -> None:

@@ -22,6 +22,7 @@ from turbrestore.io.live.stream import open_pipe, read_raw, write_raw
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.io.source import FrameSource
+from turbrestore.io.values.transfer_curves import CURVES
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video
 from turbrestore.report import SteadyFigures, check_report, write_steady_report
 from turbrestore.runs.run_record import describe_run
@@ -126,6 +127,8 @@ def steady(
     source = _from_pipe(selection, shape) if piped_in else _from_file(input, selection, quiet)
     fps, depth = source.fps or USUAL_RATE, source.bit_depth if written.bit_depth is None else written.bit_depth
     companion = source.frames if isinstance(source.frames, FrameSource) else None
+    if companion is not None and companion.colour is not None and companion.colour[1] in CURVES:
+        encoding = _encoding_of_hdr(encoding, output)
     facts, started = _Facts(), time.monotonic()
     with tempfile.TemporaryFile() as masks:
         with progress_bars(quiet) as progress:
@@ -161,6 +164,13 @@ def settings_record(machine: Machine, selection: Selection, params: SteadyParams
     """All settings of a run, as in a settings file; None where they are left to be measured."""
     records = (machine, selection, params, written)
     return {name: value for record in records for name, value in dataclasses.asdict(record).items()}
+
+
+def _encoding_of_hdr(encoding: Encoding, output: Path) -> Encoding:
+    """HEVC of 10 bits for HDR in .mp4: H.264 has 8 bits, in which codes of HLG and PQ show bands."""
+    suffix = output.suffix.lower()
+    is_h264 = suffix in (".mp4", ".mkv") and encoding.codec is None and encoding.codec_of(suffix) == "h264"
+    return dataclasses.replace(encoding, codec="hevc") if is_h264 else encoding
 
 
 def _check_companions(

@@ -17,7 +17,7 @@ ORDER = [
     "results", "settings", "memory_plan", "preparation", "fusion", "pipeline", "runs", "report",
 ]  # fmt: skip
 HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
-HEAVY |= {"astropy", "dask", "distributed"}
+HEAVY |= {"astropy", "dask", "distributed", "rawpy"}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")
 
 

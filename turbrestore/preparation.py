@@ -14,6 +14,7 @@ from .footage.levels import Levels, stretch_levels
 from .footage.light import steady_light
 from .footage.overlays import read_static_mask, without_overlay
 from .footage.passers import without_passers
+from .footage.white_balance import steady_white_balance
 from .io.source import FrameSource, Window
 from .registration.centroid import Centroid
 from .runtime.scratch import mean_of
@@ -32,7 +33,7 @@ class Prepared:
         From the levels of the clip to those of the stages.
     bars : Bars or None
     hidden : ndarray, bool, shape (H, W), or None
-        Pixels of the scene that no frame shows, because an overlay covers them; None where there is no overlay.
+        Pixels of the scene that no frame shows, because an overlay covers them or the file lacks them; None without.
     decisions : tuple of Decision
     """
 
@@ -81,10 +82,16 @@ def prepare(source: FrameSource, train: int, static_mask: str = "auto") -> Prepa
     # Before the light, because a stop would be taken for bands of it.
     source, bars, on_bars = without_bars(source)
     source, hidden, on_overlay = without_overlay(source, mask) if static_mask != "off" else (source, None, ())
+    if source.unseen is not None:
+        unseen = source.unseen[source.window]
+        hidden = unseen if hidden is None else hidden | unseen
+    source, on_colours = steady_white_balance(source)
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, train)
     source, on_passers = without_passers(source) if static_mask != "off" else (source, ())
-    return Prepared(source, levels, bars, hidden, (*on_bars, *on_overlay, *on_light, *on_range, *on_passers))
+    return Prepared(
+        source, levels, bars, hidden, (*on_bars, *on_overlay, *on_colours, *on_light, *on_range, *on_passers)
+    )
 
 
 def seeing_of_picture(

@@ -114,9 +114,18 @@ class TestValuesThatAreNotFinite:
 
     def test_too_many_are_refused_with_count_and_frame(self, frames):
         stack = frames.copy()
-        stack[4, :10] = np.nan
-        with pytest.raises(DataError, match=r"clip: frame 4: .* 640 of 4096 NaN"):
+        stack[4, :33] = np.nan
+        with pytest.raises(DataError, match=r"clip: frame 4: .* 2112 of 4096 NaN"):
             cleaned(stack)
+
+    def test_many_are_filled_by_other_frames(self, frames):
+        stack = frames.copy()
+        stack[4, :10] = np.nan
+        report, source = cleaned(stack)
+        assert report.warnings == ("640 NaN or infinite values in frame 4: filled by what other frames show",)
+        others = np.delete(stack, 4, axis=0)[:, :10].mean(axis=0)
+        np.testing.assert_allclose(source.read()[4, :10], others, atol=1e-6)
+        assert source.unseen is None
 
     def test_strict_refuses_one(self, frames):
         stack = frames.copy()

@@ -140,7 +140,7 @@ class TestMissingValues:
         assert np.argwhere(np.isnan(frames)).tolist() == [[1, 7, 8]]
         white = 65535 if zero else numbers.max()
         np.testing.assert_allclose(frames[0], (numbers[0].astype(float) + zero) / white, atol=1e-7)
-        assert open_frames(path).bit_depth == 16
+        assert open_frames(path).bit_depth == (16 if zero else 32)
 
 
 class TestFolder:
@@ -208,9 +208,17 @@ class TestRefused:
             tracemalloc.stop()
 
     def test_compressed_tiles(self, tmp_path):
-        path = tmp_path / "a.fits"
-        fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(UINT16.astype(np.int32))]).writeto(path)
-        refused(path, "compressed tiles")
+        path = tmp_path / "a.fits.fz"
+        for data in (UINT16, UINT16.astype(np.int32), RNG.random((5, 40, 30), np.float32)):
+            tiles = fits.CompImageHDU(data, quantize_level=0, compression_type="GZIP_1")
+            fits.HDUList([fits.PrimaryHDU(), tiles]).writeto(path, overwrite=True)
+            plain = tmp_path / "b.fits"
+            fits.PrimaryHDU(data).writeto(plain, overwrite=True)
+            np.testing.assert_array_equal(list(open_frames(path).native()), list(open_frames(plain).native()))
+            assert not any(card.startswith(("ZIMAGE", "TTYPE", "ZBITPIX")) for card in open_frames(path).header)
+        refused(path, "expected up to 1000 bytes", limits=Limits(max_bytes=1000))
+        path.write_bytes(path.read_bytes()[:-3000])
+        refused(path, "a.fits.fz")
 
     def test_changed_bytes_end_in_one_line_or_in_frames(self, written):
         path = written(RNG.random((5, 6, 7), np.float32), OBJECT="Moon")

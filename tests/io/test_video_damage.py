@@ -104,9 +104,7 @@ class TestRefusals:
         refused(tmp_path / "a.tif", DataError, "frame 1", "5×4", "4×5")
 
     @pytest.mark.parametrize("form", ["npy", "tif"])
-    @pytest.mark.parametrize(
-        ("value", "word"), [(4095.0, "0 to 4095"), (-0.5, "-0.5 to 0"), (np.nan, "NaN"), (np.inf, "NaN")]
-    )
+    @pytest.mark.parametrize(("value", "word"), [(np.nan, "NaN"), (np.inf, "NaN")])
     def test_floats_that_are_no_intensities(self, tmp_path, form, value, word):
         stack = np.zeros((4, 5, 6), np.float32)
         stack[2, 1, 1] = value
@@ -119,8 +117,8 @@ class TestRefusals:
     def test_arrays_that_are_no_video(self, tmp_path):
         for array in (
             np.zeros((4, 5)),
-            np.zeros((4, 5, 6), np.int16),
             np.zeros((4, 5, 6), "c8"),
+            np.zeros((4, 5, 6), bool),
             np.zeros((4, 5, 6, 4)),
         ):
             np.save(tmp_path / "a.npy", array)

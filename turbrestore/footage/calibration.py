@@ -20,7 +20,7 @@ from ..core.errors import DataError
 from ..io.output import size_text
 from ..io.pixels import PixelArray, planes_of, to_unit, with_planes
 from ..io.source import FrameSource
-from .content import fill_holes
+from .checks.missing_pixels import fill_holes
 
 # A pixel is hot where the dark exceeds its median by so many standard deviations, and by so much of full scale.
 _HOT_DEVIATIONS, _HOT_LEAST = 8.0, 0.01

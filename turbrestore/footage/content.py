@@ -12,7 +12,7 @@ saturation            half of the values or more are white                      
 ====================  =================================================================  =============================
 
 :func:`without_blank` finds blank frames alone, and leaves them out.
-:mod:`turbrestore.footage.scene_cuts` detects cuts, :mod:`turbrestore.footage.stuck_pixels` stuck pixels.
+:mod:`turbrestore.footage.checks.scene_cuts` detects cuts, :mod:`turbrestore.footage.stuck_pixels` stuck pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import dataclasses
 from array import array
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,13 +29,11 @@ from ..core.decision import Decision
 from ..core.errors import ConfigurationError, DataError, require_between
 from ..io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ..io.source import FrameSource, numbers_text
-from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
+from .checks.missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, BackdropSum, fill_holes
+from .checks.repeats import RepeatDetector
+from .checks.scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
 from .stuck_pixels import StuckPixelDetector, repair_stuck
 
-# A frame with more missing values than this share is refused.
-_MOST_MISSING = 0.01
-# Number of rings of values that are filled from the edge of a hole inwards.
-_WIDEST_HOLE = 32
 _LEAST_CONTRAST = 1 / 510
 _SATURATED = 0.5
 _BLANK_CONTRAST = 0.1
@@ -91,7 +88,7 @@ class ContentReport:
         Row, column, and channel of colour frames, in the file, of every stuck pixel; in the mosaic of a Bayer sensor
         row and column.
     duplicated : tuple of int
-        Frames that equal the one before.
+        Frames that equal the one before, but for noise of the recording or what a codec leaves.
     blank : tuple of int
         Frames without contrast.
     scenes : tuple of Scene
@@ -104,6 +101,8 @@ class ContentReport:
         Frames that :func:`clean_source` leaves out.
     warnings : tuple of str
         The defects and what is done about them; empty for a clean video.
+    backdrop : Backdrop or None
+        What frames show behind pixels that others lack; None where no frame lacks more than a hundredth.
     """
 
     numbers: range | tuple[int, ...]
@@ -117,6 +116,7 @@ class ContentReport:
     contrast: float
     left_out: frozenset[int]
     warnings: tuple[str, ...]
+    backdrop: Backdrop | None = None
 
 
 def check_content(source: FrameSource, params: ContentParams | None = None) -> ContentReport:
@@ -170,17 +170,30 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
         raise ConfigurationError(f"{source.name}: the report is about other frames; check this selection")
     cleaned = source.without(report.left_out, "")
     fill, stuck, before = bool(report.filled), report.stuck, source.repair
+    backdrop = None if report.backdrop is None else _of_file(report.backdrop, source)
 
     def repaired(pixels: PixelArray) -> PixelArray:
         pixels = pixels if before is None else before(pixels)
-        pixels = fill_holes(pixels) if fill else pixels
+        if fill:
+            pixels = fill_holes(pixels) if backdrop is None else backdrop.behind(pixels)
         if source.develop is not None:
             return with_planes(pixels, repair_stuck(planes_of(pixels), plane_places(stuck)))
         return repair_stuck(pixels, stuck) if len(stuck) else pixels
 
     return dataclasses.replace(
-        cleaned, warnings=(*source.warnings, *report.warnings), repair=repaired if fill or len(stuck) else source.repair
+        cleaned,
+        warnings=(*source.warnings, *report.warnings),
+        repair=repaired if fill or len(stuck) else source.repair,
+        unseen=source.unseen if backdrop is None or not backdrop.unseen.any() else backdrop.unseen,
     )
+
+
+def _of_file(backdrop: Backdrop, source: FrameSource) -> Backdrop:
+    """Place what belongs to the selected rows and columns among all of the file."""
+    values = np.zeros(source.file_shape[1:], np.float32)
+    unseen = np.zeros(source.file_shape[1:3], bool)
+    values[source.window], unseen[source.window] = backdrop.values, backdrop.unseen
+    return Backdrop(values, unseen)
 
 
 def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
@@ -243,6 +256,8 @@ class _ContentScan:
         self._filled: list[int] = []
         self._filled_values = 0
         self._duplicated: list[int] = []
+        self._repeats = RepeatDetector()
+        self._needs_backdrop = False
         self._stuck = StuckPixelDetector(params.stuck_excess)
         self._scenes = SceneDetector(params.cut_similarity)
 
@@ -253,6 +268,7 @@ class _ContentScan:
         if self._previous is not None and np.array_equal(pixels, self._previous):
             self._duplicated.append(number)
         self._previous = pixels
+        self._repeats.update(values)
         thumb = thumbnail(values)
         contrast = float(thumb.std())
         self._contrasts.append(contrast)
@@ -269,7 +285,7 @@ class _ContentScan:
         numbers = np.asarray(self._source.numbers)
         contrasts = np.frombuffer(self._contrasts)
         blank = _are_blank(contrasts, self._params.blank_contrast)
-        duplicated = np.isin(numbers, self._duplicated)
+        duplicated = np.isin(numbers, self._duplicated) | self._repeats.found()
         labels = np.where(blank, -1, self._scenes.labels())
         scenes, used = group_scenes(numbers, labels)
         left_out = blank | ~used
@@ -288,13 +304,14 @@ class _ContentScan:
             filled=tuple(self._filled),
             filled_values=self._filled_values,
             stuck=stuck,
-            duplicated=tuple(self._duplicated),
+            duplicated=tuple(numbers[duplicated].tolist()),
             blank=tuple(numbers[blank].tolist()),
             scenes=scenes,
             saturated=float(self._saturated) / len(numbers),
             contrast=float(contrasts.max()),
             left_out=frozenset(numbers[left_out].tolist()),
             warnings=(),
+            backdrop=self._backdrop() if self._needs_backdrop else None,
         )
         return dataclasses.replace(report, warnings=tuple(_in_words(report, bool(repeated))))
 
@@ -306,15 +323,28 @@ class _ContentScan:
         if not np.issubdtype(pixels.dtype, np.floating):
             return pixels
         missing = int(pixels.size - np.count_nonzero(np.isfinite(pixels)))
-        if missing > _MOST_MISSING * pixels.size:
+        most = MOST_MISSING if self._source.develop is None else FEW_MISSING
+        if missing > most * pixels.size:
             raise DataError(
                 f"{self._source.name}: frame {number}: expected finite values, found {missing} of {pixels.size} NaN or "
                 "infinite; select other frames or a region"
             )
-        if missing:
-            self._filled.append(number)
-            self._filled_values += missing
-        return fill_holes(pixels) if missing else pixels
+        if not missing:
+            return pixels
+        self._filled.append(number)
+        self._filled_values += missing
+        filled = fill_holes(pixels)
+        if missing > FEW_MISSING * pixels.size:
+            self._needs_backdrop = True
+            filled = np.where(np.isfinite(filled), filled, np.nanmean(filled)).astype(np.float32)
+        return filled
+
+    def _backdrop(self) -> Backdrop:
+        """Average what the frames show; they are read again, as few clips lack so much."""
+        total = BackdropSum(self._source.shape[1:])
+        for pixels in self._source.native():
+            total.add(pixels)
+        return total.backdrop()
 
 
 def _in_words(report: ContentReport, repeated: bool) -> list[str]:
@@ -324,7 +354,8 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     if report.filled:
         values = "value" if report.filled_values == 1 else "values"
         where = numbers_text(report.filled)
-        lines.append(f"{report.filled_values} NaN or infinite {values} in {where}: filled from around")
+        how = "from around" if report.backdrop is None else _how_filled(report)
+        lines.append(f"{report.filled_values} NaN or infinite {values} in {where}: filled {how}")
     if len(report.stuck):
         places = "; ".join(f"x {place[1]}, y {place[0]}" for place in report.stuck[:3])
         lines.append(
@@ -349,33 +380,16 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     return lines
 
 
+def _how_filled(report: ContentReport) -> str:
+    unseen = np.zeros(1, bool) if report.backdrop is None else report.backdrop.unseen
+    others = "by what other frames show"
+    if not unseen.any():
+        return others
+    share = f"from around, where no frame shows anything ({100 * float(unseen.mean()):.1f} % of the picture)"
+    return f"{others}, and {share}" if report.filled_values > unseen.sum() * len(report.numbers) else share
+
+
 def _are_blank(contrasts: NDArray[np.float64], share: float) -> NDArray[np.bool_]:
     """Tell which frames are blank by their contrasts; none where all would be."""
     blank = contrasts <= share * np.median(contrasts)
     return np.asarray(blank & ~blank.all())
-
-
-def fill_holes(pixels: PixelArray) -> PixelArray:
-    """Fill what is not finite, ring by ring, with the mean of the known values among the eight neighbours.
-
-    Examples
-    --------
-    >>> fill_holes(np.array([[1.0, np.nan, 3.0]], np.float32))
-    array([[1., 2., 3.]], dtype=float32)
-    """
-    missing = ~np.isfinite(pixels)
-    if not missing.any():
-        return pixels
-    with np.errstate(over="ignore"):
-        values = np.where(missing, 0, pixels).astype(np.float32)
-    for _ in range(_WIDEST_HOLE):
-        known = (~missing).astype(np.float32)
-        weight = cv2.boxFilter(known, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        total = cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        ring = missing & (weight > 0.5)
-        values[ring] = total[ring] / weight[ring]
-        missing &= ~ring
-        if not missing.any():
-            break
-    values[missing] = np.nan
-    return values

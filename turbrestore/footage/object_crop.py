@@ -16,7 +16,7 @@ from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError
 from ..io.pixels import PixelArray, to_unit
 from ..io.source import FrameSource, numbers_text
-from .content import fill_holes
+from .checks.missing_pixels import fill_holes
 
 # The object is what is brighter than this share of the way from the field to its own brightness, after smoothing.
 _SHARE, _SMOOTHING = 0.15, 2.0

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,8 @@ from .integrity import ends_early, ffv1_slices_intact, is_cut_short, varies_in_t
 from .limits import DEFAULT_LIMITS, Limits, input_errors
 from .pixels import BAYER_REMARK, PixelArray, looks_like_bayer, upright
 from .source import FrameRange, FrameSource, check_cut_short, check_frame_range
+from .values.pixel_formats import PixelFormat, frame_pixels, has_grey_palette, layout_of
+from .values.transfer_curves import BT709, remark_on_curve
 
 if TYPE_CHECKING:
     import av
@@ -43,20 +45,6 @@ OPEN_OPTIONS = {
 _INTRA_CODECS = {"ffv1", "mjpeg", "rawvideo", "png", "huffyuv", "ffvhuff", "utvideo", "prores", "dnxhd"}
 
 
-@dataclass(frozen=True)
-class _PixelFormat:
-    """Native pixel format, and the format to which its frames are converted."""
-
-    name: str
-    target: str
-    bit_depth: int
-    full_scale: int
-    channels: tuple[int, ...]
-    alpha: bool
-    orientation: int = 1
-    ramp: bool = False
-
-
 @dataclass(frozen=True, eq=False)
 class _Scan:
     """What reading all packets has shown."""
@@ -72,7 +60,11 @@ class _Scan:
 
 
 def open_container(
-    path: Path, frames: FrameRange | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
+    path: Path,
+    frames: FrameRange | None = None,
+    limits: Limits = DEFAULT_LIMITS,
+    skip_damaged: bool = False,
+    keep_hdr: bool = False,
 ) -> FrameSource:
     """Open a video file; the errors are those of :func:`turbrestore.io.video.open_frames`.
 
@@ -99,11 +91,11 @@ def open_container(
             frame = next(container.decode(stream), None)
             if frame is None:
                 raise DataError(f"{path}: expected at least one frame, found none")
-            layout = replace(native_format(path, frame.format), orientation=_orientation(frame))
-            if _has_grey_palette(frame):
-                layout = replace(layout, channels=(), ramp=True)
+            layout = layout_of(path, frame, keep_hdr)
             notes, interlaced = _notes(frame, layout, stream), frame.interlaced_frame
-            if codec == "rawvideo" and not layout.channels and looks_like_bayer(_array(frame, layout)):
+            notes += remark_on_curve(int(frame.color_trc), {**container.metadata, **stream.metadata}, keep_hdr)
+            colour = (int(frame.color_primaries), int(frame.color_trc)) if layout.transfer is None else (BT709, BT709)
+            if codec == "rawvideo" and not layout.channels and looks_like_bayer(frame_pixels(frame, layout)):
                 notes += (BAYER_REMARK,)
         scan = _scan(path, cut, limits)
         if not scan.starts_whole:
@@ -130,6 +122,7 @@ def open_container(
         path=path,
         fps=fps,
         timestamps=scan.times,
+        colour=colour,
         warnings=notes,
         damaged=damaged,
     )
@@ -165,44 +158,7 @@ def _video_stream(path: Path, container: av.container.InputContainer, limits: Li
     return stream
 
 
-def native_format(path: Path | str, native: av.VideoFormat) -> _PixelFormat:
-    """Tell how frames of a pixel format are decoded; DataError for formats of more than 16 bits."""
-    name = native.name
-    alpha = any(component.is_alpha for component in native.components)
-    values = [component for component in native.components if not component.is_alpha]
-    depth = max(component.bits for component in values)
-    if depth > 16 or "f16" in name or "f32" in name:
-        raise DataError(f"{path}: expected up to 16 bits, found {name}; store such frames as TIFF or .npy")
-    if name.startswith("bayer"):
-        depth = 8 if name.endswith("8") else 16
-    if len(values) == 1 and not native.has_palette and not native.is_rgb:
-        depth = max(depth, 8)
-        target = "gray" if depth == 8 else f"gray{depth}le"
-        return _PixelFormat(name, target, depth, 2**depth - 1, (), alpha)
-    if name.startswith("gbrp") and depth > 8:
-        return _PixelFormat(name, f"gbrp{depth}le", depth, 2**depth - 1, (3,), False)
-    if depth > 8:
-        return _PixelFormat(name, "rgb48le", depth, 65535, (3,), alpha)
-    return _PixelFormat(name, "rgb24", 8, 255, (3,), alpha)
-
-
-def _has_grey_palette(frame: av.VideoFrame) -> bool:
-    """Whether the palette of a frame is black to white, as programs write it beside grey frames in AVI."""
-    if frame.format.name != "pal8":
-        return False
-    _, palette = frame.to_ndarray()
-    return bool((palette[:, 1:] == np.arange(256)[:, None]).all())
-
-
-def _array(frame: av.VideoFrame, layout: _PixelFormat) -> PixelArray:
-    """Pixels of a frame; converted from a palette FFmpeg's grey is off by one."""
-    if not layout.ramp:
-        return convert(frame, layout.target).to_ndarray()
-    indices, _ = frame.to_ndarray()
-    return indices
-
-
-def _notes(frame: av.VideoFrame, layout: _PixelFormat, stream: av.VideoStream) -> tuple[str, ...]:
+def _notes(frame: av.VideoFrame, layout: PixelFormat, stream: av.VideoStream) -> tuple[str, ...]:
     notes = []
     # GIF frames are always decoded with alpha, which few images use.
     if layout.alpha and stream.codec_context.name != "gif":
@@ -220,20 +176,7 @@ def _notes(frame: av.VideoFrame, layout: _PixelFormat, stream: av.VideoStream) -
     return tuple(notes)
 
 
-def _orientation(frame: av.VideoFrame) -> int:
-    """Turn and reflection of the display matrix as an EXIF orientation; 1 where they are not multiples of 90°."""
-    data: Any = frame.side_data.get("DISPLAYMATRIX")
-    if data is None:
-        return 1
-    matrix = np.sign(np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2])
-    if frame.rotation % 90 or np.count_nonzero(matrix) != 2:
-        return 1
-    transposed = matrix[0, 0] == 0
-    flips = (matrix[1, 0], matrix[0, 1]) if transposed else (matrix[0, 0], matrix[1, 1])
-    return 1 + 4 * int(transposed) + [(1, 1), (-1, 1), (-1, -1), (1, -1)].index((int(flips[0]), int(flips[1])))
-
-
-def _upright_size(frame: av.VideoFrame, layout: _PixelFormat) -> tuple[int, int]:
+def _upright_size(frame: av.VideoFrame, layout: PixelFormat) -> tuple[int, int]:
     return (frame.width, frame.height) if layout.orientation > 4 else (frame.height, frame.width)
 
 
@@ -268,7 +211,8 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
     times = None
     if None not in stamps:
         ticks = np.sort(np.array(stamps, np.int64))
-        times = (ticks - ticks[0]) * tick
+        # Time stamps that are all the same say nothing.
+        times = (ticks - ticks[0]) * tick if ticks[-1] > ticks[0] or len(ticks) == 1 else None
     # A packet with a damaged slice size seems to have no checksums; in a stream without checksums all packets do.
     if len(unchecked) < len(stamps):
         damaged = sorted(damaged + unchecked)
@@ -319,7 +263,7 @@ def _declared_duration(stream: av.VideoStream) -> float | None:
 
 
 def _frames(
-    path: Path, layout: _PixelFormat, chosen: Sequence[int], intra: bool, interlaced: bool, limits: Limits
+    path: Path, layout: PixelFormat, chosen: Sequence[int], intra: bool, interlaced: bool, limits: Limits
 ) -> Iterator[PixelArray]:
     import av
 
@@ -341,17 +285,17 @@ def _frames(
             for number, frame in zip(numbers, frames, strict=False):
                 if number in wanted:
                     whole = frame if interlaced else _check(path, frame, layout, number)
-                    yield upright(_array(whole, layout), layout.orientation)
+                    yield upright(frame_pixels(whole, layout), layout.orientation)
                 if number >= chosen[-1]:
                     return
     except av.error.FFmpegError as error:
         raise DataError(f"{path}: frame {number + 1} or after cannot be decoded ({error.strerror})") from error
 
 
-def _check(path: Path, frame: av.VideoFrame, layout: _PixelFormat, number: int) -> av.VideoFrame:
+def _check(path: Path, frame: av.VideoFrame, layout: PixelFormat, number: int) -> av.VideoFrame:
     if frame.is_corrupt:
         raise DataError(f"{path}: frame {number} is damaged; copy the file again or select other frames")
-    if frame.format.name != layout.name or layout.ramp > _has_grey_palette(frame):
+    if frame.format.name != layout.name or layout.ramp > has_grey_palette(frame):
         raise DataError(f"{path}: frame {number}: expected pixel format {layout.name}, found {frame.format.name}")
     return frame
 
@@ -369,15 +313,6 @@ def _deinterlaced(stream: av.VideoStream, frames: Iterator[av.VideoFrame]) -> It
         with suppress(av.error.BlockingIOError, av.error.EOFError):
             while True:
                 yield cast("av.VideoFrame", graph.pull())
-
-
-def convert(frame: av.VideoFrame, target: str) -> av.VideoFrame:
-    """Convert a frame to the pixel format that FFmpeg calls ``target``, rounding to nearest."""
-    from av.video.reformatter import Interpolation
-
-    # By default FFmpeg rounds YUV down, by half a grey level on average.
-    exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-    return frame if frame.format.name == target else frame.reformat(format=target, interpolation=exact)
 
 
 @contextmanager

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, from_unit
 from ..core.errors import DataError, StorageError, require, require_between
-from .container import convert
 from .output import atomic_output, frames_of_one_size
 from .pixels import check_depth
+from .values.pixel_formats import FULL_RANGE, RGB, VIDEO_RANGE, convert
+from .values.transfer_curves import BT709, BT2020, CURVES, UNKNOWN
 
 if TYPE_CHECKING:
     import av
@@ -104,12 +105,14 @@ def write_container(
     overwrite: bool = False,
     encoding: Encoding = BY_SUFFIX,
     sound: Soundtrack | None = None,
+    colour: tuple[int, int] | None = None,
 ) -> None:
     """Write frames as ``.mkv`` (by default lossless FFV1 version 3 with checksums) or ``.mp4`` (lossy).
 
     The depth of FFV1 is the next of 8, 10, 12, 14 and 16 bits, that of HEVC 8 or 10 bits, that of H.264 8 bits, which
     every player shows; values fill the range; 32 is written as the largest of them. The same frames give the same
-    bytes.
+    bytes. The file says how its colours are coded: by the matrix of BT.709, or of BT.2020 for HDR, with the primaries
+    and transfer of ``colour``, numbers of ITU-T H.273, or those of BT.709.
 
     Examples
     --------
@@ -135,7 +138,7 @@ def write_container(
         ready = itertools.chain([next(iterator)], iterator)
         container = "matroska" if suffix == ".mkv" else "mp4"
         with av.open(f"file:{temporary}", "w", format=container, container_options=dict(_WRITE_OPTIONS)) as output:
-            _encode(output, ready, fps, check_depth(bit_depth), codec, encoding.crf, sound)
+            _encode(output, ready, fps, check_depth(bit_depth), codec, encoding.crf, sound, colour)
 
 
 def write_pipe(file: BinaryIO, frames: Iterable[FloatArray], fps: float, bit_depth: int = 8) -> None:
@@ -176,7 +179,7 @@ def write_pipe(file: BinaryIO, frames: Iterable[FloatArray], fps: float, bit_dep
         ready = itertools.chain([next(iterator)], iterator)
         options = {**_WRITE_OPTIONS, "flush_packets": "1", "cluster_time_limit": "1"}
         with av.open(sink, "w", format="matroska", container_options=options) as output:
-            _encode(output, ready, fps, check_depth(bit_depth), "ffv1", None, None)
+            _encode(output, ready, fps, check_depth(bit_depth), "ffv1", None, None, None)
 
 
 def _encode(
@@ -187,6 +190,7 @@ def _encode(
     codec: str,
     crf: int | None,
     sound: Soundtrack | None,
+    colour: tuple[int, int] | None,
 ) -> None:
     first = next(frames)
     # Rates such as 30000/1001 stay exact.
@@ -201,12 +205,13 @@ def _encode(
     if codec == "hevc":
         # Players of Apple know HEVC by this tag only.
         stream.codec_context.codec_tag = "hvc1"
+    tags = _tag(stream, colour, is_rgb=codec == "ffv1")
     ticks, tick = _ticks(sound, rate)
     if tick != 1 / rate:
         stream.codec_context.time_base = tick
     with _copier(output, sound) as copy_until:
         for number, frame in enumerate(itertools.chain([first], frames)):
-            picture = convert(_picture(frame, depth), pixel_format)
+            picture = convert(_picture(frame, depth), pixel_format, *tags)
             picture.pts, picture.time_base = number if ticks is None else ticks[number], tick
             output.mux(stream.encode(picture))
             copy_until(float(picture.pts * tick))
@@ -229,6 +234,16 @@ def _layout(shape: tuple[int, ...], bit_depth: int, codec: str, crf: int | None)
         # The encoder would tell about itself on standard error.
         options["x265-params"] = "log-level=none"
     return depth, pixel_format + ("10le" if depth == 10 else ""), options
+
+
+def _tag(stream: av.VideoStream, colour: tuple[int, int] | None, is_rgb: bool) -> tuple[int, int]:
+    """Write how colours are coded into the head of a stream; return matrix and range."""
+    primaries, transfer = (BT709 if number in (0, UNKNOWN) else number for number in colour or (BT709, BT709))
+    matrix = RGB if is_rgb else BT2020 if transfer in CURVES else BT709
+    codec = stream.codec_context
+    codec.color_primaries, codec.color_trc = primaries, transfer
+    codec.colorspace, codec.color_range = matrix, FULL_RANGE if is_rgb else VIDEO_RANGE
+    return matrix, int(codec.color_range)
 
 
 def _ticks(sound: Soundtrack | None, rate: Fraction) -> tuple[list[int] | None, Fraction]:

@@ -1,4 +1,4 @@
-"""Still images and animated images, read and written by imageio through Pillow.
+"""Still images, read and written by imageio through Pillow.
 
 Pillow reduces 16-bit colour to 8 bits, so OpenCV decodes those images once Pillow has found them whole; TIFF is read by
 :mod:`turbrestore.io.tiff`. The size in the header is checked before anything is decoded.
@@ -11,7 +11,7 @@ import io
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,23 +20,32 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_image, from_unit
+from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, StorageError, TurbrestoreError
 from .astronomy.fits import read_fits
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .astronomy.fits_output import write_fits
 from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
-from .output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
-from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, to_unit, upright, without_alpha
-from .source import FrameSource, check_cut_short
+from .output import atomic_output, atomic_write, check_output, check_space
+from .pixels import (
+    PixelArray,
+    at_levels,
+    check_depth,
+    depth_of,
+    from_unit_to_type,
+    full_scale_of,
+    to_unit,
+    upright,
+    without_alpha,
+)
 from .tiff import TIFF_SUFFIXES, read_tiff
+from .values.counts import holds_counts, range_of_counts
+from .values.raw_files import RAW_SUFFIXES, is_raw, read_raw_file
 
 if TYPE_CHECKING:
     import PIL.Image
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
-ANIMATION_SUFFIXES = (".png", ".apng", ".webp")
-ANIMATION_OUTPUT_SUFFIXES = (".gif", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", *RAW_SUFFIXES)
 # Pillow knows many more formats, some of which run other programs.
 _FORMATS = ("PNG", "JPEG", "BMP", "PPM", "WEBP")
 # Modes of Pillow that are converted to RGB.
@@ -58,7 +67,7 @@ def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) ->
     Parameters
     ----------
     path : path-like
-        PNG, JPEG, TIFF (one page), BMP, PGM, PPM, WebP or FITS file. Of an animation the first frame is read.
+        PNG, JPEG, TIFF (one page), BMP, PGM, PPM, WebP, raw or FITS file. Of an animation the first frame is read.
     limits : Limits
         Largest image that is read.
 
@@ -72,6 +81,8 @@ def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) ->
         The file does not exist.
     DataError
         Not an image, damaged, too large, a TIFF file of several pages, or values outside [0, 1].
+    ConfigurationError
+        A raw or FITS file, and rawpy or Astropy is not installed.
     StorageError
         The file cannot be read.
 
@@ -86,18 +97,28 @@ def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) ->
     """
     path = Path(path)
     pixels, notes = read_pixels(path, limits)
+    counts = range_of_counts([pixels], str(path)) if holds_counts(pixels.dtype) else None
+    if counts is not None:
+        return ImageFile(counts.unit(pixels), 32, (counts.remark, *notes))
     return ImageFile(to_unit(pixels, full_scale_of(pixels.dtype, str(path)), str(path)), depth_of(pixels.dtype), notes)
 
 
-def read_pixels(path: Path, limits: Limits = DEFAULT_LIMITS) -> tuple[PixelArray, tuple[str, ...]]:
-    """Read a still image as :func:`read_image` does, but in the type of its file; return warnings too."""
+def read_pixels(
+    path: Path, limits: Limits = DEFAULT_LIMITS, like: Path | None = None
+) -> tuple[PixelArray, tuple[str, ...]]:
+    """Read a still image as :func:`read_image` does, but in the type of its file; return warnings too.
+
+    A raw file takes its white balance from the file ``like``, if that is given.
+    """
     if is_fits(path):
         return read_fits(path, limits)
     suffix = path.suffix.lower()
     if suffix not in IMAGE_SUFFIXES:
         names = ", ".join((*IMAGE_SUFFIXES, *FITS_SUFFIXES))
         raise DataError(f"{path}: expected an image ({names}), found {suffix or 'no suffix'}")
-    data = _read_file(path, limits)
+    if is_raw(path):
+        return read_raw_file(path, limits, like), ()
+    data = read_file(path, limits)
     if suffix in TIFF_SUFFIXES:
         pixels, notes = read_tiff(path, data, limits)
         return (pixels, notes) if pixels is not None else without_alpha(_opencv_pixels(path, data))
@@ -105,7 +126,11 @@ def read_pixels(path: Path, limits: Limits = DEFAULT_LIMITS) -> tuple[PixelArray
 
 
 def write_image(
-    path: str | os.PathLike[str], image: ArrayLike, bit_depth: int | None = None, overwrite: bool = False
+    path: str | os.PathLike[str],
+    image: ArrayLike,
+    bit_depth: int | None = None,
+    overwrite: bool = False,
+    levels: tuple[float, float] | None = None,
 ) -> None:
     """Write a still image as PNG, TIFF or FITS, chosen by the suffix.
 
@@ -120,6 +145,8 @@ def write_image(
         floating point in TIFF and FITS and 16 bits in PNG. By default 32.
     overwrite : bool
         Replace an existing file.
+    levels : tuple of float, optional
+        Numbers that 0 and 1 become in floating point, as ``FrameSource.levels`` has them.
 
     Raises
     ------
@@ -144,7 +171,7 @@ def write_image(
     path = Path(path)
     check_output(path, overwrite=overwrite)
     if is_fits(path):
-        write_fits(path, image, bit_depth, overwrite)
+        write_fits(path, image, bit_depth, overwrite, levels=levels)
         return
     depth = check_depth(32 if bit_depth is None else bit_depth)
     is_png = path.suffix.lower() == ".png"
@@ -157,6 +184,7 @@ def write_image(
         return
     import tifffile
 
+    pixels = at_levels(pixels, levels)
     check_space(path, pixels.nbytes)
     with atomic_output(path, overwrite) as temporary:
         tifffile.imwrite(temporary, pixels, photometric="minisblack" if pixels.ndim == 2 else "rgb", metadata=None)
@@ -198,74 +226,8 @@ def write_map(path: str | os.PathLike[str], values: FloatArray, overwrite: bool 
         tifffile.imwrite(temporary, values.astype(np.float32), photometric="minisblack", metadata=None)
 
 
-def open_animation(
-    path: Path, stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
-) -> FrameSource:
-    """Open an animated PNG or WebP file; all frames are decoded once to find out whether they are whole.
-
-    Frames from ``stop`` on are not needed, so they may be missing. With ``skip_damaged`` the whole frames of a PNG file
-    that is cut short are read. 16-bit colour is read as 8 bits. The errors are those of
-    :func:`turbrestore.io.video.open_frames`.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_animation(Path(folder, "a.webp"), [np.full((2, 3), k / 4, np.float32) for k in range(4)], fps=25)
-    ...     source = open_animation(Path(folder, "a.webp"))
-    >>> source.shape, source.fps, source.format
-    ((4, 2, 3, 3), 25.0, 'webp/RGB')
-    """
-    data = _read_file(path, limits)
-    with _header(path, data, limits, ("PNG", "WEBP")) as header:
-        animation = _Animation(data, header.mode, bool(header.info.get("default_image")))
-        count, kind = getattr(header, "n_frames", 1) - animation.skips_first, str(header.format).lower()
-    if count < 2:
-        raise DataError(f"{path}: a single image; name the folder that holds the frames")
-    limits.check_count(count, str(path))
-    shape, durations = _scan(path, animation)
-    present = len(durations)
-    if kind == "png" and present == count:
-        with _header(path, data, limits, ("PNG",)) as header:
-            # Decoding does not compare the checksums.
-            header.verify()
-    deep = animation.mode == "I;16"
-    notes: tuple[str, ...] = ("alpha channel ignored",) if animation.mode in ("LA", "RGBA") else ()
-    notes += ("16-bit values read as 8 bits",) if kind == "png" and data[24] == 16 and not deep else ()
-    notes += ("variable frame rate",) if len(set(durations[:-1])) > 1 else ()
-    notes += check_cut_short(path, present, stop, skip_damaged, "damaged or cut short") if present < count else ()
-    times = np.cumsum([0.0, *durations[:-1]]) / 1000
-    return FrameSource(
-        name=path.name,
-        format=f"{kind}/{animation.mode}",
-        file_shape=(present, *shape),
-        full_scale=65535 if deep else 255,
-        bit_depth=16 if deep else 8,
-        pixels=lambda chosen: _chosen_frames(path, animation, chosen),
-        path=path,
-        fps=(present - 1) / float(times[-1]) if times[-1] > 0 else None,
-        timestamps=times if times[-1] > 0 else None,
-        warnings=notes,
-    )
-
-
-def write_animation(path: Path, frames: Iterable[FloatArray], fps: float, overwrite: bool = False) -> None:
-    """Write frames for viewing as GIF of 256 colours or lossless WebP of 8 bits, repeated without end.
-
-    All frames are in memory at 8 bits until the end. GIF counts hundredths of a second, WebP thousandths.
-    """
-    import imageio.v3 as iio
-
-    suffix = path.suffix.lower()
-    buffer = io.BytesIO()
-    writer: Any = iio.imopen(buffer, "w", plugin="pillow", extension=suffix)
-    with writer as output:
-        for frame in frames_of_one_size(frames, path):
-            output.write(from_unit(frame, 8), is_batch=False, duration=1000 / fps, loop=0, lossless=True)
-    atomic_write(path, buffer.getbuffer(), overwrite)
-
-
-def _read_file(path: Path, limits: Limits) -> bytes:
+def read_file(path: Path, limits: Limits) -> bytes:
+    """Read a whole file that is not empty."""
     limits.check_bytes(check_input(path).st_size, str(path))
     with input_errors(path):
         data = path.read_bytes()
@@ -276,13 +238,13 @@ def _read_file(path: Path, limits: Limits) -> bytes:
 
 def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
     """Upright pixels of the only or first image, with all channels."""
-    with _header(path, data, limits, _FORMATS) as header:
+    with image_header(path, data, limits, _FORMATS) as header:
         mode, kind = header.mode, header.format
         transparent = mode == "P" and "transparency" in header.info
         if kind == "PNG":
             # Decoding does not compare the checksums.
             header.verify()
-    with _image_errors(path), _opened(data) as file:
+    with image_errors(path), opened_images(data) as file:
         pixels = file.read(index=0, mode="RGBA" if transparent else "RGB" if mode in _OTHER_COLOURS else None)
         orientation = file.metadata(index=0, exclude_applied=False).get("Orientation")
     if kind == "PPM" or (kind == "PNG" and data[24] == 16):
@@ -304,7 +266,7 @@ def _at_full_range(pixels: PixelArray, data: bytes) -> PixelArray:
     return np.rint(np.minimum(pixels, white) * (full / white)).astype(pixels.dtype)
 
 
-def _opened(data: bytes) -> Any:
+def opened_images(data: bytes) -> Any:
     """Reader of imageio for all images in a file."""
     import imageio.v3 as iio
 
@@ -322,56 +284,18 @@ def _opencv_pixels(path: Path, data: bytes) -> PixelArray:
     return pixels if pixels.ndim == 2 else pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
 
 
-@dataclass(frozen=True, eq=False)
-class _Animation:
-    """Content of an animated file, its mode, and whether a still image that is no frame comes first."""
-
-    data: bytes
-    mode: str
-    skips_first: bool
-
-    def frames(self) -> Iterator[tuple[PixelArray, float]]:
-        """Decode all frames: pixels, grey or RGB, and duration in milliseconds."""
-        target = None if self.mode == "I;16" else "L" if self.mode in ("1", "L", "LA") else "RGB"
-        with _opened(self.data) as file:
-            for index, pixels in enumerate(file.iter(mode=target)):
-                if index >= self.skips_first:
-                    facts = file.metadata(index=index, exclude_applied=False)
-                    yield upright(pixels, facts.get("Orientation")), float(facts.get("duration", 0))
-
-
-def _scan(path: Path, animation: _Animation) -> tuple[tuple[int, ...], list[float]]:
-    """Shape of the frames, and duration of every frame up to the first that is damaged or missing."""
-    shape: tuple[int, ...] = ()
-    durations: list[float] = []
-    with contextlib.suppress(DataError), _image_errors(path):
-        for pixels, duration in animation.frames():
-            shape = pixels.shape
-            durations.append(duration)
-    return shape, durations
-
-
-def _chosen_frames(path: Path, animation: _Animation, chosen: Sequence[int]) -> Iterator[PixelArray]:
-    wanted, frames = frozenset(chosen), animation.frames()
-    for number in range(chosen[-1] + 1):
-        with _image_errors(path):
-            pixels, _ = next(frames)
-        if number in wanted:
-            yield pixels
-
-
 @contextlib.contextmanager
-def _header(path: Path, data: bytes, limits: Limits, formats: tuple[str, ...]) -> Iterator[PIL.Image.Image]:
+def image_header(path: Path, data: bytes, limits: Limits, formats: tuple[str, ...]) -> Iterator[PIL.Image.Image]:
     """Image of Pillow that is not decoded yet and has no more pixels than allowed."""
     import PIL.Image
 
-    with _image_errors(path), PIL.Image.open(io.BytesIO(data), formats=formats) as header:
+    with image_errors(path), PIL.Image.open(io.BytesIO(data), formats=formats) as header:
         limits.check_size(*header.size, str(path))
         yield header
 
 
 @contextlib.contextmanager
-def _image_errors(path: Path) -> Iterator[None]:
+def image_errors(path: Path) -> Iterator[None]:
     """Turn the exceptions of Pillow into DataError, and silence its warnings."""
     import PIL.Image
 

@@ -7,7 +7,6 @@ writes, are refused, so no more memory is allocated than the file is large.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 import zipfile
@@ -24,14 +23,15 @@ from ..core.errors import DataError
 from ..runtime.scratch import iter_parts, new_stack
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
 from .output import atomic_output, frames_of_one_size
-from .pixels import from_unit_to_type
+from .pixels import depth_of, from_unit_to_type
 from .source import FrameSource
+from .values.counts import from_counts, holds_counts, scale_of_numbers
 
 # Arrays of more bytes may be moved to a scratch file.
 _LARGE = 1 << 22
 # Places along each axis at which the order of the axes is judged, and the factor by which the mean over time has more
-# contrast than the mean over rows.
-_SAMPLES, _STILLER = 48, 1.2
+# contrast than the mean over rows; by the larger one where the air changes frames more than rows differ.
+_SAMPLES, _STILLER, _FAR_STILLER = 48, 1.2, 1.6
 # Frames have no shorter side.
 _LEAST_SIDE = 16
 # Planes of at most this share of the median contrast show nothing.
@@ -181,11 +181,20 @@ def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     other more than its rows do.  A warning says how such an array was read.
     """
     array, order = _frames_first(path, map_npy(path))
-    source = dataclasses.replace(FrameSource.from_array(array, path.name), pixels=MappedFrames.of(array))
+    remark = f"its axes are taken for {order}; save it as (T, H, W) or (T, H, W, 3) if that is wrong"
+    source = FrameSource(
+        name=path.name,
+        format=f"npy/{array.dtype}",
+        file_shape=array.shape,
+        full_scale=scale_of_numbers(array.dtype, path.name),
+        bit_depth=depth_of(array.dtype),
+        pixels=MappedFrames.of(array),
+        path=path,
+        warnings=(remark,) if order else (),
+    )
     limits.check_size(source.shape[2], source.shape[1], str(path))
     limits.check_count(len(source), str(path))
-    remark = (f"its axes are taken for {order}; save it as (T, H, W) or (T, H, W, 3) if that is wrong",)
-    return dataclasses.replace(source, format=f"npy/{array.dtype}", path=path, warnings=remark if order else ())
+    return from_counts(source) if holds_counts(array.dtype) else source
 
 
 def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
@@ -205,7 +214,7 @@ def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
         array.ndim == 3
         and min(shape[:2]) >= _LEAST_SIDE
         and shape[2] > 1
-        and array.dtype.kind in "uf"
+        and array.dtype.kind in "iuf"
         and _frames_last(array)
     ):
         return np.moveaxis(array, 2, 0), "(H, W, T)"
@@ -223,7 +232,8 @@ def _frames_last(array: NDArray[Any]) -> bool:
     spread, middle = (_without_blank_planes(block) for block in (spread, middle))
     still = [float(spread.mean(axis=axis).std()) for axis in (0, 2)]
     changes = [float(np.abs(np.diff(middle, axis=axis)).mean()) for axis in (0, 2)]
-    return still[1] > _STILLER * still[0] and changes[1] < changes[0]
+    smoother = changes[1] < changes[0] or (still[1] > _FAR_STILLER * still[0] and array.shape[2] < min(array.shape[:2]))
+    return still[1] > _STILLER * still[0] and smoother
 
 
 def _without_blank_planes(block: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -91,8 +91,8 @@ def full_scale_of(dtype: np.dtype[Any], name: str) -> int:
 
 
 def depth_of(dtype: np.dtype[Any]) -> int:
-    """Bit depth of an array: the bits of unsigned integers, at most 32; 32 for floating point."""
-    return min(8 * dtype.itemsize, 32) if np.issubdtype(dtype, np.unsignedinteger) else 32
+    """Bit depth of an array: the bits of integers, at most 32; 32 for floating point."""
+    return min(8 * dtype.itemsize, 32) if np.issubdtype(dtype, np.integer) else 32
 
 
 def check_depth(bit_depth: int) -> int:
@@ -111,6 +111,19 @@ def from_unit_to_type(image: FloatArray, bit_depth: int) -> PixelArray:
         np.clip(part, 0, 1, out=pixels[done : done + len(part)])
         done += len(part)
     return pixels
+
+
+def at_levels(pixels: PixelArray, levels: tuple[float, float] | None) -> PixelArray:
+    """Give intensities in floating point the numbers that 0 and 1 stand for; integers stay.
+
+    Examples
+    --------
+    >>> at_levels(np.float32([0, 0.5, 1]), (-10, 90)).tolist()
+    [-10.0, 40.0, 90.0]
+    """
+    if levels is None or pixels.dtype.kind != "f":
+        return pixels
+    return levels[0] + pixels * np.float32(levels[1] - levels[0])
 
 
 def without_alpha(pixels: PixelArray) -> tuple[PixelArray, tuple[str, ...]]:

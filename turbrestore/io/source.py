@@ -21,7 +21,7 @@ from ..core.arrays import CHANNELS, FloatArray
 from ..core.errors import ConfigurationError, DataError, require
 from ..runtime.scratch import iter_frames
 from .output import size_text
-from .pixels import BAYER_CODES, PixelArray, demosaic, depth_of, full_scale_of, to_unit
+from .pixels import PixelArray, depth_of, full_scale_of, to_unit
 
 FrameRange = tuple[int | None, int | None] | tuple[int | None, int | None, int | None]
 Roi = tuple[int, int, int, int]
@@ -55,7 +55,11 @@ class FrameSource:
     damaged : tuple of int
         Numbers, in the file, of frames that are known to be damaged.
     levels : tuple of float or None
-        Values of a FITS file that were scaled to 0 and 1; None where the type of the file says what is black and white.
+        Numbers of the file that were scaled to 0 and 1; None where its type says what is black and white.
+    colour : tuple of int or None
+        Primaries and transfer characteristic of the colours of a video, as ITU-T H.273 numbers them.
+    unseen : ndarray, bool, shape (H, W), or None
+        Pixels of the file that no frame shows and that are filled from around, such as the border of a round stop.
     header : tuple of str
         Cards of the header of a FITS file, 80 characters each.
     repair : callable or None
@@ -89,6 +93,8 @@ class FrameSource:
     warnings: tuple[str, ...] = ()
     damaged: tuple[int, ...] = ()
     levels: tuple[float, float] | None = None
+    colour: tuple[int, int] | None = None
+    unseen: NDArray[np.bool_] | None = field(default=None, repr=False)
     header: tuple[str, ...] = field(default=(), repr=False)
     repair: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
     develop: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
@@ -319,34 +325,6 @@ class FrameSource:
             raise DataError(
                 f"{self.name}: expected {len(chosen)} frames, found {done}; the file is damaged or cut short"
             )
-
-
-def as_bayer(source: FrameSource, pattern: str) -> FrameSource:
-    """Take grey frames for mosaics of a Bayer sensor.
-
-    Raises
-    ------
-    ConfigurationError
-        The pattern is unknown.
-    DataError
-        The frames are coloured, or neither of 8 nor of 16 bits.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> as_bayer(FrameSource.from_array(np.zeros((5, 4, 6), np.uint8)), "rggb").shape
-    (5, 4, 6, 3)
-    """
-    require(pattern in BAYER_CODES, f"bayer: expected one of {', '.join(BAYER_CODES)}, found {pattern!r}")
-    if len(source.file_shape) != 3 or source.bit_depth > 16:
-        kind = "floating point" if len(source.file_shape) == 3 else "colours"
-        raise DataError(f"{source.name}: --bayer: expected grey frames of 8 or 16 bits, found {kind}; leave it out")
-    return dataclasses.replace(
-        source,
-        file_shape=(*source.file_shape, 3),
-        format=f"{source.format} as {pattern}",
-        develop=lambda pixels: demosaic(pixels, pattern),
-    )
 
 
 def check_frame_range(frames: FrameRange | None) -> slice:

@@ -6,7 +6,6 @@ decompress far more than a page holds. This module therefore follows the links a
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import lzma
 import math
@@ -26,8 +25,9 @@ from ..runtime.jit import jit
 from .limits import DEFAULT_LIMITS, Limits, first_line, format_errors, input_errors
 from .npy import MappedFrames
 from .output import atomic_output, frames_of_one_size
-from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, full_scale_of, upright
+from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, upright
 from .source import FrameSource
+from .values.counts import from_counts, holds_counts, scale_of_numbers
 
 if TYPE_CHECKING:
     import tifffile
@@ -49,7 +49,7 @@ _CLEAR, _END, _TABLE = 256, 257, 4096
 
 
 def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
-    """Open a TIFF, BigTIFF or ImageJ stack, grey or RGB, with 8 or 16 bits or floating point.
+    """Open a TIFF, BigTIFF or ImageJ stack, grey or RGB, with 8 or 16 bits, floating point or counts.
 
     Where OME or ImageJ name the axes, there may be one of time or depth, and one of three channels, which become RGB;
     other files are read page by page. Packed bits, and compressions other than deflate, LZMA, LZW and PackBits, need
@@ -80,16 +80,17 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
             raise DataError(f"{path}: expected grey or RGB pages, found {kind}; convert the file")
         dtype = np.dtype(page.dtype)
         integer = np.issubdtype(dtype, np.unsignedinteger)
-        return FrameSource(
+        source = FrameSource(
             name=path.name,
             format=f"tiff/{dtype}",
             file_shape=(len(planes), page.imagelength, page.imagewidth, *((3,) if len(planes[0]) == 3 else channels)),
-            full_scale=2**page.bitspersample - 1 if integer else full_scale_of(dtype, str(path)),
+            full_scale=2**page.bitspersample - 1 if integer else scale_of_numbers(dtype, str(path)),
             bit_depth=min(page.bitspersample, 32) if integer else depth_of(dtype),
             pixels=lambda chosen: _frames(path, [planes[number] for number in chosen], limits),
             path=path,
             warnings=(*_notes(page), *pages.remarks()),
         )
+        return from_counts(source) if holds_counts(dtype) else source
 
 
 def read_tiff(path: Path, data: bytes, limits: Limits) -> tuple[PixelArray | None, tuple[str, ...]]:
@@ -242,8 +243,16 @@ def _packed_stack(path: Path, tiff: tifffile.TiffFile) -> FrameSource | None:
     array = np.memmap(path, dtype, "r", series.dataoffset, series.shape)
     if series.axes in ("TCYX", "ZCYX") and series.shape[1] == 3:
         array = np.moveaxis(array, 1, -1)
-    source = FrameSource.from_array(array, path.name)
-    return dataclasses.replace(source, format=f"tiff/{series.dtype}", path=path, pixels=MappedFrames.of(array))
+    source = FrameSource(
+        name=path.name,
+        format=f"tiff/{series.dtype}",
+        file_shape=array.shape,
+        full_scale=scale_of_numbers(array.dtype, str(path)),
+        bit_depth=depth_of(array.dtype),
+        pixels=MappedFrames.of(array),
+        path=path,
+    )
+    return from_counts(source) if holds_counts(array.dtype) else source
 
 
 def _is_decodable(page: tifffile.TiffPage) -> bool:

@@ -4,46 +4,44 @@
 input                                  module                             output
 =====================================  =================================  =====================================
 .mkv .mp4 .mov .avi .gif and others    :mod:`turbrestore.io.container`       .mkv (FFV1, lossless), .mp4 (H.264)
-.ser                                   :mod:`turbrestore.io.ser`             .ser
+.ser                                   :mod:`turbrestore.io.astronomy.ser`   .ser
 .tif .tiff (a stack)                   :mod:`turbrestore.io.tiff`            .tif .tiff
 .npy, shape (T, H, W) or (T, H, W, 3)  :mod:`turbrestore.io.npy`             .npy
 .png .apng .webp (an animation)        :mod:`turbrestore.io.images`          .gif .webp (for viewing)
 .fits .fit .fts (a cube), also .gz     :mod:`turbrestore.io.astronomy.fits`
-a folder of images or FITS files       here, :mod:`turbrestore.io.images`
+a folder of images, raw or FITS files  here, :mod:`turbrestore.io.images`
 =====================================  =================================  =====================================
 """
 
 from __future__ import annotations
 
+import dataclasses
 import os
-import re
 import stat
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, require
+from .animations import ANIMATION_OUTPUT_SUFFIXES, ANIMATION_SUFFIXES, open_animation, write_animation
 from .astronomy.fits import open_fits, open_fits_folder
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
+from .astronomy.ser import open_ser, write_ser
 from .container import CONTAINER_SUFFIXES, is_container, open_container
 from .encoding import BY_SUFFIX, Encoding, Soundtrack, write_container
-from .images import (
-    ANIMATION_OUTPUT_SUFFIXES,
-    ANIMATION_SUFFIXES,
-    IMAGE_SUFFIXES,
-    open_animation,
-    read_pixels,
-    write_animation,
-)
+from .images import IMAGE_SUFFIXES, read_pixels
 from .limits import DEFAULT_LIMITS, Limits, check_input, input_errors
 from .npy import open_npy, write_npy
 from .output import check_output, size_text
-from .pixels import PixelArray, check_depth, depth_of, full_scale_of, to_unit
-from .ser import open_ser, write_ser
-from .source import FrameRange, FrameSource, Roi, as_bayer, check_frame_range, numbers_text
+from .pixels import PixelArray, check_depth, depth_of, to_unit
+from .source import FrameRange, FrameSource, Roi, check_frame_range, numbers_text
 from .tiff import TIFF_SUFFIXES, open_tiff, write_tiff
+from .values.bayer import as_bayer
+from .values.counts import from_counts, holds_counts, scale_of_numbers
+from .values.frame_names import in_order, one_of_each_shot
 
 VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES, *FITS_SUFFIXES)
 VIDEO_OUTPUT_SUFFIXES = (".mkv", ".mp4", ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_OUTPUT_SUFFIXES)
@@ -59,6 +57,7 @@ def open_frames(
     limits: Limits = DEFAULT_LIMITS,
     skip_damaged: bool = False,
     bayer: str | None = None,
+    hdr: Literal["sdr", "keep"] = "sdr",
 ) -> FrameSource:
     """Open a video: read its headers, check that it is whole, and decode its first frame.
 
@@ -79,6 +78,8 @@ def open_frames(
         depend, each with a warning, instead of raising DataError.
     bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
         Take grey frames for mosaics of a Bayer sensor whose first pixels have these colours.
+    hdr : {"sdr", "keep"}
+        Turn HDR video (HLG, PQ) into the SDR picture, or keep its codes.
 
     Returns
     -------
@@ -106,7 +107,8 @@ def open_frames(
     ...     source.shape, len([frame for frame in source])
     ((6, 2, 3), 6)
     """
-    source = _open(Path(path), frames, limits, skip_damaged)
+    require(hdr in ("sdr", "keep"), f"hdr: expected sdr or keep, found {hdr!r}")
+    source = _open(Path(path), frames, limits, skip_damaged, hdr == "keep")
     source = source if bayer is None else as_bayer(source, bayer)
     source = source.select(frames, roi)
     source = source.without(source.damaged, f"checksum fails: {numbers_text(source.damaged)} left out")
@@ -142,7 +144,8 @@ def write_video(
     encoding : Encoding
         Codec and quality of .mkv and .mp4.
     companion : FrameSource, optional
-        Video file with a frame for each frame that is written, whose audio and time stamps .mkv and .mp4 take over.
+        Video file with a frame for each frame that is written, whose audio, time stamps and tags of colour .mkv and
+        .mp4 take over.
 
     Raises
     ------
@@ -168,7 +171,8 @@ def write_video(
     suffix = path.suffix.lower()
     checked = (check_image(frame, f"frame {number}") for number, frame in enumerate(frames))
     if suffix in (".mkv", ".mp4"):
-        write_container(path, checked, fps, bit_depth, overwrite, encoding, _soundtrack(companion))
+        colour = None if companion is None else companion.colour
+        write_container(path, checked, fps, bit_depth, overwrite, encoding, _soundtrack(companion), colour)
         return
     require(encoding == BY_SUFFIX, f"{path}: codec, crf: have an effect on .mkv and .mp4 only; leave them out")
     if suffix == ".ser":
@@ -192,7 +196,7 @@ def _soundtrack(companion: FrameSource | None) -> Soundtrack | None:
 def frame_files(folder: Path) -> list[Path]:
     """Images of a folder that are the frames of a video, without hidden files, folders and broken links.
 
-    They are sorted by name, with digits compared as numbers.
+    They are sorted by name, with digits compared as numbers, see :func:`in_order`.
 
     Examples
     --------
@@ -203,16 +207,11 @@ def frame_files(folder: Path) -> list[Path]:
     ...     [path.name for path in frame_files(Path(folder))]
     ['a9.png', 'a10.png']
     """
-
-    def natural(file: Path) -> tuple[list[tuple[int, str]], str]:
-        parts = re.findall(r"\d+|\D+", file.name)
-        return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts], file.name
-
     named = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES or is_fits(path))
-    return sorted((path for path in named if path.name[0] != "." and path.is_file()), key=natural)
+    return in_order(path for path in named if path.name[0] != "." and path.is_file())
 
 
-def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool) -> FrameSource:
+def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool, keep_hdr: bool) -> FrameSource:
     """Open a whole video by the reader of its format."""
     stop = check_frame_range(frames).stop
     is_folder = stat.S_ISDIR(check_input(path).st_mode)
@@ -220,7 +219,7 @@ def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: b
     if is_folder:
         source = _open_folder(path, limits)
     elif suffix in CONTAINER_SUFFIXES:
-        source = open_container(path, frames, limits, skip_damaged)
+        source = open_container(path, frames, limits, skip_damaged, keep_hdr)
     elif suffix == ".ser":
         source = open_ser(path, stop, limits, skip_damaged)
     elif suffix in TIFF_SUFFIXES:
@@ -232,7 +231,7 @@ def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: b
     elif suffix in ANIMATION_SUFFIXES:
         source = open_animation(path, stop, limits, skip_damaged)
     else:
-        source = _open_unknown(path, frames, limits, skip_damaged)
+        source = _open_unknown(path, frames, limits, skip_damaged, keep_hdr)
     return source
 
 
@@ -244,14 +243,16 @@ def _check_first(source: FrameSource) -> None:
     to_unit(pixels, source.full_scale, f"{source.name}: frame {source.numbers[0]}")
 
 
-def _open_unknown(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool) -> FrameSource:
+def _open_unknown(
+    path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool, keep_hdr: bool
+) -> FrameSource:
     """Open a file of an unknown suffix, or none, if its content is that of a video."""
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise DataError(f"{path}: a single image; name the folder that holds the frames")
     if not is_container(path):
         names, found = ", ".join(VIDEO_SUFFIXES), path.suffix.lower() or "no suffix"
         raise DataError(f"{path}: expected a folder of images or one of {names}, found {found}")
-    return open_container(path, frames, limits, skip_damaged)
+    return open_container(path, frames, limits, skip_damaged, keep_hdr)
 
 
 def _open_folder(folder: Path, limits: Limits) -> FrameSource:
@@ -260,30 +261,33 @@ def _open_folder(folder: Path, limits: Limits) -> FrameSource:
     if not files:
         names = ", ".join((*IMAGE_SUFFIXES, *FITS_SUFFIXES))
         raise DataError(f"{folder}: expected images ({names}), found none in the folder")
+    files, remarks = one_of_each_shot(files)
     limits.check_count(len(files), str(folder))
     fits = sum(map(is_fits, files))
     if fits == len(files):
-        return open_fits_folder(folder, files, limits)
+        source = open_fits_folder(folder, files, limits)
+        return dataclasses.replace(source, warnings=(*source.warnings, *remarks))
     if fits:
         raise DataError(f"{folder}: expected images of one kind, found {fits} FITS files among {len(files)} images")
     first, notes = read_pixels(files[0], limits)
-    return FrameSource(
+    source = FrameSource(
         name=folder.name,
         format=f"images/{files[0].suffix.lower()[1:]}",
         file_shape=(len(files), *first.shape),
-        full_scale=full_scale_of(first.dtype, str(files[0])),
+        full_scale=scale_of_numbers(first.dtype, str(files[0])),
         bit_depth=depth_of(first.dtype),
         pixels=lambda chosen: _images(files, chosen, first.dtype, first.shape, limits),
         path=folder,
-        warnings=notes,
+        warnings=(*notes, *remarks),
     )
+    return from_counts(source) if holds_counts(first.dtype) else source
 
 
 def _images(
     files: list[Path], chosen: Sequence[int], dtype: np.dtype, shape: tuple[int, ...], limits: Limits
 ) -> Iterator[PixelArray]:
     for number in chosen:
-        pixels, _ = read_pixels(files[number], limits)
+        pixels, _ = read_pixels(files[number], limits, like=files[0])
         if pixels.dtype != dtype or pixels.shape != shape:
             raise _odd_image(files, number, limits)
         yield pixels

@@ -1,7 +1,8 @@
 """Windows of a stream of frames: each frame with its neighbours in the same scene, as soon as they are there.
 
 Memory is bounded by the frames of two windows, however long the stream is.  A frame that is unlike the one before, as
-thumbnails show it (:mod:`turbrestore.footage.scene_cuts`), starts a new scene; a window holds frames of one scene only.
+thumbnails show it (:mod:`turbrestore.footage.checks.scene_cuts`), starts a new scene; a window holds frames of one
+scene only.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError
-from ..footage.scene_cuts import similarity_at, thumbnail
+from ..footage.checks.scene_cuts import similarity_at, thumbnail
 from ..registration.contrast import grey_levels
 from ..registration.opencv_flow import GreyImage
 

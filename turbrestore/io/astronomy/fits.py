@@ -12,6 +12,7 @@ axes                               frames
 (T, H, W, 3)                       colour, where only the last has
 (T, 1, H, W)                       grey
 a folder of (H, W) or (3, H, W)    grey or colour, one file a frame
+extensions of (H, W), of one name  grey, one extension a frame
 grey, with BAYERPAT                colour, by bilinear interpolation
 =================================  ==========================================================================
 
@@ -22,7 +23,8 @@ numbers                             intensity
 16 or 32 bits, BZERO of the middle  unsigned: 0 to 65535, or to 4294967295
 floating point in [0, 1]            as they are
 all others, with BSCALE and BZERO   0, or the lowest value of all frames if that is negative, becomes black; the
-                                    highest value of all frames becomes white; a remark says so
+                                    highest value of all frames becomes white, but for values that stand alone far
+                                    beyond the others, which are clipped; a remark says so
 NaN, BLANK                          missing: filled from around, where a frame has up to 1 % of them
 ==================================  =========================================================================
 """
@@ -31,7 +33,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,33 +45,33 @@ from ...core.errors import DataError
 from ...runtime.scratch import iter_frames
 from ..limits import DEFAULT_LIMITS, Limits
 from ..npy import MappedFrames
-from ..pixels import FLOAT_MARGIN, PixelArray, demosaic, depth_of, full_scale_of
+from ..pixels import PixelArray, demosaic, depth_of, full_scale_of
 from ..source import FrameSource
-from .fits_header import FitsImage, find_image
+from ..values.counts import CountRange, range_of_counts
+from .fits_header import FitsImage, find_images
 
 
 @dataclass(frozen=True)
 class _Levels:
-    """How the numbers of a file become pixels: unsigned, as they are, or from ``black`` to ``white``."""
+    """How the numbers of a file become pixels: unsigned, counts of a range, or floating point as it is."""
 
     unsigned: np.dtype[Any] | None = None
-    black: float = 0.0
-    white: float = 1.0
+    counts: CountRange | None = None
+    missing: bool = False
 
     def pixels(self, numbers: NDArray[Any], image: FitsImage) -> PixelArray:
         if self.unsigned is None:
             values = _values(numbers, image)
-            if (self.black, self.white) == (0.0, 1.0):
-                return values
-            return ((values - self.black) / (self.white - self.black)).astype(np.float32)
+            return values if self.counts is None else self.counts.unit(values)
         # Adding half of the range modulo the range flips the highest bit.
         flip = 0 if numbers.dtype.kind == "u" else 1 << (8 * numbers.dtype.itemsize - 1)
         found = np.ascontiguousarray(numbers, numbers.dtype.newbyteorder("=")).view(self.unsigned) ^ flip
         found = found.astype(self.unsigned, copy=False)
-        if image.blank is None:
+        if not self.missing:
             return found
         values = np.divide(found, np.float32(np.iinfo(self.unsigned).max), dtype=np.float32)
-        values[numbers == image.blank] = np.nan
+        if image.blank is not None:
+            values[numbers == image.blank] = np.nan
         return values
 
 
@@ -92,14 +94,19 @@ def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, sin
     ((4, 2, 3), 'fits/float32', 1.0, ('values 0 to 23 are scaled: 0 is black, 23 is white',))
     """
     path = Path(path)
-    image = find_image(path, limits)
+    images = find_images(path, limits)
+    if len(images) > 1:
+        source = _open_images(images, path, limits)
+        remark = f"its {len(images)} extensions of one size are taken for frames"
+        return dataclasses.replace(source, warnings=(*source.warnings, remark))
+    image = images[0]
     frames = _as_frames(image, image.numbers(limits))
     if single and frames.ndim == 2:
         frames = frames[None]
     if frames.ndim == 2:
         raise DataError(f"{path}: a single image; name the folder that holds the frames")
     limits.check_count(len(frames), str(path))
-    levels, notes = _levels(image, iter_frames(frames))
+    levels, notes = _levels(images, ((image, frame) for frame in iter_frames(frames)))
 
     read = MappedFrames.of(frames) if isinstance(frames, np.memmap) else lambda chosen: (frames[n] for n in chosen)
 
@@ -110,31 +117,35 @@ def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, sin
 
 
 def open_fits_folder(folder: Path, files: Sequence[Path], limits: Limits = DEFAULT_LIMITS) -> FrameSource:
-    """Open FITS files of one image each as a video; all have the size, type and scaling of the first."""
-    images = [find_image(file, limits) for file in files]
-    first = images[0]
+    """Open FITS files of one image each as a video; all have the size and type of the first."""
+    images = [find_images(file, limits)[0] for file in files]
     for image in images:
-        if image.kind != first.kind:
-            expected, found = (f"{other.shape} {other.dtype} scaled by {other.scale}" for other in (first, image))
+        if image.kind != images[0].kind:
+            expected, found = (f"{other.shape} {other.dtype}" for other in (images[0], image))
             raise DataError(f"{image.path}: expected {expected} as the first image, found {found}")
+    return _open_images(images, folder, limits)
 
-    def numbers(chosen: Sequence[int]) -> Iterator[NDArray[Any]]:
-        return (_as_image(images[number], images[number].numbers(limits)) for number in chosen)
+
+def _open_images(images: Sequence[FitsImage], path: Path, limits: Limits) -> FrameSource:
+    """Open images of one kind, each of which is a frame and may have a scaling of its own."""
+
+    def numbers(chosen: Sequence[int]) -> Iterator[tuple[FitsImage, NDArray[Any]]]:
+        for number in chosen:
+            yield images[number], _as_image(images[number], images[number].numbers(limits))
 
     def pixels(chosen: Sequence[int]) -> Iterator[PixelArray]:
-        return (levels.pixels(frame, first) for frame in numbers(chosen))
+        return (levels.pixels(frame, image) for image, frame in numbers(chosen))
 
-    levels, notes = _levels(first, numbers(range(len(files))))
-    shape = (len(files), *next(numbers(range(1))).shape)
-    source = _source(first, levels, shape, pixels, notes)
-    return dataclasses.replace(source, name=folder.name, path=folder)
+    levels, notes = _levels(images, numbers(range(len(images))))
+    shape = (len(images), *next(numbers(range(1)))[1].shape)
+    return dataclasses.replace(_source(images[0], levels, shape, pixels, notes), name=path.name, path=path)
 
 
 def read_fits(path: Path, limits: Limits) -> tuple[PixelArray, tuple[str, ...]]:
     """Read one image, grey or colour; return it in a type that its values fill, and remarks."""
-    image = find_image(path, limits)
+    image = find_images(path, limits)[0]
     numbers = _as_image(image, image.numbers(limits))
-    levels, notes = _levels(image, iter([numbers]))
+    levels, notes = _levels([image], [(image, numbers)])
     pixels, bayer = levels.pixels(numbers, image), image.bayer if numbers.ndim == 2 else None
     return pixels if bayer is None else demosaic(pixels, bayer), notes
 
@@ -143,18 +154,18 @@ def _source(
     image: FitsImage, levels: _Levels, shape: tuple[int, ...], pixels: Any, notes: tuple[str, ...]
 ) -> FrameSource:
     dtype = levels.unsigned or image.dtype.newbyteorder("=")
-    unsigned = levels.unsigned is not None and image.blank is None
+    unsigned = levels.unsigned is not None and not levels.missing
     bayer = image.bayer if len(shape) == 3 else None
     return FrameSource(
         name=image.path.name,
         format=f"fits/{dtype}" if bayer is None else f"fits/{dtype} as {bayer}",
         file_shape=shape if bayer is None else (*shape, 3),
         full_scale=full_scale_of(dtype, str(image.path)) if unsigned else 1,
-        bit_depth=min(8 * dtype.itemsize, 32) if dtype.kind in "iu" else depth_of(dtype),
+        bit_depth=depth_of(dtype) if levels.counts is None else 32,
         pixels=pixels,
         path=image.path,
         warnings=notes,
-        levels=None if (levels.black, levels.white) == (0, 1) else (levels.black, levels.white),
+        levels=None if levels.counts is None else levels.counts.levels,
         header=image.cards[:-1],
         develop=None if bayer is None else lambda mosaic: demosaic(mosaic, bayer),
     )
@@ -188,29 +199,18 @@ def _as_image(image: FitsImage, numbers: NDArray[Any]) -> NDArray[Any]:
     return numbers
 
 
-def _levels(image: FitsImage, frames: Iterator[NDArray[Any]]) -> tuple[_Levels, tuple[str, ...]]:
+def _levels(
+    images: Sequence[FitsImage], frames: Iterable[tuple[FitsImage, NDArray[Any]]]
+) -> tuple[_Levels, tuple[str, ...]]:
     """Decide what black and white are, and say what is unusual."""
-    unsigned = np.dtype(f"u{image.dtype.itemsize}")
+    image = images[0]
     middle = 0 if image.dtype.kind == "u" else 2 ** (8 * image.dtype.itemsize - 1)
-    if image.dtype.kind in "iu" and image.dtype.itemsize <= 4 and image.scale == (1, middle):
-        return _Levels(unsigned), image.notes
-    low, high = np.inf, -np.inf
-    for frame in frames:
-        values = _values(frame, image)
-        finite = np.isfinite(values)
-        low = min(low, float(values.min(initial=np.inf, where=finite)))
-        high = max(high, float(values.max(initial=-np.inf, where=finite)))
-    if high < low:
-        raise DataError(f"{image.path}: expected finite values, found none")
-    if image.dtype.kind == "f" and low >= -FLOAT_MARGIN and high <= 1 + FLOAT_MARGIN:
-        return _Levels(), image.notes
-    black = min(low, 0.0)
-    # Values that are all zero stay black.
-    white = high if high > black else black + 1
-    return _Levels(None, black, white), (
-        f"values {low:g} to {high:g} are scaled: {black:g} is black, {white:g} is white",
-        *image.notes,
-    )
+    whole = image.dtype.kind in "iu" and image.dtype.itemsize <= 4
+    if whole and all(other.scale == (1, middle) for other in images):
+        missing = any(other.blank is not None for other in images)
+        return _Levels(np.dtype(f"u{image.dtype.itemsize}"), missing=missing), image.notes
+    counts = range_of_counts((_values(frame, other) for other, frame in frames), str(image.path), image.dtype.kind)
+    return _Levels(None, counts), image.notes if counts is None else (counts.remark, *image.notes)
 
 
 def _values(numbers: NDArray[Any], image: FitsImage) -> NDArray[Any]:

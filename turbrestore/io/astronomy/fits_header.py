@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import gzip
 import math
+import re
 import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, cast
 
@@ -34,6 +35,9 @@ _PIECE = 1 << 20
 _MOST_BLOCKS = 1000
 # Headers of a file before its first image.
 _MOST_HEADERS = 100
+# Images of this name show the scene, and those of the other names say something about it.
+_SCENE = "SCI"
+_ABOUT_SCENE = {"ERR", "ERROR", "DQ", "VAR", "STAT", "WHT", "WEIGHT", "CTX", "MASK", "UNCERT", "SIGMA", "FLOW", "BPM"}
 _TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 _DAMAGED = "not a FITS file, or damaged"
 _CUT = "the file is cut short; copy it again"
@@ -41,7 +45,7 @@ _CUT = "the file is cut short; copy it again"
 
 @dataclass(frozen=True, eq=False)
 class FitsImage:
-    """The first image of a FITS file.
+    """An image of a FITS file.
 
     Attributes
     ----------
@@ -62,6 +66,10 @@ class FitsImage:
         What is unusual.
     bayer : str or None
         Colours of the first pixels of the file, where the header says that they are those of a Bayer sensor.
+    name : str
+        EXTNAME without a number at its end, in capitals.
+    tiles : int or None
+        Number of the extension, if the image is compressed in tiles.
     """
 
     path: Path
@@ -73,15 +81,19 @@ class FitsImage:
     blank: int | None
     notes: tuple[str, ...]
     bayer: str | None = None
+    name: str = ""
+    tiles: int | None = None
 
     @property
     def kind(self) -> tuple[object, ...]:
-        """What images of one folder have in common."""
-        return self.shape, self.dtype, self.scale, self.blank, self.bayer
+        """What images of one video have in common."""
+        return self.shape, self.dtype, self.bayer
 
     def numbers(self, limits: Limits) -> NDArray[Any]:
         """Map the numbers of the file into memory, or load them from a compressed file."""
         with input_errors(self.path), format_errors(self.path, _DAMAGED):
+            if self.tiles is not None:
+                return self._from_tiles(limits)
             if not _is_compressed(self.path):
                 return np.memmap(self.path, self.dtype, "r", self.offset, self.shape)
             end = self.offset + math.prod(self.shape) * self.dtype.itemsize
@@ -96,17 +108,22 @@ class FitsImage:
                 raise DataError(f"{self.path}: expected {end} bytes, found {len(data)}; {_CUT}")
             return np.frombuffer(data, self.dtype, offset=self.offset).reshape(self.shape)
 
+    def _from_tiles(self, limits: Limits) -> NDArray[Any]:
+        limits.check_bytes(math.prod(self.shape) * self.dtype.itemsize, str(self.path))
+        with _astropy_file(self.path) as file:
+            return np.array(file[self.tiles].data)
+
 
 def is_fits(path: Path) -> bool:
-    """Whether a name is that of a FITS file: .fits, .fit or .fts, or one of them with .gz.
+    """Whether a name is that of a FITS file: .fits, .fit or .fts, one of them with .gz or .fz, or .fz alone.
 
     Examples
     --------
-    >>> is_fits(Path("Moon.FIT")), is_fits(Path("moon.fits.gz")), is_fits(Path("moon.gz"))
-    (True, True, False)
+    >>> is_fits(Path("Moon.FIT")), is_fits(Path("moon.fits.gz")), is_fits(Path("moon.fz")), is_fits(Path("moon.gz"))
+    (True, True, True, False)
     """
-    name = path.name.lower().removesuffix(".gz")
-    return name.endswith(FITS_SUFFIXES)
+    name = path.name.lower()
+    return name.endswith(".fz") or name.removesuffix(".gz").endswith(FITS_SUFFIXES)
 
 
 def astropy_fits() -> Any:
@@ -118,8 +135,14 @@ def astropy_fits() -> Any:
     return fits
 
 
-def find_image(path: Path, limits: Limits) -> FitsImage:
-    """Find the first image of a FITS file; nothing but headers is read.
+def find_images(path: Path, limits: Limits) -> tuple[FitsImage, ...]:
+    """Find the images of the scene in a FITS file; nothing but headers is read.
+
+    Returns
+    -------
+    tuple of FitsImage
+        The first that is named SCI, or else the first whose name is not that of errors or masks, and, where that is a
+        single image, all others of its size and name: pipelines store one frame per extension.
 
     Raises
     ------
@@ -128,31 +151,64 @@ def find_image(path: Path, limits: Limits) -> FitsImage:
     InputNotFoundError, StorageError
         The file does not exist, or cannot be read.
     DataError
-        Not a FITS file, damaged, cut short, without an image, compressed by tiles, or larger than the limits.
+        Not a FITS file, damaged, cut short, without an image, or larger than the limits.
     """
-    fits = astropy_fits()
-    size = check_input(path).st_size
-    with input_errors(path), format_errors(path, _DAMAGED), _opened(path) as file, warnings.catch_warnings():
+    found: list[FitsImage] = []
+    with format_errors(path, _DAMAGED), warnings.catch_warnings():
         # Astropy warns of cards that break rules, and reads them.
         warnings.simplefilter("ignore")
-        offset = 0
-        for _ in range(_MOST_HEADERS):
-            cards = _read_cards(path, file, offset)
-            if not cards:
+        for image in _images(path, limits):
+            found.append(image)
+            if image.name == _SCENE and len(image.shape) > 2:
                 break
+            if len(found) == 1 and len(image.shape) > 2 and image.name not in _ABOUT_SCENE:
+                break
+    if not found:
+        raise DataError(f"{path}: expected an image of two axes or more, found none")
+    named = [image for image in found if image.name == _SCENE]
+    first = (named or [image for image in found if image.name not in _ABOUT_SCENE] or found)[0]
+    if len(first.shape) > 2:
+        return (first,)
+    return tuple(image for image in found if (image.kind, image.name) == (first.kind, first.name))
+
+
+def _images(path: Path, limits: Limits) -> Iterator[FitsImage]:
+    """Yield the images of a file in their order, as their headers describe them."""
+    fits = astropy_fits()
+    size, offset, count = check_input(path).st_size, 0, 0
+    with input_errors(path), _opened(path) as file:
+        for index in range(limits.max_frames + _MOST_HEADERS):
+            cards = _read_cards(path, file, offset)
+            if not cards or (index >= _MOST_HEADERS and not count):
+                return
             header, offset = fits.Header.fromstring("".join(cards)), offset + -(-len(cards) // 36) * _BLOCK
             length = _data_bytes(path, header)
+            image = None
             if header.get("ZIMAGE", False):
-                raise DataError(f"{path}: expected an image as it is, found one in compressed tiles; unpack it first")
-            if header.get("XTENSION", "IMAGE").strip() == "IMAGE" and header["NAXIS"] >= 2 and length:
+                image = _tiled_image(path, index)
+            elif header.get("XTENSION", "IMAGE").strip() == "IMAGE" and header["NAXIS"] >= 2 and length:
                 image = _image(path, cards, header, offset)
+            if image is not None:
                 _check_size(image, limits)
+                count += 1
+                limits.check_count(count, str(path))
                 if not _is_compressed(path) and offset + length > size:
                     raise DataError(f"{path}: expected {offset + length} bytes, found {size}; {_CUT}")
-                return image
+                yield image
             offset += -(-length // _BLOCK) * _BLOCK
             _skip_to(path, file, offset, limits)
-    raise DataError(f"{path}: expected an image of two axes or more, found none")
+
+
+def _tiled_image(path: Path, index: int) -> FitsImage:
+    """Describe an image in compressed tiles by the header that it had before."""
+    with _astropy_file(path) as file:
+        header = file[index].header
+        cards = tuple(card.image[:80].ljust(80) for card in header.cards)
+        return replace(_image(path, (*cards, "END".ljust(80)), header, 0), tiles=index)
+
+
+def _astropy_file(path: Path) -> Any:
+    return astropy_fits().open(path, do_not_scale_image_data=True, memmap=False)
 
 
 def _read_cards(path: Path, file: IO[bytes], offset: int) -> tuple[str, ...]:
@@ -198,7 +254,8 @@ def _image(path: Path, cards: tuple[str, ...], header: Header, offset: int) -> F
     if pattern and bayer is None:
         notes.append(f"the Bayer pattern {pattern} is unknown, so it is not made into colour")
     missing = blank if dtype.kind in "iu" and isinstance(blank, int) else None
-    return FitsImage(path, cards, shape, dtype, offset, (scale, zero), missing, tuple(notes), bayer)
+    name = re.sub(r"[\s_-]*\d*$", "", str(header.get("EXTNAME", "")).strip().upper())
+    return FitsImage(path, cards, shape, dtype, offset, (scale, zero), missing, tuple(notes), bayer, name)
 
 
 def _first_colours(pattern: str, header: Header, rows: int | None) -> str | None:

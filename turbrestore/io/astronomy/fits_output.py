@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arrays import FloatArray, check_image
 from ..output import atomic_output, check_output, check_space
-from ..pixels import PixelArray, check_depth, from_unit_to_type
+from ..pixels import PixelArray, at_levels, check_depth, from_unit_to_type
 from .fits_header import astropy_fits
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ def write_fits(
     history: Iterable[str] = (),
     origin: tuple[int, int] = (0, 0),
     uncertainty: FloatArray | None = None,
+    levels: tuple[float, float] | None = None,
     flows: FloatArray | None = None,
 ) -> None:
     """Write an image as FITS; the same image and header give the same bytes.
@@ -63,6 +64,8 @@ def write_fits(
         x and y of the image in the frames of the input; CRPIX1 and CRPIX2 move by them.
     uncertainty : ndarray, float32, shape (H, W), optional
         Standard deviation of every pixel, stored as the extension ``UNCERT``.
+    levels : tuple of float, optional
+        Numbers that 0 and 1 become in floating point; ``uncertainty`` is brought to them too.
     flows : ndarray, float32, shape (T, H, W, 2), optional
         Displacements (dx, dy) from the image to frames, pixels, stored as the extension ``FLOW`` of shape (T, 2, H, W).
 
@@ -90,6 +93,9 @@ def write_fits(
     check_output(path, overwrite=overwrite, suffixes=(FITS_OUTPUT_SUFFIX,))
     fits = astropy_fits()
     pixels = from_unit_to_type(check_image(image, "image"), check_depth(32 if bit_depth is None else bit_depth))
+    pixels = at_levels(pixels, levels)
+    if levels is not None and uncertainty is not None and pixels.dtype.kind == "f":
+        uncertainty = uncertainty * np.float32(levels[1] - levels[0])
     check_space(path, pixels.nbytes + sum(array.nbytes for array in (uncertainty, flows) if array is not None))
     with warnings.catch_warnings():
         # Cards of the input that break rules are written as they are, or repaired.

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
+from ...core.arrays import FloatArray, luminance
 
 _SIDE = 32
 # Rate at which the reference of a scene follows slow changes such as drift and daylight.

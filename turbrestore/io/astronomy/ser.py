@@ -25,12 +25,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, from_unit
-from ..core.errors import DataError
-from .limits import DEFAULT_LIMITS, Limits, input_errors
-from .output import atomic_output, frames_of_one_size
-from .pixels import BAYER_REMARK, PixelArray, check_depth, demosaic, looks_like_bayer
-from .source import FrameSource, check_cut_short
+from ...core.arrays import FloatArray, from_unit
+from ...core.errors import DataError
+from ..limits import DEFAULT_LIMITS, Limits, input_errors
+from ..output import atomic_output, frames_of_one_size
+from ..pixels import BAYER_REMARK, PixelArray, check_depth, demosaic, looks_like_bayer
+from ..source import FrameSource, check_cut_short
 
 SIGNATURE = b"LUCAM-RECORDER"
 HEADER_SIZE = 178

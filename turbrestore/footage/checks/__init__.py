@@ -1,0 +1,1 @@
+"""What single frames can be wrong in: missing pixels, repeats, cuts."""

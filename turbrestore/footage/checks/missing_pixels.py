@@ -1,0 +1,107 @@
+"""Pixels without a value: holes that are filled from around, and borders that no frame shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.arrays import FloatArray
+from ...io.pixels import PixelArray
+
+# Share of a frame that may be missing and is filled from around, and from which the frame shows too little.
+FEW_MISSING, MOST_MISSING = 0.01, 0.5
+# Number of rings of values that are filled from the edge of a hole inwards.
+_WIDEST_HOLE = 32
+
+
+def fill_holes(pixels: PixelArray) -> PixelArray:
+    """Fill what is not finite, ring by ring, with the mean of the known values among the eight neighbours.
+
+    Examples
+    --------
+    >>> fill_holes(np.array([[1.0, np.nan, 3.0]], np.float32))
+    array([[1., 2., 3.]], dtype=float32)
+    """
+    missing = ~np.isfinite(pixels)
+    if not missing.any():
+        return pixels
+    with np.errstate(over="ignore"):
+        values = np.where(missing, 0, pixels).astype(np.float32)
+    for _ in range(_WIDEST_HOLE):
+        known = (~missing).astype(np.float32)
+        weight = cv2.boxFilter(known, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        ring = missing & (weight > 0.5)
+        values[ring] = total[ring] / weight[ring]
+        missing &= ~ring
+        if not missing.any():
+            break
+    values[missing] = np.nan
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class Backdrop:
+    """What frames show behind the pixels that others lack.
+
+    Attributes
+    ----------
+    values : ndarray, float32, shape (H, W) or (H, W, 3)
+        Mean over the frames that have a value; where none has one, that of the pixels around.
+    unseen : ndarray, bool, shape (H, W)
+        Pixels that no frame has.
+    """
+
+    values: FloatArray
+    unseen: NDArray[np.bool_]
+
+    def behind(self, pixels: PixelArray) -> PixelArray:
+        """Fill a few missing pixels from around, many from what other frames show.
+
+        Examples
+        --------
+        >>> backdrop = Backdrop(np.full((1, 2), 7, np.float32), np.zeros((1, 2), bool))
+        >>> backdrop.behind(np.array([[np.nan, 3]], np.float32))
+        array([[7., 3.]], dtype=float32)
+        """
+        missing = ~np.isfinite(pixels)
+        if np.count_nonzero(missing) <= FEW_MISSING * pixels.size:
+            return fill_holes(pixels)
+        return np.where(missing, self.values, pixels).astype(np.float32)
+
+
+class BackdropSum:
+    """Sum of what frames show, from which a :class:`Backdrop` is made."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self._total = np.zeros(shape)
+        self._count = np.zeros(shape, np.int64)
+
+    def add(self, pixels: PixelArray) -> None:
+        """Add a frame; missing pixels are NaN or infinite."""
+        known = np.isfinite(pixels)
+        self._total[known] += pixels[known]
+        self._count += known
+
+    def backdrop(self) -> Backdrop:
+        """Divide the sum, and continue it smoothly to where no frame shows anything."""
+        mean = (self._total / np.maximum(self._count, 1)).astype(np.float32)
+        known = self._count > 0
+        unseen = np.asarray(~known if known.ndim == 2 else ~known.all(axis=2))
+        return Backdrop(_continued(mean, known.astype(np.float32)), unseen)
+
+
+def _continued(values: FloatArray, weight: FloatArray) -> FloatArray:
+    """Continue values by averages in wider and wider windows of what is known."""
+    filled, missing, reach = values.copy(), weight == 0, 1.0
+    while missing.any() and reach < 4 * max(values.shape):
+        around = cv2.GaussianBlur(weight, (0, 0), reach, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.GaussianBlur(values * weight, (0, 0), reach, borderType=cv2.BORDER_CONSTANT)
+        near = missing & (around > 0.05)
+        filled[near] = total[near] / around[near]
+        missing &= ~near
+        reach *= 3
+    return filled

@@ -1,0 +1,173 @@
+"""Counts: numbers of files that do not say which of them are black and white.
+
+Black is 0, or the lowest number of all frames if that is negative; white is the highest.  A number is lone where no
+neighbour comes near it: a hot pixel, a cosmic ray, a damaged byte.  Lone numbers, and those of a few frames alone, do
+not widen the range to more than twice what the others span; they are clipped instead.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.arrays import FloatArray
+from ...core.errors import DataError
+from ...runtime.scratch import iter_frames
+from ..pixels import FLOAT_MARGIN, PixelArray, full_scale_of
+from ..source import FrameSource
+
+# Percentage of the frames at either end whose extremes do not count.
+_FEW = 10
+_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+# Unsigned numbers of four bytes and more fill their type if one of them reaches this share of it.
+_FILLED = 1 / 256
+
+
+@dataclass(frozen=True)
+class CountRange:
+    """Numbers that mean black and white, and the lowest and highest number of all frames."""
+
+    black: float
+    white: float
+    lowest: float
+    highest: float
+
+    @property
+    def levels(self) -> tuple[float, float] | None:
+        """Black and white; None where they are 0 and 1 as in other files."""
+        return None if (self.black, self.white) == (0, 1) else (self.black, self.white)
+
+    @property
+    def remark(self) -> str:
+        """Say how the numbers are read."""
+        text = (
+            f"values {self.lowest:g} to {self.highest:g} are scaled: {self.black:g} is black, {self.white:g} is white"
+        )
+        clipped = self.lowest < self.black or self.highest > self.white
+        return text + (", and the few values beyond, which stand alone, are clipped" if clipped else "")
+
+    def unit(self, values: PixelArray) -> FloatArray:
+        """Bring numbers to intensities; NaN and infinite ones stay.
+
+        Examples
+        --------
+        >>> CountRange(-10, 90, -10, 4000).unit(np.array([-10, 40, 4000, np.inf]))
+        array([0. , 0.5, 1. , inf], dtype=float32)
+        """
+        scaled = (values.astype(np.float64) - self.black) / (self.white - self.black)
+        clipped = np.clip(scaled, 0, 1, where=np.isfinite(scaled), out=scaled)
+        return clipped.astype(np.float32)
+
+
+def holds_counts(dtype: np.dtype[Any]) -> bool:
+    """Whether the numbers of a type may be counts: signed ones, floating point, and unsigned ones of four bytes."""
+    return dtype.kind in "if" or (dtype.kind == "u" and dtype.itemsize >= 4)
+
+
+def scale_of_numbers(dtype: np.dtype[Any], name: str) -> int:
+    """Value that means intensity 1 until the range of the numbers is known; DataError for other types than numbers."""
+    return 1 if dtype.kind == "i" else full_scale_of(dtype, name)
+
+
+def range_of_counts(frames: Iterable[PixelArray], name: str, kind: str | None = None) -> CountRange | None:
+    """Find the range of the numbers of all frames; None where they are intensities already.
+
+    ``kind`` is that of the type in the file, by default that of the frames: integers are no intensities.
+
+    Raises
+    ------
+    DataError
+        No number is finite.
+
+    Examples
+    --------
+    >>> frames = np.tile(np.arange(-5.0, 95.0), (4, 3, 1))
+    >>> frames[1, 1, 50] = 60_000
+    >>> range_of_counts(frames, "a").remark.split(": ")[1]
+    '-5 is black, 94 is white, and the few values beyond, which stand alone, are clipped'
+    >>> range_of_counts(frames[:1] / 100 + 0.05, "a") is None
+    True
+    """
+    ends: list[tuple[float, float, float, float]] = []
+    dtype: np.dtype[Any] = np.dtype(np.float32)
+    for frame in iter_frames(iter(frames)):
+        dtype = frame.dtype
+        ends.append(_ends(frame))
+    lowest, low, high, highest = np.array(ends).T if ends else np.full((4, 1), np.nan)
+    if not ends or np.nanmax(highest) == -np.inf:
+        raise DataError(f"{name}: expected finite values, found only NaN or infinite ones")
+    seen = np.isfinite(highest)
+    bottom, top = float(lowest[seen].min()), float(highest[seen].max())
+    kind = kind or dtype.kind
+    if kind == "f" and bottom >= -FLOAT_MARGIN and top <= 1 + FLOAT_MARGIN:
+        return None
+    if kind == "u" and dtype.kind == "u" and top >= _FILLED * np.iinfo(dtype).max:
+        return None
+    usual = min(0.0, float(np.percentile(low[seen], _FEW, method="lower")))
+    bright = float(np.percentile(high[seen], 100 - _FEW, method="higher"))
+    if kind == "f" and usual >= -FLOAT_MARGIN and bright <= 1 + FLOAT_MARGIN:
+        return CountRange(0.0, 1.0, bottom, top)
+    span = bright - usual
+    black = min(bottom, 0.0) if bottom >= usual - span or span <= 0 else usual
+    white = top if top <= bright + span or span <= 0 else bright
+    # Numbers that are all zero stay black.
+    return CountRange(black, white if white > black else black + 1, bottom, top)
+
+
+def _ends(frame: PixelArray) -> tuple[float, float, float, float]:
+    """Lowest number, lowest and highest that have a neighbour as low or as high, and highest number."""
+    bottom, top = float(frame.min()), float(frame.max())
+    if frame.dtype.kind == "f" and bottom >= -FLOAT_MARGIN and top <= 1 + FLOAT_MARGIN:
+        # Intensities need no closer look.
+        return bottom, bottom, top, top
+    values = np.asarray(frame, np.float64)
+    known = np.isfinite(values)
+    up, down = np.where(known, values, -np.inf), np.where(known, values, np.inf)
+    highest, lowest = float(up.max()), float(down.min())
+    if min(values.shape[:2]) < 3:
+        return lowest, lowest, highest, highest
+    high = float(np.minimum(up, cv2.dilate(up, _NEIGHBOURS)).max())
+    low = float(np.maximum(down, cv2.erode(down, _NEIGHBOURS)).min())
+    return lowest, low, high, highest
+
+
+def from_counts(source: FrameSource) -> FrameSource:
+    """Scale the counts of a video by one range for all its frames; intensities stay as they are.
+
+    Every frame is read once.  What follows a damaged frame is scaled by the range of what comes before.
+
+    Examples
+    --------
+    >>> frame = np.full((4, 4), 7, np.int16)
+    >>> source = FrameSource("a", "array/int16", (2, 4, 4), 1, 16, lambda chosen: (frame for _ in chosen))
+    >>> float(from_counts(source).read().max()), from_counts(source).levels
+    (1.0, (0.0, 7.0))
+    """
+    read = source.pixels
+
+    def whole() -> Iterator[PixelArray]:
+        with suppress(DataError):
+            yield from read(range(source.file_shape[0]))
+
+    found = range_of_counts(whole(), source.name)
+    if found is None:
+        return source
+
+    def pixels(chosen: Sequence[int]) -> Iterator[NDArray[np.float32]]:
+        return (found.unit(frame) for frame in iter_frames(read(chosen)))
+
+    return dataclasses.replace(
+        source,
+        full_scale=1,
+        bit_depth=32,
+        pixels=pixels,
+        warnings=(*source.warnings, found.remark),
+        levels=found.levels,
+    )
