@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.core.errors import DataError
-from turbrestore.registration.global_shift import (
+from turbrestore.registration.camera.global_shift import (
     global_shifts,
-    mean_stabilised,
     measure_shift,
     overlap,
     prepare_shift_reference,
 )
+from turbrestore.registration.camera.stabilisation import mean_stabilised
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 PHOTO = cv2.GaussianBlur(skimage.data.camera().astype(np.float32) / 255, (0, 0), 1.0)
