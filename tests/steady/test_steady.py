@@ -22,6 +22,7 @@ from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 SIZE = 128
+STILL = np.eye(3)
 
 
 def photo(name="camera", size=SIZE):
@@ -66,7 +67,7 @@ class TestMemory:
         memory, still = None, np.zeros(frames[0].shape, bool)
         for number, (frame, flow) in enumerate(zip(frames, flows, strict=True)):
             mask = still if moving is None else moving[number]
-            memory = remember(memory, frame, lambda *_, flow=flow: flow, 0.02, 2.0, stillness, mask)
+            memory = remember(memory, frame, lambda *_, flow=flow: flow, 0.02, 2.0, stillness, mask, STILL, STILL)
         return memory
 
     def test_noise_falls_as_in_a_mean_of_all_frames(self):
@@ -80,10 +81,10 @@ class TestMemory:
         # A scene that is the first frame, then one pixel to the right of it for good: the mean lies 5/6 to the right.
         scene = cv2.GaussianBlur(photo(size=72), (0, 0), 2.0)
         first, later = scene[:, 4:68], scene[:, 3:67]
-        memory = remember(None, first, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool))
+        memory = remember(None, first, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool), STILL, STILL)
         for _ in range(5):
-            memory = remember(memory, later, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool))
-        shift = np.median(measure_flow(first, memory.image)[8:-8, 8:-8, 0])
+            memory = remember(memory, later, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool), STILL, STILL)
+        shift = np.median(measure_flow(first, memory.image, np.zeros((64, 64, 2), np.float32))[8:-8, 8:-8, 0])
         assert abs(shift - 5 / 6) < 0.1
 
     def test_what_has_changed_passes_at_once(self):
@@ -108,9 +109,10 @@ class TestMemory:
 
     def test_weak_turbulence_leaves_nothing_to_the_memory(self):
         still = np.zeros((64, 64), bool)
-        memory = remember(None, photo(size=64), measure_flow, 0.02, 1.0, 1.0, still)
+        memory = remember(None, photo(size=64), measure_flow, 0.02, 1.0, 1.0, still, STILL, STILL)
         assert np.array_equal(
-            remember(memory, photo("brick", 64), measure_flow, 0.02, 1.0, 1.0, still).image, photo("brick", 64)
+            remember(memory, photo("brick", 64), measure_flow, 0.02, 1.0, 1.0, still, STILL, STILL).image,
+            photo("brick", 64),
         )
 
     def test_an_object_is_not_held_back_by_the_memory(self):
@@ -133,15 +135,15 @@ class TestMemory:
 def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
     soft, short = cv2.GaussianBlur(photo(), (0, 0), 2.0), np.ones((SIZE, SIZE), np.float32)
     scenes = _Scenes(SteadyParams(), 0.8, Runtime(threads=1))
-    assert scenes._remembered_width(Memory(soft, short, 1)) == 0.8
-    widths = [scenes._remembered_width(Memory(soft, 30 * short, 30)) for _ in range(80)]
+    assert scenes._remembered_width(Memory(soft, short, 1, STILL)) == 0.8
+    widths = [scenes._remembered_width(Memory(soft, 30 * short, 30, STILL)) for _ in range(80)]
     assert 0 < max(np.diff([0.8, *widths])) < 0.1
     needed = estimate_blur(soft, exponent=KOLMOGOROV).removable + _ADDED
     assert widths[-1] == pytest.approx(needed, abs=0.02)
     given = _Scenes(SteadyParams(sigma=0.8), 0.8, Runtime(threads=1))
-    assert given._remembered_width(Memory(soft, 30 * short, 30)) == 0.8
+    assert given._remembered_width(Memory(soft, 30 * short, 30, STILL)) == 0.8
     flat = _Scenes(SteadyParams(), 0.8, Runtime(threads=1))
-    assert flat._remembered_width(Memory(0 * soft, 30 * short, 30)) == 0.8
+    assert flat._remembered_width(Memory(0 * soft, 30 * short, 30, STILL)) == 0.8
 
 
 @pytest.fixture(scope="module")
