@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError
 from ..core.noise import estimate_noise
-from ..registration.camera.global_shift import measure_shift
+from ..registration.camera.global_shift import LEAST_CORRELATION, correlation, measure_shift
 from ..registration.flow import MIN_SIDE
 from ..registration.flow_algebra import invert_flow
 from ..registration.opencv_flow import DisParams, FlowSolver, GreyImage, dis_solver
@@ -44,7 +44,7 @@ from .fusion import fuse
 from .motion import moving_mask
 from .path import smooth_motion, without_shake
 from .settings import SteadyParams
-from .windows import Window, contrast_levels
+from .windows import Window, WindowFrame, contrast_levels
 
 # Half of the resolution is enough for displacements as smooth as those of turbulence, and five times as fast.
 _FLOW = DisParams(finest_scale=1, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
@@ -210,11 +210,20 @@ def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
         if any(offset * other > 0 for other in cameras):
             expected = expected_motion(cameras, offset)
         else:
-            shift = measure_shift(neighbour.image, window.frame.shift_reference)
-            expected = np.column_stack([np.zeros((2, 2)), np.zeros(2) if shift is None else shift])
+            expected = _first_guess(window.frame, neighbour)
         flows[offset] = solve(neighbour.levels[None], [camera_flow(expected, levels.shape)])[0]
         cameras[offset] = fit_camera(flows[offset])
     return flows, cameras
+
+
+def _first_guess(frame: WindowFrame, neighbour: WindowFrame) -> Matrix:
+    """Find a shift of the whole frame, where the images are not alike without one.
+
+    A pattern that repeats looks as much alike a period further on, and more so through some turbulence.
+    """
+    still = correlation(frame.shift_reference.reduced, neighbour.shift_reference.reduced)
+    shift = None if still > LEAST_CORRELATION else measure_shift(neighbour.image, frame.shift_reference)
+    return np.column_stack([np.zeros((2, 2)), np.zeros(2) if shift is None else shift])
 
 
 def _placed(window: Window, cameras: dict[int, Matrix]) -> dict[int, FloatArray]:

@@ -29,6 +29,12 @@ moves by g R, and the memory with it: ``Z ← Z ∘ (id + V)`` with V the invers
 ``g_r = 1 − s (1 − g)`` and g_A the same, but at least 1/12: what the memory as a whole lies off the path of the camera
 is an error of the path or of the memory, and the output must not drift away from the input.  Where r cannot be trusted
 (w small, an object or the background it uncovers) it is filled in from around.
+
+A memory that has gone astray, because a period of a pattern was taken for another or the scene moves slowly, may still
+agree with every next frame.  It is therefore checked against the mean B of the luminance of the last frames, which the
+camera alone carries along and no flow: with e_Z and e_F the distances of Z and of ``F ∘ N E⁻¹`` from B, squared and
+averaged over a window and eight frames, w falls by ``1 / (1 + (e_Z / e_F)⁴)``, so that a memory further away than the
+frames is let go.
 """
 
 from __future__ import annotations
@@ -40,7 +46,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, luminance
 from ..registration.flow_algebra import invert_flow
 from ..registration.warp import inside, sample_linear, warp
 from .camera import Matrix, camera_flow, fit_camera
@@ -61,6 +67,10 @@ _LEAST_WEIGHT = 0.05
 _WEAK, _STRONG = 1.2, 1.8
 # Least g_A.
 _PULL = 1 / 12
+# Windows of the distance from B, pixels; weight of a frame in its mean over time, frames in B, and a distance that does
+# not count, squared intensity.
+_DIFFERENCE_WINDOW, _DISTANCE_WINDOW = 1.0, 6.0
+_CHECKED, _RECENT, _EVEN = 1 / 8, 32, 1e-5
 # Moves of the corners, pixels, that are left out, and by which the grid of the memory follows the camera.
 _LEAST_MOVE, _FARTHEST = 0.02, 1.0
 # Steadiness below which nothing is remembered.
@@ -81,12 +91,21 @@ class Memory:
         Number of frames since the memory began, at most the longest memory.
     pose : ndarray, float64, shape (3, 3)
         E.
+    mean : ndarray, float32, shape (H, W)
+        B.
+    distances : ndarray, float32, shape (H, W, 2)
+        e_Z and e_F, squared intensity.
+    let_go : float
+        Share of the memory that its distance from B has let go at the last frame.
     """
 
     image: FloatArray
     held: FloatArray
     frames: int
     pose: Matrix
+    mean: FloatArray
+    distances: FloatArray
+    let_go: float
 
 
 def remember(
@@ -137,7 +156,8 @@ def remember(
     shape = image.shape[:2]
     steadiness *= float(np.clip((largest - _WEAK) / (_STRONG - _WEAK), 0, 1))
     if memory is None or steadiness < _LEAST_STEADINESS:
-        return Memory(image, np.ones(shape, np.float32), 1, np.eye(3))
+        distances = np.zeros((*shape, 2), np.float32)
+        return Memory(image, np.ones(shape, np.float32), 1, np.eye(3), luminance(image), distances, 0.0)
     memory = _carried(memory, carry, offset, image)
     start = offset @ np.linalg.inv(memory.pose)
     expected = motion(start)
@@ -145,12 +165,17 @@ def remember(
     camera = fit_camera(flow)
     affine = camera_flow(camera, shape)
     own = flow - affine
+    placed = sample_linear((luminance(image),), camera_flow(expected, shape))
+    found = [_distance(one, memory.mean) for one in (luminance(memory.image), placed)]
+    distances = memory.distances + _CHECKED * (np.stack(found, -1) - memory.distances)
+    agrees = 1 / (1 + (distances[..., 0] / (distances[..., 1] + _EVEN)) ** 4)
     tolerance = explained_difference(memory.image, noise)
     weight = agreement_weight(sample_linear((image,), flow), memory.image, tolerance)
     weight /= 1 + (cv2.GaussianBlur(np.einsum("yxc,yxc->yx", own, own), (0, 0), _WINDOW) / largest**2) ** 2
     # R follows a slow object from frame to frame, and would hold it back, and with it the flat background beside it.
     near = cv2.dilate(moving.astype(np.uint8), _MARGIN) > 0
     weight *= 1 - cv2.GaussianBlur(near.astype(np.float32), (0, 0), _MARGIN_EDGE)
+    weight *= agrees
     trusted = np.where(cv2.dilate(near.astype(np.uint8), _BESIDE) > 0, 0, weight)
     own = _filled(own, trusted)
     frames = min(memory.frames + 1, _LONGEST)
@@ -159,7 +184,11 @@ def remember(
     innovation = warp(image, own + affine) - memory.image
     estimate = memory.image + innovation / (held if image.ndim == 2 else held[..., None])
     inverse = invert_flow((1 - kept) * own + camera_flow(max(1 - kept, _PULL) * (camera - expected), shape))
-    return Memory(warp(estimate, inverse), sample_linear((held,), inverse), frames, memory.pose)
+    mean = memory.mean + (placed - memory.mean) / np.float32(min(frames, _RECENT))
+    let_go = float(1 - agrees.mean())
+    return Memory(
+        warp(estimate, inverse), sample_linear((held,), inverse), frames, memory.pose, mean, distances, let_go
+    )
 
 
 def shown(memory: Memory) -> Memory:
@@ -178,13 +207,15 @@ def shown(memory: Memory) -> Memory:
     --------
     >>> ramp = np.tile(np.arange(5, dtype=np.float32), (3, 1))
     >>> pose = np.array([[1, 0, 0.25], [0, 1, 0], [0, 0, 1]])
-    >>> shown(Memory(ramp, np.ones((3, 5), np.float32), 1, pose)).image[0, 2].round(1)
+    >>> ones = np.ones((3, 5), np.float32)
+    >>> shown(Memory(ramp, ones, 1, pose, ones, ones, 0.0)).image[0, 2].round(1)
     np.float32(2.2)
     """
     if _corner(memory.pose, memory.held.shape) < _LEAST_MOVE:
         return memory
     flow = camera_flow(motion(memory.pose), memory.held.shape)
-    return Memory(warp(memory.image, flow), sample_linear((memory.held,), flow), memory.frames, np.eye(3))
+    held = sample_linear((memory.held,), flow)
+    return replace(memory, image=warp(memory.image, flow), held=held, pose=np.eye(3))
 
 
 def _carried(memory: Memory, carry: Matrix, offset: Matrix, image: FloatArray) -> Memory:
@@ -202,12 +233,22 @@ def _carried(memory: Memory, carry: Matrix, offset: Matrix, image: FloatArray) -
     fresh = warp(image, camera_flow(motion(offset @ np.linalg.inv(rest)), shape))
     share = seen if image.ndim == 2 else seen[..., None]
     moved = fresh + share * (warp(memory.image, flow) - fresh)
-    return Memory(moved, 1 + seen * (sample_linear((memory.held,), flow) - 1), memory.frames, rest)
+    mean = luminance(fresh) + seen * (sample_linear((memory.mean,), flow) - luminance(fresh))
+    distances = sample_linear((memory.distances[..., 0], memory.distances[..., 1]), flow)
+    return Memory(
+        moved, 1 + seen * (sample_linear((memory.held,), flow) - 1), memory.frames, rest, mean, distances, 0.0
+    )
 
 
 def _corner(pose: Matrix, shape: tuple[int, ...]) -> float:
     """How far a map moves the corners of an image at most along one axis, pixels."""
     return float((np.abs(motion(pose)) @ [shape[1] / 2, shape[0] / 2, 1.0]).max())
+
+
+def _distance(image: FloatArray, mean: FloatArray) -> FloatArray:
+    """Average the squared difference of two images in a window."""
+    difference = cv2.GaussianBlur(image - mean, (0, 0), _DIFFERENCE_WINDOW)
+    return np.asarray(cv2.GaussianBlur(difference**2, (0, 0), _DISTANCE_WINDOW), np.float32)
 
 
 def _filled(flow: FloatArray, weight: FloatArray) -> FloatArray:

@@ -40,6 +40,7 @@ _FEWEST = 4
 # κ, greater than 1 because turbulence of successive frames is alike, and less for a camera that stands, since that is
 # the assumption that a slow pan breaks.
 _DOUBT, _STANDING = 2.0, 1.5
+_AT_ENDS = 0.5
 # Least e and κ σ, pixels, so that an exact fit has a share.
 _LEAST = 1e-3
 
@@ -129,6 +130,9 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
         one_sided = min(np.sum(times[near] < 0), np.sum(times[near] > 0)) < 2
         if near.sum() < _FEWEST or (order == 2 and one_sided):
             continue
+        if one_sided and value is None:
+            # At the ends of a scene the first line is extrapolated.
+            share *= _AT_ENDS
         before, (value, left, spread) = value, _fit(times[near], seen[near], weights[near], order)
         squares = [camera_size(one, shape) ** 2 for one in left.reshape(-1, 2, 3)]
         size = float(np.sqrt(np.average(squares, weights=weights[near])))
@@ -205,7 +209,7 @@ def motion(pose: Matrix) -> Matrix:
 
 
 def _samples(path: Mapping[int, Matrix]) -> tuple[Matrix, Matrix, Matrix]:
-    """Arrange a path: times, motions as rows, and the number of frames that each stands for, as the window skips some."""
+    """Arrange a path: times, motions as rows, and the number of frames that each stands for, as some are skipped."""
     times = np.array(sorted([*path, 0]), np.float64)
     seen = np.stack([path[int(time)] if time else np.zeros((2, 3)) for time in times]).reshape(-1, 6)
     return times, seen, np.gradient(times) if len(times) > 1 else np.ones(1)

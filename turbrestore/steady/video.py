@@ -62,6 +62,8 @@ class SteadyFrame:
         Width of the blur that was removed from a frame, pixels.
     starts_scene : bool
         Whether a new scene starts here.
+    let_go : float
+        Share of the memory of the scene that was let go here, because the frames lay nearer to their own mean.
     """
 
     number: int
@@ -70,6 +72,7 @@ class SteadyFrame:
     displacement: float
     sigma: float
     starts_scene: bool
+    let_go: float
 
 
 def steady_frames(
@@ -204,4 +207,5 @@ def _sharpened(frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_], 
         displacement=frame.displacement,
         sigma=sigma,
         starts_scene=frame.starts_scene,
+        let_go=memory.let_go,
     )

@@ -132,10 +132,10 @@ def measure_shift(image: ArrayLike, reference: ShiftReference) -> Shift | None:
         raise DataError(f"image: expected {reference.shape} pixels as the reference has, found {checked.shape[:2]}")
     reduced = reduce_image(checked)
     peak = _peak(reference.spectrum * _spectrum(reduced), reduced.shape)
-    still = _correlation(reference.reduced, reduced)
+    still = correlation(reference.reduced, reduced)
     to, origin = overlap(reduced.shape, np.rint(peak))
     seen = reduced[origin]
-    moved = _correlation(reference.reduced[to], seen) if seen.size > _LEAST_OVERLAP * reduced.size else 0.0
+    moved = correlation(reference.reduced[to], seen) if seen.size > _LEAST_OVERLAP * reduced.size else 0.0
     if max(still, moved) < LEAST_CORRELATION:
         return None
     scale = np.divide(reference.shape, reduced.shape)[::-1]
@@ -311,6 +311,29 @@ def overlap(shape: tuple[int, ...], shift: ArrayLike) -> tuple[Slices, Slices]:
     return (pairs[0][0], pairs[1][0]), (pairs[0][1], pairs[1][1])
 
 
+def correlation(a: FloatArray, b: FloatArray) -> float:
+    """Correlate two images.
+
+    Parameters
+    ----------
+    a, b : ndarray, float32, shape (H, W)
+
+    Returns
+    -------
+    float
+        From −1 to 1; 0 if one of them is blank.
+
+    Examples
+    --------
+    >>> ramp = np.arange(6, dtype=np.float32).reshape(2, 3)
+    >>> correlation(ramp, 5 - ramp), correlation(ramp, 0 * ramp)
+    (-1.0, 0.0)
+    """
+    a, b = a - a.mean(), b - b.mean()
+    energy = float(np.vdot(a, a)) * float(np.vdot(b, b))
+    return float(np.vdot(a, b)) / energy**0.5 if energy > 0 else 0.0
+
+
 def _overlap_of_axis(length: int, step: int) -> Slices:
     step = min(max(step, -length), length)
     return slice(max(-step, 0), length - max(step, 0)), slice(max(step, 0), length - max(-step, 0))
@@ -371,9 +394,3 @@ def _vertex(three: FloatArray) -> float:
     """Vertex of the parabola through three values, counted from the middle one."""
     bend = float(three[0] - 2 * three[1] + three[2])
     return 0.5 * float(three[0] - three[2]) / bend if bend < 0 else 0.0
-
-
-def _correlation(a: FloatArray, b: FloatArray) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    energy = float(np.vdot(a, a)) * float(np.vdot(b, b))
-    return float(np.vdot(a, b)) / energy**0.5 if energy > 0 else 0.0
