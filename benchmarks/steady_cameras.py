@@ -10,7 +10,6 @@ python benchmarks/steady_cameras.py reported --write benchmarks/results/steady_c
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import cv2
@@ -26,7 +25,7 @@ from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_
 HEIGHT, WIDTH, COUNT, LARGE = 144, 176, 60, 400
 MARGIN = np.s_[8:-8, 8:-8]
 # Scene, a photo or the period of a façade; path of the camera; displacement, pixels RMS; seed.
-CLIPS = {
+CLIPS: dict[str, dict[str, tuple[str | tuple[int, int], str, float, int]]] = {
     "chosen": {
         "still": ("camera", "stand", 1.0, 1),
         "creep": ("camera", "creep", 1.0, 2),
@@ -149,4 +148,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
