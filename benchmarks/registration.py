@@ -16,9 +16,9 @@ import skimage.data
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.metrics import compare
+from turbrestore.registration.camera.global_shift import overlap
 from turbrestore.registration.centroid import find_centroid
 from turbrestore.registration.flow import FlowParams, estimate_flow
-from turbrestore.registration.global_shift import overlap
 from turbrestore.synthesis.scenes import printed_words
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 

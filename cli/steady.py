@@ -36,6 +36,8 @@ from .progress import progress_bars, say
 
 # Frames per second of inputs that do not say.
 USUAL_RATE = 25.0
+# Share of the image from which it is worth saying that the memory strayed.
+_ASTRAY = 0.02
 _MOST_BITS = {"h264": 8, "hevc": 10, ".gif": 8, ".webp": 8}
 
 
@@ -243,6 +245,7 @@ class _Facts:
 
     def __init__(self) -> None:
         self.figures = SteadyFigures()
+        self.let_go: list[float] = []
 
     def watch(
         self, frames: Iterable[SteadyFrame], total: int, progress: Callable[[str, int, int], None] | None
@@ -253,6 +256,7 @@ class _Facts:
             self.figures.sigma = frame.sigma
             self.figures.displacement.append(frame.displacement)
             self.figures.moving.append(float(frame.moving.mean()))
+            self.let_go.append(frame.let_go)
             if progress is not None:
                 progress("steady", len(self.figures.moving), total)
             yield frame
@@ -266,6 +270,7 @@ class _Facts:
             "sigma": self.figures.sigma,
             "mean_displacement": float(np.mean(self.figures.displacement)),
             "moving_share": float(np.mean(self.figures.moving)),
+            "let_go_share": float(np.mean(self.let_go)),
         }
 
     def text(self) -> str:
@@ -274,8 +279,15 @@ class _Facts:
         blur = f"blur of {found.sigma:.2f} pixels removed" if found.sigma > 0 else "no blur removed"
         return (
             f"{len(found.moving)} frames in {found.seconds:.1f} s, displacements of {np.mean(found.displacement):.2f} "
-            f"pixels and {blur}, {100 * np.mean(found.moving):.0f} % of the image moves"
+            f"pixels and {blur}, {100 * np.mean(found.moving):.0f} % of the image moves{self._astray()}"
         )
+
+    def _astray(self) -> str:
+        """Say where the output would have strayed from the input."""
+        share = float(np.mean(self.let_go))
+        if share < _ASTRAY:
+            return ""
+        return f"; in {100 * share:.0f} % the memory strayed from the input and was let go, so less is averaged there"
 
 
 def _images(frames: Iterable[SteadyFrame], masks: BinaryIO | None) -> Iterator[FloatArray]:

@@ -39,6 +39,7 @@ from .metrics import appearance as appearance
 from .metrics import compare as compare
 from .metrics import compare_flows as compare_flows
 from .pipeline import restore as restore
+from .registration.camera.global_shift import global_shifts as global_shifts
 from .registration.centroid import Centroid as Centroid
 from .registration.centroid import CentroidParams as CentroidParams
 from .registration.centroid import find_centroid as find_centroid
@@ -46,7 +47,6 @@ from .registration.flow import FlowParams as FlowParams
 from .registration.flow import estimate_flow as estimate_flow
 from .registration.flow_algebra import compose_flows as compose_flows
 from .registration.flow_algebra import invert_flow as invert_flow
-from .registration.global_shift import global_shifts as global_shifts
 from .report import write_report as write_report
 from .results import Restoration as Restoration
 from .results import Verdict as Verdict

@@ -11,9 +11,9 @@ from .core.arrays import FloatArray
 from .core.decision import Decision
 from .dynamics.flow_model import FlowDynamics, mean_flow_error
 from .filtering.alternating import Filtered
+from .registration.camera.global_shift import DEAD_ZONE
 from .registration.centroid import Centroid
 from .registration.coverage import Rectangle
-from .registration.global_shift import DEAD_ZONE
 from .registration.recentring import recentring_flow
 from .runtime.scratch import iter_frames
 from .seeing.strength import LARGEST_BLUR, Estimate, Seeing

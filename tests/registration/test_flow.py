@@ -208,7 +208,7 @@ def test_the_shift_of_a_start_is_not_measured_again(monkeypatch, method, most):
     def refuse(*arguments):
         raise AssertionError("measured again")
 
-    monkeypatch.setattr("turbrestore.registration.global_shift.measure_shift", refuse)
+    monkeypatch.setattr("turbrestore.registration.camera.global_shift.measure_shift", refuse)
     again = measure(target, [frame], flows)
     # Without the shift, pixels that the frame does not show would not stay where the reference has them.
     assert np.abs(again[0, :, -18:] - flows[0, :, -18:]).max() < most

@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.core.errors import DataError
-from turbrestore.registration.global_shift import (
+from turbrestore.registration.camera.global_shift import (
     global_shifts,
-    mean_stabilised,
     measure_shift,
     overlap,
     prepare_shift_reference,
 )
+from turbrestore.registration.camera.stabilisation import mean_stabilised
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 PHOTO = cv2.GaussianBlur(skimage.data.camera().astype(np.float32) / 255, (0, 0), 1.0)
@@ -142,3 +142,36 @@ def test_frames_of_something_else_mislead_no_other(odd, what):
     centre = round(float((steps[kept] + found).mean()))
     error = mean_stabilised(frames) - scene[:, centre : centre + 128]
     assert np.abs(error).mean() < 0.25 * scene.std()
+
+
+def turned(degrees, zoom, side=256, scene=PHOTO):
+    """Frame of a camera that is turned and zooms about the centre of the image."""
+    turn = cv2.getRotationMatrix2D((255.5, 255.5), degrees, zoom)
+    start = 256 - side // 2
+    return cv2.warpAffine(scene, turn, scene.shape[::-1], flags=cv2.INTER_CUBIC)[
+        start : start + side, start : start + side
+    ]
+
+
+class TestTurns:
+    ANGLES, ZOOMS = np.array([-2.0, 0.0, 2.0, 1.0, -1.0]), np.array([1.0, 1.03, 0.97, 1.02, 0.98])
+
+    def test_mean_of_a_camera_that_turns_and_zooms_is_sharp_and_in_the_middle(self):
+        frames = np.stack([turned(*pair) for pair in zip(self.ANGLES, self.ZOOMS, strict=True)])
+        before, inner = frames.copy(), np.s_[16:-16, 16:-16]
+        errors = [np.std((mean - turned(0, 1))[inner]) for mean in (mean_stabilised(frames), frames.mean(axis=0))]
+        assert errors[0] < 0.01
+        assert errors[1] > 0.05
+        assert (frames == before).all()
+
+    def test_frames_of_something_else_are_left_out(self):
+        frames = np.stack([turned(*pair) for pair in zip(self.ANGLES, self.ZOOMS, strict=True)] * 2)
+        kept = np.setdiff1d(np.arange(10), (3, 6))
+        frames[3], frames[6] = np.random.default_rng(0).random(frames[3].shape), 0.5
+        middle = turned(np.tile(self.ANGLES, 2)[kept].mean(), np.tile(self.ZOOMS, 2)[kept].mean())
+        assert np.abs(mean_stabilised(frames) - middle)[16:-16, 16:-16].mean() < 0.006
+
+    def test_turbulence_alone_is_no_turn(self):
+        flows = smooth_flows(9, 256, 256, np.random.default_rng(3), SmoothFlowParams(rms=1.5))
+        frames = np.stack(distort(seen_from(0, 0), flows, np.random.default_rng(4), noise=0.01))
+        assert (mean_stabilised(frames) == frames.mean(axis=0)).all()

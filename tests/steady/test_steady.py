@@ -1,5 +1,6 @@
 """Video in, video out: still scenes, things that move, cameras, cuts, ends and memory."""
 
+import dataclasses
 import itertools
 import weakref
 
@@ -22,6 +23,7 @@ from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 SIZE = 128
+STILL = np.eye(3)
 
 
 def photo(name="camera", size=SIZE):
@@ -66,7 +68,7 @@ class TestMemory:
         memory, still = None, np.zeros(frames[0].shape, bool)
         for number, (frame, flow) in enumerate(zip(frames, flows, strict=True)):
             mask = still if moving is None else moving[number]
-            memory = remember(memory, frame, lambda *_, flow=flow: flow, 0.02, 2.0, stillness, mask)
+            memory = remember(memory, frame, lambda *_, flow=flow: flow, 0.02, 2.0, stillness, mask, STILL, STILL)
         return memory
 
     def test_noise_falls_as_in_a_mean_of_all_frames(self):
@@ -80,10 +82,10 @@ class TestMemory:
         # A scene that is the first frame, then one pixel to the right of it for good: the mean lies 5/6 to the right.
         scene = cv2.GaussianBlur(photo(size=72), (0, 0), 2.0)
         first, later = scene[:, 4:68], scene[:, 3:67]
-        memory = remember(None, first, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool))
+        memory = remember(None, first, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool), STILL, STILL)
         for _ in range(5):
-            memory = remember(memory, later, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool))
-        shift = np.median(measure_flow(first, memory.image)[8:-8, 8:-8, 0])
+            memory = remember(memory, later, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool), STILL, STILL)
+        shift = np.median(measure_flow(first, memory.image, np.zeros((64, 64, 2), np.float32))[8:-8, 8:-8, 0])
         assert abs(shift - 5 / 6) < 0.1
 
     def test_what_has_changed_passes_at_once(self):
@@ -108,9 +110,10 @@ class TestMemory:
 
     def test_weak_turbulence_leaves_nothing_to_the_memory(self):
         still = np.zeros((64, 64), bool)
-        memory = remember(None, photo(size=64), measure_flow, 0.02, 1.0, 1.0, still)
+        memory = remember(None, photo(size=64), measure_flow, 0.02, 1.0, 1.0, still, STILL, STILL)
         assert np.array_equal(
-            remember(memory, photo("brick", 64), measure_flow, 0.02, 1.0, 1.0, still).image, photo("brick", 64)
+            remember(memory, photo("brick", 64), measure_flow, 0.02, 1.0, 1.0, still, STILL, STILL).image,
+            photo("brick", 64),
         )
 
     def test_an_object_is_not_held_back_by_the_memory(self):
@@ -133,15 +136,19 @@ class TestMemory:
 def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
     soft, short = cv2.GaussianBlur(photo(), (0, 0), 2.0), np.ones((SIZE, SIZE), np.float32)
     scenes = _Scenes(SteadyParams(), 0.8, Runtime(threads=1))
-    assert scenes._remembered_width(Memory(soft, short, 1)) == 0.8
-    widths = [scenes._remembered_width(Memory(soft, 30 * short, 30)) for _ in range(80)]
+
+    def width(scenes, image, held):
+        return scenes._remembered_width(Memory(image, held * short, held, STILL, image, np.zeros((SIZE, SIZE, 2)), 0.0))
+
+    assert width(scenes, soft, 1) == 0.8
+    widths = [width(scenes, soft, 30) for _ in range(80)]
     assert 0 < max(np.diff([0.8, *widths])) < 0.1
     needed = estimate_blur(soft, exponent=KOLMOGOROV).removable + _ADDED
     assert widths[-1] == pytest.approx(needed, abs=0.02)
     given = _Scenes(SteadyParams(sigma=0.8), 0.8, Runtime(threads=1))
-    assert given._remembered_width(Memory(soft, 30 * short, 30)) == 0.8
+    assert width(given, soft, 30) == 0.8
     flat = _Scenes(SteadyParams(), 0.8, Runtime(threads=1))
-    assert flat._remembered_width(Memory(0 * soft, 30 * short, 30)) == 0.8
+    assert width(flat, 0 * soft, 30) == 0.8
 
 
 @pytest.fixture(scope="module")
@@ -194,6 +201,40 @@ class TestMovingSquare:
         assert max(beyond) < 0.05
 
 
+def windows_of_a_wall(height, width, across=12, down=14):
+    """Regular windows on a wall."""
+    y, x = np.mgrid[: 4 * height, : 4 * width] / 4
+    window = (x % across > 0.3 * across) & (y % down > 0.35 * down)
+    return cv2.resize(np.where(window, 0.25, 0.65).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+
+
+def test_periodic_windows_keep_their_places():
+    scene = windows_of_a_wall(SIZE, SIZE)
+    scene[:20] = 0.85
+    frames = shaken([scene] * 28, rms=1.0)
+    gains = [psnr(ours, scene) - psnr(seen, scene) for ours, seen in zip(images(frames, sigma=0), frames, strict=True)]
+    assert min(gains) > 1
+    assert np.mean(gains) > 4
+
+
+def test_a_memory_that_has_gone_astray_is_let_go():
+    wall, still = windows_of_a_wall(96, 96, 16, 16), np.zeros((96, 96), bool)
+
+    def remembered(memory, flow):
+        return remember(memory, frame, lambda *_: flow, 0.01, 2.0, 1.0, still, STILL, STILL)
+
+    frame, none, memory = wall, np.zeros((96, 96, 2), np.float32), None
+    for _ in range(12):
+        memory = remembered(memory, none)
+    assert memory.held[40:56, 40:56].min() > 10
+    assert memory.let_go < 0.01
+    # It slips by a period with every frame agreeing, but for a corner that does not repeat.
+    astray = dataclasses.replace(memory, image=np.roll(wall, 5, 1))
+    for _ in range(8):
+        astray = remembered(astray, np.full((96, 96, 2), (-5.0, 0.0), np.float32))
+    assert astray.let_go > 0.3
+
+
 class TestCamera:
     @staticmethod
     def pan(step=2, count=14):
@@ -205,6 +246,28 @@ class TestCamera:
         truth = self.pan()
         ours = images(truth, camera=camera, sigma=0)
         assert min(psnr(image, scene) for image, scene in zip(ours, truth, strict=True)) > 30
+
+    @pytest.mark.parametrize("path", ["creep", "stop", "nod", "zoom"])
+    def test_the_picture_neither_lags_nor_drifts(self, path):
+        large, times = photo(size=2 * SIZE), np.arange(30.0)
+        x = {"creep": 0.2 * times, "stop": np.minimum(times, 15), "nod": 3 * np.sin(times / 5), "zoom": 0 * times}[path]
+        zoom = 1 + 0.003 * times * (path == "zoom")
+        truth = [
+            cv2.warpAffine(large, np.array([[a, 0, 64 * (1 - 2 * a) - b], [0, a, 64 * (1 - 2 * a)]]), (SIZE, SIZE))
+            for a, b in zip(zoom, x, strict=True)
+        ]
+        seen, window = shaken(truth), cv2.createHanningWindow((SIZE, SIZE), cv2.CV_32F)
+        ours = images(seen, sigma=0)
+        assert min(psnr(a, c) - psnr(b, c) for a, b, c in zip(ours, seen, truth, strict=True)) > 0
+        shifts = [cv2.phaseCorrelate(c.copy(), a.copy(), window)[0] for a, c in zip(ours, truth, strict=True)]
+        assert np.hypot(*np.mean(shifts[-12:], 0)) < 0.2
+        assert np.hypot(*np.transpose(shifts)).max() < 0.8
+
+    def test_a_quiet_camera_in_a_hand_passes(self):
+        hand = np.cumsum(np.random.default_rng(1).normal(0, 1, (20, 2)), 0)
+        large = cv2.GaussianBlur(photo(size=2 * SIZE), (0, 0), 0.7)
+        truth = [cv2.warpAffine(large, np.array([[1, 0, -64 - x], [0, 1, -64 - y]]), (SIZE, SIZE)) for x, y in hand]
+        assert min(psnr(ours, scene) for ours, scene in zip(images(truth, sigma=0), truth, strict=True)) > 38
 
     def test_a_locked_camera_stands_still(self):
         truth, left = self.pan(step=1, count=10), np.s_[16:-16, 16:-24]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import FrameSource, Window
-from ..registration.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
+from ..registration.camera.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
 
 # Longest side of the reduced frames, pixels, of up to that many frames, and of more.
 _SIDE, _MANY, _SIDE_OF_MANY = 96, 4000, 48

@@ -26,7 +26,7 @@ from ..core.errors import DataError
 from ..core.noise import estimate_noise
 from ..io.images import read_image
 from ..io.source import FrameSource, Window
-from ..registration.global_shift import global_shifts
+from ..registration.camera.global_shift import global_shifts
 
 # Frames from which the overlay is found, and most frames of a clip in which one is looked for.
 _SAMPLES, _MOST = 60, 1500

@@ -32,9 +32,9 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import fill_frames, iter_frames, mean_of, new_stack
 from ..runtime.steps import finish
 from ..runtime.threads import map_ahead, sum_in_threads
+from .camera.stabilisation import mean_stabilised
 from .flow import FlowFrame, FlowParams, measure_flows, prepare_reference
 from .flow_algebra import compose_flows, invert_flow
-from .global_shift import mean_stabilised
 from .warp import inside, warp
 
 if TYPE_CHECKING:

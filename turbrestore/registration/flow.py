@@ -11,8 +11,9 @@ surrounds them all:
 1. Local contrast is normalised (zero mean, unit deviation in a Gaussian window), so that dark and low-contrast regions
    register as well as bright ones; ``contrast_floor`` keeps noise in flat regions from being amplified.  If much of the
    gradient of a frame is noise, the method sees frame and reference through a Gaussian of one pixel.
-2. A shift of the whole frame by more than two pixels is measured (:mod:`turbrestore.registration.global_shift`) and
-   removed by whole pixels, which needs no interpolation.  The flow is that shift plus the flow to the shifted frame.
+2. A shift of the whole frame by more than two pixels is measured
+   (:mod:`turbrestore.registration.camera.global_shift`) and removed by whole pixels, which needs no interpolation.  The
+   flow is that shift plus the flow to the shifted frame.
    Pixels beyond the edge of the shifted frame are filled from the reference, so that they move with the shift.  If a
    frame has a start that moves as a whole, the shift is taken from the start.
 3. The method measures the flow.
@@ -38,9 +39,9 @@ from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import fill_frames, iter_frames, new_stack
 from ..runtime.threads import in_batches, map_ahead
+from .camera.global_shift import ShiftReference, frame_shift, prepare_shift_reference, shift_frame
 from .confidence import flow_confidence, noise_share, regularise_flow
 from .contrast import grey_levels
-from .global_shift import ShiftReference, frame_shift, prepare_shift_reference, shift_frame
 from .opencv_flow import DisParams, FarnebackParams, FlowSolver, GreyImage, dis_solver, farneback_solver
 from .tvl1 import TvL1Params, tvl1_solver
 

@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import DataError
+from .camera.global_shift import DEAD_ZONE
 from .flow_algebra import invert_flow
-from .global_shift import DEAD_ZONE
 from .warp import warp
 
 

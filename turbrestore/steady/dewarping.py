@@ -25,27 +25,31 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError
 from ..core.noise import estimate_noise
+from ..registration.camera.global_shift import LEAST_CORRELATION, correlation, measure_shift
 from ..registration.flow import MIN_SIDE
 from ..registration.flow_algebra import invert_flow
 from ..registration.opencv_flow import DisParams, FlowSolver, GreyImage, dis_solver
 from ..registration.warp import sample_linear, warp
 from .camera import Matrix, camera_flow, fit_camera
 from .displacement import (
-    camera_displacement,
-    camera_shake,
+    camera_steadiness,
+    displacement_size,
+    expected_motion,
     largest_displacement,
     mean_displacement,
+    whole_displacement,
     without_camera,
 )
 from .fusion import fuse
 from .motion import moving_mask
+from .path import smooth_motion, without_shake
 from .settings import SteadyParams
-from .windows import Window, contrast_levels
+from .windows import Window, WindowFrame, contrast_levels
 
 # Half of the resolution is enough for displacements as smooth as those of turbulence, and five times as fast.
 _FLOW = DisParams(finest_scale=1, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
 # Level of the pyramid, above the finest, at which a search with a start begins.
-_START_LEVEL = 3
+_START_LEVEL = 1
 # Smallest side of a frame that is registered at half of the resolution.
 _HALVED = 128
 
@@ -70,6 +74,10 @@ class DewarpedFrame:
         What fusion has left of it.
     largest : float
         What turbulence displaces at most, pixels; infinite without neighbours.
+    size : float
+        Median size of the displacement of turbulence, pixels.
+    steadiness : float
+        Whether the camera moves at constant velocity, 0 to 1.
     starts_scene : bool
         Whether a new scene starts here.
     cameras : mapping of int to ndarray, float64, shape (2, 3)
@@ -86,6 +94,8 @@ class DewarpedFrame:
     noise: float
     share: float
     largest: float
+    size: float
+    steadiness: float
     starts_scene: bool
     cameras: Mapping[int, Matrix]
     removed_camera: Matrix
@@ -121,12 +131,16 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
     flows, cameras = _measure(window)
     own = without_camera(flows, cameras)
     removed_camera, displacement, largest = np.zeros((2, 3)), np.zeros((*shape, 2), np.float32), np.inf
+    size, steadiness = 0.0, 1.0
     if flows:
-        largest = params.largest or largest_displacement(own, {} if params.camera == "lock" else cameras)
-        if params.camera == "steady":
-            removed_camera = camera_shake(cameras)
-        else:
-            removed_camera = camera_displacement(cameras, shape, largest if params.camera == "keep" else np.inf)
+        size = displacement_size(own)
+        steadiness = camera_steadiness({} if params.camera == "lock" else cameras, shape)
+        largest = params.largest or largest_displacement(size, steadiness)
+        removed_camera = (
+            smooth_motion(cameras, whole_displacement(size, largest), shape)
+            if params.camera == "keep"
+            else without_shake(cameras, order=params.camera == "steady")
+        )
         displacement = mean_displacement(own, largest) + camera_flow(removed_camera, shape)
     inverse = invert_flow(displacement)
     registered = (
@@ -143,18 +157,22 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
         noise=noise,
         share=float(1 / np.sqrt(1 + len(flows) * float(agreement.mean()))),
         largest=largest,
+        size=size,
+        steadiness=steadiness,
         starts_scene=window.starts_scene,
         cameras=cameras,
         removed_camera=removed_camera,
     )
 
 
-def measure_flow(reference: FloatArray, image: FloatArray) -> FloatArray:
-    """Flow between two images that lie close together, as between a frame and its neighbours.
+def measure_flow(reference: FloatArray, image: FloatArray, start: FloatArray) -> FloatArray:
+    """Flow between two images, searched for near where it starts.
 
     Parameters
     ----------
     reference, image : ndarray, float32, shape (H, W) or (H, W, 3)
+    start : ndarray, float32, shape (H, W, 2)
+        Pixels.
 
     Returns
     -------
@@ -164,10 +182,10 @@ def measure_flow(reference: FloatArray, image: FloatArray) -> FloatArray:
     Examples
     --------
     >>> image = np.random.default_rng(0).random((32, 32)).astype(np.float32)
-    >>> float(abs(measure_flow(image, image)).max())
+    >>> float(abs(measure_flow(image, image, np.zeros((32, 32, 2), np.float32))).max())
     0.0
     """
-    return _solver(contrast_levels(reference))(contrast_levels(image)[None], [None])[0]
+    return _solver(contrast_levels(reference))(contrast_levels(image)[None], [start])[0]
 
 
 def _solver(levels: GreyImage) -> FlowSolver:
@@ -187,14 +205,25 @@ def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
     solve = _solver(levels)
     flows: dict[int, FloatArray] = {}
     cameras: dict[int, Matrix] = {}
-    before = {-1: 0, 1: 0}
     for offset in sorted(window.neighbours, key=abs):
-        side = 1 if offset > 0 else -1
-        near, before[side] = before[side], offset
-        start = camera_flow(cameras[near] * (offset / near), levels.shape) if near else None
-        flows[offset] = solve(window.neighbours[offset].levels[None], [start])[0]
+        neighbour = window.neighbours[offset]
+        if any(offset * other > 0 for other in cameras):
+            expected = expected_motion(cameras, offset)
+        else:
+            expected = _first_guess(window.frame, neighbour)
+        flows[offset] = solve(neighbour.levels[None], [camera_flow(expected, levels.shape)])[0]
         cameras[offset] = fit_camera(flows[offset])
     return flows, cameras
+
+
+def _first_guess(frame: WindowFrame, neighbour: WindowFrame) -> Matrix:
+    """Find a shift of the whole frame, where the images are not alike without one.
+
+    A pattern that repeats looks as much alike a period further on, and more so through some turbulence.
+    """
+    still = correlation(frame.shift_reference.reduced, neighbour.shift_reference.reduced)
+    shift = None if still > LEAST_CORRELATION else measure_shift(neighbour.image, frame.shift_reference)
+    return np.column_stack([np.zeros((2, 2)), np.zeros(2) if shift is None else shift])
 
 
 def _placed(window: Window, cameras: dict[int, Matrix]) -> dict[int, FloatArray]:

@@ -36,13 +36,12 @@ from .camera import Matrix, camera_flow, camera_size
 _WINDOW, _OWN_SHARE = 4.0, 0.5
 # c over the median of |S_i| while the camera stands still; smallest and largest c, pixels.
 _SIZES, _LEAST, _MOST = 2.5, 1.0, 4.0
-# Travel of the camera within the window, pixels, at which it counts as half moving; turbulence moves whole frames by
-# up to 3 pixels, and a hand by 10 and more.
-_TRAVEL = 6.0
+# Distance of the camera from motion at constant velocity, pixels, at which it counts as half shaking.
+_SHAKE = 2.0
 # Every so many pixels enter the median.
 _SAMPLE = 4
-# The camera may shake by this share of c before its motion passes for wanted.
-_CAMERA_SHARE = 0.5
+# What turbulence moves whole frames by, in medians of |S_i|.
+_WHOLE = 1.4
 
 
 def mean_displacement(flows: Mapping[int, FloatArray], largest: float) -> FloatArray:
@@ -78,71 +77,38 @@ def mean_displacement(flows: Mapping[int, FloatArray], largest: float) -> FloatA
     return np.asarray(total / weights, np.float32)
 
 
-def camera_displacement(cameras: Mapping[int, Matrix], shape: tuple[int, ...], largest: float) -> Matrix:
-    """Weighted mean of the motions of the camera, in which a large one has little weight.
-
-    Parameters
-    ----------
-    cameras : mapping of int to ndarray, float64, shape (2, 3)
-        M of A_i by i.
-    shape : tuple of int
-        (H, W) of the frames.
-    largest : float
-        c, pixels; infinity gives every motion the same weight.
-
-    Returns
-    -------
-    ndarray, float64, shape (2, 3)
-
-    Examples
-    --------
-    >>> pan = np.array([[0, 0, 7.0], [0, 0, 0]])
-    >>> float(abs(camera_displacement({1: pan, -1: -pan}, (8, 8), 1.0)).max())
-    0.0
-    """
-    total, weights = np.zeros((2, 3)), _OWN_SHARE
-    for offset in sorted({abs(offset) for offset in cameras}):
-        mean = _symmetric(cameras, offset)
-        weight = 1 / (1 + (camera_size(mean, shape) / (_CAMERA_SHARE * largest)) ** 4)
-        total, weights = total + weight * mean, weights + weight
-    return total / weights
-
-
-def camera_shake(cameras: Mapping[int, Matrix]) -> Matrix:
-    """Deviation of the camera from motion at constant velocity, with the sign of :func:`camera_displacement`.
-
-    Parameters
-    ----------
-    cameras : mapping of int to ndarray, float64, shape (2, 3)
-        M of A_i by i; not empty.
-
-    Returns
-    -------
-    ndarray, float64, shape (2, 3)
-        Value at the frame of the line that fits the path of the camera best.
-
-    Examples
-    --------
-    >>> pan = np.array([[0, 0, 7.0], [0, 0, 0]])
-    >>> bool(abs(camera_shake({1: pan, 2: 2 * pan})).max() < 1e-9)
-    True
-    """
-    offsets = np.array([0, *cameras])
-    path = np.stack([np.zeros((2, 3)), *cameras.values()]).reshape(-1, 6)
-    # With one neighbour a line fits both: the frame stays.
-    line = np.linalg.lstsq(np.stack([np.ones(len(offsets)), offsets], 1), path, rcond=None)[0]
-    return line[0].reshape(2, 3)
-
-
-def largest_displacement(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix]) -> float:
-    """Tell what turbulence displaces at most.
+def displacement_size(flows: Mapping[int, FloatArray]) -> float:
+    """Median of |S_i| over the image, mean over i.
 
     Parameters
     ----------
     flows : mapping of int to ndarray, float32, shape (H, W, 2)
         F_i − A_i by i, pixels; not empty.
-    cameras : mapping of int to ndarray, float64, shape (2, 3)
-        M of A_i by i; empty if the camera is known to stand still.
+
+    Returns
+    -------
+    float
+        Pixels.
+
+    Examples
+    --------
+    >>> jolt = np.full((8, 8, 2), (0.6, 0.8), np.float32)
+    >>> round(displacement_size({-1: jolt, 1: jolt}), 3)
+    1.0
+    """
+    means = [_symmetric(flows, distance)[::_SAMPLE, ::_SAMPLE] for distance in {abs(offset) for offset in flows}]
+    return float(np.mean([np.median(np.hypot(mean[..., 0], mean[..., 1])) for mean in means]))
+
+
+def largest_displacement(size: float, steadiness: float) -> float:
+    """Tell what turbulence displaces at most.
+
+    Parameters
+    ----------
+    size : float
+        Median of |S_i|, pixels.
+    steadiness : float
+        Of the camera, 0 to 1.
 
     Returns
     -------
@@ -151,21 +117,60 @@ def largest_displacement(flows: Mapping[int, FloatArray], cameras: Mapping[int, 
 
     Examples
     --------
-    >>> jolt, pan = np.full((8, 8, 2), (0.6, 0.8), np.float32), np.array([[0, 0, 20.0], [0, 0, 0]])
-    >>> largest_displacement({-1: jolt, 1: jolt}, {})
-    2.5
-    >>> round(largest_displacement({-1: jolt, 1: jolt}, {-1: -pan, 1: pan}), 2)
-    1.0
+    >>> largest_displacement(1.0, 1.0), largest_displacement(1.0, 0.0)
+    (2.5, 1.0)
     """
-    means = [_symmetric(flows, distance)[::_SAMPLE, ::_SAMPLE] for distance in {abs(offset) for offset in flows}]
-    sizes = [float(np.median(np.hypot(mean[..., 0], mean[..., 1]))) for mean in means]
-    still = float(np.clip(_SIZES * np.mean(sizes), _LEAST, _MOST))
-    shape = next(iter(flows.values())).shape
-    return _LEAST + (still - _LEAST) * camera_stillness(cameras, shape)
+    return _LEAST + (float(np.clip(_SIZES * size, _LEAST, _MOST)) - _LEAST) * steadiness
 
 
-def camera_stillness(cameras: Mapping[int, Matrix], shape: tuple[int, ...]) -> float:
-    """Tell whether the camera stands still.
+def whole_displacement(size: float, largest: float) -> float:
+    """Tell by what turbulence moves whole frames.
+
+    Parameters
+    ----------
+    size : float
+        Median of |S_i|, pixels.
+    largest : float
+        c, pixels.
+
+    Returns
+    -------
+    float
+        Pixels.
+
+    Examples
+    --------
+    >>> whole_displacement(1.0, 2.5)
+    1.4
+    """
+    return _WHOLE * min(size, largest / _SIZES)
+
+
+def expected_motion(cameras: Mapping[int, Matrix], offset: int) -> Matrix:
+    """Motion of the camera to a neighbour if it goes on as to the others.
+
+    Parameters
+    ----------
+    cameras : mapping of int to ndarray, float64, shape (2, 3)
+        M of A_i by i.
+    offset : int
+        The neighbour.
+
+    Returns
+    -------
+    ndarray, float64, shape (2, 3)
+
+    Examples
+    --------
+    >>> expected_motion({1: np.array([[0, 0, 2.0], [0, 0, 0]])}, 3)[0, 2].round(6)
+    np.float64(6.0)
+    """
+    line = _straight_path(cameras)[2]
+    return (line[0] + offset * line[1]).reshape(2, 3)
+
+
+def camera_steadiness(cameras: Mapping[int, Matrix], shape: tuple[int, ...]) -> float:
+    """Tell whether the camera moves at constant velocity within the window.
 
     Parameters
     ----------
@@ -177,15 +182,22 @@ def camera_stillness(cameras: Mapping[int, Matrix], shape: tuple[int, ...]) -> f
     Returns
     -------
     float
-        1 for a camera that stands still, near 0 for one that travels far within the window.
+        1 for a camera that stands still or pans evenly, near 0 for one that shakes.
 
     Examples
     --------
-    >>> camera_stillness({1: np.zeros((2, 3))}, (8, 8))
+    >>> pan, jolt = np.array([[0, 0, 7.0], [0, 0, 0]]), np.array([[0, 0, 9.0], [0, 0, 0]])
+    >>> camera_steadiness({-1: -pan, 1: pan}, (8, 8))
     1.0
+    >>> camera_steadiness({-1: jolt, 1: jolt}, (8, 8)) < 0.01
+    True
     """
-    travel = float(np.median([camera_size(camera, shape) for camera in cameras.values()])) if cameras else 0.0
-    return 1 / (1 + (travel / _TRAVEL) ** 8)
+    if not cameras:
+        return 1.0
+    offsets, path, line = _straight_path(cameras)
+    left = path - np.stack([np.ones(len(offsets)), offsets], 1) @ line
+    size = np.sqrt(np.mean([camera_size(one, shape) ** 2 for one in left.reshape(-1, 2, 3)]))
+    return float(1 / (1 + (size / _SHAKE) ** 8))
 
 
 def without_camera(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix]) -> dict[int, FloatArray]:
@@ -207,6 +219,13 @@ def without_camera(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix
     0.0
     """
     return {offset: flow - camera_flow(cameras[offset], flow.shape) for offset, flow in flows.items()}
+
+
+def _straight_path(cameras: Mapping[int, Matrix]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frames of the window, the path of the camera, and the line that fits it best."""
+    offsets = np.array([0, *cameras])
+    path = np.stack([np.zeros((2, 3)), *cameras.values()]).reshape(-1, 6)
+    return offsets, path, np.linalg.lstsq(np.stack([np.ones(len(offsets)), offsets], 1), path, rcond=None)[0]
 
 
 def _symmetric(values: Mapping[int, np.ndarray], offset: int) -> np.ndarray:

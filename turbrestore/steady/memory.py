@@ -4,12 +4,19 @@ Symbols
 -------
 F : frame k, dewarped and fused within its window
 Z : memory; n : number of frames that it holds, for every pixel, so that its variance is that of a frame over n
+C : affine map from the steadied frame k to the one before; N : from the steadied frame to F; both from the path of the
+    camera (:mod:`turbrestore.steady.path`)
+E : pose, affine map from the steadied frame to the grid of Z
 R : flow from Z to F; A its affine part; r = R − A
 w : agreement of ``F ∘ (id + R)`` with Z (:mod:`turbrestore.steady.fusion`), less where r is more than turbulence, 0 in
     objects that move (:mod:`turbrestore.steady.motion`)
 g : gain, 1 over the number of frames since the memory began, at least 1/64
-s : stillness, 0 to 1, of the camera, less where turbulence is weak: the window averages that out, and what is left
+s : steadiness, 0 to 1, of the camera, less where turbulence is weak: the window averages that out, and what is left
     is motion, of leaves or water
+
+The camera carries the memory along before anything is compared, ``E ← E C``.  As the grid of Z moves by whole pixels,
+a pan costs no sharpness; turns and zooms resample it when they move the corners by a pixel.  The search for R starts
+from ``N E⁻¹``, where the path of the camera expects F.
 
 Z is a Kalman filter of one value for every pixel, whose image drift a pixel earns: where the innovation
 ``F ∘ (id + R) − Z`` is explained by misregistration and noise (w = 1), n grows and the frame has a weight of 1/n; where
@@ -18,28 +25,33 @@ it is not, the variance is opened, n falls to 1, and the frame passes::
     n ← 1 + w min(n, s (1 − g) / (1 − s (1 − g))),      Z ← Z + (F ∘ (id + R) − Z) / n
 
 The geometry is estimated likewise.  R is what F lies away from the mean geometry of the frames before, so that the mean
-moves by g R, and the memory with it: ``Z ← Z ∘ (id + V)`` with V the inverse flow of ``g_r r + g_A A``, and ::
+moves by g R, and the memory with it: ``Z ← Z ∘ (id + V)`` with V the inverse flow of ``g_r r + g_A (A − (N E⁻¹ − 1))``,
+``g_r = 1 − s (1 − g)`` and g_A the same, but at least 1/12: what the memory as a whole lies off the path of the camera
+is an error of the path or of the memory, and the output must not drift away from the input.  Where r cannot be trusted
+(w small, an object or the background it uncovers) it is filled in from around.
 
-    g_r = 1 − s (1 − g),      g_A = 1 − s (1 − g) / (1 + (|A| / 2c)⁸)
-
-with c what turbulence displaces at most: a whole frame that lies far away has been moved by the camera, and the memory
-follows.  Where r cannot be trusted (w small, an object or the background it uncovers) it is filled in from around.
+A memory that has gone astray, because a period of a pattern was taken for another or the scene moves slowly, may still
+agree with every next frame.  It is therefore checked against the mean B of the luminance of the last frames, which the
+camera alone carries along and no flow: with e_Z and e_F the distances of Z and of ``F ∘ N E⁻¹`` from B, squared and
+averaged over a window and eight frames, w falls by ``1 / (1 + (e_Z / e_F)⁴)``, so that a memory further away than the
+frames is let go.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, luminance
 from ..registration.flow_algebra import invert_flow
-from ..registration.warp import sample_linear, warp
-from .camera import camera_flow, camera_size, fit_camera
+from ..registration.warp import inside, sample_linear, warp
+from .camera import Matrix, camera_flow, fit_camera
 from .fusion import agreement_weight, explained_difference
+from .path import motion
 
 # Longest memory, frames: a change of the light is followed as fast.
 _LONGEST = 64
@@ -53,8 +65,16 @@ _BESIDE = np.ones((25, 25), np.uint8)
 _LEAST_WEIGHT = 0.05
 # What weak turbulence displaces at most, which leaves nothing to the memory, and strong turbulence, pixels.
 _WEAK, _STRONG = 1.2, 1.8
-# Stillness below which nothing is remembered.
-_LEAST_STILLNESS = 0.1
+# Least g_A.
+_PULL = 1 / 12
+# Windows of the distance from B, pixels; weight of a frame in its mean over time, frames in B, and a distance that does
+# not count, squared intensity.
+_DIFFERENCE_WINDOW, _DISTANCE_WINDOW = 1.0, 6.0
+_CHECKED, _RECENT, _EVEN = 1 / 8, 32, 1e-5
+# Moves of the corners, pixels, that are left out, and by which the grid of the memory follows the camera.
+_LEAST_MOVE, _FARTHEST = 0.02, 1.0
+# Steadiness below which nothing is remembered.
+_LEAST_STEADINESS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,23 +89,37 @@ class Memory:
         n, frames.
     frames : int
         Number of frames since the memory began, at most the longest memory.
+    pose : ndarray, float64, shape (3, 3)
+        E.
+    mean : ndarray, float32, shape (H, W)
+        B.
+    distances : ndarray, float32, shape (H, W, 2)
+        e_Z and e_F, squared intensity.
+    let_go : float
+        Share of the memory that its distance from B has let go at the last frame.
     """
 
     image: FloatArray
     held: FloatArray
     frames: int
+    pose: Matrix
+    mean: FloatArray
+    distances: FloatArray
+    let_go: float
 
 
 def remember(
     memory: Memory | None,
     image: FloatArray,
-    flow_between: Callable[[FloatArray, FloatArray], FloatArray],
+    flow_between: Callable[[FloatArray, FloatArray, FloatArray], FloatArray],
     noise: float,
     largest: float,
-    stillness: float,
+    steadiness: float,
     moving: NDArray[np.bool_],
+    carry: Matrix,
+    offset: Matrix,
 ) -> Memory:
-    """Take a frame into the memory; the image of the memory is then the estimate of this frame.
+    """Take a frame into the memory, which :func:`shown` then gives as the estimate of this frame.
 
     Parameters
     ----------
@@ -94,15 +128,17 @@ def remember(
     image : ndarray, float32, shape (H, W) or (H, W, 3)
         F.
     flow_between : callable
-        From two images to the flow from the first to the second, float32, shape (H, W, 2), pixels.
+        From two images and a start to the flow from the first to the second, float32, shape (H, W, 2), pixels.
     noise : float
         Standard deviation of the noise of a frame, intensity.
     largest : float
-        c, pixels.
-    stillness : float
-        Stillness of the camera, 0 to 1.
+        What turbulence displaces at most, pixels.
+    steadiness : float
+        Steadiness of the camera, 0 to 1.
     moving : ndarray, bool, shape (H, W)
         Where something moves against the scene.
+    carry, offset : ndarray, float64, shape (3, 3)
+        C and N.
 
     Returns
     -------
@@ -111,36 +147,108 @@ def remember(
     Examples
     --------
     >>> one, other = np.full((9, 9), 0.5, np.float32), np.full((9, 9), 0.51, np.float32)
-    >>> none = lambda first, second: np.zeros((9, 9, 2), np.float32)
-    >>> settings = none, 0.01, 2.0, 1.0, np.zeros((9, 9), bool)
+    >>> none = lambda first, second, start: start
+    >>> settings = none, 0.01, 2.0, 1.0, np.zeros((9, 9), bool), np.eye(3), np.eye(3)
     >>> memory = remember(remember(None, one, *settings), other, *settings)
     >>> round(float(memory.image[4, 4]), 4), round(float(memory.held[4, 4]), 1)
     (0.5053, 1.9)
     """
     shape = image.shape[:2]
-    stillness *= float(np.clip((largest - _WEAK) / (_STRONG - _WEAK), 0, 1))
-    if memory is None or stillness < _LEAST_STILLNESS:
-        return Memory(image, np.ones(shape, np.float32), 1)
-    flow = flow_between(memory.image, image)
+    steadiness *= float(np.clip((largest - _WEAK) / (_STRONG - _WEAK), 0, 1))
+    if memory is None or steadiness < _LEAST_STEADINESS:
+        distances = np.zeros((*shape, 2), np.float32)
+        return Memory(image, np.ones(shape, np.float32), 1, np.eye(3), luminance(image), distances, 0.0)
+    memory = _carried(memory, carry, offset, image)
+    start = offset @ np.linalg.inv(memory.pose)
+    expected = motion(start)
+    flow = flow_between(memory.image, image, camera_flow(expected, shape))
     camera = fit_camera(flow)
     affine = camera_flow(camera, shape)
     own = flow - affine
+    placed = sample_linear((luminance(image),), camera_flow(expected, shape))
+    found = [_distance(one, memory.mean) for one in (luminance(memory.image), placed)]
+    distances = memory.distances + _CHECKED * (np.stack(found, -1) - memory.distances)
+    agrees = 1 / (1 + (distances[..., 0] / (distances[..., 1] + _EVEN)) ** 4)
     tolerance = explained_difference(memory.image, noise)
     weight = agreement_weight(sample_linear((image,), flow), memory.image, tolerance)
     weight /= 1 + (cv2.GaussianBlur(np.einsum("yxc,yxc->yx", own, own), (0, 0), _WINDOW) / largest**2) ** 2
     # R follows a slow object from frame to frame, and would hold it back, and with it the flat background beside it.
     near = cv2.dilate(moving.astype(np.uint8), _MARGIN) > 0
     weight *= 1 - cv2.GaussianBlur(near.astype(np.float32), (0, 0), _MARGIN_EDGE)
+    weight *= agrees
     trusted = np.where(cv2.dilate(near.astype(np.uint8), _BESIDE) > 0, 0, weight)
     own = _filled(own, trusted)
     frames = min(memory.frames + 1, _LONGEST)
-    kept = stillness * (1 - 1 / frames)
+    kept = steadiness * (1 - 1 / frames)
     held = 1 + weight * np.minimum(memory.held, kept / (1 - kept))
     innovation = warp(image, own + affine) - memory.image
     estimate = memory.image + innovation / (held if image.ndim == 2 else held[..., None])
-    trust = 1 / (1 + (camera_size(camera, shape) / (2 * largest)) ** 8)
-    inverse = invert_flow((1 - kept) * own + (1 - kept * trust) * affine)
-    return Memory(warp(estimate, inverse), sample_linear((held,), inverse), frames)
+    inverse = invert_flow((1 - kept) * own + camera_flow(max(1 - kept, _PULL) * (camera - expected), shape))
+    mean = memory.mean + (placed - memory.mean) / np.float32(min(frames, _RECENT))
+    let_go = float(1 - agrees.mean())
+    return Memory(
+        warp(estimate, inverse), sample_linear((held,), inverse), frames, memory.pose, mean, distances, let_go
+    )
+
+
+def shown(memory: Memory) -> Memory:
+    """Bring a memory from its grid to the steadied frame.
+
+    Parameters
+    ----------
+    memory : Memory
+
+    Returns
+    -------
+    Memory
+        E is the identity.
+
+    Examples
+    --------
+    >>> ramp = np.tile(np.arange(5, dtype=np.float32), (3, 1))
+    >>> pose = np.array([[1, 0, 0.25], [0, 1, 0], [0, 0, 1]])
+    >>> ones = np.ones((3, 5), np.float32)
+    >>> shown(Memory(ramp, ones, 1, pose, ones, ones, 0.0)).image[0, 2].round(1)
+    np.float32(2.2)
+    """
+    if _corner(memory.pose, memory.held.shape) < _LEAST_MOVE:
+        return memory
+    flow = camera_flow(motion(memory.pose), memory.held.shape)
+    held = sample_linear((memory.held,), flow)
+    return replace(memory, image=warp(memory.image, flow), held=held, pose=np.eye(3))
+
+
+def _carried(memory: Memory, carry: Matrix, offset: Matrix, image: FloatArray) -> Memory:
+    """Carry a memory along with the camera, by whole pixels if that is enough; what comes into sight is that of F."""
+    shape = memory.held.shape
+    pose = memory.pose @ carry
+    if _corner(pose, shape) < _FARTHEST:
+        return replace(memory, pose=pose)
+    rest = pose.copy()
+    rest[:2, 2] -= np.rint(pose[:2, 2])
+    if _corner(rest, shape) >= _FARTHEST:
+        rest = np.eye(3)
+    flow = camera_flow(motion(pose @ np.linalg.inv(rest)), shape)
+    seen = inside(flow)
+    fresh = warp(image, camera_flow(motion(offset @ np.linalg.inv(rest)), shape))
+    share = seen if image.ndim == 2 else seen[..., None]
+    moved = fresh + share * (warp(memory.image, flow) - fresh)
+    mean = luminance(fresh) + seen * (sample_linear((memory.mean,), flow) - luminance(fresh))
+    distances = sample_linear((memory.distances[..., 0], memory.distances[..., 1]), flow)
+    return Memory(
+        moved, 1 + seen * (sample_linear((memory.held,), flow) - 1), memory.frames, rest, mean, distances, 0.0
+    )
+
+
+def _corner(pose: Matrix, shape: tuple[int, ...]) -> float:
+    """How far a map moves the corners of an image at most along one axis, pixels."""
+    return float((np.abs(motion(pose)) @ [shape[1] / 2, shape[0] / 2, 1.0]).max())
+
+
+def _distance(image: FloatArray, mean: FloatArray) -> FloatArray:
+    """Average the squared difference of two images in a window."""
+    difference = cv2.GaussianBlur(image - mean, (0, 0), _DIFFERENCE_WINDOW)
+    return np.asarray(cv2.GaussianBlur(difference**2, (0, 0), _DISTANCE_WINDOW), np.float32)
 
 
 def _filled(flow: FloatArray, weight: FloatArray) -> FloatArray:

@@ -28,8 +28,9 @@ from ..runtime.threads import map_in_turns
 from .camera import Matrix, camera_flow
 from .deblurring import deblur
 from .dewarping import DewarpedFrame, dewarp_frame, measure_flow
-from .displacement import camera_stillness
-from .memory import Memory, remember
+from .displacement import whole_displacement
+from .memory import Memory, remember, shown
+from .path import LONGEST, camera_position, homogeneous, longer_path, motion, smooth_motion
 from .settings import SteadyParams
 from .windows import iter_windows
 
@@ -61,6 +62,8 @@ class SteadyFrame:
         Width of the blur that was removed from a frame, pixels.
     starts_scene : bool
         Whether a new scene starts here.
+    let_go : float
+        Share of the memory of the scene that was let go here, because the frames lay nearer to their own mean.
     """
 
     number: int
@@ -69,6 +72,7 @@ class SteadyFrame:
     displacement: float
     sigma: float
     starts_scene: bool
+    let_go: float
 
 
 def steady_frames(
@@ -128,21 +132,50 @@ class _Scenes:
     """What is carried from frame to frame of a scene."""
 
     def __init__(self, params: SteadyParams, sigma: float, runtime: Runtime) -> None:
-        self._lock = params.camera == "lock"
+        self._params = params
         self._memory: Memory | None = None
         self._given, self._runtime = params.sigma is not None, runtime
         self._first = self._width = sigma
         self._found: float | None = None
-        self._paths: deque[np.ndarray] = deque(maxlen=params.reach)
+        self._positions: deque[Matrix] = deque(maxlen=LONGEST)
+        # From the frame before to the steadied one.
+        self._steadied = np.eye(3)
 
     def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_], float]:
         """Estimate of the scene at a frame, what moves, and the width of the blur of what is remembered."""
         if frame.starts_scene:
             self._memory, self._width, self._found = None, self._first, None
-        image, moving = self._locked(frame) if self._lock else (frame.image, frame.moving)
-        stillness = 1.0 if self._lock else camera_stillness(frame.cameras, moving.shape)
-        self._memory = remember(self._memory, image, measure_flow, frame.noise, frame.largest, stillness, moving)
-        return self._memory, moving, self._remembered_width(self._memory)
+            self._positions.clear()
+        carry, offset = self._follow(frame)
+        image, moving = frame.image, frame.moving
+        if self._params.camera != "keep":
+            image, moving = _placed(image, moving, offset)
+            offset = np.eye(3)
+        self._memory = remember(
+            self._memory, image, measure_flow, frame.noise, frame.largest, frame.steadiness, moving, carry, offset
+        )
+        return shown(self._memory), moving, self._remembered_width(self._memory)
+
+    def _follow(self, frame: DewarpedFrame) -> tuple[Matrix, Matrix]:
+        """Follow the camera: maps from the steadied frame to the one before, and to the dewarped frame."""
+        position, shape = camera_position(self._positions, frame.cameras), frame.moving.shape
+        dewarped = homogeneous(frame.removed_camera)
+        if self._params.camera == "lock":
+            if not self._positions:
+                self._start = dewarped
+            steadied = self._start @ np.linalg.inv(position)
+        elif self._params.camera == "steady":
+            steadied = dewarped
+        else:
+            tolerance = whole_displacement(frame.size, frame.largest)
+            path = longer_path(self._positions, position, frame.cameras)
+            steadied = homogeneous(smooth_motion(path, tolerance, shape))
+        back, carry = np.linalg.inv(steadied), np.eye(3)
+        if self._positions:
+            carry = self._steadied @ self._positions[-1] @ np.linalg.inv(position) @ back
+        self._positions.append(position)
+        self._steadied = steadied
+        return carry, dewarped @ back
 
     def _remembered_width(self, memory: Memory) -> float:
         """Width to remove from what is remembered, which gradually becomes the one that its own image needs."""
@@ -154,23 +187,13 @@ class _Scenes:
             self._width += (self._found - self._width) / _GRADUALLY
         return self._width
 
-    def _locked(self, frame: DewarpedFrame) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Show a frame of a scene from where its steadied first frame was taken.
 
-        The map from there to the frame is the mean over its earlier neighbours of the map to them and on to the frame;
-        those far away keep errors from adding up with every frame.
-        """
-        removed = _affine(frame.removed_camera)
-        if frame.starts_scene:
-            self._paths.clear()
-            path = np.linalg.inv(removed)
-        else:
-            earlier = [offset for offset in frame.cameras if offset < 0]
-            steps = [np.linalg.inv(_affine(frame.cameras[offset])) @ self._paths[offset] for offset in earlier]
-            path = np.mean(steps, 0)
-        self._paths.append(path)
-        flow = camera_flow((removed @ path)[:2] - np.eye(3)[:2], frame.moving.shape)
-        return warp(frame.image, flow), sample_linear((frame.moving.astype(np.float32),), flow) > 0.5
+def _placed(image: FloatArray, moving: NDArray[np.bool_], offset: Matrix) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Dewarped frame and what moves, where the camera is wanted."""
+    if np.allclose(offset, np.eye(3)):
+        return image, moving
+    flow = camera_flow(motion(offset), moving.shape)
+    return warp(image, flow), sample_linear((moving.astype(np.float32),), flow) > 0.5
 
 
 def _sharpened(frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_], float], sigma: float) -> SteadyFrame:
@@ -184,9 +207,5 @@ def _sharpened(frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_], 
         displacement=frame.displacement,
         sigma=sigma,
         starts_scene=frame.starts_scene,
+        let_go=memory.let_go,
     )
-
-
-def _affine(matrix: Matrix) -> NDArray[np.float64]:
-    """Write the map id + A as a matrix of homogeneous coordinates about the centre."""
-    return np.eye(3) + np.vstack([matrix, np.zeros(3)])

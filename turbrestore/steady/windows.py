@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError
 from ..footage.checks.scene_cuts import similarity_at, thumbnail
+from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
 from ..registration.contrast import grey_levels
 from ..registration.opencv_flow import GreyImage
 
@@ -40,11 +41,14 @@ class WindowFrame:
         Contrast-normalised image, which flow is measured from.
     scene : int
         Number of the scene, from 0.
+    shift_reference : ShiftReference
+        What shifts of the whole image are measured against.
     """
 
     image: FloatArray
     levels: GreyImage
     scene: int
+    shift_reference: ShiftReference
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,4 +156,4 @@ def _prepared(frames: Iterable[ArrayLike]) -> Iterator[WindowFrame]:
         if before is not None and np.any(before) and np.any(detail):
             scene += similarity_at(detail, before)[0] < _CUT
         before = detail
-        yield WindowFrame(image, contrast_levels(image), scene)
+        yield WindowFrame(image, contrast_levels(image), scene, prepare_shift_reference(image))

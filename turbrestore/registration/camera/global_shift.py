@@ -11,7 +11,7 @@ and more.  It is cheap, because it runs on reduced images: dense flow measures t
 moving the frame by it makes the images clearly more alike where they overlap.  Turbulence alone does not pass that
 test, so its frames are left as they are.
 
-Small rotations need no such step: 2° move the corners of an image by a fortieth of its side.
+A camera that turns or zooms is followed by :mod:`turbrestore.registration.camera.stabilisation`.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from ..core.arrays import FloatArray, check_frames, check_image, luminance
-from ..core.errors import DataError
-from ..runtime.scratch import iter_frames, mean_of
-from ..runtime.threads import map_ahead
+from ...core.arrays import FloatArray, check_frames, check_image, luminance
+from ...core.errors import DataError
+from ...runtime.scratch import iter_frames
+from ...runtime.threads import map_ahead
 
 # Images are reduced by a whole factor until no side is longer; larger ones would only take longer.
 _LONGEST_SIDE = 192
@@ -38,7 +38,7 @@ _WINDOW, _FLOOR = 6.0, 0.01
 # Standard deviation of the expected peak, pixels of the reduced image: turbulence smears it.
 _PEAK_WIDTH = 1.0
 # Correlation that a shift must reach, and its least gain over the correlation without a shift.
-_LEAST_CORRELATION, _LEAST_GAIN = 0.3, 0.1
+LEAST_CORRELATION, _LEAST_GAIN = 0.3, 0.1
 # Share of the image below which an overlap says nothing about the whole.
 _LEAST_OVERLAP = 0.1
 # Shifts up to this many pixels are left to dense flow.
@@ -95,7 +95,7 @@ def prepare_shift_reference(image: ArrayLike) -> ShiftReference:
     (120, 160)
     """
     checked = check_image(image)
-    reduced = _reduce(checked)
+    reduced = reduce_image(checked)
     return ShiftReference(reduced, np.conj(_spectrum(reduced)), checked.shape[:2])
 
 
@@ -130,13 +130,13 @@ def measure_shift(image: ArrayLike, reference: ShiftReference) -> Shift | None:
     checked = check_image(image)
     if checked.shape[:2] != reference.shape:
         raise DataError(f"image: expected {reference.shape} pixels as the reference has, found {checked.shape[:2]}")
-    reduced = _reduce(checked)
+    reduced = reduce_image(checked)
     peak = _peak(reference.spectrum * _spectrum(reduced), reduced.shape)
-    still = _correlation(reference.reduced, reduced)
+    still = correlation(reference.reduced, reduced)
     to, origin = overlap(reduced.shape, np.rint(peak))
     seen = reduced[origin]
-    moved = _correlation(reference.reduced[to], seen) if seen.size > _LEAST_OVERLAP * reduced.size else 0.0
-    if max(still, moved) < _LEAST_CORRELATION:
+    moved = correlation(reference.reduced[to], seen) if seen.size > _LEAST_OVERLAP * reduced.size else 0.0
+    if max(still, moved) < LEAST_CORRELATION:
         return None
     scale = np.divide(reference.shape, reduced.shape)[::-1]
     return peak * scale if moved > still + _LEAST_GAIN else np.zeros(2)
@@ -170,54 +170,65 @@ def global_shifts(frames: ArrayLike) -> Shift:
     >>> global_shifts(np.stack([scene[:, k : k + 64] for k in (0, 10, 20)])).round()[:, 0]
     array([ 10.,   0., -10.])
     """
-    return _known_shifts(check_frames(frames))[0]
+    return known_shifts(check_frames(frames))[0]
 
 
-def mean_stabilised(frames: ArrayLike, threads: int = 0) -> FloatArray:
-    """Temporal mean of the frames, each moved by whole pixels to the mean position.
-
-    If all frames lie within two pixels of it they are averaged as they are; otherwise frames whose shift is unknown are
-    left out.
+def known_shifts(stack: FloatArray, threads: int = 0) -> tuple[Shift, NDArray[np.bool_]]:
+    """Shifts of all frames against their mean position, and which of them were found.
 
     Parameters
     ----------
-    frames : array_like, shape (T, H, W) or (T, H, W, 3)
-        Frames of one scene.
+    stack : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
     threads : int
         Frames compared side by side; 0 means one for each available core.
 
     Returns
     -------
-    ndarray, float32, shape (H, W) or (H, W, 3)
-
-    Raises
-    ------
-    DataError
-        Wrong shape, or values are not finite.
+    shifts : ndarray, float64, shape (T, 2)
+        Pixels.
+    known : ndarray, bool, shape (T,)
 
     Examples
     --------
-    >>> import numpy as np
     >>> scene = np.random.default_rng(0).random((64, 100)).astype(np.float32)
-    >>> mean = mean_stabilised(np.stack([scene[:, k : k + 64] for k in (0, 10, 20)]))
-    >>> bool(np.allclose(mean, scene[:, 10:74]))
-    True
+    >>> known_shifts(np.stack([scene[:, :64], scene[:, 4:68], np.zeros((64, 64), np.float32)]))[1].tolist()
+    [True, True, False]
     """
-    stack = check_frames(frames)
-    mean = mean_of(stack)
-    shifts, known = _known_shifts(stack, threads)
-    if np.abs(shifts).max() <= DEAD_ZONE:
-        return mean
-    total = np.zeros(mean.shape)
-    count = np.zeros(mean.shape[:2])
-    found = np.flatnonzero(known)
-    for shift, frame in zip(shifts[found], iter_frames(stack[number] for number in found), strict=True):
-        to, origin = overlap(count.shape, np.rint(shift))
-        total[to] += frame[origin]
-        count[to] += 1
-    seen = count > 0
-    mean[seen] = (total[seen].T / count[seen]).T
-    return mean
+    numbers = np.arange(len(stack))
+    # The middle frame may itself show something else.
+    for anchor in (len(stack) // 2, len(stack) // 4, 3 * len(stack) // 4):
+        shifts, known = np.zeros((len(stack), 2)), numbers == anchor
+        for order in (numbers[anchor + 1 :], numbers[:anchor][::-1]):
+            _follow(stack, anchor, order.tolist(), shifts, known, threads)
+        if 2 * known.sum() > len(stack):
+            break
+    shifts = np.column_stack([np.interp(numbers, numbers[known], axis) for axis in shifts[known].T])
+    return shifts - shifts.mean(axis=0), known
+
+
+def reduce_image(image: FloatArray) -> FloatArray:
+    """Reduce an image to its luminance with zero mean and unit deviation in a Gaussian window.
+
+    Parameters
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+
+    Returns
+    -------
+    ndarray, float32, shape (h, w)
+        At most 192 pixels a side.
+
+    Examples
+    --------
+    >>> reduce_image(np.zeros((480, 640), np.float32)).shape
+    (120, 160)
+    """
+    height, width = image.shape[:2]
+    factor = -(-max(height, width) // _LONGEST_SIDE)
+    size = max(width // factor, 1), max(height // factor, 1)
+    grey = luminance(image if factor == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    centred = grey - cv2.GaussianBlur(grey, (0, 0), _WINDOW)
+    return centred / np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), _WINDOW) + np.float32(_FLOOR**2))
 
 
 def frame_shift(image: FloatArray, start: FloatArray | None, reference: ShiftReference) -> FloatArray:
@@ -300,23 +311,32 @@ def overlap(shape: tuple[int, ...], shift: ArrayLike) -> tuple[Slices, Slices]:
     return (pairs[0][0], pairs[1][0]), (pairs[0][1], pairs[1][1])
 
 
+def correlation(a: FloatArray, b: FloatArray) -> float:
+    """Correlate two images.
+
+    Parameters
+    ----------
+    a, b : ndarray, float32, shape (H, W)
+
+    Returns
+    -------
+    float
+        From −1 to 1; 0 if one of them is blank.
+
+    Examples
+    --------
+    >>> ramp = np.arange(6, dtype=np.float32).reshape(2, 3)
+    >>> correlation(ramp, 5 - ramp), correlation(ramp, 0 * ramp)
+    (-1.0, 0.0)
+    """
+    a, b = a - a.mean(), b - b.mean()
+    energy = float(np.vdot(a, a)) * float(np.vdot(b, b))
+    return float(np.vdot(a, b)) / energy**0.5 if energy > 0 else 0.0
+
+
 def _overlap_of_axis(length: int, step: int) -> Slices:
     step = min(max(step, -length), length)
     return slice(max(-step, 0), length - max(step, 0)), slice(max(step, 0), length - max(-step, 0))
-
-
-def _known_shifts(stack: FloatArray, threads: int = 0) -> tuple[Shift, NDArray[np.bool_]]:
-    """Shifts of all frames, and which of them were found."""
-    numbers = np.arange(len(stack))
-    # The middle frame may itself show something else.
-    for anchor in (len(stack) // 2, len(stack) // 4, 3 * len(stack) // 4):
-        shifts, known = np.zeros((len(stack), 2)), numbers == anchor
-        for order in (numbers[anchor + 1 :], numbers[:anchor][::-1]):
-            _follow(stack, anchor, order.tolist(), shifts, known, threads)
-        if 2 * known.sum() > len(stack):
-            break
-    shifts = np.column_stack([np.interp(numbers, numbers[known], axis) for axis in shifts[known].T])
-    return shifts - shifts.mean(axis=0), known
 
 
 def _follow(
@@ -350,16 +370,6 @@ def _common_shift(flow: FloatArray) -> FloatArray | None:
     return shift if together >= _SHARE_OF_WHOLE else None
 
 
-def _reduce(image: FloatArray) -> FloatArray:
-    """Reduced luminance with zero mean and unit deviation in a Gaussian window."""
-    height, width = image.shape[:2]
-    factor = -(-max(height, width) // _LONGEST_SIDE)
-    size = max(width // factor, 1), max(height // factor, 1)
-    grey = luminance(image if factor == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-    centred = grey - cv2.GaussianBlur(grey, (0, 0), _WINDOW)
-    return centred / np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), _WINDOW) + np.float32(_FLOOR**2))
-
-
 def _spectrum(reduced: FloatArray) -> NDArray[np.complex64]:
     window = cv2.createHanningWindow((max(reduced.shape[1], 2), max(reduced.shape[0], 2)), cv2.CV_32F)
     return fft.rfft2(reduced * window)
@@ -384,9 +394,3 @@ def _vertex(three: FloatArray) -> float:
     """Vertex of the parabola through three values, counted from the middle one."""
     bend = float(three[0] - 2 * three[1] + three[2])
     return 0.5 * float(three[0] - three[2]) / bend if bend < 0 else 0.0
-
-
-def _correlation(a: FloatArray, b: FloatArray) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    energy = float(np.vdot(a, a)) * float(np.vdot(b, b))
-    return float(np.vdot(a, b)) / energy**0.5 if energy > 0 else 0.0

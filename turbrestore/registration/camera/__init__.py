@@ -1,0 +1,1 @@
+"""Motion of the camera: shifts, turns and zooms of whole frames."""

@@ -1,0 +1,224 @@
+"""Path of the camera through a scene, and the smooth path that the steadied video takes.
+
+Symbols
+-------
+k : the frame; j a frame before it, or after it within the window
+G_j : affine map from the first frame of the scene to frame j, homogeneous, pixels about the centre of the image
+P_j : motion of the camera from frame k to frame j, ``G_j G_k⁻¹ − 1``, of shape (2, 3)
+T : map from frame k to the steadied frame, ``1 +`` the value at k of a polynomial fitted to the P_j
+e : by what turbulence moves whole frames, pixels
+ε_i, σ_i : what fit i leaves, root mean square; standard deviation of its value at k, from ε_i
+
+Turbulence moves whole frames as well, but at random about where the camera is, and a camera stands, pans and zooms at
+constant velocity for a while.  A parabola through a few frames follows whatever the camera does and averages little; a
+line through many averages much, without a lag behind a pan; a mean of many is best while the camera stands.  The fits
+are taken in this order, as long as each agrees with the one before (the intersection of confidence intervals of
+Goldenshluger and Nemirovski 1997): fit i has the share ::
+
+    Π_{l ≤ i} 1 / (1 + (ε_l / e)⁸) · 1 / (1 + (|value_l − value_{l−1}| / κ σ_{l−1})⁴)
+
+of what those before leave, without the last factor for the first.  Where even the first leaves more than e, the camera
+shakes, and T = 1.
+
+G_j is the median over the earlier neighbours of frame j of the map to them and on to frame j; those far away keep
+errors from adding up with every frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from .camera import Matrix, camera_size
+
+# Frames before k that are kept.
+LONGEST = 48
+# Fits: frames on either side of k, and order of the polynomial; fewest frames of a fit.
+_FITS = (6, 2), (6, 1), (12, 1), (24, 1), (LONGEST, 1), (LONGEST, 0)
+_FEWEST = 4
+# κ, greater than 1 because turbulence of successive frames is alike, and less for a camera that stands, since that is
+# the assumption that a slow pan breaks.
+_DOUBT, _STANDING = 2.0, 1.5
+_AT_ENDS = 0.5
+# Least e and κ σ, pixels, so that an exact fit has a share.
+_LEAST = 1e-3
+
+
+def camera_position(before: Sequence[Matrix], cameras: Mapping[int, Matrix]) -> Matrix:
+    """Position G_k of a frame from those of the frames before it.
+
+    Parameters
+    ----------
+    before : sequence of ndarray, float64, shape (3, 3)
+        G of the frames before, the nearest last; empty for the first frame.
+    cameras : mapping of int to ndarray, float64, shape (2, 3)
+        Motion of the camera from the frame to its neighbours.
+
+    Returns
+    -------
+    ndarray, float64, shape (3, 3)
+
+    Examples
+    --------
+    >>> step = np.array([[0, 0, -2.0], [0, 0, 0]])
+    >>> float(camera_position([np.eye(3)], {-1: step})[0, 2])
+    2.0
+    """
+    known = [offset for offset in cameras if -len(before) <= offset < 0]
+    if not known:
+        return np.eye(3)
+    return np.median([np.linalg.inv(homogeneous(cameras[offset])) @ before[offset] for offset in known], 0)
+
+
+def longer_path(before: Sequence[Matrix], position: Matrix, cameras: Mapping[int, Matrix]) -> dict[int, Matrix]:
+    """Motion from a frame to all frames that are known: those before it, and its later neighbours.
+
+    Parameters
+    ----------
+    before : sequence of ndarray, float64, shape (3, 3)
+        G of the frames before, the nearest last.
+    position : ndarray, float64, shape (3, 3)
+        G_k.
+    cameras : mapping of int to ndarray, float64, shape (2, 3)
+        Motion of the camera from the frame to its neighbours.
+
+    Returns
+    -------
+    dict of int to ndarray, float64, shape (2, 3)
+        P_j by j − k.
+
+    Examples
+    --------
+    >>> sorted(longer_path([np.eye(3)] * 3, np.eye(3), {-1: np.zeros((2, 3)), 2: np.zeros((2, 3))}))
+    [-3, -2, -1, 2]
+    """
+    inverse = np.linalg.inv(position)
+    past = {number - len(before): motion(other @ inverse) for number, other in enumerate(before)}
+    return past | {offset: camera for offset, camera in cameras.items() if offset > 0}
+
+
+def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int, ...]) -> Matrix:
+    """Motion T − 1 from a frame to where it is on the smooth path.
+
+    Parameters
+    ----------
+    path : mapping of int to ndarray, float64, shape (2, 3)
+        P_j by j − k, pixels.
+    tolerance : float
+        e, pixels.
+    shape : tuple of int
+        (H, W) of the frames.
+
+    Returns
+    -------
+    ndarray, float64, shape (2, 3)
+
+    Examples
+    --------
+    >>> pan = np.array([[0, 0, 0.5], [0, 0, 0]])
+    >>> path = {j: j * pan + [[0, 0, 0.3], [0, 0, 0]] for j in range(-20, 13) if j}
+    >>> float(smooth_motion(path, 1.0, (64, 64))[0, 2].round(1))
+    0.3
+    >>> abs(smooth_motion(path, 0.01, (64, 64))).max() < 0.01
+    np.True_
+    """
+    times, seen, weights = _samples(path)
+    smooth, share, value, doubt = np.zeros(6), 1.0, None, 0.0
+    for span, order in _FITS:
+        near = np.abs(times) <= span
+        one_sided = min(np.sum(times[near] < 0), np.sum(times[near] > 0)) < 2
+        if near.sum() < _FEWEST or (order == 2 and one_sided):
+            continue
+        if one_sided and value is None:
+            # At the ends of a scene the first line is extrapolated.
+            share *= _AT_ENDS
+        before, (value, left, spread) = value, _fit(times[near], seen[near], weights[near], order)
+        squares = [camera_size(one, shape) ** 2 for one in left.reshape(-1, 2, 3)]
+        size = float(np.sqrt(np.average(squares, weights=weights[near])))
+        share *= 1 / (1 + (size / max(tolerance, _LEAST)) ** 8)
+        if before is not None:
+            differs = camera_size((value - before).reshape(2, 3), shape)
+            share *= 1 / (1 + (differs / max((_DOUBT if order else _STANDING) * doubt, _LEAST)) ** 4)
+        smooth = smooth + share * (value - smooth)
+        doubt = size * spread
+    return smooth.reshape(2, 3)
+
+
+def without_shake(path: Mapping[int, Matrix], order: int) -> Matrix:
+    """Motion from a frame to where it is on the line, or at the point, that fits the path best.
+
+    Parameters
+    ----------
+    path : mapping of int to ndarray, float64, shape (2, 3)
+        P_j by j − k, pixels; not empty.
+    order : int
+        0 for a point, 1 for a line.
+
+    Returns
+    -------
+    ndarray, float64, shape (2, 3)
+
+    Examples
+    --------
+    >>> pan = np.array([[0, 0, 7.0], [0, 0, 0]])
+    >>> bool(abs(without_shake({1: pan, 2: 2 * pan}, 1)).max() < 1e-9)
+    True
+    """
+    times, seen, _ = _samples(path)
+    # With one neighbour a line fits both: the frame stays.
+    return _fit(times, seen, np.ones(len(times)), order)[0].reshape(2, 3)
+
+
+def homogeneous(matrix: Matrix) -> Matrix:
+    """Map id + A as a matrix of homogeneous coordinates about the centre.
+
+    Parameters
+    ----------
+    matrix : ndarray, float64, shape (2, 3)
+
+    Returns
+    -------
+    ndarray, float64, shape (3, 3)
+
+    Examples
+    --------
+    >>> homogeneous(np.zeros((2, 3))).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    return np.eye(3) + np.vstack([matrix, np.zeros(3)])
+
+
+def motion(pose: Matrix) -> Matrix:
+    """Undo :func:`homogeneous`.
+
+    Parameters
+    ----------
+    pose : ndarray, float64, shape (3, 3)
+
+    Returns
+    -------
+    ndarray, float64, shape (2, 3)
+
+    Examples
+    --------
+    >>> motion(np.eye(3)).any()
+    np.False_
+    """
+    return pose[:2] - np.eye(3)[:2]
+
+
+def _samples(path: Mapping[int, Matrix]) -> tuple[Matrix, Matrix, Matrix]:
+    """Arrange a path: times, motions as rows, and the number of frames that each stands for, as some are skipped."""
+    times = np.array(sorted([*path, 0]), np.float64)
+    seen = np.stack([path[int(time)] if time else np.zeros((2, 3)) for time in times]).reshape(-1, 6)
+    return times, seen, np.gradient(times) if len(times) > 1 else np.ones(1)
+
+
+def _fit(times: Matrix, seen: Matrix, weights: Matrix, order: int) -> tuple[Matrix, Matrix, float]:
+    """Value at 0 of a polynomial, what it leaves, and its standard deviation over that of a frame."""
+    basis = np.stack([(times / LONGEST) ** power for power in range(order + 1)], 1)
+    root = np.sqrt(weights)
+    solve = np.linalg.pinv(basis * root[:, None]) * root
+    solution = solve @ seen
+    return solution[0], seen - basis @ solution, float(np.linalg.norm(solve[0]))
