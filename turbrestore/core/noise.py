@@ -68,34 +68,32 @@ def fit_noise_curve(level: FloatArray, variance: FloatArray, energy: FloatArray)
     >>> curve.variance(np.array([[0.2, 0.8]])).round(3)
     array([[0.002, 0.008]], dtype=float32)
     """
-    level, variance, energy = (np.asarray(part, np.float64).ravel() for part in (level, variance, energy))
-    count = int(np.clip(level.size // _PIXELS, 1, _LEVELS))
-    low, high = np.percentile(level, (1, 99))
+    flat = tuple(np.asarray(part, np.float64).ravel() for part in (level, variance, energy))
+    levels, _, energies = flat
+    count = int(np.clip(levels.size // _PIXELS, 1, _LEVELS))
+    low, high = np.percentile(levels, (1, 99))
     # Of equal width, because a dark sky would else take all of them.
     edges = np.linspace(low, max(high, low + 1e-9), count + 1)
-    numbers = np.clip(np.searchsorted(edges, level) - 1, 0, count - 1)
+    numbers = np.clip(np.searchsorted(edges, levels) - 1, 0, count - 1)
     groups = []
     for number in range(count):
         chosen = np.flatnonzero(numbers == number)
-        if chosen.size < min(_PIXELS, level.size):
+        if chosen.size < min(_PIXELS, levels.size):
             continue
         size = max(int(_FLATTEST * chosen.size), 1)
-        chosen = chosen[np.argpartition(energy[chosen], min(2 * size, chosen.size - 1))]
-        ordered = chosen[: 2 * size][np.argsort(energy[chosen[: 2 * size]])]
-        groups.append(
-            [[part[pixels].mean() for part in (level, variance, energy)] for pixels in (ordered[:size], ordered[size:])]
-        )
+        chosen = chosen[np.argpartition(energies[chosen], min(2 * size, chosen.size - 1))]
+        ordered = chosen[: 2 * size][np.argsort(energies[chosen[: 2 * size]])]
+        groups.append([[part[pixels].mean() for part in flat] for pixels in (ordered[:size], ordered[size:])])
     if not groups:
-        return NoiseCurve(np.array([0.0]), np.array([variance.mean()]))
+        return NoiseCurve(np.array([0.0]), np.array([flat[1].mean()]))
     found = np.array(groups)  # (K, 2, 3)
-    levels = found[:, :, 0].mean(axis=1)
+    known = found[:, :, 0].mean(axis=1)
     design = np.zeros((2 * len(found), len(found) + 1))
     design[np.arange(2 * len(found)), np.repeat(np.arange(len(found)), 2)] = 1
     scale = max(float(found[..., 2].max()), 1e-18)
     design[:, -1] = found[..., 2].ravel() / scale
     variances, _ = nnls(design, found[..., 1].ravel())
-    order = np.argsort(levels)
-    return NoiseCurve(levels[order], variances[:-1][order])
+    return NoiseCurve(known, variances[:-1])
 
 
 def estimate_noise(image: ArrayLike) -> float:

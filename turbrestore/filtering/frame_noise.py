@@ -44,7 +44,7 @@ _AROUND_FOLD, _FOLD_FADE = 3, 2.0
 # averaged in a Gaussian window of this standard deviation, pixels.
 OUTLIER, OUTLIER_WINDOW = 6.0, 3.0
 # The same for what is as small as a flake, against the median of the frames.
-_DISAGREES, AGREEMENT_WINDOW, _FINE_WINDOW = 4.0, 1.5, 0.8
+_DISAGREES, AGREEMENT_WINDOW, _FINE_WINDOW = 8.0, 1.5, 0.8
 # Sobel's derivative divided by 8 is the first along one axis and the second along the other.
 _DIFFERENCE, _BINOMIAL = np.array([-1, 0, 1], np.float32), np.array([0.125, 0.25, 0.125], np.float32)
 _BOX = np.ones(2 * _AROUND_FOLD + 1, np.float32)

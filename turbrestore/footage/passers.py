@@ -45,15 +45,18 @@ _GAP, _DISC, _AROUND = 2, 7, 3
 _FADE = 1.5
 # The same for what is small: e² counts from the first times the sum of a quarter of v, for e is measured in a window,
 # and the square of the least deviation; windows of e and of v, radius of what is nearby, and the transition, pixels.
-_SMALL_EXCEEDS, _SMALL_SHARE = 9.0, 0.25
+_SMALL_EXCEEDS, _SMALL_SHARE, _SLIGHTLY = 9.0, 0.25, 0.2
 _SMALL_WINDOW, _SMALL_USUAL_WINDOW, _NEARBY, _SMALL_FADE = 0.8, 1.5, 3, 0.7
+# Least share of the frames that is small, which strong turbulence over fine detail reaches by two thirds, and that of
+# what is brighter than the scene nearby, or darker, among it.
+_LEAST_SMALL, _ONE_SIDED = 0.06, 0.75
 # Least and largest share of the frames that passes, largest part of a frame that is replaced, and fewest frames that
 # show a pixel of the background.
 _LEAST, _LARGEST, _LARGEST_PART, _SEEN = 0.0025, 0.35, 0.5, 3
 # Root mean square of the shifts from which the camera moves, pixels; least share of all edges that the background has.
 _CAMERA, _OWN_EDGES = 3.0, 0.5
-# Most pixels of what a moving camera shows, in frames.
-_LARGEST_SCENE = 4.0
+# Most pixels of what a moving camera shows, in frames, and the share of the variance that following it may leave.
+_LARGEST_SCENE, _FOLLOWED = 4.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,17 +122,18 @@ class Background:
 
 @dataclass(frozen=True, eq=False)
 class _Usual:
-    """The median, and what frames do not exceed where nothing passes: d, the range nearby, and e² (None: not used)."""
+    """The median, what frames do not exceed where nothing passes (d, the range, e² or None), and the mean of v."""
 
     median: FloatArray
     deviation: FloatArray
     low: FloatArray
     high: FloatArray
     excess: FloatArray | None
+    spread: float
 
     def at(self, place: Window) -> _Usual:
         parts = (self.median[place], self.deviation[place], self.low[place], self.high[place])
-        return _Usual(*parts, None if self.excess is None else self.excess[place])
+        return _Usual(*parts, None if self.excess is None else self.excess[place], self.spread)
 
     def of_large(self) -> _Usual:
         return dataclasses.replace(self, excess=None)
@@ -180,14 +184,20 @@ def _usual_of(source: FrameSource) -> tuple[_Usual, Placement] | None:
     stack = np.empty((len(sample), *sample.shape[1:3]), np.uint8)
     for plane, frame in zip(stack, sample, strict=True):
         np.rint(255 * np.clip(luminance(frame), 0, 1), out=plane, casting="unsafe")
-    placement = Placement.still(source)
-    usual = _passed_in(stack, sample.numbers, placement)
-    if usual is None and _moves(measured_shifts(map(_grey, stack), stack.shape)):
-        # For a camera that moves the scene passes too; what moves as most of the frame does is the scene.
-        placement = placed(source, measured_shifts(map(luminance, source), source.shape))
-        if np.prod(placement.shape) <= _LARGEST_SCENE * np.prod(placement.size):
-            usual = _passed_in(stack, sample.numbers, placement)
-    return None if usual is None else (usual, placement)
+    still = Placement.still(source)
+    usual = _usual(stack, sample.numbers, still)
+    found = _passed_by(stack, sample.numbers, usual, still)
+    if found is not None:
+        return found, still
+    if not _moves(measured_shifts(map(_grey, stack), stack.shape)):
+        return None
+    # For a camera that moves the scene passes too; what moves as most of the frame does is the scene.
+    moving = placed(source, measured_shifts(map(luminance, source), source.shape))
+    if np.prod(moving.shape) > _LARGEST_SCENE * np.prod(moving.size):
+        return None
+    followed = _usual(stack, sample.numbers, moving)
+    found = _passed_by(stack, sample.numbers, followed, moving) if followed.spread < _FOLLOWED * usual.spread else None
+    return None if found is None else (found, moving)
 
 
 def _moves(shifts: NDArray[np.float64]) -> bool:
@@ -198,14 +208,12 @@ def _grey(plane: NDArray[np.uint8]) -> FloatArray:
     return plane.astype(np.float32) / np.float32(255)
 
 
-def _passed_in(stack: NDArray[np.uint8], numbers: Sequence[int], placement: Placement) -> _Usual | None:
-    """Find what a sample of the frames usually shows; None where nothing passes, or so much that it is the scene."""
-    usual = _usual(stack, [placement.place(number) for number in numbers], placement.shape)
+def _passed_by(stack: NDArray[np.uint8], numbers: Sequence[int], usual: _Usual, placement: Placement) -> _Usual | None:
+    """Return what tells what passes in a sample; None where nothing does, or so much that it is the scene."""
     parts = [usual.at(placement.place(number)) for number in numbers]
     large = [_passing(_grey(plane), part.of_large()) for plane, part in zip(stack, parts, strict=True)]
     masks = [_passing(_grey(plane), part) for plane, part in zip(stack, parts, strict=True)]
-    # The edges of what is large are not what is small.
-    if sum(float(_small_share(*pair)) for pair in zip(large, masks, strict=True)) < _LEAST * len(stack):
+    if not _is_precipitation(stack, large, parts):
         usual, parts, masks = usual.of_large(), [part.of_large() for part in parts], large
     if not _LEAST <= float(np.mean([(mask > 0).mean() for mask in masks])) <= _LARGEST:
         return None
@@ -213,9 +221,17 @@ def _passed_in(stack: NDArray[np.uint8], numbers: Sequence[int], placement: Plac
     return usual if _stands(stack, masks, parts, shifts) else None
 
 
-def _small_share(large: NDArray[np.uint8], mask: NDArray[np.uint8]) -> float:
-    near = cv2.dilate(large, _disc(2 * _DISC))
-    return float(((mask == 255) & (near == 0)).mean())
+def _is_precipitation(stack: NDArray[np.uint8], large: list[NDArray[np.uint8]], parts: list[_Usual]) -> bool:
+    """Whether more of the frames is beyond the range of the scene, on one side of it, than turbulence explains."""
+    shares, brighter = [], []
+    for plane, mask, part in zip(stack, large, parts, strict=True):
+        grey = _grey(plane)
+        # The edges of what is large are not what is small.
+        small = (_small(grey, part) > 0) & (cv2.dilate(mask, _disc(2 * _DISC)) == 0)
+        shares.append(small.mean())
+        brighter.append((small & (grey > part.median)).mean())
+    share = float(np.mean(shares))
+    return share >= _LEAST_SMALL and abs(float(np.mean(brighter)) / share - 0.5) >= _ONE_SIDED - 0.5
 
 
 def _stands(
@@ -234,8 +250,9 @@ def _stands(
     return bool(edges[1] > _OWN_EDGES * edges[0]) and not _moves(away - away.mean(axis=0))
 
 
-def _usual(stack: NDArray[np.uint8], places: list[Window], shape: tuple[int, int]) -> _Usual:
+def _usual(stack: NDArray[np.uint8], numbers: Sequence[int], placement: Placement) -> _Usual:
     """Median over the frames at every place of the scene, and the values that are not exceeded where nothing passes."""
+    shape, places = placement.shape, [placement.place(number) for number in numbers]
     median, variance, seen = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
     for top in range(0, shape[0], _ROWS):
         rows = slice(top, min(top + _ROWS, shape[0]))
@@ -255,7 +272,8 @@ def _usual(stack: NDArray[np.uint8], places: list[Window], shape: tuple[int, int
         np.where(known, some, np.float32(np.inf)) for some in (_EXCEEDS * deviation, _SMALL_EXCEEDS * excess)
     )
     smooth, nearby = cv2.GaussianBlur(median, (0, 0), _SMALL_WINDOW), _disc(_NEARBY)
-    return _Usual(median, deviation, cv2.erode(smooth, nearby), cv2.dilate(smooth, nearby), excess)
+    spread = float(variance[seen > 0].mean()) if seen.any() else np.inf
+    return _Usual(median, deviation, cv2.erode(smooth, nearby), cv2.dilate(smooth, nearby), excess, spread)
 
 
 def _median(values: FloatArray) -> FloatArray:
@@ -275,14 +293,19 @@ def _passing(grey: FloatArray, usual: _Usual) -> NDArray[np.uint8]:
     if usual.excess is not None:
         weight = np.maximum(weight, _faded(_small(grey, usual), 1, _SMALL_FADE))
     weight = np.rint(255 * weight).astype(np.uint8)
-    return weight if (weight > 0).mean() <= _LARGEST_PART else np.zeros_like(weight)
+    return np.asarray(weight if (weight > 0).mean() <= _LARGEST_PART else np.zeros_like(weight), np.uint8)
 
 
 def _small(grey: FloatArray, usual: _Usual) -> NDArray[np.uint8]:
-    """Mark what is beyond the range of the scene nearby."""
+    """Mark what is clearly beyond the range of the scene nearby, and what is slightly so and belongs to it."""
     assert usual.excess is not None
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMALL_WINDOW)
-    return (np.maximum(np.maximum(smooth - usual.high, usual.low - smooth), 0) ** 2 > usual.excess).view(np.uint8)
+    beyond = np.maximum(np.maximum(smooth - usual.high, usual.low - smooth), 0) ** 2
+    _, labels = cv2.connectedComponents((beyond > _SLIGHTLY * usual.excess).view(np.uint8), connectivity=8)
+    clear = np.zeros(int(labels.max()) + 1, np.uint8)
+    clear[labels[beyond > usual.excess]] = 1
+    clear[0] = 0
+    return np.asarray(clear[labels], np.uint8)
 
 
 def _faded(mask: NDArray[np.uint8], around: int, fade: float) -> FloatArray:
