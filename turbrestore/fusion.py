@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from .agreement.last_guard import FEWEST, Halves, registered_halves
 from .blind.structure import StructureReading, compare_structure
 from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
@@ -25,7 +26,7 @@ from .memory_plan import MemoryPlan
 from .preparation import Prepared, seeing_of_picture
 from .registration.centroid import Centroid, centroid_steps
 from .registration.flow_algebra import invert_flow
-from .registration.recentring import recentring_flow
+from .registration.recentring import recentre, recentring_flow
 from .registration.warp import warp
 from .results import Store
 from .runtime.scratch import fill_stack, iter_frames, mean_of
@@ -116,7 +117,8 @@ class Run:
 class Fused:
     """Results of the stages before the deconvolution.
 
-    ``is_mean`` says that the image is the mean of the frames, because the filtered one has structure that they lack.
+    ``is_mean`` says that the image is the mean of the frames, because the filtered one has structure that they lack;
+    ``halves`` are at the levels of the clip, None for few frames.
     """
 
     image: FloatArray
@@ -127,6 +129,7 @@ class Fused:
     dynamics: FlowDynamics | None = None
     filtered: Filtered | None = None
     is_mean: bool = False
+    halves: Halves | None = None
 
 
 def fuse(run: Run) -> Fused:
@@ -159,7 +162,8 @@ def fuse(run: Run) -> Fused:
     structure = _compare_structure(levels.stretched(filtered.image), training, centroid, filtered.mean_flow)
     run.decide(*explain_structure(structure))
     image = filtered.image if structure.passed else mean
-    return Fused(image, mean, centroid, seeing, saturation, dynamics, filtered, is_mean=not structure.passed)
+    halves = _halves(run, training, centroid, filtered.mean_flow)
+    return Fused(image, mean, centroid, seeing, saturation, dynamics, filtered, not structure.passed, halves)
 
 
 def _find_centroid(run: Run, training: FloatArray) -> Centroid:
@@ -197,6 +201,15 @@ def _compare_structure(
     if mean_flow.any():
         image = warp(image, invert_flow(recentring_flow(mean_flow)))
     return compare_structure(image, training, centroid.flows)
+
+
+def _halves(run: Run, training: FloatArray, centroid: Centroid, mean_flow: FloatArray) -> Halves | None:
+    """Average two halves of the training frames, in the geometry of the filtered image."""
+    if len(training) < FEWEST or not run.params.runs("deconvolve"):
+        return None
+    found = registered_halves(training, centroid.flows, training.shape[1:], len(training), run.plan.runtime.threads)
+    halves = (run.levels.original(recentre(half, mean_flow)) for half in (found.first, found.second))
+    return Halves(*halves)
 
 
 def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:

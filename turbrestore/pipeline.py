@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .agreement.last_guard import keep_agreed
 from .blind.remove_blur import Deblurred, remove_blur_steps
 from .core.arrays import FloatArray
 from .core.decision import Decision
@@ -144,6 +145,10 @@ def _restored(run: Run) -> Restoration:
         deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
+    agreed = None if deblurred is None or fused.halves is None else keep_agreed(image, fused.halves)
+    if agreed is not None:
+        run.decide(*agreed.decisions)
+        image = agreed.image
     seen = coverage(centroid.flows)
     crop, on_border = _crop(image, seen, params.border, deblurred)
     run.decide(on_border)
@@ -165,6 +170,7 @@ def _restored(run: Run) -> Restoration:
         seconds=run.seconds,
         seeing=fused.seeing,
         uncertainty=None if uncertainty is None else uncertainty[y : y + height, x : x + width],
+        disagreement=None if agreed is None else agreed.share[y : y + height, x : x + width],
     )
 
 

@@ -104,6 +104,9 @@ class Restoration:
     uncertainty : ndarray, float32, shape (H, W), or None
         Standard deviation of every pixel of the image, intensity; infinite where nothing is known, and everywhere
         where the mean of the frames is the result; None unless the filter has run.
+    disagreement : ndarray, float32, shape (H, W), or None
+        Share, 0 to 1, of the mean of the registered frames in the detail of the image, because they do not agree on it;
+        None unless the image was deblurred.
     """
 
     image: FloatArray
@@ -121,6 +124,7 @@ class Restoration:
     seconds: dict[str, float]
     seeing: Seeing | None = None
     uncertainty: FloatArray | None = None
+    disagreement: FloatArray | None = None
 
     def plot(self) -> Figure:
         """Draw the temporal mean beside the result.

@@ -7,7 +7,7 @@ z : local sharpness of a frame, standardised over the frames; β its weight
 v : variance of z over the frames
 κ : share of the middle of the window that z leaves out, see :func:`local_sharpness`
 d : squared deviation of a frame from the mean frame, in units of its usual variance
-d' : the same from the median of the frames, in a window as small as a flake of snow; e = max(d / 6, d' / 4, 1)
+d' : the same from the median of the frames, in a window as small as a flake of snow; e = max(d / 6, d' / 8, 1)
 m : 1 where the frame gives no measurement, because the map id + Ŵ folds or leaves the frame
 
 The paper takes Z to be one number, Z₀.  So does this module for β = 0; for β > 0::

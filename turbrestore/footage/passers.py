@@ -215,6 +215,11 @@ def _passed_by(stack: NDArray[np.uint8], numbers: Sequence[int], usual: _Usual, 
     masks = [_passing(_grey(plane), part) for plane, part in zip(stack, parts, strict=True)]
     if not _is_precipitation(stack, large, parts):
         usual, parts, masks = usual.of_large(), [part.of_large() for part in parts], large
+    else:
+        # Rain widens the spread of the frames, under which some of it hides.
+        usual = _usual(stack, numbers, placement, masks)
+        parts = [usual.at(placement.place(number)) for number in numbers]
+        masks = [_passing(_grey(plane), part) for plane, part in zip(stack, parts, strict=True)]
     if not _LEAST <= float(np.mean([(mask > 0).mean() for mask in masks])) <= _LARGEST:
         return None
     shifts = np.array([placement.shifts[number] for number in numbers], np.float64)
@@ -250,17 +255,33 @@ def _stands(
     return bool(edges[1] > _OWN_EDGES * edges[0]) and not _moves(away - away.mean(axis=0))
 
 
-def _usual(stack: NDArray[np.uint8], numbers: Sequence[int], placement: Placement) -> _Usual:
-    """Median over the frames at every place of the scene, and the values that are not exceeded where nothing passes."""
+def _usual(
+    stack: NDArray[np.uint8],
+    numbers: Sequence[int],
+    placement: Placement,
+    masks: Sequence[NDArray[np.uint8]] | None = None,
+) -> _Usual:
+    """Median over the frames at every place of the scene, and the values that are not exceeded where nothing passes.
+
+    What is known to pass does not count, but does where that leaves too few frames.
+    """
     shape, places = placement.shape, [placement.place(number) for number in numbers]
     median, variance, seen = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
     for top in range(0, shape[0], _ROWS):
         rows = slice(top, min(top + _ROWS, shape[0]))
         values = np.full((len(stack), rows.stop - top, shape[1]), np.nan, np.float32)
-        for plane, frame, (down, across) in zip(values, stack, places, strict=True):
+        hidden = np.zeros(values.shape, bool)
+        for index, (frame, (down, across)) in enumerate(zip(stack, places, strict=True)):
             first, last = max(down.start, top), min(down.stop, rows.stop)
             if first < last:
-                plane[first - top : last - top, across] = _grey(frame[first - down.start : last - down.start])
+                shown, part = (
+                    np.s_[index, first - top : last - top, across],
+                    np.s_[first - down.start : last - down.start],
+                )
+                values[shown] = _grey(frame[part])
+                hidden[shown] = False if masks is None else masks[index][part] > 0
+        few = (np.isfinite(values) & ~hidden).sum(axis=0) < _FEWEST
+        values[hidden & ~few] = np.nan
         seen[rows] = np.isfinite(values).sum(axis=0) >= _FEWEST
         median[rows] = _median(values)
         variance[rows] = (_MEDIAN_DEVIATION * _median(np.abs(values - median[rows]))) ** 2
