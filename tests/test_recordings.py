@@ -158,12 +158,12 @@ class TestOverlays:
     def test_scenes_have_none(self, shaken, clip):
         for frames in (shaken, u8(clip.frames), u8(0.2 + 0 * clip.frames[:1] + 0.3 * clip.frames)):
             source = FrameSource.from_array(frames)
-            assert without_overlay(source) == (source, None, ())
+            assert without_overlay(source) == (source, None, None, ())
 
     def test_a_window_is_that_of_the_whole_frame(self, shaken):
         covered = shaken.copy()
         covered[:, 40, 20:60] = 255
-        source, _, _ = without_overlay(FrameSource.from_array(covered))
+        source, _, _, _ = without_overlay(FrameSource.from_array(covered))
         part = source.select((2, 5), (15, 30, 30, 25))
         np.testing.assert_array_equal(part.read(), source.read(2, 5)[:, 30:55, 15:45])
 
@@ -191,7 +191,7 @@ class TestBars:
         y, x = np.mgrid[:64, :80]
         disc = 0.8 * (np.hypot(x - 40, y - 32) < 20)
         source = FrameSource.from_array(u8(np.stack([np.roll(disc, k, axis=1) for k in range(5)])))
-        assert without_bars(source) == (source, None, ())
+        assert without_bars(source) == (source, None, None, ())
 
 
 class TestRange:
