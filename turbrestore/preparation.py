@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .agreement.sensor_pattern import without_stripes
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .footage.bars import Bars, without_bars
@@ -86,10 +87,13 @@ def prepare(source: FrameSource, train: int, static_mask: str = "auto") -> Prepa
     source, hidden, title, on_overlay = (
         without_overlay(source, mask) if static_mask != "off" else (source, None, None, ())
     )
+    source, on_stripes = without_stripes(source)
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, train)
     source, on_passers = without_passers(source) if static_mask != "off" else (source, ())
-    return Prepared(source, levels, bars, hidden, title, (*on_bars, *on_overlay, *on_light, *on_range, *on_passers))
+    return Prepared(
+        source, levels, bars, hidden, title, (*on_bars, *on_overlay, *on_stripes, *on_light, *on_range, *on_passers)
+    )
 
 
 def seeing_of_picture(
