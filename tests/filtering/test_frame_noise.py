@@ -54,7 +54,8 @@ def test_the_noise_is_that_of_its_definition(model_and_frames):
     assert sharp == pytest.approx(product.sum() / energy.sum(), rel=1e-3)
     score = np.clip(model.score_scale * (smooth(product, model.window) - model.mean_sharpness), -3, 3)
     excess = smooth(np.square(frame - model.mean_frame), 3.0) / model.deviation / 6
-    small = smooth(np.square(frame - model.median), 0.8) / model.spread / 8
+    difference = frame - model.median
+    small = smooth(np.square(difference - smooth(difference, 5.0)), 0.8) / model.spread / 8
     assert excess.max() > 3
     assert (small > np.maximum(excess, 1)).any()
     excess = np.maximum(np.maximum(excess, small), 1)

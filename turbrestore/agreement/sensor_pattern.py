@@ -35,7 +35,7 @@ _STANDS = 0.25
 # Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion, pixels.
 _EDGE, _LEAST_MOTION = 8.0, 0.3
 # Parts along the stripes, and the least correlation of their offsets.
-_PARTS, _ALIKE = 3, 0.5
+_PARTS, _ALIKE = 3, 0.4
 # A dead column varies less than this share of the noise and of the columns around; dead ones are few, and told
 # from others where there is noise of some size.
 _DEAD, _AROUND, _MOST_DEAD, _LEAST_NOISE = 0.3, 9, 0.05, 1 / 1020

@@ -43,8 +43,8 @@ _AROUND_FOLD, _FOLD_FADE = 3, 2.0
 # A frame that deviates from the usual by more than this many variances does not show the scene; the deviation is
 # averaged in a Gaussian window of this standard deviation, pixels.
 OUTLIER, OUTLIER_WINDOW = 6.0, 3.0
-# The same for what is as small as a flake, against the median of the frames.
-_DISAGREES, AGREEMENT_WINDOW, _FINE_WINDOW = 8.0, 1.5, 0.8
+# The same for what is as small as a flake, against the median of the frames, without what is wider than that.
+_DISAGREES, AGREEMENT_WINDOW, _FINE_WINDOW, LEVEL_WINDOW = 8.0, 1.5, 0.8, 5.0
 # Sobel's derivative divided by 8 is the first along one axis and the second along the other.
 _DIFFERENCE, _BINOMIAL = np.array([-1, 0, 1], np.float32), np.array([0.125, 0.25, 0.125], np.float32)
 _BOX = np.ones(2 * _AROUND_FOLD + 1, np.float32)
@@ -141,7 +141,10 @@ def frame_noise_variance(
     if beta == 0:
         return arrays.full_like(grey, statistics.image_noise), sharp
     excess = squared_deviation(grey, statistics.mean_frame, statistics.deviation, ops) / OUTLIER
-    disagreement = smooth((grey - statistics.median) ** 2, _FINE_WINDOW, ops) / (statistics.spread * _DISAGREES)
+    difference = grey - statistics.median
+    # Light that has changed is no disagreement.
+    difference = difference - smooth(difference, LEVEL_WINDOW, ops)
+    disagreement = smooth(difference * difference, _FINE_WINDOW, ops) / (statistics.spread * _DISAGREES)
     excess = arrays.clip(arrays.maximum(excess, disagreement), 1, None)
     squared = excess * excess
     local = local_sharpness(projection, statistics.window, statistics.left_out, ops)

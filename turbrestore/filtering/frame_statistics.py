@@ -25,6 +25,7 @@ from ..runtime.scratch import iter_frames
 from ..runtime.threads import sum_in_threads
 from .frame_noise import (
     AGREEMENT_WINDOW,
+    LEVEL_WINDOW,
     OUTLIER,
     OUTLIER_WINDOW,
     FrameStatistics,
@@ -119,12 +120,12 @@ def measure_frame_statistics(
     count = float(number)
     mean, variance = _mean_and_variance(total, squares, count)
     variance *= count / max(count - 1, 1)
-    centre, usual = _median_and_spread(frames, flows, mean.shape, int(count))
+    centre, usual, fine = _median_and_spread(frames, flows, mean.shape, int(count))
     mean, variance, passed = _robust_start(mean, variance, centre, usual)
 
     square = template[0] ** 2 + template[1] ** 2
     energy = smooth(square, window, _OPS)
-    sensor_noise = fit_noise_curve(mean, variance, energy).variance(mean)
+    sensor_noise = fit_noise_curve(mean, np.where(passed, variance, fine), energy).variance(mean)
     mean_frame, deviation, moments = _without_outliers(frames, flows, mean, variance, template, window, threads)
     sharpness, spread, explained, left_out = _leave_middle_out(moments, template, energy, sensor_noise, window)
     scale = _score_scale(sharpness, spread, explained)
@@ -162,8 +163,8 @@ def _mean_and_variance(
 
 def _median_and_spread(
     frames: Iterable[FloatArray], flows: Iterable[FloatArray], shape: tuple[int, ...], count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Median of some registered frames, and their squared median deviation as a variance."""
+) -> tuple[FloatArray, FloatArray, np.ndarray]:
+    """Median of some registered frames, their squared median deviation as a variance, and their variance in detail."""
     picked = set(np.linspace(0, count - 1, min(count, _RESERVOIR)).round().astype(int).tolist())
     stack = np.empty((len(picked), *shape), np.float16)
     chosen = (
@@ -179,7 +180,12 @@ def _median_and_spread(
         values = stack[:, rows].astype(np.float32)
         centre[rows] = np.median(values, axis=0)
         spread[rows] = (_MEDIAN_DEVIATION * np.median(np.abs(values - centre[rows]), axis=0)) ** 2
-    return centre, spread
+    fine = np.zeros(shape)
+    for plane in stack:
+        difference = plane.astype(np.float32) - centre
+        # Light that has changed is no noise.
+        cv2.accumulateSquare(difference - smooth(difference, LEVEL_WINDOW, _OPS), fine)
+    return centre, spread, fine / max(len(stack) - 1, 1)
 
 
 def _robust_start(

@@ -220,7 +220,8 @@ def _passed_by(stack: NDArray[np.uint8], numbers: Sequence[int], usual: _Usual, 
         usual = _usual(stack, numbers, placement, masks)
         parts = [usual.at(placement.place(number)) for number in numbers]
         masks = [_passing(_grey(plane), part) for plane, part in zip(stack, parts, strict=True)]
-    if not _LEAST <= float(np.mean([(mask > 0).mean() for mask in masks])) <= _LARGEST:
+    touched, share = np.mean([(mask > 0).mean() for mask in masks]), np.mean([mask.mean() / 255 for mask in masks])
+    if touched < _LEAST or share > _LARGEST:
         return None
     shifts = np.array([placement.shifts[number] for number in numbers], np.float64)
     return usual if _stands(stack, masks, parts, shifts) else None
@@ -252,7 +253,9 @@ def _stands(
         np.hypot(*np.gradient(some, axis=(1, 2))).sum() for some in (reduced(map(_grey, stack), stack.shape), left)
     ]
     away = shifts_of_reduced(left, stack.shape) - shifts
-    return bool(edges[1] > _OWN_EDGES * edges[0]) and not _moves(away - away.mean(axis=0))
+    # Snow has more edges than the scene.
+    own = parts[0].excess is not None or bool(edges[1] > _OWN_EDGES * edges[0])
+    return own and not _moves(away - away.mean(axis=0))
 
 
 def _usual(
@@ -314,7 +317,7 @@ def _passing(grey: FloatArray, usual: _Usual) -> NDArray[np.uint8]:
     if usual.excess is not None:
         weight = np.maximum(weight, _faded(_small(grey, usual), 1, _SMALL_FADE))
     weight = np.rint(255 * weight).astype(np.uint8)
-    return np.asarray(weight if (weight > 0).mean() <= _LARGEST_PART else np.zeros_like(weight), np.uint8)
+    return np.asarray(weight if weight.mean() <= 255 * _LARGEST_PART else np.zeros_like(weight), np.uint8)
 
 
 def _small(grey: FloatArray, usual: _Usual) -> NDArray[np.uint8]:
