@@ -38,7 +38,7 @@ _NONE, _ALL = 0.3, 0.8
 # Energy that is nothing, squared intensity; fewest frames that have two halves.
 _NOTHING, FEWEST = 1e-8, 8
 # Least g, and the share of the image that has it, that is worth a remark.
-_CLEAR, _REMARKED = 0.5, 0.02
+_CLEAR, _REMARKED = 0.5, 0.15
 
 
 @dataclass(frozen=True, eq=False)
