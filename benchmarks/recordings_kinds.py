@@ -112,11 +112,12 @@ def clips() -> Iterator[tuple[str, np.ndarray, FloatArray]]:
         still = make_sequence(19, COUNT, SIDE, scene, blur=0.8, noise=0.008, rms=1.2)
         for kind, record in KINDS.items():
             yield f"{scene}, {kind}", record(still.frames), still.scene
-    wide = make_sequence(20, COUNT, SIDE + 64, "camera", blur=0.8, noise=0.008, rms=0.8)
-    frames = np.stack([frame[32 : 32 + SIDE, 2 * k : 2 * k + SIDE] for k, frame in enumerate(wide.frames)])
+    wide = make_sequence(20, COUNT, SIDE + 48, "camera", blur=0.8, noise=0.008, rms=0.8)
+    places = np.arange(COUNT) * 3 // 2
+    frames = np.stack([frame[24 : 24 + SIDE, x : x + SIDE] for frame, x in zip(wide.frames, places, strict=True)])
     for k, frame in enumerate(frames):
         frame[100:124, max(9 * k - 60, 0) : max(9 * k, 0)] = 0.9
-    yield "camera, car before a moving camera", as_8_bits(frames), wide.scene[32 : 32 + SIDE, 31 : 31 + SIDE]
+    yield "camera, car before a moving camera", as_8_bits(frames), wide.scene[24 : 24 + SIDE, 23 : 23 + SIDE]
 
 
 def figures() -> Iterator[Figures]:
