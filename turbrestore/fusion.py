@@ -205,7 +205,8 @@ def _compare_structure(
 
 def _halves(run: Run, training: FloatArray, centroid: Centroid, mean_flow: FloatArray) -> Halves | None:
     """Average two halves of the training frames, in the geometry of the filtered image."""
-    if len(training) < FEWEST or not run.params.runs("deconvolve"):
+    # No guard overrides a width that was asked for.
+    if len(training) < FEWEST or not run.params.runs("deconvolve") or run.params.deconvolution.sigma is not None:
         return None
     found = registered_halves(training, centroid.flows, training.shape[1:], len(training), run.plan.runtime.threads)
     halves = (run.levels.original(recentre(half, mean_flow)) for half in (found.first, found.second))
