@@ -148,7 +148,22 @@ def recordings() -> list[Row]:
     )
     rule = f"the result is no more than {clips.SLACK} dB worse than the temporal mean"
     title = "clips as people record them: light, walkers, overlays, range"
-    return [Row(title, len(rows), rule, len(rows) - len(worse), worse), *usual_files()]
+    kinds = recordings_kinds(clips.SLACK)
+    return [Row(title, len(rows), rule, len(rows) - len(worse), worse), kinds, *usual_files()]
+
+
+def recordings_kinds(slack: float) -> Row:
+    """Clips of benchmarks/recordings_kinds.py."""
+    kinds = importlib.import_module("recordings_kinds")
+    rows = list(kinds.figures())
+    worse = tuple(
+        f"{row.name}: {row.result:.2f} dB, at least {row.bound(slack):.2f}"
+        for row in rows
+        if row.result < row.bound(slack)
+    )
+    rule = f"the result is no more than {slack} dB worse than the temporal mean; in snow and rain above the median"
+    title = "clips with more than the scene: snow, rain, photons, titles, stripes, a car before a moving camera"
+    return Row(title, len(rows), rule, len(rows) - len(worse), worse)
 
 
 GROUPS: dict[str, Callable[[], list[Row]]] = {

@@ -13,8 +13,8 @@ PACKAGE = Path(__file__).parents[1] / "turbrestore"
 # A folder, or a module that lies beside the folders, imports only from itself and from those before it.
 ORDER = [
     "core", "runtime", "display", "io", "registration", "footage", "dynamics", "filtering", "blur_moments", "blur",
-    "deconvolution", "blind", "steady", "synthesis", "seeing", "uncertainty", "metrics", "wording", "tiled_stages",
-    "results", "settings", "memory_plan", "preparation", "fusion", "pipeline", "runs", "report",
+    "deconvolution", "blind", "steady", "synthesis", "seeing", "uncertainty", "agreement", "metrics", "wording",
+    "tiled_stages", "results", "settings", "memory_plan", "preparation", "fusion", "pipeline", "runs", "report",
 ]  # fmt: skip
 HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
 HEAVY |= {"astropy", "dask", "distributed", "rawpy"}

@@ -9,6 +9,7 @@ import pytest
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.bars import without_bars
+from turbrestore.footage.content import check_content
 from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.light import steady_light
 from turbrestore.footage.overlays import read_static_mask, without_overlay
@@ -158,14 +159,42 @@ class TestOverlays:
     def test_scenes_have_none(self, shaken, clip):
         for frames in (shaken, u8(clip.frames), u8(0.2 + 0 * clip.frames[:1] + 0.3 * clip.frames)):
             source = FrameSource.from_array(frames)
-            assert without_overlay(source) == (source, None, ())
+            assert without_overlay(source) == (source, None, None, ())
 
     def test_a_window_is_that_of_the_whole_frame(self, shaken):
         covered = shaken.copy()
         covered[:, 40, 20:60] = 255
-        source, _, _ = without_overlay(FrameSource.from_array(covered))
+        source, _, _, _ = without_overlay(FrameSource.from_array(covered))
         part = source.select((2, 5), (15, 30, 30, 25))
         np.testing.assert_array_equal(part.read(), source.read(2, 5)[:, 30:55, 15:45])
+
+
+@pytest.fixture(scope="module")
+def titled(clip):
+    frames = u8(0.8 * clip.frames)
+    for frame in frames:
+        for shade, width in ((0, 3), (255, 1)):
+            cv2.putText(frame, "GATE 7", (6, 70), cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, width)
+    return frames
+
+
+class TestTitles:
+    """Text that is burnt in while the camera stands keeps its pixels."""
+
+    def test_they_stay_as_in_the_mean_and_the_scene_as_without_them(self, clip, titled):
+        found, alone = (restore(FrameSource.from_array(some)) for some in (titled, u8(0.8 * clip.frames)))
+        assert "overlay" in subjects(found)
+        letters = titled.min(axis=0) == 255
+        assert letters.sum() > 20
+        assert found.image[letters].min() > 0.97
+        rows = np.s_[10:48, 10:70]
+        assert np.sqrt(np.mean((found.image[rows] - alone.image[rows]) ** 2)) < 0.025
+
+    def test_a_window_is_that_of_the_whole_frame_and_letters_are_no_stuck_pixels(self, titled):
+        _, hidden, title, _ = without_overlay(FrameSource.from_array(titled))
+        assert title is not None and np.array_equal(hidden, title.mask)
+        np.testing.assert_allclose(title.put_back(np.zeros((20, 30)), 5, 55)[title.mask[55:75, 5:35]].max(), 1)
+        assert len(check_content(FrameSource.from_array(titled)).stuck) == 0
 
 
 class TestBars:

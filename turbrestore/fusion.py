@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from .agreement.last_guard import FEWEST, Halves, registered_halves
 from .blind.structure import StructureReading, compare_structure
 from .blur.posterior import BlurWitnesses, measure_witnesses
 from .core.arrays import FloatArray, luminance
@@ -26,7 +27,7 @@ from .memory_plan import MemoryPlan
 from .preparation import Prepared, seeing_of_picture
 from .registration.centroid import Centroid, centroid_steps
 from .registration.flow_algebra import invert_flow
-from .registration.recentring import recentring_flow
+from .registration.recentring import recentre, recentring_flow
 from .registration.warp import warp
 from .results import Store
 from .runtime.scratch import fill_stack, iter_frames, mean_of
@@ -117,7 +118,8 @@ class Run:
 class Fused:
     """Results of the stages before the deconvolution.
 
-    ``is_mean`` says that the image is the mean of the frames, because the filtered one has structure that they lack.
+    ``is_mean`` says that the image is the mean of the frames, because the filtered one has structure that they lack;
+    ``halves`` are at the levels of the clip, None for few frames.
     """
 
     image: FloatArray
@@ -129,6 +131,7 @@ class Fused:
     filtered: Filtered | None = None
     is_mean: bool = False
     witnesses: BlurWitnesses | None = None
+    halves: Halves | None = None
 
 
 def fuse(run: Run) -> Fused:
@@ -162,7 +165,9 @@ def fuse(run: Run) -> Fused:
     run.decide(*explain_structure(structure))
     image = filtered.image if structure.passed else mean
     witnesses = _find_witnesses(run, training, centroid, seeing)
-    return Fused(image, mean, centroid, seeing, saturation, dynamics, filtered, not structure.passed, witnesses)
+    halves = _halves(run, training, centroid, filtered.mean_flow)
+    found = mean, centroid, seeing, saturation, dynamics, filtered
+    return Fused(image, *found, not structure.passed, witnesses, halves)
 
 
 def _find_centroid(run: Run, training: FloatArray) -> Centroid:
@@ -200,6 +205,16 @@ def _compare_structure(
     if mean_flow.any():
         image = warp(image, invert_flow(recentring_flow(mean_flow)))
     return compare_structure(image, training, centroid.flows)
+
+
+def _halves(run: Run, training: FloatArray, centroid: Centroid, mean_flow: FloatArray) -> Halves | None:
+    """Average two halves of the training frames, in the geometry of the filtered image."""
+    # No guard overrides a width that was asked for.
+    if len(training) < FEWEST or not run.params.runs("deconvolve") or run.params.deconvolution.sigma is not None:
+        return None
+    found = registered_halves(training, centroid.flows, training.shape[1:], len(training), run.plan.runtime.threads)
+    halves = (run.levels.original(recentre(half, mean_flow)) for half in (found.first, found.second))
+    return Halves(*halves)
 
 
 def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:

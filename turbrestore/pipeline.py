@@ -9,12 +9,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .agreement.last_guard import keep_agreed
 from .blind.remove_blur import Deblurred, remove_blur_steps
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.errors import require
+from .footage.bars import Bars
 from .footage.content import without_blank
 from .footage.levels import Levels
+from .footage.overlays import Title
 from .fusion import Fused, Run, fuse
 from .io.output import check_space
 from .io.source import FrameSource
@@ -125,14 +128,19 @@ def restore(
     run.decide(*prepared.decisions)
     with returning_freed_memory(runtime.memory_limit is not None):
         restoration = _restored(run)
-    if bars is None:
-        return restoration
-    image, uncertainty = bars.put_back(restoration.image, *restoration.crop[:2]), restoration.uncertainty
+    for kept in (prepared.title, bars):
+        restoration = restoration if kept is None else _put_back(restoration, kept)
+    return restoration
+
+
+def _put_back(restoration: Restoration, kept: Bars | Title) -> Restoration:
+    """Give the images of a restoration what is no scene."""
+    image, uncertainty = kept.put_back(restoration.image, *restoration.crop[:2]), restoration.uncertainty
     if uncertainty is not None:
-        # What lies under the bars was not seen.
-        hidden = bars.put_back(np.full_like(restoration.image, -1), *restoration.crop[:2]) >= 0
+        # What lies under it was not seen.
+        hidden = kept.put_back(np.full_like(restoration.image, -1), *restoration.crop[:2]) >= 0
         uncertainty = np.where(hidden if hidden.ndim == 2 else hidden[..., 0], np.float32(np.inf), uncertainty)
-    return replace(restoration, image=image, mean=bars.put_back(restoration.mean), uncertainty=uncertainty)
+    return replace(restoration, image=image, mean=kept.put_back(restoration.mean), uncertainty=uncertainty)
 
 
 def _restored(run: Run) -> Restoration:
@@ -144,6 +152,10 @@ def _restored(run: Run) -> Restoration:
         deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
+    agreed = None if deblurred is None or fused.halves is None else keep_agreed(image, fused.halves)
+    if agreed is not None:
+        run.decide(*agreed.decisions)
+        image = agreed.image
     seen = coverage(centroid.flows)
     crop, on_border = _crop(image, seen, params.border, deblurred)
     run.decide(on_border)
@@ -166,6 +178,7 @@ def _restored(run: Run) -> Restoration:
         seconds=run.seconds,
         seeing=fused.seeing,
         uncertainty=None if uncertainty is None else uncertainty[y : y + height, x : x + width],
+        disagreement=None if agreed is None else agreed.share[y : y + height, x : x + width],
     )
 
 

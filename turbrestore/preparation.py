@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .agreement.sensor_pattern import without_stripes
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .footage.bars import Bars, without_bars
 from .footage.levels import Levels, stretch_levels
 from .footage.light import steady_light
-from .footage.overlays import read_static_mask, without_overlay
+from .footage.overlays import Title, read_static_mask, without_overlay
 from .footage.passers import without_passers
 from .footage.white_balance import steady_white_balance
 from .io.source import FrameSource, Window
@@ -34,6 +35,8 @@ class Prepared:
     bars : Bars or None
     hidden : ndarray, bool, shape (H, W), or None
         Pixels of the scene that no frame shows, because an overlay covers them or the file lacks them; None without.
+    title : Title or None
+        Overlay that is put back into results.
     decisions : tuple of Decision
     """
 
@@ -41,6 +44,7 @@ class Prepared:
     levels: Levels
     bars: Bars | None
     hidden: NDArray[np.bool_] | None
+    title: Title | None
     decisions: tuple[Decision, ...]
 
     @property
@@ -81,16 +85,24 @@ def prepare(source: FrameSource, train: int, static_mask: str = "auto") -> Prepa
     mask = None if static_mask in ("auto", "off") else read_static_mask(static_mask, source)
     # Before the light, because a stop would be taken for bands of it.
     source, bars, on_bars = without_bars(source)
-    source, hidden, on_overlay = without_overlay(source, mask) if static_mask != "off" else (source, None, ())
+    source, hidden, title, on_overlay = (
+        without_overlay(source, mask) if static_mask != "off" else (source, None, None, ())
+    )
     if source.unseen is not None:
         unseen = source.unseen[source.window]
         hidden = unseen if hidden is None else hidden | unseen
+    source, on_stripes = without_stripes(source)
     source, on_colours = steady_white_balance(source)
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, train)
     source, on_passers = without_passers(source) if static_mask != "off" else (source, ())
     return Prepared(
-        source, levels, bars, hidden, (*on_bars, *on_overlay, *on_colours, *on_light, *on_range, *on_passers)
+        source,
+        levels,
+        bars,
+        hidden,
+        title,
+        (*on_bars, *on_overlay, *on_stripes, *on_colours, *on_light, *on_range, *on_passers),
     )
 
 

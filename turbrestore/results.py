@@ -143,6 +143,9 @@ class Restoration:
     uncertainty : ndarray, float32, shape (H, W), or None
         Standard deviation of every pixel of the image, intensity; infinite where nothing is known, and everywhere
         where the mean of the frames is the result; None unless the filter has run.
+    disagreement : ndarray, float32, shape (H, W), or None
+        Share, 0 to 1, of the mean of the registered frames in the detail of the image, because they do not agree on it;
+        None unless the image was deblurred.
     """
 
     image: FloatArray
@@ -161,6 +164,7 @@ class Restoration:
     seeing: Seeing | None = None
     uncertainty: FloatArray | None = None
     posterior: BlurPosterior | None = None
+    disagreement: FloatArray | None = None
 
     @property
     def motion(self) -> float:

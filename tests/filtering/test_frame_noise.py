@@ -53,8 +53,12 @@ def test_the_noise_is_that_of_its_definition(model_and_frames):
     energy = sum(a**2 for a in gradient(scene))
     assert sharp == pytest.approx(product.sum() / energy.sum(), rel=1e-3)
     score = np.clip(model.score_scale * (smooth(product, model.window) - model.mean_sharpness), -3, 3)
-    excess = np.maximum(smooth(np.square(frame - model.mean_frame), 3.0) / model.deviation / 6, 1)
+    excess = smooth(np.square(frame - model.mean_frame), 3.0) / model.deviation / 6
+    difference = frame - model.median
+    small = smooth(np.square(difference - smooth(difference, 5.0)), 0.8) / model.spread / 8
     assert excess.max() > 3
+    assert (small > np.maximum(excess, 1)).any()
+    excess = np.maximum(np.maximum(excess, small), 1)
     score = np.where(score > 0, score / excess**2, score)
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     seen = 1.0

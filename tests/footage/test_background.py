@@ -90,3 +90,44 @@ def test_a_black_frame_is_left_as_it_is():
 def test_few_frames_tell_nothing():
     source = FrameSource.from_array(clip("brick", 3)[0][:8])
     assert without_passers(source) == (source, ())
+
+
+def snowy(frames, share, seed=3):
+    """Soft white flakes that cover a share of every frame, and that share as 1."""
+    rng, covers = np.random.default_rng(seed), np.zeros(frames.shape, np.float32)
+    for cover in covers:
+        while (cover > 0.3).mean() < share:
+            x, y = rng.integers(0, SIDE * 16, 2)
+            cv2.circle(cover, (int(x), int(y)), int(16 * rng.uniform(1, 2.5)), 1.0, -1, cv2.LINE_AA, 4)
+    covers = np.stack([cv2.GaussianBlur(cover, (0, 0), 0.8) for cover in covers])
+    return frames * (1 - covers) + 0.95 * covers, covers
+
+
+def test_snow_is_replaced_by_the_background():
+    empty = 0.8 * clip("camera")[1]
+    frames, covers = snowy(empty, 0.06)
+    cleaned, (decision,) = without_passers(FrameSource.from_array(frames))
+    before, after = (np.abs(some - empty)[covers > 0.3].mean() for some in (frames, cleaned.read()))
+    assert after < 0.25 * before
+    assert "snow" in decision.reason
+    found, median = restore(frames).image, np.median(frames, axis=0)
+    assert (
+        compare(found, 0.8 * SCENES["camera"](SIDE, SIDE)).psnr
+        > compare(median, 0.8 * SCENES["camera"](SIDE, SIDE)).psnr + 1
+    )
+
+
+def test_a_car_is_replaced_while_the_camera_moves():
+    scene, rng = SCENES["camera"](160, 300), np.random.default_rng(2)
+    empty = np.stack([scene[:, 2 * k : 2 * k + 160] for k in range(COUNT)]) + 0.01 * rng.standard_normal(
+        (COUNT, 160, 160)
+    )
+    empty = empty.clip(0, 1).astype(np.float32)
+    frames = empty.copy()
+    for k, frame in enumerate(frames):
+        frame[90:120, 6 * k - 50 : 6 * k] = 0.95 if 50 <= 6 * k <= 160 else frame[90:120, 6 * k - 50 : 6 * k]
+    cleaned, (decision,) = without_passers(FrameSource.from_array(frames))
+    covered = np.abs(frames - empty) > 0.1
+    assert covered.any() and decision.subject == "passers"
+    before, after = (np.sqrt(np.mean((some - empty)[covered] ** 2)) for some in (frames, cleaned.read()))
+    assert after < 0.3 * before

@@ -152,7 +152,7 @@ def test_bars_do_not_count(clip):
     found, alone = (turbrestore.restore(frames, params).seeing.displacement_variance for frames in (barred, clip[0]))
     assert found.value == pytest.approx(alone.value, rel=0.1)
     frames = np.pad(clip[0], ((0, 0), (24, 24), (0, 0)), mode="symmetric")
-    prepared = Prepared(FrameSource.from_array(frames), Levels(), Bars(np.s_[24:-24, :], barred[0]), None, ())
+    prepared = Prepared(FrameSource.from_array(frames), Levels(), Bars(np.s_[24:-24, :], barred[0]), None, None, ())
     flows = np.pad(clip[1].flows, ((0, 0), (24, 24), (0, 0), (0, 0)), constant_values=3.0)
     image = np.pad(clip[1].image, ((24, 24), (0, 0)), mode="symmetric")
     within = seeing_of_picture(prepared, frames, replace(clip[1], image=image, flows=flows))

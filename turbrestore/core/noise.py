@@ -1,15 +1,99 @@
-"""Estimation of the noise of an image."""
+"""Estimation of the noise of an image, and of how it depends on the level."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import nnls
 
-from .arrays import check_image, luminance
+from .arrays import FloatArray, check_image, luminance
 
 # Rows that are filtered at once.
 _NOISE_ROWS = 256
+# Levels at which a curve of the noise is known at most, fewest pixels for one of them, and share of these pixels, the
+# flattest, in each of two groups.
+_LEVELS, _PIXELS, _FLATTEST = 12, 200, 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseCurve:
+    """Variance of the noise against the level: the photon transfer curve of a recording.
+
+    It is affine for raw frames, whose light comes in photons, and of any form after a tone curve.
+
+    Attributes
+    ----------
+    levels : ndarray, float64, shape (K,)
+        Ascending intensities.
+    variances : ndarray, float64, shape (K,)
+        Squared intensity; between the levels the variance is linear, and constant beyond them.
+    """
+
+    levels: NDArray[np.float64]
+    variances: NDArray[np.float64]
+
+    def variance(self, image: FloatArray) -> FloatArray:
+        """Return the variance of the noise at every pixel of an image, shape (H, W)."""
+        return np.interp(image, self.levels, self.variances).astype(np.float32)
+
+
+def fit_noise_curve(level: FloatArray, variance: FloatArray, energy: FloatArray) -> NoiseCurve:
+    """Fit the variance of the noise against the level to registered frames.
+
+    Frames that are not registered exactly vary by the squared gradient times the variance of the displacement, which is
+    one number for the image, and by noise.  The flattest pixels of every level tell both.
+
+    Parameters
+    ----------
+    level : ndarray, shape (H, W)
+        Mean of the frames, intensity.
+    variance : ndarray, shape (H, W)
+        Their variance over time.
+    energy : ndarray, shape (H, W)
+        Squared gradient of the mean, locally averaged.
+
+    Returns
+    -------
+    NoiseCurve
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> level = np.tile(np.linspace(0.1, 0.9, 200), (200, 1))
+    >>> energy = rng.exponential(1e-3, level.shape)
+    >>> curve = fit_noise_curve(level, 0.01 * level + 0.3 * energy, energy)
+    >>> curve.variance(np.array([[0.2, 0.8]])).round(3)
+    array([[0.002, 0.008]], dtype=float32)
+    """
+    flat = tuple(np.asarray(part, np.float64).ravel() for part in (level, variance, energy))
+    levels, _, energies = flat
+    count = int(np.clip(levels.size // _PIXELS, 1, _LEVELS))
+    low, high = np.percentile(levels, (1, 99))
+    # Of equal width, because a dark sky would else take all of them.
+    edges = np.linspace(low, max(high, low + 1e-9), count + 1)
+    numbers = np.clip(np.searchsorted(edges, levels) - 1, 0, count - 1)
+    groups = []
+    for number in range(count):
+        chosen = np.flatnonzero(numbers == number)
+        if chosen.size < min(_PIXELS, levels.size):
+            continue
+        size = max(int(_FLATTEST * chosen.size), 1)
+        chosen = chosen[np.argpartition(energies[chosen], min(2 * size, chosen.size - 1))]
+        ordered = chosen[: 2 * size][np.argsort(energies[chosen[: 2 * size]])]
+        groups.append([[part[pixels].mean() for part in flat] for pixels in (ordered[:size], ordered[size:])])
+    if not groups:
+        return NoiseCurve(np.array([0.0]), np.array([flat[1].mean()]))
+    found = np.array(groups)  # (K, 2, 3)
+    known = found[:, :, 0].mean(axis=1)
+    design = np.zeros((2 * len(found), len(found) + 1))
+    design[np.arange(2 * len(found)), np.repeat(np.arange(len(found)), 2)] = 1
+    scale = max(float(found[..., 2].max()), 1e-18)
+    design[:, -1] = found[..., 2].ravel() / scale
+    variances, _ = nnls(design, found[..., 1].ravel())
+    return NoiseCurve(known, variances[:-1])
 
 
 def estimate_noise(image: ArrayLike) -> float:

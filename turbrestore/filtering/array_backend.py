@@ -71,7 +71,7 @@ class ArrayBackend:
 
     def load_statistics(self, statistics: FrameStatistics) -> FrameStatistics:
         """Bring the maps that Z follows from to the device."""
-        names = ("mean_sharpness", "score_scale", "score_variance", "mean_frame", "deviation")
+        names = ("mean_sharpness", "score_scale", "score_variance", "mean_frame", "deviation", "median", "spread")
         maps = {name: self.load(getattr(statistics, name)) for name in names}
         along, across = statistics.template
         return replace(statistics, template=(self.load(along), self.load(across)), **maps)

@@ -6,7 +6,8 @@ Z : variance of a registered frame about the image
 z : local sharpness of a frame, standardised over the frames; β its weight
 v : variance of z over the frames
 κ : share of the middle of the window that z leaves out, see :func:`local_sharpness`
-d : squared deviation of a frame from the mean frame, in units of its usual variance; e = max(d / 6, 1) the excess
+d : squared deviation of a frame from the mean frame, in units of its usual variance
+d' : the same from the median of the frames, in a window as small as a flake of snow; e = max(d / 6, d' / 8, 1)
 m : 1 where the frame gives no measurement, because the map id + Ŵ folds or leaves the frame
 
 The paper takes Z to be one number, Z₀.  So does this module for β = 0; for β > 0::
@@ -42,6 +43,8 @@ _AROUND_FOLD, _FOLD_FADE = 3, 2.0
 # A frame that deviates from the usual by more than this many variances does not show the scene; the deviation is
 # averaged in a Gaussian window of this standard deviation, pixels.
 OUTLIER, OUTLIER_WINDOW = 6.0, 3.0
+# The same for what is as small as a flake, against the median of the frames, without what is wider than that.
+_DISAGREES, AGREEMENT_WINDOW, _FINE_WINDOW, LEVEL_WINDOW = 8.0, 1.5, 0.8, 5.0
 # Sobel's derivative divided by 8 is the first along one axis and the second along the other.
 _DIFFERENCE, _BINOMIAL = np.array([-1, 0, 1], np.float32), np.array([0.125, 0.25, 0.125], np.float32)
 _BOX = np.ones(2 * _AROUND_FOLD + 1, np.float32)
@@ -75,6 +78,9 @@ class FrameStatistics:
         Mean luminance of the registered frames without outliers.
     deviation : array, float32, shape (H, W)
         Variance of the registered frames about it, locally averaged, squared intensity.
+    median, spread : arrays, float32, shape (H, W)
+        Median luminance of the registered frames, and the square of their median deviation from it, scaled to a
+        variance and averaged in a small window.
     """
 
     image_noise: float
@@ -88,6 +94,8 @@ class FrameStatistics:
     sharpness_weight: float
     mean_frame: Stack
     deviation: Stack
+    median: Stack
+    spread: Stack
 
 
 def frame_noise_variance(
@@ -132,8 +140,12 @@ def frame_noise_variance(
     sharp = float(projection.sum()) / max(statistics.template_energy, 1e-12)
     if beta == 0:
         return arrays.full_like(grey, statistics.image_noise), sharp
-    excess = squared_deviation(grey, statistics.mean_frame, statistics.deviation, ops)
-    excess = arrays.clip(excess / OUTLIER, 1, None)
+    excess = squared_deviation(grey, statistics.mean_frame, statistics.deviation, ops) / OUTLIER
+    difference = grey - statistics.median
+    # Light that has changed is no disagreement.
+    difference = difference - smooth(difference, LEVEL_WINDOW, ops)
+    disagreement = smooth(difference * difference, _FINE_WINDOW, ops) / (statistics.spread * _DISAGREES)
+    excess = arrays.clip(arrays.maximum(excess, disagreement), 1, None)
     squared = excess * excess
     local = local_sharpness(projection, statistics.window, statistics.left_out, ops)
     score = (local - statistics.mean_sharpness) * statistics.score_scale

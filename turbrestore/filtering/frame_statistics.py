@@ -18,11 +18,14 @@ import cv2
 import numpy as np
 
 from ..core.arrays import FloatArray, luminance
+from ..core.noise import fit_noise_curve
 from ..registration.warp import warp
 from ..runtime.image_stacks import numpy_ops
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import sum_in_threads
 from .frame_noise import (
+    AGREEMENT_WINDOW,
+    LEVEL_WINDOW,
     OUTLIER,
     OUTLIER_WINDOW,
     FrameStatistics,
@@ -117,16 +120,16 @@ def measure_frame_statistics(
     count = float(number)
     mean, variance = _mean_and_variance(total, squares, count)
     variance *= count / max(count - 1, 1)
-    mean, variance, passed = _robust_start(frames, flows, mean, variance, int(count))
+    centre, usual, fine = _median_and_spread(frames, flows, mean.shape, int(count))
+    mean, variance, passed = _robust_start(mean, variance, centre, usual)
 
-    # The flattest fifth of the image varies by sensor noise alone; elsewhere blur and misregistration add to it.
     square = template[0] ** 2 + template[1] ** 2
     energy = smooth(square, window, _OPS)
-    sensor_noise = float(variance[energy <= np.quantile(energy, 0.2)].mean())
+    sensor_noise = fit_noise_curve(mean, np.where(passed, variance, fine), energy).variance(mean)
     mean_frame, deviation, moments = _without_outliers(frames, flows, mean, variance, template, window, threads)
     sharpness, spread, explained, left_out = _leave_middle_out(moments, template, energy, sensor_noise, window)
     scale = _score_scale(sharpness, spread, explained)
-    weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, sensor_noise / count)
+    weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, float(sensor_noise.mean()) / count)
     # Near what passes flow is pulled along, and a frame may be sharp without showing the scene.
     scale *= 1 - smooth(passed.astype(np.float32), window, _OPS)
     return FrameStatistics(
@@ -141,6 +144,8 @@ def measure_frame_statistics(
         sharpness_weight=weight,
         mean_frame=mean_frame,
         deviation=deviation,
+        median=centre,
+        spread=_deviation(usual, AGREEMENT_WINDOW),
     )
 
 
@@ -156,16 +161,12 @@ def _mean_and_variance(
     return mean, np.maximum(squares / count - mean**2, 0.0)
 
 
-def _robust_start(
-    frames: Iterable[FloatArray], flows: Iterable[FloatArray], mean: np.ndarray, variance: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and variance, but median and squared median deviation where something has passed; mark these pixels too.
-
-    What covers a pixel in a share p of the frames lies (1 − p) / p variances from the mean, and is no outlier if p
-    exceeds a seventh.  The median and the median deviation hardly know of it up to p = 0.3.
-    """
+def _median_and_spread(
+    frames: Iterable[FloatArray], flows: Iterable[FloatArray], shape: tuple[int, ...], count: int
+) -> tuple[FloatArray, FloatArray, np.ndarray]:
+    """Median of some registered frames, their squared median deviation as a variance, and their variance in detail."""
     picked = set(np.linspace(0, count - 1, min(count, _RESERVOIR)).round().astype(int).tolist())
-    stack = np.empty((len(picked), *mean.shape), np.float16)
+    stack = np.empty((len(picked), *shape), np.float16)
     chosen = (
         pair
         for number, pair in enumerate(zip(iter_frames(frames), iter_frames(flows), strict=True))
@@ -173,13 +174,29 @@ def _robust_start(
     )
     for plane, (frame, flow) in zip(stack, chosen, strict=True):
         plane[...] = luminance(warp(frame, flow))
-    centre, spread = np.empty(mean.shape), np.empty(mean.shape)
-    for top in range(0, len(mean), _ROWS):
+    centre, spread = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    for top in range(0, shape[0], _ROWS):
         rows = np.s_[top : top + _ROWS]
         values = stack[:, rows].astype(np.float32)
         centre[rows] = np.median(values, axis=0)
         spread[rows] = (_MEDIAN_DEVIATION * np.median(np.abs(values - centre[rows]), axis=0)) ** 2
-    usual = smooth(spread.astype(np.float32), OUTLIER_WINDOW, _OPS) + np.float32(_IMAGE_NOISE_FLOOR)
+    fine = np.zeros(shape)
+    for plane in stack:
+        difference = plane.astype(np.float32) - centre
+        # Light that has changed is no noise.
+        cv2.accumulateSquare(difference - smooth(difference, LEVEL_WINDOW, _OPS), fine)
+    return centre, spread, fine / max(len(stack) - 1, 1)
+
+
+def _robust_start(
+    mean: np.ndarray, variance: np.ndarray, centre: FloatArray, spread: FloatArray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean and variance, but median and squared median deviation where something has passed; mark these pixels too.
+
+    What covers a pixel in a share p of the frames lies (1 − p) / p variances from the mean, and is no outlier if p
+    exceeds a seventh.  The median and the median deviation hardly know of it up to p = 0.3.
+    """
+    usual = smooth(spread, OUTLIER_WINDOW, _OPS) + np.float32(_IMAGE_NOISE_FLOOR)
     passed = smooth(variance.astype(np.float32), OUTLIER_WINDOW, _OPS) > _HEAVY_TAIL * usual
     return np.where(passed, centre, mean), np.where(passed, spread, variance), passed
 
@@ -225,16 +242,16 @@ def _without_outliers(
     return trimmed.astype(np.float32), deviation, _SharpnessMoments(whole, middle, whole_spread, middle_spread, joint)
 
 
-def _deviation(variance: np.ndarray) -> FloatArray:
+def _deviation(variance: np.ndarray, window: float = OUTLIER_WINDOW) -> FloatArray:
     floor = max(_LEAST_DEVIATION * float(variance.mean()), _IMAGE_NOISE_FLOOR)
-    return smooth(variance.astype(np.float32), OUTLIER_WINDOW, _OPS) + np.float32(floor)
+    return smooth(variance.astype(np.float32), window, _OPS) + np.float32(floor)
 
 
 def _leave_middle_out(
     moments: _SharpnessMoments,
     template: tuple[FloatArray, FloatArray],
     energy: FloatArray,
-    noise: float,
+    noise: FloatArray,
     window: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Mean and variance of the local sharpness, the part of the variance that noise explains, and κ.

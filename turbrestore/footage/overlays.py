@@ -9,6 +9,10 @@ s : shift of the scene in a frame, measured without what stands
 Pixels of an overlay are replaced in every frame by what other frames show of the scene at that place, moved by whole
 pixels.  Where none shows anything the scene around is continued smoothly, because an edge there would be taken for one
 of the scene.  Flow, fusion and deconvolution then see the scene alone.
+
+With a camera that stands no frame shows what is behind a title.  The scene moves all the same, by the pixel or two that
+the air bends it: every frame is continued over the overlay, whose pixels are put back into the result as they are in
+the mean of the frames.
 """
 
 from __future__ import annotations
@@ -34,8 +38,9 @@ _SAMPLES, _MOST = 60, 1500
 _SIDE = 192
 # Root mean square of the shifts from which a scene moves, pixels.
 _LEAST_MOTION = 3.0
-# An edge stands if its gradient is that many times the deviation, and that many times the noise.
-_STANDS, _DEVIATIONS = 1.0, 8.0
+# An edge stands if it varies by less than its gradient times this share of the motion of the edges, or one pixel, and
+# if its gradient is that many times the noise; with a camera that stands, the edges move by at least so many pixels.
+_STANDS, _DEVIATIONS, _LEAST_BENDING = 1 / 3, 8.0, 0.3
 # Deviation of a pixel that stands, in units of the noise of a frame, and the least in intensity.
 _STILL, _LEAST_STILL = 2.5, 1 / 255
 # Deviation of what has no noise, in units of the noise, and how dark a stop is between black and the scene.
@@ -46,6 +51,11 @@ _LEAST_EDGES, _LARGEST = 0.0005, 0.7
 _REPORTED, _WIDER = 0.002, 3.0
 # Pixels around an overlay that are replaced too, and reach of the fill under which shifts are measured.
 _AROUND, _REACH = 2, 12.0
+# With a camera that stands: radius around standing edges in which what has no noise belongs to them, and of the gaps
+# between letters; pixels around them over which the overlay fades.
+_NEAR, _GAP, _FADE = 4, 2, 0.7
+# Deviation of a title, in units of the noise.
+_NOISELESS = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +94,39 @@ class Overlay:
         chosen = self.mask[down : down + len(values), across : across + values.shape[1]]
         replaced[chosen] = behind[chosen]
         return replaced
+
+
+@dataclass(frozen=True, eq=False)
+class Title:
+    """Pixels that stand while the air bends the scene around them.
+
+    Attributes
+    ----------
+    mask : ndarray, bool, shape (H, W)
+    frame : ndarray, float32, shape (H, W) or (H, W, 3)
+        Mean of the frames.
+    window : tuple of slice
+        Rows and columns of the file that the mask spans.
+    """
+
+    mask: NDArray[np.bool_]
+    frame: FloatArray
+    window: Window
+
+    def without(self, _: int, values: FloatArray, window: Window) -> FloatArray:
+        """Continue a frame, or a window of it, over the pixels that stand."""
+        down, across = (
+            slice(wanted.start - own.start, wanted.stop - own.start)
+            for wanted, own in zip(window, self.window, strict=True)
+        )
+        return _continued(values, ~self.mask[down, across]) if self.mask[down, across].any() else values
+
+    def put_back(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:
+        """Give an image, whose first pixel is at (left, top) of the frame, the pixels that stand, with a soft edge."""
+        window = np.s_[top : top + len(image), left : left + image.shape[1]]
+        weight = np.maximum(cv2.GaussianBlur(self.mask.astype(np.float32), (0, 0), _FADE), self.mask)[window]
+        weight = weight if image.ndim == 2 else weight[..., None]
+        return image + weight * (self.frame[window] - image)
 
 
 def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArray[np.bool_]:
@@ -129,7 +172,7 @@ def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArr
 
 def without_overlay(
     source: FrameSource, mask: NDArray[np.bool_] | None = None
-) -> tuple[FrameSource, NDArray[np.bool_] | None, tuple[Decision, ...]]:
+) -> tuple[FrameSource, NDArray[np.bool_] | None, Title | None, tuple[Decision, ...]]:
     """Replace what stands in the frames while the scene moves; a source without it is returned as it is.
 
     Parameters
@@ -143,6 +186,8 @@ def without_overlay(
     source : FrameSource
     hidden : ndarray, bool, shape (H, W), or None
         Pixels of the scene that no frame shows; None where nothing stands.
+    title : Title or None
+        What has to be put back into results, because the camera stands as well.
     decisions : tuple of Decision
 
     Raises
@@ -155,18 +200,22 @@ def without_overlay(
     >>> scene = cv2.GaussianBlur(np.random.default_rng(0).random((90, 140)).astype(np.float32), (0, 0), 3)
     >>> frames = np.stack([scene[:, k : k + 96] for k in range(0, 40, 4)])
     >>> frames[:, 40:42, 20:44] = 1
-    >>> cleaned, hidden, (found,) = without_overlay(FrameSource.from_array(frames))
+    >>> cleaned, hidden, _, (found,) = without_overlay(FrameSource.from_array(frames))
     >>> bool(cleaned.read()[5].max() < 0.9), bool(hidden.any()), found.subject
     (True, False, 'overlay')
     """
-    given = mask is not None
+    given, title = mask is not None, None
     if mask is None and 3 <= len(source) <= _MOST:
-        mask = _standing(source)
+        mask, title = _standing(source)
     if mask is None:
-        return source, None, ()
+        return source, None, None, ()
     shifts = _shifts_of(source, mask)
     if not given and float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _LEAST_MOTION:
-        return source, None, ()
+        if title is None:
+            return source, None, None, ()
+        choice = f"{100 * float(title.mask.mean()):.1f} % of the frame kept as in the mean of the frames"
+        reason = "it stands while the air bends the scene around it; it is neither moved nor deblurred"
+        return source.adjusted(title.without), title.mask, title, (Decision("overlay", choice, reason),)
     overlay = _overlay(source, mask, np.rint(shifts).astype(int))
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
     reason = "asked for" if given else "it stands while the scene moves"
@@ -175,38 +224,62 @@ def without_overlay(
         choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced"
         reason += f"; {100 * hidden:.1f} % is shown by no frame and filled from around, the rest by others"
     decision = Decision("overlay", choice, reason)
-    return source.adjusted(overlay.without), overlay.hidden, (decision,)
+    return source.adjusted(overlay.without), overlay.hidden, None, (decision,)
 
 
-def _standing(source: FrameSource) -> NDArray[np.bool_] | None:
-    """Pixels of connected regions that do not change and have edges that stand."""
+def _standing(source: FrameSource) -> tuple[NDArray[np.bool_] | None, Title | None]:
+    """Find connected regions with edges that stand: for a camera that moves and, if edges move, for one that stands."""
     part = source.select((0, len(source), max(1, len(source) // _SAMPLES)))
-    total, squares, noise = np.zeros(source.shape[1:3]), np.zeros(source.shape[1:3]), []
+    total, sums, noise = np.zeros(source.shape[1:]), np.zeros((2, *source.shape[1:3])), []
     for frame in part:
         grey = luminance(frame)
-        cv2.accumulate(grey, total)
-        cv2.accumulateSquare(grey, squares)
+        cv2.accumulate(frame, total)
+        cv2.accumulate(grey, sums[0])
+        cv2.accumulateSquare(grey, sums[1])
         noise.append(estimate_noise(grey))
-    mean = (total / len(part)).astype(np.float32)
-    deviation = np.sqrt(np.maximum(squares / len(part) - np.square(total / len(part)), 0))
-    floor = max(_STILL * float(np.median(noise)), _LEAST_STILL)
+    sums /= len(part)
+    mean, usual = sums[0].astype(np.float32), float(np.median(noise))
+    deviation = np.sqrt(np.maximum(sums[1] - np.square(sums[0]), 0))
+    floor = max(_STILL * usual, _LEAST_STILL)
     still = deviation < floor
     gradient = np.hypot(cv2.Sobel(mean, cv2.CV_32F, 1, 0), cv2.Sobel(mean, cv2.CV_32F, 0, 1)) / 8
-    edges = still & (gradient > _STANDS * deviation) & (gradient > _DEVIATIONS / _STILL * floor)
+    clear = gradient > _DEVIATIONS / _STILL * floor
+    motion = _motion(deviation[clear], gradient[clear], usual)
+    edges = still & clear & (gradient * min(_STANDS * motion, 1.0) > deviation)
     if edges.sum() < _LEAST_EDGES * edges.size:
-        return None
+        return None, None
+    constant = deviation < _CONSTANT * max(usual, _LEAST_STILL / _STILL)
     # A flat part of the scene does not change either; what stands has no noise of the scene, or is dark like a stop.
     black = float(mean.min())
     dark = mean < black + _DARK * (float(np.median(mean[~still])) - black) if (~still).any() else still
-    constant = deviation < _CONSTANT * max(float(np.median(noise)), _LEAST_STILL / _STILL)
-    grown = (still & dark) | constant | edges
+    mask = _connected((still & dark) | constant | edges, edges)
+    if mask.mean() > _LARGEST:
+        return None, None
+    mask = cv2.dilate(mask.astype(np.uint8), np.ones((2 * _AROUND + 1,) * 2, np.uint8)) > 0
+    # The camera draws a title over its noise, which no edge of the scene lacks.
+    edges &= deviation < _NOISELESS * max(usual, _LEAST_STILL / _STILL)
+    if motion < _LEAST_BENDING or edges.sum() < _LEAST_EDGES * edges.size:
+        return mask, None
+    near = cv2.dilate(edges.astype(np.uint8), np.ones((2 * _NEAR + 1,) * 2, np.uint8)) > 0
+    letters = _connected((constant & near) | edges, edges).astype(np.uint8)
+    letters = cv2.morphologyEx(letters, cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
+    letters = cv2.dilate(letters, np.ones((3, 3), np.uint8)) > 0
+    return mask, Title(letters, (total / len(part)).astype(np.float32), source.window)
+
+
+def _motion(deviation: NDArray[np.float64], gradient: FloatArray, noise: float) -> float:
+    """Motion of most edges, pixels."""
+    if not deviation.size:
+        return 0.0
+    return float(np.sqrt(np.median(np.maximum(deviation**2 - noise**2, 0) / gradient**2)))
+
+
+def _connected(grown: NDArray[np.bool_], edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Regions that have edges that stand."""
     _, labels = cv2.connectedComponents(grown.astype(np.uint8), connectivity=8)
     counts = np.bincount(labels[edges], minlength=int(labels.max()) + 1)
     counts[0] = 0
-    mask = (counts > 0)[labels]
-    if mask.mean() > _LARGEST:
-        return None
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * _AROUND + 1,) * 2, np.uint8)) > 0
+    return np.asarray((counts > 0)[labels])
 
 
 def _shifts_of(source: FrameSource, mask: NDArray[np.bool_]) -> NDArray[np.float64]:

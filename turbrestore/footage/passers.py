@@ -1,23 +1,27 @@
-"""What moves through the scene: cars and people, behind which most frames show the background.
+"""What moves through the scene: cars and people, snow and rain, behind which most frames show the background.
 
 Symbols
 -------
-m, v : median of the frames at every pixel; squared median deviation, scaled to a variance
+m, v : median of the frames at every place of the scene; squared median deviation, scaled to a variance
 d : squared deviation of a frame from m, averaged in a Gaussian window
+e : distance of a frame from the range that m has nearby
 
 Turbulence bends edges by a few pixels, so v is large beside edges.  A pixel belongs to what passes where d exceeds the
-largest v around it several times, over an area that holds a disc of 15 pixels; what is smaller, the alternating filter
-leaves out (:mod:`turbrestore.filtering.frame_noise`).  Such pixels are replaced by the mean of the frames that show the
-background there.  The mean is less sharp than a frame and weighs little in the filter, but flow is no longer pulled
-along by what passes.
+largest v around it several times, over an area that holds a disc of 15 pixels.  Flakes and streaks are smaller, but
+bending never leaves the range of the scene nearby, so they are where e² exceeds v several times; this counts if it is
+so in more of the frames than turbulence explains, and what is left, the alternating filter leaves out
+(:mod:`turbrestore.filtering.frame_noise`).  Such pixels are replaced by the mean of the frames that show the background
+there.  The mean is less sharp than a frame and weighs little in the filter, but flow is no longer pulled along by what
+passes.
 
-The median is the background where that is seen in more than half of the frames.  Frames are compared where they are, so
-nothing is replaced while the camera moves.
+The median is the background where that is seen in more than half of the frames.  While the camera moves, frames are
+compared at the place of the scene that they show, to whole pixels.  What no frame shows free stays as it is.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -27,7 +31,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import FrameSource, Window
-from ..registration.camera.global_shift import global_shifts
+from .placement import Placement, measured_shifts, placed, reduced, shifts_of_reduced
 
 # Frames of which the median is taken, the fewest that tell what passes, and rows that it is taken of at once.
 _SAMPLES, _FEWEST, _ROWS = 25, 9, 64
@@ -39,12 +43,20 @@ _WINDOW, _USUAL_WINDOW, _USUAL_REACH = 1.5, 3.0, 4
 _GAP, _DISC, _AROUND = 2, 7, 3
 # Standard deviation of the transition between frame and background, pixels.
 _FADE = 1.5
+# The same for what is small: e² counts from the first times the sum of a quarter of v, for e is measured in a window,
+# and the square of the least deviation; windows of e and of v, radius of what is nearby, and the transition, pixels.
+_SMALL_EXCEEDS, _SMALL_SHARE, _SLIGHTLY = 9.0, 0.25, 0.2
+_SMALL_WINDOW, _SMALL_USUAL_WINDOW, _NEARBY, _SMALL_FADE = 0.8, 1.5, 3, 0.7
+# Least share of the frames that is small, which strong turbulence over fine detail reaches by two thirds, and that of
+# what is brighter than the scene nearby, or darker, among it.
+_LEAST_SMALL, _ONE_SIDED = 0.06, 0.75
 # Least and largest share of the frames that passes, largest part of a frame that is replaced, and fewest frames that
 # show a pixel of the background.
 _LEAST, _LARGEST, _LARGEST_PART, _SEEN = 0.0025, 0.35, 0.5, 3
-# Root mean square of the shifts from which the camera moves, pixels; least share of all edges that the background has;
-# longest side of the frames that both are found in.
-_CAMERA, _OWN_EDGES, _SIDE = 3.0, 0.5, 192
+# Root mean square of the shifts from which the camera moves, pixels; least share of all edges that the background has.
+_CAMERA, _OWN_EDGES = 3.0, 0.5
+# Most pixels of what a moving camera shows, in frames, and the share of the variance that following it may leave.
+_LARGEST_SCENE, _FOLLOWED = 4.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,18 +65,22 @@ class Background:
 
     Attributes
     ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-    known : ndarray, uint8, shape (H, W)
+    image : ndarray, float32, shape (H', W') or (H', W', 3)
+    known : ndarray, uint8, shape (H', W')
         1 where enough frames show the background, else 0.
-    masks : dict of int to ndarray, uint8
-        What passes in a frame, by the number of the frame in the file: a PNG of shape (H, W); none where nothing does.
+    weights : dict of int to ndarray, uint8
+        Share of the background in a frame from which something is taken, by the number of the frame in the file: a PNG
+        of shape (H, W) with 255 for the background alone.
+    placement : Placement
+        Where frames lie in the image.
     window : tuple of slice
-        Rows and columns of the file that these are.
+        Rows and columns of the file that the frames are.
     """
 
     image: FloatArray
     known: NDArray[np.uint8]
-    masks: dict[int, NDArray[np.uint8]]
+    weights: dict[int, NDArray[np.uint8]]
+    placement: Placement
     window: Window
 
     def shown(self, number: int, values: FloatArray, window: Window) -> FloatArray:
@@ -84,24 +100,43 @@ class Background:
 
         Examples
         --------
-        >>> _, stored = cv2.imencode(".png", np.ones((16, 16), np.uint8))
+        >>> _, stored = cv2.imencode(".png", np.full((16, 16), 255, np.uint8))
         >>> scene, known = np.full((16, 16), 0.5, np.float32), np.ones((16, 16), np.uint8)
-        >>> background = Background(scene, known, {7: stored}, np.s_[0:16, 0:16])
+        >>> still = Placement({7: (0, 0)}, (16, 16))
+        >>> background = Background(scene, known, {7: stored}, still, np.s_[0:16, 0:16])
         >>> background.shown(7, np.ones((1, 2), np.float32), np.s_[8:9, 8:10])
         array([[0.5, 0.5]], dtype=float32)
         """
-        if number not in self.masks:
+        if number not in self.weights:
             return values
-        # The whole mask is faded, so that a tile is that part of the whole frame.
-        mask = np.asarray(cv2.imdecode(self.masks[number], cv2.IMREAD_GRAYSCALE), np.uint8)
-        inside = cv2.erode(mask, _disc(_AROUND)).astype(np.float32)
-        weight = np.maximum(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _FADE), inside) * (mask & self.known)
-        part = tuple(
+        down, across = (
             slice(wanted.start - own.start, wanted.stop - own.start)
             for wanted, own in zip(window, self.window, strict=True)
         )
-        weight = weight[part] if values.ndim == 2 else weight[part][..., None]
-        return values + weight * (self.image[part] - values)
+        place = self.placement.place(number)
+        stored = np.asarray(cv2.imdecode(self.weights[number], cv2.IMREAD_GRAYSCALE))[down, across]
+        weight = stored.astype(np.float32) / np.float32(255) * self.known[place][down, across]
+        weight = weight if values.ndim == 2 else weight[..., None]
+        return values + weight * (self.image[place][down, across] - values)
+
+
+@dataclass(frozen=True, eq=False)
+class _Usual:
+    """The median, what frames do not exceed where nothing passes (d, the range, e² or None), and the mean of v."""
+
+    median: FloatArray
+    deviation: FloatArray
+    low: FloatArray
+    high: FloatArray
+    excess: FloatArray | None
+    spread: float
+
+    def at(self, place: Window) -> _Usual:
+        parts = (self.median[place], self.deviation[place], self.low[place], self.high[place])
+        return _Usual(*parts, None if self.excess is None else self.excess[place], self.spread)
+
+    def of_large(self) -> _Usual:
+        return dataclasses.replace(self, excess=None)
 
 
 def without_passers(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
@@ -136,80 +171,191 @@ def without_passers(source: FrameSource) -> tuple[FrameSource, tuple[Decision, .
         return source, ()
     background, share, touched = _background(source, *usual)
     reason = f"they cover {share:.1%} of the frames, and {touched:.0%} of the scene at some time"
+    if usual[0].excess is not None:
+        reason += "; small ones such as snow or rain are among them"
     decision = Decision("passers", "replaced by the background", reason)
     return source.adjusted(background.shown), (decision,)
 
 
-def _usual_of(source: FrameSource) -> tuple[FloatArray, FloatArray] | None:
-    """Median of the frames, and the value that d does not exceed where nothing passes; None where nothing does."""
+def _usual_of(source: FrameSource) -> tuple[_Usual, Placement] | None:
+    """Find what frames usually show, and where they lie; None where nothing passes."""
     picked = np.unique(np.linspace(0, len(source) - 1, _SAMPLES).round().astype(int))
     sample = dataclasses.replace(source, numbers=tuple(source.numbers[int(index)] for index in picked))
     stack = np.empty((len(sample), *sample.shape[1:3]), np.uint8)
     for plane, frame in zip(stack, sample, strict=True):
         np.rint(255 * np.clip(luminance(frame), 0, 1), out=plane, casting="unsafe")
-    median, usual = _usual(stack)
-    share = float(np.mean([_passing(_grey(plane), median, usual).mean() for plane in stack]))
-    return (median, usual) if _LEAST <= share <= _LARGEST and _stands(stack, median, usual) else None
+    still = Placement.still(source)
+    usual = _usual(stack, sample.numbers, still)
+    found = _passed_by(stack, sample.numbers, usual, still)
+    if found is not None:
+        return found, still
+    if not _moves(measured_shifts(map(_grey, stack), stack.shape)):
+        return None
+    # For a camera that moves the scene passes too; what moves as most of the frame does is the scene.
+    moving = placed(source, measured_shifts(map(luminance, source), source.shape))
+    if np.prod(moving.shape) > _LARGEST_SCENE * np.prod(moving.size):
+        return None
+    followed = _usual(stack, sample.numbers, moving)
+    found = _passed_by(stack, sample.numbers, followed, moving) if followed.spread < _FOLLOWED * usual.spread else None
+    return None if found is None else (found, moving)
+
+
+def _moves(shifts: NDArray[np.float64]) -> bool:
+    return float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) >= _CAMERA
 
 
 def _grey(plane: NDArray[np.uint8]) -> FloatArray:
     return plane.astype(np.float32) / np.float32(255)
 
 
-def _stands(stack: NDArray[np.uint8], median: FloatArray, usual: FloatArray) -> bool:
-    """Whether what is left without the passers is a scene, with edges of its own, that stands in the frame.
+def _passed_by(stack: NDArray[np.uint8], numbers: Sequence[int], usual: _Usual, placement: Placement) -> _Usual | None:
+    """Return what tells what passes in a sample; None where nothing does, or so much that it is the scene."""
+    parts = [usual.at(placement.place(number)) for number in numbers]
+    large = [_passing(_grey(plane), part.of_large()) for plane, part in zip(stack, parts, strict=True)]
+    masks = [_passing(_grey(plane), part) for plane, part in zip(stack, parts, strict=True)]
+    if not _is_precipitation(stack, large, parts):
+        usual, parts, masks = usual.of_large(), [part.of_large() for part in parts], large
+    else:
+        # Rain widens the spread of the frames, under which some of it hides.
+        usual = _usual(stack, numbers, placement, masks)
+        parts = [usual.at(placement.place(number)) for number in numbers]
+        masks = [_passing(_grey(plane), part) for plane, part in zip(stack, parts, strict=True)]
+    touched, share = np.mean([(mask > 0).mean() for mask in masks]), np.mean([mask.mean() / 255 for mask in masks])
+    if touched < _LEAST or share > _LARGEST:
+        return None
+    shifts = np.array([placement.shifts[number] for number in numbers], np.float64)
+    return usual if _stands(stack, masks, parts, shifts) else None
+
+
+def _is_precipitation(stack: NDArray[np.uint8], large: list[NDArray[np.uint8]], parts: list[_Usual]) -> bool:
+    """Whether more of the frames is beyond the range of the scene, on one side of it, than turbulence explains."""
+    shares, brighter = [], []
+    for plane, mask, part in zip(stack, large, parts, strict=True):
+        grey = _grey(plane)
+        # The edges of what is large are not what is small.
+        small = (_small(grey, part) > 0) & (cv2.dilate(mask, _disc(2 * _DISC)) == 0)
+        shares.append(small.mean())
+        brighter.append((small & (grey > part.median)).mean())
+    share = float(np.mean(shares))
+    return share >= _LEAST_SMALL and abs(float(np.mean(brighter)) / share - 0.5) >= _ONE_SIDED - 0.5
+
+
+def _stands(
+    stack: NDArray[np.uint8], masks: list[NDArray[np.uint8]], parts: list[_Usual], shifts: NDArray[np.float64]
+) -> bool:
+    """Whether what is left without the passers is a scene, with edges of its own, that lies where it is taken to lie.
 
     A planet that drifts over a black sky passes through nothing.
     """
-    height, width = median.shape
-    factor = max(1.0, max(height, width) / _SIDE)
-    size = max(16, round(width / factor)), max(16, round(height / factor))
-    whole, left = (np.empty((len(stack), size[1], size[0]), np.float32) for _ in range(2))
-    for number, plane in enumerate(stack):
-        grey = _grey(plane)
-        for small, image in ((whole, grey), (left, np.where(_passing(grey, median, usual) > 0, median, grey))):
-            small[number] = cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
-    edges = [np.hypot(*np.gradient(small, axis=(1, 2))).sum() for small in (whole, left)]
-    shifts = global_shifts(left) * (width / size[0], height / size[1])
-    return bool(edges[1] > _OWN_EDGES * edges[0]) and float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _CAMERA
+    seen = zip(stack, masks, parts, strict=True)
+    left = reduced((np.where(mask > 0, part.median, _grey(plane)) for plane, mask, part in seen), stack.shape)
+    edges = [
+        np.hypot(*np.gradient(some, axis=(1, 2))).sum() for some in (reduced(map(_grey, stack), stack.shape), left)
+    ]
+    away = shifts_of_reduced(left, stack.shape) - shifts
+    # Snow has more edges than the scene.
+    own = parts[0].excess is not None or bool(edges[1] > _OWN_EDGES * edges[0])
+    return own and not _moves(away - away.mean(axis=0))
 
 
-def _usual(stack: NDArray[np.uint8]) -> tuple[FloatArray, FloatArray]:
-    """Median, and the value that d does not exceed where nothing passes."""
-    median, variance = (np.empty(stack.shape[1:], np.float32) for _ in range(2))
-    for top in range(0, stack.shape[1], _ROWS):
-        rows = np.s_[top : top + _ROWS]
-        values = stack[:, rows].astype(np.float32) / 255
-        median[rows] = np.median(values, axis=0)
-        variance[rows] = (_MEDIAN_DEVIATION * np.median(np.abs(values - median[rows]), axis=0)) ** 2
-    around = cv2.GaussianBlur(variance, (0, 0), _USUAL_WINDOW)
-    around = cv2.dilate(around, np.ones((2 * _USUAL_REACH + 1,) * 2, np.uint8))
-    return median, np.float32(_EXCEEDS) * (around + np.float32(_LEAST_DEVIATION**2))
+def _usual(
+    stack: NDArray[np.uint8],
+    numbers: Sequence[int],
+    placement: Placement,
+    masks: Sequence[NDArray[np.uint8]] | None = None,
+) -> _Usual:
+    """Median over the frames at every place of the scene, and the values that are not exceeded where nothing passes.
+
+    What is known to pass does not count, but does where that leaves too few frames.
+    """
+    shape, places = placement.shape, [placement.place(number) for number in numbers]
+    median, variance, seen = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
+    for top in range(0, shape[0], _ROWS):
+        rows = slice(top, min(top + _ROWS, shape[0]))
+        values = np.full((len(stack), rows.stop - top, shape[1]), np.nan, np.float32)
+        hidden = np.zeros(values.shape, bool)
+        for index, (frame, (down, across)) in enumerate(zip(stack, places, strict=True)):
+            first, last = max(down.start, top), min(down.stop, rows.stop)
+            if first < last:
+                shown, part = (
+                    np.s_[index, first - top : last - top, across],
+                    np.s_[first - down.start : last - down.start],
+                )
+                values[shown] = _grey(frame[part])
+                hidden[shown] = False if masks is None else masks[index][part] > 0
+        few = (np.isfinite(values) & ~hidden).sum(axis=0) < _FEWEST
+        values[hidden & ~few] = np.nan
+        seen[rows] = np.isfinite(values).sum(axis=0) >= _FEWEST
+        median[rows] = _median(values)
+        variance[rows] = (_MEDIAN_DEVIATION * _median(np.abs(values - median[rows]))) ** 2
+    around = np.ones((2 * _USUAL_REACH + 1,) * 2, np.uint8)
+    least, known = np.float32(_LEAST_DEVIATION**2), cv2.erode(seen, around) > 0
+    deviation = cv2.dilate(cv2.GaussianBlur(variance, (0, 0), _USUAL_WINDOW), around) + least
+    excess = np.float32(_SMALL_SHARE) * cv2.GaussianBlur(variance, (0, 0), _SMALL_USUAL_WINDOW) + least
+    deviation, excess = (
+        np.where(known, some, np.float32(np.inf)) for some in (_EXCEEDS * deviation, _SMALL_EXCEEDS * excess)
+    )
+    smooth, nearby = cv2.GaussianBlur(median, (0, 0), _SMALL_WINDOW), _disc(_NEARBY)
+    spread = float(variance[seen > 0].mean()) if seen.any() else np.inf
+    return _Usual(median, deviation, cv2.erode(smooth, nearby), cv2.dilate(smooth, nearby), excess, spread)
 
 
-def _passing(grey: FloatArray, median: FloatArray, usual: FloatArray) -> NDArray[np.uint8]:
-    """Mark what passes by 1; nothing where it would be most of the frame, which then shows something else."""
-    mask = (cv2.GaussianBlur((grey - median) ** 2, (0, 0), _WINDOW) > usual).view(np.uint8)
+def _median(values: FloatArray) -> FloatArray:
+    """Median over the first axis of what is not NaN; 0 where all is."""
+    count, ordered = np.isfinite(values).sum(axis=0), np.sort(values, axis=0)
+    middle = (np.maximum(count - 1, 0) // 2, np.maximum(count, 1) // 2)
+    low, high = (np.take_along_axis(ordered, np.minimum(index, len(values) - 1)[None], 0)[0] for index in middle)
+    return np.nan_to_num((low + high) / 2)
+
+
+def _passing(grey: FloatArray, usual: _Usual) -> NDArray[np.uint8]:
+    """Mark what passes by 255, fading; nothing where it would be most of the frame, which then shows something else."""
+    mask = (cv2.GaussianBlur((grey - usual.median) ** 2, (0, 0), _WINDOW) > usual.deviation).view(np.uint8)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _disc(_GAP))
     mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(_DISC))
-    mask = np.asarray(cv2.dilate(mask, _disc(_AROUND)), np.uint8)
-    return mask if mask.mean() <= _LARGEST_PART else np.zeros_like(mask)
+    weight = _faded(mask, _AROUND, _FADE)
+    if usual.excess is not None:
+        weight = np.maximum(weight, _faded(_small(grey, usual), 1, _SMALL_FADE))
+    weight = np.rint(255 * weight).astype(np.uint8)
+    return np.asarray(weight if weight.mean() <= 255 * _LARGEST_PART else np.zeros_like(weight), np.uint8)
 
 
-def _background(source: FrameSource, median: FloatArray, usual: FloatArray) -> tuple[Background, float, float]:
+def _small(grey: FloatArray, usual: _Usual) -> NDArray[np.uint8]:
+    """Mark what is clearly beyond the range of the scene nearby, and what is slightly so and belongs to it."""
+    assert usual.excess is not None
+    smooth = cv2.GaussianBlur(grey, (0, 0), _SMALL_WINDOW)
+    beyond = np.maximum(np.maximum(smooth - usual.high, usual.low - smooth), 0) ** 2
+    _, labels = cv2.connectedComponents((beyond > _SLIGHTLY * usual.excess).view(np.uint8), connectivity=8)
+    clear = np.zeros(int(labels.max()) + 1, np.uint8)
+    clear[labels[beyond > usual.excess]] = 1
+    clear[0] = 0
+    return np.asarray(clear[labels], np.uint8)
+
+
+def _faded(mask: NDArray[np.uint8], around: int, fade: float) -> FloatArray:
+    """Widen a mask, and fade it outside of what it was."""
+    wide = cv2.dilate(mask, _disc(around)).astype(np.float32)
+    return np.maximum(cv2.GaussianBlur(wide, (0, 0), fade) * wide, mask.astype(np.float32))
+
+
+def _background(source: FrameSource, usual: _Usual, placement: Placement) -> tuple[Background, float, float]:
     """Average the frames where nothing passes; the share of the frames and that of the scene where something does."""
-    total, count = np.zeros(source.shape[1:]), np.zeros(source.shape[1:3], np.float32)
-    masks: dict[int, NDArray[np.uint8]] = {}
+    shape = placement.shape
+    total, count, most = np.zeros((*shape, *source.shape[3:])), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    weights: dict[int, NDArray[np.uint8]] = {}
     for number, frame in zip(source.numbers, source, strict=True):
-        mask = _passing(luminance(frame), median, usual)
-        if mask.any():
-            masks[number] = np.asarray(cv2.imencode(".png", mask)[1], np.uint8)
-        cv2.accumulate(frame, total, 1 - mask)
-        count += 1 - mask
+        place = placement.place(number)
+        weight = _passing(luminance(frame), usual.at(place))
+        if weight.any():
+            weights[number] = np.asarray(cv2.imencode(".png", weight)[1], np.uint8)
+        free = weight == 0
+        total[place][free] += frame[free]
+        count[place] += free
+        most[place] += 1
     seen = np.maximum(count, 1) if total.ndim == 2 else np.maximum(count, 1)[..., None]
     known = (count >= _SEEN).astype(np.uint8)
-    background = Background((total / seen).astype(np.float32), known, masks, source.window)
-    return background, 1 - float(count.mean()) / len(source), float((count < len(source)).mean())
+    background = Background((total / seen).astype(np.float32), known, weights, placement, source.window)
+    return background, 1 - float(count.sum() / most.sum()), float((count < most).mean())
 
 
 def _disc(radius: int) -> NDArray[np.uint8]:

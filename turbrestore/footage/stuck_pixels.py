@@ -21,7 +21,7 @@ _FEWEST_FRAMES = 10
 _DENSE_FRAMES = 8
 # A lone pixel exceeds its highest neighbour by this share of its distance from the median of all neighbours.
 _ALONE = 0.8
-_STILL, _MOVING = 1.5 / 255, 8 / 255
+_STILL, _MOVING, _OF_LETTER = 1.5 / 255, 8 / 255, 1
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _AROUND = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
 
@@ -52,8 +52,12 @@ class StuckPixelDetector:
         none = np.empty((0, 2), np.int64)
         if self._searching or not len(self._places) or self._frames < _FEWEST_FRAMES:
             return none
-        still = (self._most - self._least <= _STILL) & (self._moved() >= _MOVING)
-        stuck = self._places[still | (self._alone >= _ALONE)]
+        moves = self._highest - self._lowest
+        moved = moves.mean(axis=1) >= _MOVING
+        still = (self._most - self._least <= _STILL) & moved
+        # A neighbour that stands too, while others move, is part of a letter of a title.
+        letter = moved & ((moves <= _STILL).sum(axis=1) >= _OF_LETTER)
+        stuck = self._places[(still | (self._alone >= _ALONE)) & ~letter]
         return none if len(stuck) > _MOST_STUCK * self._size else stuck
 
     def _compare_all(self, values: FloatArray) -> None:
@@ -90,9 +94,6 @@ class StuckPixelDetector:
         self._least, self._most = np.minimum(self._least, own)[keep], np.maximum(self._most, own)[keep]
         self._lowest = np.minimum(self._lowest, around)[keep]
         self._highest = np.maximum(self._highest, around)[keep]
-
-    def _moved(self) -> FloatArray:
-        return (self._highest - self._lowest).mean(axis=1)
 
 
 def _with_neighbours(values: PixelArray, places: NDArray[np.int64]) -> tuple[PixelArray, PixelArray]:

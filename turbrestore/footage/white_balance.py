@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import FrameSource, Window
-from ..registration.global_shift import global_shifts
+from ..registration.camera.global_shift import global_shifts
 
 # Longest side of the reduced frames, pixels, and their blur.
 _SIDE, _BLUR = 64, 1.5

@@ -1,0 +1,139 @@
+"""Clips with more than the scene in them: snow, rain, noise of photons, titles, stripes, a car before a moving camera.
+
+    python benchmarks/recordings_kinds.py
+
+prints the peak signal-to-noise ratio of the result, of the filtered image, of the temporal mean and of the median of
+every clip, after the best gain and offset.  ``robustness.py --groups recordings`` asks that no result is worse than the
+mean, and that in snow and rain it is better than the median.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from turbrestore.core.arrays import FloatArray
+from turbrestore.io.source import FrameSource
+from turbrestore.metrics import compare
+from turbrestore.pipeline import restore
+
+COUNT, SIDE = 32, 144
+# Kinds in which what hides the scene covers a pixel in less than half of the frames.
+COVERED = ("snow", "rain")
+RNG = np.random.default_rng
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Ratios of one clip, in dB."""
+
+    name: str
+    result: float
+    filtered: float
+    mean: float
+    median: float
+
+    def bound(self, slack: float) -> float:
+        """Return the least ratio that the result may have."""
+        return self.median if self.name.split()[-1] in COVERED else self.mean - slack
+
+
+def as_8_bits(frames: FloatArray) -> np.ndarray:
+    """Frames of a camera of 8 bits."""
+    return np.rint(255 * np.clip(frames, 0, 1)).astype(np.uint8)
+
+
+def covered(frames: FloatArray, share: float, streaks: bool) -> np.ndarray:
+    """Snow or rain that covers a share of every frame."""
+    rng, result = RNG(21), frames.copy()
+    for frame in result:
+        cover = np.zeros(frame.shape, np.float32)
+        while (cover > 0.3).mean() < share:
+            x, y = (int(place) for place in rng.uniform(0, 16 * SIDE, 2))
+            if streaks:
+                length, shade = rng.uniform(15, 30), rng.uniform(0.3, 0.6)
+                cv2.line(
+                    cover, (x // 16, y // 16), (int(x / 16 - 0.2 * length), int(y / 16 + length)), shade, 1, cv2.LINE_AA
+                )
+            else:
+                cv2.circle(cover, (x, y), int(16 * rng.uniform(1, 2.4)), rng.uniform(0.6, 1), -1, cv2.LINE_AA, 4)
+        cover = np.clip(cv2.GaussianBlur(cover, (0, 0), 0.8), 0, 1)
+        np.add(frame, cover * (0.95 - frame), out=frame)
+    return as_8_bits(result)
+
+
+def photons(frames: FloatArray, white: float) -> np.ndarray:
+    """Light of so many photons where it is white."""
+    counts = RNG(22).poisson(white * np.clip(0.75 * frames, 0, 1)) / white
+    return np.rint(65535 * np.clip(counts, 0, 1)).astype(np.uint16)
+
+
+def titled(frames: FloatArray) -> np.ndarray:
+    """Draw a place and a clock that ticks once."""
+    result = as_8_bits(frames)
+    for number, frame in enumerate(result):
+        for shade, width in ((0, 3), (255, 1)):
+            for text, place in (("PIER 3", (6, 138)), (f"07:31:{20 + number // 20}", (6, 14))):
+                cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, shade, width)
+    return result
+
+
+def striped(frames: FloatArray, dead: bool = False) -> np.ndarray:
+    """Columns with offsets of their own, or two that are dead."""
+    if not dead:
+        return as_8_bits(0.1 + 0.8 * frames + 0.015 * RNG(23).standard_normal(SIDE).astype(np.float32))
+    result = as_8_bits(frames)
+    result[:, :, 61], result[:, 90] = 4, 180
+    return result
+
+
+KINDS: dict[str, Callable[[FloatArray], np.ndarray]] = {
+    "snow": lambda f: covered(f, 0.07, False),
+    "rain": lambda f: covered(f, 0.12, True),
+    "60 photons": lambda f: photons(f, 60),
+    "400 photons": lambda f: photons(f, 400),
+    "night": lambda f: as_8_bits(0.6 * f + 0.15 * RNG(24).standard_normal(f.shape).astype(np.float32)),
+    "title": titled,
+    "stripes": striped,
+    "dead columns": lambda f: striped(f, dead=True),
+}
+
+
+def clips() -> Iterator[tuple[str, np.ndarray, FloatArray]]:
+    """Name, frames and truth of every clip."""
+    from conftest import make_sequence
+
+    for scene in ("camera", "chart"):
+        still = make_sequence(19, COUNT, SIDE, scene, blur=0.8, noise=0.008, rms=1.2)
+        for kind, record in KINDS.items():
+            yield f"{scene}, {kind}", record(still.frames), still.scene
+    wide = make_sequence(20, COUNT, SIDE + 48, "camera", blur=0.8, noise=0.008, rms=0.8)
+    places = np.arange(COUNT) * 3 // 2
+    frames = np.stack([frame[24 : 24 + SIDE, x : x + SIDE] for frame, x in zip(wide.frames, places, strict=True)])
+    for k, frame in enumerate(frames):
+        frame[100:124, max(9 * k - 60, 0) : max(9 * k, 0)] = 0.9
+    yield "camera, car before a moving camera", as_8_bits(frames), wide.scene[24 : 24 + SIDE, 23 : 23 + SIDE]
+
+
+def figures() -> Iterator[Figures]:
+    """Ratios of every clip."""
+    for name, frames, truth in clips():
+        found, raw = restore(FrameSource.from_array(frames)), frames / np.float32(np.iinfo(frames.dtype).max)
+        fused = found.mean if found.filtered is None else found.filtered.image
+        images = found.image, fused, raw.mean(axis=0), np.median(raw, axis=0)
+        yield Figures(name, *(compare(image, truth).psnr_fit for image in images))
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    for row in figures():
+        print(
+            "{name}: result {result:.2f}, filtered {filtered:.2f}, mean {mean:.2f}, median {median:.2f}".format(
+                **vars(row)
+            )
+        )

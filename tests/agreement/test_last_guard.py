@@ -1,0 +1,54 @@
+"""Detail that the halves of a clip do not agree on is that of the registered mean; what they agree on stays."""
+
+import numpy as np
+
+from turbrestore.agreement.last_guard import Halves, keep_agreed, registered_halves
+from turbrestore.metrics import psnr
+from turbrestore.synthesis.scenes import SCENES
+
+NOISE = 0.02
+
+
+def halves_of(scene, seed=0, noise=NOISE):
+    rng = np.random.default_rng(seed)
+    return Halves(*(np.float32(scene + rng.normal(0, noise, scene.shape)) for _ in range(2)))
+
+
+def test_what_the_halves_agree_on_stays():
+    scene = SCENES["brick"](96, 96)
+    guarded = keep_agreed(scene, halves_of(0.5 + 0.5 * (scene - 0.5), noise=0.002))
+    assert np.abs(guarded.image - scene).max() < 0.01
+    assert guarded.decisions == ()
+
+
+def test_amplified_noise_in_flat_parts_gives_way_and_edges_stay():
+    scene = np.full((96, 96), 0.4, np.float32)
+    scene[:, 48:] = 0.8
+    halves = halves_of(scene)
+    mean = (halves.first + halves.second) / 2
+    noisy = scene + 4 * (mean - scene)
+    guarded = keep_agreed(noisy, halves)
+    flat = np.s_[:, :30]
+    assert guarded.image[flat].std() < 1.2 * mean[flat].std() < 0.4 * noisy[flat].std()
+    assert psnr(guarded.image, scene) > psnr(noisy, scene) + 5
+    edge = np.diff(guarded.image[:, 44:52], axis=1).max(axis=1)
+    assert np.median(edge) > 0.35
+    assert guarded.share[flat].mean() > 0.5
+    assert guarded.decisions[0].subject == "agreement"
+
+
+def test_a_result_that_is_smoother_than_the_mean_stays():
+    flat = np.full((64, 64, 3), 0.5, np.float32)
+    guarded = keep_agreed(flat, halves_of(flat))
+    assert np.abs(guarded.image - flat).max() < 1e-5
+
+
+def test_halves_are_means_of_frames_moved_in_place():
+    rng = np.random.default_rng(0)
+    scene = rng.random((24, 40)).astype(np.float32)
+    moves = rng.integers(-3, 4, 12)
+    frames = np.stack([np.roll(scene, move, axis=1) for move in moves])
+    flows = np.zeros((12, 24, 40, 2), np.float32)
+    flows[..., 0] = moves[:, None, None]
+    for half in vars(registered_halves(frames, flows, scene.shape, 12)).values():
+        np.testing.assert_allclose(half[:, 4:-4], scene[:, 4:-4], atol=1e-3)

@@ -1,0 +1,48 @@
+"""Stripes of the sensor are subtracted and dead columns filled; stripes of the scene stay."""
+
+import numpy as np
+
+from conftest import make_sequence
+from turbrestore.agreement.sensor_pattern import without_stripes
+from turbrestore.io.source import FrameSource
+
+SIDE = 160
+
+
+def clip(scene="camera"):
+    return make_sequence(3, 24, SIDE, scene, blur=0.8, noise=0.008, rms=1.2).frames.clip(0, 1)
+
+
+def test_offsets_of_columns_and_rows_are_subtracted():
+    frames, rng = 0.1 + 0.8 * clip(), np.random.default_rng(1)
+    columns, rows = 0.02 * rng.standard_normal(SIDE), 0.02 * rng.standard_normal((SIDE, 1))
+    for pattern in (columns, rows, columns + rows):
+        cleaned, (decision,) = without_stripes(FrameSource.from_array(np.float32(frames + pattern)))
+        left = (cleaned.read() - frames).mean(axis=0)
+        assert np.diff(left, axis=0).std() + np.diff(left, axis=1).std() < 0.35 * (
+            np.diff(pattern + np.zeros((SIDE, SIDE)), axis=0).std()
+            + np.diff(pattern + np.zeros((SIDE, SIDE)), axis=1).std()
+        )
+        assert decision.subject == "stripes"
+
+
+def test_dead_columns_and_rows_are_filled_in_windows_as_in_whole_frames():
+    frames = clip()
+    broken = frames.copy()
+    broken[:, :, 40], broken[:, 61] = 0.03, 1.0
+    source, (decision,) = without_stripes(FrameSource.from_array(broken))
+    whole = source.read()
+    assert np.abs(whole - frames)[:, 61].mean() < 0.06 and np.abs(whole - frames)[:, :, 40].mean() < 0.06
+    assert "2 dead" in decision.choice
+    np.testing.assert_allclose(source.select(roi=(30, 50, 20, 20)).read(), whole[:, 50:70, 30:50], atol=1e-6)
+
+
+def test_stripes_of_the_scene_are_left():
+    for scene in ("camera", "chart"):
+        source = FrameSource.from_array(clip(scene))
+        assert without_stripes(source) == (source, ())
+    x = np.arange(96)
+    flows = np.cumsum(np.random.default_rng(0).normal(0, 1, 24))
+    waves = np.stack([np.tile(0.5 + 0.2 * np.sin((x - shift - shift.mean()) / 2), (96, 1)) for shift in flows])
+    source = FrameSource.from_array(np.float32(waves + np.random.default_rng(1).normal(0, 0.01, waves.shape)))
+    assert without_stripes(source) == (source, ())

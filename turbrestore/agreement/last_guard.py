@@ -1,0 +1,178 @@
+"""The last guard: detail of the result that the frames do not agree on gives way to the mean of the registered frames.
+
+Symbols
+-------
+A, B : means of the registered frames of two halves of the clip, of alternating quarters
+b : one of four bands of detail, differences of Gaussians of 0, 1, 2, 4 and 8 pixels
+r : correlation of b of A with b of B in a window; ρ = 2 r / (1 + r) that of their mean with the scene (Spearman and
+    Brown), as far as the frames tell
+g : share of the mean in a band of the result
+
+What stands in the scene is in both halves.  Noise is not, nor are waves, clouds, rain and what registration has torn;
+deconvolution sharpens them all the same, and so do weights that follow sharpness.  Where ρ is low and the result has
+more energy in a band than the mean of the registered frames, ``g = (1 − ρ')(E / E₀ − 1)``, with ρ' and g between 0 and
+1, goes from the one to the other.  Where the halves agree, and where the result is smoother than the mean, it stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..core.arrays import FloatArray, luminance
+from ..core.decision import Decision
+from ..registration.warp import warp
+from ..runtime.scratch import iter_frames
+from ..runtime.threads import sum_in_threads
+
+# Parts of the clip that belong to one half and the other in turn.
+_PARTS = 4
+# Gaussians that separate the bands; the window of a band, in these and in pixels.
+_SCALES = (1.0, 2.0, 4.0, 8.0)
+_WINDOWS, _WINDOW = 2.0, 1.0
+# ρ below which nothing of a band is taken for the scene, and above which all of it is.
+_NONE, _ALL = 0.3, 0.8
+# Energy that is nothing, squared intensity; fewest frames that have two halves.
+_NOTHING, FEWEST = 1e-8, 8
+# Least g, and the share of the image that has it, that is worth a remark.
+_CLEAR, _REMARKED = 0.5, 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class Halves:
+    """Means of the registered frames of two halves of a clip, in the geometry of the result.
+
+    Attributes
+    ----------
+    first, second : ndarray, float32, shape (H, W) or (H, W, 3)
+    """
+
+    first: FloatArray
+    second: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Guarded:
+    """The image that is left, and what gave way.
+
+    Attributes
+    ----------
+    image : ndarray, float32, shape (H, W) or (H, W, 3)
+    share : ndarray, float32, shape (H, W)
+        Largest g of the bands, 0 to 1.
+    decisions : tuple of Decision
+    """
+
+    image: FloatArray
+    share: FloatArray
+    decisions: tuple[Decision, ...]
+
+
+def registered_halves(
+    frames: Iterable[FloatArray], flows: Iterable[FloatArray], shape: tuple[int, ...], count: int, threads: int = 0
+) -> Halves:
+    """Average the registered frames of each half.
+
+    Parameters
+    ----------
+    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
+    flows : iterable of ndarray, float32, shape (H, W, 2)
+        From the image to each frame, pixels.
+    shape : tuple of int
+        Shape of a frame.
+    count : int
+        Number of frames, at least two.
+    threads : int
+        Frames warped side by side; 0 means one per available core.
+
+    Returns
+    -------
+    Halves
+        In the geometry of the image that the flows start from.
+
+    Examples
+    --------
+    >>> frames, still = np.arange(8, dtype=np.float32)[:, None, None] + np.zeros((8, 4, 4)), np.zeros((8, 4, 4, 2))
+    >>> halves = registered_halves(np.float32(frames), np.float32(still), (4, 4), 8)
+    >>> halves.first[0, 0].round(3), halves.second[0, 0].round(3)
+    (np.float32(2.5), np.float32(4.5))
+    """
+
+    def add(numbered: list[tuple[int, FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
+        sums, counts = np.zeros((2, *shape)), np.zeros(2)
+        for number, frame, flow in numbered:
+            half = number * _PARTS // count % 2
+            cv2.accumulate(warp(frame, flow), sums[half])
+            counts[half] += 1
+        return sums, counts
+
+    numbered = zip(range(count), iter_frames(frames), iter_frames(flows), strict=True)
+    sums, counts = sum_in_threads(add, numbered, threads)
+    return Halves(*(total.astype(np.float32) / np.float32(some) for total, some in zip(sums, counts, strict=True)))
+
+
+def keep_agreed(result: FloatArray, halves: Halves) -> Guarded:
+    """Let the mean of the registered frames take the place of detail that they do not agree on.
+
+    Parameters
+    ----------
+    result : ndarray, float32, shape (H, W) or (H, W, 3)
+    halves : Halves
+        Of the same shape.
+
+    Returns
+    -------
+    Guarded
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> halves = Halves(*(rng.normal(0.5, 0.01, (2, 64, 64)).astype(np.float32)))
+    >>> guarded = keep_agreed(0.5 + 5 * (halves.first - 0.5), halves)
+    >>> bool(guarded.image.std() < 0.02), guarded.decisions[0].subject
+    (True, 'agreement')
+    """
+    first, second = luminance(halves.first), luminance(halves.second)
+    mean, left = (halves.first + halves.second) / np.float32(2), result
+    image, share = np.zeros_like(result), np.zeros(result.shape[:2], np.float32)
+    for scale in _SCALES:
+        (first, a), (second, b), (mean, usual), (left, detail) = (
+            _split(some, scale) for some in (first, second, mean, left)
+        )
+        window = _WINDOWS * scale + _WINDOW
+        product, squares = _smooth(a * b, window), _smooth(a * a, window) * _smooth(b * b, window)
+        alike = np.clip(product / np.sqrt(squares + np.float32(_NOTHING**2)), 0, 1)
+        unlike = 1 - np.clip((2 * alike / (1 + alike) - _NONE) / (_ALL - _NONE), 0, 1)
+        more = _energy(detail, window) / (_energy(usual, window) + np.float32(_NOTHING)) - 1
+        more = more if more.ndim == 2 else more.max(axis=2)
+        given = (unlike * np.clip(more, 0, 1)).astype(np.float32)
+        image += detail + (usual - detail) * (given if result.ndim == 2 else given[..., None])
+        np.maximum(share, given, out=share)
+    return Guarded(np.clip(image + left, 0, 1), share, explain_agreement(share))
+
+
+def explain_agreement(share: FloatArray) -> tuple[Decision, ...]:
+    """Say what gave way, if it is worth a remark."""
+    clear = float((share >= _CLEAR).mean())
+    if clear < _REMARKED:
+        return ()
+    choice = f"detail in {100 * clear:.0f} % of the image is that of the mean of the registered frames"
+    reason = "there the halves of the clip do not agree on it: noise, water, clouds, rain or registration that failed"
+    return (Decision("agreement", choice, reason),)
+
+
+def _split(image: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:
+    """Return an image without its finest detail, and the detail."""
+    smooth = _smooth(image, scale)
+    return smooth, image - smooth
+
+
+def _smooth(image: FloatArray, scale: float) -> FloatArray:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), scale), np.float32)
+
+
+def _energy(detail: FloatArray, window: float) -> FloatArray:
+    return _smooth(detail * detail, window)

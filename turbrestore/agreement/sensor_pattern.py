@@ -1,0 +1,175 @@
+"""Stripes of the sensor: columns and rows with an offset of their own, and dead ones.
+
+Symbols
+-------
+m, v : mean and variance of the frames over time; n² variance of the noise, the floor of v
+c : offset of a column: median over the rows of m minus m smoothed across the columns
+s : motion of the edges of the scene, pixels
+
+Stripes of the scene move with the air, so v exceeds n² by s² times the squared slope of c.  Those of the sensor stand,
+and v knows nothing of them.  They are subtracted from every frame; a column that does not change while others do is
+filled from beside it.  Rows are the columns of the transposed frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.arrays import FloatArray, luminance
+from ..core.decision import Decision
+from ..core.noise import estimate_noise
+from ..io.source import FrameSource, Window
+
+# Frames from which stripes are found, and the fewest.
+_SAMPLES, _FEWEST = 60, 8
+# Smoothing across the stripes, pixels.
+_ACROSS = 3.0
+# Least offset, in standard errors of the mean of the frames and in intensity, that is worth a correction.
+_CLEARLY, _LEAST = 4.0, 5e-4
+# Largest share, of the variance that stripes of the scene would have, of those of the sensor.
+_STANDS = 0.25
+# Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion, pixels.
+_EDGE, _LEAST_MOTION = 8.0, 0.3
+# Parts along the stripes, and the least correlation of their offsets.
+_PARTS, _ALIKE = 3, 0.4
+# A dead column varies less than this share of the noise and of the columns around; dead ones are few, and told
+# from others where there is noise of some size.
+_DEAD, _AROUND, _MOST_DEAD, _LEAST_NOISE = 0.3, 9, 0.05, 1 / 1020
+
+
+@dataclass(frozen=True, eq=False)
+class _Stripes:
+    """Offsets of columns and rows, and those that are dead, of a window of the file."""
+
+    offsets: tuple[FloatArray, FloatArray]
+    dead: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+    window: Window
+
+    def without(self, _: int, values: FloatArray, window: Window) -> FloatArray:
+        """Take the stripes out of a frame, or of a window of it."""
+        rows, columns = (
+            slice(wanted.start - own.start, wanted.stop - own.start)
+            for wanted, own in zip(window, self.window, strict=True)
+        )
+        pattern = self.offsets[0][None, columns] + self.offsets[1][rows, None]
+        flat = values - (pattern if values.ndim == 2 else pattern[..., None])
+        flat = _filled(flat, self.dead[0][columns])
+        return _filled(flat.swapaxes(0, 1), self.dead[1][rows]).swapaxes(0, 1)
+
+
+def without_stripes(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
+    """Take stripes of the sensor out of the frames; a source without them is returned as it is.
+
+    Parameters
+    ----------
+    source : FrameSource
+
+    Returns
+    -------
+    source : FrameSource
+    decisions : tuple of Decision
+        What was found, if anything.
+
+    Raises
+    ------
+    DataError
+        Frames are damaged.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> scene = cv2.GaussianBlur(rng.random((80, 80)).astype(np.float32), (0, 0), 3)
+    >>> stripes = 0.02 * rng.standard_normal(80).astype(np.float32)
+    >>> frames = np.stack([np.roll(scene, (k % 3, k % 2), (0, 1)) + stripes for k in range(12)])
+    >>> cleaned, (found,) = without_stripes(FrameSource.from_array(frames))
+    >>> found.subject, bool(np.abs(np.diff(cleaned.read()[0], axis=1)).mean() < 0.01)
+    ('stripes', True)
+    """
+    if len(source) < _FEWEST:
+        return source, ()
+    part = source.select((0, len(source), max(1, len(source) // _SAMPLES)))
+    sums, noise = np.zeros((2, *source.shape[1:3])), []
+    for frame in part:
+        grey = luminance(frame)
+        cv2.accumulate(grey, sums[0])
+        cv2.accumulateSquare(grey, sums[1])
+        noise.append(estimate_noise(grey))
+    sums /= len(part)
+    mean, variance = sums[0].astype(np.float32), np.maximum(sums[1] - np.square(sums[0]), 0).astype(np.float32)
+    usual = max(float(np.median(noise)), 1e-4)
+    motion = _motion(mean, variance, usual)
+    if motion < _LEAST_MOTION:
+        return source, ()
+    dead = (_dead(variance, usual), _dead(variance.T, usual))
+    offsets = tuple(
+        _offsets(_filled(image, gone), spread, usual / np.sqrt(len(part)), motion)
+        for image, spread, gone in ((mean, variance, dead[0]), (mean.T, variance.T, dead[1]))
+    )
+    count = int(dead[0].sum() + dead[1].sum())
+    size = float(np.sqrt(sum(np.mean(offset**2) for offset in offsets)))
+    if not count and size == 0:
+        return source, ()
+    stripes = _Stripes((offsets[0], offsets[1]), dead, source.window)
+    kinds = [
+        *([f"offsets of {100 * size:.2g} % of full scale subtracted"] if size else ()),
+        *([f"{count} dead columns or rows filled from beside them"] if count else ()),
+    ]
+    decision = Decision("stripes", "; ".join(kinds), "they stand while the air moves the scene")
+    return source.adjusted(stripes.without), (decision,)
+
+
+def _motion(mean: FloatArray, variance: FloatArray, noise: float) -> float:
+    """Root of the median squared motion of the edges of the scene, across themselves."""
+    smooth = cv2.GaussianBlur(mean, (0, 0), 1.0)
+    squares = (cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32) ** 2 + (cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32) ** 2
+    edges = squares > max((_EDGE * noise) ** 2 / 4, float(np.quantile(squares, 0.9)))
+    if not edges.any():
+        return 0.0
+    return float(np.sqrt(np.median(np.maximum(variance[edges] - noise**2, 0) / squares[edges])))
+
+
+def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float) -> FloatArray:
+    """Offset of every column, and of all or none, as they belong to the sensor or to the scene."""
+    fine = mean - cv2.GaussianBlur(mean, (0, 0), sigmaX=_ACROSS, sigmaY=1e-3)
+    offsets = np.median(fine, axis=0).astype(np.float32)
+    size = float(np.sqrt(np.mean(np.median(np.abs(offsets)) ** 2)))
+    parts = [np.median(part, axis=0) for part in np.array_split(fine, _PARTS)]
+    if size < max(_CLEARLY * 1.25 * error / np.sqrt(len(mean)), _LEAST) or np.corrcoef(parts).min() < _ALIKE:
+        return np.zeros_like(offsets)
+    slope = np.gradient(offsets) ** 2
+    level = np.median(variance, axis=0)
+    # What v gains from the flattest columns to the steepest; edges of the scene are too few to move these medians.
+    steep, flat = slope >= np.quantile(slope, 0.75), slope <= np.quantile(slope, 0.25)
+    gained = float(np.median(level[steep]) - np.median(level[flat]))
+    expected = motion**2 * float(np.median(slope[steep]) - np.median(slope[flat]))
+    return offsets if gained < _STANDS * expected else np.zeros_like(offsets)
+
+
+def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
+    """Mark the columns that have no noise while those around do."""
+    level = np.sqrt(np.median(variance, axis=0)).astype(np.float32)
+    around = np.array(
+        [
+            np.median(part)
+            for part in np.lib.stride_tricks.sliding_window_view(np.pad(level, _AROUND, "reflect"), 2 * _AROUND + 1)
+        ]
+    )
+    dead = level < _DEAD * np.minimum(around, noise if noise > _LEAST_NOISE else 0)
+    return dead if dead.mean() <= _MOST_DEAD else np.zeros_like(dead)
+
+
+def _filled(image: FloatArray, dead: NDArray[np.bool_]) -> FloatArray:
+    """Fill dead columns linearly from beside them."""
+    if not dead.any() or dead.all():
+        return image
+    filled, places = image.copy(), np.flatnonzero(~dead)
+    for column in np.flatnonzero(dead):
+        right = int(np.searchsorted(places, column))
+        a, b = places[max(right - 1, 0)], places[min(right, len(places) - 1)]
+        share = np.float32(0 if a == b else np.clip((column - a) / (b - a), 0, 1))
+        filled[:, column] = image[:, a] * (1 - share) + image[:, b] * share
+    return filled
