@@ -11,10 +11,10 @@ from turbrestore.blur.estimation import (
     _most_detailed,
     _preference,
     _reduce,
-    unreduced_width,
     estimate_blur,
     find_candidates,
     removable_width,
+    unreduced_width,
 )
 from turbrestore.blur.marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
 from turbrestore.blur.psf import GAUSSIAN, KOLMOGOROV, blur_otf, fused_exponent

@@ -144,8 +144,8 @@ class BlurPosterior:
 class _Hypotheses:
     """Transfer functions (a, l, rings) of airs and lenses, with their widths and exponents (a, l).
 
-    The last air does not blur.  ``amplitude`` and ``power`` are s and s_4 (a, rings), ``prior`` the logarithm of the prior
-    (a, l), and ``expected_v`` is V (a − 1).
+    The last air does not blur.  ``amplitude`` and ``power`` are s and s_4 (a, rings), ``prior`` is the logarithm of the
+    prior (a, l), and ``expected_v`` is V (a − 1).
     """
 
     transfer: Float64Array

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..io.source import FrameSource, Window
-from ..registration.global_shift import global_shifts
+from ..registration.camera.global_shift import global_shifts
 
 # Longest side of the reduced frames whose shifts are measured.
 _SIDE = 192
