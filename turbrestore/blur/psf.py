@@ -135,6 +135,18 @@ def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -
     return np.exp(-np.log(2) * (np.hypot(rows, columns) / half_frequency(sigma)) ** exponent).astype(np.float32)
 
 
+def radial_otf(frequencies: ArrayLike, sigma: float, exponent: float = GAUSSIAN) -> Float64Array:
+    """Return the transfer function of :func:`blur_otf` at radial frequencies, cycles per pixel.
+
+    Examples
+    --------
+    >>> radial_otf([0.0, half_frequency(1.5)], 1.5, 1.2).round(3).tolist()
+    [1.0, 0.5]
+    """
+    nu = np.asarray(frequencies, np.float64)
+    return np.ones_like(nu) if sigma == 0 else np.exp(-np.log(2) * (nu / half_frequency(sigma)) ** exponent)
+
+
 def fused_exponent(sigma: float) -> float:
     """Exponent of the transfer function of fused frames whose blur is this wide.
 

@@ -4,6 +4,7 @@ from .curves import plot_blur, plot_convergence, plot_filter, plot_frames, plot_
 from .figure import new_figure
 from .maps import plot_displacements, plot_flow, plot_images, plot_uncertainty
 from .spectra import plot_dynamics, plot_eigenvalues, plot_prediction, plot_singular_values
+from .witnesses import plot_transfer, plot_variation, plot_witnesses
 
 __all__ = [
     "new_figure",
@@ -20,5 +21,8 @@ __all__ = [
     "plot_over_frames",
     "plot_prediction",
     "plot_singular_values",
+    "plot_transfer",
     "plot_uncertainty",
+    "plot_variation",
+    "plot_witnesses",
 ]

@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..metrics import sharpness
-from ..results import Restoration
+from ..results import Restoration, Verdict
 from ..runs.run_record import RunRecord
-from ..runtime.scratch import variance_of
 from ..settings import RestoreParams
 from ..wording import interval_words
 
@@ -23,6 +21,7 @@ _STAGE_NAMES = {
     "seeing": "Seeing",
     "identify": "Flow model",
     "filter": "Alternating filter",
+    "witnesses": "Witnesses of the blur",
     "deconvolve": "Deconvolution",
     "uncertainty": "Uncertainty",
 }
@@ -51,14 +50,6 @@ class Fact:
     value: str
     note: str = ""
     doubtful: bool = False
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What a run gained, in a sentence without its full stop, and what a person should check."""
-
-    gained: str
-    checks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -106,14 +97,12 @@ def headline(restoration: Restoration) -> list[Fact]:
     -------
     list of Fact
     """
-    deviation = float(np.sqrt(variance_of(restoration.centroid.flows).sum(axis=-1).mean()))
     facts = [
         Fact("Frames", str(restoration.frame_count), f"{restoration.train} of them for training"),
-        Fact("Motion", f"{deviation:.2f} px", "root mean square"),
+        Fact("Motion", f"{restoration.motion:.2f} px", "root mean square"),
     ]
-    gain = _sharpness_gain(restoration)
-    if gain is not None:
-        facts.append(Fact("Sharpness", f"×{gain:.2f}", "relative to the mean"))
+    if not math.isnan(restoration.sharpening):
+        facts.append(Fact("Sharpness", f"×{restoration.sharpening:.2f}", "relative to the mean"))
     if restoration.deconvolution is not None:
         sigma = restoration.deconvolution.sigma
         facts.append(Fact("Blur removed", f"{sigma:.2f} px" if sigma > 0 else "none", _blur_note(restoration)))
@@ -143,15 +132,10 @@ def findings(restoration: Restoration) -> list[Fact]:
 
 
 def verdict(restoration: Restoration, run: RunRecord) -> Verdict:
-    """Say what was gained, and list all doubts: of the reader, of the stages, and of what they measured."""
-    gained = f"{restoration.frame_count} frames became one image"
-    gain = _sharpness_gain(restoration)
-    if gain is not None:
-        gained += f", {gain:.2f} times as sharp as their mean"
-    mean = [f"{one.choice}: {one.reason}" for one in restoration.decisions if one.subject == "structure"]
+    """Return the verdict on a restoration, whose checks begin with the remarks of the reader and of the flow model."""
+    found = restoration.verdict
     notes = () if restoration.dynamics is None else restoration.dynamics.notes
-    doubts = [f"{fact.name}: {fact.note}" for fact in findings(restoration) if fact.doubtful]
-    return Verdict(gained, (*mean, *run.warnings, *notes, *doubts))
+    return dataclasses.replace(found, checks=(*run.warnings, *notes, *found.checks))
 
 
 def settings(run: RunRecord, defaults: Mapping[str, Any] | None = None) -> list[Setting]:
@@ -193,13 +177,6 @@ def laps(restoration: Restoration) -> list[Lap]:
     return found
 
 
-def _sharpness_gain(restoration: Restoration) -> float | None:
-    """Sharpness of the image relative to the mean of the frames; None where the mean has no contrast."""
-    x, y, width, height = restoration.crop
-    mean = restoration.mean[y : y + height, x : x + width]
-    return sharpness(restoration.image, mean) if np.ptp(mean) > 0 else None
-
-
 def _motion_facts(restoration: Restoration) -> Iterator[Fact]:
     centroid, dynamics = restoration.centroid, restoration.dynamics
     yield Fact(
@@ -239,8 +216,12 @@ def _filter_facts(restoration: Restoration) -> Iterator[Fact]:
 
 
 def _blur_facts(restoration: Restoration) -> Iterator[Fact]:
-    blur, done = restoration.blur, restoration.deconvolution
-    if blur is not None:
+    blur, done, posterior = restoration.blur, restoration.deconvolution, restoration.posterior
+    if posterior is not None:
+        low, width, high = posterior.width
+        note = f"{low:.2f} to {high:.2f} px; the air has blurred it with a probability of {posterior.air:.0%}"
+        yield Fact("Blur by all witnesses", f"{width:.2f} px", note)
+    elif blur is not None:
         known = math.isfinite(blur.uncertainty)
         value = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} px" if known else f"{blur.sigma:.2f} px"
         note = f"evidence {blur.evidence:.2f}, image reduced {blur.reduction}×" if known else "cannot be measured"
@@ -297,6 +278,9 @@ def _uncertainty_facts(restoration: Restoration) -> Iterator[Fact]:
 
 def _blur_note(restoration: Restoration) -> str:
     blur = restoration.blur
+    if restoration.posterior is not None:
+        low, _, high = restoration.posterior.width
+        return f"measured {low:.2f} to {high:.2f}"
     if blur is None:
         return "as requested"
     if not math.isfinite(blur.uncertainty):

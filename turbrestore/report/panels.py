@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ..blur.posterior import BlurPosterior
+from ..blur.psf import radial_otf
 from ..deconvolution.deconvolve import Deconvolution
 from ..display.plots import (
     plot_blur,
@@ -17,7 +19,10 @@ from ..display.plots import (
     plot_frames,
     plot_objective,
     plot_singular_values,
+    plot_transfer,
     plot_uncertainty,
+    plot_variation,
+    plot_witnesses,
 )
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
@@ -83,7 +88,9 @@ def draw_panels(restoration: Restoration, run: RunRecord) -> list[Panel]:
         panels += _dynamics(restoration.dynamics)
     if restoration.filtered is not None:
         panels += _filter(restoration.filtered)
-    if restoration.blur is not None:
+    if restoration.posterior is not None:
+        panels += _witnesses(restoration.posterior)
+    elif restoration.blur is not None:
         blur = restoration.blur
         figure = plot_blur(blur.widths, blur.costs, blur.sigma, blur.uncertainty)
         caption = "The minimum is the estimated width; the band shows its uncertainty."
@@ -128,6 +135,30 @@ def _filter(filtered: Filtered) -> Iterator[Panel]:
     figure = plot_frames(filtered.sharpness, filtered.shares)
     caption = "Sharp frames have more weight. Dashed: the sharpness of the centroid, and equal weights."
     yield make_panel(figure, "frames", "Sharpness and share of each frame", caption)
+
+
+def _witnesses(posterior: BlurPosterior) -> Iterator[Panel]:
+    widths = {
+        "displacement": posterior.by_displacement,
+        "variation": posterior.by_variation,
+        "edges": posterior.by_image,
+        "all": posterior.width,
+    }
+    figure = plot_witnesses(widths, posterior.removed)
+    caption = "Bars hold the width with a probability of 68 %. Dashed: the width that is removed."
+    yield make_panel(figure, "witnesses", "Widths of the blur by each witness", caption)
+    curves = {"lowest": posterior.lowest, "mean": posterior.transfer, "highest": posterior.highest}
+    removed = radial_otf(posterior.frequencies, posterior.removed, posterior.exponent)
+    caption = "With 68 % of the probability. Dashed: the transfer function that is removed."
+    figure = plot_transfer(posterior.frequencies, curves, removed)
+    yield make_panel(figure, "transfer", "Transfer function of the blur", caption)
+    rows = {
+        "amplitude": (posterior.variation, posterior.variation_error, posterior.expected_variation),
+        "power": (posterior.power_variation, posterior.power_variation_error, posterior.expected_power_variation),
+    }
+    caption = "Points: measured on the registered frames. Lines: expected by the posterior. A blur by the air varies."
+    figure = plot_variation(posterior.frequencies, rows)
+    yield make_panel(figure, "variation", "Variation of the spectra of the frames", caption)
 
 
 def _deconvolution(deconvolution: Deconvolution) -> Iterator[Panel]:

@@ -1,0 +1,105 @@
+"""Posterior of the blur: what a hypothesis predicts leads back to it, and one wrong witness is outvoted."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from turbrestore.blind.decisions import explain_posterior
+from turbrestore.blind.remove_blur import remove_blur_steps
+from turbrestore.blur.image_evidence import image_evidence
+from turbrestore.blur.posterior import (
+    _EXCLUDED,
+    BlurWitnesses,
+    _hypotheses,
+    _shapes,
+    blur_posterior,
+    measure_witnesses,
+)
+from turbrestore.blur.psf import half_frequency, radial_otf
+from turbrestore.blur.short_exposure import displacement_variance, short_exposures
+from turbrestore.blur.spectral_variation import RINGS, SpectralVariation
+from turbrestore.runtime.steps import finish
+from turbrestore.synthesis.scenes import SCENES
+
+# Share of the variation that windows over several isoplanatic patches leave.
+SHARE = 0.33
+
+
+def expected_variation(strength, diffraction):
+    """Variation of frames with little noise, registered exactly, behind air of theory."""
+    mean, amplitude, power = (
+        values[0, 0] for values in short_exposures(np.array([strength]), np.array([diffraction]), RINGS)
+    )
+    error = np.full(len(RINGS), 1e-3)
+    signal = 1e5 * mean**2
+    ones = np.ones(len(RINGS))
+    return SpectralVariation(SHARE * amplitude, error, SHARE * power, error, signal, ones, 0 * ones, 0.0, 40, 1), mean
+
+
+@pytest.mark.parametrize(("strength", "diffraction"), [(1.2, 1.5), (2.5, 2.0), (4.0, 1.2)])
+def test_theory_leads_back_to_its_blur(strength, diffraction):
+    variation, mean = expected_variation(strength, diffraction)
+    variance = float(displacement_variance(np.array(strength), np.array(diffraction)))
+    (true,), _ = _shapes(mean[None])
+    found = blur_posterior(None, BlurWitnesses(variation, variance, 40.0))
+    low, middle, high = found.width
+    assert low / 1.1 < true < high * 1.1 and low < middle < high
+    assert abs(middle / true - 1) < 0.3
+    assert found.air > 0.95 and found.removed > 0.5 * true
+
+
+def test_shapes_of_power_laws_are_found():
+    for sigma, exponent in ((0.9, 2.0), (1.5, 1.2), (2.5, 1.6)):
+        (width,), (shape,) = _shapes(radial_otf(RINGS, sigma, exponent)[None])
+        assert width == pytest.approx(sigma, rel=0.02) and shape == pytest.approx(exponent, abs=0.05)
+    assert half_frequency(width) < 0.5
+
+
+def still_clip(scene, count=12, noise=0.004):
+    frames = scene + np.random.default_rng(0).normal(0, noise, (count, *scene.shape))
+    return frames.astype(np.float32), np.zeros((count, *scene.shape, 2), np.float32)
+
+
+def test_nothing_is_removed_from_a_sharp_clip_that_stands_still():
+    frames, flows = still_clip(SCENES["camera"](128, 128))
+    image = frames.mean(axis=0)
+    witnesses = measure_witnesses(frames, flows, 0.0, 12.0)
+    result = finish(remove_blur_steps(image, image, witnesses=witnesses))
+    assert result.deconvolution.sigma == 0 and result.posterior.removed == 0
+    np.testing.assert_array_equal(result.deconvolution.image, np.clip(image, 0, 1))
+    assert "no blur is certain enough" in result.decisions[0].reason
+
+
+def test_a_lens_is_told_from_the_air():
+    frames, flows = still_clip(cv2.GaussianBlur(SCENES["camera"](128, 128), (0, 0), 2.0))
+    image = frames.mean(axis=0)
+    witnesses = measure_witnesses(frames, flows, 0.0, 12.0)
+    found = blur_posterior(image_evidence(image), witnesses, witnesses.variation.with_power(image))
+    assert found.air < 0.2 and found.width[1] == pytest.approx(2.0, rel=0.25)
+    assert 0 < found.removed < 2.2 and found.exponent > 1.8
+
+
+def test_one_wrong_witness_is_outvoted():
+    variation, _ = expected_variation(2.5, 2.0)
+    frames, _ = still_clip(SCENES["words"](128, 128))
+    sharp = image_evidence(frames.mean(axis=0))
+    still = BlurWitnesses(variation, 0.0, 40.0)
+    assert blur_posterior(sharp, still).width[1] < blur_posterior(None, still).width[1]
+    assert _EXCLUDED[0] < _EXCLUDED[1] < _EXCLUDED[2] < _EXCLUDED[0] + _EXCLUDED[1]
+    moving = replace(still, displacement=float(displacement_variance(np.array(2.5), np.array(2.0))))
+    assert blur_posterior(sharp, moving).width[1] > 1
+
+
+def test_weights_and_quantiles_are_in_order():
+    variation, _ = expected_variation(2.0, 1.5)
+    known = _hypotheses()
+    assert np.exp(known.prior).sum() == pytest.approx(1)
+    found = blur_posterior(None, BlurWitnesses(variation, 0.7, 30.0))
+    assert (found.lowest <= found.highest).all() and found.transfer[0] == pytest.approx(1)
+    for quantiles in (found.width, found.by_displacement, found.by_variation, found.by_image):
+        assert (np.diff(quantiles) >= 0).all()
+    decision = explain_posterior(found)
+    assert f"{found.removed:.2f} pixels removed" == decision.choice
+    assert f"{found.width[1]:.2f} pixels, {found.width[0]:.2f} to {found.width[2]:.2f}" in decision.reason
