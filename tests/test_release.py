@@ -16,6 +16,7 @@ def test_every_package_is_in_the_wheel():
     found = {".".join(folder.parts) for folder in folders} | {
         "turbrestore_cli",
         "turbrestore_app",
+        "turbrestore_app.views",
         "turbrestore_napari",
     }
     assert set(TOOL["packages"]) == found

@@ -115,7 +115,7 @@ def test_without_torch_a_device_ends_the_command_before_it_keeps_anything(tmp_pa
     np.save(tmp_path / "in.npy", np.random.default_rng(0).random((3, 32, 32)).astype(np.float32))
     words = ["restore", str(tmp_path / "in.npy"), str(tmp_path / "out.png"), "--device", "cuda"]
     assert main([*words, "--keep", str(tmp_path / "kept")]) == 2
-    assert "device: torch is not installed, found 'cuda'" in capsys.readouterr().err
+    assert "--device: expected torch for 'cuda', which is not installed" in capsys.readouterr().err
     assert not list(tmp_path.glob("**/*.npz"))
 
 

@@ -16,7 +16,7 @@ from turbrestore.settings import RestoreParams
 @pytest.fixture(scope="module")
 def restoration():
     """A blurred chart, so that motion and blur are removed."""
-    sequence = make_sequence(seed=3, count=24, size=112, rms=1.2, blur=1.2, blur_change=0.6, noise=0.005)
+    sequence = make_sequence(seed=3, count=24, size=112, rms=1.2, blur=2.2, blur_change=0.4, noise=0.005)
     return restore(sequence.frames)
 
 

@@ -234,7 +234,8 @@ def _find_witnesses(run: Run, training: FloatArray, centroid: Centroid, seeing: 
         return None
     begun, known = time.perf_counter(), None if seeing is None else seeing.displacement_variance
     flow_variance = float(np.mean([np.square(flow).mean() for flow in iter_frames(centroid.flows)]))
-    frames = float(len(training)) if seeing is None else seeing.independent_frames
+    # Without a displacement that can be measured, that of the flow stands for it.
+    frames = float(len(training)) if seeing is None or known is None else seeing.independent_frames
     rows, columns = run.prepared.picture
     seen, flows = training[:, rows, columns], centroid.flows[:, rows, columns]
     witnesses = measure_witnesses(seen, flows, flow_variance if known is None else known.value, frames)

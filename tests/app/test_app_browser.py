@@ -159,7 +159,7 @@ def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
     page.get_by_text(f"{sides[2]}×{sides[3]} pixels from 48 frames").wait_for(timeout=LONG)
     assert page.locator("#right option").all_inner_texts() == ["Frame", "Mean", "Centroid", "Filtered", "Result"]
     page.get_by_text("decisions").click()
-    assert page.get_by_text("blur: ").is_visible()
+    assert page.locator("dt").get_by_text("blur: ").is_visible()
 
     stage, before = page.locator("#stage"), pixels(page.locator("#stage"))
     begun = time.monotonic()

@@ -142,11 +142,11 @@ class TestRestore:
         c, d, e, chain, whole = (tmp_path / name for name in ("c.npz", "d.npz", "e.npz", "chain.tif", "whole.tif"))
         once, depth = ["--centroid.iterations", "1"], ["--bit-depth", "32"]
         for words in (
-            ["restore", clip, whole, "--train", "4", *depth, *QUICK],
+            ["restore", clip, whole, "--train", "4", "--sigma", "1", *depth, *QUICK],
             ["centroid", clip, c, "--train", "4", *once],
             ["identify", c, d],
             ["filter", clip, c, d, e, "--filter.inner-iterations", "1"],
-            ["deconvolve", e, chain, "--guide", c, *depth],
+            ["deconvolve", e, chain, "--guide", c, "--sigma", "1", *depth],
         ):
             code, _, err = run(*words)
             assert code == 0, err
@@ -197,11 +197,12 @@ class TestRestore:
         frames = make_sequence(seed=5, count=50, size=64, rms=0.5).frames
         clip = frames_clip(tmp_path / "long.mkv", frames)
         quick = ["--centroid.iterations", "1", "--flow.method", "farneback", "--quiet"]
-        for words, count in (([], 40), (["--frames", "0:50"], 50), (["--frames", "0:50", "--train", "9"], 9)):
+        named = ["--frames", "0:50"]
+        for words, count, measured in (([], 40, 50), (named, 50, 50), ([*named, "--train", "9"], 9, 9)):
             assert run("centroid", clip, tmp_path / "c.npz", *words, *quick, "--overwrite")[0] == 0
             assert load_artifact(tmp_path / "c.npz", Centroid).flows.shape[0] == count
             code, out, _ = run("seeing", clip, *words, *quick, "--json")
-            assert (code, json.loads(out)["frames"]) == (0, count)
+            assert (code, json.loads(out)["frames"]) == (0, measured)
         assert f"frames used{count:>16} of 50" in run("seeing", clip, *words, *quick)[1]
 
     @pytest.mark.parametrize("until", ["centroid", "identify", "filter"])

@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from turbrestore.blur.estimation import BlurEstimate
+from turbrestore.blur.posterior import BlurWitnesses, blur_posterior
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams, deconvolve
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
@@ -52,6 +53,7 @@ def make_results():
         "filtered": filter_frames(CLIP, CLIP[0], dynamics, FAST),
         "deconvolution": deconvolve(CLIP[0], 1.0, DeconvolutionParams(method="tv", iterations=5)),
         "blur": BlurEstimate(1.0, 0.1, 5 / 3, 0.01, 1, 9.0, np.arange(3.0), np.ones(3)),
+        "posterior": blur_posterior(None, BlurWitnesses(None, 1.0, 9.0)),
     }
 
 

@@ -44,7 +44,7 @@ QUICK = RestoreParams(centroid=CentroidParams(iterations=1))
 
 @pytest.fixture(scope="module")
 def frames():
-    return make_sequence(seed=41, count=6, size=64, rms=0.8).frames
+    return make_sequence(seed=41, count=6, size=64, rms=0.8, blur=2.0).frames
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ class TestPage:
 
     def test_whole_run(self, page, whole):
         text = html.unescape(page)
-        for word in ("Frame 3", "Mean", "Centroid", "Filtered", "Result", "3 states", "Estimated blur", "numpy"):
+        for word in ("Frame 3", "Mean", "Centroid", "Filtered", "Result", "3 states", "Blur by all witnesses", "numpy"):
             assert word in text
         assert f"{whole.blur.sigma:.2f} ± {whole.blur.uncertainty:.2f} px" in text
         labels = [a["aria-label"] for tag, a in Elements(page).found if tag == "svg" and "aria-label" in a]

@@ -178,6 +178,7 @@ def test_zoom_by_keys_is_pixelated_and_pans(open_page):
 
 def test_mouse_drags_the_border_and_the_image(open_page):
     page = open_page()
+    page.locator("#stage").scroll_into_view_if_needed()
     box = page.locator("#stage").bounding_box()
     middle = box["y"] + box["height"] / 2
     page.mouse.move(box["x"] + box["width"] / 2, middle)

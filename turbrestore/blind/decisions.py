@@ -67,7 +67,7 @@ def explain_posterior(posterior: BlurPosterior) -> Decision:
         reason = f"no blur is certain enough; {reason}"
     outside = [name for name, found in witnesses.items() if found[0] > high or found[2] < low]
     if outside:
-        reason += f"; {' and '.join(outside)} contradict{'s' if len(outside) == 1 else ''} the others"
+        reason += f"; these disagree with the others: {' and '.join(outside)}"
     return Decision("blur", choice, reason)
 
 

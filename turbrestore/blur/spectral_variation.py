@@ -35,6 +35,8 @@ SIDE, _BORDER = 64, 16
 _WINDOWS, _FRAMES = 5, 48
 # Frames by whose flows white noise is warped, and highest rings, from which the noise is taken.
 _NOISE_FRAMES, _NOISE_RINGS = 4, 4
+# Least power of the noise: a standard deviation of 10⁻⁴ under the window.
+_LEAST_NOISE = 1e-8 * SIDE**2 * 9 / 64
 # Frequencies of the rings, cycles per pixel.
 RINGS: Float64Array = np.arange(SIDE // 2 + 1) / SIDE
 # The derivative of a flow is taken behind a Gaussian of this standard deviation, pixels.
@@ -176,7 +178,9 @@ def _ratios(
 ) -> SpectralVariation:
     """Ratios of the sums over windows (n, 5, rings), and their errors by leaving out one window after the other."""
     number = len(sums)
-    noise = float(np.median((sums[:, 0].mean(axis=0) / response)[-_NOISE_RINGS:])) * response
+    # Frames without any noise are taken for as noisy as this.
+    level = float(np.median((sums[:, 0].mean(axis=0) / response)[-_NOISE_RINGS:]))
+    noise = max(level, _LEAST_NOISE) * response
 
     def ratios(mean: Float64Array) -> Float64Array:
         variance, coherent, power, square, spread = mean

@@ -29,7 +29,7 @@ _STAGE_NAMES = {
 
 # What a run takes of its input and of the machine unless told otherwise; what is not named here is left open.
 _USUAL_RUN = {
-    **{"preset": "standard", "threads": 0, "device": "cpu"},
+    **{"preset": "standard", "threads": 0, "device": "cpu", "hdr": "sdr"},
     **dict.fromkeys(("strict", "skip_damaged", "crop_to_object"), False),
 }
 

@@ -139,7 +139,7 @@ def _filter(filtered: Filtered) -> Iterator[Panel]:
 
 def _witnesses(posterior: BlurPosterior) -> Iterator[Panel]:
     widths = {
-        "displacement": posterior.by_displacement,
+        "motion": posterior.by_displacement,
         "variation": posterior.by_variation,
         "edges": posterior.by_image,
         "all": posterior.width,

@@ -193,26 +193,14 @@ class RunFolder:
             self.flush()
 
     def flush(self) -> None:
-        """Write the newest checkpoint, if it is not written yet.
-
-        Raises
-        ------
-        OutputError, StorageError
-            It cannot be written.
-        """
+        """Write the newest checkpoint, if it is not written yet; StorageError if that fails."""
         if self._newest is None or len(self._newest.records) <= self._written:
             return
         save_checkpoint(self.folder / CHECKPOINT, self._newest, self._key)
         self._written = len(self._newest.records)
 
     def expect(self, *outputs: Path) -> None:
-        """Note which outputs are about to be written, so that a run that dies meanwhile may replace its own.
-
-        Parameters
-        ----------
-        *outputs : Path
-            None once they are complete.
-        """
+        """Note which outputs are about to be written, so that a run that dies meanwhile may replace its own."""
         self._outputs = tuple(str(path.absolute()) for path in outputs)
         self._write_record()
 
@@ -339,7 +327,7 @@ class RunFolder:
             self._write_record()
 
     def _remove_the_rest(self) -> None:
-        """Remove what does not belong to this run, so that nobody takes it for a part of it."""
+        """Remove what does not belong to this run, such as files of other runs."""
         kept = {*self._files, *([CHECKPOINT] if self._written else [])}
         try:
             tiles = {
