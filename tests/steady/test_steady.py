@@ -359,3 +359,10 @@ def test_edges_of_a_still_scene_are_not_taken_for_motion():
     air = phase_screen_frames(scene, 20, np.random.default_rng(0), PhaseScreenParams(d_over_r0=2.5))
     moving = [frame.moving.mean() for frame in steady_frames([frame.image for frame in air], SteadyParams(sigma=0))]
     assert np.mean(moving[4:]) < 0.15
+
+
+def test_a_sharp_clip_that_stands_still_is_not_deblurred():
+    scene = photo()
+    frames = (scene + np.random.default_rng(0).normal(0, 0.004, (12, *scene.shape))).astype(np.float32)
+    for frame in steady_frames(frames):
+        assert frame.sigma == 0 and psnr(frame.image, scene) > 45

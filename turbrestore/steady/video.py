@@ -13,15 +13,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..blur.estimation import estimate_blur
+from ..blur.image_evidence import image_evidence
+from ..blur.posterior import blur_posterior, measure_witnesses
 from ..blur.psf import KOLMOGOROV
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, luminance
 from ..registration.warp import sample_linear, warp
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_in_turns
@@ -32,7 +34,7 @@ from .displacement import whole_displacement
 from .memory import Memory, remember, shown
 from .path import LONGEST, camera_position, homogeneous, longer_path, motion, smooth_motion
 from .settings import SteadyParams
-from .windows import iter_windows
+from .windows import Window, iter_windows
 
 # Share of the estimated width that is removed: on the two videos of docs/steady.md, a width
 # too small by 15 % costs 0.1 dB, one too large by as much 0.4 dB, and estimates are too large by up to a third.
@@ -43,6 +45,8 @@ _ADDED = 0.15
 # Frames that the memory holds on average when the width of its blur is estimated, and frames over which the width that
 # is removed goes there, so that no frame is suddenly sharper.
 _REMEMBERED, _GRADUALLY = 24, 16
+# Variance of the displacement below which frames stand still, squared pixels.
+_STILL = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +122,8 @@ def steady_frames(
         # Of the shape that is removed: a width is that of one shape.
         middle = dewarp_frame(head[-1], params)
         sigma = _CAUTION * estimate_blur(middle.image, exponent=KOLMOGOROV, runtime=runtime).removable
+        if sigma > 0 and _is_sharp_and_still(head[-1], middle.image, runtime):
+            params, sigma = replace(params, sigma=0.0), 0.0
     scenes = _Scenes(params, sigma, runtime)
     yield from map_in_turns(
         lambda window: dewarp_frame(window, params),
@@ -126,6 +132,20 @@ def steady_frames(
         chain(head, windows),
         runtime.threads,
     )
+
+
+def _is_sharp_and_still(window: Window, image: FloatArray, runtime: Runtime) -> bool:
+    """Whether the frames of a window neither move nor vary, and the image fused from them is not clearly blurred."""
+    frames = np.stack([window.frame.image, *(frame.image for frame in window.neighbours.values())])
+    still = np.zeros((*image.shape[:2], 2), np.float32)
+    flows = np.stack([measure_flow(frames[0], frame, still) for frame in frames])
+    displacement = float(np.square(flows - np.median(flows, axis=(1, 2), keepdims=True)).mean())
+    if displacement > _STILL:
+        return False
+    grey = luminance(image)
+    witnesses = measure_witnesses(frames, flows, displacement, float(len(frames)))
+    ratio = None if witnesses.variation is None else witnesses.variation.with_power(grey)
+    return blur_posterior(image_evidence(grey, runtime), witnesses, ratio).removed == 0
 
 
 class _Scenes:
