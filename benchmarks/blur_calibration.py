@@ -114,6 +114,8 @@ def table_of(figures: list[Figures]) -> str:
     lines = [
         "# Calibration of the blur",
         "",
+        "Made by `python benchmarks/blur_calibration.py FOLDER --write benchmarks/results/blur_calibration.md`.",
+        "",
         "Relative errors of widths above .6 px: bias, and median and 90 % quantile of the size.",
         "",
         "| clips | displacement | variation | image | posterior |",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from typing import TypeVar
@@ -164,7 +164,7 @@ def fuse(run: Run) -> Fused:
     structure = _compare_structure(levels.stretched(filtered.image), training, centroid, filtered.mean_flow)
     run.decide(*explain_structure(structure))
     image = filtered.image if structure.passed else mean
-    witnesses = _find_witnesses(run, training, centroid, seeing)
+    witnesses = _find_witnesses(run, training, centroid, seeing) if structure.passed else None
     halves = _halves(run, training, centroid, filtered.mean_flow)
     found = mean, centroid, seeing, saturation, dynamics, filtered
     return Fused(image, *found, not structure.passed, witnesses, halves)
@@ -233,12 +233,15 @@ def _find_witnesses(run: Run, training: FloatArray, centroid: Centroid, seeing: 
     if not run.params.runs("deconvolve") or run.params.deconvolution.sigma is not None:
         return None
     begun, known = time.perf_counter(), None if seeing is None else seeing.displacement_variance
-    flow_variance = float(np.mean([np.square(flow).mean() for flow in iter_frames(centroid.flows)]))
-    # Without a displacement that can be measured, that of the flow stands for it.
-    frames = float(len(training)) if seeing is None or known is None else seeing.independent_frames
-    rows, columns = run.prepared.picture
+    rows, columns = picture = run.prepared.picture
     seen, flows = training[:, rows, columns], centroid.flows[:, rows, columns]
-    witnesses = measure_witnesses(seen, flows, flow_variance if known is None else known.value, frames)
+    if seeing is not None and known is not None:
+        displacement, frames = known.value, seeing.independent_frames
+    else:
+        # Without a displacement that can be measured, that of the flow stands for it, less what the camera adds.
+        about = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
+        displacement, frames = float(np.mean(about)), float(len(training))
+    witnesses = replace(measure_witnesses(seen, flows, displacement, frames), picture=picture)
     run.seconds["witnesses"] = time.perf_counter() - begun
     return witnesses
 

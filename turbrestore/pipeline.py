@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .agreement.last_guard import keep_agreed
+from .blind.blur_to_remove import SIGMAS_A_SIDE
 from .blind.remove_blur import Deblurred, remove_blur_steps
 from .core.arrays import FloatArray
 from .core.decision import Decision
@@ -45,8 +46,6 @@ from .wording import explain_border
 
 # Every pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
-# The shorter side of the image is at least this many widths of the blur; a wider blur leaves nothing to restore.
-_SIGMAS_A_SIDE = 8
 
 
 def restore(
@@ -235,7 +234,7 @@ def _crop(image: FloatArray, seen: FloatArray, border: str, deblurred: Deblurred
 
 
 def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
-    largest = min(shape[1:3]) / _SIGMAS_A_SIDE
+    largest = min(shape[1:3]) / SIGMAS_A_SIDE
     require(
         sigma is None or sigma <= largest,
         f"sigma: expected at most {largest:g} pixels for frames of {shape[2]}×{shape[1]}, found {sigma}",

@@ -213,6 +213,8 @@ def test_frames_are_chosen_by_the_strip_and_the_line(open_tab):
 
 
 def test_what_astronomers_choose_is_in_the_command(open_tab, app):
+    from playwright.sync_api import expect
+
     dark = app.folder / "dark.png"
     write_image(dark, np.zeros((192, 256), np.float32), 8)
     page = open_tab()
@@ -229,7 +231,7 @@ def test_what_astronomers_choose_is_in_the_command(open_tab, app):
         command = page.get_by_label("Command", exact=True).inner_text()
         assert shlex.split(command)[4:] == ["--roi=60,40,64,48", "--dark=dark.png"]
         press(page, "Whole frame")
-        assert page.get_by_label("width", exact=True).input_value() == ""
+        expect(page.get_by_label("width", exact=True)).to_have_value("")
         assert not page.get_by_role("button", name="Whole frame").is_visible()
     finally:
         dark.unlink()

@@ -69,3 +69,13 @@ def test_few_frames_and_small_ones_are_not_measured(scene):
     frames = np.repeat(scene[None, :90], 8, axis=0)
     assert measure_variation(frames, still(frames)) is None
     assert RINGS[-1] == 0.5
+
+
+def test_a_camera_that_moves_far_adds_no_variation():
+    wide = SCENES["camera"](192, 256)
+    steps = (0, 9, 21, 30, 39, 44)
+    frames = noisy(np.stack([wide[:, step : step + 200] for step in steps]))
+    flows = still(frames)
+    flows[..., 0] = np.mean(steps) - np.reshape(steps, (-1, 1, 1))
+    found = measure_variation(frames, flows)
+    assert (np.abs(found.amplitude)[CLEAR] < 0.01).all()

@@ -152,9 +152,9 @@ class TestPage:
         text = html.unescape(page)
         for word in ("Frame 3", "Mean", "Centroid", "Filtered", "Result", "3 states", "Blur by all witnesses", "numpy"):
             assert word in text
-        assert f"{whole.blur.sigma:.2f} ± {whole.blur.uncertainty:.2f} px" in text
+        assert f"{whole.posterior.width[1]:.2f} px" in text and f"{whole.posterior.removed:.2f} px removed" in text
         labels = [a["aria-label"] for tag, a in Elements(page).found if tag == "svg" and "aria-label" in a]
-        assert len(labels) == 9 + bool(whole.deconvolution.recorded.size)
+        assert len(labels) == 11 + bool(whole.deconvolution.recorded.size)
         for stage in whole.seconds.values():
             assert f"{stage:.2f} s" in text
 
@@ -179,7 +179,7 @@ class TestPage:
 
     def test_what_the_image_does_not_tell_is_said(self, whole):
         blur = dataclasses.replace(whole.blur, sigma=0.0, uncertainty=math.inf, widths=np.zeros(0), costs=np.zeros(0))
-        unknown = dataclasses.replace(whole, blur=blur)
+        unknown = dataclasses.replace(whole, blur=blur, posterior=None)
         (fact,) = (fact for fact in facts.findings(unknown) if fact.name == "Estimated blur")
         assert (fact.value, fact.note, fact.doubtful) == ("0.00 px", "cannot be measured", True)
         assert "could not be estimated" in [fact.note for fact in facts.headline(unknown)]
@@ -190,7 +190,7 @@ class TestPage:
         page = render_report(whole, doubted)
         assert page.index("frame 3 left out") < page.index('<dl class="headline">')
         assert page.count("frame 3 left out") == 1
-        assert "times as sharp as their mean" in sure
+        assert "times as sharp as the mean of 6 frames" in sure
         assert facts.verdict(whole, doubted).checks[0] == doubted.warnings[0]
 
     def test_settings_that_differ_are_marked(self, run):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from ..blur.edges import limit_to_edges
 from ..blur.estimation import BlurEstimate, estimate_blur
 from ..blur.image_evidence import image_evidence
@@ -11,6 +13,10 @@ from ..blur.posterior import BlurPosterior, BlurWitnesses, blur_posterior
 from ..core.arrays import FloatArray, luminance
 from ..deconvolution.deconvolve import DeconvolutionParams
 from ..runtime.runtime import Runtime
+
+# The widest blur that is found, pixels, and the least shorter side of an image in widths of its blur: a wider one
+# leaves nothing to restore.
+WIDEST, SIGMAS_A_SIDE = 21.0, 8
 
 
 def find_blur(
@@ -22,9 +28,13 @@ def find_blur(
     if witnesses is None:
         return estimate_blur(image, exponent=params.exponent, runtime=runtime), None
     grey = luminance(image)
+    if witnesses.picture is not None:
+        grey = np.ascontiguousarray(grey[witnesses.picture])
     evidence = image_evidence(grey, runtime)
     ratio = None if witnesses.variation is None else witnesses.variation.with_power(grey)
     posterior = blur_posterior(evidence, witnesses, ratio)
+    widest = min(WIDEST, min(grey.shape) / SIGMAS_A_SIDE)
+    posterior = replace(posterior, removed=min(posterior.removed, widest))
     if evidence is None:
         return estimate_blur(image, exponent=params.exponent, runtime=runtime), replace(posterior, removed=0.0)
     if posterior.removed == 0:
@@ -34,4 +44,4 @@ def find_blur(
     if not limited.edge_limited:
         return evidence.estimate, posterior
     removed = limited.sigma if limited.blurred else 0.0
-    return evidence.estimate, replace(posterior, removed=removed, exponent=limited.exponent)
+    return evidence.estimate, replace(posterior, removed=removed, exponent=limited.exponent, edge_limited=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ..blur.estimation import BlurEstimate
 from ..blur.posterior import BlurPosterior
 from ..core.decision import Decision
@@ -58,12 +60,15 @@ def explain_posterior(posterior: BlurPosterior) -> Decision:
         "the variation of the frames": posterior.by_variation,
         "the edges of the image": posterior.by_image,
     }
+    witnesses = {name: found for name, found in witnesses.items() if np.isfinite(found).all()}
     said = ", ".join(f"{name} {found[0]:.2f} to {found[2]:.2f}" for name, found in witnesses.items())
     cause = "mostly by the air" if posterior.air > _MOSTLY else "by the air or the lens"
     if posterior.air < 1 - _MOSTLY:
         cause = "not by the air"
     reason = f"{width:.2f} pixels, {low:.2f} to {high:.2f}, {cause}; expected from {said}"
-    if posterior.removed == 0:
+    if posterior.edge_limited:
+        reason = f"the edges of the image are too steep for more; {reason}"
+    elif posterior.removed == 0:
         reason = f"no blur is certain enough; {reason}"
     outside = [name for name, found in witnesses.items() if found[0] > high or found[2] < low]
     if outside:

@@ -26,7 +26,7 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.tiling import halo_tiles, largest_tile
 from .blur_map import BlurMap, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
-from .blur_to_remove import find_blur
+from .blur_to_remove import WIDEST, find_blur
 from .decisions import explain_blur, explain_blur_map, explain_guards, explain_posterior
 from .guards import GuardParams, GuardReading, evaluate_guards
 from .tiled_deconvolution import MOST_THREADS, tiled_deconvolution_steps
@@ -36,8 +36,6 @@ Result = TypeVar("Result")
 # Bytes per pixel, and per pixel and channel, of what is computed before and after the deconvolution; the guards take
 # most.
 _BYTES, _CHANNEL_BYTES = 22, 2
-# The widest blur that an estimate finds, pixels.
-_WIDEST = 21.0
 # Bytes per pixel of the maps of widths, and per pixel and channel of the results of two attempts.
 _WIDTHS_BYTES, _RESULTS_BYTES = 8, 8
 
@@ -249,7 +247,7 @@ def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side
     pixels, channels = shape[0] * shape[1], shape[2] if len(shape) == 3 else 1
     part = shape if side is None else (*largest_tile((shape[0], shape[1]), side), *shape[2:])
     beside = float(pixels * (_BYTES + channels * _CHANNEL_BYTES))
-    params = params if params.sigma is not None else replace(params, sigma=_WIDEST)
+    params = params if params.sigma is not None else replace(params, sigma=WIDEST)
     return _image_bytes(shape) + max(beside, deconvolution_memory(part, params, MOST_THREADS))
 
 

@@ -17,7 +17,7 @@ Each gives the likelihood of every hypothesis (D/r0, λ/D, σ_l).  One more hypo
 does not blur it.
 
 1. The displacement: V is that of the hypothesis (Fried 1966), within a factor that the outer scale leaves open.
-2. The variation of the spectra.  Expected are ``g s + 0.8 ε² ln² H + j`` and ``g s_4 + 1.4 ε² ln² H + j/4`` with
+2. The variation of the spectra.  Expected are ``g s + 0.8 ε² ln² H + j`` and ``g s_4 + 1.36 ε² ln² H + j/4`` with
    ``j = exp(4π² τ² ν²) − 1``: the air, the static blur that registration stretches, and displacement that it misses.
 3. The image: ``exp(−κ_m (L − min L))``.  L is a mean over gradients that are neither independent nor exactly modelled,
    so it counts as that of only κ_m of them.  Scenes are soft themselves, which adds to the width in squares.
@@ -53,11 +53,11 @@ Float64Array = NDArray[np.float64]
 # Hypotheses: D/r0, λ/D and σ_l.
 _STRENGTHS = np.geomspace(0.5, 7, 11)
 _DIFFRACTIONS = np.geomspace(0.35, 4.5, 11)
-_LENSES = np.array([0.2, 0.35, 0.5, 0.7, 0.9, 1.1, 1.35, 1.6, 1.9, 2.3, 2.8, 3.4, 4.2])
+_LENSES = np.array([0.2, 0.35, 0.5, 0.7, 0.9, 1.1, 1.35, 1.6, 1.9, 2.3, 2.8, 3.4, 4.2, 5.2, 6.5, 8.0, 10.0])
 # Prior: usual λ/D and the standard deviation of its logarithm; share of air that does not blur; weights of the σ_l.
 _USUAL_DIFFRACTION, _DIFFRACTION_SPREAD, _NO_BLUR = 1.4, 0.6, 0.05
-_LENS_PRIOR = np.array([22, 16, 12, 7, 7, 6, 6, 6, 5, 4.5, 4, 3, 1.5])
-# Logarithms of V over which air that does not blur is equally likely; it stands still below the second, squared pixels.
+_LENS_PRIOR = np.array([22, 16, 12, 7, 7, 6, 6, 6, 5, 4.5, 4, 3, 1.5, 1, 0.7, 0.5, 0.3])
+# Range of ln V of air that does not blur, V below which a scene stands still, and the least V, squared pixels.
 _RANGE_OF_V, _STILL, _LEAST_V = 7.0, 0.03, 1e-3
 # g and τ: values, and mean and standard deviation of the logarithm.
 _SHARES, _SHARE_PRIOR = np.exp([-2.2, -1.6, -1.1, -0.7, -0.3]), (-1.1, 0.5)
@@ -71,8 +71,8 @@ _FIRST_RING, _LAST_RING, _CLEAR = 2, 25, 2.0
 # κ_m; softness of scenes, pixels, with weights.
 _GRADIENTS = 40.0
 _SOFTNESS = ((0.25, 0.36), (0.5, 0.35), (0.8, 0.2), (1.15, 0.07), (1.6, 0.02))
-# A witness whose model does not hold must not outvote the others: the most that displacement, variation and image count
-# against a hypothesis, as logarithms.  The two of the frames together outvote the image, and it each of them.
+# The most that displacement, variation and image count against a hypothesis, as logarithms: the model of a witness may
+# not hold.  Together the two witnesses of the frames outvote the image; alone, the image outvotes either.
 _EXCLUDED = (6.0, 8.0, 10.0)
 # Fidelity of the Wiener filter and exponent of the power of a scene; factors on the width that are tried.
 _FIDELITY, _SCENE = 1500.0, 2.2
@@ -90,11 +90,15 @@ _QUANTILES = (0.16, 0.5, 0.84)
 
 @dataclass(frozen=True, eq=False)
 class BlurWitnesses:
-    """What the frames say about their blur: s and s_4, if they could be measured, V, and the frames that V is from."""
+    """What the frames say about their blur: s and s_4, if they could be measured, V, and how many are independent.
+
+    ``picture`` is the part of the image that the frames show, without bars.
+    """
 
     variation: SpectralVariation | None
     displacement: float
     frames: float
+    picture: tuple[slice, slice] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +112,11 @@ class BlurPosterior:
     width : ndarray, float64, shape (3,)
         16 %, 50 % and 84 % quantiles of the width, pixels.
     by_displacement, by_variation, by_image : ndarray, float64, shape (3,)
-        The same by each witness alone.
+        The same by each witness alone; NaN where it says nothing.
     air : float
         Probability that the air has blurred the image.
+    edge_limited : bool
+        Whether less is removed because the edges of the image are too steep for more.
     frequencies : ndarray, float64, shape (k,)
         Of the arrays that follow, cycles per pixel.
     transfer, lowest, highest : ndarray, float64, shape (k,)
@@ -128,6 +134,7 @@ class BlurPosterior:
     by_variation: Float64Array
     by_image: Float64Array
     air: float
+    edge_limited: bool
     frequencies: Float64Array
     transfer: Float64Array
     lowest: Float64Array
@@ -182,7 +189,7 @@ def blur_posterior(
     """
     known, variation = _hypotheses(), witnesses.variation
     scale = 1 if variation is None else variation.reduction
-    of_v = _displacement_likelihood(witnesses.displacement / scale**2, witnesses.frames)[:, None] + 0 * known.width
+    of_v = _displacement_likelihood(witnesses.displacement, witnesses.frames, scale)[:, None] + 0 * known.width
     of_s = 0 * known.width if variation is None else _variation_likelihood(variation)
     of_v, of_s = (np.maximum(one, one.max() - most) for one, most in ((of_v, _EXCLUDED[0]), (of_s, _EXCLUDED[1])))
     kappa = _sharper(known, _normalised(known.prior + of_v + of_s), ratio)
@@ -191,11 +198,13 @@ def blur_posterior(
     kappa = _sharper(known, weights, ratio)
 
     def quantiles(likelihood: Float64Array) -> Float64Array:
+        if np.ptp(likelihood) == 0:
+            return np.full(len(_QUANTILES), np.nan)
         return _quantiles(kappa * scale * known.width, _normalised(known.prior + likelihood))
 
     curves = np.array([np.interp(RINGS * kappa, RINGS, curve) for curve in known.transfer.reshape(-1, len(RINGS))])
     mean = np.exp(weights.ravel() @ np.log(np.maximum(curves, _LEAST_TRANSFER)))
-    width, exponent = _least_loss(curves, weights.ravel(), mean)
+    width, exponent = _least_loss(curves, weights.ravel(), mean, scale)
     width *= scale
     low, high = _curve_quantiles(curves, weights.ravel())
     return BlurPosterior(
@@ -206,6 +215,7 @@ def blur_posterior(
         by_variation=quantiles(of_s),
         by_image=quantiles(of_image),
         air=float(1 - weights[-1].sum()),
+        edge_limited=False,
         frequencies=RINGS / scale,
         transfer=mean,
         lowest=low,
@@ -254,12 +264,15 @@ def _shapes(transfer: Float64Array) -> tuple[Float64Array, Float64Array]:
     return half_frequency(1.0) / half, exponent
 
 
-def _displacement_likelihood(variance: float, frames: float) -> Float64Array:
-    """Log likelihood of V for every air."""
-    known, measured = _hypotheses(), max(variance, _LEAST_V)
+def _displacement_likelihood(variance: float, frames: float, scale: int) -> Float64Array:
+    """Log likelihood of V, in pixels of the image, for every air in reduced pixels; 0 where V is not known."""
+    known = _hypotheses()
+    if not np.isfinite(variance):
+        return np.zeros(len(known.prior))
+    still, measured = variance < _STILL, max(variance, _LEAST_V) / scale**2
     spread = np.hypot(TILT_SPREAD, 1.4 / max(frames, 1.0) ** 0.5)
     of_air = -0.5 * (np.log(measured / known.expected_v) / spread) ** 2 - np.log(spread * np.sqrt(2 * np.pi))
-    return np.append(of_air, np.log(0.5 * (measured < _STILL) + 0.5 / _RANGE_OF_V))
+    return np.append(of_air, np.log(0.5 * still + 0.5 / _RANGE_OF_V))
 
 
 def _variation_likelihood(measured: SpectralVariation) -> Float64Array:
@@ -328,9 +341,9 @@ def _sharper(known: _Hypotheses, weights: Float64Array, ratio: Float64Array | No
     return float(np.clip(after / before, 0.6, 1.1)) if mean[-1] < 0.5 and (mean * ratio)[-1] < 0.5 else 1.0
 
 
-def _least_loss(curves: Float64Array, weights: Float64Array, mean: Float64Array) -> tuple[float, float]:
+def _least_loss(curves: Float64Array, weights: Float64Array, mean: Float64Array, scale: int) -> tuple[float, float]:
     """Width and exponent of the blur whose removal loses least on average, width 0 if removing none does."""
-    noise = (2 * np.pi * RINGS) ** 2 / _FIDELITY
+    noise = (2 * np.pi * RINGS / scale) ** 2 / _FIDELITY
     scene = np.append(0.0, RINGS[1:] ** (1 - _SCENE))
     (width,), (exponent,) = _shapes(mean[None])
 

@@ -33,6 +33,8 @@ Float64Array = NDArray[np.float64]
 SIDE, _BORDER = 64, 16
 # Most windows along an axis, and most frames.
 _WINDOWS, _FRAMES = 5, 48
+# Fewest frames that are compared.
+_FEWEST = 4
 # Frames by whose flows white noise is warped, and highest rings, from which the noise is taken.
 _NOISE_FRAMES, _NOISE_RINGS = 4, 4
 # Least power of the noise: a standard deviation of 10⁻⁴ under the window.
@@ -49,7 +51,8 @@ class SpectralVariation:
 
     ``amplitude`` is s and ``power`` is s_4, with their standard errors; ``signal`` is the ratio of the power of the
     scene to that of the noise in a frame, ``mean_power`` the power of the mean of the frames without its noise, and
-    ``stretch`` is ε.  Frames were reduced by the factor ``reduction`` before.
+    ``stretch`` is ε; ``noise_power`` is the power of the noise of one of the
+    ``frames``, which were reduced by the factor ``reduction`` before.
     """
 
     amplitude: Float64Array
@@ -66,34 +69,45 @@ class SpectralVariation:
     def with_power(self, image: FloatArray) -> Float64Array:
         """Amplitude spectrum of an image of the same scene over that of the mean of the frames."""
         own = window_power(luminance(image), self.reduction) - self.noise_power / self.frames
-        ratio = np.maximum(own, 1e-12) / np.maximum(self.mean_power, 1e-12)
-        return np.sqrt(np.clip(ratio, 0.04, 25.0))
+        ratio = np.sqrt(np.clip(np.maximum(own, 1e-12) / np.maximum(self.mean_power, 1e-12), 0.04, 25.0))
+        lost = np.flatnonzero(self.signal[2:] < 2)
+        if len(lost):
+            # Where noise is stronger than the scene, the last ratio that is known goes on.
+            ratio[2 + lost[0] :] = ratio[1 + lost[0]]
+        return ratio
 
 
 def measure_variation(frames: FloatArray, flows: FloatArray, reduction: int = 1) -> SpectralVariation | None:
     """Measure how the spectra of frames (T, H, W[, 3]) vary that are registered by flows (T, H, W, 2), pixels.
 
-    None if there are fewer than four frames, or if the reduced image has no room for a window.
+    None if there are fewer than four frames that show a window, or if the reduced image has no room for one.
     """
     height, width = (length // reduction for length in frames.shape[1:3])
     corners = _corners(height, width)
-    if len(frames) < 4 or not corners:
+    if len(frames) < _FEWEST or not corners:
         return None
     picked = np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)
     rng, sums, stretches, responses = np.random.default_rng(0), [], [], []
+    every = -(-len(picked) // _NOISE_FRAMES)
     for top, left in corners:
         spectra, noise = [], []
         for count, number in enumerate(picked):
-            plane, flow = _around(frames[number], flows[number], top, left, reduction)
+            found = _around(frames[number], flows[number], top, left, reduction)
+            if found is None:
+                continue
+            plane, flow = found
             spectra.append(_spectrum(warp(plane, flow)))
-            if count < _NOISE_FRAMES:
+            if count % every == 0:
                 white = rng.standard_normal(plane.shape).astype(np.float32)
                 noise.append(_spectrum(warp(white, flow)))
                 stretches.append(_mean_square_derivative(flow))
-        sums.append(_sums(np.array(spectra)))
-        responses.append(_by_ring(np.square(np.abs(np.array(noise))).mean(axis=0)))
+        if len(spectra) >= _FEWEST and noise:
+            sums.append(_sums(np.array(spectra)))
+            responses.append(_by_ring(np.square(np.abs(np.array(noise))).mean(axis=0)))
         drop_pages(frames)
         drop_pages(flows)
+    if not sums:
+        return None
     response = np.mean(responses, axis=0)
     return _ratios(np.array(sums), response / response[2:6].mean(), len(picked), float(np.mean(stretches)), reduction)
 
@@ -130,10 +144,20 @@ def _reduced(stack: FloatArray, top: int, left: int, side: int, factor: int) -> 
     return cv2.resize(part, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
 
 
-def _around(frame: FloatArray, flow: FloatArray, top: int, left: int, factor: int) -> tuple[FloatArray, FloatArray]:
-    """Luminance of a frame and its flow in and around a window, both in reduced pixels."""
+def _around(
+    frame: FloatArray, flow: FloatArray, top: int, left: int, factor: int
+) -> tuple[FloatArray, FloatArray] | None:
+    """Luminance of a frame in and around what a window shows, and the flow from there, both in reduced pixels.
+
+    The place of the part takes the whole pixels of the mean flow, which a camera may add.  None beyond the frame.
+    """
     moved = _reduced(flow, top, left, SIDE, factor) / np.float32(factor)
-    return luminance(_reduced(frame, top, left, SIDE, factor)), moved
+    whole = np.rint(moved.mean(axis=(0, 1)))
+    row, column = top + int(whole[1]), left + int(whole[0])
+    ends = ((row, frame.shape[0]), (column, frame.shape[1]))
+    if any(start < _BORDER or (start + SIDE + _BORDER) * factor > length for start, length in ends):
+        return None
+    return luminance(_reduced(frame, row, column, SIDE, factor)), moved - whole.astype(np.float32)
 
 
 def _spectrum(plane: FloatArray) -> NDArray[np.complex64]:
@@ -178,7 +202,7 @@ def _ratios(
 ) -> SpectralVariation:
     """Ratios of the sums over windows (n, 5, rings), and their errors by leaving out one window after the other."""
     number = len(sums)
-    # Frames without any noise are taken for as noisy as this.
+    # Frames without any noise are taken to have this noise.
     level = float(np.median((sums[:, 0].mean(axis=0) / response)[-_NOISE_RINGS:]))
     noise = max(level, _LEAST_NOISE) * response
 

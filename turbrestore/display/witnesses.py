@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 Curve = NDArray[np.float64]
 
-# Least variation that is drawn.
-_LEAST = 1e-4
+# Least and largest variation that are drawn.
+_LEAST, _MOST = 1e-4, 10.0
 
 
 def plot_witnesses(widths: Mapping[str, ArrayLike], removed: float) -> Figure:
@@ -75,12 +75,13 @@ def plot_variation(frequencies: ArrayLike, rows: Mapping[str, tuple[ArrayLike, A
     drawn = False
     for number, (name, columns) in enumerate(rows.items()):
         value, error, expected = (np.asarray(column, float) for column in columns)
-        seen = np.isfinite(value) & (value > _LEAST)
+        seen = np.isfinite(value) & (value > np.maximum(error, _LEAST)) & (value < _MOST)
         color = (ACCENT, INK)[number % 2]
         bars = np.stack([np.minimum(error, value * 0.9), error])[:, seen]
         axes.errorbar(nu[seen], value[seen], bars, color=color, marker="o", markersize=3, linewidth=0, elinewidth=0.8)
-        axes.plot(nu, np.maximum(expected, _LEAST), color=color, linewidth=1.2, label=name)
-        drawn = drawn or bool(seen.any())
+        if seen.any():
+            axes.plot(nu, np.clip(expected, _LEAST, _MOST), color=color, linewidth=1.2, label=name)
+            drawn = True
     if not drawn:
         return write_instead(figure, axes, "the frames hardly vary")
     axes.set_yscale("log")

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..blur.posterior import BlurPosterior
 from ..blur.psf import radial_otf
 from ..deconvolution.deconvolve import Deconvolution
@@ -144,6 +146,7 @@ def _witnesses(posterior: BlurPosterior) -> Iterator[Panel]:
         "edges": posterior.by_image,
         "all": posterior.width,
     }
+    widths = {name: found for name, found in widths.items() if np.isfinite(found).all()}
     figure = plot_witnesses(widths, posterior.removed)
     caption = "Bars hold the width with a probability of 68 %. Dashed: the width that is removed."
     yield make_panel(figure, "witnesses", "Widths of the blur by each witness", caption)

@@ -143,8 +143,10 @@ FIELDS: dict[str, dict[str, Field]] = {
     "posterior": {
         "removed": Number(),
         "exponent": Number(),
-        **dict.fromkeys(("width", "by_displacement", "by_variation", "by_image"), Array("f8", "3", low=0)),
+        "width": Array("f8", "3", low=0),
+        **dict.fromkeys(("by_displacement", "by_variation", "by_image"), Array("f8", "3", low=0, gaps=True)),
         "air": Number(high=1 + _ROUNDING),
+        "edge_limited": Flag(),
         **dict.fromkeys(("frequencies", "transfer", "lowest", "highest"), Array("f8", "k", low=0)),
         **{
             f"{prefix}{name}{suffix}": Array("f8", "k", gaps=True)
