@@ -71,7 +71,8 @@ class TestWriting:
         assert np.mean(np.abs(found - expected)) < 0.02
 
     @pytest.mark.parametrize("name", ["a.mkv", "a.mp4", "a.npy", "a.tif", "a.ser"])
-    @pytest.mark.parametrize("shape", [(5, 16, 20), (5, 16, 20, 3)])
+    # Of frames of 16×20 pixels, x264 itself makes other bytes once in a thousand times.
+    @pytest.mark.parametrize("shape", [(5, 64, 96), (5, 64, 96, 3)])
     def test_the_same_frames_give_the_same_bytes(self, tmp_path, name, shape):
         stack = np.random.default_rng(0).random(shape, dtype=np.float32)
         written = []

@@ -30,7 +30,7 @@ from turbrestore.runtime.scratch import new_stack
 
 @pytest.fixture(scope="module")
 def restoration():
-    frames = make_sequence(seed=21, count=6, size=64, rms=0.6).frames
+    frames = make_sequence(seed=21, count=6, size=64, rms=0.6, blur=2.0).frames
     return restore(frames, RestoreParams(centroid=CentroidParams(iterations=1)))
 
 

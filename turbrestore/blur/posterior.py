@@ -29,7 +29,8 @@ Removal
 The mean of ln H under the posterior is the shape.  Its width is multiplied by the factor, 1.1 at most, that loses least
 on average over the hypotheses, in decibels: the loss is ``Σ_ν ν^(1 − 2.2) (W H − 1)²`` after the Wiener filter W of the
 blur that is removed, for a scene whose power falls as ν^(−2.2).  Too wide a blur amplifies what is left and costs more
-than too narrow a one.
+than too narrow a one.  Where the image contradicts the posterior, the geometric mean of this width and of the widest
+that the image allows is removed.
 
 Constants of the likelihoods were set on simulated clips; ``benchmarks/results/blur_calibration.md`` is of others.
 """
@@ -205,15 +206,16 @@ def blur_posterior(
     curves = np.array([np.interp(RINGS * kappa, RINGS, curve) for curve in known.transfer.reshape(-1, len(RINGS))])
     mean = np.exp(weights.ravel() @ np.log(np.maximum(curves, _LEAST_TRANSFER)))
     width, exponent = _least_loss(curves, weights.ravel(), mean, scale)
-    width *= scale
+    by_image, whole = quantiles(of_image), _quantiles(kappa * scale * known.width, weights)
+    width = _less_if_contradicted(width * scale, float(by_image[2]), float(whole[0]))
     low, high = _curve_quantiles(curves, weights.ravel())
     return BlurPosterior(
         removed=width if width >= _LEAST_REMOVED else 0.0,
         exponent=exponent,
-        width=_quantiles(kappa * scale * known.width, weights),
+        width=whole,
         by_displacement=quantiles(of_v),
         by_variation=quantiles(of_s),
-        by_image=quantiles(of_image),
+        by_image=by_image,
         air=float(1 - weights[-1].sum()),
         edge_limited=False,
         frequencies=RINGS / scale,
@@ -358,6 +360,11 @@ def _least_loss(curves: Float64Array, weights: Float64Array, mean: Float64Array,
         if value < best:
             best, chosen = value, factor
     return float(chosen * width), float(exponent)
+
+
+def _less_if_contradicted(width: float, widest_by_image: float, narrowest: float) -> float:
+    """Return the mean, in logarithm, with the widest blur by the image where the posterior has only wider ones."""
+    return (width * min(width, widest_by_image)) ** 0.5 if widest_by_image < narrowest else width
 
 
 def _normalised(logs: Float64Array) -> Float64Array:
