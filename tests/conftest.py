@@ -1,5 +1,6 @@
 """Small synthetic sequences with known motion, shared by several tests."""
 
+import os
 import shutil
 import signal
 from dataclasses import dataclass
@@ -8,10 +9,17 @@ import cv2
 import numpy as np
 import pytest
 import skimage.data
+from hypothesis import HealthCheck, settings
 
 from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
+
+# A busy machine is slow, which no test is to blame for; in CI the examples are the same every time.
+settings.register_profile(
+    "shared", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=bool(os.environ.get("CI"))
+)
+settings.load_profile("shared")
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
