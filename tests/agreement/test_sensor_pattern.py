@@ -3,7 +3,7 @@
 import numpy as np
 
 from conftest import make_sequence
-from turbrestore.agreement.sensor_pattern import without_stripes
+from turbrestore.agreement.sensor_pattern import _dead, without_stripes
 from turbrestore.io.source import FrameSource
 
 SIDE = 160
@@ -46,3 +46,9 @@ def test_stripes_of_the_scene_are_left():
     waves = np.stack([np.tile(0.5 + 0.2 * np.sin((x - shift - shift.mean()) / 2), (96, 1)) for shift in flows])
     source = FrameSource.from_array(np.float32(waves + np.random.default_rng(1).normal(0, 0.01, waves.shape)))
     assert without_stripes(source) == (source, ())
+
+
+def test_columns_at_the_border_are_not_dead():
+    variance = np.full((40, 400), 1e-4, np.float32)
+    variance[:, [0, 1, 30, 399]] = 0
+    assert np.flatnonzero(_dead(variance, 0.01)).tolist() == [30]

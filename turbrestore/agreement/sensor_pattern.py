@@ -159,7 +159,12 @@ def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
         ]
     )
     dead = level < _DEAD * np.minimum(around, noise if noise > _LEAST_NOISE else 0)
-    return dead if dead.mean() <= _MOST_DEAD else np.zeros_like(dead)
+    if dead.mean() > _MOST_DEAD:
+        return np.zeros_like(dead)
+    # Columns at the border are bars, or light that is clipped there.
+    alive = np.flatnonzero(~dead)
+    dead[: alive[0]] = dead[alive[-1] + 1 :] = False
+    return dead
 
 
 def _filled(image: FloatArray, dead: NDArray[np.bool_]) -> FloatArray:

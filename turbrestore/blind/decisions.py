@@ -51,9 +51,9 @@ def explain_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None 
     return Decision("blur", choice, found + where + remark)
 
 
-def explain_posterior(posterior: BlurPosterior) -> Decision:
-    """Explain which width is removed, and what each witness says."""
-    choice = f"{posterior.removed:.2f} pixels removed" if posterior.removed > 0 else "none removed"
+def explain_posterior(posterior: BlurPosterior, removed: float) -> Decision:
+    """Explain which width is removed in the end, pixels, and what each witness says."""
+    choice = f"{removed:.2f} pixels removed" if removed > 0 else "none removed"
     low, width, high = posterior.width
     witnesses = {
         "the displacement": posterior.by_displacement,

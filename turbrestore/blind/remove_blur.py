@@ -216,7 +216,7 @@ def remove_blur_steps(
     else:
         result, readings = yield from guarded_steps(attempt, image, sigma, guards, first)
     on_guards = explain_guards(result.sigma, readings, guards)
-    on_blur = explain_blur(blur, sigma, tiles) if posterior is None else explain_posterior(posterior)
+    on_blur = explain_blur(blur, sigma, tiles) if posterior is None else explain_posterior(posterior, result.sigma)
     decisions = (on_blur, *explain_blur_map(tiles), *on_guards)
     return Deblurred(result, blur, tiles, readings, decisions, posterior)
 
