@@ -64,21 +64,6 @@ class _Stripes:
 def without_stripes(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
     """Take stripes of the sensor out of the frames; a source without them is returned as it is.
 
-    Parameters
-    ----------
-    source : FrameSource
-
-    Returns
-    -------
-    source : FrameSource
-    decisions : tuple of Decision
-        What was found, if anything.
-
-    Raises
-    ------
-    DataError
-        Frames are damaged.
-
     Examples
     --------
     >>> rng = np.random.default_rng(0)

@@ -53,21 +53,6 @@ class Bars:
 def without_bars(source: FrameSource) -> tuple[FrameSource, Bars | None, tuple[Decision, ...]]:
     """Fill bars with the mirrored picture; a source without bars is returned as it is.
 
-    Parameters
-    ----------
-    source : FrameSource
-
-    Returns
-    -------
-    source : FrameSource
-    bars : Bars or None
-    decisions : tuple of Decision
-
-    Raises
-    ------
-    DataError
-        Frames are damaged.
-
     Examples
     --------
     >>> frames = np.random.default_rng(0).uniform(0.3, 0.9, (5, 32, 32)).astype(np.float32)

@@ -94,21 +94,6 @@ class Light:
 def steady_light(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
     """Take changes of the light out of the frames; a source whose light is steady is returned as it is.
 
-    Parameters
-    ----------
-    source : FrameSource
-
-    Returns
-    -------
-    source : FrameSource
-    decisions : tuple of Decision
-        What was found, if anything.
-
-    Raises
-    ------
-    DataError
-        Frames are damaged.
-
     Examples
     --------
     >>> scene = np.random.default_rng(0).uniform(0.2, 0.6, (1, 32, 32))

@@ -175,25 +175,8 @@ def without_overlay(
 ) -> tuple[FrameSource, NDArray[np.bool_] | None, Title | None, tuple[Decision, ...]]:
     """Replace what stands in the frames while the scene moves; a source without it is returned as it is.
 
-    Parameters
-    ----------
-    source : FrameSource
-    mask : ndarray, bool, shape (H, W), optional
-        Pixels that are replaced; by default they are looked for.
-
-    Returns
-    -------
-    source : FrameSource
-    hidden : ndarray, bool, shape (H, W), or None
-        Pixels of the scene that no frame shows; None where nothing stands.
-    title : Title or None
-        What has to be put back into results, because the camera stands as well.
-    decisions : tuple of Decision
-
-    Raises
-    ------
-    DataError
-        Frames are damaged.
+    Return the source, the pixels (H, W) of the scene that no frame shows, the title that has to be put back into
+    results because the camera stands as well, and the decisions.  ``mask`` (H, W) names the pixels that are replaced.
 
     Examples
     --------

@@ -142,21 +142,6 @@ class _Usual:
 def without_passers(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
     """Replace what passes by the background; a source in which nothing does is returned as it is.
 
-    Parameters
-    ----------
-    source : FrameSource
-
-    Returns
-    -------
-    source : FrameSource
-    decisions : tuple of Decision
-        What was found, if anything.
-
-    Raises
-    ------
-    DataError
-        Frames are damaged.
-
     Examples
     --------
     >>> frames = np.tile(np.kron(np.eye(3, 6), np.full((16, 16), 0.5)), (15, 1, 1))

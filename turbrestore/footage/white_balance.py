@@ -46,21 +46,6 @@ class WhiteBalance:
 def steady_white_balance(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
     """Take a white balance that changes out of the frames; others, and grey frames, are returned as they are.
 
-    Parameters
-    ----------
-    source : FrameSource
-
-    Returns
-    -------
-    source : FrameSource
-    decisions : tuple of Decision
-        What was found, if anything.
-
-    Raises
-    ------
-    DataError
-        Frames are damaged.
-
     Examples
     --------
     >>> scene = np.random.default_rng(0).uniform(0.2, 0.6, (1, 32, 32, 3))
