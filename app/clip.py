@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from turbrestore.core.arrays import FloatArray
-from turbrestore.footage.content import clean_source
+from turbrestore.footage.checks.content import clean_source
 from turbrestore_cli.inputs import open_checked
 from turbrestore_cli.inspection import describe_clip
 from turbrestore_cli.options import Selection

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from turbrestore.core.arrays import FloatArray
-from turbrestore.footage.content import clean_source, keep_all
+from turbrestore.footage.checks.content import clean_source, keep_all
 from turbrestore.io.output import check_output
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.report.film import Film, film_length, write_film

@@ -8,7 +8,7 @@ from pathlib import Path
 from turbrestore.core.arrays import FloatArray, check_image
 from turbrestore.core.errors import DataError, require
 from turbrestore.footage.calibration import calibrated, make_calibration
-from turbrestore.footage.content import ContentParams, ContentReport, check_content, clean_source
+from turbrestore.footage.checks.content import ContentParams, ContentReport, check_content, clean_source
 from turbrestore.footage.object_crop import crop_to_object
 from turbrestore.io.astronomy.fits import open_fits
 from turbrestore.io.astronomy.fits_header import is_fits

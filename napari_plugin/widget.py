@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import DataError, TurbrestoreError
-from turbrestore.footage.content import check_content, clean_source
+from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.footage.frame_selection import Share
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames

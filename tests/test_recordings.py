@@ -9,7 +9,7 @@ import pytest
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.bars import without_bars
-from turbrestore.footage.content import check_content
+from turbrestore.footage.checks.content import check_content
 from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.light import steady_light
 from turbrestore.footage.overlays import read_static_mask, without_overlay

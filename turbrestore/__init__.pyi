@@ -22,11 +22,11 @@ from .footage.calibration import Calibration as Calibration
 from .footage.calibration import calibrate as calibrate
 from .footage.calibration import calibrated as calibrated
 from .footage.calibration import make_calibration as make_calibration
+from .footage.checks.content import ContentParams as ContentParams
+from .footage.checks.content import ContentReport as ContentReport
+from .footage.checks.content import check_content as check_content
+from .footage.checks.content import clean_source as clean_source
 from .footage.checks.scene_cuts import Scene as Scene
-from .footage.content import ContentParams as ContentParams
-from .footage.content import ContentReport as ContentReport
-from .footage.content import check_content as check_content
-from .footage.content import clean_source as clean_source
 from .footage.object_crop import crop_to_object as crop_to_object
 from .io.images import read_image as read_image
 from .io.images import write_image as write_image

@@ -16,7 +16,7 @@ from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.errors import require
 from .footage.bars import Bars
-from .footage.content import without_blank
+from .footage.checks.content import without_blank
 from .footage.levels import Levels
 from .footage.overlays import Title
 from .fusion import Fused, Run, fuse

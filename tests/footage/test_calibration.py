@@ -7,7 +7,7 @@ from astropy.io import fits
 from conftest import make_sequence
 from turbrestore.core.errors import DataError
 from turbrestore.footage.calibration import calibrated, make_calibration
-from turbrestore.footage.content import check_content, clean_source
+from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.io.images import read_image, write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.footage.content import ContentParams, check_content, clean_source, without_blank
+from turbrestore.footage.checks.content import ContentParams, check_content, clean_source, without_blank
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.pipeline import restore

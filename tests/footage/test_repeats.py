@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
+from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.footage.checks.repeats import RepeatDetector
-from turbrestore.footage.content import check_content, clean_source
 from turbrestore.io.encoding import Encoding
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video

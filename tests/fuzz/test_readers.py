@@ -19,7 +19,7 @@ from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionPar
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import FlowDynamics
 from turbrestore.filtering.alternating import Filtered, FilterParams, filter_frames
-from turbrestore.footage.content import check_content, clean_source
+from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.io.images import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.npy import map_npy, read_npz

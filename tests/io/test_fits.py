@@ -11,7 +11,7 @@ from astropy.io import fits
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.calibration import calibrated, make_calibration
-from turbrestore.footage.content import check_content, clean_source
+from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.io.astronomy.fits import open_fits
 from turbrestore.io.astronomy.fits_output import write_fits
 from turbrestore.io.images import read_image, write_image

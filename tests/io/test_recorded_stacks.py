@@ -6,7 +6,7 @@ import pytest
 import tifffile
 
 from turbrestore.core.errors import DataError
-from turbrestore.footage.content import check_content
+from turbrestore.footage.checks.content import check_content
 from turbrestore.io.images import read_image
 from turbrestore.io.video import open_frames
 from videos import refused, scene

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, OutputError, TurbrestoreError
-from turbrestore.footage.content import check_content, clean_source
+from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.io.astronomy.ser import open_ser, read_ser_header, write_ser
 from turbrestore.io.video import open_frames
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from usual_files import without_times
 
-from turbrestore.footage.content import check_content, clean_source
+from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.io.astronomy.fits_output import write_fits
 from turbrestore.io.images import write_image
 from turbrestore.io.values.counts import range_of_counts

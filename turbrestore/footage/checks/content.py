@@ -12,7 +12,7 @@ saturation            half of the values or more are white                      
 ====================  =================================================================  =============================
 
 :func:`without_blank` finds blank frames alone, and leaves them out.
-:mod:`turbrestore.footage.checks.scene_cuts` detects cuts, :mod:`turbrestore.footage.stuck_pixels` stuck pixels.
+:mod:`turbrestore.footage.checks.scene_cuts` detects cuts, :mod:`turbrestore.footage.checks.stuck_pixels` stuck pixels.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
-from ..core.decision import Decision
-from ..core.errors import ConfigurationError, DataError, require_between
-from ..io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
-from ..io.source import FrameSource, numbers_text
-from .checks.missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, BackdropSum, fill_holes
-from .checks.repeats import RepeatDetector
-from .checks.scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
+from ...core.arrays import FloatArray
+from ...core.decision import Decision
+from ...core.errors import ConfigurationError, DataError, require_between
+from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
+from ...io.source import FrameSource, numbers_text
+from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, BackdropSum, fill_holes
+from .repeats import RepeatDetector
+from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
 from .stuck_pixels import StuckPixelDetector, repair_stuck
 
 _LEAST_CONTRAST = 1 / 510

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
-from ..io.pixels import PixelArray
+from ...core.arrays import FloatArray
+from ...io.pixels import PixelArray
 
 _MOST_STUCK = 0.005
 _FEWEST_FRAMES = 10
