@@ -104,35 +104,7 @@ class _Choice:
 
 
 def plan_memory(shape: tuple[int, ...], params: RestoreParams, runtime: Runtime) -> MemoryPlan:
-    """Decide how many frames are trained on, where they are kept, how many threads work, and how large the tiles are.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Shape of the frames, (T, H, W) or (T, H, W, 3).
-    params : RestoreParams
-    runtime : Runtime
-        What the restoration may use; its scratch folder is that of temporary files if it names none.
-
-    Returns
-    -------
-    MemoryPlan
-
-    Raises
-    ------
-    DataError
-        Fewer than two frames, or frames too small.
-    ConfigurationError
-        More training frames are wanted than there are, the device is not there, or the limit cannot be kept.
-
-    Examples
-    --------
-    >>> plan_memory((300, 1080, 1920), RestoreParams(), Runtime()).train
-    60
-    >>> plan = plan_memory((300, 1080, 1920), RestoreParams(), Runtime(memory_limit="2GB"))
-    >>> plan.train, plan.runtime.scratch is None, plan.tile
-    (60, False, None)
-    """
+    """Decide how many frames are trained on and where they are kept, and set threads and tiles."""
     train = training_share(shape[0], shape[1:], params.train, params.filter.training == "skip")
     runtime = replace(runtime, device=find_device(runtime.device))
     folder = runtime.scratch or Path(tempfile.gettempdir())
@@ -184,39 +156,7 @@ def _has_room(folder: Path, size: int) -> bool:
 def training_share(
     frame_count: int, frame_shape: tuple[int, ...], wanted: int | None = None, half: bool = False
 ) -> int:
-    """Return how many frames the centroid and the flow dynamics are found from, if memory is not limited.
-
-    Parameters
-    ----------
-    frame_count : int
-        Number of frames in the clip.
-    frame_shape : tuple of int
-        (H, W) or (H, W, 3).
-    wanted : int, optional
-        Number that the user asked for.
-    half : bool
-        Whether more than half would leave too few frames to filter.
-
-    Returns
-    -------
-    int
-        ``wanted``; else all of up to 40 frames unless ``half``, then half of them, at most 100 and at most what 1.5 GB
-        hold.
-
-    Raises
-    ------
-    DataError
-        Fewer than two frames, or frames too small.
-    ConfigurationError
-        More frames are wanted than there are.
-
-    Examples
-    --------
-    >>> [training_share(n, (256, 256)) for n in (5, 40, 60, 120, 900)]
-    [5, 40, 40, 60, 100]
-    >>> training_share(40, (256, 256), half=True)
-    20
-    """
+    """Return how many frames the centroid and the flow dynamics are found from, if memory is not limited."""
     if frame_count < 2:
         raise DataError(f"frames: expected at least 2 to restore an image from, found {frame_count}")
     if min(frame_shape[:2]) < MIN_SIDE:

@@ -185,28 +185,7 @@ def compare_flows(flows: ArrayLike, truth: ArrayLike) -> FlowComparison:
 def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Align a result with the truth by cross-correlation, to a fraction of a pixel, and crop both to one interior.
 
-    Parameters
-    ----------
-    result : array_like, shape (H, W) or (H, W, 3)
-    truth : array_like, shape (H', W') or (H', W', 3)
-
-    Returns
-    -------
-    result, truth : ndarray, float32
-        Same shape, grey.
-
-    Raises
-    ------
-    DataError
-        An image is too small, the truth is of one colour, or the result does not fit inside it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> truth = np.random.default_rng(0).random((128, 128)).astype(np.float32)
-    >>> a, t = align(truth[4:, 7:], truth)
-    >>> bool(np.allclose(a, t, atol=0.02))
-    True
+    ``result`` (H, W) or (H, W, 3); ``truth`` (H', W') or (H', W', 3).
     """
     from skimage.registration import phase_cross_correlation
 
@@ -233,27 +212,7 @@ def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
 def comparable(image: FloatArray, name: str) -> FloatArray:
     """Return an image if it is large enough for :func:`compare`.
 
-    Parameters
-    ----------
-    image : ndarray, shape (H, W) or (H, W, 3)
-    name : str
-        Name of the image in the error message.
-
-    Returns
-    -------
-    ndarray
-        The image itself.
-
-    Raises
-    ------
-    DataError
-        A side is shorter than 68 pixels.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> comparable(np.zeros((68, 100), np.float32), "truth").shape
-    (68, 100)
+    ``image`` (H, W) or (H, W, 3).
     """
     if min(image.shape[:2]) < _SMALLEST:
         raise DataError(f"{name}: expected at least {_SMALLEST} pixels a side to be compared, found {image.shape[:2]}")
@@ -261,28 +220,7 @@ def comparable(image: FloatArray, name: str) -> FloatArray:
 
 
 def psnr(image: ArrayLike, truth: ArrayLike) -> float:
-    """Peak signal-to-noise ratio for full scale 1, without alignment.
-
-    Parameters
-    ----------
-    image, truth : array_like, same shape
-
-    Returns
-    -------
-    float
-        dB; infinite for equal images.
-
-    Raises
-    ------
-    DataError
-        Shapes differ.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> round(psnr(np.full((4, 4), 0.1), np.zeros((4, 4))), 3)
-    20.0
-    """
+    """Peak signal-to-noise ratio for full scale 1, without alignment."""
     a, t = np.asarray(image, np.float64), np.asarray(truth, np.float64)
     if a.shape != t.shape:
         raise DataError(f"image: expected the shape of the truth {t.shape}, found {a.shape}")
@@ -293,26 +231,7 @@ def psnr(image: ArrayLike, truth: ArrayLike) -> float:
 def sharpness(image: ArrayLike, reference: ArrayLike) -> float:
     """Mean gradient magnitude relative to that of a reference, for example the temporal mean.
 
-    Parameters
-    ----------
-    image, reference : array_like, shape (H, W) or (H, W, 3)
-
-    Returns
-    -------
-    float
-        Above 1 where the image is sharper than the reference.
-
-    Raises
-    ------
-    DataError
-        The reference has no gradient.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> ramp = np.tile(np.linspace(0, 1, 128, dtype=np.float32), (128, 1))
-    >>> round(sharpness(ramp, 0.5 * ramp), 3)
-    2.0
+    ``image, reference`` (H, W) or (H, W, 3).
     """
     gradients = [_gradient(grey) for grey in map(_grey, iter_frames((image, reference)), ("image", "reference"))]
     if gradients[1] == 0:
@@ -323,29 +242,7 @@ def sharpness(image: ArrayLike, reference: ArrayLike) -> float:
 def overshoot(image: ArrayLike, reference: ArrayLike, tolerance: float = 0.05) -> float:
     """Share of pixels that exceed the local range (7×7) of a reference by more than a tolerance, as ringing does.
 
-    Parameters
-    ----------
-    image, reference : array_like, shape (H, W) or (H, W, 3)
-        Same size.
-    tolerance : float
-        Share of full scale.
-
-    Returns
-    -------
-    float
-        0 to 1.
-
-    Raises
-    ------
-    DataError
-        Sizes differ.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> flat = np.full((64, 64), 0.5, np.float32)
-    >>> overshoot(flat, flat), overshoot(flat + 0.1, flat)
-    (0.0, 1.0)
+    ``image, reference`` (H, W) or (H, W, 3).
     """
     a, r = _grey(image, "image"), _grey(reference, "reference")
     if a.shape != r.shape:
@@ -358,26 +255,7 @@ def overshoot(image: ArrayLike, reference: ArrayLike, tolerance: float = 0.05) -
 def endpoint_error(flow: ArrayLike, truth: ArrayLike) -> float:
     """Mean length of the difference of two flows.
 
-    Parameters
-    ----------
-    flow, truth : array_like, shape (H, W, 2) or (T, H, W, 2)
-        Pixels.
-
-    Returns
-    -------
-    float
-        Pixels.
-
-    Raises
-    ------
-    DataError
-        Shapes differ.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> endpoint_error(np.zeros((2, 2, 2)), np.full((2, 2, 2), (3.0, 4.0)))
-    5.0
+    ``flow, truth`` (H, W, 2) or (T, H, W, 2).
     """
     a, t = check_flow(flow), check_flow(truth, "truth")
     if a.shape != t.shape:

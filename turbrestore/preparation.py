@@ -54,34 +54,7 @@ class Prepared:
 
 
 def prepare(source: FrameSource, train: int, static_mask: str = "auto") -> Prepared:
-    """Prepare the frames of a clip.
-
-    Parameters
-    ----------
-    source : FrameSource
-    train : int
-        Number of frames, from the first on, that the range is taken from.
-    static_mask : str
-        ``auto``, ``off`` or the file of a mask, see :class:`turbrestore.RestoreParams`.
-
-    Returns
-    -------
-    Prepared
-
-    Raises
-    ------
-    DataError
-        Frames are damaged or show nothing, or the mask has another size.
-    InputNotFoundError, StorageError
-        The mask does not exist, or cannot be read.
-
-    Examples
-    --------
-    >>> frames = np.random.default_rng(0).uniform(0.3, 0.9, (5, 32, 32)).astype(np.float32)
-    >>> frames[:, :6] = 0.06
-    >>> prepare(FrameSource.from_array(frames), 5).picture
-    (slice(6, 32, None), slice(0, 32, None))
-    """
+    """Prepare the frames of a clip."""
     mask = None if static_mask in ("auto", "off") else read_static_mask(static_mask, source)
     # Before the light, because a stop would be taken for bands of it.
     source, bars, on_bars = without_bars(source)
@@ -111,33 +84,7 @@ def seeing_of_picture(
 ) -> Seeing:
     """Measure the strength of the turbulence between the bars, since what fills them is not the scene.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
-        Prepared frames; at least three.
-    centroid : Centroid
-        Of these frames, with their levels.
-    optics : Optics, optional
-    threads : int
-        0 means one for each core.
-
-    Returns
-    -------
-    Seeing
-
-    Raises
-    ------
-    DataError
-        Fewer than three frames.
-
-    Examples
-    --------
-    >>> from turbrestore.registration.centroid import find_centroid
-    >>> prepared = prepare(FrameSource.from_array(np.random.default_rng(0).uniform(size=(4, 48, 48))), 4)
-    >>> frames = prepared.source.read()
-    >>> seeing_of_picture(prepared, frames, find_centroid(frames)).remarks[0][:24]
-    'too little structure or '
+    ``frames`` (T, H, W) or (T, H, W, 3).
     """
     rows, columns = prepared.picture
     seen, flows = frames[:, rows, columns], centroid.flows[:, rows, columns]

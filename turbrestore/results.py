@@ -61,13 +61,7 @@ class Store(Protocol):
 
 
 class NoStore:
-    """A store that computes every result and keeps none.
-
-    Examples
-    --------
-    >>> NoStore().get("seven", lambda: 7)
-    7
-    """
+    """A store that computes every result and keeps none."""
 
     stored = frozenset[str]()
 

@@ -103,41 +103,12 @@ def centroid_tasks(
     flow_params: FlowParams,
     runtime: Runtime,
 ) -> Iterator[CentroidTask]:
-    """Describe the centroids of all tiles.
-
-    Parameters
-    ----------
-    source : FrameSource
-        Whole frames.
-    tiles : iterable of HaloTile
-    train, params, flow_params, runtime
-        As in :class:`CentroidTask`.
-
-    Yields
-    ------
-    CentroidTask
-    """
+    """Describe the centroids of all tiles."""
     return (CentroidTask(source.select(roi=tile.roi), train, params, flow_params, runtime) for tile in tiles)
 
 
 def run_centroid_task(task: CentroidTask) -> Centroid:
-    """Find the centroid of a tile whose frames are read here.
-
-    Parameters
-    ----------
-    task : CentroidTask
-
-    Returns
-    -------
-    Centroid
-        In memory.
-
-    Examples
-    --------
-    >>> source = FrameSource.from_array(np.ones((3, 16, 16), np.float32))
-    >>> run_centroid_task(CentroidTask(source, 2, CentroidParams(), FlowParams(), Runtime())).flows.shape
-    (2, 16, 16, 2)
-    """
+    """Find the centroid of a tile whose frames are read here."""
     runtime = _here(task.runtime)
     frames = fill_stack((task.train, *task.source.shape[1:]), iter(task.source), runtime.scratch)
     found = find_centroid(frames, task.params, task.flow_params, runtime)
@@ -154,23 +125,7 @@ def filter_tasks(
     flow_params: FlowParams,
     runtime: Runtime,
 ) -> Iterator[FilterTask]:
-    """Describe the filters of tiles.
-
-    Parameters
-    ----------
-    source : FrameSource
-        Whole frames.
-    tiles : iterable of HaloTile
-    centroid : Centroid
-        Of whole frames.
-    counted, dynamics_params, params, flow_params, runtime
-        As in :class:`FilterTask`.
-
-    Yields
-    ------
-    FilterTask
-        With copies of the image and the flows of the tile.
-    """
+    """Describe the filters of tiles."""
     settings = counted, dynamics_params, params, flow_params, runtime
     for tile in tiles:
         image, flows = centroid.image[tile.rows, tile.columns].copy(), cut_tile(centroid.flows, tile)
@@ -178,24 +133,7 @@ def filter_tasks(
 
 
 def run_filter_task(task: FilterTask) -> Filtered:
-    """Filter a tile whose frames are read here.
-
-    Parameters
-    ----------
-    task : FilterTask
-
-    Returns
-    -------
-    Filtered
-
-    Examples
-    --------
-    >>> source = FrameSource.from_array(np.random.default_rng(0).uniform(0.4, 0.6, (3, 16, 16)).astype(np.float32))
-    >>> flows, every = np.zeros((2, 16, 16, 2), np.float32), np.ones(3, bool)
-    >>> settings = DynamicsParams(), FilterParams(), FlowParams(), Runtime()
-    >>> run_filter_task(FilterTask(source, source.read()[0], flows, every, *settings)).image.shape
-    (16, 16)
-    """
+    """Filter a tile whose frames are read here."""
     runtime = _here(task.runtime)
     frames = fill_stack((len(task.flows), *task.source.shape[1:]), iter(task.source), runtime.scratch)
     settings = task.dynamics_params, task.params, task.flow_params, runtime
@@ -215,33 +153,7 @@ def tile_filter_steps(
 ) -> Generator[FilterStep, None, Filtered]:
     """Identify the motion of a tile and filter it.
 
-    Parameters
-    ----------
-    source : FrameSource
-        All frames of the tile.
-    frames : ndarray, float32, shape (K, h, w) or (K, h, w, 3)
-        Its training frames, the first of the source.
-    image : ndarray, float32, shape (h, w) or (h, w, 3)
-        Centroid of the tile.
-    flows : ndarray, float32, shape (K, h, w, 2)
-        Flows from it to the training frames, pixels.
-    counted : ndarray, bool, shape (T,)
-        Frames that count.
-    dynamics_params, params, flow_params, runtime
-        Settings of the flow model, the filter and the flow, and what may be used of the machine.
-
-    Yields
-    ------
-    FilterStep
-
-    Returns
-    -------
-    Filtered
-
-    Raises
-    ------
-    DataError
-        As :func:`turbrestore.filtering.alternating.filter_frames`.
+    ``frames`` (K, h, w) or (K, h, w, 3); ``image`` (h, w) or (h, w, 3); ``flows`` (K, h, w, 2); ``counted`` (T,).
     """
     dynamics = identify(flows, dynamics_params, runtime)
     rest = iter(source.select(frames=(len(frames), None))) if len(frames) < len(source) else ()
@@ -252,19 +164,7 @@ def tile_filter_steps(
 def only_counted(frames: Iterable[FloatArray], counted: NDArray[np.bool_]) -> Iterator[FloatArray | None]:
     """Replace frames that do not count by None.
 
-    Parameters
-    ----------
-    frames : iterable of ndarray
-    counted : ndarray, bool, shape (T,)
-
-    Yields
-    ------
-    ndarray or None
-
-    Examples
-    --------
-    >>> list(only_counted([np.float32(1), np.float32(2)], np.array([False, True])))
-    [None, np.float32(2.0)]
+    ``counted`` (T,).
     """
     return (frame if counts else None for frame, counts in zip(frames, counted, strict=True))
 
@@ -272,33 +172,7 @@ def only_counted(frames: Iterable[FloatArray], counted: NDArray[np.bool_]) -> It
 def join_centroids(
     parts: Iterable[Centroid], tiles: Sequence[HaloTile], shape: tuple[int, ...], scratch: Path | None = None
 ) -> Centroid:
-    """Blend the centroids of all tiles and the flows from them.
-
-    Parameters
-    ----------
-    parts : iterable of Centroid
-        One for each tile; consumed lazily, so that the flows of one tile at a time are in memory.
-    tiles : sequence of HaloTile
-    shape : tuple of int
-        Shape of the training frames, (T, H, W) or (T, H, W, 3).
-    scratch : Path, optional
-        Folder of the files that hold image and flows; without one they stay in memory.
-
-    Returns
-    -------
-    Centroid
-        It has converged if all tiles have.  The mean flow of an iteration is the mean over the tiles, of which those
-        that have stopped count with their last.
-
-    Examples
-    --------
-    >>> from turbrestore.runtime.tiling import halo_tiles
-    >>> tiles = halo_tiles((40, 64), side=44, halo=8)
-    >>> parts = (find_centroid(np.ones((2, *tile.shape), np.float32)) for tile in tiles)
-    >>> centroid = join_centroids(parts, tiles, (2, 40, 64))
-    >>> len(tiles), centroid.flows.shape, centroid.converged
-    (2, (2, 40, 64, 2), True)
-    """
+    """Blend the centroids of all tiles and the flows from them."""
     image, flows = new_mosaic(shape[1:], scratch), new_mosaic((*shape[:3], 2), scratch)
     sizes, converged, remaining = list[NDArray[np.float64]](), True, iter(parts)
     for tile in tiles:
@@ -318,37 +192,7 @@ def join_centroids(
 def join_filtered(
     parts: Iterable[Filtered], tiles: Sequence[HaloTile], shape: tuple[int, ...], scratch: Path | None = None
 ) -> Filtered:
-    """Blend the filtered images of all tiles, and join their records.
-
-    Parameters
-    ----------
-    parts : iterable of Filtered
-        One for each tile; consumed lazily, so that the images of one tile at a time are in memory.
-    tiles : sequence of HaloTile
-    shape : tuple of int
-        Shape of a frame, (H, W) or (H, W, 3).
-    scratch : Path, optional
-        Folder of the files that hold the images; without one they stay in memory.
-
-    Returns
-    -------
-    Filtered
-        Its flow states are those of all tiles, one tile after the other; other figures are means over the tiles,
-        weighted by their areas.
-
-    Examples
-    --------
-    >>> from turbrestore.runtime.tiling import halo_tiles
-    >>> one, tiles = np.ones(2), halo_tiles((40, 64), side=44, halo=8)
-    >>> images = (np.ones(tile.shape, np.float32) for tile in tiles)
-    >>> parts = (
-    ...     Filtered(image, image, one[:, None], one, one, one, one / 2, 1e-4, 2.0, np.dstack([image, image]))
-    ...     for image in images
-    ... )
-    >>> joined = join_filtered(parts, tiles, (40, 64))
-    >>> joined.image.shape, joined.flow_states.shape, joined.shares
-    ((40, 64), (2, 2), array([0.5, 0.5]))
-    """
+    """Blend the filtered images of all tiles, and join their records."""
     image, variance = new_mosaic(shape, scratch), new_mosaic(shape[:2], scratch)
     mean_flow = new_mosaic((*shape[:2], 2), scratch)
     records: dict[str, list[np.ndarray]] = {}

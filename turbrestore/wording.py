@@ -29,24 +29,7 @@ _LARGE_MOTION = 1 / 12
 
 
 def explain_training(train: int, frame_count: int, wanted: int | None) -> Decision:
-    """Say which frames the centroid and the flow model are computed from.
-
-    Parameters
-    ----------
-    train, frame_count : int
-        Number of training frames, and of all frames.
-    wanted : int or None
-        Number of training frames that the user asked for.
-
-    Returns
-    -------
-    Decision
-
-    Examples
-    --------
-    >>> explain_training(60, 120, None)
-    Decision(subject='training', choice='first 60 of 120 frames', reason='half of the clip')
-    """
+    """Say which frames the centroid and the flow model are computed from."""
     half = frame_count // 2
     if wanted is not None:
         reason = "asked for"
@@ -64,22 +47,7 @@ def explain_training(train: int, frame_count: int, wanted: int | None) -> Decisi
 def explain_input(training: FloatArray) -> tuple[Decision, ...]:
     """Report saturated pixels.
 
-    Parameters
-    ----------
-    training : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
-
-    Returns
-    -------
-    tuple of Decision
-        Empty if there is nothing to report.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> frames = np.random.default_rng(0).uniform(0.2, 0.8, (4, 16, 16)).astype(np.float32)
-    >>> frames[:, :4] = 1
-    >>> [(decision.subject, decision.choice) for decision in explain_input(frames)]
-    [('saturation', 'left as it is')]
+    ``training`` (T, H, W) or (T, H, W, 3).
     """
     saturated = float(np.mean([np.mean(frame >= _SATURATED) for frame in iter_frames(training)]))
     if saturated <= _REPORTED_SHARE:
@@ -91,21 +59,7 @@ def explain_input(training: FloatArray) -> tuple[Decision, ...]:
 def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
     """Report motion that is too large for optical flow.
 
-    Parameters
-    ----------
-    flows : ndarray, float32, shape (T, H, W, 2)
-        From the centroid to the frames, pixels.
-
-    Returns
-    -------
-    tuple of Decision
-        Empty if there is nothing to report.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> explain_motion(np.full((2, 24, 24, 2), 3.0, np.float32))[0].choice
-    'taken as measured'
+    ``flows`` (T, H, W, 2).
     """
     squares = sum(float(np.mean(np.square(flow), dtype=np.float64)) for flow in iter_frames(flows))
     rms = float(np.sqrt(2 * squares / len(flows)))
@@ -119,23 +73,7 @@ def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
 def explain_camera(flows: FloatArray) -> tuple[Decision, ...]:
     """Report how far the camera moved, if it did.
 
-    Parameters
-    ----------
-    flows : ndarray, float32, shape (T, H, W, 2)
-        From the centroid to each training frame, pixels.
-
-    Returns
-    -------
-    tuple of Decision
-        Empty if no frame is shifted by more than two pixels.
-
-    Examples
-    --------
-    >>> still = np.zeros((3, 16, 16, 2), np.float32)
-    >>> explain_camera(still)
-    ()
-    >>> explain_camera(still + np.float32([6, -8]))[0].choice
-    'followed over 10.0 pixels'
+    ``flows`` (T, H, W, 2).
     """
     shifts = np.array([np.median(flow[::4, ::4].reshape(-1, 2), axis=0) for flow in iter_frames(flows)])
     largest = float(np.hypot(shifts[:, 0], shifts[:, 1]).max())
@@ -145,22 +83,7 @@ def explain_camera(flows: FloatArray) -> tuple[Decision, ...]:
 
 
 def explain_centroid(centroid: Centroid) -> Decision:
-    """Say how the centroid was found.
-
-    Parameters
-    ----------
-    centroid : Centroid
-
-    Returns
-    -------
-    Decision
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> explain_centroid(Centroid(np.zeros((4, 4)), np.zeros((2, 4, 4, 2)), np.array([0.9, 0.1]), True)).choice
-    '2 iterations, converged'
-    """
+    """Say how the centroid was found."""
     sizes = centroid.mean_flow_sizes
     return Decision(
         "centroid",
@@ -170,26 +93,7 @@ def explain_centroid(centroid: Centroid) -> Decision:
 
 
 def explain_dynamics(dynamics: FlowDynamics, modelled: bool = False) -> tuple[Decision, ...]:
-    """Say which rank the flow model has, how it was adjusted, and whether it changes the image.
-
-    Parameters
-    ----------
-    dynamics : FlowDynamics
-    modelled : bool
-        Whether frames are registered by the flow of the model and not by the measured one.
-
-    Returns
-    -------
-    tuple of Decision
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> flows = np.random.default_rng(0).normal(size=(8, 4, 4, 2)).astype(np.float32)
-    >>> explain_dynamics(identify(flows))[0].subject
-    'flow model'
-    """
+    """Say which rank the flow model has, how it was adjusted, and whether it changes the image."""
     largest = float(abs(dynamics.eigenvalues).max(initial=0.0))
     modes = Decision(
         "flow model",
@@ -201,28 +105,7 @@ def explain_dynamics(dynamics: FlowDynamics, modelled: bool = False) -> tuple[De
 
 
 def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
-    """Say how many frames the image is made of.
-
-    Parameters
-    ----------
-    filtered : Filtered
-    chosen : int or None
-        Number of the sharpest frames that the user asked for.
-
-    Returns
-    -------
-    Decision
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> shares = np.array([0.45, 0.05, 0.5])
-    >>> none = np.zeros(3)
-    >>> black, still = np.zeros((4, 4)), np.zeros((4, 4, 2))
-    >>> filtered = Filtered(black, black, none, none, none, none, shares, 1e-4, 2.0, still)
-    >>> explain_frames(filtered, None).choice
-    '2 of 3 frames count'
-    """
+    """Say how many frames the image is made of."""
     count = filtered.shares.size
     mean = 1 / (count if chosen is None else chosen)
     counting = int(np.sum(filtered.shares >= _COUNTS * mean))
@@ -234,29 +117,7 @@ def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
 
 
 def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
-    """Say how far the image was moved onto the mean geometry, and how well that is known.
-
-    Parameters
-    ----------
-    filtered : Filtered
-    dynamics : FlowDynamics
-
-    Returns
-    -------
-    Decision
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> black, none, flows = np.zeros((4, 4)), np.zeros(8), np.zeros((8, 4, 4, 2), np.float32)
-    >>> filtered = Filtered(black, black, none, none, none, none, none, 1e-4, 2.0, flows[0] + np.float32(0.3))
-    >>> decision = explain_geometry(filtered, identify(flows))
-    >>> decision.choice
-    'moved by 0.42 pixels'
-    >>> decision.reason
-    'mean flow to all frames, root mean square; its standard error is 0.00 pixels'
-    """
+    """Say how far the image was moved onto the mean geometry, and how well that is known."""
     moved = float(np.sqrt(2 * np.mean(np.square(recentring_flow(filtered.mean_flow)), dtype=np.float64)))
     error = mean_flow_error(dynamics, int(np.isfinite(filtered.sharpness).sum()))
     reason = f"mean flow to all frames, root mean square; its standard error is {error:.2f} pixels"
@@ -264,24 +125,7 @@ def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
 
 
 def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
-    """Say that the filtered image is not the result, if it has edges that few frames have.
-
-    Parameters
-    ----------
-    reading : StructureReading
-
-    Returns
-    -------
-    tuple of Decision
-        Empty if there is nothing to report.
-
-    Examples
-    --------
-    >>> explain_structure(StructureReading(0.02, 0.05))
-    ()
-    >>> explain_structure(StructureReading(0.25, 0.6))[0].choice
-    'the mean of the frames is the result'
-    """
+    """Say that the filtered image is not the result, if it has edges that few frames have."""
     if reading.passed:
         return ()
     reason = (
@@ -292,24 +136,7 @@ def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
 
 
 def explain_seeing(seeing: Seeing) -> tuple[Decision, ...]:
-    """Compare the displacement by flow with that by blur, and pass on the remarks.
-
-    Parameters
-    ----------
-    seeing : Seeing
-
-    Returns
-    -------
-    tuple of Decision
-        Empty where the displacement could not be measured and there is nothing to remark.
-
-    Examples
-    --------
-    >>> nothing = [None] * 3
-    >>> same = Estimate(1.0, 0.8, 1.2)
-    >>> explain_seeing(Seeing(*nothing, same, same, *nothing, 0.0, 9.0, 0.1))[0].choice
-    'by blur as by flow'
-    """
+    """Compare the displacement by flow with that by blur, and pass on the remarks."""
     remarks = tuple(Decision("displacement", "to be looked at", remark) for remark in seeing.remarks)
     by_flow, by_blur = seeing.displacement_by_flow, seeing.displacement_by_blur
     if remarks or by_flow is None or by_blur is None:
@@ -326,46 +153,13 @@ def explain_seeing(seeing: Seeing) -> tuple[Decision, ...]:
 
 
 def interval_words(estimate: Estimate, spec: str = ".2f") -> str:
-    """Write an estimate and its 95 % interval, which may have no upper end.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    spec : str
-        Format of the numbers.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> interval_words(Estimate(2.5, 2.1, 2.9)), interval_words(Estimate(2.5, 2.1, math.inf))
-    ('2.50 (2.10 to 2.90)', '2.50 (at least 2.10)')
-    """
+    """Write an estimate and its 95 % interval, which may have no upper end."""
     bounded = math.isfinite(estimate.high)
     ends = f"{estimate.low:{spec}} to {estimate.high:{spec}}" if bounded else f"at least {estimate.low:{spec}}"
     return f"{estimate.value:{spec}} ({ends})"
 
 
 def explain_border(least_seen: float, crop: Rectangle | None) -> Decision:
-    """Say whether the border was kept or cropped.
-
-    Parameters
-    ----------
-    least_seen : float
-        Share of the training frames that show the pixel seen in the fewest of them.
-    crop : tuple of int, or None
-        x, y, width and height of the part that is kept.
-
-    Returns
-    -------
-    Decision
-
-    Examples
-    --------
-    >>> explain_border(0.6, None).choice
-    'kept'
-    """
+    """Say whether the border was kept or cropped."""
     choice = "kept" if crop is None else f"cropped to {crop[2]}×{crop[3]} pixels from ({crop[0]}, {crop[1]})"
     return Decision("border", choice, f"every pixel is visible in at least {least_seen:.0%} of the training frames")

@@ -76,29 +76,7 @@ def registered_halves(
 ) -> Halves:
     """Average the registered frames of each half.
 
-    Parameters
-    ----------
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-    flows : iterable of ndarray, float32, shape (H, W, 2)
-        From the image to each frame, pixels.
-    shape : tuple of int
-        Shape of a frame.
-    count : int
-        Number of frames, at least two.
-    threads : int
-        Frames warped side by side; 0 means one per available core.
-
-    Returns
-    -------
-    Halves
-        In the geometry of the image that the flows start from.
-
-    Examples
-    --------
-    >>> frames, still = np.arange(8, dtype=np.float32)[:, None, None] + np.zeros((8, 4, 4)), np.zeros((8, 4, 4, 2))
-    >>> halves = registered_halves(np.float32(frames), np.float32(still), (4, 4), 8)
-    >>> halves.first[0, 0].round(3), halves.second[0, 0].round(3)
-    (np.float32(2.5), np.float32(4.5))
+    ``frames`` (H, W) or (H, W, 3) each; ``flows`` (H, W, 2) each.
     """
 
     def add(numbered: list[tuple[int, FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
@@ -117,23 +95,7 @@ def registered_halves(
 def keep_agreed(result: FloatArray, halves: Halves) -> Guarded:
     """Let the mean of the registered frames take the place of detail that they do not agree on.
 
-    Parameters
-    ----------
-    result : ndarray, float32, shape (H, W) or (H, W, 3)
-    halves : Halves
-        Of the same shape.
-
-    Returns
-    -------
-    Guarded
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> halves = Halves(*(rng.normal(0.5, 0.01, (2, 64, 64)).astype(np.float32)))
-    >>> guarded = keep_agreed(0.5 + 5 * (halves.first - 0.5), halves)
-    >>> bool(guarded.image.std() < 0.02), guarded.decisions[0].subject
-    (True, 'agreement')
+    ``result`` (H, W) or (H, W, 3).
     """
     first, second = luminance(halves.first), luminance(halves.second)
     mean, left = (halves.first + halves.second) / np.float32(2), result

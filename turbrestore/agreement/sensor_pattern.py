@@ -62,18 +62,7 @@ class _Stripes:
 
 
 def without_stripes(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Take stripes of the sensor out of the frames; a source without them is returned as it is.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> scene = cv2.GaussianBlur(rng.random((80, 80)).astype(np.float32), (0, 0), 3)
-    >>> stripes = 0.02 * rng.standard_normal(80).astype(np.float32)
-    >>> frames = np.stack([np.roll(scene, (k % 3, k % 2), (0, 1)) + stripes for k in range(12)])
-    >>> cleaned, (found,) = without_stripes(FrameSource.from_array(frames))
-    >>> found.subject, bool(np.abs(np.diff(cleaned.read()[0], axis=1)).mean() < 0.01)
-    ('stripes', True)
-    """
+    """Take stripes of the sensor out of the frames; a source without them is returned as it is."""
     if len(source) < _FEWEST:
         return source, ()
     part = source.select((0, len(source), max(1, len(source) // _SAMPLES)))

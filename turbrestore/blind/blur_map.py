@@ -72,32 +72,7 @@ class BlurMap:
 def estimate_blur_map(image: ArrayLike, whole: BlurEstimate, runtime: Runtime = DEFAULT) -> BlurMap | None:
     """Estimate the blur of overlapping tiles, two or three along each side.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        Blurred image.
-    whole : BlurEstimate
-        Estimate of the whole image.
-    runtime : Runtime
-        Number of threads, of which at most two are used; it does not change the result.
-
-    Returns
-    -------
-    BlurMap or None
-        None if the image is too small for tiles of 240 pixels.
-
-    Raises
-    ------
-    DataError
-        The shape is wrong, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.blur.estimation import estimate_blur
-    >>> small = np.zeros((256, 256))
-    >>> estimate_blur_map(small, estimate_blur(small)) is None
-    True
+    ``image`` (H, W) or (H, W, 3).
     """
     return finish(blur_map_steps(image, whole, runtime))
 
@@ -105,34 +80,7 @@ def estimate_blur_map(image: ArrayLike, whole: BlurEstimate, runtime: Runtime = 
 def blur_map_steps(
     image: ArrayLike, whole: BlurEstimate, runtime: Runtime = DEFAULT
 ) -> Generator[int, None, BlurMap | None]:
-    """Estimate the blur of overlapping tiles, one tile per step; see :func:`estimate_blur_map`.
-
-    Parameters
-    ----------
-    image, whole, runtime
-        See :func:`estimate_blur_map`.
-
-    Yields
-    ------
-    int
-        Number of tiles done, first those whose widths were found, then those for which one of them was chosen.
-
-    Returns
-    -------
-    BlurMap or None
-
-    Raises
-    ------
-    DataError
-        The shape is wrong, or values are not finite.
-
-    Examples
-    --------
-    >>> from turbrestore.blur.estimation import estimate_blur
-    >>> flat = np.zeros((480, 480))
-    >>> list(blur_map_steps(flat, estimate_blur(flat)))
-    [1, 2, 3, 4]
-    """
+    """Estimate the blur of overlapping tiles, one tile per step; see :func:`estimate_blur_map`."""
     grey = luminance(check_image(image))
     rows, columns = _spans(grey.shape[0]), _spans(grey.shape[1])
     if len(rows) == 1 or len(columns) == 1:
@@ -160,22 +108,7 @@ def blur_map_steps(
 def sigma_map(tiles: ArrayLike, shape: tuple[int, int]) -> FloatArray:
     """Interpolate the widths of tiles between their centres, to a width for every pixel.
 
-    Parameters
-    ----------
-    tiles : array_like, shape (rows, columns)
-        Width of each tile, pixels.
-    shape : tuple of int
-        (H, W).
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W)
-        Pixels.
-
-    Examples
-    --------
-    >>> sigma_map([[1.0, 2.0], [1.0, 2.0]], (480, 480))[0, [0, 240, 479]].round(2).tolist()
-    [1.0, 1.5, 2.0]
+    ``tiles`` (rows, columns); returns (H, W).
     """
     values = np.asarray(tiles, np.float32)
     axes = []
@@ -193,35 +126,7 @@ def varying_deconvolution_steps(
 ) -> Generator[DeconvolutionState, None, Deconvolution]:
     """Deconvolve by a width for every pixel: by a few widths, between whose images is interpolated.
 
-    Parameters
-    ----------
-    attempt : callable
-        Returns the generator that deconvolves the whole image by one width in pixels.
-    sigmas : ndarray, float32, shape (H, W)
-        Width for every pixel.
-    runtime : Runtime
-        Folder of a file that holds the image; without one it stays in memory.
-
-    Yields
-    ------
-    DeconvolutionState
-        After each iteration for each width.
-
-    Returns
-    -------
-    Deconvolution
-        Its ``sigma`` is the mean width; the record of the iterations is that of the largest width.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from functools import partial
-    >>> from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve, deconvolve_steps
-    >>> image = np.random.default_rng(0).uniform(size=(32, 32)).astype(np.float32)
-    >>> by_wiener = partial(deconvolve_steps, image, params=DeconvolutionParams(method="wiener"))
-    >>> result = finish(varying_deconvolution_steps(by_wiener, np.linspace(1, 2, 32 * 32).reshape(32, 32)))
-    >>> round(result.sigma, 3)
-    1.5
+    ``sigmas`` (H, W).
     """
     widths = _widths_between(float(sigmas.min()), float(sigmas.max()))
     for index, width in enumerate(widths):

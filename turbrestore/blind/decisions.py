@@ -15,26 +15,7 @@ _MOSTLY = 0.8
 
 
 def explain_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None = None) -> Decision:
-    """Explain which width is removed.
-
-    Parameters
-    ----------
-    blur : BlurEstimate or None
-        None if the width was given.
-    sigma : float
-        Width of the first attempt, pixels.
-    tiles : BlurMap, optional
-        Widths of tiles.
-
-    Returns
-    -------
-    Decision
-
-    Examples
-    --------
-    >>> explain_blur(None, 1.5)
-    Decision(subject='blur', choice='1.50 pixels removed', reason='asked for')
-    """
+    """Explain which width is removed."""
     choice = f"{sigma:.2f} pixels removed" if sigma > 0 else "none removed"
     if blur is None:
         return Decision("blur", choice, "asked for")
@@ -77,24 +58,7 @@ def explain_posterior(posterior: BlurPosterior, removed: float) -> Decision:
 
 
 def explain_blur_map(tiles: BlurMap | None) -> tuple[Decision, ...]:
-    """Explain whether every pixel gets a width of its own.
-
-    Parameters
-    ----------
-    tiles : BlurMap or None
-        None if the image was not split into tiles.
-
-    Returns
-    -------
-    tuple of Decision
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> [decision] = explain_blur_map(BlurMap(np.ones((2, 2)), np.zeros((2, 2)), varies=False))
-    >>> decision.choice, decision.reason
-    ('one width for the whole image', '1.00 to 1.00 pixels in 2×2 tiles, equal within their uncertainties')
-    """
+    """Explain whether every pixel gets a width of its own."""
     if tiles is None:
         return ()
     choice = "a width for every pixel" if tiles.varies else "one width for the whole image"
@@ -105,30 +69,7 @@ def explain_blur_map(tiles: BlurMap | None) -> tuple[Decision, ...]:
 
 
 def explain_guards(sigma: float, readings: tuple[GuardReading, ...], guards: GuardParams) -> tuple[Decision, ...]:
-    """Explain what the guards measured and what followed from it.
-
-    Parameters
-    ----------
-    sigma : float
-        Width that was removed in the end, pixels; 0 if none was.
-    readings : tuple of GuardReading
-        One for each attempt.
-    guards : GuardParams
-        The bounds.
-
-    Returns
-    -------
-    tuple of Decision
-        Empty without a reading.
-
-    Examples
-    --------
-    >>> [decision] = explain_guards(2.0, (GuardReading(2.0, 0.03, 0.01, 1.5, passed=True),), GuardParams())
-    >>> decision.choice
-    'passed'
-    >>> decision.reason
-    'at 2.00 px 3% of edges ring (bound 15%), 1% of pixels near edges overshoot (bound 12%), noise × 1.5 (bound 6)'
-    """
+    """Explain what the guards measured and what followed from it."""
     if not readings:
         return ()
     first, last = readings[0], readings[-1]

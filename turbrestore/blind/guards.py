@@ -83,23 +83,7 @@ class GuardParams:
         require_between("tries", self.tries, 1, 100)
 
     def first_back_off(self, reading: GuardReading) -> float:
-        """Return the factor on the width after the first attempt, if that failed.
-
-        Parameters
-        ----------
-        reading : GuardReading
-            Of that attempt.
-
-        Returns
-        -------
-        float
-            ``back_off``, or its square root if no bound is exceeded by more than a half.
-
-        Examples
-        --------
-        >>> GuardParams(back_off=0.81).first_back_off(GuardReading(2.0, 0.2, 0.1, 1.5, passed=False))
-        0.9
-        """
+        """Return the factor on the width after the first attempt, if that failed."""
         excess = max(
             reading.ringing / max(self.ringing, _LEAST_BOUND),
             reading.overshoot / max(self.overshoot, _LEAST_BOUND),
@@ -138,35 +122,7 @@ def evaluate_guards(
 ) -> GuardReading:
     """Compare a deconvolved image with the blurred one.
 
-    Parameters
-    ----------
-    result : array_like, shape (H, W) or (H, W, 3)
-        Deconvolved image, u.
-    blurred : array_like, shape of ``result``
-        Blurred image, f.
-    sigma : float
-        Width of the blur that was removed, pixels.
-    params : GuardParams, optional
-        Bounds.
-
-    Returns
-    -------
-    GuardReading
-        For colour images, the largest figures of the luminance and of each channel.
-
-    Raises
-    ------
-    DataError
-        The shapes differ, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> edge = np.repeat([[0.2] * 24 + [0.8] * 24], 48, axis=0)
-    >>> evaluate_guards(edge, edge, 1.0).ringing
-    0.0
-    >>> evaluate_guards(edge + 0.15 * (abs(np.arange(48) - 25.5) < 2), edge, 1.0).passed
-    False
+    ``result`` (H, W) or (H, W, 3).
     """
     params = params or GuardParams()
     after, before = check_image(result, "result"), check_image(blurred, "blurred")

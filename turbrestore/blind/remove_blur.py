@@ -99,41 +99,7 @@ def remove_blur(
 ) -> Deblurred:
     """Remove a blur of given or of estimated width.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Blurred image.
-    guide : ndarray, float32, shape of ``image``
-        Image that the nonlocal weights are computed from.
-    deconvolution : DeconvolutionParams, optional
-        Method, and the width if it is known.
-    guards : GuardParams, optional
-        Bounds that the result must keep.
-    runtime : Runtime
-        Threads, device, and the folder of files that hold images; without one they stay in memory.
-    side : int, optional
-        Longest side of the overlapping tiles in which the CPU deconvolves the image, pixels; by default the image is
-        deconvolved as a whole.
-
-    Returns
-    -------
-    Deblurred
-
-    Raises
-    ------
-    DataError
-        The shapes differ, or values are not finite.
-    StorageError
-        The folder has no room for the images.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.synthesis.scenes import resolution_chart
-    >>> chart = resolution_chart(64, 64)
-    >>> result = remove_blur(chart, chart, DeconvolutionParams(sigma=0.0))
-    >>> result.decisions
-    (Decision(subject='blur', choice='none removed', reason='asked for'),)
+    ``image`` (H, W) or (H, W, 3).
     """
     return finish(remove_blur_steps(image, guide, deconvolution, guards, runtime, side))
 
@@ -147,36 +113,7 @@ def remove_blur_steps(
     side: int | None = None,
     witnesses: BlurWitnesses | None = None,
 ) -> Steps[Deblurred]:
-    """Remove a blur step by step; see :func:`remove_blur`.
-
-    Parameters
-    ----------
-    image, guide, deconvolution, guards, runtime, side
-        See :func:`remove_blur`.
-    witnesses : BlurWitnesses, optional
-        What the frames say about their blur; by default the image alone tells it.
-
-    Yields
-    ------
-    DeblurState
-        After each iteration of each attempt.
-
-    Returns
-    -------
-    Deblurred
-
-    Raises
-    ------
-    DataError, ConfigurationError, StorageError
-        See :func:`remove_blur`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> flat, params = np.full((32, 32), 0.5, np.float32), DeconvolutionParams(method="wiener", sigma=1.5, iterations=1)
-    >>> list(remove_blur_steps(flat, flat, params))
-    [DeblurState(sigma=1.5, attempt=1, iteration=1)]
-    """
+    """Remove a blur step by step; see :func:`remove_blur`."""
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
     blur, posterior = find_blur(image, params, runtime, witnesses)
     if posterior is None:
@@ -222,28 +159,7 @@ def remove_blur_steps(
 
 
 def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side: int | None = None) -> float:
-    """Return the memory that :func:`remove_blur` takes beside the blurred image and its guide.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        (H, W) or (H, W, 3).
-    params : DeconvolutionParams
-        Method, and the width if it is known; otherwise the memory is that of the widest blur.
-    side : int, optional
-        Longest side of the tiles, pixels; by default the image is not split.
-
-    Returns
-    -------
-    float
-        Bytes; results are in memory, not in files.
-
-    Examples
-    --------
-    >>> params = DeconvolutionParams(sigma=1.5)
-    >>> remove_blur_memory((2000, 2000), params, side=512) < remove_blur_memory((2000, 2000), params)
-    True
-    """
+    """Return the memory that :func:`remove_blur` takes beside the blurred image and its guide."""
     pixels, channels = shape[0] * shape[1], shape[2] if len(shape) == 3 else 1
     part = shape if side is None else (*largest_tile((shape[0], shape[1]), side), *shape[2:])
     beside = float(pixels * (_BYTES + channels * _CHANNEL_BYTES))
@@ -254,27 +170,7 @@ def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side
 def blur_to_remove(
     estimate: BlurEstimate | None, deconvolution: DeconvolutionParams
 ) -> tuple[float, DeconvolutionParams]:
-    """Decide on the width to remove, and complete the settings by the shape of the blur.
-
-    Parameters
-    ----------
-    estimate : BlurEstimate or None
-        Needed if ``deconvolution.sigma`` is None.
-    deconvolution : DeconvolutionParams
-        Settings.
-
-    Returns
-    -------
-    sigma : float
-        The given width, otherwise the one that is safe to remove; pixels.
-    deconvolution : DeconvolutionParams
-
-    Examples
-    --------
-    >>> sigma, params = blur_to_remove(None, DeconvolutionParams(sigma=1.5))
-    >>> sigma, params.exponent
-    (1.5, None)
-    """
+    """Decide on the width to remove, and complete the settings by the shape of the blur."""
     if deconvolution.sigma is not None or estimate is None:
         return deconvolution.sigma or 0.0, deconvolution
     return estimate.removable, replace(deconvolution, exponent=estimate.exponent)
@@ -289,43 +185,7 @@ def guarded_steps(
 ) -> Steps[tuple[Deconvolution, tuple[GuardReading, ...]]]:
     """Deconvolve by smaller and smaller widths until the guards pass.
 
-    Parameters
-    ----------
-    attempt : callable
-        Returns the generator that deconvolves ``blurred`` by a width in pixels.
-    blurred : ndarray, float32, shape (H, W) or (H, W, 3)
-    sigma : float
-        First width, pixels.
-    guards : GuardParams
-        Bounds.
-    first : Deconvolution, optional
-        Result of the first attempt, if it has already been made.
-
-    Yields
-    ------
-    DeblurState
-
-    Returns
-    -------
-    result : Deconvolution
-        The first that passes; the image without any blur removed if none does.
-    readings : tuple of GuardReading
-        One for each attempt.
-
-    Raises
-    ------
-    DataError
-        Values are not finite.
-
-    Examples
-    --------
-    >>> from turbrestore.deconvolution.deconvolve import deconvolve_steps
-    >>> import numpy as np
-    >>> image = np.full((32, 32), 0.5, np.float32)
-    >>> steps = guarded_steps(lambda width: deconvolve_steps(image, width), image, 0.0, GuardParams())
-    >>> result, readings = finish(steps)
-    >>> result.sigma, readings
-    (0.0, ())
+    ``blurred`` (H, W) or (H, W, 3).
     """
     readings: list[GuardReading] = []
     while sigma > 0 and len(readings) < guards.tries:

@@ -47,27 +47,7 @@ _SAMPLES = 1 << 18
 def ringing(after: FloatArray, before: FloatArray, sigma: float) -> float:
     """Return the share of strong edges along which a deconvolved image rings.
 
-    Parameters
-    ----------
-    after : ndarray, float32, shape (H, W)
-        u.
-    before : ndarray, float32, shape (H, W)
-        f.
-    sigma : float
-        Width of the blur that was removed, pixels.
-
-    Returns
-    -------
-    float
-        0 to 1; 0 where there is no edge beside a plateau.
-
-    Examples
-    --------
-    >>> import cv2
-    >>> edge = np.repeat([[0.2] * 24 + [0.8] * 24], 48, axis=0).astype(np.float32)
-    >>> blurred = cv2.GaussianBlur(edge, (0, 0), 1.5)
-    >>> ringing(edge, blurred, 1.5), ringing(edge + 2 * (edge - blurred), blurred, 1.5)
-    (0.0, 1.0)
+    ``after`` (H, W); ``before`` (H, W).
     """
     reach = max(_SMALLEST_REACH, int(np.ceil(_REACH_SIGMAS * sigma)))
     noise = estimate_noise(before)

@@ -70,25 +70,7 @@ class StructureReading:
 def compare_structure(image: FloatArray, frames: FloatArray, flows: FloatArray) -> StructureReading:
     """Compare a fused image with the registered frames.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        f.
-    frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
-    flows : ndarray, float32, shape (T, H, W, 2)
-        From the image to each frame, pixels.
-
-    Returns
-    -------
-    StructureReading
-        Nothing is unseen where no edge stands out from the noise of a frame.
-
-    Examples
-    --------
-    >>> scene = np.kron(np.eye(4, dtype=np.float32), np.ones((16, 16), np.float32))
-    >>> still, rising = np.zeros((3, 64, 64, 2), np.float32), np.arange(3, dtype=np.float32)[:, None, None]
-    >>> [compare_structure(scene, frames, still).unseen for frames in (scene + rising, 0 * scene + rising)]
-    [0.0, 1.0]
+    ``image`` (H, W) or (H, W, 3); ``frames`` (T, H, W) or (T, H, W, 3); ``flows`` (T, H, W, 2).
     """
     picked = np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)
     gradient = _gradient(luminance(image))

@@ -42,47 +42,7 @@ def tiled_deconvolution_steps(
 ) -> Generator[DeconvolutionState, None, Deconvolution]:
     """Deconvolve an image tile by tile.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        Blurred image.
-    sigma : float
-        Width of the blur, pixels.
-    params : DeconvolutionParams, optional
-        Method and settings; ``params.sigma`` is not used.
-    guide : array_like, shape (H, W) or (H, W, 3), optional
-        Image that nonlocal weights are computed from; by default ``image``.
-    runtime : Runtime
-        Threads, device, and the folder of a file that holds the result.
-    tiles : tuple of HaloTile
-        From :func:`turbrestore.runtime.tiling.halo_tiles`; by default the whole image.
-
-    Yields
-    ------
-    DeconvolutionState
-        After each iteration of each tile.
-
-    Returns
-    -------
-    Deconvolution
-        ``converged`` if all tiles have; ``noise`` is the root mean square over the tiles, and the record of the
-        iterations that of the tile which took most.
-
-    Raises
-    ------
-    DataError
-        The shapes differ, or values are not finite.
-    StorageError
-        The folder has no room for the result.
-
-    Examples
-    --------
-    >>> from turbrestore.runtime.steps import finish
-    >>> from turbrestore.runtime.tiling import halo_tiles
-    >>> image = np.random.default_rng(0).uniform(size=(40, 64)).astype(np.float32)
-    >>> wiener, tiles = DeconvolutionParams(method="wiener"), halo_tiles(image.shape, side=44, halo=8)
-    >>> len(tiles), finish(tiled_deconvolution_steps(image, 1.0, wiener, tiles=tiles)).image.shape
-    (2, (40, 64))
+    ``image`` (H, W) or (H, W, 3); ``guide`` (H, W) or (H, W, 3).
     """
     pixels = check_image(image)
     around = None if guide is None else check_image(guide, "guide")

@@ -31,20 +31,7 @@ _SMOOTH, _NOISY = (1.5, 2.0), (0.03, 0.05)
 def noise_multiple(image: FloatArray) -> float:
     """Multiple of the noise that is measured in an image and in its reductions.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W)
-
-    Returns
-    -------
-    float
-        1.5 to 2.
-
-    Examples
-    --------
-    >>> white = np.random.default_rng(0).normal(0.5, 0.1, (64, 64)).astype(np.float32)
-    >>> noise_multiple(white), noise_multiple(cv2.GaussianBlur(white, (0, 0), 0.7))
-    (1.5, 2.0)
+    ``image`` (H, W).
     """
     fine = max(estimate_noise(image), LEAST_NOISE)
     halved = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -56,23 +43,7 @@ def noise_multiple(image: FloatArray) -> float:
 def assumed_noise(image: FloatArray, noise: float | None = None, multiple: float = _MULTIPLES[0]) -> float:
     """Return n.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W)
-    noise : float, optional
-        Standard deviation of its noise, intensity; measured by default.
-    multiple : float
-        From :func:`noise_multiple`, where the noise is measured.
-
-    Returns
-    -------
-    float
-        Intensity.
-
-    Examples
-    --------
-    >>> round(assumed_noise(np.tile(np.float32([0, 1]), (8, 4)), noise=0.01), 4)
-    0.0195
+    ``image`` (H, W).
     """
     level = estimate_noise(image) if noise is None else noise
     return max(float(np.hypot(multiple * level, _MISFIT * image.std())), LEAST_NOISE)

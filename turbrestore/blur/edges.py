@@ -71,20 +71,7 @@ class Edges:
 def find_edges(image: FloatArray, noise: float) -> Edges:
     """Find the pixels at which the gradient is largest along its own direction.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W)
-    noise : float
-        Standard deviation of its noise, intensity.
-
-    Returns
-    -------
-    Edges
-
-    Examples
-    --------
-    >>> find_edges(np.repeat([[0, 0, 0, 0, 1, 1, 1, 1]], 2, axis=0).astype(np.float32), 0.01).normals.tolist()
-    [[0.0, 1.0], [0.0, 1.0]]
+    ``image`` (H, W).
     """
     places, normals = [np.zeros((0, 2), np.float32)], [np.zeros((0, 2), np.float32)]
     for top in range(0, len(image), _ROWS):
@@ -104,23 +91,7 @@ def find_edges(image: FloatArray, noise: float) -> Edges:
 
 
 def fewer_edges(edges: Edges, most: int) -> Edges:
-    """Leave out rows of tiles until about as few edges remain as wanted.
-
-    Parameters
-    ----------
-    edges : Edges
-    most : int
-
-    Returns
-    -------
-    Edges
-
-    Examples
-    --------
-    >>> places = np.array([[0, 0], [16, 0], [32, 0]], np.float32)
-    >>> fewer_edges(Edges(places, places), 2).places.tolist()
-    [[0.0, 0.0], [32.0, 0.0]]
-    """
+    """Leave out rows of tiles until about as few edges remain as wanted."""
     every = -(-len(edges.places) // most)
     # Of the rows that have edges, since those that are kept must not be empty.
     _, rows = np.unique(edges.places[:, 0] // _TILE, return_inverse=True)
@@ -131,26 +102,7 @@ def fewer_edges(edges: Edges, most: int) -> Edges:
 def edge_profiles(image: FloatArray, edges: Edges, reach: int) -> tuple[FloatArray, FloatArray]:
     """Follow the image along the normals on either side of edges.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W)
-    edges : Edges
-        n of them.
-    reach : int
-        Distance up to which they are followed, pixels.
-
-    Returns
-    -------
-    bright, dark : ndarray, float32, shape (n, reach + 1)
-        The bright side, and the negated dark side, so that both rise away from the edge.
-
-    Examples
-    --------
-    >>> ramp = np.repeat([[1, 2, 3, 4, 5]], 3, axis=0).astype(np.float32)
-    >>> edge = Edges(np.array([[1, 2]], np.float32), np.array([[0, 1]], np.float32))
-    >>> bright, dark = edge_profiles(ramp, edge, 2)
-    >>> bright.tolist(), dark.tolist()
-    ([[3.0, 4.0, 5.0]], [[-3.0, -2.0, -1.0]])
+    ``image`` (H, W); returns ``bright, dark`` (n, reach + 1).
     """
     # Commands that estimate no blur start faster without it.
     from scipy import ndimage
@@ -166,18 +118,7 @@ def edge_profiles(image: FloatArray, edges: Edges, reach: int) -> tuple[FloatArr
 def largest_fall(profiles: NDArray[Any]) -> NDArray[Any]:
     """Return the largest fall of each profile from any sample to a later one.
 
-    Parameters
-    ----------
-    profiles : ndarray, shape (n, k)
-
-    Returns
-    -------
-    ndarray, shape (n,)
-
-    Examples
-    --------
-    >>> largest_fall(np.array([[0.0, 3.0, 1.0, 2.0]])).tolist()
-    [2.0]
+    ``profiles`` (n, k); returns (n,).
     """
     return (np.maximum.accumulate(profiles, axis=1) - profiles).max(axis=1)
 
@@ -187,26 +128,7 @@ def limit_to_edges(estimate: BlurEstimate, image: FloatArray) -> BlurEstimate:
 
     The width becomes the largest that the edges allow to a Gaussian, since wings of a blur cannot be told from a soft
     limb; its uncertainty is the difference to the width that they allow to the shape that was assumed.
-
-    Parameters
-    ----------
-    estimate : BlurEstimate
-        Likeliest width.
-    image : ndarray, float32, shape (H, W)
-        Blurred image.
-
-    Returns
-    -------
-    BlurEstimate
-        ``estimate`` itself if the edges allow its width, or if too few edges of the image rise on either side.
-
-    Examples
-    --------
-    >>> from turbrestore.blur.estimation import estimate_blur
-    >>> y, x = np.mgrid[-80:80, -80:80]
-    >>> disc = np.sqrt(np.clip(1 - (x**2 + y**2) / 50**2, 0, 1)).astype(np.float32)
-    >>> estimate_blur(cv2.GaussianBlur(disc, (0, 0), 1.2)).edge_limited
-    True
+    ``image`` (H, W).
     """
     width = _widest_blur(image, GAUSSIAN, estimate.sigma)
     if width >= estimate.sigma:

@@ -220,22 +220,8 @@ def estimate_blur(
 def removable_width(sigma: ArrayLike, uncertainty: ArrayLike) -> Float64Array:
     """Width that is safe to remove: half of the uncertainty is left in up to 2 pixels, nothing from 3 pixels on.
 
-    Removing too wide a blur rings.  Narrow ones are found too wide rather than too narrow, because scenes are soft
+    Removing too wide a blur rings. Narrow ones are found too wide rather than too narrow, because scenes are soft
     themselves; wide ones are found too narrow as it is, by 12 % at 6 pixels.
-
-    Parameters
-    ----------
-    sigma, uncertainty : array_like
-        Pixels.  Nothing is safe to remove if the uncertainty is infinite.
-
-    Returns
-    -------
-    ndarray, float64
-
-    Examples
-    --------
-    >>> removable_width([1.0, 2.5, 6.0], [0.2, 0.4, 1.2]).round(2).tolist()
-    [0.9, 2.4, 6.0]
     """
     width, known = np.asarray(sigma, np.float64), np.isfinite(uncertainty)
     left_in = np.interp(width, [_NARROW, _WIDE], [_CAUTION, 0.0]) * np.where(known, uncertainty, 0.0)
@@ -245,32 +231,7 @@ def removable_width(sigma: ArrayLike, uncertainty: ArrayLike) -> Float64Array:
 def find_candidates(
     image: ArrayLike, noise: float | None = None, exponent: float | None = None
 ) -> tuple[BlurCandidate, ...]:
-    """Find the likeliest blur at each reduction of an image, without its uncertainty.
-
-    Parameters
-    ----------
-    image, noise, exponent
-        See :func:`estimate_blur`.
-
-    Returns
-    -------
-    tuple of BlurCandidate
-        Empty if the image is too small or uniform.
-
-    Raises
-    ------
-    DataError
-        The shape is wrong, or values are not finite.
-    ConfigurationError
-        ``noise`` is negative or not finite, or ``exponent`` is outside 1 to 2.
-
-    Examples
-    --------
-    >>> from turbrestore.synthesis.scenes import SCENES
-    >>> blurred = cv2.GaussianBlur(SCENES["camera"](128, 128), (0, 0), 2.0)
-    >>> [(one.estimate.reduction, one.plausible) for one in find_candidates(blurred, exponent=2.0)]
-    [(1, True), (2, True)]
-    """
+    """Find the likeliest blur at each reduction of an image, without its uncertainty."""
     grey = luminance(check_image(image))
     usable = noise is None or (np.isfinite(noise) and noise >= 0)
     require(usable, f"noise: expected a finite number of 0 or more, found {noise}")
@@ -284,26 +245,7 @@ def find_candidates(
 
 
 def choose_blur(candidates: tuple[BlurCandidate, ...], runtime: Runtime = DEFAULT) -> BlurEstimate:
-    """Choose the plausible candidate whose width depends least on the assumed noise.
-
-    Parameters
-    ----------
-    candidates : tuple of BlurCandidate, at least one
-        From :func:`find_candidates`; the first is that of the image itself.
-    runtime : Runtime
-        Number of threads, of which at most two are used; it does not change the result.
-
-    Returns
-    -------
-    BlurEstimate
-        The width of a sharp image if no candidate is plausible.
-
-    Examples
-    --------
-    >>> from turbrestore.synthesis.scenes import SCENES
-    >>> choose_blur(find_candidates(SCENES["chart"](128, 128))).sigma
-    0.35
-    """
+    """Choose the plausible candidate whose width depends least on the assumed noise."""
     # Only the costs at half and at twice the noise are computed in parallel: one candidate takes most of the time.
     with ThreadTeam(min(runtime.workers, 2)) as team:
         plausible = [_with_uncertainty(one, team) for one in candidates if one.plausible]

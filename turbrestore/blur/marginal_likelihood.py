@@ -78,18 +78,7 @@ class ImageGradients:
 def image_gradients(image: FloatArray) -> ImageGradients:
     """Compute the tapered gradients of an image and their spectrum.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (h + 1, w + 1)
-
-    Returns
-    -------
-    ImageGradients
-
-    Examples
-    --------
-    >>> image_gradients(np.zeros((65, 49), np.float32)).planes.shape
-    (64, 48, 2)
+    ``image`` (h + 1, w + 1).
     """
     dx, dy = image[:-1, 1:] - image[:-1, :-1], image[1:, :-1] - image[:-1, :-1]
     rows, columns = (_taper(size) for size in dx.shape)
@@ -101,28 +90,7 @@ def image_gradients(image: FloatArray) -> ImageGradients:
 def width_costs(gradients: ImageGradients, exponent: float | Sequence[float], noise: float, rises: int) -> Float64Array:
     """Compute L for increasing widths until it has risen several times in a row; L has a single minimum.
 
-    Parameters
-    ----------
-    gradients : ImageGradients
-    exponent : float or sequence of float
-        Shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`: of all, or of each of ``WIDTHS``.
-    noise : float
-        n, intensity, above 0.
-    rises : int
-        Number of consecutive rises after which to stop.
-
-    Returns
-    -------
-    ndarray, float64, shape (k,)
-        L of the first k of ``WIDTHS``.
-
-    Examples
-    --------
-    >>> from turbrestore.synthesis.scenes import SCENES
-    >>> blurred = cv2.GaussianBlur(SCENES["camera"](97, 97), (0, 0), 1.1)
-    >>> costs = width_costs(image_gradients(blurred), exponent=2.0, noise=0.01, rises=2)
-    >>> bool(0.8 < WIDTHS[costs.argmin()] < 1.4)
-    True
+    Returns (k,).
     """
     costs: list[float] = []
     scene = gradients.planes
@@ -139,20 +107,7 @@ def width_costs(gradients: ImageGradients, exponent: float | Sequence[float], no
 def likeliest_width(costs: Float64Array) -> float:
     """Return the width at which L is smallest, by a parabola in log σ through the three smallest neighbours.
 
-    Parameters
-    ----------
-    costs : ndarray, float64, shape (k,)
-        From :func:`width_costs`.
-
-    Returns
-    -------
-    float
-        Pixels; one of ``WIDTHS`` if the smallest cost is the first or the last.
-
-    Examples
-    --------
-    >>> likeliest_width(np.array([1.0, 2.0, 3.0]))
-    0.35
+    ``costs`` (k,).
     """
     index = int(np.argmin(costs))
     if not 0 < index < len(costs) - 1:
@@ -167,31 +122,7 @@ def fit_scene(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Minimise the bound over x and γ for one blur, from a given start.
 
-    Parameters
-    ----------
-    gradients : ImageGradients
-        y.
-    scene, prior : ndarray, float32, shape (h, w, 2)
-        Start of x and γ.
-    blur : (float, float)
-        Width in pixels, and exponent.
-    noise : float
-        n, intensity.
-
-    Returns
-    -------
-    scene, prior : ndarray, float32, shape (h, w, 2)
-        x and γ after a fixed number of updates.
-    cost : float
-        L.
-
-    Examples
-    --------
-    >>> gradients = image_gradients(np.zeros((17, 17), np.float32))
-    >>> ones = np.ones_like(gradients.planes)
-    >>> scene, _, _ = fit_scene(gradients, 0 * ones, ones, (1.0, 2.0), 0.1)
-    >>> float(abs(scene).max())
-    0.0
+    ``scene, prior`` (h, w, 2); returns ``scene, prior`` (h, w, 2).
     """
     width, exponent = blur
     otf = np.exp(-np.log(2) * (gradients.frequency / half_frequency(width)) ** exponent).astype(np.float32)
@@ -254,24 +185,7 @@ def descend(
 ) -> None:
     """Take one preconditioned conjugate gradient step; the caller has already applied ``KᵀK / λ``.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (m,)
-        ``KᵀK / λ`` applied to the direction; overwritten.
-    precision, preconditioner : ndarray, float32, shape (m,)
-        1 / γ and C.
-    direction, x, residual : ndarray, float32, shape (m,)
-        Updated in place.
-    decrease : ndarray, float32, shape (1,)
-        ⟨residual, C residual⟩; updated in place.
-
-    Examples
-    --------
-    >>> one = np.ones(1, np.float32)
-    >>> direction, x, residual, decrease = 2 * one, 0 * one, 2 * one, 4 * one
-    >>> descend.py_func(2 * one, one, one, direction, x, residual, decrease)
-    >>> x, residual, decrease
-    (array([1.], dtype=float32), array([0.], dtype=float32), array([0.], dtype=float32))
+    ``image`` (m,); ``precision, preconditioner`` (m,); ``direction, x, residual`` (m,); ``decrease`` (1,).
     """
     curvature, remaining = np.float32(0), np.float32(0)
     for pixel in range(x.size):

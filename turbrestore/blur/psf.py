@@ -36,25 +36,7 @@ _WIDE, _HALFWAY = 1.2, 1.3
 def gaussian_psf(sigma: float) -> FloatArray:
     """Sample a Gaussian point spread function at pixel centres, out to 4σ.
 
-    Parameters
-    ----------
-    sigma : float
-        Standard deviation, pixels; 0 gives a single 1.
-
-    Returns
-    -------
-    ndarray, float32, shape (n, n), n odd
-        Sums to 1.
-
-    Raises
-    ------
-    ConfigurationError
-        ``sigma`` is negative or not finite.
-
-    Examples
-    --------
-    >>> gaussian_psf(0.5).shape
-    (5, 5)
+    Returns (n, n).
     """
     _check_sigma(sigma)
     radius = int(np.ceil(4 * sigma))
@@ -68,27 +50,7 @@ def gaussian_psf(sigma: float) -> FloatArray:
 def gaussian_otf(shape: tuple[int, int], sigma: float) -> FloatArray:
     """Return the transfer function of a Gaussian on a periodic grid: ``exp(−2π²σ²ν²)``.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of the image.
-    sigma : float
-        Standard deviation, pixels.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W // 2 + 1)
-        1 at frequency 0.
-
-    Raises
-    ------
-    ConfigurationError
-        ``sigma`` is negative or not finite.
-
-    Examples
-    --------
-    >>> float(gaussian_otf((4, 4), 1.0)[0, 0])
-    1.0
+    Returns (H, W // 2 + 1).
     """
     _check_sigma(sigma)
     rows, columns = (np.exp(-2 * (np.pi * sigma * nu) ** 2) for nu in _frequencies(shape))
@@ -98,34 +60,10 @@ def gaussian_otf(shape: tuple[int, int], sigma: float) -> FloatArray:
 def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -> FloatArray:
     """Return the transfer function ``exp(−ln 2 (ν/ν_h)^p)`` on a periodic grid, ``ν_h = √(ln 2 / 2) / (π σ)``.
 
-    p = 2 is the Gaussian of :func:`gaussian_otf`.  p = 5/3 is a long exposure through Kolmogorov turbulence (Fried
-    1966), whose point spread function has a narrower core and wider wings.  Fused frames have wider wings still, see
+    p = 2 is the Gaussian of :func:`gaussian_otf`. p = 5/3 is a long exposure through Kolmogorov turbulence (Fried
+    1966), whose point spread function has a narrower core and wider wings. Fused frames have wider wings still, see
     :func:`fused_exponent`.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of the image.
-    sigma : float
-        Width, pixels: standard deviation of the Gaussian with the same ν_h.
-    exponent : float
-        p, 1 to 2.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W // 2 + 1)
-        1 at frequency 0.
-
-    Raises
-    ------
-    ConfigurationError
-        ``sigma`` is negative or not finite, or ``exponent`` outside 1 to 2.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> bool(np.allclose(blur_otf((8, 8), 1.0), gaussian_otf((8, 8), 1.0), atol=1e-6))
-    True
+    Returns (H, W // 2 + 1).
     """
     _check_sigma(sigma)
     check_exponent(exponent)
@@ -136,13 +74,7 @@ def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -
 
 
 def radial_otf(frequencies: ArrayLike, sigma: float, exponent: float = GAUSSIAN) -> Float64Array:
-    """Return the transfer function of :func:`blur_otf` at radial frequencies, cycles per pixel.
-
-    Examples
-    --------
-    >>> radial_otf([0.0, half_frequency(1.5)], 1.5, 1.2).round(3).tolist()
-    [1.0, 0.5]
-    """
+    """Return the transfer function of :func:`blur_otf` at radial frequencies, cycles per pixel."""
     nu = np.asarray(frequencies, np.float64)
     return np.ones_like(nu) if sigma == 0 else np.exp(-np.log(2) * (nu / half_frequency(sigma)) ** exponent)
 
@@ -153,90 +85,24 @@ def fused_exponent(sigma: float) -> float:
     Short exposures, and averages of blurs of different widths, have a sharp core in a wide halo: p is 1 to 1.3.
     Registration, interpolation and pixels add a blur of about half a pixel that is close to a Gaussian, so that p is
     larger where the whole is not much wider than that: ``1.2 + (5/3 − 1.2) / (1 + (σ / 1.3)⁴)``.
-
-    Parameters
-    ----------
-    sigma : float
-        Width, pixels.
-
-    Returns
-    -------
-    float
-        p, 5/3 for narrow blurs to 1.2 for wide ones.
-
-    Examples
-    --------
-    >>> [round(fused_exponent(sigma), 2) for sigma in (0.35, 1.0, 1.4, 4.0)]
-    [1.66, 1.55, 1.4, 1.21]
     """
     return _WIDE + (KOLMOGOROV - _WIDE) / (1 + (sigma / _HALFWAY) ** 4)
 
 
 def half_frequency(sigma: float) -> float:
-    """Return the frequency at which the transfer function of a Gaussian is one half: ``√(ln 2 / 2) / (π σ)``.
-
-    Parameters
-    ----------
-    sigma : float
-        Standard deviation, pixels, above 0.
-
-    Returns
-    -------
-    float
-        Cycles per pixel.
-
-    Examples
-    --------
-    >>> round(half_frequency(1.0), 4)
-    0.1874
-    """
+    """Return the frequency at which the transfer function of a Gaussian is one half: ``√(ln 2 / 2) / (π σ)``."""
     return float(np.sqrt(np.log(2) / 2) / (np.pi * sigma))
 
 
 def check_exponent(exponent: float) -> None:
-    """Check the exponent of :func:`blur_otf`.
-
-    Parameters
-    ----------
-    exponent : float
-        p.
-
-    Raises
-    ------
-    ConfigurationError
-        Outside 1 to 2.
-
-    Examples
-    --------
-    >>> check_exponent(2.0)
-    """
+    """Check the exponent of :func:`blur_otf`."""
     require(1 <= exponent <= 2, f"exponent: expected 1 to 2 (a Gaussian), found {exponent}")
 
 
 def psf_to_otf(psf: ArrayLike, shape: tuple[int, int]) -> NDArray[np.complex64]:
     """Compute the transfer function of a sampled point spread function on a periodic grid.
 
-    Parameters
-    ----------
-    psf : array_like, shape (h, w), both odd
-        Centred on its middle pixel; it is divided by its sum.
-    shape : (int, int)
-        Rows and columns of the image, at least (h, w).
-
-    Returns
-    -------
-    ndarray, complex64, shape (H, W // 2 + 1)
-
-    Raises
-    ------
-    DataError
-        The PSF has an even size, is larger than the image, has negative values, or sums to 0.
-
-    Examples
-    --------
-    >>> psf_to_otf([[0.0, 1.0, 0.0]], (2, 4))
-    array([[1.+0.j, 1.+0.j, 1.+0.j],
-           [1.+0.j, 1.+0.j, 1.+0.j]], dtype=complex64)
+    ``psf`` (h, w); returns (H, W // 2 + 1).
     """
     kernel = check_psf(psf)
     height, width = kernel.shape
@@ -251,24 +117,7 @@ def psf_to_otf(psf: ArrayLike, shape: tuple[int, int]) -> NDArray[np.complex64]:
 def check_psf(psf: ArrayLike) -> Float64Array:
     """Return ``psf`` as a float64 array that sums to 1.
 
-    Parameters
-    ----------
-    psf : array_like, shape (h, w), both odd
-        Not negative.
-
-    Returns
-    -------
-    ndarray, float64, shape (h, w)
-
-    Raises
-    ------
-    DataError
-        The PSF does not have two odd axes, has negative or infinite values, or sums to 0.
-
-    Examples
-    --------
-    >>> check_psf([[2.0]])
-    array([[1.]])
+    ``psf`` (h, w); returns (h, w).
     """
     kernel = np.asarray(psf, dtype=np.float64)
     if kernel.ndim != 2 or any(size % 2 == 0 for size in kernel.shape):
@@ -282,20 +131,7 @@ def check_psf(psf: ArrayLike) -> Float64Array:
 def laplacian_symbol(height: int, width: int) -> FloatArray:
     """Return the Fourier symbol of −Δ for periodic forward differences.
 
-    Parameters
-    ----------
-    height, width : int
-        Size of the image.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W // 2 + 1)
-
-    Examples
-    --------
-    >>> laplacian_symbol(2, 2)
-    array([[0., 4.],
-           [4., 8.]], dtype=float32)
+    Returns (H, W // 2 + 1).
     """
     rows, columns = (2 - 2 * np.cos(2 * np.pi * nu) for nu in _frequencies((height, width)))
     return (rows + columns).astype(np.float32)
@@ -304,26 +140,9 @@ def laplacian_symbol(height: int, width: int) -> FloatArray:
 def wiener_fidelity(image: FloatArray, noise: float) -> float:
     """Compute the weight λ of the data for Wiener deconvolution: ``6 s / √(n² + 0.002²)``.
 
-    s is the standard deviation of the image.  On photographs, brick and text blurred by σ = 1 to 3 px the result is
-    within 0.5 dB of that of the best λ for n = 0.01 to 0.02.  For less noise, a perfectly known blur would allow 3 to
-    10 times more (0.2 to 1.5 dB better, 3 dB on thin text); the floor of 0.002 accounts for errors of the blur model.
-
-    Parameters
-    ----------
-    image : ndarray, float32
-        Blurred image.
-    noise : float
-        n, intensity.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> round(wiener_fidelity(np.array([[0.0, 1.0]], np.float32), 0.0))
-    1500
+    s is the standard deviation of the image. On photographs, brick and text blurred by σ = 1 to 3 px the result is
+    within 0.5 dB of that of the best λ for n = 0.01 to 0.02. For less noise, a perfectly known blur would allow 3 to 10
+    times more (0.2 to 1.5 dB better, 3 dB on thin text); the floor of 0.002 accounts for errors of the blur model.
     """
     # Unlike NumPy's, OpenCV's keeps no copy of the image in double precision.
     _, deviation = cv2.meanStdDev(image.reshape(-1, 1))

@@ -36,12 +36,6 @@ def short_exposures(
     """Return H, s and s_4 (strengths, diffractions, frequencies) for D/r0, λ/D in pixels, and cycles per pixel.
 
     s and s_4 are interpolated in log D/r0, and keep their last value beyond u = 1, where H is 0.
-
-    Examples
-    --------
-    >>> mean, s, _ = short_exposures(np.array([3.0]), np.array([2.0]), np.array([0.0, 0.1, 0.6]))
-    >>> mean[0, 0].round(2).tolist(), s[0, 0, :2].round(3).tolist()
-    ([1.0, 0.42, 0.0], [0.0, 0.079])
     """
     known, u, table = _table()
     results = []

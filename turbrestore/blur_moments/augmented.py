@@ -44,11 +44,6 @@ class Oscillator:
     ------
     ConfigurationError
         A number is not above 0.
-
-    Examples
-    --------
-    >>> Oscillator(gain=1.0, frequency=34.0, damping=0.2).damping
-    0.2
     """
 
     gain: float
@@ -77,12 +72,6 @@ class OscillatorMotion:
     ------
     ConfigurationError
         Q has the wrong shape.
-
-    Examples
-    --------
-    >>> timing = ExposureTiming(fast_period=1e-3, exposure=0.1, readout=0.35, frame_period=0.45)
-    >>> OscillatorMotion(Oscillator(1.0, 34.0, 0.2), timing, np.zeros((5, 5))).order
-    5
     """
 
     nominal: Oscillator

@@ -49,16 +49,7 @@ class ExposureTable:
     def image_and_jacobian(self, path: Float64Array, jacobian: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Image of a path, and its derivative with respect to the state.
 
-        Parameters
-        ----------
-        path : ndarray, float64, shape (..., N_e)
-        jacobian : ndarray, float64, shape (..., N_e, n)
-            Derivative of the path.
-
-        Returns
-        -------
-        image : ndarray, float64, shape (..., P)
-        derivative : ndarray, float64, shape (..., n, P)
+        ``path`` (..., N_e); ``jacobian`` (..., N_e, n); returns ``image`` (..., P), ``derivative`` (..., n, P).
         """
         # A position beyond the table falls into its first or last row, which holds no light.
         place = np.clip((path - self.first) / self.step, 0.0, len(self.response) - 1.0)
@@ -88,30 +79,7 @@ class ExposureTable:
 
 
 def tabulate(sensor: LineSensor) -> ExposureTable:
-    """Tabulate the exposure operator of a sensor.
-
-    Parameters
-    ----------
-    sensor : LineSensor
-        With a kernel of positive width: the image of an ideal point has no derivative.
-
-    Returns
-    -------
-    ExposureTable
-
-    Raises
-    ------
-    ConfigurationError
-        The kernel has no width, or one so small that its table would not fit into memory.
-
-    Examples
-    --------
-    >>> from turbrestore.blur_moments.sensor import GaussianKernel, PixelGrid
-    >>> table = tabulate(LineSensor(GaussianKernel(0.1), PixelGrid(-1.0, 1.0, 40), noise=0.1))
-    >>> image, _ = table.image_and_jacobian(np.zeros(3), np.ones((3, 1)))
-    >>> round(float(image.sum()) * 0.05, 6)
-    1.0
-    """
+    """Tabulate the exposure operator of a sensor."""
     kernel, pixels = sensor.kernel, sensor.pixels
     require(kernel.sigma > 0, "kernel: expected one with a width, found a delta, whose image has no derivative")
     step, reach = kernel.sigma / _POSITIONS_PER_SIGMA, _REACH * kernel.sigma

@@ -144,24 +144,7 @@ def frame_blur(frames: ArrayLike, noise: float, params: CueParams | None = None)
 def prepare_blur_reference(
     frames: ArrayLike, noise: float, params: CueParams | None = None
 ) -> tuple[BlurReference, FrameBlur]:
-    """Measure the blur of every frame as :func:`frame_blur` does, and prepare a reference for other frames.
-
-    Parameters
-    ----------
-    frames, noise, params
-        As of :func:`frame_blur`.
-
-    Returns
-    -------
-    reference : BlurReference
-        For :func:`relative_frame_blur`.
-    blur : FrameBlur
-
-    Raises
-    ------
-    DataError, ConfigurationError
-        As :func:`frame_blur`.
-    """
+    """Measure the blur of every frame as :func:`frame_blur` does, and prepare a reference for other frames."""
     params = params or CueParams()
     stack = check_frames(frames, at_least=2)
     spectra = TileSpectra.of(stack.shape[1:3], params)
@@ -184,37 +167,7 @@ def relative_frame_blur(frames: ArrayLike, reference: BlurReference, noise: floa
     """Blur of frames, or of an image fused from them, relative to the frames of a reference.
 
     The result for a frame does not depend on the other frames given.
-
-    Parameters
-    ----------
-    frames : array_like, shape (T, H, W) or (T, H, W, 3)
-        Frames of the same scene.
-    reference : BlurReference
-        From :func:`prepare_blur_reference`.
-    noise : float, optional
-        Standard deviation of the white noise of these frames, intensity; by default that of the reference.
-
-    Returns
-    -------
-    FrameBlur
-        ``relative`` to the mean of the frames of the reference, ``extra`` above the sharpest of them, at least 0.
-
-    Raises
-    ------
-    DataError
-        Frames of another size than those of the reference.
-    ConfigurationError
-        The noise is negative.
-
-    Examples
-    --------
-    >>> import cv2, numpy as np
-    >>> scene = np.random.default_rng(0).normal(0.5, 0.1, (48, 48)).cumsum(0).cumsum(1).astype(np.float32) % 1
-    >>> frames = np.stack([cv2.GaussianBlur(scene, (0, 0), sigma) for sigma in (1.0, 1.414, 1.0)])
-    >>> reference, _ = prepare_blur_reference(frames, noise=1e-4)
-    >>> soft = cv2.GaussianBlur(scene, (0, 0), 1.225)
-    >>> relative_frame_blur(soft[None], reference).extra.ravel().astype(float).round(1).tolist()
-    [0.5]
+    ``frames`` (T, H, W) or (T, H, W, 3).
     """
     stack = check_frames(frames)
     if stack.shape[1:3] != reference.shape:

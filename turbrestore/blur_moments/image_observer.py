@@ -65,11 +65,6 @@ class ImageFilter:
     ------
     ConfigurationError
         Unknown norm, or less than one iteration or start.
-
-    Examples
-    --------
-    >>> ImageFilter("two").iterations
-    20
     """
 
     norm: str = "map"
@@ -86,21 +81,7 @@ class ImageFilter:
     def step(
         self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
     ) -> tuple[Gaussian, Innovation]:
-        """Correct the predicted state by its frame; see :meth:`.observers.Observer.step`.
-
-        Returns
-        -------
-        state : Gaussian
-            Its covariance is that of the problem linearised at the estimate.
-        innovation : Innovation
-            In information form; ``normalised_squared`` is the smallest misfit, chi-squared with as many degrees of
-            freedom as pixels if the model fits.
-
-        Raises
-        ------
-        DataError
-            Shapes do not agree, values are not finite, or the covariance of the state is singular.
-        """
+        """Correct the predicted state by its frame; see :meth:`.observers.Observer.step`."""
         problem = _Problem(model, state, frame, inputs, self.norm)
         best = problem.start[:, None, :]
         if self.iterations > 1 or self.norm != "map":

@@ -53,17 +53,7 @@ class Motion(Protocol):
     def path_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Output ŷ at the fast steps of the exposure, and its derivative with respect to the state.
 
-        Parameters
-        ----------
-        mean : ndarray, float64, shape (..., n)
-            State at the start of the exposure.
-        inputs : ndarray, float64, shape (..., N)
-            u_s.
-
-        Returns
-        -------
-        path : ndarray, float64, shape (..., N_e)
-        jacobian : ndarray, float64, shape (..., N_e, n)
+        ``mean`` (..., n); ``inputs`` (..., N); returns ``path`` (..., N_e), ``jacobian`` (..., N_e, n).
         """
         ...
 
@@ -74,16 +64,7 @@ class Motion(Protocol):
     def fast_output(self, state: Gaussian, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Output at every fast step of the frame period, within the exposure and until the next one.
 
-        Parameters
-        ----------
-        state : Gaussian
-            At the start of the exposure, after its frame; shape (..., n).
-        inputs : ndarray, float64, shape (..., N)
-            u_s.
-
-        Returns
-        -------
-        mean, variance : ndarray, float64, shape (..., N)
+        ``inputs`` (..., N); returns ``mean, variance`` (..., N).
         """
         ...
 
@@ -103,11 +84,6 @@ class FastSystem:
     ------
     ConfigurationError
         Shapes do not agree, values are not finite, or the system is unstable.
-
-    Examples
-    --------
-    >>> FastSystem([[0.5]], [1.0], [1.0]).B
-    array([1.])
     """
 
     A: Float64Array
@@ -155,15 +131,6 @@ class LiftedSystem:
         Output at every fast step as a function of the inputs.
     Q : ndarray, float64, shape (n, n)
         Covariance of the disturbance between two exposures.
-
-    Examples
-    --------
-    >>> timing = ExposureTiming(fast_period=1.0, exposure=2.0, readout=1.0, frame_period=3.0)
-    >>> lifted = lift(FastSystem([[0.5]], [1.0], [1.0]), timing, [[0.1]])
-    >>> lifted.path_and_jacobian(np.array([1.0]), np.array([1.0, 0.0, 0.0]))[0]
-    array([1. , 1.5])
-    >>> lifted.fast_output(Gaussian(np.ones(1), np.eye(1)), np.zeros(3))
-    (array([1.  , 0.5 , 0.25]), array([1.    , 0.25  , 0.0625]))
     """
 
     timing: ExposureTiming
@@ -203,29 +170,7 @@ class LiftedSystem:
 def discretise(A: ArrayLike, B: ArrayLike, period: float) -> tuple[Float64Array, Float64Array]:
     """Discretise ``ẋ = A x + B u`` with an input that is constant over each step (zero-order hold).
 
-    Parameters
-    ----------
-    A : array_like, shape (n, n)
-    B : array_like, shape (n,)
-    period : float
-        T_f, s.
-
-    Returns
-    -------
-    A_f : ndarray, float64, shape (n, n)
-    B_f : ndarray, float64, shape (n,)
-
-    Raises
-    ------
-    ConfigurationError
-        The period is not positive, shapes do not agree, or values are not finite.
-
-    Examples
-    --------
-    >>> A_f, B_f = discretise([[0, 1], [-20, -30]], [0, 20], 1e-3)
-    >>> A_f.round(4)
-    array([[ 1.    ,  0.001 ],
-           [-0.0197,  0.9704]])
+    ``A`` (n, n); ``B`` (n,); returns ``A_f`` (n, n), ``B_f`` (n,).
     """
     A, B = np.asarray(A, np.float64), np.atleast_1d(np.asarray(B, np.float64))
     require(0 < period < np.inf, f"period: expected a time above 0 s, found {period:g}")
@@ -241,28 +186,7 @@ def discretise(A: ArrayLike, B: ArrayLike, period: float) -> tuple[Float64Array,
 def lift(fast: FastSystem, timing: ExposureTiming, Q: ArrayLike) -> LiftedSystem:
     """Lift a fast system to the rate of the frames (paper 2, section IV).
 
-    Parameters
-    ----------
-    fast : FastSystem
-    timing : ExposureTiming
-    Q : array_like, shape (n, n)
-        Covariance of the disturbance that is added between two exposures.
-
-    Returns
-    -------
-    LiftedSystem
-
-    Raises
-    ------
-    ConfigurationError
-        Q has the wrong shape, or the average outputs of the exposures do not determine the state.
-
-    Examples
-    --------
-    >>> timing = ExposureTiming(fast_period=1.0, exposure=2.0, readout=1.0, frame_period=3.0)
-    >>> lifted = lift(FastSystem([[0.5]], [1.0], [1.0]), timing, [[0.1]])
-    >>> lifted.A, lifted.B, lifted.C, lifted.D
-    (array([[0.125]]), array([[0.25, 0.5 , 1.  ]]), array([0.75]), array([0.5, 0. , 0. ]))
+    ``Q`` (n, n).
     """
     steps, n = timing.frame_steps, len(fast.B)
     noise = np.asarray(Q, np.float64)
@@ -288,25 +212,10 @@ def lift(fast: FastSystem, timing: ExposureTiming, Q: ArrayLike) -> LiftedSystem
 def is_observable(A: ArrayLike, C: ArrayLike) -> bool:
     """Whether the outputs C x, C A x, … determine the state (test of Popov, Belevitch and Hautus).
 
-    A simple eigenvalue needs an eigenvector v with C v ≠ 0.  Eigenvalues count as distinct relative to their size,
-    so that modes that die out within a step are kept apart.  For multiple eigenvalues λ the rank of ``[λ I − A; C]``
+    A simple eigenvalue needs an eigenvector v with C v ≠ 0. Eigenvalues count as distinct relative to their size, so
+    that modes that die out within a step are kept apart. For multiple eigenvalues λ the rank of ``[λ I − A; C]``
     decides.
-
-    Parameters
-    ----------
-    A : array_like, shape (n, n)
-    C : array_like, shape (n,) or (m, n)
-
-    Returns
-    -------
-    bool
-
-    Examples
-    --------
-    >>> is_observable([[0.5, 0.0], [0.0, 0.5]], [1.0, 1.0])
-    False
-    >>> is_observable([[1.0, 1.0], [0.0, 1.0]], [1.0, 0.0])
-    True
+    ``A`` (n, n); ``C`` (n,) or (m, n).
     """
     A, C = np.asarray(A, np.float64), np.atleast_2d(np.asarray(C, np.float64))
     values, vectors = np.linalg.eig(A)
@@ -325,13 +234,7 @@ def is_observable(A: ArrayLike, C: ArrayLike) -> bool:
 
 
 def check_inputs(motion: Motion, state: Gaussian, inputs: ArrayLike) -> Float64Array:
-    """Return the inputs of a frame period as float64, after checking that state and inputs belong to a motion.
-
-    Raises
-    ------
-    DataError
-        Wrong number of states or inputs, or inputs that are not finite.
-    """
+    """Return the inputs of a frame period as float64, after checking that state and inputs belong to a motion."""
     if state.mean.shape[-1] != motion.order:
         raise DataError(f"state: expected a mean of shape (..., {motion.order}), found {state.mean.shape}")
     values, steps = np.asarray(inputs, np.float64), motion.timing.frame_steps

@@ -59,17 +59,7 @@ class BlurModel:
     def image_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Predict the image from a state.
 
-        Parameters
-        ----------
-        mean : ndarray, float64, shape (..., n)
-            State at the start of the exposure.
-        inputs : ndarray, float64, shape (..., N)
-
-        Returns
-        -------
-        image : ndarray, float64, shape (..., count)
-        derivative : ndarray, float64, shape (..., n, count)
-            With respect to the state.
+        ``mean`` (..., n); ``inputs`` (..., N); returns ``image`` (..., count), ``derivative`` (..., n, count).
         """
         return self.table.image_and_jacobian(*self.motion.path_and_jacobian(mean, inputs))
 
@@ -84,39 +74,7 @@ def predicted_moments(
     """Predict the moments h(x̂) from a state, with their derivative and the covariance of their noise.
 
     They follow from the moments of path and kernel by the binomial relation, as if all light fell on the pixels.
-
-    Parameters
-    ----------
-    model : BlurModel
-    mean : ndarray, float64, shape (..., n)
-        State at the start of the exposure.
-    inputs : ndarray, float64, shape (..., N)
-    orders : tuple of int
-        Orders of the moments.
-    basis : {"monomial", "legendre"}
-
-    Returns
-    -------
-    moments : ndarray, float64, shape (..., m)
-    H : ndarray, float64, shape (..., m, n)
-    R : ndarray, float64, shape (m, m)
-
-    Raises
-    ------
-    ConfigurationError
-        As many moments as pixels: R would be singular.
-
-    Examples
-    --------
-    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
-    >>> from turbrestore.blur_moments.sensor import ExposureTiming
-    >>> timing = ExposureTiming(fast_period=1.0, exposure=2.0, readout=0.0, frame_period=2.0)
-    >>> motion = lift(FastSystem([[0.5]], [1.0], [1.0]), timing, [[0.1]])
-    >>> sensor = LineSensor(GaussianKernel(0.1), PixelGrid(-1.0, 1.0, 20, integrating=False), noise=0.1)
-    >>> h, H, _ = predicted_moments(BlurModel(motion, sensor), np.array([0.4]), np.zeros(2), (1, 2))
-    >>> h.round(3), H.round(3)
-    (array([0.3 , 0.11]), array([[0.75],
-           [0.5 ]]))
+    ``mean`` (..., n); ``inputs`` (..., N); returns ``moments`` (..., m), ``H`` (..., m, n), ``R`` (m, m).
     """
     sensor, order, chosen = model.sensor, max(orders), list(orders)
     pixels = sensor.pixels
@@ -137,33 +95,7 @@ def image_moments(
 ) -> Float64Array:
     """Moments of images of a line.
 
-    Parameters
-    ----------
-    image : array_like, shape (..., count)
-        Intensity per unit of length.
-    pixels : PixelGrid
-    order : int
-        Highest order p.
-    basis : {"monomial", "legendre"}
-    total : float
-        Known total intensity of the exposure, the denominator.
-
-    Returns
-    -------
-    ndarray, float64, shape (..., order + 1)
-        Orders 0 to p; order 0 is the measured share of the total.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, or values are not finite.
-    ConfigurationError
-        Unknown basis, negative order, or a total that is not above 0.
-
-    Examples
-    --------
-    >>> image_moments([0.25, 0.75], PixelGrid(-1.0, 1.0, 2), order=2)
-    array([1.  , 0.25, 0.25])
+    ``image`` (..., count); returns (..., order + 1).
     """
     values = np.asarray(image, np.float64)
     if values.ndim < 1 or values.shape[-1] != pixels.count or not np.isfinite(values).all():
@@ -175,31 +107,9 @@ def image_moments(
 def moment_noise(pixels: PixelGrid, order: int, density: float, basis: str = "monomial") -> Float64Array:
     """Covariance of the noise of the moments, ``V ∫ b_p b_q dη``.
 
-    On [−1, 1] with fine pixels: 2V, 2V/3 and 2V/5 for orders 0, 1, 2; 2V/3 between 0 and 2; 0 between 1 and 2.
-    Paper 1, eq. 11, in the text available, has 3V for the second.
-
-    Parameters
-    ----------
-    pixels : PixelGrid
-    order : int
-        Highest order.
-    density : float
-        V of the white noise.
-    basis : {"monomial", "legendre"}
-
-    Returns
-    -------
-    ndarray, float64, shape (order + 1, order + 1)
-
-    Raises
-    ------
-    ConfigurationError
-        Unknown basis, negative order or negative density.
-
-    Examples
-    --------
-    >>> moment_noise(PixelGrid(-1.0, 1.0, 2000), 2, density=0.1).diagonal().round(4)
-    array([0.2   , 0.0667, 0.04  ])
+    On [−1, 1] with fine pixels: 2V, 2V/3 and 2V/5 for orders 0, 1, 2; 2V/3 between 0 and 2; 0 between 1 and 2. Paper 1,
+    eq. 11, in the text available, has 3V for the second.
+    Returns (order + 1, order + 1).
     """
     require(0 <= density < np.inf, f"density: expected noise of at least 0, found {density:g}")
     functions = basis_functions(pixels, order, basis)
@@ -209,32 +119,9 @@ def moment_noise(pixels: PixelGrid, order: int, density: float, basis: str = "mo
 def kernel_relation(kernel: GaussianKernel, pixels: PixelGrid, order: int) -> Float64Array:
     """Matrix from the moments of a path to those of its image: the binomial relation (paper 2, eq. 3).
 
-    The moments of kernel and pixel are those of offset, Gaussian and pixel one after the other; an integrating pixel
-    of width Δ adds Δ²/12 to the variance.
-
-    Parameters
-    ----------
-    kernel : GaussianKernel
-    pixels : PixelGrid
-    order : int
-        Highest order.
-
-    Returns
-    -------
-    ndarray, float64, shape (order + 1, order + 1)
-        Entry (p, i) is ``binom(p, i) y_Ψ^(p−i)``; the first column holds the raw moments of the kernel.
-
-    Raises
-    ------
-    ConfigurationError
-        The order is negative.
-
-    Examples
-    --------
-    >>> kernel_relation(GaussianKernel(0.5, offset=1.0), PixelGrid(0.0, 1.0, 1, integrating=False), 2)
-    array([[1.  , 0.  , 0.  ],
-           [1.  , 1.  , 0.  ],
-           [1.25, 2.  , 1.  ]])
+    The moments of kernel and pixel are those of offset, Gaussian and pixel one after the other; an integrating pixel of
+    width Δ adds Δ²/12 to the variance.
+    Returns (order + 1, order + 1).
     """
     p = _orders(order)
     odd_product = np.array([np.prod(np.arange(k - 1, 0, -2, dtype=np.float64)) for k in p])
@@ -248,26 +135,7 @@ def kernel_relation(kernel: GaussianKernel, pixels: PixelGrid, order: int) -> Fl
 def basis_functions(pixels: PixelGrid, order: int, basis: str = "monomial") -> Float64Array:
     """Functions on which images are projected, at the centres of the pixels.
 
-    Parameters
-    ----------
-    pixels : PixelGrid
-    order : int
-        Highest order.
-    basis : {"monomial", "legendre"}
-
-    Returns
-    -------
-    ndarray, float64, shape (count, order + 1)
-
-    Raises
-    ------
-    ConfigurationError
-        Unknown basis or negative order.
-
-    Examples
-    --------
-    >>> basis_functions(PixelGrid(-1.0, 1.0, 2), order=2, basis="legendre")[:, 2].round(4)
-    array([-0.0833, -0.0833])
+    Returns (count, order + 1).
     """
     return pixels.centres[:, None] ** _orders(order) @ basis_change(pixels, order, basis).T
 
@@ -275,30 +143,7 @@ def basis_functions(pixels: PixelGrid, order: int, basis: str = "monomial") -> F
 def basis_change(pixels: PixelGrid, order: int, basis: str) -> Float64Array:
     """Matrix from monomial moments to those of another basis.
 
-    Parameters
-    ----------
-    pixels : PixelGrid
-        Their interval is that of the Legendre polynomials.
-    order : int
-        Highest order.
-    basis : {"monomial", "legendre"}
-
-    Returns
-    -------
-    ndarray, float64, shape (order + 1, order + 1)
-        Lower triangular with ones on the diagonal.
-
-    Raises
-    ------
-    ConfigurationError
-        Unknown basis or negative order.
-
-    Examples
-    --------
-    >>> basis_change(PixelGrid(-1.0, 1.0, 10), 2, "legendre").round(4)
-    array([[ 1.    ,  0.    ,  0.    ],
-           [ 0.    ,  1.    ,  0.    ],
-           [-0.3333,  0.    ,  1.    ]])
+    Returns (order + 1, order + 1).
     """
     if basis not in BASES:
         raise ConfigurationError(f"basis: expected one of {', '.join(BASES)}, found {basis!r}")

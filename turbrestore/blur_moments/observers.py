@@ -48,23 +48,7 @@ class Observer(Protocol):
     ) -> tuple[Gaussian, Innovation]:
         """Correct the predicted state at the start of an exposure by its frame.
 
-        Parameters
-        ----------
-        model : BlurModel
-        state : Gaussian
-            Prediction, shape (..., n).
-        frame : array_like, shape (..., count)
-        inputs : array_like, shape (..., N)
-
-        Returns
-        -------
-        state : Gaussian
-        innovation : Innovation
-
-        Raises
-        ------
-        DataError
-            Shapes do not agree or values are not finite.
+        ``frame`` (..., count); ``inputs`` (..., N).
         """
         ...
 
@@ -86,13 +70,7 @@ class FixedGain:
     def step(
         self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
     ) -> tuple[Gaussian, Innovation]:
-        """Correct the predicted state by its frame; see :meth:`Observer.step`.
-
-        Raises
-        ------
-        ConfigurationError
-            The gain belongs to another system.
-        """
+        """Correct the predicted state by its frame; see :meth:`Observer.step`."""
         order, size = model.motion.order, np.shape(self.gain)
         require(size == (order,), f"gain: expected shape {(order,)}, found {size}")
         measured, expected, H, R = _extended_terms(model, state, frame, inputs, MomentFilter((1,)))
@@ -123,11 +101,6 @@ class MomentFilter:
     ------
     ConfigurationError
         No orders, orders below 1 or not ascending, unknown basis or method.
-
-    Examples
-    --------
-    >>> MomentFilter(orders=(1,)).method
-    'extended'
     """
 
     orders: tuple[int, ...] = (1, 2)
@@ -167,35 +140,7 @@ def run_observer(
 ) -> list[tuple[Gaussian, Innovation]]:
     """Run an observer over frames.
 
-    Parameters
-    ----------
-    observer : Observer
-    model : BlurModel
-    start : Gaussian
-        State at the start of the first exposure, shape (..., n).
-    frames : array_like, shape (T, ..., count)
-    inputs : array_like, shape (T, ..., N)
-
-    Returns
-    -------
-    list of (Gaussian, Innovation)
-        State at the start of every exposure, after its frame.
-
-    Raises
-    ------
-    DataError
-        The numbers of frames and inputs differ; and what ``step`` raises.
-
-    Examples
-    --------
-    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
-    >>> from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid
-    >>> timing = ExposureTiming(fast_period=1.0, exposure=2.0, readout=0.0, frame_period=2.0)
-    >>> motion = lift(FastSystem([[0.9]], [0.1], [1.0]), timing, [[0.01]])
-    >>> model = BlurModel(motion, LineSensor(GaussianKernel(0.1), PixelGrid(-1.0, 1.0, 20), noise=0.1))
-    >>> start = Gaussian(np.zeros(1), np.eye(1))
-    >>> len(run_observer(MomentFilter(), model, start, np.full((3, 20), 0.5), np.zeros((3, 2))))
-    3
+    ``frames`` (T, ..., count); ``inputs`` (T, ..., N).
     """
     images, all_inputs = np.asarray(frames), np.asarray(inputs)
     if len(images) != len(all_inputs):
@@ -210,28 +155,7 @@ def run_observer(
 def luenberger(motion: LiftedSystem, poles: ArrayLike) -> FixedGain:
     """Luenberger observer with the given poles of ``A_s − L C_s A_s`` (paper 2, O1).
 
-    Parameters
-    ----------
-    motion : LiftedSystem
-    poles : array_like, shape (n,)
-        Inside the unit circle and distinct, because there is only one output.
-
-    Returns
-    -------
-    FixedGain
-
-    Raises
-    ------
-    ConfigurationError
-        A pole outside the unit circle, or poles that cannot be placed.
-
-    Examples
-    --------
-    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
-    >>> from turbrestore.blur_moments.sensor import ExposureTiming
-    >>> timing = ExposureTiming(fast_period=1.0, exposure=1.0, readout=0.0, frame_period=1.0)
-    >>> luenberger(lift(FastSystem([[0.8]], [1.0], [1.0]), timing, [[0.1]]), [0.2]).gain
-    array([0.75])
+    ``poles`` (n,).
     """
     wanted = np.atleast_1d(np.asarray(poles))
     require(
@@ -248,35 +172,7 @@ def luenberger(motion: LiftedSystem, poles: ArrayLike) -> FixedGain:
 def steady_kalman(model: BlurModel) -> tuple[FixedGain, Float64Array]:
     """Observer with the steady-state gain of the Kalman filter on the first moment (paper 1, O1).
 
-    Parameters
-    ----------
-    model : BlurModel
-        With a :class:`~.lifting.LiftedSystem`.
-
-    Returns
-    -------
-    observer : FixedGain
-    cov : ndarray, float64, shape (n, n)
-        P, steady-state covariance of the prediction.
-
-    Raises
-    ------
-    ConfigurationError
-        The motion is not linear.
-    DataError
-        The Riccati equation has no stabilising solution: Q is not a covariance, or is zero where the system does not
-        decay.
-
-    Examples
-    --------
-    >>> from turbrestore.blur_moments.lifting import FastSystem, lift
-    >>> from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid
-    >>> timing = ExposureTiming(fast_period=1.0, exposure=1.0, readout=0.0, frame_period=1.0)
-    >>> motion = lift(FastSystem([[1.0]], [1.0], [1.0]), timing, [[0.5]])
-    >>> sensor = LineSensor(GaussianKernel(0.05), PixelGrid(-1.0, 1.0, 1000), noise=1.5)
-    >>> observer, cov = steady_kalman(BlurModel(motion, sensor))
-    >>> cov.round(4), observer.gain.round(4)
-    (array([[1.]]), array([0.5]))
+    Returns ``cov`` (n, n).
     """
     motion, sensor = model.motion, model.sensor
     if not isinstance(motion, LiftedSystem):

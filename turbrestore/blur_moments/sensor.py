@@ -53,12 +53,6 @@ class ExposureTiming:
     ConfigurationError
         A time is not positive or not a whole number of fast steps, the frame period is shorter than exposure and
         readout, or the exposure is shorter than one fast step.
-
-    Examples
-    --------
-    >>> timing = ExposureTiming(fast_period=1e-3, exposure=0.1, readout=0.35, frame_period=0.45, trigger=0.09)
-    >>> timing.frame_steps, timing.exposure_steps
-    (450, 100)
     """
 
     fast_period: float
@@ -115,11 +109,6 @@ class PixelGrid:
     ------
     ConfigurationError
         No pixel, or no width.
-
-    Examples
-    --------
-    >>> PixelGrid(-1.0, 1.0, 4).centres
-    array([-0.75, -0.25,  0.25,  0.75])
     """
 
     start: float
@@ -160,13 +149,6 @@ class GaussianKernel:
     ------
     ConfigurationError
         The width is negative, or a number is not finite.
-
-    Examples
-    --------
-    >>> GaussianKernel(0.0).response(np.array([0.0, 1.0]), PixelGrid(0.0, 1.0, 2))
-    array([2., 0.])
-    >>> GaussianKernel(1.0).slope(np.array([0.0]), PixelGrid(-1.0, 1.0, 2))
-    array([0.])
     """
 
     sigma: float
@@ -177,23 +159,7 @@ class GaussianKernel:
         require(bool(np.isfinite(self.offset)), f"offset: expected a finite position, found {self.offset:g}")
 
     def response(self, distance: Float64Array, pixels: PixelGrid) -> Float64Array:
-        """Intensity that pixels record at the distances η − y from a point at rest.
-
-        Parameters
-        ----------
-        distance : ndarray, float64
-            η − y.
-        pixels : PixelGrid
-
-        Returns
-        -------
-        ndarray, float64, shape of ``distance``
-
-        Raises
-        ------
-        ConfigurationError
-            An ideal point on pixels that do not integrate.
-        """
+        """Intensity that pixels record at the distances η − y from a point at rest."""
         d, sigma, width = distance - self.offset, self.sigma, pixels.width
         if sigma == 0:
             require(pixels.integrating, "kernel: expected integrating pixels under a delta, found pixels that sample")
@@ -204,23 +170,7 @@ class GaussianKernel:
         return np.exp(-0.5 * (d / sigma) ** 2) / (_SQRT_2PI * sigma)
 
     def slope(self, distance: Float64Array, pixels: PixelGrid) -> Float64Array:
-        """Differentiate :meth:`response` with respect to the distance.
-
-        Parameters
-        ----------
-        distance : ndarray, float64
-            η − y.
-        pixels : PixelGrid
-
-        Returns
-        -------
-        ndarray, float64, shape of ``distance``
-
-        Raises
-        ------
-        ConfigurationError
-            The image of an ideal point has no derivative.
-        """
+        """Differentiate :meth:`response` with respect to the distance."""
         d, sigma, width = distance - self.offset, self.sigma, pixels.width
         require(sigma > 0, "kernel: expected one with a width, found a delta, whose image has no derivative")
         if pixels.integrating:
@@ -246,11 +196,6 @@ class LineSensor:
     ------
     ConfigurationError
         Noise or total is not above 0.
-
-    Examples
-    --------
-    >>> LineSensor(GaussianKernel(0.05), PixelGrid(-1.0, 1.0, 100), noise=0.1).total
-    1.0
     """
 
     kernel: GaussianKernel
@@ -271,31 +216,7 @@ class LineSensor:
 def expose(path: ArrayLike, kernel: GaussianKernel, pixels: PixelGrid, total: float = 1.0) -> Float64Array:
     """Exposure operator C_Ψ: the image of a moving point (paper 1, eq. 3; paper 2, eq. 1).
 
-    Parameters
-    ----------
-    path : array_like, shape (..., N_e)
-        Output y at the fast steps of the exposure.
-    kernel : GaussianKernel
-    pixels : PixelGrid
-    total : float
-        Total intensity; T_e for the integral as printed.
-
-    Returns
-    -------
-    ndarray, float64, shape (..., count)
-        Intensity per unit of length, without the light that misses the pixels.
-
-    Raises
-    ------
-    DataError
-        Empty exposure, or values that are not finite.
-    ConfigurationError
-        An ideal point on pixels that do not integrate.
-
-    Examples
-    --------
-    >>> expose([-0.5, 0.5, 0.5, 0.5], GaussianKernel(0.0), PixelGrid(-1.0, 1.0, 2))
-    array([0.25, 0.75])
+    ``path`` (..., N_e); returns (..., count).
     """
     positions = np.asarray(path, np.float64)
     if positions.ndim < 1 or positions.shape[-1] == 0:

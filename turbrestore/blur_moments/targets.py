@@ -54,11 +54,6 @@ class RandomWalk:
     ------
     ConfigurationError
         Not above 0.
-
-    Examples
-    --------
-    >>> RandomWalk(3.0).smear(exposure=2.0)
-    1.0
     """
 
     diffusion: float
@@ -92,11 +87,6 @@ class ConstantVelocity:
     ------
     ConfigurationError
         Not above 0.
-
-    Examples
-    --------
-    >>> ConstantVelocity(0.1).prior(step=1.0, frame_period=0.5).diagonal()
-    array([ 1., 16.])
     """
 
     acceleration: float
@@ -139,11 +129,6 @@ class Oscillation:
     ------
     ConfigurationError
         A number is not above 0, the damping is not below 1, or the range is empty.
-
-    Examples
-    --------
-    >>> len(Oscillation(frequency=12.0, damping=0.1, drive=1.0).dynamics()[0])
-    3
     """
 
     frequency: float
@@ -181,28 +166,8 @@ TargetMotion = RandomWalk | ConstantVelocity | Oscillation
 def lift_motion(motion: TargetMotion, timing: ExposureTiming) -> LiftedSystem:
     """Lift the motion of one axis to the rate of the frames.
 
-    The output is taken in the middle of the fast steps.  The random force of a frame period is added at its end, with
+    The output is taken in the middle of the fast steps. The random force of a frame period is added at its end, with
     the covariance ``∫ expm(A t) q expm(Aᵀ t) dt`` (Van Loan 1978).
-
-    Parameters
-    ----------
-    motion : RandomWalk, ConstantVelocity or Oscillation
-    timing : ExposureTiming
-
-    Returns
-    -------
-    LiftedSystem
-
-    Raises
-    ------
-    ConfigurationError
-        The frames do not determine the state: an oscillation at a multiple of half the frame rate.
-
-    Examples
-    --------
-    >>> timing = ExposureTiming(fast_period=0.25, exposure=1.0, readout=0.0, frame_period=1.0)
-    >>> lift_motion(ConstantVelocity(3.0), timing).Q.round(6).tolist()
-    [[1.0, 1.5], [1.5, 3.0]]
     """
     A, intensity = motion.dynamics()
     n = len(A)
@@ -234,15 +199,6 @@ class PlaneModel:
     ------
     ConfigurationError
         Noise or total is not above 0.
-
-    Examples
-    --------
-    >>> timing = ExposureTiming(fast_period=0.25, exposure=0.5, readout=0.0, frame_period=1.0)
-    >>> pixels = PixelGrid(-8, 8, 16)
-    >>> model = PlaneModel(lift_motion(RandomWalk(0.1), timing), 1.0, pixels, pixels, noise=0.01)
-    >>> model.advance(Gaussian(np.zeros(2), np.eye(2))).cov
-    array([[1.1, 0. ],
-           [0. , 1.1]])
     """
 
     axis: LiftedSystem
@@ -280,11 +236,6 @@ class PlaneMomentFilter:
     ------
     ConfigurationError
         Unknown order or basis.
-
-    Examples
-    --------
-    >>> PlaneMomentFilter().order
-    2
     """
 
     order: int = 2
@@ -297,23 +248,7 @@ class PlaneMomentFilter:
     def step(self, model: PlaneModel, state: Gaussian, frame: ArrayLike) -> tuple[Gaussian, Innovation]:
         """Correct the predicted state at the start of an exposure by its frame.
 
-        Parameters
-        ----------
-        model : PlaneModel
-        state : Gaussian
-            Prediction, shape (n,).
-        frame : array_like, shape (rows, columns)
-            Without background.
-
-        Returns
-        -------
-        state : Gaussian
-        innovation : Innovation
-
-        Raises
-        ------
-        DataError
-            Shapes do not agree or values are not finite.
+        ``frame`` (rows, columns).
         """
         measure, _, R = self._tables(model)
         image = np.asarray(frame, np.float64)
@@ -326,17 +261,7 @@ class PlaneMomentFilter:
     def predicted(self, model: PlaneModel, state: Gaussian) -> tuple[Float64Array, Float64Array, Float64Array]:
         """Mean of the moments, their derivative, and the covariance that their curvature adds.
 
-        Parameters
-        ----------
-        model : PlaneModel
-        state : Gaussian
-            Shape (n,).
-
-        Returns
-        -------
-        mean : ndarray, float64, shape (m,)
-        H : ndarray, float64, shape (m, n)
-        spread : ndarray, float64, shape (m, m)
+        Returns ``mean`` (m,), ``H`` (m, n), ``spread`` (m, m).
         """
         _, of_path, _ = self._tables(model)
         f = model.outputs(model.axis.timing.exposure_steps)

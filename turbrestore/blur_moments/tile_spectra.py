@@ -105,14 +105,6 @@ class TileSpectra:
         Flat indices of the frequencies in the half-plane that a real transform gives.
     kx, ky : ndarray, float64, shape (f,)
         The frequencies, radians per pixel.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> noise = np.random.default_rng(0).normal(0.5, 1, (96, 96)).astype(np.float32)
-    >>> power = TileSpectra.of(noise.shape, CueParams()).power(noise)
-    >>> power.shape, round(float(power.mean()), 1)
-    ((9, 438), 1.0)
     """
 
     grid: TileGrid
@@ -123,23 +115,7 @@ class TileSpectra:
 
     @classmethod
     def of(cls, shape: tuple[int, ...], params: CueParams) -> TileSpectra:
-        """Lay tiles over images of a shape.
-
-        Parameters
-        ----------
-        shape : tuple of int
-            Height and width of the images, pixels.
-        params : CueParams
-
-        Returns
-        -------
-        TileSpectra
-
-        Raises
-        ------
-        DataError
-            A side is shorter than 16 pixels.
-        """
+        """Lay tiles over images of a shape."""
         if min(shape) < 16:
             raise DataError(f"image: expected at least 16 pixels a side, found shape {tuple(shape)}")
         height, width = (min(int(params.tile), length) for length in shape)
@@ -158,14 +134,7 @@ class TileSpectra:
     def power(self, image: FloatArray) -> FloatArray:
         """Compute the power spectra of the tiles; white noise of variance 1 gives 1.
 
-        Parameters
-        ----------
-        image : ndarray, float32, shape (H, W)
-
-        Returns
-        -------
-        ndarray, float32, shape (tiles, f)
-            P, squared intensity.
+        ``image`` (H, W); returns (tiles, f).
         """
         # The mean brightness is subtracted first, because float32 has seven digits only.
         tiles = np.lib.stride_tricks.sliding_window_view(image - image.mean(), self.grid.size)
@@ -179,19 +148,7 @@ class TileSpectra:
     def cells(self, sectors: int = 1) -> tuple[FloatArray, Float64Array, Float64Array]:
         """Divide the spectrum into rings and sectors.
 
-        Parameters
-        ----------
-        sectors : int
-            Number of directions that are distinguished.
-
-        Returns
-        -------
-        averaging : ndarray, float32, shape (f, cells)
-            A spectrum times this matrix is the mean of every cell.
-        k2 : ndarray, float64, shape (cells,)
-            Mean of k².
-        counts : ndarray, float64, shape (cells,)
-            Number of independent values in each cell, at least 1.
+        Returns ``averaging`` (f, cells), ``k2`` (cells,), ``counts`` (cells,).
         """
         k = np.hypot(self.kx, self.ky)
         ring = np.rint(k / (2 * np.pi) * min(self.grid.size))
@@ -210,19 +167,9 @@ class TileSpectra:
     def widening(self, powers: list[Float64Array], k2: Float64Array) -> Float64Array:
         """Factor by which the smear of the window changes k² in an exponent.
 
-        A smear by a variance δ² per axis turns P into P + δ²/2 ΔP, and the logarithm of a ratio −D k² into
-        −D (k² + δ²/2 (4 + 2 k d/dk log P₁P₂)).
-
-        Parameters
-        ----------
-        powers : list of two ndarrays, float64, shape (rings,)
-            P₁ and P₂ above the noise.
-        k2 : ndarray, float64, shape (rings,)
-
-        Returns
-        -------
-        ndarray, float64, shape (rings,)
-            0.5 to 1.5.
+        A smear by a variance δ² per axis turns P into P + δ²/2 ΔP, and the logarithm of a ratio −D k² into −D (k² +
+        δ²/2 (4 + 2 k d/dk log P₁P₂)).
+        ``powers`` (rings,) each; ``k2`` (rings,); returns (rings,).
         """
         slopes = sum(_log_slope(power, k2) for power in powers)
         return np.clip(1 + self.smear * (2 + slopes) / k2, 0.5, 1.5)
@@ -231,21 +178,7 @@ class TileSpectra:
 def tile_map(values: ArrayLike, grid: TileGrid) -> FloatArray:
     """Interpolate values of the tiles to every pixel: bilinear between the centres of the tiles, constant beyond.
 
-    Parameters
-    ----------
-    values : array_like, shape (m, n)
-    grid : TileGrid
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> grid = TileGrid(np.array([0]), np.array([0, 2]), (2, 2), (2, 4))
-    >>> tile_map([[0.0, 1.0]], grid)[0]
-    array([0.  , 0.25, 0.75, 1.  ], dtype=float32)
+    ``values`` (m, n); returns (H, W).
     """
     tiles = np.asarray(values, np.float32)
     positions = []
@@ -257,28 +190,7 @@ def tile_map(values: ArrayLike, grid: TileGrid) -> FloatArray:
 
 
 def noise_floor(noise: float) -> float:
-    """Power that white noise adds to a spectrum.
-
-    Parameters
-    ----------
-    noise : float
-        Standard deviation of the noise, intensity.
-
-    Returns
-    -------
-    float
-        n, squared intensity; above 0 even without noise.
-
-    Raises
-    ------
-    ConfigurationError
-        The noise is negative or not finite.
-
-    Examples
-    --------
-    >>> noise_floor(0.5)
-    0.25
-    """
+    """Power that white noise adds to a spectrum."""
     require(np.isfinite(noise) and noise >= 0, f"noise: expected a finite number of 0 or more, found {noise}")
     return max(noise, _LEAST_NOISE) ** 2
 

@@ -34,29 +34,7 @@ _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 def check_image(image: ArrayLike, name: str = "image") -> FloatArray:
     """Return ``image`` as a finite float32 array of shape (H, W) or (H, W, 3).
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        Floating point intensities (0 to 1), or unsigned integers, which are divided by the largest value of
-        their type.
-    name : str
-        Name of the array in error messages.
-
-    Returns
-    -------
-    ndarray, float32
-        The image itself when it already has the right type, a copy otherwise.
-
-    Raises
-    ------
-    DataError
-        Wrong number of axes or channels, empty, not numeric, NaN or infinite values.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> check_image(np.array([[0, 255]], np.uint8))
-    array([[0., 1.]], dtype=float32)
+    ``image`` (H, W) or (H, W, 3).
     """
     array = _as_float(image, name)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in CHANNELS):
@@ -67,31 +45,7 @@ def check_image(image: ArrayLike, name: str = "image") -> FloatArray:
 def check_frames(frames: ArrayLike, name: str = "frames", at_least: int = 1) -> FloatArray:
     """Return ``frames`` as a finite float32 array of shape (T, H, W) or (T, H, W, 3).
 
-    Parameters
-    ----------
-    frames : array_like, shape (T, H, W) or (T, H, W, 3)
-        Floating point intensities (0 to 1), or unsigned integers, which are divided by the largest value of
-        their type.
-    name : str
-        Name of the array in error messages.
-    at_least : int
-        Smallest number of frames that the caller can work with.
-
-    Returns
-    -------
-    ndarray, float32
-        The array itself when it already has the right type, a copy otherwise.
-
-    Raises
-    ------
-    DataError
-        Too few frames, wrong number of axes or channels, not numeric, NaN or infinite values.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> check_frames(np.zeros((4, 2, 3))).shape
-    (4, 2, 3)
+    ``frames`` (T, H, W) or (T, H, W, 3).
     """
     array = _as_float(frames, name)
     if array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in CHANNELS):
@@ -104,28 +58,7 @@ def check_frames(frames: ArrayLike, name: str = "frames", at_least: int = 1) -> 
 def check_flow(flow: ArrayLike, name: str = "flow") -> FloatArray:
     """Return ``flow`` as a finite float32 array of shape (H, W, 2) or (T, H, W, 2).
 
-    Parameters
-    ----------
-    flow : array_like, shape (H, W, 2) or (T, H, W, 2)
-        Displacements in pixels, last axis (dx, dy).
-    name : str
-        Name of the array in error messages.
-
-    Returns
-    -------
-    ndarray, float32
-        The flow itself when it already has the right type, a copy otherwise.
-
-    Raises
-    ------
-    DataError
-        Wrong shape, empty, not numeric, NaN or infinite values.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> check_flow(np.zeros((2, 3, 2))).dtype
-    dtype('float32')
+    ``flow`` (H, W, 2) or (T, H, W, 2).
     """
     values = np.asarray(flow)
     if values.dtype.kind not in "fiu":
@@ -139,21 +72,7 @@ def check_flow(flow: ArrayLike, name: str = "flow") -> FloatArray:
 def luminance(image: FloatArray) -> FloatArray:
     """Luminance of an image or of frames, by the weights of Rec. 601.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (..., H, W) or (..., H, W, 3)
-        Arrays with two axes, or whose last axis is not 3, are grey already.
-
-    Returns
-    -------
-    ndarray, float32, shape (..., H, W)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> luminance(np.ones((2, 2, 3), np.float32))
-    array([[1., 1.],
-           [1., 1.]], dtype=float32)
+    ``image`` (..., H, W) or (..., H, W, 3); returns (..., H, W).
     """
     if image.ndim < 3 or image.shape[-1] not in CHANNELS:
         return image
@@ -166,25 +85,7 @@ def luminance(image: FloatArray) -> FloatArray:
 
 
 def from_unit(image: FloatArray, bit_depth: int) -> NDArray[np.unsignedinteger]:
-    """Quantise intensities in [0, 1] to unsigned integers of ``bit_depth`` bits.
-
-    Parameters
-    ----------
-    image : ndarray, float32
-        Values outside [0, 1] are clipped.
-    bit_depth : int
-        1 to 16; up to 8 gives uint8, above gives uint16.
-
-    Returns
-    -------
-    ndarray, uint8 or uint16
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from_unit(np.array([0.0, 0.5, 1.2], np.float32), 8)
-    array([  0, 128, 255], dtype=uint8)
-    """
+    """Quantise intensities in [0, 1] to unsigned integers of ``bit_depth`` bits."""
     top = 2**bit_depth - 1
     dtype = np.uint8 if bit_depth <= 8 else np.uint16
     levels, done = np.empty(image.shape, dtype), 0

@@ -42,52 +42,11 @@ class StorageError(TurbrestoreError):
 
 
 def require_between(name: str, value: float, low: float, high: float, unit: str = "") -> None:
-    """Raise :class:`ConfigurationError` unless ``low <= value <= high``; NaN never does.
-
-    Parameters
-    ----------
-    name : str
-        Name of the setting.
-    value : float
-        Its value.
-    low, high : float
-        Smallest and largest value allowed.
-    unit : str
-        Unit of the value, for the message.
-
-    Raises
-    ------
-    ConfigurationError
-        The value is outside the range.
-
-    Examples
-    --------
-    >>> require_between("width", float("inf"), 0, 100, "pixels")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.ConfigurationError: width: expected 0 to 100 pixels, found inf
-    """
+    """Raise :class:`ConfigurationError` unless ``low <= value <= high``; NaN never does."""
     require(low <= value <= high, f"{name}: expected {low:g} to {high:g}{' ' * bool(unit)}{unit}, found {value:g}")
 
 
 def require(condition: bool, message: str) -> None:
-    """Raise :class:`ConfigurationError` with ``message`` unless ``condition`` holds.
-
-    Parameters
-    ----------
-    condition : bool
-        Condition that a setting must meet.
-    message : str
-        One line: expected, found, and what to do.
-
-    Raises
-    ------
-    ConfigurationError
-        The condition is false.
-
-    Examples
-    --------
-    >>> require(0 < 1, "never shown")
-    """
+    """Raise :class:`ConfigurationError` with ``message`` unless ``condition`` holds."""
     if not condition:
         raise ConfigurationError(message)

@@ -44,29 +44,8 @@ def fit_noise_curve(level: FloatArray, variance: FloatArray, energy: FloatArray)
     """Fit the variance of the noise against the level to registered frames.
 
     Frames that are not registered exactly vary by the squared gradient times the variance of the displacement, which is
-    one number for the image, and by noise.  The flattest pixels of every level tell both.
-
-    Parameters
-    ----------
-    level : ndarray, shape (H, W)
-        Mean of the frames, intensity.
-    variance : ndarray, shape (H, W)
-        Their variance over time.
-    energy : ndarray, shape (H, W)
-        Squared gradient of the mean, locally averaged.
-
-    Returns
-    -------
-    NoiseCurve
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> level = np.tile(np.linspace(0.1, 0.9, 200), (200, 1))
-    >>> energy = rng.exponential(1e-3, level.shape)
-    >>> curve = fit_noise_curve(level, 0.01 * level + 0.3 * energy, energy)
-    >>> curve.variance(np.array([[0.2, 0.8]])).round(3)
-    array([[0.002, 0.008]], dtype=float32)
+    one number for the image, and by noise. The flattest pixels of every level tell both.
+    ``level`` (H, W); ``variance`` (H, W); ``energy`` (H, W).
     """
     flat = tuple(np.asarray(part, np.float64).ravel() for part in (level, variance, energy))
     levels, _, energies = flat
@@ -100,30 +79,9 @@ def estimate_noise(image: ArrayLike) -> float:
     """Estimate the standard deviation of the noise from the median of |second differences in x and y|.
 
     The mask ``[1 −2 1]ᵀ[1 −2 1] / 6`` (Immerkær 1996) keeps the deviation of white noise and cancels planes; the
-    median, unlike the mean, is insensitive to edges.  A fused image has smoother noise than a frame, because
+    median, unlike the mean, is insensitive to edges. A fused image has smoother noise than a frame, because
     registration interpolates; its low frequencies contain more noise than this estimate.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        Colour is reduced to luminance.
-
-    Returns
-    -------
-    float
-        Intensity; 0 for images below 3×3.
-
-    Raises
-    ------
-    DataError
-        Wrong shape or values that are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> noisy = np.random.default_rng(0).normal(0.5, 0.01, (64, 64))
-    >>> round(estimate_noise(noisy), 3)
-    0.01
+    ``image`` (H, W) or (H, W, 3).
     """
     grey = luminance(check_image(image))
     if min(grey.shape) < 3:

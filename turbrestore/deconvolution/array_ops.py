@@ -48,24 +48,7 @@ class ArrayOps:
 
 
 def numpy_ops(threads: int = 1) -> ArrayOps:
-    """Operations of NumPy and SciPy.
-
-    Parameters
-    ----------
-    threads : int
-        Threads that share the transform of a large image.
-
-    Returns
-    -------
-    ArrayOps
-
-    Examples
-    --------
-    >>> ops = numpy_ops()
-    >>> image = np.eye(4, dtype=np.float32)
-    >>> bool(np.allclose(ops.back(ops.forward(image), image.shape), image))
-    True
-    """
+    """Operations of NumPy and SciPy."""
 
     def workers(shape: tuple[int, ...]) -> int:
         return threads if shape[0] * shape[1] >= _PARALLEL_PIXELS else 1
@@ -80,23 +63,7 @@ def numpy_ops(threads: int = 1) -> ArrayOps:
 
 
 def torch_ops(device: str) -> ArrayOps:
-    """Operations of torch on a device.
-
-    Parameters
-    ----------
-    device : str
-        Name that torch gives it.
-
-    Returns
-    -------
-    ArrayOps
-
-    Examples
-    --------
-    >>> ops = torch_ops("cpu")
-    >>> ops.total(ops.load(np.ones((2, 3), np.float32)))
-    6.0
-    """
+    """Operations of torch on a device."""
     import torch
 
     return ArrayOps(

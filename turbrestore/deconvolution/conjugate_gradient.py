@@ -120,25 +120,7 @@ class ConjugateGradients:
 
 
 def quadratic_solver(problem: Problem, method: str) -> ConjugateGradients:
-    """Solver of a quadratic method.
-
-    Parameters
-    ----------
-    problem : Problem
-    method : {"wiener", "tikhonov"}
-
-    Returns
-    -------
-    ConjugateGradients
-
-    Examples
-    --------
-    >>> from turbrestore.deconvolution.array_ops import numpy_ops
-    >>> image = np.ones((2, 2), np.float32)
-    >>> quadratic_solver(Problem(image, image, image, 1.0, numpy_ops()), "wiener").symbol
-    array([[0., 4.],
-           [4., 8.]], dtype=float32)
-    """
+    """Solver of a quadratic method."""
     symbol = laplacian_symbol(*problem.shape) if method == "wiener" else np.ones((1, 1), np.float32)
     return ConjugateGradients(problem.ops.load(symbol))
 
@@ -146,22 +128,7 @@ def quadratic_solver(problem: Problem, method: str) -> ConjugateGradients:
 def wiener_image(problem: Problem) -> Array:
     """Wiener solution that nltv and tv start from, with a fidelity of its own.
 
-    Parameters
-    ----------
-    problem : Problem
-        Its fidelity is replaced by :func:`turbrestore.blur.psf.wiener_fidelity`.
-
-    Returns
-    -------
-    array, float32, shape (P, Q)
-
-    Examples
-    --------
-    >>> from turbrestore.deconvolution.array_ops import numpy_ops
-    >>> image = np.ones((2, 2), np.float32)
-    >>> wiener_image(Problem(image, image, image, 1.0, numpy_ops()))
-    array([[1., 1.],
-           [1., 1.]], dtype=float32)
+    Returns (P, Q).
     """
     observed = problem.ops.store(problem.observed)
     problem = replace(problem, fidelity=wiener_fidelity(observed, estimate_noise(observed)))

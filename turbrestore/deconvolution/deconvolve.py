@@ -232,27 +232,7 @@ def deconvolve_steps(
     guide: ArrayLike | None = None,
     runtime: Runtime = DEFAULT,
 ) -> DeconvolutionSteps:
-    """Deblur an image step by step; arguments, errors and result as of :func:`deconvolve`.
-
-    Yields
-    ------
-    DeconvolutionState
-        After every iteration; none if there is no blur to remove.
-
-    Returns
-    -------
-    Deconvolution
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.runtime.steps import finish
-    >>> image = np.random.default_rng(0).random((16, 16), np.float32)
-    >>> done = []
-    >>> steps = deconvolve_steps(image, 1.0, DeconvolutionParams(method="tv", iterations=3))
-    >>> finish(steps, lambda state: done.append(state.iteration)).iterations, done
-    (3, [1, 2, 3])
-    """
+    """Deblur an image step by step; arguments, errors and result as of :func:`deconvolve`."""
     params = params or DeconvolutionParams()
     pixels = check_image(image)
     if sigma_or_psf is None:
@@ -292,29 +272,7 @@ def deconvolve_steps(
 def whole_image_fidelity(image: ArrayLike, params: DeconvolutionParams | None = None) -> float:
     """Weight λ of the data for the whole image, so that tiles of it can be deconvolved with the same weight.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        f.
-    params : DeconvolutionParams, optional
-
-    Returns
-    -------
-    float
-        ``params.fidelity`` if it is given, else λ from the noise of the image.
-
-    Notes
-    -----
-    If a tile is deconvolved with the λ and the ``weights.h`` of the whole image, 99 % of its pixels outside a halo of
-    96 pixels agree with the whole image within .01.  For the other pixels, other patches are the most similar ones,
-    because each tile sharpens its own part of the guide.  If the guide of the whole image is sharpened beforehand
-    (``method="wiener"``) and ``sharpen_guide`` is False, all pixels agree.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> round(whole_image_fidelity(np.tile(np.linspace(0, 1, 101), (9, 1))))
-    5000
+    ``image`` (H, W) or (H, W, 3).
     """
     params = params or DeconvolutionParams()
     return _noise_and_fidelity(split_planes(check_image(image), params.channels), params)[1]

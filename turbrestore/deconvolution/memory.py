@@ -27,27 +27,7 @@ _PAIRS = 0.55
 
 
 def deconvolution_memory(shape: tuple[int, ...], params: DeconvolutionParams, threads: int = 1) -> float:
-    """Largest memory that the deconvolution of an image takes, its input not counted.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        (H, W) or (H, W, 3).
-    params : DeconvolutionParams
-        If ``params.sigma`` is None, the margin is that of a blur of 3 pixels.
-    threads : int
-        Threads that work.
-
-    Returns
-    -------
-    float
-        Bytes.
-
-    Examples
-    --------
-    >>> round(deconvolution_memory((1080, 1920), DeconvolutionParams(), threads=2) / 1e6)
-    849
-    """
+    """Largest memory that the deconvolution of an image takes, its input not counted."""
     reach = int(np.ceil(MARGIN_SIGMAS * (params.sigma if params.sigma is not None else _SIGMA)))
     height, width = margin_around((shape[0], shape[1]), reach if params.boundary == "unknown" else None).shape
     colour = len(shape) == 3

@@ -113,16 +113,7 @@ def add_gradient(
 ) -> None:
     """Replace a by ``ga + K change`` on the pairs of a band, and add |a|² to their pixels.
 
-    Parameters
-    ----------
-    factor, change, squares : ndarray, float32, shape (H · W,)
-        g, the image that K is applied to, and |a|².
-    starts, heads, roots : ndarray
-        Of :class:`turbrestore.deconvolution.nonlocal_weights.NonlocalGraph`.
-    band : ndarray, int64, shape (2,)
-        First tail of the band, and the one after its last.
-    values : ndarray, float32, shape (2, E)
-        a.
+    ``factor, change, squares`` (H · W,); ``band`` (2,); ``values`` (2, E).
     """
     there, back = values[0], values[1]
     for tail in range(np.uintp(band[0]), np.uintp(band[1])):
@@ -150,12 +141,7 @@ def add_adjoint(
 ) -> None:
     """Add ``Kᵀ(ga + Kl)`` of the pairs of a band to their pixels.
 
-    Parameters
-    ----------
-    factor, lag, adjoint : ndarray, float32, shape (H · W,)
-        g, l and the sum.
-    starts, heads, roots, band, values : ndarray
-        As of :func:`add_gradient`.
+    ``factor, lag, adjoint`` (H · W,).
     """
     there, back = values[0], values[1]
     for tail in range(np.uintp(band[0]), np.uintp(band[1])):

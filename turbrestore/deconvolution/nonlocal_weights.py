@@ -146,35 +146,8 @@ def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None, thr
     """Weights ``w(x, y) = exp(−d(x, y)/h²)``, ``d = Σ_z G_a(z) [g(x + z) − g(y + z)]²`` (paper 3, eq. 23).
 
     The printed equation has the absolute difference instead of its square, which does not fit the unit of h²; the
-    square is that of the nonlocal means that the paper cites.  Beyond the border the guide is reflected.
-
-    A pixel is joined to the ``best`` most similar pixels of its search window and to its ``nearest`` ones, and they
-    to it.
-
-    Parameters
-    ----------
-    guide : array_like, shape (H, W) or (H, W, 3)
-        g; colour is reduced to luminance.
-    params : NonlocalParams, optional
-        Size of patches, search and neighbourhood.
-    threads : int
-        Tiles searched side by side; 0 means one per available core.
-
-    Returns
-    -------
-    NonlocalGraph
-
-    Raises
-    ------
-    DataError
-        Wrong shape, values that are not finite, or fewer than two pixels.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> graph = nonlocal_weights(np.array([[0.0, 0.0, 1.0]]), NonlocalParams(patch=1, search=3, best=1, h=1.0))
-    >>> graph.starts, graph.heads, (graph.roots**2).round(3)
-    (array([0, 1, 2, 2], dtype=int32), array([1, 2], dtype=int32), array([1.   , 0.368], dtype=float32))
+    square is that of the nonlocal means that the paper cites. Beyond the border the guide is reflected.
+    ``guide`` (H, W) or (H, W, 3).
     """
     params = params or NonlocalParams()
     grey = luminance(check_image(guide, "guide"))
@@ -192,24 +165,10 @@ def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None, thr
 def automatic_h(grey: FloatArray) -> float:
     """Choose the filtering parameter h: an eighth of the contrast of the guide, or 4 times its noise if that is more.
 
-    Contrast is the range from the 1st to the 99th percentile.  The paper takes h equal to the noise: a fused image has
-    so little that almost every weight would vanish, and with them the regularisation.  At 4 times the noise n, patches
+    Contrast is the range from the 1st to the 99th percentile. The paper takes h equal to the noise: a fused image has
+    so little that almost every weight would vanish, and with them the regularisation. At 4 times the noise n, patches
     that differ by noise alone (d = 2 n²) keep the weight .88, so that flat regions hold together.
-
-    Parameters
-    ----------
-    grey : ndarray, float32, shape (H, W)
-        g.
-
-    Returns
-    -------
-    float
-        Intensity.
-
-    Examples
-    --------
-    >>> round(automatic_h(np.tile(np.linspace(0, 1, 101, dtype=np.float32), (9, 1))), 3)
-    0.123
+    ``grey`` (H, W).
     """
     low, high = np.percentile(grey, (1, 99))
     # The last term only keeps h positive for an image of one colour, where all distances are 0.
@@ -219,25 +178,7 @@ def automatic_h(grey: FloatArray) -> float:
 def search_patches(grey: FloatArray, params: NonlocalParams, threads: int = 0) -> Keys:
     """Keys of the neighbours that every pixel chooses.
 
-    Parameters
-    ----------
-    grey : ndarray, float32, shape (H, W)
-        g; reflected beyond the border.
-    params : NonlocalParams
-    threads : int
-        Tiles searched side by side; 0 means one per available core.
-
-    Returns
-    -------
-    ndarray, int32, shape (H · W, nearest + best)
-        The nearest offsets in their order, then the best, which may be among the nearest too.
-
-    Examples
-    --------
-    >>> params = NonlocalParams(patch=1, search=3, best=1, nearest=0)
-    >>> keys = search_patches(np.float32([[0, 0, 1]]), params)
-    >>> params.offsets[keys[:, 0] & params.rank_mask, 1]
-    array([ 1, -1, -1], dtype=int32)
+    ``grey`` (H, W); returns (H · W, nearest + best).
     """
     (height, width), offsets, window = grey.shape, params.offsets, params.window
     margin = params.search // 2 + params.patch // 2
@@ -263,26 +204,7 @@ def search_patches(grey: FloatArray, params: NonlocalParams, threads: int = 0) -
 def join_pairs(keys: Keys, width: int, params: NonlocalParams) -> tuple[NDArray[np.int32], NDArray[np.int32], Keys]:
     """Pairs of pixels from the neighbours that they choose; a pair that both choose counts once.
 
-    Parameters
-    ----------
-    keys : ndarray, int32, shape (H · W, nearest + best)
-        From :func:`search_patches`; overwritten.
-    width : int
-        Columns of the image.
-    params : NonlocalParams
-
-    Returns
-    -------
-    starts, heads : ndarray, int32
-        As in :class:`NonlocalGraph`.
-    keys : ndarray, int32, shape (E,)
-        Key of each pair.
-
-    Examples
-    --------
-    >>> params = NonlocalParams(patch=1, search=3, best=1, nearest=0)
-    >>> join_pairs(search_patches(np.float32([[0, 0, 1]]), params), 3, params)[:2]
-    (array([0, 1, 2, 2], dtype=int32), array([1, 2], dtype=int32))
+    ``keys`` (H · W, nearest + best); returns ``keys`` (E,).
     """
     offsets, radius = params.offsets, params.search // 2
     steps = offsets @ np.array([width, 1])

@@ -37,24 +37,10 @@ def search_tile(
 ) -> None:
     """Choose neighbours of every pixel of a tile.
 
-    Two distances at a time pass the sorted keys of the best and change places with those that they are less than.
-    There is no branch in that, so that the compiler works on many pixels at once.
-
-    Parameters
-    ----------
-    block : ndarray, float32, shape (rows + 2 margin, columns + 2 margin)
-        g of the tile, and around it as far as patches reach.
-    window : ndarray, float32, shape (patch,)
-        G_a along one axis.
-    offsets : ndarray, int32, shape (n, 2)
-        (dy, dx), nearest first; n is even.
-    edges : ndarray, int64, shape (4,)
-        First row of the image and the one after its last, and the same of columns, relative to the tile.
-    nearest, rank_mask : int
-        See :class:`NonlocalParams`.
-    found : ndarray, int32, shape (rows, nearest + best or more, columns)
-        Filled with the keys; it has to be full of numbers above all keys.  The number of places for the best is a
-        multiple of five.
+    Two distances at a time pass the sorted keys of the best and change places with those that they are less than. There
+    is no branch in that, so that the compiler works on many pixels at once.
+    ``block`` (rows + 2 margin, columns + 2 margin); ``window`` (patch,); ``offsets`` (n, 2); ``edges`` (4,); ``found``
+    (rows, nearest + best or more, columns).
     """
     rows, places, columns = found.shape
     patch, nothing, far = window.size, np.float32(0), np.float32(np.inf)

@@ -123,24 +123,7 @@ class Margin:
 
 
 def margin_around(size: tuple[int, int], least: int | None) -> Margin:
-    """Margin of at least ``least`` pixels on each side, enlarged to a size with a fast Fourier transform.
-
-    Parameters
-    ----------
-    size : (int, int)
-        H and W of the image.
-    least : int or None
-        Smallest width, pixels; None adds no margin.
-
-    Returns
-    -------
-    Margin
-
-    Examples
-    --------
-    >>> margin_around((64, 62), 4).widths
-    ((4, 4), (5, 5))
-    """
+    """Margin of at least ``least`` pixels on each side, enlarged to a size with a fast Fourier transform."""
     if least is None:
         return Margin(size, ((0, 0), (0, 0)))
     extra = [fft.next_fast_len(length + 2 * least, real=True) - length for length in size]
@@ -151,20 +134,7 @@ def margin_around(size: tuple[int, int], least: int | None) -> Margin:
 def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:
     """Split an image into the planes that are deblurred.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-    channels : {"luminance", "each"}
-        Whether a colour image gives its luminance alone or every channel.
-
-    Returns
-    -------
-    list of ndarray, float32, shape (H, W)
-
-    Examples
-    --------
-    >>> len(split_planes(np.zeros((2, 2, 3), np.float32), "each"))
-    3
+    ``image`` (H, W) or (H, W, 3); returns (H, W) each.
     """
     if image.ndim == 3 and channels == "each":
         return [np.ascontiguousarray(image[..., index]) for index in range(image.shape[2])]
@@ -174,22 +144,7 @@ def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:
 def join_planes(image: FloatArray, planes: list[FloatArray], channels: str) -> FloatArray:
     """Join deblurred planes into an image; the reverse of :func:`split_planes`.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Blurred image; chroma is taken from it.
-    planes : list of ndarray, float32, shape (H, W)
-    channels : {"luminance", "each"}
-
-    Returns
-    -------
-    ndarray, float32, shape of ``image``
-
-    Examples
-    --------
-    >>> grey = np.full((2, 2), 0.5, np.float32)
-    >>> join_planes(np.zeros((2, 2, 3), np.float32), [grey], "luminance")[0, 0]
-    array([0.5, 0.5, 0.5], dtype=float32)
+    ``image`` (H, W) or (H, W, 3); ``planes`` (H, W) each.
     """
     if image.ndim == 2:
         return planes[0]
@@ -201,37 +156,7 @@ def join_planes(image: FloatArray, planes: list[FloatArray], channels: str) -> F
 def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
     """Choose the weight λ of the data term from the noise of the blurred image.
 
-    Parameters
-    ----------
-    method : {"nltv", "tv", "wiener", "tikhonov"}
-        Penalty.
-    image : ndarray, float32, shape (H, W)
-        Blurred image.
-    noise : float
-        Standard deviation n of its noise, intensity.
-
-    Returns
-    -------
-    float
-        For nltv ``20/√(n² + .004²)``, for tv ``12/√(n² + .003²)``, for wiener the value of
-        :func:`turbrestore.blur.psf.wiener_fidelity`, and for tikhonov half of that.
-
-    Notes
-    -----
-    Total variation has the unit of intensity and the data term the unit of its square, so λ is proportional to 1/n.
-    For nltv and tv on photographs, brick and text, blurred with σ from 1 to 3 pixels, the result is within 0.4 dB of
-    that of the best λ if n is between .01 and .02.  For less noise and a blur that is known exactly, the best λ is 3
-    to 10 times larger; it gains 0.1 to 3 dB, and 5 dB on thin text.
-
-    The constants beside n limit λ, so that a slightly wrong σ does little harm.  This matters because a registered
-    average is less sharp than its low noise suggests.  On registered averages of simulated turbulence, with an error of
-    σ of up to 0.2 pixels, 3λ gains at most 0.3 dB and loses up to 1.7 dB.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> round(automatic_fidelity("nltv", np.zeros((2, 2), np.float32), 0.003))
-    4000
+    ``image`` (H, W).
     """
     if method == "nltv":
         return 20.0 / float(np.hypot(noise, 0.004))
@@ -244,31 +169,7 @@ def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
 def read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:
     """Read a blur that is given either by its width or by its PSF.
 
-    Parameters
-    ----------
-    sigma_or_psf : float, or array_like of shape (h, w) with odd sizes
-        As of :func:`turbrestore.deconvolution.deconvolve.deconvolve`.
-
-    Returns
-    -------
-    psf : ndarray, float64, or None
-        None if only the width is given.
-    sigma : float
-        Standard deviation, pixels.
-    reach : int
-        Largest distance over which the blur moves light, pixels.
-
-    Raises
-    ------
-    DataError
-        An unusable PSF.
-    ConfigurationError
-        A width that is negative or not finite.
-
-    Examples
-    --------
-    >>> read_blur(1.5)
-    (None, 1.5, 6)
+    ``sigma_or_psf`` (h, w).
     """
     if np.ndim(sigma_or_psf) == 0:
         sigma: Any = sigma_or_psf

@@ -102,30 +102,7 @@ def iterate(
     iterations: int,
     tolerance: float,
 ) -> Generator[DeconvolutionState, None, Solution]:
-    """Step the problems of all channels until no image changes any more.
-
-    Parameters
-    ----------
-    solver : Solver
-    problems : list of Problem
-        One for each channel.
-    states : list
-        State of the solver for each problem.
-    measured : array, float32, shape of the images
-        1 where changes count, else 0.
-    iterations : int
-        Largest number of iterations.
-    tolerance : float
-        Change that is small enough.
-
-    Yields
-    ------
-    DeconvolutionState
-
-    Returns
-    -------
-    Solution
-    """
+    """Step the problems of all channels until no image changes any more."""
     ops, images = problems[0].ops, [state.image for state in states]
     earlier = deque([images], max(solver.rest, 1))
     changes, records, begun, converged = list[float](), list[tuple[int, float, float]](), 0, False
@@ -151,25 +128,7 @@ def iterate(
 
 
 def predicted_change(changes: Sequence[float]) -> float:
-    """Predict the sum of the changes that follow.
-
-    Parameters
-    ----------
-    changes : sequence of float
-        Changes over all windows until now.
-
-    Returns
-    -------
-    float
-        In the unit of the changes; the largest prediction as long as there are too few of them.
-
-    Examples
-    --------
-    >>> predicted_change([0.8, 0.4, 0.2, 0.1, 0.05])
-    0.05
-    >>> predicted_change([0.8, 0.5])
-    3.0
-    """
+    """Predict the sum of the changes that follow."""
     last, span = changes[-1], min(SPAN, len(changes) - 1)
     if span < FEWEST or not last < changes[-1 - span]:
         return last * MOST
@@ -180,26 +139,7 @@ def predicted_change(changes: Sequence[float]) -> float:
 def change_of(before: list[Array], after: list[Array], measured: Array, ops: ArrayOps) -> float:
     """Change of images as they are shown: clipped to [0, 1], and where changes are measured.
 
-    Parameters
-    ----------
-    before, after : list of array, float32, shape (P, Q)
-        Channels of two images.
-    measured : array, float32, shape (P, Q)
-        1 where changes count, else 0.
-    ops : ArrayOps
-        Library that the arrays belong to.
-
-    Returns
-    -------
-    float
-        Root of the sum of squares over the tile that changed most, relative to that of the brightest tile.
-
-    Examples
-    --------
-    >>> from turbrestore.deconvolution.array_ops import numpy_ops
-    >>> grey = np.full((4, 4), 0.5, np.float32)
-    >>> change_of([grey], [1.25 * grey], np.ones_like(grey), numpy_ops())
-    0.2
+    ``before, after`` (P, Q) each; ``measured`` (P, Q).
     """
     moved, size = np.zeros((2, 1, 1))
     for old, new in zip(before, after, strict=True):
@@ -213,21 +153,7 @@ def change_of(before: list[Array], after: list[Array], measured: Array, ops: Arr
 def tile_sums(image: Array, ops: ArrayOps) -> NDArray[np.float64]:
     """Sum an image over tiles.
 
-    Parameters
-    ----------
-    image : array, float32, shape (P, Q)
-    ops : ArrayOps
-        Library that the image belongs to.
-
-    Returns
-    -------
-    ndarray, float64, shape (ceil(P / TILE), ceil(Q / TILE))
-
-    Examples
-    --------
-    >>> from turbrestore.deconvolution.array_ops import numpy_ops
-    >>> tile_sums(np.ones((2, 65), np.float32), numpy_ops())
-    array([[128.,   2.]])
+    ``image`` (P, Q); returns (ceil(P / TILE), ceil(Q / TILE)).
     """
     rows, columns = (-(-length // TILE) for length in image.shape)
     padded = ops.load(np.zeros((rows * TILE, columns * TILE), np.float32))

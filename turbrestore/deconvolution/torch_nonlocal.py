@@ -121,26 +121,7 @@ class TorchNonlocalPenalty:
 def torch_nonlocal_penalty(guide: FloatArray, params: NonlocalParams, device: str) -> TorchNonlocalPenalty:
     """Nonlocal TV with weights between the similar patches of a guide.
 
-    Parameters
-    ----------
-    guide : ndarray, float32, shape (H, W)
-        g.
-    params : NonlocalParams
-        Size of patches, search and neighbourhood.
-    device : str
-        Name that torch gives it.
-
-    Returns
-    -------
-    TorchNonlocalPenalty
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> params = NonlocalParams(patch=1, search=3, best=1, h=1.0)
-    >>> penalty = torch_nonlocal_penalty(np.float32([[0, 0, 1]]), params, "cpu")
-    >>> penalty.tails.tolist(), penalty.heads.tolist(), (penalty.root**2).numpy().round(3)
-    ([0, 1], [1, 2], array([1.   , 0.368], dtype=float32))
+    ``guide`` (H, W).
     """
     import torch
 

@@ -14,23 +14,7 @@ from .array_ops import Array, ArrayOps
 def local_gradient(u: Array, ops: ArrayOps) -> Array:
     """Periodic forward differences ∇u.
 
-    Parameters
-    ----------
-    u : array, float32, shape (H, W)
-    ops : ArrayOps
-        Library that u belongs to.
-
-    Returns
-    -------
-    array, float32, shape (2, H, W)
-        Along y, and along x.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.deconvolution.array_ops import numpy_ops
-    >>> local_gradient(np.array([[1.0, 3.0]], np.float32), numpy_ops())[1]
-    array([[ 2., -2.]], dtype=float32)
+    ``u`` (H, W); returns (2, H, W).
     """
     return ops.arrays.stack([ops.arrays.roll(u, -1, axis) - u for axis in (0, 1)])
 
@@ -38,22 +22,7 @@ def local_gradient(u: Array, ops: ArrayOps) -> Array:
 def local_divergence(v: Array, ops: ArrayOps) -> Array:
     """Negative adjoint of :func:`local_gradient`.
 
-    Parameters
-    ----------
-    v : array, float32, shape (2, H, W)
-    ops : ArrayOps
-        Library that v belongs to.
-
-    Returns
-    -------
-    array, float32, shape (H, W)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.deconvolution.array_ops import numpy_ops
-    >>> local_divergence(np.array([[[0.0, 0.0]], [[2.0, 0.0]]], np.float32), numpy_ops())
-    array([[ 2., -2.]], dtype=float32)
+    ``v`` (2, H, W); returns (H, W).
     """
     return v[0] - ops.arrays.roll(v[0], 1, 0) + v[1] - ops.arrays.roll(v[1], 1, 1)
 

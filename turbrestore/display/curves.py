@@ -24,26 +24,7 @@ _POINTS = 600
 def plot_convergence(mean_flow_sizes: ArrayLike, tolerance: float | None = None) -> Figure:
     """Show the length of the mean flow in every iteration of the centroid.
 
-    Parameters
-    ----------
-    mean_flow_sizes : array_like, shape (iterations,)
-        Pixels.
-    tolerance : float, optional
-        Pixels.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> len(plot_convergence([0.8, 0.3, 0.1], 0.2).axes)
-    1
+    ``mean_flow_sizes`` (iterations,).
     """
     sizes = np.asarray(mean_flow_sizes, float)
     figure = new_figure()
@@ -63,26 +44,7 @@ def plot_convergence(mean_flow_sizes: ArrayLike, tolerance: float | None = None)
 def plot_filter(gains: ArrayLike, innovations: ArrayLike) -> Figure:
     """Show the gain of the image and the innovation of the flow, frame by frame.
 
-    Parameters
-    ----------
-    gains : array_like, shape (N,)
-        0 to 1.
-    innovations : array_like, shape (N,)
-        Pixels; NaN leaves a gap.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> len(plot_filter([1.0, 0.5, 0.3], [0.2, 0.2, 0.1]).axes)
-    2
+    ``gains`` (N,); ``innovations`` (N,).
     """
     figure = new_figure(WIDTH, WIDTH * 0.84)
     rows = {"Gain of the image": np.asarray(gains, float), "Innovation of the flow, pixels": np.asarray(innovations)}
@@ -93,26 +55,7 @@ def plot_filter(gains: ArrayLike, innovations: ArrayLike) -> Figure:
 def plot_frames(sharpness: ArrayLike, shares: ArrayLike) -> Figure:
     """Show how sharp each frame is, and how much weight it has.
 
-    Parameters
-    ----------
-    sharpness : array_like, shape (N,)
-        Relative to the image that the filter started from; NaN leaves a gap.
-    shares : array_like, shape (N,)
-        They sum to 1, and are drawn times N, so that 1 is an equal share.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> len(plot_frames([0.9, 1.0, 1.1], [0.2, 0.3, 0.5]).axes)
-    2
+    ``sharpness`` (N,); ``shares`` (N,).
     """
     weights = np.asarray(shares, float)
     return plot_over_frames({"Sharpness": sharpness, "Share of the result, 1 = equal": weights * weights.size}, 1.0)
@@ -121,26 +64,7 @@ def plot_frames(sharpness: ArrayLike, shares: ArrayLike) -> Figure:
 def plot_over_frames(rows: Mapping[str, ArrayLike], reference: float | None = None) -> Figure:
     """Show values of every frame, a row of the figure for each kind.
 
-    Parameters
-    ----------
-    rows : mapping of str to array_like, shape (N,)
-        Values by their name and unit; NaN leaves a gap.
-    reference : float, optional
-        Value to compare with.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> len(plot_over_frames({"gain": [0.9, 1.0, 1.1]}, 1.0).axes)
-    1
+    ``rows`` (N,).
     """
     figure = new_figure(WIDTH, WIDTH * 0.42 * len(rows))
     for axes in _draw_rows(figure, {name: np.asarray(values, float) for name, values in rows.items()}):
@@ -152,25 +76,7 @@ def plot_over_frames(rows: Mapping[str, ArrayLike], reference: float | None = No
 def plot_objective(recorded: ArrayLike, objective: ArrayLike) -> Figure:
     """Show the energy that the deconvolution minimises, over the iterations.
 
-    Parameters
-    ----------
-    recorded : array_like, int, shape (n,)
-        Iterations.
-    objective : array_like, shape (n,)
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> len(plot_objective([1, 10, 20], [9.0, 5.0, 4.5]).axes)
-    1
+    ``recorded`` (n,); ``objective`` (n,).
     """
     figure = new_figure()
     axes = add_axes(figure, "Deconvolution: energy", "iteration", "")
@@ -184,28 +90,7 @@ def plot_objective(recorded: ArrayLike, objective: ArrayLike) -> Figure:
 def plot_blur(widths: ArrayLike, costs: ArrayLike, sigma: float, uncertainty: float) -> Figure:
     """Show the likelihood of every blur width that was tried, and the estimated width.
 
-    Parameters
-    ----------
-    widths : array_like, shape (k,)
-        Pixels.
-    costs : array_like, shape (k,)
-        Negative logarithm of the likelihood per value; drawn relative to the lowest.
-    sigma, uncertainty : float
-        Pixels; the uncertainty may be infinite.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> len(plot_blur([0.5, 1.0, 1.5], [0.3, 0.0, 0.2], 1.05, 0.1).axes)
-    1
+    ``widths`` (k,); ``costs`` (k,).
     """
     figure = new_figure()
     axes = add_axes(figure, "Blur: cost of every width that was tried", "width σ, pixels", "−log likelihood − minimum")

@@ -25,27 +25,7 @@ FONT = 8.5
 
 
 def new_figure(width: float = WIDTH, height: float = HEIGHT) -> Figure:
-    """Make an empty figure with a transparent background, which notebooks show as SVG.
-
-    Parameters
-    ----------
-    width, height : float
-        Inches.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> len(new_figure().axes)
-    0
-    """
+    """Make an empty figure with a transparent background, which notebooks show as SVG."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:

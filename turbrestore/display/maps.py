@@ -31,30 +31,7 @@ _SCALE_QUANTILE = 0.99
 def plot_flow(flow: ArrayLike, image: ArrayLike | None = None, title: str = "Displacement of one frame") -> Figure:
     """Show the length of a flow as colour and the flow itself as arrows, over its reference image.
 
-    Parameters
-    ----------
-    flow : array_like, shape (H, W, 2)
-        Pixels.
-    image : array_like, shape (H, W) or (H, W, 3), optional
-        Reference of the flow.
-    title : str
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    DataError
-        The array is not a flow, or the image has another size.
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> len(plot_flow(np.ones((24, 32, 2))).axes)
-    2
+    ``flow`` (H, W, 2); ``image`` (H, W) or (H, W, 3).
     """
     field = check_flow(flow)
     if field.ndim != 3:
@@ -69,31 +46,7 @@ def plot_flow(flow: ArrayLike, image: ArrayLike | None = None, title: str = "Dis
 def plot_displacements(flows: ArrayLike, image: ArrayLike | None = None) -> Figure:
     """Show how far every pixel moves: standard deviation as colour, direction of the largest motion as strokes.
 
-    Parameters
-    ----------
-    flows : array_like, shape (T, H, W, 2)
-        Pixels, at least two.
-    image : array_like, shape (H, W) or (H, W, 3), optional
-        Reference of the flows.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        The colour is the square root of the displacement variance summed over both axes.
-
-    Raises
-    ------
-    DataError
-        The array is not a stack of at least two flows, or the image has another size.
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> flows = np.random.default_rng(0).normal(size=(6, 24, 32, 2))
-    >>> len(plot_displacements(flows).axes)
-    2
+    ``flows`` (T, H, W, 2); ``image`` (H, W) or (H, W, 3).
     """
     stack = check_flow(flows, "flows")
     if stack.ndim != 4 or len(stack) < 2:
@@ -113,29 +66,7 @@ def plot_displacements(flows: ArrayLike, image: ArrayLike | None = None) -> Figu
 def plot_uncertainty(deviation: ArrayLike, image: ArrayLike | None = None) -> Figure:
     """Show the standard deviation of every pixel as colour; infinite ones have the brightest colour.
 
-    Parameters
-    ----------
-    deviation : array_like, shape (H, W)
-        Intensity, 0 or more.
-    image : array_like, shape (H, W) or (H, W, 3), optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    DataError
-        The image has another size.
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> deviation = np.full((24, 32), 0.01); deviation[:4] = np.inf
-    >>> len(plot_uncertainty(deviation).axes)
-    2
+    ``deviation`` (H, W); ``image`` (H, W) or (H, W, 3).
     """
     percent = 100 * np.asarray(deviation, np.float32)
     known = percent[np.isfinite(percent)]
@@ -146,29 +77,7 @@ def plot_uncertainty(deviation: ArrayLike, image: ArrayLike | None = None) -> Fi
 def plot_images(images: Mapping[str, ArrayLike], columns: int | None = None) -> Figure:
     """Show images side by side.
 
-    Parameters
-    ----------
-    images : mapping of str to array_like, shape (H, W) or (H, W, 3)
-        Title and intensities, 0 to 1.
-    columns : int, optional
-        Most images in a row; by default all.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    DataError
-        One of the arrays is not an image.
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> len(plot_images({"mean": np.zeros((8, 8)), "result": np.ones((8, 8))}).axes)
-    2
+    ``images`` (H, W) or (H, W, 3).
     """
     checked = {title: np.clip(check_image(image, title), 0, 1) for title, image in images.items()}
     height, width = next(iter(checked.values())).shape[:2]

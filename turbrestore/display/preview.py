@@ -25,26 +25,7 @@ def encode_image(
 ) -> bytes:
     """Encode an image of 8 bits as a file.
 
-    Parameters
-    ----------
-    pixels : ndarray, uint8, shape (H, W) or (H, W, 3)
-    kind : {"png", "webp"}
-    quality : int, optional
-        Quality of WebP, 1 to 100; lossless by default.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    DataError
-        The image cannot be encoded, for example because it is larger than the format allows.
-
-    Examples
-    --------
-    >>> encode_image(np.zeros((4, 4), np.uint8))[1:4]
-    b'PNG'
+    ``pixels`` (H, W) or (H, W, 3).
     """
     settings = [] if kind == "png" else [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS if quality is None else quality]
     try:
@@ -57,44 +38,14 @@ def encode_image(
 
 
 def data_uri(data: bytes, kind: str = "png") -> str:
-    """Make a data URI, an address that contains the image file itself.
-
-    Parameters
-    ----------
-    data : bytes
-        Content of an image file.
-    kind : str
-        ``"png"`` or ``"webp"``.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> data_uri(b"abc")
-    'data:image/png;base64,YWJj'
-    """
+    """Make a data URI, an address that contains the image file itself."""
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 def shrink(image: FloatArray, longest: int) -> FloatArray:
     """Reduce an image by averaging, if its longest side is larger than allowed.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-    longest : int
-        Longest side of the result, pixels.
-
-    Returns
-    -------
-    ndarray, float32
-
-    Examples
-    --------
-    >>> shrink(np.zeros((10, 400), np.float32), 200).shape
-    (5, 200)
+    ``image`` (H, W) or (H, W, 3).
     """
     factor = longest / max(image.shape[:2])
     if factor >= 1:
@@ -106,23 +57,7 @@ def shrink(image: FloatArray, longest: int) -> FloatArray:
 def preview(title: str, facts: Iterable[tuple[str, str]], image: FloatArray | None = None) -> str:
     """Make a small HTML card for notebooks: a thumbnail beside key figures.
 
-    Parameters
-    ----------
-    title : str
-    facts : iterable of (str, str)
-        Name and value.
-    image : ndarray, float32, shape (H, W) or (H, W, 3), optional
-        It is reduced to at most 224 pixels a side.
-
-    Returns
-    -------
-    str
-        HTML; all text is escaped.
-
-    Examples
-    --------
-    >>> preview("Blur", [("width", "1.2 < 2 px")]).count("&lt;")
-    1
+    ``image`` (H, W) or (H, W, 3).
     """
     rows = "".join(
         f"<tr><th style='text-align:left;font-weight:normal;opacity:.7;padding:1px 12px 1px 0'>{html.escape(name)}</th>"

@@ -24,26 +24,7 @@ _ROUNDING = 1e-5
 def plot_singular_values(singular_values: ArrayLike, rank: int) -> Figure:
     """Show the singular values of the flows, with those of the chosen states marked.
 
-    Parameters
-    ----------
-    singular_values : array_like, shape (τ,)
-        In descending order.
-    rank : int
-        Number of states.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> len(plot_singular_values([3.0, 1.0, 0.1], 2).axes)
-    1
+    ``singular_values`` (τ,).
     """
     figure = new_figure()
     _draw_singular_values(add_axes(figure), np.asarray(singular_values, float), rank)
@@ -53,23 +34,7 @@ def plot_singular_values(singular_values: ArrayLike, rank: int) -> Figure:
 def plot_eigenvalues(eigenvalues: ArrayLike) -> Figure:
     """Show the eigenvalues of the transition matrix and the unit circle (paper 3, Figure 7).
 
-    Parameters
-    ----------
-    eigenvalues : array_like, complex, shape (n,)
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> len(plot_eigenvalues([0.9 + 0.1j, 0.9 - 0.1j]).axes)
-    1
+    ``eigenvalues`` (n,).
     """
     figure = new_figure(WIDTH, WIDTH * 0.84)
     _draw_eigenvalues(add_axes(figure), np.asarray(eigenvalues, complex))
@@ -79,25 +44,7 @@ def plot_eigenvalues(eigenvalues: ArrayLike) -> Figure:
 def plot_dynamics(singular_values: ArrayLike, eigenvalues: ArrayLike) -> Figure:
     """Show the singular values of the flows beside the eigenvalues of the transition matrix.
 
-    Parameters
-    ----------
-    singular_values : array_like, shape (τ,)
-    eigenvalues : array_like, complex, shape (n,)
-        One for each chosen state.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> len(plot_dynamics([3.0, 1.0, 0.1], [0.5, -0.5]).axes)
-    2
+    ``singular_values`` (τ,); ``eigenvalues`` (n,).
     """
     figure = new_figure(2 * WIDTH, HEIGHT * 1.2)
     values = np.asarray(eigenvalues, complex)
@@ -115,33 +62,7 @@ def plot_prediction(
 ) -> Figure:
     """Show the error of one-step prediction over τ for each n, and eigenvalues of A for each τ (paper 3, Figure 7).
 
-    Parameters
-    ----------
-    lengths : array_like, shape (a,)
-        τ.
-    ranks : array_like, shape (b,)
-        n.
-    errors : array_like, shape (a, b)
-        Pixels; NaN leaves a gap.
-    eigenvalues : sequence of sequence of array_like
-        Of A, by τ and n; those of the largest n that a τ has are drawn.
-    baselines : mapping of str to float
-        Errors without a model, pixels, by what is predicted.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> len(plot_prediction([4, 8], [2], [[0.4], [0.3]], [[np.zeros(2)], [np.zeros(2)]], {"last flow": 0.5}).axes)
-    3
+    ``lengths`` (a,); ``ranks`` (b,); ``errors`` (a, b).
     """
     taus, values = np.asarray(lengths), np.asarray(errors, float)
     columns = len(taus)

@@ -20,13 +20,7 @@ _LEAST, _MOST = 1e-4, 10.0
 
 
 def plot_witnesses(widths: Mapping[str, ArrayLike], removed: float) -> Figure:
-    """Draw the 16 %, 50 % and 84 % quantiles of the width by each witness, pixels, and the width that is removed.
-
-    Examples
-    --------
-    >>> len(plot_witnesses({"displacement": [0.8, 1.2, 1.9], "all": [1.0, 1.1, 1.2]}, 1.1).axes)
-    1
-    """
+    """Draw the 16 %, 50 % and 84 % quantiles of the width by each witness, pixels, and the width that is removed."""
     figure = new_figure()
     axes = add_axes(figure, "Blur: what each witness says, and what is removed", "width σ, pixels", "")
     for place, quantiles in enumerate(np.asarray(found, float) for found in widths.values()):
@@ -42,13 +36,7 @@ def plot_witnesses(widths: Mapping[str, ArrayLike], removed: float) -> Figure:
 
 
 def plot_transfer(frequencies: ArrayLike, curves: Mapping[str, ArrayLike], removed: ArrayLike) -> Figure:
-    """Draw the transfer function by the posterior (``mean``, ``lowest``, ``highest``), and the one that is removed.
-
-    Examples
-    --------
-    >>> len(plot_transfer([0, 0.5], {name: [1, 0] for name in ("mean", "lowest", "highest")}, [1, 0]).axes)
-    1
-    """
+    """Draw the transfer function by the posterior (``mean``, ``lowest``, ``highest``), and the one that is removed."""
     figure = new_figure()
     axes = add_axes(figure, "Blur: contrast that is left", "frequency, cycles per pixel", "transfer function")
     nu = np.asarray(frequencies, float)
@@ -62,13 +50,7 @@ def plot_transfer(frequencies: ArrayLike, curves: Mapping[str, ArrayLike], remov
 
 
 def plot_variation(frequencies: ArrayLike, rows: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]]) -> Figure:
-    """Draw measured variation, its error and what is expected of it, by name; NaN is left out.
-
-    Examples
-    --------
-    >>> len(plot_variation([0.1, 0.2], {"amplitude": ([0.01, 0.04], [0.001, 0.01], [0.02, 0.05])}).axes)
-    1
-    """
+    """Draw measured variation, its error and what is expected of it, by name; NaN is left out."""
     figure = new_figure()
     axes = add_axes(figure, "Blur: how much the frames vary", "frequency, cycles per pixel", "relative variance")
     nu = np.asarray(frequencies, float)

@@ -169,46 +169,12 @@ def identify_memory(shape: tuple[int, ...], train: int) -> float:
 
     The constants were measured by ``benchmarks/memory.py --stages`` at 1280×720, grey and in colour, with one, two and
     four threads, and rounded up by at least a twentieth.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Of the frames, (T, H, W) or (T, H, W, 3).
-    train : int
-        τ, number of flows.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> identify_memory((120, 256, 256), 60) / 1e6
-    140.0
     """
     return min(_STRIPS, _STRIP_NUMBER * shape[1] * shape[2] * train)
 
 
 def modes_memory(shape: tuple[int, ...], train: int, params: DynamicsParams | None = None) -> float:
-    """Largest size of C, bytes: 8 for each pixel and state.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Of the frames, (T, H, W) or (T, H, W, 3).
-    train : int
-        τ, number of flows.
-    params : DynamicsParams, optional
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> modes_memory((120, 256, 256), 60) == 8 * 256 * 256 * 20
-    True
-    """
+    """Largest size of C, bytes: 8 for each pixel and state."""
     params = params or DynamicsParams()
     automatic = min(params.max_rank, int(train / params.frames_per_state))
     return 8.0 * shape[1] * shape[2] * min(automatic if params.rank is None else params.rank, train - 1)

@@ -154,28 +154,9 @@ class FlowDynamics:
 def mean_flow_error(dynamics: FlowDynamics, count: int) -> float:
     """Compute the standard error of the mean of consecutive flows, that of the mean geometry of so many frames.
 
-    Successive flows are alike, so they are worth fewer independent ones.  State i, with a correlation ρ_i from one
-    frame to the next, averages out as ``count (1 − ρ_i) / (1 + ρ_i)`` independent states do, and at least as one.  As
-    the states of the training flows are uncorrelated, ρ_i is ``A_ii``.
-
-    Parameters
-    ----------
-    dynamics : FlowDynamics
-    count : int
-        Number of frames, at least 1.
-
-    Returns
-    -------
-    float
-        Root mean square over the pixels of the length of the error, pixels.
-
-    Examples
-    --------
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> flows = np.zeros((6, 2, 2, 2)); flows[:3, ..., 0], flows[3:, ..., 0] = 1, -1
-    >>> dynamics = identify(flows)
-    >>> dynamics.A.round(2), round(mean_flow_error(dynamics, 100), 2)
-    (array([[0.6]]), 0.22)
+    Successive flows are alike, so they are worth fewer independent ones. State i, with a correlation ρ_i from one frame
+    to the next, averages out as ``count (1 − ρ_i) / (1 + ρ_i)`` independent states do, and at least as one. As the
+    states of the training flows are uncorrelated, ρ_i is ``A_ii``.
     """
     correlation = np.clip(np.diag(dynamics.A), 0, max(1 - 2 / count, 0))
     independent = np.maximum(count * (1 - correlation) / (1 + correlation), 1)
@@ -187,24 +168,7 @@ def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64A
     """State of a flow: Cᵀ (W − W̄), the least-squares solution of eq. 10 since Cᵀ C = I (paper 3, eq. 9).
 
     The arguments are not checked.
-
-    Parameters
-    ----------
-    dynamics : FlowDynamics
-    deviation : ndarray, float32, shape (H, W, 2)
-        W − W̄, pixels.
-
-    Returns
-    -------
-    ndarray, float64, shape (n,)
-
-    Examples
-    --------
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> flows = np.zeros((4, 2, 2, 2), np.float32); flows[..., 0] = np.array([1, -1, 1, -1])[:, None, None]
-    >>> dynamics = identify(flows)
-    >>> np.abs(project_deviation(dynamics, flows[0] - dynamics.mean_flow)).round(3)
-    array([2.])
+    ``deviation`` (H, W, 2); returns (n,).
     """
     # C is stored column by column.
     modes, flat, state = dynamics.C.T, deviation.reshape(-1), np.zeros(dynamics.C.shape[1])
@@ -219,21 +183,7 @@ def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64A
 def add_products(modes: FloatArray, deviation: FloatArray, first: int, end: int, state: Float64Array) -> None:
     """Add the inner products of some flows and one flow over a range of pixels.
 
-    Parameters
-    ----------
-    modes : ndarray, float32, shape (n, P)
-    deviation : ndarray, float32, shape (P,)
-    first, end : int
-        Range in P, without the end.
-    state : ndarray, float64, shape (n,)
-        Added to.
-
-    Examples
-    --------
-    >>> state = np.zeros(2)
-    >>> add_products.py_func(np.eye(2, dtype=np.float32), np.float32([3, 5]), 0, 2, state)
-    >>> state
-    array([3., 5.])
+    ``modes`` (n, P); ``deviation`` (P,); ``state`` (n,).
     """
     for start in range(first, end, SUMMED):
         stop = min(start + SUMMED, end)
@@ -247,28 +197,7 @@ def add_products(modes: FloatArray, deviation: FloatArray, first: int, end: int,
 def flow_of(dynamics: FlowDynamics, state: ArrayLike) -> FloatArray:
     """Flow of a state: W̄ + C ξ (paper 3, eq. 10, without the residual r).
 
-    Parameters
-    ----------
-    dynamics : FlowDynamics
-    state : array_like, shape (n,)
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W, 2)
-        Pixels.
-
-    Raises
-    ------
-    DataError
-        The state has another shape, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> dynamics = identify(np.full((3, 2, 2, 2), 0.5, np.float32))
-    >>> flow_of(dynamics, np.zeros(dynamics.rank))[0, 0]
-    array([0.5, 0.5], dtype=float32)
+    ``state`` (n,); returns (H, W, 2).
     """
     state = check_state(dynamics, state).astype(np.float32)
     moved, done = np.empty(len(dynamics.C), np.float32), 0
@@ -314,25 +243,7 @@ def predict_flow(dynamics: FlowDynamics, state: ArrayLike) -> FloatArray:
 def check_state(dynamics: FlowDynamics, state: ArrayLike) -> Float64Array:
     """Return ``state`` as a finite float64 array of shape (n,).
 
-    Parameters
-    ----------
-    dynamics : FlowDynamics
-    state : array_like, shape (n,)
-
-    Returns
-    -------
-    ndarray, float64, shape (n,)
-
-    Raises
-    ------
-    DataError
-        The state has another shape, or values are not finite.
-
-    Examples
-    --------
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> check_state(identify(np.zeros((3, 2, 2, 2), np.float32)), [])
-    array([], dtype=float64)
+    ``state`` (n,); returns (n,).
     """
     array = np.asarray(state, np.float64)
     if array.shape != (dynamics.rank,):

@@ -45,12 +45,6 @@ class FlowStrips:
     threads : int
         Strips of an array that are worked on side by side, 0 for one per available core; flows in other containers may
         be computed on the fly and are read by one thread.
-
-    Examples
-    --------
-    >>> strips = FlowStrips.of(np.zeros((3, 4, 5, 2), np.float32))
-    >>> [strips.read(rows).shape for rows in strips.rows()]
-    [(3, 40)]
     """
 
     flows: FloatArray | Iterable[FloatArray]
@@ -63,20 +57,7 @@ class FlowStrips:
     def of(cls, flows: FloatArray | Iterable[FloatArray], threads: int = 0) -> FlowStrips:
         """Check the shapes of flows.
 
-        Parameters
-        ----------
-        flows : ndarray of shape (τ, H, W, 2), or iterable of arrays of shape (H, W, 2)
-        threads : int
-            0 means one per available core.
-
-        Returns
-        -------
-        FlowStrips
-
-        Raises
-        ------
-        DataError
-            Fewer than two flows, shapes that differ, or an iterator that can be iterated only once.
+        ``flows`` (τ, H, W, 2), or iterable of arrays of shape (H, W, 2).
         """
         if isinstance(flows, np.ndarray):
             shapes = [flows.shape[1:]] * len(flows) if flows.ndim else []
@@ -96,17 +77,7 @@ class FlowStrips:
         return cls(flows, len(shapes), height, width, threads if isinstance(flows, np.ndarray) else 1)
 
     def rows(self, *written: object) -> Iterator[slice]:
-        """Rows of each strip.
-
-        Parameters
-        ----------
-        written : object
-            Arrays that are filled strip by strip; the memory of mapped ones is handed back after each.
-
-        Yields
-        ------
-        slice
-        """
+        """Rows of each strip."""
         size = _STRIP_BYTES if isinstance(self.flows, np.ndarray) else _STRIP_BYTES_MADE
         step = max(size // (16 * self.count * max(self.width, 1)), 1)
         return iter_slices(self.height, step, self.flows, *written)
@@ -114,19 +85,7 @@ class FlowStrips:
     def read(self, rows: slice) -> Float64Array:
         """Flows of these rows.
 
-        Parameters
-        ----------
-        rows : slice
-
-        Returns
-        -------
-        ndarray, float64, shape (τ, numbers)
-            A copy.
-
-        Raises
-        ------
-        DataError
-            Values that are not finite.
+        Returns (τ, numbers).
         """
         flows = self.flows
         strip = flows[:, rows] if isinstance(flows, np.ndarray) else np.stack([np.asarray(f)[rows] for f in flows])
@@ -136,25 +95,7 @@ class FlowStrips:
 def gram_matrix(strips: FlowStrips) -> tuple[FloatArray, Float64Array, float]:
     """Gram matrix of the flows without their mean, strip by strip.
 
-    Parameters
-    ----------
-    strips : FlowStrips
-
-    Returns
-    -------
-    mean : ndarray, float32, shape (H, W, 2)
-        W̄, pixels.
-    gram : ndarray, float64, shape (τ, τ)
-        G, squared pixels.
-    norm : float
-        Root of the sum of squares of all flows, the mean included; pixels.
-
-    Examples
-    --------
-    >>> flows = np.zeros((2, 1, 1, 2), np.float32); flows[0, ..., 0], flows[1, ..., 0] = 3, 1
-    >>> mean, gram, norm = gram_matrix(FlowStrips.of(flows))
-    >>> mean.ravel(), gram.tolist(), round(norm**2)
-    (array([2., 0.], dtype=float32), [[1.0, -1.0], [-1.0, 1.0]], 10)
+    Returns ``mean`` (H, W, 2), ``gram`` (τ, τ).
     """
     mean = np.empty((strips.height, strips.width, 2), np.float32)
 
@@ -176,24 +117,7 @@ def gram_matrix(strips: FlowStrips) -> tuple[FloatArray, Float64Array, float]:
 def singular_vectors(gram: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Singular values of X, and V.
 
-    Parameters
-    ----------
-    gram : ndarray, float64, shape (τ, τ)
-        G.
-
-    Returns
-    -------
-    values : ndarray, float64, shape (τ,)
-        In descending order.
-    V : ndarray, float64, shape (τ, τ)
-        Orthonormal columns, the largest entry of each positive.
-
-    Examples
-    --------
-    >>> values, V = singular_vectors(np.diag([1.0, 4.0]))
-    >>> values, V
-    (array([2., 1.]), array([[0., 1.],
-           [1., 0.]]))
+    ``gram`` (τ, τ); returns ``values`` (τ,), ``V`` (τ, τ).
     """
     values, V = np.linalg.eigh(gram)
     values, V = np.sqrt(np.maximum(values[::-1], 0.0)), V[:, ::-1]
@@ -210,34 +134,7 @@ def spatial_modes(
 ) -> tuple[FloatArray, Float64Array]:
     """C = X V Σ⁻¹ and the energy outside its subspace, strip by strip.
 
-    Parameters
-    ----------
-    strips : FlowStrips
-    mean : ndarray, float32, shape (H, W, 2)
-        W̄, pixels.
-    singular_values : ndarray, float64, shape (n,)
-        The first n, none of them zero.
-    V : ndarray, float64, shape (τ, n)
-        The first n columns.
-    scratch : Path, optional
-        Folder of the file that holds C; by default it is in memory.
-
-    Returns
-    -------
-    C : ndarray, float32, shape (2 H W, n)
-        In Fortran order.
-    energy : ndarray, float64, shape (H, W)
-        Sum over time of the squares of X − C Ξ, mean of the two components, squared pixels.
-
-    Examples
-    --------
-    >>> flows = np.zeros((2, 1, 1, 2), np.float32); flows[0, ..., 0], flows[1, ..., 0] = 3, 1
-    >>> strips = FlowStrips.of(flows)
-    >>> mean, gram, _ = gram_matrix(strips)
-    >>> values, V = singular_vectors(gram)
-    >>> C, energy = spatial_modes(strips, mean, values[:1], V[:, :1])
-    >>> np.abs(C).round(3).tolist(), float(energy.round(3)[0, 0])
-    ([[1.0], [0.0]], 0.0)
+    ``mean`` (H, W, 2); ``singular_values`` (n,); ``V`` (τ, n); returns ``C`` (2 H W, n), ``energy`` (H, W).
     """
     # Stored mode after mode: products with C and with Cᵀ are then twice as fast.
     C = new_stack((len(singular_values), *mean.shape), scratch)

@@ -61,29 +61,7 @@ def study_prediction(
 ) -> PredictionStudy:
     """Train models of several τ and n, and predict the last quarter of the flows by each.
 
-    Parameters
-    ----------
-    flows : array_like, shape (T, H, W, 2)
-        Flows from one reference to successive frames, pixels; at least 5.
-    params : DynamicsParams, optional
-        ``rank`` is the largest n; by default it is a third of the largest τ, at most ``max_rank``.
-    runtime : Runtime
-
-    Returns
-    -------
-    PredictionStudy
-
-    Raises
-    ------
-    DataError
-        Fewer than 5 flows, or not flows.
-
-    Examples
-    --------
-    >>> turns = np.exp(0.7j * np.arange(16))[:, None, None, None] * np.ones((16, 2, 3, 1))
-    >>> study = study_prediction(np.concatenate([turns.real, turns.imag], axis=-1))
-    >>> study.errors[-1].round(3).tolist(), round(study.repeated, 2)
-    ([0.615, 0.11, 0.11], 0.48)
+    ``flows`` (T, H, W, 2).
     """
     params, stack = params or DynamicsParams(), check_flow(flows, "flows")
     if stack.ndim != 4 or len(stack) < 5:
@@ -116,22 +94,7 @@ def study_prediction(
 def prediction_error(dynamics: FlowDynamics, flows: FloatArray) -> float:
     """Error of predicting each flow but the first from the one before.
 
-    Parameters
-    ----------
-    dynamics : FlowDynamics
-    flows : ndarray, float32, shape (T, H, W, 2)
-        Successive flows, pixels; at least two.
-
-    Returns
-    -------
-    float
-        Root mean square, pixels for each component.
-
-    Examples
-    --------
-    >>> flows = np.zeros((6, 2, 2, 2), np.float32); flows[::2, ..., 0], flows[1::2, ..., 0] = 1, -1
-    >>> round(prediction_error(identify(flows), flows), 3)
-    0.0
+    ``flows`` (T, H, W, 2).
     """
     squared, predicted = 0.0, None
     for flow in iter_frames(flows):

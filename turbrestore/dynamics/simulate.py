@@ -52,35 +52,8 @@ def stable_system(dynamics: FlowDynamics, largest_modulus: float = 0.99) -> tupl
 
     Eigenvalues of larger modulus are scaled to ``largest_modulus`` and keep their angle; the others do not change. For
     that the blocks on the diagonal of A's real Schur form are scaled, which is well conditioned even if A has no basis
-    of eigenvectors. Q is ``P − A P Aᵀ`` with its negative eigenvalues set to zero. If there were any, a change of
-    coordinates (the symmetric map from the resulting stationary covariance to P) restores P exactly and does not
-    change the eigenvalues. States are measured in units of their own deviation throughout.
-
-    Parameters
-    ----------
-    dynamics : FlowDynamics
-    largest_modulus : float
-        Below 1. At 0.99 the memory of a state is a hundred frames, about the longest that a training sequence can
-        distinguish from an infinite one.
-
-    Returns
-    -------
-    A, Q : ndarray, float64, shape (n, n)
-
-    Raises
-    ------
-    ConfigurationError
-        ``largest_modulus`` is not between 0 and 1.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> flows = np.zeros((6, 2, 2, 2), np.float32); flows[::2, ..., 0], flows[1::2, ..., 0] = 1, -1
-    >>> dynamics = identify(flows)
-    >>> A, Q = stable_system(dynamics, 0.9)
-    >>> A.round(3), bool(np.isclose(A**2 * dynamics.state_covariance + Q, dynamics.state_covariance).all())
-    (array([[-0.9]]), True)
+    of eigenvectors. Q is ``P − A P Aᵀ`` with its negative eigenvalues set to zero.
+    Returns ``A, Q`` (n, n).
     """
     if not 0 < largest_modulus < 1:
         raise ConfigurationError(f"largest_modulus: expected above 0 and below 1, found {largest_modulus}")

@@ -160,39 +160,7 @@ def filter_steps(
     runtime: Runtime = DEFAULT,
     start: FilterCheckpoint | None = None,
 ) -> Generator[FilterStep, None, Filtered]:
-    """Run the filter step by step; :func:`filter_frames` runs it to its end and describes the arguments.
-
-    Parameters
-    ----------
-    frames, reference, dynamics, params, flow_params, known_flows, runtime
-        As in :func:`filter_frames`.
-    start : FilterCheckpoint, optional
-        From an earlier run with the same arguments.  The frames before it are read and skipped, and the result is that
-        of one run, bit for bit.
-
-    Yields
-    ------
-    FilterStep
-
-    Returns
-    -------
-    Filtered
-
-    Raises
-    ------
-    DataError
-        As in :func:`filter_frames`, or ``start`` does not belong to these frames.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> frames = np.tile(np.float32(0.5), (5, 16, 16))
-    >>> dynamics = identify(np.zeros((5, 16, 16, 2), np.float32))
-    >>> steps = filter_steps(frames, frames[0], dynamics, FilterParams(block=3), known_flows=np.zeros((2, 16, 16, 2)))
-    >>> [step.flows_measured for step in steps if step.checkpoint is not None]
-    [5, 8]
-    """
+    """Run the filter step by step; :func:`filter_frames` runs it to its end and describes the arguments."""
     params, flow_params = params or FilterParams(), flow_params or FlowParams()
     image = check_image(reference, "reference")
     flows = _check_flows(image, dynamics, known_flows)

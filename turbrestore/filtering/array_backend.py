@@ -78,29 +78,7 @@ class ArrayBackend:
 
 
 def array_backend(device: str) -> ArrayBackend:
-    """Return the backend of a device.
-
-    Parameters
-    ----------
-    device : str
-        ``"cpu"``, ``"cuda"``, ``"auto"`` or another name that torch gives a device.
-
-    Returns
-    -------
-    ArrayBackend
-
-    Raises
-    ------
-    ConfigurationError
-        There is no such device, or torch is not installed.
-
-    Examples
-    --------
-    >>> backend = array_backend("cpu")
-    >>> registered, grey, seen = backend.warp(np.ones((4, 5, 3), np.float32), np.zeros((4, 5, 2), np.float32))
-    >>> registered.shape, grey.shape, float(seen.min())
-    ((3, 4, 5), (4, 5), 1.0)
-    """
+    """Return the backend of a device."""
     found = find_device(device)
     if found == CPU:
         return ArrayBackend(found, numpy_ops(), _warp_on_cpu)

@@ -251,33 +251,7 @@ class Filtered:
 def after_training(prior: FilterState, image: FloatArray, dynamics: FlowDynamics, known_flows: int) -> FilterCheckpoint:
     """Start after the training frames, with the state of the last of them (paper 3, section 6).
 
-    Parameters
-    ----------
-    prior : FilterState
-        Its flow is replaced: ξ̂_τ is Cᵀ (W_τ − W̄), a measurement of the state with the noise R I.
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Image to start from.
-    dynamics : FlowDynamics
-    known_flows : int
-        Number of flows to training frames.
-
-    Returns
-    -------
-    FilterCheckpoint
-        The training frames have records, and do not count.
-
-    Raises
-    ------
-    DataError
-        The model was identified from another number of flows.
-
-    Examples
-    --------
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> flow, pixels = np.zeros((2, 3, 2), np.float32), PixelGaussian(np.zeros((2, 3)), np.ones((2, 3)))
-    >>> state = FilterState(pixels, Gaussian(np.zeros(0), np.eye(0)), flow, flow)
-    >>> len(after_training(state, pixels.mean, identify(np.zeros((4, 2, 3, 2), np.float32)), 4).records)
-    4
+    ``image`` (H, W) or (H, W, 3).
     """
     if known_flows != dynamics.frame_count:
         raise DataError(
@@ -292,23 +266,7 @@ def after_training(prior: FilterState, image: FloatArray, dynamics: FlowDynamics
 def mean_flow_over(flow_sum: FloatArray, records: Sequence[FrameRecord]) -> FloatArray:
     """Average the flows to the frames that count; 0 if none of them does.
 
-    Parameters
-    ----------
-    flow_sum : ndarray, float32, shape (H, W, 2)
-        Sum of W^meas, pixels.
-    records : sequence of FrameRecord
-        Of the frames; those that do not count have no sharpness.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W, 2)
-
-    Examples
-    --------
-    >>> none = np.zeros(0)
-    >>> records = [FrameRecord(none, 0.1, 0.1, sharpness, 1.0) for sharpness in (1.0, np.nan, 1.0)]
-    >>> float(mean_flow_over(np.full((2, 2, 2), 3, np.float32), records).max())
-    1.5
+    ``flow_sum`` (H, W, 2); returns (H, W, 2).
     """
     return flow_sum / np.float32(max(sum(np.isfinite(record.sharpness) for record in records), 1))
 
@@ -319,25 +277,7 @@ def join_records(
     image_noise: float,
     sharpness_weight: float,
 ) -> Filtered:
-    """Join the last state and the records of all frames.
-
-    Parameters
-    ----------
-    state : FilterState
-    records : sequence of FrameRecord
-    image_noise, sharpness_weight : float
-
-    Returns
-    -------
-    Filtered
-
-    Examples
-    --------
-    >>> flow, pixels = np.zeros((2, 3, 2), np.float32), PixelGaussian(np.zeros((2, 3)), np.ones((2, 3)))
-    >>> state = FilterState(pixels, Gaussian(np.zeros(1), np.eye(1)), flow, flow)
-    >>> join_records(state, [FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0)] * 2, 1e-4, 2.0).shares
-    array([0.5, 0.5])
-    """
+    """Join the last state and the records of all frames."""
     information = np.array([record.information for record in records])
     if not information.any():
         raise DataError("frames: expected at least one after those with known flows, found none; train on fewer")
@@ -360,25 +300,6 @@ def filter_memory(shape: tuple[int, ...], train: int, params: FilterParams | Non
 
     The constants were measured by ``benchmarks/memory.py --stages`` at 1280×720, grey and in colour, with one, two and
     four threads, and rounded up by at least a twentieth.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Of all frames, (T, H, W) or (T, H, W, 3).
-    train : int
-        Frames with known flows.
-    params : FilterParams, optional
-    threads : int
-        Frames that are worked on side by side.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> filter_memory((120, 256, 256), 60, threads=2) / 256**2
-    229.0
     """
     params, pixels = params or FilterParams(), float(shape[1] * shape[2])
     channels = shape[3] if len(shape) == 4 else 1

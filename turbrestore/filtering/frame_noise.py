@@ -103,37 +103,7 @@ def frame_noise_variance(
 ) -> tuple[Stack, float]:
     """Z of one frame, and how sharp the frame is.
 
-    Parameters
-    ----------
-    grey : array, float32, shape (H, W)
-        Luminance of the frame, warped onto the image.
-    flow : array, float32, shape (H, W, 2)
-        Ŵ by which it was warped, pixels.
-    seen : array, float32, shape (H, W)
-        1 where the warp samples the frame, falling to 0 beyond its border.
-    statistics : FrameStatistics
-    sharpness : float
-        β; 0 gives the same Z for every frame and pixel, as in the paper.
-    ops : StackOps
-
-    Returns
-    -------
-    noise : array, float32, shape (H, W)
-        Z, squared intensity.
-    sharpness : float
-        Gradient of the frame projected on that of the image: 1 for the image itself, less for a blurred, torn or
-        misregistered frame.
-
-    Examples
-    --------
-    >>> from turbrestore.filtering.frame_statistics import measure_frame_statistics
-    >>> from turbrestore.runtime.image_stacks import numpy_ops
-    >>> image = np.tile(np.sin(np.arange(16.0)), (16, 1)).astype(np.float32)
-    >>> still, ones = np.zeros((2, 16, 16, 2), np.float32), np.ones((16, 16), np.float32)
-    >>> statistics = measure_frame_statistics([image, image], still, image)
-    >>> noise, sharp = frame_noise_variance(0.5 * image, still[0], ones, statistics, 0.0, numpy_ops())
-    >>> bool((noise == np.float32(statistics.image_noise)).all()), round(sharp, 3)
-    (True, 0.5)
+    ``grey`` (H, W); ``flow`` (H, W, 2); ``seen`` (H, W); returns ``noise`` (H, W).
     """
     arrays, beta = ops.arrays, float(sharpness)
     projection = project_gradient(grey, statistics.template, ops)
@@ -162,29 +132,9 @@ def frame_noise_variance(
 def invalid_mask(flow: Stack, seen: Stack, ops: StackOps) -> Stack:
     """Mark where a frame gives no measurement: the map id + Ŵ folds, or leaves the frame.
 
-    Beyond the frame its border is repeated, which is no measurement.  Paper 3 assumes that the maps are
-    diffeomorphisms: where the estimate folds it is wrong, and what it samples may have more contrast than the scene.
-
-    Parameters
-    ----------
-    flow : array, float32, shape (H, W, 2)
-        Ŵ, pixels.
-    seen : array, float32, shape (H, W)
-        1 where the warp samples the frame, 0 beyond.
-    ops : StackOps
-
-    Returns
-    -------
-    array, float32, shape (H, W)
-        1 where the flow is invalid, fading to 0 around folds.
-
-    Examples
-    --------
-    >>> from turbrestore.runtime.image_stacks import numpy_ops
-    >>> flow = np.zeros((9, 40, 2), np.float32)
-    >>> flow[:, 20:, 0] = -3
-    >>> invalid_mask(flow, np.ones((9, 40), np.float32), numpy_ops())[4, [5, 12, 16, 20]].round(2)
-    array([0.  , 0.04, 0.6 , 0.95], dtype=float32)
+    Beyond the frame its border is repeated, which is no measurement. Paper 3 assumes that the maps are diffeomorphisms:
+    where the estimate folds it is wrong, and what it samples may have more contrast than the scene.
+    ``flow`` (H, W, 2); ``seen`` (H, W); returns (H, W).
     """
     (ux, uy), (vx, vy) = (gradient(flow[..., axis], ops) for axis in (0, 1))
     folded = (ux + 1) * (vy + 1) <= uy * vx
@@ -215,32 +165,10 @@ def project_gradient(grey: Stack, template: tuple[Stack, Stack], ops: StackOps) 
 def local_sharpness(projection: Stack, window: float, left_out: float, ops: StackOps) -> Stack:
     """Average of the projected gradient in a Gaussian window, of whose middle a share is left out.
 
-    The noise n of a pixel is part of the score of the window around it.  By Stein's lemma the weights ``exp(β z)``
-    therefore shift the fused pixel by ``β cov(n, z)``, whatever the number of frames.  The shift is proportional to the
+    The noise n of a pixel is part of the score of the window around it. By Stein's lemma the weights ``exp(β z)``
+    therefore shift the fused pixel by ``β cov(n, z)``, whatever the number of frames. The shift is proportional to the
     Laplacian of the template: noise is added that looks like sharpness, and a blind estimate of the blur believes it.
-    ``(g_s − κ g_{s/2}) / (1 − κ)`` with κ = 1/4 is zero in the middle, so that the covariance vanishes.
-
-    Parameters
-    ----------
-    projection : array, float32, shape (H, W)
-        From :func:`project_gradient`.
-    window : float
-        s, pixels.
-    left_out : float
-        κ, 0 to 1/4.
-    ops : StackOps
-
-    Returns
-    -------
-    array, float32, shape (H, W)
-
-    Examples
-    --------
-    >>> from turbrestore.runtime.image_stacks import numpy_ops
-    >>> impulse = np.zeros((33, 33), np.float32)
-    >>> impulse[16, 16] = 1
-    >>> [round(float(local_sharpness(impulse, 3.0, kappa, numpy_ops())[16, 16]), 3) for kappa in (0.0, 0.25)]
-    [0.018, 0.0]
+    ``projection`` (H, W); returns (H, W).
     """
     whole = smooth(projection, window, ops)
     if left_out == 0:

@@ -124,24 +124,7 @@ def pass_over(
 ) -> Iterator[TrackedFrame]:
     """Measure flows from an image to frames, update the flow state by these flows, and register the frames.
 
-    Parameters
-    ----------
-    frames : iterable of Frame
-        Consumed lazily.
-    starts : iterable of ndarray or None
-        Known flow to each frame, pixels, from which the measurement of its flow starts; None if it is not known.  There
-        are at least as many as frames.
-    image : ndarray, float32, shape (H, W) or (H, W, 3), or None
-        Reference of the flows; if None, the known flows are used as the measured ones.
-    state : Gaussian
-        ξ̂ and P before the first frame.
-    settled : int
-        Number of frames at the start for which this is the last pass.
-    settings : PassSettings
-
-    Yields
-    ------
-    TrackedFrame
+    ``image`` (H, W) or (H, W, 3).
     """
     reference = None if image is None else prepare_reference(image, settings.flow, settings.runtime)
     batch, threads = (1, settings.runtime.threads) if reference is None else (reference.batch, reference.threads)
@@ -172,19 +155,7 @@ def pass_over(
 def _register(image: FloatArray, measured: FloatArray, state: Gaussian, settings: PassSettings) -> RegisteredFrame:
     """Warp a frame onto the image by Ŵ and estimate its noise Z (eq. 15).
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        The frame.
-    measured : ndarray, float32, shape (H, W, 2)
-        W^meas, pixels.
-    state : Gaussian
-        ξ̂ and P after the frame.
-    settings : PassSettings
-
-    Returns
-    -------
-    RegisteredFrame
+    ``image`` (H, W) or (H, W, 3); ``measured`` (H, W, 2).
     """
     backend = settings.backend
     flow = backend.ops.load(flow_of(settings.dynamics, state.mean) if settings.modelled else measured)

@@ -75,37 +75,7 @@ def measure_frame_statistics(
 ) -> FrameStatistics:
     """Temporal statistics of frames registered by their flows.
 
-    Parameters
-    ----------
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-        Iterated three times; at least one.
-    flows : iterable of ndarray, float32, shape (H, W, 2)
-        From the image to each frame, pixels; iterated as often.
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Image that the frames are registered to.
-    window : float
-        Standard deviation of the window in which sharpness is measured, pixels.
-    image_noise : float, optional
-        Z₀, squared intensity; by default the mean temporal variance of the registered frames.
-    threads : int
-        Frames warped side by side; 0 means one per available core.
-
-    Returns
-    -------
-    FrameStatistics
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> frames = list(np.random.default_rng(0).normal(0.5, 0.1, (50, 16, 16)).astype(np.float32))
-    >>> still, image = np.zeros((50, 16, 16, 2), np.float32), np.full((16, 16), 0.5, np.float32)
-    >>> round(measure_frame_statistics(frames, still, image).image_noise, 3)
-    0.01
+    ``frames`` (H, W) or (H, W, 3) each; ``flows`` (H, W, 2) each; ``image`` (H, W) or (H, W, 3).
     """
     template = gradient(luminance(image), _OPS)
 

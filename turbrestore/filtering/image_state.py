@@ -38,11 +38,6 @@ class PixelGaussian:
     ------
     DataError
         Shapes do not agree, values are not finite, or a variance is negative.
-
-    Examples
-    --------
-    >>> PixelGaussian(np.zeros((2, 3), np.float32), np.ones((2, 3))).variance.dtype
-    dtype('float32')
     """
 
     mean: NDArray[np.floating]
@@ -73,29 +68,7 @@ class PixelStacks(NamedTuple):
 def update_pixels(state: PixelStacks, registered: Stack, noise: Stack, drift: float) -> tuple[PixelStacks, Stack]:
     """Predict the image and update it by a registered frame (paper 3, eqs. 14a, 14c, 15 and 16).
 
-    Parameters
-    ----------
-    state : PixelStacks
-        ρ̂ and Σ after the frame before.
-    registered : array, float32, shape (C, H, W)
-        I ∘ ŵ.
-    noise : array, float32, shape (H, W)
-        Z, squared intensity, positive.
-    drift : float
-        S, squared intensity.
-
-    Returns
-    -------
-    state : PixelStacks
-    gain : array, float32, shape (H, W)
-        L.
-
-    Examples
-    --------
-    >>> state = PixelStacks(np.zeros((1, 1, 2), np.float32), np.ones((1, 2), np.float32))
-    >>> after, gain = update_pixels(state, state.mean + 1, np.full((1, 2), 3, np.float32), drift=0.0)
-    >>> after.mean, after.variance, gain
-    (array([[[0.25, 0.25]]], dtype=float32), array([[0.75, 0.75]], dtype=float32), array([[0.25, 0.25]], dtype=float32))
+    ``registered`` (C, H, W); ``noise`` (H, W); returns ``gain`` (H, W).
     """
     prior = state.variance + drift  # (14c); by (14a) the mean stays
     gain = prior / (prior + noise)  # L of (16)

@@ -41,12 +41,6 @@ class Gaussian:
     ------
     DataError
         Shapes do not agree, values are not finite, or the covariance is no covariance.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> Gaussian(np.zeros(2), np.eye(2)).mean
-    array([0., 0.])
     """
 
     mean: Float64Array
@@ -96,29 +90,7 @@ class Innovation:
 def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
     """Time update: A ξ̂ (paper 3, eq. 14b) and A P Aᵀ + Q (eq. 14d).
 
-    Parameters
-    ----------
-    state : Gaussian
-        After the last measurement.
-    A : array_like, shape (..., n, n)
-        State transition.
-    Q : array_like, shape (..., n, n)
-        Covariance of the process noise.
-
-    Returns
-    -------
-    Gaussian
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, Q is no covariance, or the result overflows.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> predict(Gaussian(np.ones(1), np.eye(1)), 0.5 * np.eye(1), np.eye(1)).cov
-    array([[1.25]])
+    ``A`` (..., n, n); ``Q`` (..., n, n).
     """
     n = state.mean.shape[-1]
     A, Q = np.asarray(A, np.float64), np.asarray(Q, np.float64)
@@ -135,38 +107,9 @@ def update(
 ) -> tuple[Gaussian, Innovation]:
     """Measurement update in covariance form, for few components (paper 3, eqs. 17 and 18).
 
-    The new covariance is Joseph's ``(I − M H) P (I − M H)ᵀ + M R Mᵀ`` where the paper has ``(I − M H) P``: both are
-    the same in exact arithmetic, but only the first stays symmetric and positive semi-definite in floating point.
-
-    Parameters
-    ----------
-    state : Gaussian
-        Prediction.
-    measurement : array_like, shape (..., m)
-        z; NaN where missing. If all components are missing the state is returned unchanged.
-    H : array_like, shape (..., m, n)
-        Measurement matrix, or the Jacobian of a nonlinear measurement at the prediction.
-    R : array_like, shape (..., m, m)
-        Covariance of the measurement noise.
-    predicted : array_like, shape (..., m), optional
-        h(ξ̂) of a nonlinear measurement (extended Kalman filter). H ξ̂ by default.
-
-    Returns
-    -------
-    state : Gaussian
-    innovation : Innovation
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, R is no covariance, the innovation has a singular covariance, or infinite values.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> after, innovation = update(Gaussian(np.zeros(1), np.eye(1)), [2.0], np.eye(1), np.eye(1))
-    >>> after.mean, after.cov, innovation.normalised_squared
-    (array([1.]), array([[0.5]]), array(2.))
+    The new covariance is Joseph's ``(I − M H) P (I − M H)ᵀ + M R Mᵀ`` where the paper has ``(I − M H) P``: both are the
+    same in exact arithmetic, but only the first stays symmetric and positive semi-definite in floating point.
+    ``measurement`` (..., m); ``H`` (..., m, n); ``R`` (..., m, m); ``predicted`` (..., m).
     """
     n = state.mean.shape[-1]
     z, H, R = np.asarray(measurement, np.float64), np.asarray(H, np.float64), np.asarray(R, np.float64)
@@ -203,39 +146,10 @@ def update_information(
 ) -> tuple[Gaussian, Innovation]:
     """Measurement update in information form, for many components and few states (paper 3, eq. 19).
 
-    ``M = (G + P⁻¹)⁻¹ Hᵀ R⁻¹`` with ``G = Hᵀ R⁻¹ H``: only n×n matrices are decomposed. With ``P = L Lᵀ`` and
-    ``Lᵀ G L = V D Vᵀ`` the new covariance is ``T Tᵀ``, ``T = L V (I + D)^(-1/2)``: P may be singular, and the
-    result is symmetric and positive semi-definite. Its relative error is about 1e-16 times the largest of D.
-
-    Parameters
-    ----------
-    state : Gaussian
-        Prediction.
-    measurement : array_like, shape (..., m)
-        z; NaN where missing.
-    H : array_like, shape (..., m, n)
-        Measurement matrix, for example C of the flow.
-    noise_variance : float or array_like, shape (m,)
-        Diagonal of R, positive, one number for all components or one each.
-
-    Returns
-    -------
-    state : Gaussian
-    innovation : Innovation
-        ``values`` and ``cov`` are those of Hᵀ R⁻¹ (z − H ξ̂).
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, a noise variance is not positive, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> C = np.array([[0.6], [0.8]], np.float32)
-    >>> after, _ = update_information(Gaussian(np.zeros(1), np.eye(1)), [0.6, 0.8], C, 1.0)
-    >>> after.mean.round(6), after.cov.round(6)
-    (array([0.5]), array([[0.5]]))
+    ``M = (G + P⁻¹)⁻¹ Hᵀ R⁻¹`` with ``G = Hᵀ R⁻¹ H``: only n×n matrices are decomposed. With ``P = L Lᵀ`` and ``Lᵀ G L =
+    V D Vᵀ`` the new covariance is ``T Tᵀ``, ``T = L V (I + D)^(-1/2)``: P may be singular, and the result is symmetric
+    and positive semi-definite. Its relative error is about 1e-16 times the largest of D.
+    ``measurement`` (..., m); ``H`` (..., m, n); ``noise_variance`` (m,).
     """
     n = state.mean.shape[-1]
     z, H = np.asarray(measurement, np.float64), np.asarray(H, np.float64)

@@ -51,16 +51,7 @@ class Bars:
 
 
 def without_bars(source: FrameSource) -> tuple[FrameSource, Bars | None, tuple[Decision, ...]]:
-    """Fill bars with the mirrored picture; a source without bars is returned as it is.
-
-    Examples
-    --------
-    >>> frames = np.random.default_rng(0).uniform(0.3, 0.9, (5, 32, 32)).astype(np.float32)
-    >>> frames[:, :6] = 0.06
-    >>> filled, bars, (found,) = without_bars(FrameSource.from_array(frames))
-    >>> bars.picture, bool(filled.read().min() > 0.2), found.choice
-    ((slice(6, 32, None), slice(0, 32, None)), True, 'bars filled for the work, and put back: top 6')
-    """
+    """Fill bars with the mirrored picture; a source without bars is returned as it is."""
     mean, lowest, highest = _extremes(source)
     height, width = lowest.shape
     uneven = (highest - lowest > _EVEN) | (highest > _DARK)

@@ -21,13 +21,7 @@ _DARK = 1e-3
 
 
 class Share(float):
-    """A fraction; text of a number, with or without a percent sign, is understood.
-
-    Examples
-    --------
-    >>> Share("30%"), Share(0.3), Share("1")
-    (0.3, 0.3, 1.0)
-    """
+    """A fraction; text of a number, with or without a percent sign, is understood."""
 
     def __new__(cls, value: float | str) -> Share:
         """Read the number; raise ConfigurationError where there is none."""
@@ -40,20 +34,7 @@ class Share(float):
 
 
 def frame_quality(frames: Iterable[ArrayLike]) -> np.ndarray:
-    """Sharpness of the frames of one clip, which are taken one at a time: float64 of shape (T,).
-
-    Raises
-    ------
-    DataError
-        There are no frames, or one is not a finite image.
-
-    Examples
-    --------
-    >>> sharp = np.zeros((32, 32), np.float32); sharp[:, 16:] = 1
-    >>> soft = np.repeat([np.clip((np.arange(32) - 8) / 16, 0, 1)], 32, axis=0)
-    >>> bool(np.diff(frame_quality([soft, sharp]))[0] > 0)
-    True
-    """
+    """Sharpness of the frames of one clip, which are taken one at a time: float64 of shape (T,)."""
     quality = []
     for index, frame in enumerate(frames):
         grey = luminance(check_image(frame, f"frame {index}"))
@@ -65,13 +46,7 @@ def frame_quality(frames: Iterable[ArrayLike]) -> np.ndarray:
 
 
 def best_frames(quality: ArrayLike, share: float) -> np.ndarray:
-    """Mark the ⌈share · T⌉ frames of highest quality; of equal frames the earlier ones.
-
-    Examples
-    --------
-    >>> best_frames([0.1, 0.5, 0.3, 0.2], 0.5).tolist()
-    [False, True, True, False]
-    """
+    """Mark the ⌈share · T⌉ frames of highest quality; of equal frames the earlier ones."""
     check_share(share)
     values = np.asarray(quality, np.float64)
     kept = np.zeros(values.shape, bool)

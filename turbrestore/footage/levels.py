@@ -43,12 +43,6 @@ class Levels:
     low : float
         Intensity that becomes 0.
     gain : float
-
-    Examples
-    --------
-    >>> levels = Levels(0.1, 4.0)
-    >>> levels.stretched(np.float32([0.1, 0.2])), levels.original(np.float32([0, 0.4]))
-    (array([0. , 0.4], dtype=float32), array([0.1, 0.2], dtype=float32))
     """
 
     low: float = 0.0
@@ -86,33 +80,7 @@ class Levels:
 
 
 def stretch_levels(source: FrameSource, train: int) -> tuple[FrameSource, Levels, tuple[Decision, ...]]:
-    """Stretch the frames of a clip that uses a part of the scale.
-
-    Parameters
-    ----------
-    source : FrameSource
-    train : int
-        Number of frames, from the first on, that the range is taken from.
-
-    Returns
-    -------
-    source : FrameSource
-        With intensities of 0.15 to 0.85 where the clip was stretched, else as it was.
-    levels : Levels
-    decisions : tuple of Decision
-
-    Raises
-    ------
-    DataError
-        Frames are damaged, or show nothing.
-
-    Examples
-    --------
-    >>> frames = 0.1 + 0.01 * np.tile(np.linspace(0, 1, 16), (4, 16, 1))
-    >>> stretched, levels, (found,) = stretch_levels(FrameSource.from_array(frames), 4)
-    >>> bool(0.05 < stretched.read().min() < stretched.read().max() < 0.95), found.subject
-    (True, 'range')
-    """
+    """Stretch the frames of a clip that uses a part of the scale."""
     low, high = _range_of(source, train)
     span = high - low
     if span >= _SPAN:

@@ -65,23 +65,7 @@ class Light:
     def steady(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Correct the rows of a frame.
 
-        Parameters
-        ----------
-        number : int
-            Of the frame, in the file.
-        values : ndarray, float32, shape (H, W) or (H, W, 3)
-        window : tuple of slice
-            Rows and columns of the file that ``values`` holds.
-
-        Returns
-        -------
-        ndarray, float32, shape of ``values``
-
-        Examples
-        --------
-        >>> light = Light({7: np.array([2.0])}, {7: 0.1}, slice(0, 4))
-        >>> light.steady(7, np.full((2, 1), 0.5, np.float32), np.s_[1:3, 0:1]).ravel()
-        array([0.2, 0.2], dtype=float32)
+        ``values`` (H, W) or (H, W, 3).
         """
         coefficients, rows = self.gains[number], window[0]
         places = (np.arange(rows.start, rows.stop) - self.rows.start + 0.5) / (self.rows.stop - self.rows.start)
@@ -92,15 +76,7 @@ class Light:
 
 
 def steady_light(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Take changes of the light out of the frames; a source whose light is steady is returned as it is.
-
-    Examples
-    --------
-    >>> scene = np.random.default_rng(0).uniform(0.2, 0.6, (1, 32, 32))
-    >>> source, (found,) = steady_light(FrameSource.from_array(scene * np.linspace(0.9, 1.1, 9)[:, None, None]))
-    >>> found.choice, round(float(np.ptp(source.read().mean(axis=(1, 2)))), 3)
-    ('exposure of each frame evened out', 0.0)
-    """
+    """Take changes of the light out of the frames; a source whose light is steady is returned as it is."""
     light, decisions = _measure_light(source)
     if light is None:
         return source, ()

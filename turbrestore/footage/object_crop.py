@@ -52,21 +52,7 @@ class ObjectPlace:
 def find_object(frame: FloatArray) -> ObjectPlace | None:
     """Find the largest bright object of a frame; None where nothing stands out of the field.
 
-    Parameters
-    ----------
-    frame : ndarray, float32, shape (H, W) or (H, W, 3)
-
-    Returns
-    -------
-    ObjectPlace or None
-
-    Examples
-    --------
-    >>> frame = np.zeros((60, 80), np.float32)
-    >>> frame[20:31, 40:61] = 1
-    >>> place = find_object(frame)
-    >>> round(place.x), round(place.y), place.cut
-    (50, 25, False)
+    ``frame`` (H, W) or (H, W, 3).
     """
     grey = luminance(frame)
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTHING)

@@ -132,29 +132,7 @@ class Title:
 def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArray[np.bool_]:
     """Read which pixels of the frames do not show the scene.
 
-    Parameters
-    ----------
-    path : path-like
-        Image of the size of the frames, or of the frames in the file if ``source`` is a region of them; pixels that are
-        not black do not show the scene.
-    source : FrameSource
-
-    Returns
-    -------
-    ndarray, bool, shape (H, W)
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The file does not exist, or cannot be read.
-    DataError
-        No image, of another size, or all of it black or none.
-
-    Examples
-    --------
-    >>> read_static_mask("none.png", FrameSource.from_array(np.zeros((2, 16, 16))))
-    Traceback (most recent call last):
-    turbrestore.core.errors.InputNotFoundError: none.png: no such file or folder
+    Returns (H, W).
     """
     image = read_image(path).image
     marked: NDArray[np.bool_] = luminance(image) > 0
@@ -176,16 +154,7 @@ def without_overlay(
     """Replace what stands in the frames while the scene moves; a source without it is returned as it is.
 
     Return the source, the pixels (H, W) of the scene that no frame shows, the title that has to be put back into
-    results because the camera stands as well, and the decisions.  ``mask`` (H, W) names the pixels that are replaced.
-
-    Examples
-    --------
-    >>> scene = cv2.GaussianBlur(np.random.default_rng(0).random((90, 140)).astype(np.float32), (0, 0), 3)
-    >>> frames = np.stack([scene[:, k : k + 96] for k in range(0, 40, 4)])
-    >>> frames[:, 40:42, 20:44] = 1
-    >>> cleaned, hidden, _, (found,) = without_overlay(FrameSource.from_array(frames))
-    >>> bool(cleaned.read()[5].max() < 0.9), bool(hidden.any()), found.subject
-    (True, False, 'overlay')
+    results because the camera stands as well, and the decisions. ``mask`` (H, W) names the pixels that are replaced.
     """
     given, title = mask is not None, None
     if mask is None and 3 <= len(source) <= _MOST:

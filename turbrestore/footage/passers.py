@@ -86,26 +86,7 @@ class Background:
     def shown(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Replace what passes in a frame, or in a window of it.
 
-        Parameters
-        ----------
-        number : int
-            Of the frame, in the file.
-        values : ndarray, float32, shape (h, w) or (h, w, 3)
-        window : tuple of slice
-            Rows and columns of the file that they are.
-
-        Returns
-        -------
-        ndarray, float32, shape of ``values``
-
-        Examples
-        --------
-        >>> _, stored = cv2.imencode(".png", np.full((16, 16), 255, np.uint8))
-        >>> scene, known = np.full((16, 16), 0.5, np.float32), np.ones((16, 16), np.uint8)
-        >>> still = Placement({7: (0, 0)}, (16, 16))
-        >>> background = Background(scene, known, {7: stored}, still, np.s_[0:16, 0:16])
-        >>> background.shown(7, np.ones((1, 2), np.float32), np.s_[8:9, 8:10])
-        array([[0.5, 0.5]], dtype=float32)
+        ``values`` (h, w) or (h, w, 3).
         """
         if number not in self.weights:
             return values
@@ -140,17 +121,7 @@ class _Usual:
 
 
 def without_passers(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Replace what passes by the background; a source in which nothing does is returned as it is.
-
-    Examples
-    --------
-    >>> frames = np.tile(np.kron(np.eye(3, 6), np.full((16, 16), 0.5)), (15, 1, 1))
-    >>> for k, frame in enumerate(frames):
-    ...     frame[12:30, 6 * k : 6 * k + 12] = 0.9
-    >>> cleaned, (found,) = without_passers(FrameSource.from_array(frames))
-    >>> bool(cleaned.read().max() < 0.6), found.subject
-    (True, 'passers')
-    """
+    """Replace what passes by the background; a source in which nothing does is returned as it is."""
     usual = _usual_of(source) if len(source) >= _FEWEST else None
     if usual is None:
         return source, ()

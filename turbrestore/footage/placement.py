@@ -44,13 +44,7 @@ class Placement:
         return self.size[0] + bottom - top, self.size[1] + right - left
 
     def place(self, number: int) -> Window:
-        """Return the rows and columns of the scene that a frame shows.
-
-        Examples
-        --------
-        >>> Placement({0: (2, 0), 1: (-1, 5)}, (16, 16)).place(1)
-        (slice(0, 16, None), slice(3, 19, None))
-        """
+        """Return the rows and columns of the scene that a frame shows."""
         dx, dy = self.shifts[number]
         top, left = self._range(1)[1] - dy, self._range(0)[1] - dx
         return slice(top, top + self.size[0]), slice(left, left + self.size[1])

@@ -44,17 +44,7 @@ class WhiteBalance:
 
 
 def steady_white_balance(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Take a white balance that changes out of the frames; others, and grey frames, are returned as they are.
-
-    Examples
-    --------
-    >>> scene = np.random.default_rng(0).uniform(0.2, 0.6, (1, 32, 32, 3))
-    >>> red = np.ones((8, 1, 1, 3)); red[::2, ..., 0] = 1.2
-    >>> steady, (found,) = steady_white_balance(FrameSource.from_array(scene * red))
-    >>> mean = steady.read().mean(axis=(1, 2))
-    >>> found.subject, round(float(np.ptp(mean[:, 0] / mean[:, 2])), 3)
-    ('white balance', 0.0)
-    """
+    """Take a white balance that changes out of the frames; others, and grey frames, are returned as they are."""
     if len(source.shape) != 4 or len(source) < 3:
         return source, ()
     ratios = _ratios(_reduced(source))

@@ -31,15 +31,6 @@ def open_animation(
     Frames from ``stop`` on are not needed, so they may be missing. With ``skip_damaged`` the whole frames of a PNG file
     that is cut short are read. 16-bit colour is read as 8 bits. The errors are those of
     :func:`turbrestore.io.video.open_frames`.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_animation(Path(folder, "a.webp"), [np.full((2, 3), k / 4, np.float32) for k in range(4)], fps=25)
-    ...     source = open_animation(Path(folder, "a.webp"))
-    >>> source.shape, source.fps, source.format
-    ((4, 2, 3, 3), 25.0, 'webp/RGB')
     """
     data = read_file(path, limits)
     with image_header(path, data, limits, ("PNG", "WEBP")) as header:

@@ -70,16 +70,6 @@ def open_container(
 
     ``frames`` is the range that will be selected: damage elsewhere is no error, but the source has all frames. With
     ``skip_damaged`` damaged frames on which no others depend are listed in ``FrameSource.damaged``.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from turbrestore.io.encoding import write_container
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_container(Path(folder, "a.mkv"), [np.zeros((4, 6), np.float32)] * 3, fps=25, bit_depth=12)
-    ...     source = open_container(Path(folder, "a.mkv"))
-    >>> source.shape, source.bit_depth, source.fps, source.format
-    ((3, 4, 6), 12, 25.0, 'ffv1/gray12le')
     """
     with input_errors(path):
         cut = is_cut_short(path)

@@ -57,11 +57,6 @@ class Encoding:
     ------
     ConfigurationError
         The codec is unknown, or the factor is out of range.
-
-    Examples
-    --------
-    >>> Encoding(crf=20).codec_of(".mkv")
-    'h264'
     """
 
     codec: Literal["h264", "hevc", "ffv1"] | None = None
@@ -113,16 +108,6 @@ def write_container(
     every player shows; values fill the range; 32 is written as the largest of them. The same frames give the same
     bytes. The file says how its colours are coded: by the matrix of BT.709, or of BT.2020 for HDR, with the primaries
     and transfer of ``colour``, numbers of ITU-T H.273, or those of BT.709.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from turbrestore.io.container import open_container
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_container(Path(folder, "a.mkv"), [np.full((1, 2), 0.2, np.float32)], fps=25)
-    ...     open_container(Path(folder, "a.mkv")).read()
-    array([[[0.2, 0.2]]], dtype=float32)
     """
     import av
 
@@ -144,32 +129,7 @@ def write_container(
 def write_pipe(file: BinaryIO, frames: Iterable[FloatArray], fps: float, bit_depth: int = 8) -> None:
     r"""Write frames to a pipe as FFV1 in Matroska, each as soon as it is there.
 
-    Parameters
-    ----------
-    file : binary file
-        Need not be seekable.
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-    fps : float
-        Frames per second.
-    bit_depth : int
-        As for :func:`write_container`.
-
-    Raises
-    ------
-    BrokenPipeError
-        Nobody reads the pipe any more.
-    StorageError
-        The pipe takes no more.
-    DataError
-        No frames, or frames of two sizes.
-
-    Examples
-    --------
-    >>> import io
-    >>> file = io.BytesIO()
-    >>> write_pipe(file, [np.zeros((4, 6), np.float32)], 25)
-    >>> file.getvalue()[:4]
-    b'\x1aE\xdf\xa3'
+    ``frames`` (H, W) or (H, W, 3) each.
     """
     import av
 

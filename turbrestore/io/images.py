@@ -193,30 +193,7 @@ def write_image(
 def write_map(path: str | os.PathLike[str], values: FloatArray, overwrite: bool = False) -> None:
     """Write numbers that are no intensities as TIFF in floating point; infinite ones stay so.
 
-    Parameters
-    ----------
-    path : path-like
-        Ends in ``.tif`` or ``.tiff``.
-    values : ndarray, float32, shape (H, W)
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    ConfigurationError
-        Unsupported suffix.
-    OutputError
-        The file exists, or its folder is missing or not writable.
-    StorageError
-        Writing failed; nothing is left behind.
-
-    Examples
-    --------
-    >>> import tempfile, tifffile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_map(folder + "/a.tif", np.float32([[0.5, np.inf]]))
-    ...     tifffile.imread(folder + "/a.tif")
-    array([[0.5, inf]], dtype=float32)
+    ``values`` (H, W).
     """
     import tifffile
 

@@ -40,23 +40,7 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
-    """Map the array of a ``.npy`` file into memory, read-only; it is read on demand.
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The file does not exist, or cannot be read.
-    DataError
-        Not a ``.npy`` file, shorter than its header says, or not of numbers.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     np.save(folder + "/a.npy", np.arange(6).reshape(2, 3))
-    ...     map_npy(folder + "/a.npy")[1].tolist()
-    [3, 4, 5]
-    """
+    """Map the array of a ``.npy`` file into memory, read-only; it is read on demand."""
     path = Path(path)
     size = check_input(path).st_size
     with input_errors(path), format_errors(path, "not a whole .npy array of numbers"), path.open("rb") as file:
@@ -75,13 +59,6 @@ def read_npz(
 
     Where ``scratch`` is a folder, arrays of float32 of more than ``large`` bytes (by default 4 MiB) go to scratch files
     there.
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The file does not exist, or cannot be read.
-    DataError
-        Not an archive of arrays, damaged, compressed, or larger than the limits.
     """
     path = Path(path)
     size = check_input(path).st_size
@@ -128,15 +105,6 @@ class MappedFrames:
     shape, strides : tuple of int
         Of all frames; strides in bytes.
     dtype : dtype
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     np.save(folder + "/a.npy", np.arange(12).reshape(2, 3, 2))
-    ...     frames = MappedFrames.of(np.moveaxis(np.load(folder + "/a.npy", mmap_mode="r"), 2, 0))
-    ...     frames.shape, [frame.tolist() for frame in frames([1])]
-    ((2, 2, 3), [[[1, 3, 5], [7, 9, 11]]])
     """
 
     path: Path
@@ -156,15 +124,7 @@ class MappedFrames:
         return MappedFrames(Path(str(whole.filename)), start, array.shape, array.strides, array.dtype)
 
     def __call__(self, chosen: Sequence[int]) -> Iterator[NDArray[Any]]:
-        """Map one frame after the other.
-
-        Raises
-        ------
-        InputNotFoundError, StorageError
-            The file has gone, or cannot be read.
-        DataError
-            The file has become shorter.
-        """
+        """Map one frame after the other."""
         shape, strides = self.shape[1:], self.strides[1:]
         last = sum((length - 1) * stride for length, stride in zip(shape, strides, strict=True))
         for number in chosen:

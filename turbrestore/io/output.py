@@ -33,13 +33,6 @@ def check_output(
 
     The output must be none of the ``inputs``, files or folders, under any name, and in none of the folders. Its suffix
     must be one of ``suffixes``, in lower case with the dot; None allows any.
-
-    Raises
-    ------
-    ConfigurationError
-        Unsupported suffix, or FITS where Astropy is not installed.
-    OutputError
-        The path is a folder, a device or an input, it exists already, or its folder is missing or not writable.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -68,27 +61,7 @@ def check_output(
 
 
 def check_space(path: str | os.PathLike[str], size: int) -> None:
-    """Raise StorageError unless ``size`` bytes, a tenth and a megabyte more are free where ``path`` lies.
-
-    Parameters
-    ----------
-    path : path
-        A file that will be written, or a folder.
-    size : int
-        Bytes.
-
-    Raises
-    ------
-    StorageError
-        There is less space.
-
-    Examples
-    --------
-    >>> check_space("result.png", 10**30)  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.StorageError: result.png: needs ... MiB, found ... MiB free; make room on the disk
-    """
+    """Raise StorageError unless ``size`` bytes, a tenth and a megabyte more are free where ``path`` lies."""
     place, needed = Path(os.path.realpath(path)), size + size // 10 + _SPARE
     try:
         total, _, free = shutil.disk_usage(place if place.is_dir() else place.parent)
@@ -105,15 +78,6 @@ def atomic_output(path: str | os.PathLike[str], overwrite: bool = False) -> Iter
 
     Any exception in the block, Ctrl-C included, removes the temporary file and leaves ``path`` as it was. A symbolic
     link is followed. OutputError is raised where no file can be created, StorageError where writing fails.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     with atomic_output(folder + "/a.txt") as temporary:
-    ...         _ = temporary.write_text("complete")
-    ...     Path(folder, "a.txt").read_text()
-    'complete'
     """
     check_output(path, overwrite=overwrite, suffixes=None)
     target = Path(os.path.realpath(path))

@@ -44,21 +44,6 @@ def to_unit(pixels: PixelArray, full_scale: float, name: str) -> FloatArray:
     Unsigned integers are divided by ``full_scale``. Floating point values up to 0.01 outside [0, 1] are clipped:
     rounding and resampling produce such values, while another scale (0 to 255, 0 to 4095) goes far beyond. ``name`` is
     the array in messages.
-
-    Raises
-    ------
-    DataError
-        NaN, infinite or out of range.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> to_unit(np.array([0, 1023], np.uint16), 1023, "frame 0")
-    array([0., 1.], dtype=float32)
-    >>> to_unit(np.array([0.0, 4095.0]), 1, "frame 0")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.DataError: frame 0: expected values in 0 to 1, found 0 to 4095; divide them by full scale
     """
     pixels = np.asarray(pixels)
     if np.issubdtype(pixels.dtype, np.unsignedinteger):
@@ -114,13 +99,7 @@ def from_unit_to_type(image: FloatArray, bit_depth: int) -> PixelArray:
 
 
 def at_levels(pixels: PixelArray, levels: tuple[float, float] | None) -> PixelArray:
-    """Give intensities in floating point the numbers that 0 and 1 stand for; integers stay.
-
-    Examples
-    --------
-    >>> at_levels(np.float32([0, 0.5, 1]), (-10, 90)).tolist()
-    [-10.0, 40.0, 90.0]
-    """
+    """Give intensities in floating point the numbers that 0 and 1 stand for; integers stay."""
     if levels is None or pixels.dtype.kind != "f":
         return pixels
     return levels[0] + pixels * np.float32(levels[1] - levels[0])
@@ -150,14 +129,6 @@ def demosaic(pixels: PixelArray, pattern: str) -> PixelArray:
 
     OpenCV's edge-aware interpolation gains a little on sharp frames without noise, and loses as much or more on noisy
     ones, which is what turbulent footage is made of.
-
-    Examples
-    --------
-    >>> mosaic = np.tile(np.array([[9, 5], [5, 1]], np.uint8), (4, 4))
-    >>> demosaic(mosaic, "rggb")[3, 3].tolist()
-    [9, 5, 1]
-    >>> demosaic(mosaic / np.float32(8), "bggr")[3, 3].tolist()
-    [0.125, 0.625, 1.125]
     """
     if pixels.dtype.itemsize > 2:
         return _demosaic_wide(pixels, pattern)
@@ -182,15 +153,7 @@ def _demosaic_wide(pixels: PixelArray, pattern: str) -> PixelArray:
 
 
 def looks_like_bayer(pixels: PixelArray) -> bool:
-    """Whether pixels alternate along rows and columns, as the colours of a mosaic do.
-
-    Examples
-    --------
-    >>> looks_like_bayer(np.tile(np.array([[9, 5], [5, 1]], np.uint8), (8, 8)))
-    True
-    >>> looks_like_bayer(np.tile(np.arange(16), (16, 1)))
-    False
-    """
+    """Whether pixels alternate along rows and columns, as the colours of a mosaic do."""
     values = pixels.astype(np.float32)
     if values.ndim != 2 or min(values.shape) < 16:
         return False
@@ -203,48 +166,24 @@ def looks_like_bayer(pixels: PixelArray) -> bool:
 
 
 def planes_of(mosaic: PixelArray) -> PixelArray:
-    """Split a mosaic (H, W) into its planes (H // 2, W // 2, 4); a last odd row or column is left out.
-
-    Examples
-    --------
-    >>> planes_of(np.array([[1, 2], [3, 4]])).tolist()
-    [[[1, 2, 3, 4]]]
-    """
+    """Split a mosaic (H, W) into its planes (H // 2, W // 2, 4); a last odd row or column is left out."""
     height, width = mosaic.shape[0] // 2 * 2, mosaic.shape[1] // 2 * 2
     parts = [mosaic[row:height:2, column:width:2] for row in (0, 1) for column in (0, 1)]
     return np.stack(parts, axis=-1)
 
 
 def mosaic_places(places: PixelArray) -> PixelArray:
-    """Turn rows, columns and numbers of planes, (N, 3), into rows and columns of the mosaic, (N, 2).
-
-    Examples
-    --------
-    >>> mosaic_places(np.array([[5, 7, 2]])).tolist()
-    [[11, 14]]
-    """
+    """Turn rows, columns and numbers of planes, (N, 3), into rows and columns of the mosaic, (N, 2)."""
     return np.stack([2 * places[:, 0] + places[:, 2] // 2, 2 * places[:, 1] + places[:, 2] % 2], axis=-1)
 
 
 def plane_places(places: PixelArray) -> PixelArray:
-    """Turn rows and columns of the mosaic, (N, 2), into rows, columns and numbers of planes, (N, 3).
-
-    Examples
-    --------
-    >>> plane_places(np.array([[11, 14]])).tolist()
-    [[5, 7, 2]]
-    """
+    """Turn rows and columns of the mosaic, (N, 2), into rows, columns and numbers of planes, (N, 3)."""
     return np.stack([places[:, 0] // 2, places[:, 1] // 2, 2 * (places[:, 0] % 2) + places[:, 1] % 2], axis=-1)
 
 
 def with_planes(mosaic: PixelArray, planes: PixelArray) -> PixelArray:
-    """Return a copy of a mosaic whose planes are replaced.
-
-    Examples
-    --------
-    >>> with_planes(np.zeros((2, 3), int), np.array([[[1, 2, 3, 4]]])).tolist()
-    [[1, 2, 0], [3, 4, 0]]
-    """
+    """Return a copy of a mosaic whose planes are replaced."""
     replaced = mosaic.copy()
     height, width = 2 * planes.shape[0], 2 * planes.shape[1]
     for number in range(4):

@@ -350,11 +350,6 @@ def check_cut_short(
     """Raise DataError for a video of which only the first ``intact`` frames are there, or return a warning.
 
     The other frames may be missing if ``skip_damaged`` is true, or if frames from ``stop`` on are not needed.
-
-    Examples
-    --------
-    >>> check_cut_short(Path("a.ser"), 59, None, skip_damaged=True)
-    ('cut short; only its first 59 frames are used',)
     """
     if skip_damaged and intact:
         return (f"cut short; only its first {intact} frames are used",)
@@ -367,12 +362,6 @@ def check_cut_short(
 
 
 def numbers_text(numbers: Collection[int]) -> str:
-    """List the first few of ascending frame numbers, and count the others.
-
-    Examples
-    --------
-    >>> numbers_text(range(10, 30))
-    'frames 10, 11, 12, 13, 14 and 15 more'
-    """
+    """List the first few of ascending frame numbers, and count the others."""
     first = f"frame{'s' * (len(numbers) > 1)} {', '.join(str(number) for number in islice(numbers, _NAMED))}"
     return f"{first} and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else first

@@ -54,15 +54,6 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     Where OME or ImageJ name the axes, there may be one of time or depth, and one of three channels, which become RGB;
     other files are read page by page. Packed bits, and compressions other than deflate, LZMA, LZW and PackBits, need
     the package ``imagecodecs``. The errors are those of :func:`turbrestore.io.video.open_frames`.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_tiff(Path(folder, "a.tif"), [np.full((2, 3), 0.25, np.float32)] * 4, bit_depth=32)
-    ...     source = open_tiff(Path(folder, "a.tif"))
-    ...     source.shape, source.format, float(source.read().max())
-    ((4, 2, 3), 'tiff/float32', 0.25)
     """
     import tifffile
 
@@ -143,13 +134,7 @@ class Pages:
 
 
 def list_pages(path: Path, file: BinaryIO, limits: Limits) -> Pages:
-    r"""List the pages of a TIFF file by following the links from page to page; raise DataError for broken links.
-
-    Examples
-    --------
-    >>> list_pages(Path("a.tif"), io.BytesIO(b"II*\0\x08\0\0\0" + bytes(14)), Limits())
-    Pages(count=1, whole=(0,))
-    """
+    r"""List the pages of a TIFF file by following the links from page to page; raise DataError for broken links."""
     head = file.read(16)
     order = {b"II": "<", b"MM": ">"}.get(head[:2], "")
     version = struct.unpack(f"{order}H", head[2:4])[0] if len(head) == 16 else None

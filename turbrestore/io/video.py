@@ -197,15 +197,6 @@ def frame_files(folder: Path) -> list[Path]:
     """Images of a folder that are the frames of a video, without hidden files, folders and broken links.
 
     They are sorted by name, with digits compared as numbers, see :func:`in_order`.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     for name in ("a10.png", "a9.png", ".a1.png", "notes.txt"):
-    ...         Path(folder, name).touch()
-    ...     [path.name for path in frame_files(Path(folder))]
-    ['a9.png', 'a10.png']
     """
     named = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES or is_fits(path))
     return in_order(path for path in named if path.name[0] != "." and path.is_file())

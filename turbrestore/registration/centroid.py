@@ -190,33 +190,7 @@ def centroid_steps(
     flow_params: FlowParams | None = None,
     runtime: Runtime = DEFAULT,
 ) -> Generator[CentroidState, None, Centroid]:
-    """Iterate to the centroid of ``frames`` flow by flow.
-
-    Parameters
-    ----------
-    frames, params, flow_params, runtime
-        As for :func:`find_centroid`.
-
-    Yields
-    ------
-    CentroidState
-        After each measured flow.
-
-    Returns
-    -------
-    Centroid
-
-    Raises
-    ------
-    DataError, ConfigurationError
-        As for :func:`find_centroid`, when the first state is asked for.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> list(centroid_steps(np.ones((2, 16, 16)), CentroidParams(iterations=1)))
-    [CentroidState(iteration=1, measured=1), CentroidState(iteration=1, measured=2)]
-    """
+    """Iterate to the centroid of ``frames`` flow by flow."""
     params, flow_params = params or CentroidParams(), flow_params or FlowParams()
     stack = check_frames(frames, at_least=2)
     require(params.start < len(stack), f"start: expected a frame below {len(stack)}, found {params.start}")
@@ -274,24 +248,7 @@ def mean_registered(frames: FloatArray, flows: FloatArray, runtime: Runtime = DE
     """Average of frames warped onto the reference that their flows start from.
 
     Each pixel is averaged over the frames that show it; if none does, over all of them, with their borders repeated.
-
-    Parameters
-    ----------
-    frames : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
-    flows : ndarray, float32, shape (T, H, W, 2)
-        Pixels.
-    runtime : Runtime
-        Threads, and the device on which frames are warped.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W) or (H, W, 3)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> mean_registered(np.ones((2, 4, 4), np.float32), np.zeros((2, 4, 4, 2), np.float32))[0]
-    array([1., 1., 1., 1.], dtype=float32)
+    ``frames`` (T, H, W) or (T, H, W, 3); ``flows`` (T, H, W, 2); returns (H, W) or (H, W, 3).
     """
 
     def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, np.ndarray]:

@@ -77,27 +77,7 @@ class FlowConfidence:
 def flow_confidence(reference: ArrayLike) -> FlowConfidence:
     """Structure tensors of the image that flows start from.
 
-    Parameters
-    ----------
-    reference : array_like, shape (H, W) or (H, W, 3)
-        Intensities; colour is reduced to luminance.
-
-    Returns
-    -------
-    FlowConfidence
-
-    Raises
-    ------
-    DataError
-        Wrong shape, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> edges = np.tile(np.arange(32) // 8 % 2, (32, 1)).astype(np.float32)
-    >>> along_x, _, along_y = flow_confidence(edges).tensors[0][:, 16, 16]
-    >>> bool(along_x > 0.01), bool(along_y < 1e-6)
-    (True, True)
+    ``reference`` (H, W) or (H, W, 3).
     """
     image = luminance(check_image(reference, "reference"))
     dx, dy = _gradient(image)
@@ -114,30 +94,7 @@ def flow_confidence(reference: ArrayLike) -> FlowConfidence:
 def noise_share(image: ArrayLike, noise: float) -> float:
     """Share of the squared gradient of an image that is noise.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        Intensities; colour is reduced to luminance.
-    noise : float
-        σ, intensity.
-
-    Returns
-    -------
-    float
-        About 1 for white noise alone, 0 for an image without noise.
-
-    Raises
-    ------
-    DataError
-        Wrong shape, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> white = np.random.default_rng(0).normal(0.5, 0.1, (64, 64))
-    >>> ramp = np.tile(np.arange(64) / 2.0, (64, 1))
-    >>> round(noise_share(white, 0.1), 1), round(noise_share(ramp + white, 0.1), 2)
-    (1.0, 0.0)
+    ``image`` (H, W) or (H, W, 3).
     """
     squares = sum(float(np.square(part).mean(dtype=np.float64)) for part in _gradient(luminance(check_image(image))))
     return 2 * _SCHARR_NOISE * noise**2 / max(squares, 1e-18)
@@ -146,33 +103,7 @@ def noise_share(image: ArrayLike, noise: float) -> float:
 def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -> FloatArray:
     """Draw a flow towards its neighbourhood where the texture does not determine it.
 
-    Parameters
-    ----------
-    flow : array_like, shape (H, W, 2)
-        Measured displacements (dx, dy), pixels.
-    confidence : FlowConfidence
-        Of the reference that the flow starts from.
-    noise : float
-        σ of the frame that the flow leads to, intensity.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W, 2)
-        Pixels, within the range of ``flow`` and zero; zero where the whole image is flat.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, or values are not finite.
-    ConfigurationError
-        ``noise`` is negative or not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> flat = flow_confidence(np.full((32, 32), 0.5))
-    >>> float(np.abs(regularise_flow(np.full((32, 32, 2), 3.0), flat, 0.01)).max())
-    0.0
+    ``flow`` (H, W, 2); returns (H, W, 2).
     """
     measured = check_flow(flow)
     require(0 <= noise < np.inf, f"noise: expected a finite number of 0 or more, found {noise}")
@@ -204,21 +135,7 @@ def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -
 def subtract_noise(noise: np.float32, xx: FloatArray, xy: FloatArray, yy: FloatArray, lowered: FloatArray) -> None:
     """Lower both eigenvalues of the tensor of each pixel by ``noise``, but not below zero.
 
-    Parameters
-    ----------
-    noise : float32
-        Squared intensity per squared pixel.
-    xx, xy, yy : ndarray, float32, shape (P,)
-        Structure tensors.
-    lowered : ndarray, float32, shape (3, P)
-        Filled, with xx, xy and yy.
-
-    Examples
-    --------
-    >>> lowered = np.empty((3, 1), np.float32)
-    >>> subtract_noise(np.float32(1), np.float32([5]), np.float32([0]), np.float32([0.5]), lowered)
-    >>> lowered[:, 0]
-    array([4., 0., 0.], dtype=float32)
+    ``xx, xy, yy`` (P,); ``lowered`` (3, P).
     """
     zero, two, tiny = np.float32(0), np.float32(2), np.finfo(np.float32).tiny
     for pixel in range(xx.size):
@@ -265,24 +182,7 @@ def posterior_mean(
 
     Where J is singular, along an edge, cancellation leaves few digits of its determinant; as ε is at least κ tr(J) / 2,
     single precision keeps four digits and a half of the flow there.
-
-    Parameters
-    ----------
-    noise : float32
-        ``m σ² / (A τ²)``.
-    xx, xy, yy : ndarray, float32, shape (P,)
-        J.
-    weighted_x, weighted_y, expected_x, expected_y : ndarray, float32, shape (P,)
-        J W and W̄.
-    x, y : ndarray, float32, shape (P,)
-        Filled.
-
-    Examples
-    --------
-    >>> one, zero, x, y = np.float32([1]), np.float32([0]), np.empty(1, np.float32), np.empty(1, np.float32)
-    >>> posterior_mean(np.float32(1), one, zero, zero, 3 * one, zero, zero, 5 * one, x, y)
-    >>> x.round(2), y.round(2)
-    (array([1.5], dtype=float32), array([5.], dtype=float32))
+    ``xx, xy, yy`` (P,); ``weighted_x, weighted_y, expected_x, expected_y`` (P,); ``x, y`` (P,).
     """
     half = np.float32(_TILT / 2)
     for pixel in range(x.size):

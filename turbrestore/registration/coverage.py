@@ -16,27 +16,7 @@ Rectangle = tuple[int, int, int, int]
 def coverage(flows: ArrayLike) -> FloatArray:
     """Share of the frames that show each pixel of the reference.
 
-    Parameters
-    ----------
-    flows : array_like, shape (T, H, W, 2)
-        From the reference to each frame, pixels.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W)
-        0 to 1.
-
-    Raises
-    ------
-    DataError
-        Wrong shape, no flows, or values that are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> flows = np.zeros((2, 3, 4, 2), np.float32); flows[1, ..., 0] = 2
-    >>> coverage(flows)[0]
-    array([1. , 1. , 0.5, 0.5], dtype=float32)
+    ``flows`` (T, H, W, 2); returns (H, W).
     """
     stack = check_flow(flows, "flows")
     if stack.ndim != 4 or not len(stack):
@@ -51,35 +31,8 @@ def well_seen(seen: ArrayLike, least: float = 0.9, margin: int = 0, smallest: in
     """Rectangle whose border enough frames show.
 
     The side with the worst pixel is trimmed until no pixel of the border is below ``least``; pixels inside are not
-    examined.  If less than the smallest size would be left, nothing is trimmed.
-
-    Parameters
-    ----------
-    seen : array_like, shape (H, W)
-        From :func:`coverage`.
-    least : float
-        Share of the frames, 0 to 1.
-    margin : int
-        Further pixels to trim on every side.
-    smallest : int
-        Shortest side of the result, pixels.
-
-    Returns
-    -------
-    x, y, width, height : int
-        Pixels.
-
-    Raises
-    ------
-    ConfigurationError
-        ``least`` or ``margin`` is out of range.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> seen = np.ones((40, 60)); seen[:3] = 0.5
-    >>> well_seen(seen, margin=1)
-    (1, 4, 58, 35)
+    examined. If less than the smallest size would be left, nothing is trimmed.
+    ``seen`` (H, W).
     """
     require_between("least", least, 0, 1)
     require_between("margin", margin, 0, 10_000, "pixels")

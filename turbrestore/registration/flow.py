@@ -199,36 +199,8 @@ def iterate_flows(
     """Yield ``(frame, flow)`` in order while threads solve a few frames ahead.
 
     A handful of frames are in memory at a time, however long ``frames`` is.
-
-    Parameters
-    ----------
-    reference : array_like, shape (H, W) or (H, W, 3)
-        Image that every frame is compared with.
-    frames : iterable of array_like, shape (H, W) or (H, W, 3)
-        Consumed lazily.
-    params : FlowParams, optional
-        Method and settings.
-    runtime : Runtime
-        Threads, and the device of ``tvl1``.
-
-    Yields
-    ------
-    frame : ndarray, float32, shape (H, W) or (H, W, 3)
-    flow : ndarray, float32, shape (H, W, 2)
-        Displacements (dx, dy) in pixels.
-
-    Raises
-    ------
-    DataError
-        As :func:`estimate_flow`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> y, x = np.mgrid[:32, :32]
-    >>> image = (0.5 + 0.2 * np.sin(x / 3.0) * np.cos(y / 4.0)).astype(np.float32)
-    >>> [float(abs(flow).max()) for _, flow in iterate_flows(image, [image, image])]
-    [0.0, 0.0]
+    ``reference`` (H, W) or (H, W, 3); ``frames`` (H, W) or (H, W, 3) each; yields ``frame`` (H, W) or (H, W, 3),
+    ``flow`` (H, W, 2).
     """
     target = prepare_reference(reference, params, runtime)
     checked = (check_image(frame, f"frame {number}") for number, frame in enumerate(frames))
@@ -242,34 +214,7 @@ def measure_flows(
 ) -> Iterator[tuple[FlowFrame, FloatArray]]:
     """Measure flows from a prepared reference while threads solve a few frames ahead.
 
-    Parameters
-    ----------
-    reference : FlowReference
-    frames : iterable of ndarray or FlowFrame
-        Images, float32, shape (H, W) or (H, W, 3), or frames that were prepared for an earlier reference.
-    starts : iterable of ndarray or None
-        For each frame the flow from a similar reference, pixels, or None.
-
-    Yields
-    ------
-    frame : FlowFrame
-        May serve the next reference.
-    flow : ndarray, float32, shape (H, W, 2)
-        Pixels.
-
-    Raises
-    ------
-    DataError
-        A frame has another size than the reference.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> image = np.ones((16, 16), np.float32)
-    >>> [(frame, flow)] = measure_flows(prepare_reference(image), [image])
-    >>> [(_, again)] = measure_flows(prepare_reference(image), [frame], [flow])
-    >>> float(abs(again).max())
-    0.0
+    Yields ``flow`` (H, W, 2).
     """
 
     def solve(batch: list[tuple[FloatArray | FlowFrame, FloatArray | None]]) -> list[tuple[FlowFrame, FloatArray]]:
@@ -292,33 +237,7 @@ def prepare_reference(
 ) -> FlowReference:
     """Prepare the image that flows start from.
 
-    Parameters
-    ----------
-    reference : array_like, shape (H, W) or (H, W, 3)
-    params : FlowParams, optional
-        Method and settings.
-    runtime : Runtime
-        Threads, and the device of ``tvl1``.
-    start_level : int
-        Level of the pyramid of dense inverse search, counted from the finest that is used, at which flows that have a
-        start begin.
-
-    Returns
-    -------
-    FlowReference
-
-    Raises
-    ------
-    DataError
-        The image is smaller than 16×16, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> y, x = np.mgrid[:32, :32].astype(np.float32)
-    >>> reference = prepare_reference(y * x / 1024)
-    >>> float(abs(reference.solve([reference.prepare(y * x / 1024)])[0]).max())
-    0.0
+    ``reference`` (H, W) or (H, W, 3).
     """
     params = params or FlowParams()
     target = check_image(reference, "reference")

@@ -90,23 +90,7 @@ class FarnebackParams:
 def dis_solver(params: DisParams, reference: GreyImage, start_level: int) -> FlowSolver:
     """Prepare dense inverse search from a reference.
 
-    Parameters
-    ----------
-    params : DisParams
-    reference : ndarray, uint8, shape (H, W)
-    start_level : int
-        Pyramid level, counted from the finest that is used, at which a flow with a start begins.
-
-    Returns
-    -------
-    callable
-        From frames, uint8, shape (B, H, W), and their starts (arrays or None) to flows, float32, shape (B, H, W, 2).
-
-    Examples
-    --------
-    >>> image = np.zeros((32, 32), np.uint8)
-    >>> dis_solver(DisParams(), image, 0)(image[None], [None]).shape
-    (1, 32, 32, 2)
+    ``reference`` (H, W).
     """
 
     def solve(frame: GreyImage, start: FloatArray | None) -> FloatArray:
@@ -130,21 +114,7 @@ def dis_solver(params: DisParams, reference: GreyImage, start_level: int) -> Flo
 def farneback_solver(params: FarnebackParams, reference: GreyImage) -> FlowSolver:
     """Prepare Farneback's method from a reference; it ignores starts.
 
-    Parameters
-    ----------
-    params : FarnebackParams
-    reference : ndarray, uint8, shape (H, W)
-
-    Returns
-    -------
-    callable
-        As :func:`dis_solver`.
-
-    Examples
-    --------
-    >>> image = np.zeros((32, 32), np.uint8)
-    >>> farneback_solver(FarnebackParams(), image)(image[None], [None]).shape
-    (1, 32, 32, 2)
+    ``reference`` (H, W).
     """
     deviation = {5: 1.1, 7: 1.5}[params.neighbourhood]
 
@@ -166,24 +136,6 @@ def farneback_solver(params: FarnebackParams, reference: GreyImage) -> FlowSolve
 
 
 def flow_memory(shape: tuple[int, ...], threads: int) -> float:
-    """Memory that measuring flow takes beside the frames and their flows.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Of the frames: (T, H, W) or (T, H, W, 3).
-    threads : int
-        Frames solved side by side.
-
-    Returns
-    -------
-    float
-        Bytes, of ``dis``, which takes most; measured, with a twentieth added.
-
-    Examples
-    --------
-    >>> flow_memory((60, 1000, 1000), threads=2) / 1e6
-    515.0
-    """
+    """Memory that measuring flow takes beside the frames and their flows."""
     pixels, channels = shape[1] * shape[2], shape[3] if len(shape) > 3 else 1
     return float(pixels * (120 + 5 * channels + threads * (185 + 10 * channels)))

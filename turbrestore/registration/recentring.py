@@ -34,28 +34,7 @@ def recentring_flow(mean_flow: ArrayLike) -> FloatArray:
 
     A shift of the whole image by more than two pixels is the camera's; it is left, because it bends nothing, and
     following it would move a part of the image out of the frame.
-
-    Parameters
-    ----------
-    mean_flow : array_like, shape (H, W, 2)
-        W̄, pixels.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W, 2)
-        V, pixels; ``warp(image, V)`` is the image at the mean geometry.
-
-    Raises
-    ------
-    DataError
-        Wrong shape, or values are not finite.
-
-    Examples
-    --------
-    >>> recentring_flow(np.full((4, 4, 2), 0.5, np.float32))[0, 0]
-    array([-0.5, -0.5], dtype=float32)
-    >>> float(abs(recentring_flow(np.full((4, 4, 2), 5.0, np.float32))).max())
-    0.0
+    ``mean_flow`` (H, W, 2); returns (H, W, 2).
     """
     flow = check_flow(mean_flow, "mean_flow")
     if flow.ndim != 3:
@@ -67,27 +46,7 @@ def recentring_flow(mean_flow: ArrayLike) -> FloatArray:
 def recentre(image: ArrayLike, mean_flow: ArrayLike) -> FloatArray:
     """Move an image onto the mean geometry of its frames: ``q ∘ (id + W̄)^{-1}``.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        q.
-    mean_flow : array_like, shape (H, W, 2)
-        W̄, the mean of the flows from the image to the frames, pixels.
-
-    Returns
-    -------
-    ndarray, float32, shape of ``image``
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, or values are not finite.
-
-    Examples
-    --------
-    >>> ramp = np.tile(np.arange(16, dtype=np.float32), (16, 1))
-    >>> recentre(ramp, np.full((16, 16, 2), (0.5, 0.0), np.float32))[8, 8].round(3)
-    np.float32(7.5)
+    ``image`` (H, W) or (H, W, 3); ``mean_flow`` (H, W, 2).
     """
     V = recentring_flow(mean_flow)
     # Interpolation by no shift would change the last bits.

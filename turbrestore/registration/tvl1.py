@@ -170,31 +170,7 @@ class TvL1Flows:
 def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device: str = CPU) -> TvL1Reference:
     """Prepare the reference of many flows.
 
-    Parameters
-    ----------
-    reference : array_like, shape (H, W) or (H, W, 3)
-        At least 16×16 pixels; colour is reduced to luminance.
-    params : TvL1Params, optional
-        Settings of all flows from this reference.
-    device : str
-        Where flows are computed, see :mod:`turbrestore.runtime.device`.
-
-    Returns
-    -------
-    TvL1Reference
-
-    Raises
-    ------
-    DataError
-        Wrong shape, too small, or values that are not finite.
-    ConfigurationError
-        The device does not exist.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> [level.image.shape for level in prepare_tvl1(np.zeros((80, 70))).levels]
-    [(1, 80, 70), (1, 40, 35), (1, 20, 18)]
+    ``reference`` (H, W) or (H, W, 3).
     """
     params = params or TvL1Params()
     image = luminance(check_image(reference, "reference"))
@@ -211,40 +187,7 @@ def tvl1_flows(
 ) -> TvL1Flows:
     """Flows from the reference to each of some frames, in the calling thread.
 
-    Parameters
-    ----------
-    frames : array_like, shape (T, H, W) or (T, H, W, 3)
-        In the intensity unit of the reference; a device solves them together, so memory grows with T.
-    reference : TvL1Reference
-        From :func:`prepare_tvl1`.
-    start : array_like, shape (T, H, W, 2), optional
-        Flows to begin with on the coarsest level, zero by default: earlier flows to these frames from a similar
-        reference.  The flow to the frame before, or the one that a dynamic texture predicts, is hardly better than zero
-        where turbulence changes from frame to frame.
-    levels : int, optional
-        Number of finest levels to go through; all by default.  A good start replaces the others, and two save a tenth
-        of the time.
-
-    Returns
-    -------
-    TvL1Flows
-        The flow of a frame does not depend on the other frames.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, or values are not finite.
-    ConfigurationError
-        ``levels`` is less than 1.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> y, x = np.mgrid[:64, :64]
-    >>> reference, frame = (100 + 50 * np.sin((x - dx) / 3) * np.cos(y / 4) for dx in (0, 0.7))
-    >>> found = tvl1_flows(frame[None], prepare_tvl1(reference))
-    >>> np.median(found.flows[0], axis=(0, 1)).round(1) + 0
-    array([0.7, 0. ], dtype=float32)
+    ``frames`` (T, H, W) or (T, H, W, 3); ``start`` (T, H, W, 2).
     """
     stack = luminance(check_frames(frames))
     shape = tuple(reference.levels[0].image.shape[-2:])
@@ -266,28 +209,7 @@ def tvl1_flows(
 def tvl1_solver(params: TvL1Params, reference: GreyImage, device: str) -> FlowSolver:
     """Prepare TV-L1 from a reference as a method of :mod:`turbrestore.registration.flow`.
 
-    Parameters
-    ----------
-    params : TvL1Params
-    reference : ndarray, uint8, shape (H, W)
-    device : str
-        Name from :func:`turbrestore.runtime.device.find_device`.
-
-    Returns
-    -------
-    callable
-        As :func:`turbrestore.registration.opencv_flow.dis_solver`.
-
-    Raises
-    ------
-    ConfigurationError
-        The memory of the device is not enough.
-
-    Examples
-    --------
-    >>> image = np.zeros((32, 32), np.uint8)
-    >>> tvl1_solver(TvL1Params(), image, "cpu")(image[None], [None]).shape
-    (1, 32, 32, 2)
+    ``reference`` (H, W).
     """
     with memory_of(device):
         prepared = prepare_tvl1(reference.astype(np.float32), params, device)

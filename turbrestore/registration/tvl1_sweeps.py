@@ -91,33 +91,7 @@ class SweepParams:
 def sweep(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams, ops: StackOps) -> Stack:
     """Sweep the flows of a batch.
 
-    Parameters
-    ----------
-    problem : FlowProblem
-        Data term.
-    flow : stack, shape (B, 2, H, W)
-        u to begin with.
-    dual : stack, shape (B, 2, 2, H, W)
-        p: axis (x, y), component; overwritten by its final value.  Its x vanishes in the last column, its y in the last
-        row.
-    params : SweepParams
-        Step and count.
-    ops : StackOps
-        Operations of the CPU, or of the device.
-
-    Returns
-    -------
-    stack, shape (B, 2, H, W)
-        u.
-
-    Examples
-    --------
-    >>> from turbrestore.runtime.image_stacks import numpy_ops
-    >>> one = np.ones((1, 4, 4), np.float32)
-    >>> along_x = np.stack([one, 0 * one], axis=1)
-    >>> u, p = np.zeros((1, 2, 4, 4), np.float32), np.zeros((1, 2, 2, 4, 4), np.float32)
-    >>> sweep(FlowProblem(along_x, -2 * one, 5 * one), u, p, SweepParams(10, 0.7, 0.3), numpy_ops())[0, :, 0, 0]
-    array([2., 0.], dtype=float32)
+    ``flow`` (B, 2, H, W); ``dual`` (B, 2, 2, H, W); returns (B, 2, H, W).
     """
     if ops.arrays is not np:
         return _sweep_on_device(problem, flow, dual, params)
@@ -141,24 +115,7 @@ def sweep_frame(
 ) -> None:
     """Sweep the flow of one frame.
 
-    Parameters
-    ----------
-    direction : ndarray, float32, shape (2, H, W)
-    offset, bound : ndarray, float32, shape (H, W)
-        Of a :class:`FlowProblem`.
-    flow, ahead : ndarray, float32, shape (2, H, W)
-        u and ū; overwritten.
-    dual : ndarray, float32, shape (2, 2, H, W)
-        p, as for :func:`sweep`; overwritten.
-    steps : ndarray, float32, shape (4,)
-        τ, σ, ``1 / (1 + σα)`` and the number of sweeps.
-
-    Examples
-    --------
-    >>> one, u, p = np.ones((4, 4), np.float32), np.zeros((2, 4, 4), np.float32), np.zeros((2, 2, 4, 4), np.float32)
-    >>> sweep_frame(np.stack([one, 0 * one]), -2 * one, 5 * one, u, u.copy(), p, np.float32([0.7, 0.2, 0.9, 10]))
-    >>> u[:, 0, 0]
-    array([2., 0.], dtype=float32)
+    ``direction`` (2, H, W); ``offset, bound`` (H, W); ``flow, ahead`` (2, H, W); ``dual`` (2, 2, H, W); ``steps`` (4,).
     """
     height, width = offset.shape
     step, dual_step, shrink, one = steps[0], steps[1], steps[2], np.float32(1)
@@ -228,16 +185,7 @@ def _sweep_on_device(problem: FlowProblem, flow: Stack, dual: Stack, params: Swe
 def add_differences(u: Stack, px: Stack, py: Stack) -> None:
     """Add ∇u to p, for arrays of NumPy or torch.
 
-    Parameters
-    ----------
-    u, px, py : stack, shape (..., H, W)
-
-    Examples
-    --------
-    >>> px, py = np.zeros((2, 1, 3))
-    >>> add_differences(np.array([[1.0, 3.0, 2.0]]), px, py)
-    >>> px
-    array([[ 2., -1.,  0.]])
+    ``u, px, py`` (..., H, W).
     """
     px[..., :-1] += u[..., 1:]
     px[..., :-1] -= u[..., :-1]
@@ -248,19 +196,7 @@ def add_differences(u: Stack, px: Stack, py: Stack) -> None:
 def divergence(px: Stack, py: Stack, out: Stack) -> None:
     """Negative adjoint of the forward differences, for p that vanishes across the last column and row.
 
-    Parameters
-    ----------
-    px, py : stack, shape (..., H, W)
-        Components of p, arrays of NumPy or torch.
-    out : stack, shape (..., H, W)
-        Receives div p.
-
-    Examples
-    --------
-    >>> px, out = np.array([[1.0, 2.0, 0.0]]), np.empty((1, 3))
-    >>> divergence(px, np.zeros((1, 3)), out)
-    >>> out
-    array([[ 1.,  1., -2.]])
+    ``px, py`` (..., H, W); ``out`` (..., H, W).
     """
     out[...] = px
     out += py
@@ -271,23 +207,7 @@ def divergence(px: Stack, py: Stack, out: Stack) -> None:
 def resize_dual(dual: Stack, shape: Shape, ops: StackOps) -> Stack:
     """Dual variable on another grid.
 
-    Parameters
-    ----------
-    dual : stack, shape (B, 2, 2, h, w)
-    shape : tuple of int
-        (H, W).
-    ops : StackOps
-
-    Returns
-    -------
-    stack, shape (B, 2, 2, H, W)
-
-    Examples
-    --------
-    >>> from turbrestore.runtime.image_stacks import numpy_ops
-    >>> resize_dual(np.ones((1, 2, 2, 2, 2), np.float32), (3, 3), numpy_ops())[0, :, 0, 1]
-    array([[1., 1., 0.],
-           [1., 1., 1.]], dtype=float32)
+    ``dual`` (B, 2, 2, h, w); returns (B, 2, 2, H, W).
     """
     result = ops.resize(dual, shape)
     # There are no differences across the border.

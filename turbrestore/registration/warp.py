@@ -34,36 +34,7 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device
     """Backward warp: ``result(x, y) = image(x + dx, y + dy)``.
 
     With ``flow = estimate_flow(reference, frame)`` the result lies on the reference (``I ∘ w``; paper 3, eq. 15).
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        Intensities.
-    flow : array_like, shape (H, W, 2)
-        Displacements (dx, dy) in pixels.
-    interpolation : {"cubic", "linear"}
-        Cubic B-splines keep detail; linear never leaves the range of the image and has an exact adjoint.
-    device : str
-        Where the cubic warp is computed, see :mod:`turbrestore.runtime.device`; the linear one runs on the CPU.
-
-    Returns
-    -------
-    ndarray, float32, shape of ``image``
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, or values are not finite.
-    ConfigurationError
-        Unknown interpolation, or the device is not there or has not enough memory.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> ramp = np.tile(np.arange(5, dtype=np.float32), (3, 1))
-    >>> shift = np.zeros((3, 5, 2), np.float32); shift[..., 0] = 0.25
-    >>> warp(ramp, shift, interpolation="linear")[0]
-    array([0.25, 1.25, 2.25, 3.25, 4.  ], dtype=float32)
+    ``image`` (H, W) or (H, W, 3); ``flow`` (H, W, 2).
     """
     image, flow = check_image(image), check_flow(flow)
     if interpolation not in INTERPOLATIONS:
@@ -84,27 +55,7 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device
 def inside(flow: ArrayLike) -> FloatArray:
     """Mask of the pixels that a warp samples inside the image rather than from its repeated border.
 
-    Parameters
-    ----------
-    flow : array_like, shape (H, W, 2)
-        Displacements (dx, dy) in pixels.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W)
-        1 where the sample lies within the image, falling to 0 over one pixel beyond the centres of its border pixels.
-
-    Raises
-    ------
-    DataError
-        Wrong shape, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> shift = np.zeros((3, 5, 2), np.float32); shift[..., 0] = 1.25
-    >>> inside(shift)[0]
-    array([1.  , 1.  , 1.  , 0.75, 0.  ], dtype=float32)
+    ``flow`` (H, W, 2); returns (H, W).
     """
     flow = check_flow(flow)
     if flow.ndim != 3:
@@ -120,24 +71,7 @@ def inside(flow: ArrayLike) -> FloatArray:
 def sample_linear(planes: Sequence[FloatArray], flow: FloatArray, rows: slice = slice(None)) -> FloatArray:
     """Sample planes bilinearly where the flow of some rows leads.
 
-    Parameters
-    ----------
-    planes : sequence of ndarray, float32, shape (H, W) or (H, W, 3)
-    flow : ndarray, float32, shape (h, W, 2)
-        Displacements (dx, dy) of those rows, pixels.
-    rows : slice
-        The rows.
-
-    Returns
-    -------
-    ndarray, float32, shape (h, W), or with a last axis for the planes
-        Outside the image the nearest pixel is repeated.
-
-    Examples
-    --------
-    >>> ramp = np.tile(np.arange(4, dtype=np.float32), (2, 1))
-    >>> sample_linear([ramp], np.full((1, 4, 2), 0.5, np.float32), slice(1, 2))
-    array([[0.5, 1.5, 2.5, 3. ]], dtype=float32)
+    ``planes`` (H, W) or (H, W, 3) each; ``flow`` (h, W, 2); returns (h, W).
     """
     x, y = (axis[rows] for axis in _pixel_grid(*planes[0].shape[:2]))
     position = x + flow[..., 0], y + flow[..., 1]
@@ -146,22 +80,7 @@ def sample_linear(planes: Sequence[FloatArray], flow: FloatArray, rows: slice = 
 
 
 def strips(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Split the rows of an image into pieces whose intermediate results stay in the cache.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        (H, W) and what follows.
-
-    Yields
-    ------
-    slice
-
-    Examples
-    --------
-    >>> list(strips((400, 400)))
-    [slice(0, 163, None), slice(163, 326, None), slice(326, 400, None)]
-    """
+    """Split the rows of an image into pieces whose intermediate results stay in the cache."""
     rows = max(_STRIP // shape[1], 1)
     return (slice(start, min(start + rows, shape[0])) for start in range(0, shape[0], rows))
 

@@ -61,44 +61,13 @@ class ClipRow:
 def thumbnail_uri(image: FloatArray) -> str:
     """Make a small picture that a page can hold.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-
-    Returns
-    -------
-    str
-        Data URI.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> thumbnail_uri(np.zeros((4, 4), np.float32))[:23]
-    'data:image/webp;base64,'
+    ``image`` (H, W) or (H, W, 3).
     """
     return data_uri(encode_image(from_unit(shrink(image, _LONGEST), 8), "webp", _QUALITY), "webp")
 
 
 def render_batch(rows: Sequence[ClipRow], folder: str = "") -> str:
-    """Return the page of a batch as HTML.
-
-    Parameters
-    ----------
-    rows : sequence of ClipRow
-    folder : str
-        Name of the folder of the results, for the title.
-
-    Raises
-    ------
-    ConfigurationError
-        Jinja is not installed.
-
-    Examples
-    --------
-    >>> page = render_batch([ClipRow("<a>.mkv", "a.png", "failed", "cut short")])
-    >>> "&lt;a&gt;.mkv" in page, "cut short" in page
-    (True, True)
-    """
+    """Return the page of a batch as HTML."""
     templates = environment()
     from markupsafe import Markup
 

@@ -19,23 +19,7 @@ _KEYS = "Drag to pan; arrow keys, + and − work on the image."
 
 
 def comparison(gallery: Gallery) -> str:
-    """Return the markup for comparing the images of a gallery; it needs ``compare.css`` and ``compare.js``.
-
-    Parameters
-    ----------
-    gallery : Gallery
-        At least one picture.
-
-    Returns
-    -------
-    str
-        HTML in which all text is escaped.
-
-    Raises
-    ------
-    ConfigurationError
-        Jinja2 is not installed.
-    """
+    """Return the markup for comparing the images of a gallery; it needs ``compare.css`` and ``compare.js``."""
     pictures = gallery.pictures
     return _markup(pictures, pictures[-1].key, gallery.stretch, f"{_KEYS} {gallery.encoding}.")
 

@@ -87,16 +87,7 @@ class Lap:
 
 
 def headline(restoration: Restoration) -> list[Fact]:
-    """Return the key figures, which stand at the top of the page.
-
-    Parameters
-    ----------
-    restoration : Restoration
-
-    Returns
-    -------
-    list of Fact
-    """
+    """Return the key figures, which stand at the top of the page."""
     facts = [
         Fact("Frames", str(restoration.frame_count), f"{restoration.train} of them for training"),
         Fact("Motion", f"{restoration.motion:.2f} px", "root mean square"),
@@ -111,16 +102,7 @@ def headline(restoration: Restoration) -> list[Fact]:
 
 
 def findings(restoration: Restoration) -> list[Fact]:
-    """Return the results of every stage.
-
-    Parameters
-    ----------
-    restoration : Restoration
-
-    Returns
-    -------
-    list of Fact
-    """
+    """Return the results of every stage."""
     return [
         *_motion_facts(restoration),
         *_filter_facts(restoration),
@@ -139,18 +121,7 @@ def verdict(restoration: Restoration, run: RunRecord) -> Verdict:
 
 
 def settings(run: RunRecord, defaults: Mapping[str, Any] | None = None) -> list[Setting]:
-    """Return all settings, named as on the command line, with dots between the levels.
-
-    Parameters
-    ----------
-    run : RunRecord
-    defaults : mapping, optional
-        Nested as the settings of the run; by default those of a restoration.
-
-    Returns
-    -------
-    list of Setting
-    """
+    """Return all settings, named as on the command line, with dots between the levels."""
     usual = dict(_flat({**_USUAL_RUN, **dataclasses.asdict(RestoreParams())} if defaults is None else defaults))
     return [
         Setting(name.replace("_", "-"), _as_written(value), value != usual.get(name))
@@ -159,16 +130,7 @@ def settings(run: RunRecord, defaults: Mapping[str, Any] | None = None) -> list[
 
 
 def laps(restoration: Restoration) -> list[Lap]:
-    """Return the time of every stage, in the order of the run.
-
-    Parameters
-    ----------
-    restoration : Restoration
-
-    Returns
-    -------
-    list of Lap
-    """
+    """Return the time of every stage, in the order of the run."""
     total = sum(restoration.seconds.values()) or 1.0
     found, start = [], 0.0
     for name, seconds in restoration.seconds.items():

@@ -69,13 +69,7 @@ class Layer:
 
 
 def film_length(count: int, height: int, width: int) -> int:
-    """Return how many frames of a video its film has: its length in memory and on the page is bounded.
-
-    Examples
-    --------
-    >>> film_length(300, 540, 960), film_length(2000, 360, 640), film_length(2000, 1080, 1920)
-    (300, 750, 241)
-    """
+    """Return how many frames of a video its film has: its length in memory and on the page is bounded."""
     scale = min(_LONGEST / max(height, width), 1.0) ** 2
     return min(count, _MOST_FRAMES, max(int(_MOST_PIXELS / (height * width * scale)), 1))
 
@@ -88,26 +82,7 @@ def write_film(
     rate_factor: int,
     masks: Iterable[NDArray[np.bool_]] | None = None,
 ) -> Film:
-    """Write input and output as a film, with their difference and what moves if masks are given.
-
-    Parameters
-    ----------
-    path : Path
-        ``.mp4``.
-    pairs : iterable of (ndarray, ndarray)
-        Frames of input and output, of one size; all of them are read.
-    count : int
-        Number of frames to write, see :func:`film_length`.
-    fps : float
-    rate_factor : int
-        Quality of H.264, 0 to 51; smaller is better.
-    masks : iterable of ndarray, bool, optional
-        Where something moves in each frame.
-
-    Returns
-    -------
-    Film
-    """
+    """Write input and output as a film, with their difference and what moves if masks are given."""
     shown: list[FloatArray] = []
     written = 0
     panels = ("input", "output") if masks is None else tuple(_TITLES)

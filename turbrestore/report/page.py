@@ -28,31 +28,7 @@ _PACKAGES = ("matplotlib", "jinja2")
 def check_report(
     path: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = (), overwrite: bool = False
 ) -> None:
-    """Raise an error before the work begins if the report could not be written.
-
-    Parameters
-    ----------
-    path : path
-        File to write.
-    inputs : iterable of path
-        Files that the run reads.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    ConfigurationError
-        The suffix is not .html or .htm, or a package is not installed.
-    OutputError
-        The file exists or is an input, or its folder does not exist.
-
-    Examples
-    --------
-    >>> check_report("report.txt")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.ConfigurationError: report.txt: expected a name that ends in .html or .htm, found .txt
-    """
+    """Raise an error before the work begins if the report could not be written."""
     check_output(path, inputs, overwrite, _SUFFIXES)
     # The packages are only looked for here; loading them takes memory that the restoration needs.
     for package in _PACKAGES:
@@ -102,33 +78,7 @@ def write_report(
 
 
 def render_report(restoration: Restoration, run: RunRecord) -> str:
-    """Return the report of a restoration as HTML.
-
-    Parameters
-    ----------
-    restoration : Restoration
-        Complete, or stopped after an earlier stage.
-    run : RunRecord
-        Input, settings and versions.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.pipeline import RestoreParams, restore
-    >>> frames = np.random.default_rng(0).uniform(size=(4, 32, 32)).astype(np.float32)
-    >>> page = render_report(restore(frames, RestoreParams(until="centroid")), RunRecord("<b>.mkv", frames[2]))
-    >>> "<b>" in page, "&lt;b&gt;.mkv" in page
-    (False, True)
-    """
+    """Return the report of a restoration as HTML."""
     from markupsafe import Markup
 
     template = environment().get_template("template.html")

@@ -60,21 +60,7 @@ class Panel:
 
 
 def make_panel(figure: Figure, name: str, description: str, caption: str) -> Panel:
-    """Prepare a figure for the page: its axes are aligned with those of the others, its title becomes text that wraps.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-    name : str
-        Unique on the page.
-    description : str
-        What the figure shows, for screen readers.
-    caption : str
-
-    Returns
-    -------
-    Panel
-    """
+    """Prepare a figure for the page: align its axes with the others, and turn its title into text that wraps."""
     from markupsafe import Markup
 
     title = take_title(figure) or description

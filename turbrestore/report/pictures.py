@@ -83,18 +83,7 @@ class Gallery:
 
 
 def stages(restoration: Restoration, frame: FloatArray) -> dict[str, FloatArray]:
-    """Return the images of all stages, cropped like the result.  A last stage equal to the result is left out.
-
-    Parameters
-    ----------
-    restoration : Restoration
-    frame : ndarray, float32
-        One frame of the input.
-
-    Returns
-    -------
-    dict of str to ndarray
-    """
+    """Return the images of all stages, cropped like the result. A last stage equal to the result is left out."""
     x, y, width, height = restoration.crop
     images = {"frame": frame, "mean": restoration.mean, "centroid": restoration.centroid.image}
     if restoration.filtered is not None:
@@ -111,16 +100,7 @@ def stages(restoration: Restoration, frame: FloatArray) -> dict[str, FloatArray]
 def encode_gallery(images: dict[str, FloatArray], frame_number: int) -> Gallery:
     """Encode images for the page.
 
-    Parameters
-    ----------
-    images : dict of str to ndarray, float32, shape (H, W) or (H, W, 3)
-        All of the same size.
-    frame_number : int
-        Number of the frame ``images["frame"]``.
-
-    Returns
-    -------
-    Gallery
+    ``images`` (H, W) or (H, W, 3) each.
     """
     low, high = shown_range(images["result"])
     shown = {key: to_levels(image, low, high) for key, image in zip(images, iter_frames(images.values()), strict=True)}

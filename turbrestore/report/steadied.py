@@ -70,31 +70,7 @@ def write_steady_report(
     """Write a steadied video as one HTML file.
 
     Memory does not grow with the length of the video but by the film, see :func:`film_length`.
-
-    Parameters
-    ----------
-    path : path
-        Ends in .html or .htm.
-    sources : tuple of FrameSource
-        Input and output, of as many frames of one size.
-    masks : iterable of ndarray, bool, shape (H, W)
-        Where something moves, for every frame.
-    figures : SteadyFigures
-    run : RunRecord
-        Input, settings and versions, see :func:`turbrestore.runs.run_record.describe_run`.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    ConfigurationError
-        The suffix is not .html or .htm, or a package is not installed.
-    OutputError
-        The file exists, or its folder does not.
-    DataError
-        A video cannot be read.
-    StorageError
-        Writing failed; nothing is left behind.
+    ``masks`` (H, W) each.
     """
     from markupsafe import Markup
 

@@ -29,26 +29,7 @@ _FONT = re.compile(r"font:[^;]*?([\d.]+)px[^;]*;?")
 
 
 def inline_svg(figure: Figure, name: str, description: str) -> str:
-    """Draw a figure as an ``<svg>`` element without namespaces, styles or metadata.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-    name : str
-        Unique on the page; all ids in the element begin with it.
-    description : str
-        What the figure shows, for screen readers.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> from turbrestore.display.plots import plot_convergence
-    >>> inline_svg(plot_convergence([1.0, 0.2]), "c", "mean flow")[:35]
-    '<svg role="img" aria-label="mean fl'
-    """
+    """Draw a figure as an ``<svg>`` element without namespaces, styles or metadata."""
     import matplotlib as mpl
 
     buffer = io.StringIO()

@@ -20,31 +20,7 @@ _ARRAYS = (*_STATE, "reference", "flow_states", *_FIGURES)
 
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, key: str) -> None:
-    """Write a checkpoint; an older one is replaced when the new one is complete.
-
-    Parameters
-    ----------
-    path : path
-    checkpoint : FilterCheckpoint
-    key : str
-        Identifies the frames and settings; it is stored in the file itself.
-
-    Raises
-    ------
-    OutputError, StorageError
-        The file cannot be created or completed; the older one is left.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> image, flow = PixelGaussian(np.zeros((2, 3)), np.ones((2, 3))), Gaussian(np.zeros(1), np.eye(1))
-    >>> state = FilterState(image, flow, *np.zeros((2, 2, 3, 2), np.float32))
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     one = FilterCheckpoint(state, (FrameRecord(np.zeros(1), 1.0, 0.1, 1.0, 9.0),), np.zeros((2, 3)))
-    ...     save_checkpoint(folder + "/c.npz", one, "A")
-    ...     len(load_checkpoint(folder + "/c.npz", "A").records)
-    1
-    """
+    """Write a checkpoint; an older one is replaced when the new one is complete."""
     image, flow, records = checkpoint.state.image, checkpoint.state.flow, checkpoint.records
     arrays: dict[str, np.ndarray] = {name: np.array([getattr(record, name) for record in records]) for name in _FIGURES}
     states = np.array([record.flow_state for record in records], np.float64)
@@ -56,33 +32,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, 
 
 
 def load_checkpoint(path: str | os.PathLike[str], key: str) -> FilterCheckpoint:
-    """Read a checkpoint back.
-
-    Parameters
-    ----------
-    path : path
-        File written by :func:`save_checkpoint`.
-    key : str
-        What it was written with.
-
-    Returns
-    -------
-    FilterCheckpoint
-
-    Raises
-    ------
-    InputNotFoundError
-        There is no such file.
-    DataError
-        It is damaged, something else or has another key.
-
-    Examples
-    --------
-    >>> load_checkpoint("missing.npz", "A")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
-    """
+    """Read a checkpoint back."""
     source = Path(path)
     kept = _read(source, key)
     try:

@@ -21,30 +21,7 @@ _RESULTS = 10
 
 
 def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryPlan) -> dict[str, dict[str, Any]]:
-    """List what each stage depends on beside the stage before it; reads the input once.
-
-    Parameters
-    ----------
-    source : FrameSource
-    params : RestoreParams
-    plan : MemoryPlan
-        Of this restoration.
-
-    Returns
-    -------
-    dict of str to dict
-        As JSON holds it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from turbrestore.memory_plan import plan_memory
-    >>> from turbrestore.runtime.runtime import DEFAULT
-    >>> source, params = FrameSource.from_array(np.zeros((5, 16, 16))), RestoreParams()
-    >>> facts = stage_dependencies(source, params, plan_memory(source.shape, params, DEFAULT))
-    >>> list(facts), facts["centroid"]["frames"]
-    (['centroid', 'dynamics', 'filtered', 'deblurred'], [0, 5, 1])
-    """
+    """List what each stage depends on beside the stage before it; reads the input once."""
     settings = dataclasses.asdict(params)
     rows, columns = source.window
     facts = {
@@ -75,18 +52,7 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
 
 
 def filter_key(facts: dict[str, dict[str, Any]]) -> str:
-    """Return a checksum of all that the filter depends on.
-
-    Parameters
-    ----------
-    facts : dict
-        From :func:`stage_dependencies`.
-
-    Returns
-    -------
-    str
-        Hexadecimal.
-    """
+    """Return a checksum of all that the filter depends on."""
     parts = [facts[stage] for stage in ("centroid", "dynamics", "filtered")]
     return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=16).hexdigest()
 
@@ -104,24 +70,7 @@ def _span(numbers: Sequence[int]) -> list[int]:
 
 
 def list_changes(before: Any, now: Any, name: str = "") -> Iterator[str]:
-    """Say what differs between two records, one line for each value.
-
-    Parameters
-    ----------
-    before, now : object
-        As JSON holds them.
-    name : str
-        Dotted name of the value.
-
-    Yields
-    ------
-    str
-
-    Examples
-    --------
-    >>> list(list_changes({"flow": {"method": "dis"}}, {"flow": {"method": "tvl1"}}))
-    ['flow.method was dis and is tvl1']
-    """
+    """Say what differs between two records, one line for each value."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key in {**before, **now}:
             yield from list_changes(before.get(key), now.get(key), f"{name}.{key}" if name else key)

@@ -17,28 +17,7 @@ _WHOLE, _PIECE, _PIECES = 4 << 30, 1 << 16, 1024
 
 
 def content_digest(source: FrameSource) -> str:
-    """Checksum of what a video holds, wherever it lies and whatever its time stamps say.
-
-    Parameters
-    ----------
-    source : FrameSource
-
-    Returns
-    -------
-    str
-        Hexadecimal.
-
-    Raises
-    ------
-    InputNotFoundError, StorageError
-        The file is gone or cannot be read.
-
-    Examples
-    --------
-    >>> one, other = (FrameSource.from_array(np.full((2, 4, 4), value)) for value in (0.1, 0.2))
-    >>> content_digest(one) == content_digest(one), content_digest(one) == content_digest(other)
-    (True, False)
-    """
+    """Checksum of what a video holds, wherever it lies and whatever its time stamps say."""
     found = hashlib.blake2b(digest_size=16)
     if source.path is None:
         for frame in source.pixels(source.numbers):
@@ -54,30 +33,7 @@ def content_digest(source: FrameSource) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """Checksum of a file; of a very large one, of its size, time stamp and pieces.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    str
-        Hexadecimal.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = Path(folder, "a").write_bytes(b"abc")
-    ...     file_digest(Path(folder, "a"))
-    'cf4ab791c62b8d2b2109c90275287816'
-    """
+    """Checksum of a file; of a very large one, of its size, time stamp and pieces."""
     found = hashlib.blake2b(digest_size=16)
     with path.open("rb") as stream:
         status = os.fstat(stream.fileno())

@@ -17,34 +17,9 @@ LOCK = ".lock"
 def lock_folder(folder: str | os.PathLike[str]) -> Iterator[bool]:
     """Hold a folder for one run; it is created if its parent is there, and removed again if it stays empty.
 
-    The operating system releases the lock when the process ends, however it ends.  The lock is one of ``flock`` on a
-    file in the folder, on Windows one of ``LockFile``.  Network file systems lock across machines as far as their
-    server does.
-
-    Parameters
-    ----------
-    folder : path
-        Folder to hold.
-
-    Yields
-    ------
-    bool
-        False where the file system cannot lock at all; nobody else is kept out then.
-
-    Raises
-    ------
-    OutputError
-        Another run holds the folder, or it cannot be created or written to.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder, lock_folder(folder):
-    ...     try:
-    ...         lock_folder(folder).__enter__()
-    ...     except OutputError as error:
-    ...         print(str(error).removeprefix(folder))
-    : another run is at work in this folder; wait for it or name another one
+    The operating system releases the lock when the process ends, however it ends. The lock is one of ``flock`` on a
+    file in the folder, on Windows one of ``LockFile``. Network file systems lock across machines as far as their server
+    does.
     """
     place = Path(folder)
     try:

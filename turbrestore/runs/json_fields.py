@@ -26,13 +26,6 @@ class JsonFields:
         File of the record, for messages.
     record : dict
         What it says.
-
-    Examples
-    --------
-    >>> JsonFields(Path("run.json"), {"train": "8"}).value("train", int)
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.DataError: run.json: expected train to be int, found '8'
     """
 
     path: Path
@@ -109,13 +102,7 @@ class JsonFields:
         return Seeing(**values)
 
     def like(self, usual: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the record, whose values are sections and numbers where ``usual`` has such.
-
-        Parameters
-        ----------
-        usual : mapping
-            Nested, as ``dataclasses.asdict`` gives it; what is missing in the record, or null for a number, passes.
-        """
+        """Return the record, whose values are sections and numbers where ``usual`` has such."""
         for name, value in usual.items():
             if name not in self.record:
                 continue

@@ -85,27 +85,7 @@ def save_run(folder: str | os.PathLike[str], restoration: Restoration, run: RunR
 
 
 def save_results(folder: Path, restoration: Restoration, run: RunRecord, stored: Collection[str]) -> dict[str, Any]:
-    """Write the images, and the results of the stages that are not there yet.
-
-    Parameters
-    ----------
-    folder : Path
-        An existing folder.
-    restoration : Restoration
-    run : RunRecord
-    stored : collection of str
-        Names of files that are there already.
-
-    Returns
-    -------
-    dict
-        What the record has to say of a complete run.
-
-    Raises
-    ------
-    OutputError, StorageError
-        Writing failed.
-    """
+    """Write the images, and the results of the stages that are not there yet."""
     # A report would be of an earlier run.
     (folder / REPORT).unlink(missing_ok=True)
     results = {name: getattr(restoration, name) for name in RESULTS}
@@ -134,45 +114,13 @@ def save_results(folder: Path, restoration: Restoration, run: RunRecord, stored:
 
 
 def write_record(folder: Path, parts: Mapping[str, Any]) -> None:
-    """Write ``run.json``; an older one is replaced when the new one is complete.
-
-    Parameters
-    ----------
-    folder : Path
-    parts : mapping
-        What the record holds beside the version of its layout.
-
-    Raises
-    ------
-    OutputError, StorageError
-        Writing failed.
-    """
+    """Write ``run.json``; an older one is replaced when the new one is complete."""
     text = json.dumps({"schema": SCHEMA, **parts}, indent=1) + "\n"
     atomic_write(folder / RECORD, text.encode(), overwrite=True)
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
-    """Read ``run.json``.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    dict or None
-        None where there is no such file.
-
-    Raises
-    ------
-    DataError
-        The record is damaged or of another version of the layout.
-
-    Examples
-    --------
-    >>> read_record(Path("nowhere")) is None
-    True
-    """
+    """Read ``run.json``."""
     record = _read_json(folder / RECORD)
     if record is None:
         return None
@@ -185,28 +133,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def read_stages(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Read the record of the stages that are kept in a folder.
-
-    Parameters
-    ----------
-    folder : path
-
-    Returns
-    -------
-    dict or None
-        None where there is no such record.  A record of an earlier layout counts as one without stages, so that they
-        are run again.
-
-    Raises
-    ------
-    DataError
-        The record is damaged or of a later version of the layout.
-
-    Examples
-    --------
-    >>> read_stages("nowhere") is None
-    True
-    """
+    """Read the record of the stages that are kept in a folder."""
     place = Path(folder)
     try:
         kept = _read_json(place / RECORD)

@@ -102,17 +102,6 @@ class RunFolder:
         ``every`` is below 1.
     OutputError
         The folder cannot be written to.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from turbrestore.pipeline import restore
-    >>> frames = FrameSource.from_array(np.random.default_rng(0).uniform(size=(4, 32, 32)))
-    >>> params = RestoreParams(until="centroid")
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = restore(frames, params, store=RunFolder(folder, frames, params))
-    ...     RunFolder(folder, frames, RestoreParams(), resume=True).notes
-    ('continues after the centroid',)
     """
 
     def __init__(
@@ -148,23 +137,7 @@ class RunFolder:
         return frozenset(self._files)
 
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
-        """Return a result that was kept, else compute and keep it.
-
-        Parameters
-        ----------
-        name : str
-            Name of a stage, ``mean``, or ``filtered_tile_N``.
-        compute : callable
-
-        Returns
-        -------
-        object
-
-        Raises
-        ------
-        OutputError, StorageError
-            The result cannot be written.
-        """
+        """Return a result that was kept, else compute and keep it."""
         kept = self._load(name)
         if kept is not None:
             return cast(Result, kept)
@@ -177,17 +150,7 @@ class RunFolder:
         return self._newest
 
     def checkpoint(self, state: FilterCheckpoint) -> None:
-        """Take the newest checkpoint of the filter, and write it if enough frames have passed since the last.
-
-        Parameters
-        ----------
-        state : FilterCheckpoint
-
-        Raises
-        ------
-        OutputError, StorageError
-            It cannot be written.
-        """
+        """Take the newest checkpoint of the filter, and write it if enough frames have passed since the last."""
         self._newest = state
         if len(state.records) + self._block > self._written + self._every:
             self.flush()
@@ -205,12 +168,7 @@ class RunFolder:
         self._write_record()
 
     def progress(self) -> str:
-        """Say how far the results on disk go.
-
-        Returns
-        -------
-        str
-        """
+        """Say how far the results on disk go."""
         stages = itertools.takewhile(lambda stage: FILES[stage][0] in self._files, FILES)
         last = [TITLES[stage] for stage in stages][-1:]
         words = f"after the {last[0]}" if last else "from the start"
@@ -227,18 +185,7 @@ class RunFolder:
             (self.folder / name).unlink(missing_ok=True)
 
     def complete(self, restoration: Restoration, run: RunRecord) -> None:
-        """Write what :func:`turbrestore.load_run` needs beside the results of the stages.
-
-        Parameters
-        ----------
-        restoration : Restoration
-        run : RunRecord
-
-        Raises
-        ------
-        OutputError, StorageError
-            It cannot be written.
-        """
+        """Write what :func:`turbrestore.load_run` needs beside the results of the stages."""
         self._completed = save_results(self.folder, restoration, run, self.stored)
         self._write_record()
 
@@ -356,21 +303,7 @@ class RunFolder:
 
 
 def is_part(path: Path) -> bool:
-    """Tell whether a file was left by a writer that was killed.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    bool
-
-    Examples
-    --------
-    >>> is_part(Path(".0123456789abcdef.part")), is_part(Path("letter.part"))
-    (True, False)
-    """
+    """Tell whether a file was left by a writer that was killed."""
     return _PART.fullmatch(path.name) is not None
 
 

@@ -110,17 +110,7 @@ def describe_run(
 
 
 def versions() -> dict[str, str]:
-    """Versions of turbrestore, Python and the packages that compute.
-
-    Returns
-    -------
-    dict of str to str
-
-    Examples
-    --------
-    >>> list(versions())[:3]
-    ['turbrestore', 'Python', 'numpy']
-    """
+    """Versions of turbrestore, Python and the packages that compute."""
     found = {"turbrestore": __version__, "Python": platform.python_version()}
     for name in _PACKAGES:
         try:

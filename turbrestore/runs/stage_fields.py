@@ -158,29 +158,7 @@ FIELDS: dict[str, dict[str, Field]] = {
 
 
 def check_fields(kind: str, fields: Mapping[str, Any], name: str) -> None:
-    """Refuse fields that a stage cannot have made.
-
-    Parameters
-    ----------
-    kind : str
-        Kind of the stage file.
-    fields : mapping
-        Values by field.
-    name : str
-        How error messages call the file.
-
-    Raises
-    ------
-    DataError
-        A field is missing, too many, of another type or shape, not finite or out of range.
-
-    Examples
-    --------
-    >>> check_fields("centroid", {"image": 0}, "a.npz")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.DataError: a.npz: expected the fields ['converged', 'flows', ...], found ['image']
-    """
+    """Refuse fields that a stage cannot have made."""
     layout = FIELDS[kind]
     if set(fields) != set(layout):
         raise DataError(f"{name}: expected the fields {sorted(layout)}, found {sorted(fields)}")

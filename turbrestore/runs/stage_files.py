@@ -130,28 +130,7 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Pat
 def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
     """Read an image file, or the image of a stage file that has one.
 
-    Parameters
-    ----------
-    path : path
-        Image, or ``.npz`` of a centroid, a filtered or a deconvolved image.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W) or (H, W, 3)
-
-    Raises
-    ------
-    InputNotFoundError
-        There is no such file.
-    DataError
-        The file is damaged or holds no image.
-
-    Examples
-    --------
-    >>> load_stage_image("missing.npz")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
+    Returns (H, W) or (H, W, 3).
     """
     source = Path(path)
     if source.suffix.lower() != ".npz":
@@ -162,33 +141,9 @@ def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
 def load_guide(path: str | os.PathLike[str], image: str | os.PathLike[str]) -> FloatArray:
     """Read the image of a stage file that guides the deconvolution of another one, in the geometry of the latter.
 
-    A filtered image lies at the mean geometry of all frames, the centroid at that of the training frames.  So the
+    A filtered image lies at the mean geometry of all frames, the centroid at that of the training frames. So the
     centroid is moved as the filtered image was, as :func:`turbrestore.restore` does.
-
-    Parameters
-    ----------
-    path : path
-        Stage file of the guide.
-    image : path
-        Stage file of the image whose deconvolution it guides.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W) or (H, W, 3)
-
-    Raises
-    ------
-    InputNotFoundError
-        There is no such file.
-    DataError
-        A file is damaged or holds no image, or the stage files are of clips of different sizes.
-
-    Examples
-    --------
-    >>> load_guide("missing.npz", "missing.npz")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
+    Returns (H, W) or (H, W, 3).
     """
     (kind, fields), (other, fields_of_image) = _read(Path(path)), _read(Path(image))
     guide = _image_of(Path(path), kind, fields)
@@ -203,29 +158,7 @@ def load_guide(path: str | os.PathLike[str], image: str | os.PathLike[str]) -> F
 def save_flows(path: str | os.PathLike[str], flows: ArrayLike, overwrite: bool = False) -> None:
     """Write flows as a ``.npy`` file.
 
-    Parameters
-    ----------
-    path : path
-        Must end in ``.npy``.
-    flows : array_like, shape (T, H, W, 2)
-        Pixels.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    ConfigurationError
-        Another suffix.
-    OutputError
-        The file exists, or its folder does not.
-
-    Examples
-    --------
-    >>> import numpy as np, tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     save_flows(folder + "/flows.npy", np.zeros((2, 4, 4, 2)))
-    ...     load_flows(folder + "/flows.npy").shape
-    (2, 4, 4, 2)
+    ``flows`` (T, H, W, 2).
     """
     target = Path(path)
     check_output(target, overwrite=overwrite, suffixes=(".npy",))
@@ -236,29 +169,7 @@ def save_flows(path: str | os.PathLike[str], flows: ArrayLike, overwrite: bool =
 def load_flows(path: str | os.PathLike[str]) -> FloatArray:
     """Read flows from a ``.npy`` file, or those of a centroid stage file.
 
-    Parameters
-    ----------
-    path : path
-        ``.npy``, or ``.npz`` of a centroid.
-
-    Returns
-    -------
-    ndarray, float32, shape (T, H, W, 2)
-        Memory-mapped if it comes from ``.npy``.
-
-    Raises
-    ------
-    InputNotFoundError
-        There is no such file.
-    DataError
-        The file is damaged or holds something else.
-
-    Examples
-    --------
-    >>> load_flows("missing.npy")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.InputNotFoundError: missing.npy: no such file
+    Returns (T, H, W, 2).
     """
     source = Path(path)
     if source.suffix.lower() == ".npz":

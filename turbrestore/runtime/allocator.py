@@ -17,18 +17,7 @@ def returning_freed_memory(wanted: bool = True) -> Iterator[None]:
     """Return arrays of a megabyte and more to the system as soon as they are freed.
 
     By default glibc keeps freed arrays of up to 32 MB for later ones, and what lies between those in use adds a third
-    to the peak of a restoration at 1920×1080.  The setting belongs to the process.
-
-    Parameters
-    ----------
-    wanted : bool
-        False leaves everything as it is.
-
-    Examples
-    --------
-    >>> with returning_freed_memory():
-    ...     sum([1, 1])
-    2
+    to the peak of a restoration at 1920×1080. The setting belongs to the process.
     """
     if not wanted or platform.libc_ver()[0] != "glibc":
         yield

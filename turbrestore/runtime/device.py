@@ -39,53 +39,13 @@ _SMALLER = "process a smaller part of the frame (roi)"
 
 
 def check_device(name: str) -> None:
-    """Raise unless a setting looks like the name of a device; whether it is there is not asked.
-
-    Parameters
-    ----------
-    name : str
-        What was set.
-
-    Raises
-    ------
-    ConfigurationError
-        It cannot be a name.
-
-    Examples
-    --------
-    >>> check_device("cuda:1")
-    >>> check_device("GPU 1")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.ConfigurationError: device: expected auto, cpu, cuda or a name that torch knows, found ...
-    """
+    """Raise unless a setting looks like the name of a device; whether it is there is not asked."""
     known = isinstance(name, str) and _NAME.fullmatch(name) is not None
     require(known, f"device: expected auto, cpu, cuda or a name that torch knows, found {name!r}")
 
 
 def find_device(wanted: str) -> str:
-    """Name of the device that a setting means on this machine.
-
-    Parameters
-    ----------
-    wanted : str
-        ``"auto"``, ``"cpu"``, ``"cuda"`` or another of torch's names.
-
-    Returns
-    -------
-    str
-        ``"cpu"``: NumPy and OpenCV; any other: torch on the device of that name.
-
-    Raises
-    ------
-    ConfigurationError
-        A device other than ``"auto"`` and ``"cpu"`` was asked for and is not there, or torch is not installed.
-
-    Examples
-    --------
-    >>> find_device("cpu")
-    'cpu'
-    """
+    """Name of the device that a setting means on this machine."""
     check_device(wanted)
     if wanted == CPU:
         return CPU
@@ -107,52 +67,14 @@ def find_device(wanted: str) -> str:
 
 
 def needs_torch(wanted: str | None) -> bool:
-    """Tell whether torch is loaded to compute on a device, or only to ask for one.
-
-    Parameters
-    ----------
-    wanted : str or None
-        As in :func:`find_device`; None for what is not asked for.
-
-    Returns
-    -------
-    bool
-        False for ``"auto"`` where there is surely no GPU, or no torch.
-
-    Examples
-    --------
-    >>> needs_torch("cpu"), needs_torch("cuda")
-    (False, True)
-    """
+    """Tell whether torch is loaded to compute on a device, or only to ask for one."""
     if wanted == "auto":
         return importlib.util.find_spec("torch") is not None and _may_have_gpu()
     return wanted is not None and wanted != CPU
 
 
 def explain_device(wanted: str, found: str, flow_method: str) -> tuple[Decision, ...]:
-    """Put into words where a restoration computes.
-
-    Parameters
-    ----------
-    wanted : str
-        The device that was asked for.
-    found : str
-        From :func:`find_device`.
-    flow_method : str
-        Method of the optical flow; those of OpenCV run on the CPU.
-
-    Returns
-    -------
-    tuple of Decision
-        Empty where the CPU was asked for.
-
-    Examples
-    --------
-    >>> explain_device("cpu", "cpu", "dis")
-    ()
-    >>> explain_device("cuda", "cuda", "dis")[1].choice
-    'on the CPU'
-    """
+    """Put into words where a restoration computes."""
     if wanted == CPU:
         return ()
     if found == CPU:
@@ -166,28 +88,7 @@ def explain_device(wanted: str, found: str, flow_method: str) -> tuple[Decision,
 
 @contextmanager
 def memory_of(device: str, advice: str = _SMALLER) -> Iterator[None]:
-    """Say in one line that the memory of a device is not enough.
-
-    Parameters
-    ----------
-    device : str
-        Its name.
-    advice : str
-        What to do other than to compute on the CPU.
-
-    Raises
-    ------
-    ConfigurationError
-        torch finds no memory for what is computed meanwhile.
-
-    Examples
-    --------
-    >>> with memory_of("cuda", "lower the batch"):
-    ...     raise RuntimeError("CUDA out of memory. Tried to allocate 9 GiB")
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.ConfigurationError: device: the memory of 'cuda' is not enough; lower the batch or use 'cpu'
-    """
+    """Say in one line that the memory of a device is not enough."""
     try:
         yield
     except RuntimeError as error:

@@ -70,19 +70,7 @@ class StackOps:
 
 @functools.cache
 def numpy_ops() -> StackOps:
-    """Operations of NumPy and OpenCV.
-
-    Returns
-    -------
-    StackOps
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> ramp = np.tile(np.arange(8, dtype=np.float32), (1, 8, 1))
-    >>> numpy_ops().resize(ramp, (4, 4))[0, 0]
-    array([0.5, 2.5, 4.5, 6.5], dtype=float32)
-    """
+    """Operations of NumPy and OpenCV."""
 
     def each(function: Callable[[FloatArray, FloatArray], object], stack: FloatArray, size: Shape) -> FloatArray:
         result = np.empty((*stack.shape[:-2], *size), np.float32)
@@ -122,23 +110,6 @@ def torch_ops(device: str) -> StackOps:
     """Operations of torch and kornia.
 
     A repeated run gives the same bytes, in full single precision (see :func:`full_precision`): nothing is scattered.
-
-    Parameters
-    ----------
-    device : str
-        Name that torch gives it, such as ``"cuda"``; ``"cpu"`` is torch on the CPU.  It must exist.
-
-    Returns
-    -------
-    StackOps
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> ops = torch_ops("cpu")
-    >>> ramp = np.tile(np.arange(8, dtype=np.float32), (1, 8, 1))
-    >>> ops.store(ops.resize(ops.load(ramp), (4, 4)))[0, 0]
-    array([0.5, 2.5, 4.5, 6.5], dtype=float32)
     """
     import torch
     from kornia.filters import filter2d_separable, median_blur
@@ -178,21 +149,7 @@ def torch_ops(device: str) -> StackOps:
 def spline_coefficients(stack: Stack, ops: StackOps) -> Stack:
     """Coefficients of the cubic B-spline through the pixels.
 
-    Parameters
-    ----------
-    stack : stack, shape (..., H, W)
-    ops : StackOps
-
-    Returns
-    -------
-    stack, shape (..., H, W)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> flat = np.full((1, 16, 16), 0.5, np.float32)
-    >>> bool(np.allclose(spline_coefficients(flat, numpy_ops()), 0.5))
-    True
+    ``stack`` (..., H, W); returns (..., H, W).
     """
     return ops.filter(stack, PREFILTER, PREFILTER)
 
@@ -200,24 +157,7 @@ def spline_coefficients(stack: Stack, ops: StackOps) -> Stack:
 def warp_stack(stack: Stack, flow: Stack, ops: StackOps) -> Stack:
     """Backward warp by cubic B-splines: the equation behind :func:`turbrestore.registration.warp.warp`.
 
-    Parameters
-    ----------
-    stack : stack, shape (B, H, W)
-        Channels of one image.
-    flow : stack, shape (H, W, 2)
-        Displacements (dx, dy), pixels.
-    ops : StackOps
-
-    Returns
-    -------
-    stack, shape (B, H, W)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> ramp = np.tile(np.arange(16, dtype=np.float32), (1, 16, 1))
-    >>> warp_stack(ramp, np.full((16, 16, 2), 0.25, np.float32), numpy_ops())[0, 0, 6:10].round(3)
-    array([6.25, 7.25, 8.25, 9.25], dtype=float32)
+    ``stack`` (B, H, W); ``flow`` (H, W, 2); returns (B, H, W).
     """
     planes = ops.arrays.moveaxis(flow, -1, 0)
     return ops.sample(spline_coefficients(stack, ops), ops.arrays.broadcast_to(planes, (len(stack), *planes.shape)))
@@ -227,21 +167,7 @@ def warp_stack(stack: Stack, flow: Stack, ops: StackOps) -> Stack:
 def sample_spline(coefficients: FloatArray, flow: FloatArray, result: FloatArray) -> None:
     """Sum 4×4 B-spline coefficients at each position that a flow leads to.
 
-    Parameters
-    ----------
-    coefficients : ndarray, float32, shape (H + 3, W + 3)
-        With one pixel before the image and two beyond it.
-    flow : ndarray, float32, shape (H, W, 2)
-        Displacements (dx, dy) in pixels.
-    result : ndarray, float32, shape (H, W)
-        Filled.
-
-    Examples
-    --------
-    >>> shifted = np.empty((2, 3), np.float32)
-    >>> sample_spline(np.ones((5, 6), np.float32), np.full((2, 3, 2), 0.5, np.float32), shifted)
-    >>> shifted.round(6).tolist()
-    [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
+    ``coefficients`` (H + 3, W + 3); ``flow`` (H, W, 2); ``result`` (H, W).
     """
     zero, one, sixth = np.float32(0), np.float32(1), np.float32(1 / 6)
     three, four, six = np.float32(3), np.float32(4), np.float32(6)
@@ -329,17 +255,5 @@ def full_precision() -> _FullPrecision:
     """Keep the convolutions of cuDNN, which kornia's filters and median use, in single precision and reproducible.
 
     A GPU otherwise rounds their factors to ten bits.
-
-    Returns
-    -------
-    context manager
-        The same every time; threads may enter it side by side.
-
-    Examples
-    --------
-    >>> from torch.backends import cudnn
-    >>> with full_precision():
-    ...     cudnn.allow_tf32
-    False
     """
     return _FullPrecision()

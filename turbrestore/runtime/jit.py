@@ -51,28 +51,8 @@ class Jit(Generic[Arguments]):
 def jit(py_func: Callable[Arguments, None]) -> Jit[Arguments]:
     """Compile a function over arrays at its first call; the machine code is kept on disk for later runs.
 
-    Compiled code runs without the interpreter lock.  Literals should be ``np.float32``, because others are computed
-    in double precision.  In an inner loop an index is best made ``np.uintp``, because a signed index may count from
-    the end, which is checked at every access; but the sum of an unsigned and a signed integer is a float.
-
-    Parameters
-    ----------
-    py_func : callable
-        Loops over arrays and numbers that write into arrays and return nothing.
-
-    Returns
-    -------
-    Jit
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> @jit
-    ... def double(array):
-    ...     for index in range(array.size):
-    ...         array[index] *= 2
-    >>> double.py_func(numbers := np.arange(3))
-    >>> numbers
-    array([0, 2, 4])
+    Compiled code runs without the interpreter lock. Literals should be ``np.float32``, because others are computed in
+    double precision. In an inner loop an index is best made ``np.uintp``, because a signed index may count from the
+    end, which is checked at every access; but the sum of an unsigned and a signed integer is a float.
     """
     return Jit(py_func)

@@ -25,11 +25,6 @@ class MemorySize(float):
     ------
     ConfigurationError
         Neither.
-
-    Examples
-    --------
-    >>> MemorySize("2GB"), MemorySize("1.5 MiB"), MemorySize(3e9)
-    (2000000000.0, 1572864.0, 3000000000.0)
     """
 
     def __new__(cls, value: float | str) -> Self:
@@ -50,21 +45,7 @@ class MemorySize(float):
 
 
 def size_text(size: float) -> str:
-    """Write a number of bytes with a unit in which it is no less than one.
-
-    Parameters
-    ----------
-    size : float
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> [size_text(size) for size in (2, 4100, 280e6, 1.3e9)]
-    ['2 bytes', '4.1 kB', '280 MB', '1.30 GB']
-    """
+    """Write a number of bytes with a unit in which it is no less than one."""
     if size >= 1e9:
         return f"{size / 1e9:.2f} GB"
     if size >= 1e6:

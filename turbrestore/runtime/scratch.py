@@ -31,31 +31,7 @@ _PART = 1 << 22
 
 
 def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.float32]:
-    """Return an array to be filled, in memory or in a file; an array in a file is full of zeros.
-
-    Parameters
-    ----------
-    shape : tuple of int
-    folder : Path, optional
-        Where the file lies; without it the array is in memory.
-
-    Returns
-    -------
-    ndarray, float32
-        A :class:`numpy.memmap` where it is in a file.
-
-    Raises
-    ------
-    StorageError
-        The folder has no room for it, or cannot be written to.
-
-    Examples
-    --------
-    >>> stack = new_stack((3, 4, 4), Path(tempfile.gettempdir()))
-    >>> stack[1] = 1
-    >>> float(stack.sum())
-    16.0
-    """
+    """Return an array to be filled, in memory or in a file; an array in a file is full of zeros."""
     size = 4 * int(np.prod(shape, dtype=np.int64))
     if folder is None or size == 0:
         return np.empty(shape, np.float32)
@@ -79,28 +55,7 @@ def fill_stack(
 ) -> NDArray[np.float32]:
     """Return an array with the next items of an iterator, in memory or in a file.
 
-    Parameters
-    ----------
-    shape : tuple of int
-        (T, ...); T items are taken.
-    items : iterator of ndarray, float32, shape (...)
-    folder : Path, optional
-        Folder of the file; without it the array is in memory.
-
-    Returns
-    -------
-    ndarray, float32
-        A :class:`numpy.memmap` where it is in a file.
-
-    Raises
-    ------
-    StorageError
-        The folder has no room for the file, or cannot be written to.
-
-    Examples
-    --------
-    >>> fill_stack((2, 3), iter([np.zeros(3, np.float32), np.ones(3, np.float32)])).tolist()
-    [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
+    ``items`` (...) each.
     """
     stack = new_stack(shape, folder)
     for index in range(len(stack)):
@@ -111,29 +66,7 @@ def fill_stack(
 
 
 def to_scratch(array: NDArray[np.float32], folder: Path | None = None) -> NDArray[np.float32]:
-    """Move an array to a file, if there is a folder for it and the array is in none.
-
-    Parameters
-    ----------
-    array : ndarray, float32
-    folder : Path, optional
-        Where the file lies; without it nothing happens.
-
-    Returns
-    -------
-    ndarray, float32
-        A :class:`numpy.memmap` where it is in a file.
-
-    Raises
-    ------
-    StorageError
-        The folder has no room for it, or cannot be written to.
-
-    Examples
-    --------
-    >>> to_scratch(np.ones((2, 3), np.float32)).sum()
-    np.float32(6.0)
-    """
+    """Move an array to a file, if there is a folder for it and the array is in none."""
     if folder is None or _is_mapped(array):
         return array
     stack = new_stack(array.shape, folder)
@@ -143,21 +76,7 @@ def to_scratch(array: NDArray[np.float32], folder: Path | None = None) -> NDArra
 
 
 def drop_pages(array: object) -> None:
-    """Hand back the memory of the pages of a mapped file; they are read again when they are needed.
-
-    Parameters
-    ----------
-    array : object
-        An array of a mapped file, or a part of one; nothing happens to anything else.
-
-    Examples
-    --------
-    >>> stack = new_stack((2, 4, 4), Path(tempfile.gettempdir()))
-    >>> stack[:] = 2
-    >>> drop_pages(stack[1])
-    >>> float(stack[1, 0, 0])
-    2.0
-    """
+    """Hand back the memory of the pages of a mapped file; they are read again when they are needed."""
     mode = None
     while isinstance(array, np.ndarray):
         mode = array.mode if isinstance(array, np.memmap) else mode
@@ -175,22 +94,7 @@ def _is_mapped(array: object) -> bool:
 
 
 def iter_frames(items: Iterable[Item]) -> Iterator[Item]:
-    """Yield one item after the other, and hand back the memory of each that is part of a mapped file.
-
-    Parameters
-    ----------
-    items : iterable
-        A stack of frames or flows, or a list of them.
-
-    Yields
-    ------
-    object
-
-    Examples
-    --------
-    >>> [float(frame.mean()) for frame in iter_frames(np.ones((2, 3, 3), np.float32))]
-    [1.0, 1.0]
-    """
+    """Yield one item after the other, and hand back the memory of each that is part of a mapped file."""
     for item in items:
         try:
             yield item
@@ -202,22 +106,7 @@ def iter_frames(items: Iterable[Item]) -> Iterator[Item]:
 def fill_frames(stack: NDArray[Any], items: Iterable[NDArray[Any]]) -> Iterator[int]:
     """Write items into a stack one after the other, and hand back the memory of each if the stack is a mapped file.
 
-    Parameters
-    ----------
-    stack : ndarray, shape (T, ...)
-    items : iterable of ndarray, shape (...)
-        At most T; each is asked for once the one before has been written.
-
-    Yields
-    ------
-    int
-        Number of items written so far.
-
-    Examples
-    --------
-    >>> stack = new_stack((2, 3), Path(tempfile.gettempdir()))
-    >>> list(fill_frames(stack, np.eye(2, 3))), stack.tolist()
-    ([1, 2], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    ``stack`` (T, ...); ``items`` (...) each.
     """
     for written, item in enumerate(items, 1):
         stack[written - 1] = item
@@ -226,46 +115,13 @@ def fill_frames(stack: NDArray[Any], items: Iterable[NDArray[Any]]) -> Iterator[
 
 
 def iter_parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    """Yield consecutive pieces of an array, each small, and hand back their memory if it is a mapped file.
-
-    Parameters
-    ----------
-    array : ndarray
-        Split along its first axis.
-
-    Yields
-    ------
-    ndarray
-        Views.
-
-    Examples
-    --------
-    >>> [part.shape for part in iter_parts(np.zeros((3, 1000, 1000)))]
-    [(3, 1000, 1000)]
-    """
+    """Yield consecutive pieces of an array, each small, and hand back their memory if it is a mapped file."""
     step = max(1, len(array) * _PART // max(array.size, 1))
     yield from iter_frames(array[start : start + step] for start in range(0, len(array), step))
 
 
 def iter_slices(length: int, step: int, *arrays: object) -> Iterator[slice]:
-    """Yield slices of ``step`` rows, and hand back the memory of mapped arrays after the work on each.
-
-    Parameters
-    ----------
-    length, step : int
-        Rows in all, and rows of a slice; the last may be shorter.
-    arrays : object
-        What is read or written meanwhile; nothing happens to arrays in memory.
-
-    Yields
-    ------
-    slice
-
-    Examples
-    --------
-    >>> list(iter_slices(5, 2))
-    [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
-    """
+    """Yield slices of ``step`` rows, and hand back the memory of mapped arrays after the work on each."""
     for start in range(0, length, step):
         try:
             yield slice(start, min(start + step, length))
@@ -277,19 +133,7 @@ def iter_slices(length: int, step: int, *arrays: object) -> Iterator[slice]:
 def mean_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
     """Mean over the first axis, as ``stack.mean(axis=0)`` gives it, bit for bit.
 
-    Parameters
-    ----------
-    stack : ndarray, float32, shape (T, ...)
-        At least one frame or flow; in memory, or mapped.
-
-    Returns
-    -------
-    ndarray, float32, shape (...)
-
-    Examples
-    --------
-    >>> mean_of(np.array([[1.0, 2.0], [3.0, 4.0]], np.float32))
-    array([2., 3.], dtype=float32)
+    ``stack`` (T, ...); returns (...).
     """
     total = np.zeros(stack.shape[1:], np.float32)
     for part in iter_frames(stack):
@@ -300,19 +144,7 @@ def mean_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
 def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
     """Variance over the first axis.
 
-    Parameters
-    ----------
-    stack : ndarray, float32, shape (T, ...)
-        At least one frame or flow; in memory, or mapped.
-
-    Returns
-    -------
-    ndarray, float32, shape (...)
-
-    Examples
-    --------
-    >>> variance_of(np.array([[1.0, 2.0], [3.0, 6.0]], np.float32))
-    array([1., 4.], dtype=float32)
+    ``stack`` (T, ...); returns (...).
     """
     variance = np.zeros(stack.shape[1:], np.float32)
     rows = np.atleast_1d(variance)

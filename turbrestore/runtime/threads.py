@@ -38,29 +38,8 @@ def map_ahead(
 ) -> Iterator[tuple[Item, Result]]:
     """Yield ``(item, function(item))`` in order while threads work a few items ahead.
 
-    Memory is bounded by a handful of items and results, however many there are.  The threads of OpenCV and BLAS are
+    Memory is bounded by a handful of items and results, however many there are. The threads of OpenCV and BLAS are
     switched off meanwhile: items run side by side already.
-
-    Parameters
-    ----------
-    function : callable
-        Should release the interpreter lock, as OpenCV and NumPy do.
-    items : iterable
-        Consumed lazily, in the calling thread.
-    threads : int
-        0 means one per available core.
-    on_end : callable, optional
-        Called at the end, after an error and where the stream is left early too, before items that have not begun are
-        given up: calls of ``function`` that wait for each other can be woken.
-
-    Yields
-    ------
-    item, result
-
-    Examples
-    --------
-    >>> list(map_ahead(abs, [-1, 2]))
-    [(-1, 1), (2, 2)]
     """
     workers = threads or available_cores()
     _keep_freed_memory()
@@ -93,26 +72,7 @@ def map_in_turns(
     """Yield ``late(in_turn(early(item)))`` in order, one thread from an item's first step to its last.
 
     ``early`` and ``late`` run side by side, ``in_turn`` for one item after the other in their order, so that it may
-    carry a state along.  An item's data stay in the cache of one core, and no more threads run than there are cores.
-
-    Parameters
-    ----------
-    early, in_turn, late : callable
-    items : iterable
-        Consumed lazily, in the calling thread.
-    threads : int
-        0 means one per available core.
-
-    Yields
-    ------
-    result
-
-    Examples
-    --------
-    >>> from itertools import accumulate
-    >>> sums = iter(accumulate([4, 1, 9]))
-    >>> list(map_in_turns(abs, lambda one: next(sums), float, [4, -1, 9]))
-    [4.0, 5.0, 14.0]
+    carry a state along. An item's data stay in the cache of one core, and no more threads run than there are cores.
     """
     turns, due, broken = threading.Condition(), 0, math.inf
 
@@ -150,24 +110,6 @@ def sum_in_threads(
     """Sum arrays over items: those of a few items in one thread, then those sums in order.
 
     Which items go together does not depend on the number of threads, so neither do the bytes of the result.
-
-    Parameters
-    ----------
-    add : callable
-        From a few consecutive items to the sums of what is made of them.
-    items : iterable
-        At least one; consumed lazily, in the calling thread.
-    threads : int
-        0 means one per available core.
-
-    Returns
-    -------
-    tuple of ndarray, float64
-
-    Examples
-    --------
-    >>> sum_in_threads(lambda some: (np.array(sum(some), np.float64),), range(100))
-    (array(4950.),)
     """
     totals: tuple[NDArray[np.float64], ...] = ()
     for _, sums in map_ahead(add, in_batches(items, _SUMMED), threads):
@@ -185,12 +127,6 @@ class ThreadTeam:
     ----------
     threads : int
         At least 1, with the caller.
-
-    Examples
-    --------
-    >>> with ThreadTeam(2) as team:
-    ...     list(team.map(abs, [-2, 3]))
-    [2, 3]
     """
 
     def __init__(self, threads: int) -> None:
@@ -208,16 +144,6 @@ class ThreadTeam:
         """Yield ``function(item)`` in order; nothing begins before the first is asked for.
 
         All have ended when this has, also after an error or where it is left early; it may be called within itself.
-
-        Parameters
-        ----------
-        function : callable
-            Should release the interpreter lock.
-        items : iterable
-
-        Yields
-        ------
-        result
         """
         left, found, due = deque(enumerate(items)), dict[int, Result](), 0
 
@@ -257,39 +183,13 @@ class ThreadTeam:
 
 
 def in_batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
-    """Yield lists of ``size`` consecutive items, the last perhaps shorter.
-
-    Parameters
-    ----------
-    items : iterable
-        Consumed lazily.
-    size : int
-
-    Yields
-    ------
-    list
-
-    Examples
-    --------
-    >>> list(in_batches("abc", 2))
-    [['a', 'b'], ['c']]
-    """
+    """Yield lists of ``size`` consecutive items, the last perhaps shorter."""
     stream = iter(items)
     return iter(lambda: list(islice(stream, size)), [])
 
 
 def available_cores() -> int:
-    """Count the cores that this process may use.
-
-    Returns
-    -------
-    int
-
-    Examples
-    --------
-    >>> available_cores() >= 1
-    True
-    """
+    """Count the cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -325,18 +225,7 @@ def one_thread_each() -> _OneThreadEach:
     """Keep OpenCV and BLAS from starting threads of their own, and give them back what they had afterwards.
 
     Beside busy threads a BLAS call on two threads is not twice as fast but tens of times slower: each waits for the
-    other to be scheduled.  Uses may overlap, in one thread or in several: what they had comes back after the last.
-
-    Returns
-    -------
-    context manager
-        The same every time; a decorator too.
-
-    Examples
-    --------
-    >>> with one_thread_each():
-    ...     cv2.getNumThreads()
-    1
+    other to be scheduled. Uses may overlap, in one thread or in several: what they had comes back after the last.
     """
     return _OneThreadEach()
 

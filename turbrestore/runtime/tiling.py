@@ -51,32 +51,7 @@ class HaloTile:
 
 
 def halo_tiles(shape: tuple[int, int], side: int, halo: int = HALO) -> tuple[HaloTile, ...]:
-    """Cut frames into as few tiles as there can be of cores of equal size.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Height and width of the frames.
-    side : int
-        Longest side of a tile with its halo, pixels.
-    halo : int
-        Pixels on each side of a core that does not lie at the edge of the frame.
-
-    Returns
-    -------
-    tuple of HaloTile
-        Row by row; one without halo where the frame is no larger than a tile.
-
-    Raises
-    ------
-    ConfigurationError
-        ``side`` is less than four halos.
-
-    Examples
-    --------
-    >>> [tile.roi for tile in halo_tiles((100, 300), side=140, halo=20)]
-    [(0, 0, 120, 100), (80, 0, 140, 100), (180, 0, 120, 100)]
-    """
+    """Cut frames into as few tiles as there can be of cores of equal size."""
     require(halo >= 1, f"halo: expected at least 1 pixel, found {halo}")
     require(side >= 4 * halo, f"side: expected at least four halos ({4 * halo} pixels), found {side}")
     rows, columns = (_spans(length, side, halo) for length in shape)
@@ -84,25 +59,7 @@ def halo_tiles(shape: tuple[int, int], side: int, halo: int = HALO) -> tuple[Hal
 
 
 def largest_tile(shape: tuple[int, int], side: int, halo: int = HALO) -> tuple[int, int]:
-    """Height and width that no tile exceeds.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Height and width of the frames.
-    side, halo : int
-        As in :func:`halo_tiles`.
-
-    Returns
-    -------
-    height, width : int
-        Pixels; those of the frames if there is only one tile.
-
-    Examples
-    --------
-    >>> largest_tile((100, 300), side=140, halo=20)
-    (100, 140)
-    """
+    """Height and width that no tile exceeds."""
     counts = [_count(length, side, halo) for length in shape]
     tallest, widest = (
         length if count == 1 else min(-(-length // count) + (1 if count == 2 else 2) * halo, length)
@@ -114,23 +71,7 @@ def largest_tile(shape: tuple[int, int], side: int, halo: int = HALO) -> tuple[i
 def cut_tile(stack: FloatArray, tile: HaloTile, folder: Path | None = None) -> FloatArray:
     """Copy a tile of every frame or flow.
 
-    Parameters
-    ----------
-    stack : ndarray, float32, shape (T, H, W, ...)
-        In memory or in a mapped file.
-    tile : HaloTile
-    folder : Path, optional
-        Folder of a file that holds the copy; by default it is in memory.
-
-    Returns
-    -------
-    ndarray, float32, shape (T, h, w, ...)
-
-    Examples
-    --------
-    >>> tile = halo_tiles((100, 300), side=140, halo=20)[0]
-    >>> cut_tile(np.zeros((2, 100, 300, 3), np.float32), tile).shape
-    (2, 100, 120, 3)
+    ``stack`` (T, H, W, ...); returns (T, h, w, ...).
     """
     part = new_stack((len(stack), *tile.shape, *stack.shape[3:]), folder)
     for index, frame in enumerate(stack):
@@ -141,23 +82,7 @@ def cut_tile(stack: FloatArray, tile: HaloTile, folder: Path | None = None) -> F
 
 
 def new_mosaic(shape: tuple[int, ...], folder: Path | None = None) -> FloatArray:
-    """Return zeros that tiles can be added to.
-
-    Parameters
-    ----------
-    shape : tuple of int
-    folder : Path, optional
-        Folder of a file that holds them; by default they are in memory.
-
-    Returns
-    -------
-    ndarray, float32
-
-    Examples
-    --------
-    >>> new_mosaic((1, 3))
-    array([[0., 0., 0.]], dtype=float32)
-    """
+    """Return zeros that tiles can be added to."""
     mosaic = new_stack(shape, folder)
     # A new file has zeros already.
     if folder is None:
@@ -168,20 +93,7 @@ def new_mosaic(shape: tuple[int, ...], folder: Path | None = None) -> FloatArray
 def add_tile(mosaic: FloatArray, tile: HaloTile, part: FloatArray) -> None:
     """Add what was made of a tile to the whole, by the weight of the tile.
 
-    Parameters
-    ----------
-    mosaic : ndarray, float32, shape (H, W, ...)
-        In memory or in a mapped file.
-    tile : HaloTile
-    part : ndarray, float32, shape (h, w, ...)
-
-    Examples
-    --------
-    >>> mosaic = new_mosaic((100, 300))
-    >>> for tile in halo_tiles((100, 300), side=140, halo=20):
-    ...     add_tile(mosaic, tile, np.ones(tile.shape, np.float32))
-    >>> bool(abs(mosaic - 1).max() < 1e-6)
-    True
+    ``mosaic`` (H, W, ...); ``part`` (h, w, ...).
     """
     weights = np.outer(tile.row_weights, tile.column_weights)
     mosaic[tile.rows, tile.columns] += part * weights.reshape(*weights.shape, *[1] * (part.ndim - 2))

@@ -126,38 +126,7 @@ def block_displacement(
 ) -> Displacement:
     """Measure the displacement of blocks.
 
-    Parameters
-    ----------
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-        At least three, consecutive.
-    flows : iterable of ndarray, float32, shape (H, W, 2)
-        From the image to each frame, pixels.
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-    noise : float
-        Standard deviation of the noise of a frame, intensity.
-    threads : int
-        Frames that are worked on side by side; 0 means one for each core.
-
-    Returns
-    -------
-    Displacement
-
-    Raises
-    ------
-    DataError
-        Fewer than three frames.
-
-    Examples
-    --------
-    >>> from turbrestore.synthesis.scenes import resolution_chart
-    >>> chart, still = resolution_chart(64, 64), np.zeros((64, 64, 2), np.float32)
-    >>> moved = [warp(chart, still + np.float32([shift, 0])) for shift in (-0.4, 0.0, 0.4)]
-    >>> flows = [still - np.float32([shift, 0]) for shift in (-0.4, 0.0, 0.4)]
-    >>> found = block_displacement(moved, flows, chart, 0.0)
-    >>> found.blocks[:, found.counts].mean(axis=1).round(1) + 0.0
-    array([[ 0.4,  0. ],
-           [ 0. ,  0. ],
-           [-0.4,  0. ]])
+    ``frames`` (H, W) or (H, W, 3) each; ``flows`` (H, W, 2) each; ``image`` (H, W) or (H, W, 3).
     """
     grey = luminance(image)
     ix, iy = sobel_gradient(grey)
@@ -195,23 +164,7 @@ def block_displacement(
 def motion_statistics(w: Float64Array, noise_variance: float) -> MotionStatistics:
     """Variance of displacements over a long time, and its degrees of freedom.
 
-    Parameters
-    ----------
-    w : ndarray, float64, shape (T, K, 2)
-        Displacements of K blocks, less their mean over time.
-    noise_variance : float
-        To be taken out, squared pixels.
-
-    Returns
-    -------
-    MotionStatistics
-
-    Examples
-    --------
-    >>> w = np.random.default_rng(0).normal(0, 1.5, (2000, 4, 2))
-    >>> found = motion_statistics(w - w.mean(axis=0), 0.25)
-    >>> found.variance.round(1), round(found.independent_frames, -3), round(found.freedom, -3)
-    (array([2., 2.]), 2000.0, 16000.0)
+    ``w`` (T, K, 2).
     """
     frames = len(w)
     flat = w.reshape(frames, -1)
@@ -237,21 +190,6 @@ def rotation_share(displacement: Displacement) -> float:
     """Share of rotation in the gradient of the displacement.
 
     Tilt is the gradient of a phase, and has no rotation; fields whose components are independent have 0.5.
-
-    Parameters
-    ----------
-    displacement : Displacement
-
-    Returns
-    -------
-    float
-        NaN where no four neighbouring blocks count.
-
-    Examples
-    --------
-    >>> w = np.random.default_rng(0).normal(size=(200, 8, 8, 2))
-    >>> round(rotation_share(Displacement(w, np.ones((8, 8), bool), 8, 8.0, 0.0)), 1)
-    0.5
     """
     w, counts = displacement.blocks, displacement.counts
     four = counts[1:, 1:] & counts[1:, :-1] & counts[:-1, 1:] & counts[:-1, :-1]
@@ -265,20 +203,7 @@ def rotation_share(displacement: Displacement) -> float:
 def separation_correlation(displacement: Displacement) -> Float64Array:
     """Correlation of the displacements of blocks that count, 0, 1, … blocks apart along a row or a column.
 
-    Parameters
-    ----------
-    displacement : Displacement
-
-    Returns
-    -------
-    ndarray, float64, shape (S,)
-        NaN where no pair of blocks has this separation.
-
-    Examples
-    --------
-    >>> w = np.random.default_rng(0).normal(size=(200, 8, 8, 2))
-    >>> separation_correlation(Displacement(w, np.ones((8, 8), bool), 8, 8.0, 0.0))[:2].round(1) + 0.0
-    array([1., 0.])
+    Returns (S,).
     """
     w, counts = displacement.blocks, displacement.counts
     known = np.where(counts[..., None], w, np.nan)
@@ -295,21 +220,7 @@ def separation_correlation(displacement: Displacement) -> Float64Array:
 def block_means(plane: NDArray[np.floating], side: int) -> FloatArray:
     """Means over square blocks in the middle of a plane.
 
-    Parameters
-    ----------
-    plane : ndarray, float32, shape (H, W)
-    side : int
-        Of a block, pixels.
-
-    Returns
-    -------
-    ndarray, float32, shape (H // side, W // side)
-
-    Examples
-    --------
-    >>> block_means(np.arange(16, dtype=np.float32).reshape(4, 4), 2)
-    array([[ 2.5,  4.5],
-           [10.5, 12.5]], dtype=float32)
+    ``plane`` (H, W); returns (H // side, W // side).
     """
     rows, columns = plane.shape[0] // side, plane.shape[1] // side
     top, left = (plane.shape[0] - rows * side) // 2, (plane.shape[1] - columns * side) // 2

@@ -272,24 +272,7 @@ def measure_seeing(
 
 
 def chi_square_interval(variance: float, freedom: float, relative: float = 0.0) -> Estimate:
-    """95 % interval of a variance with ν degrees of freedom and an independent relative error.
-
-    Parameters
-    ----------
-    variance, freedom : float
-    relative : float
-        Standard deviation of the relative error.
-
-    Returns
-    -------
-    Estimate
-
-    Examples
-    --------
-    >>> found = chi_square_interval(1.0, 100.0)
-    >>> round(found.low, 2), round(found.high, 2)
-    (0.77, 1.35)
-    """
+    """95 % interval of a variance with ν degrees of freedom and an independent relative error."""
     upper, lower = (max(float(special.chdtri(freedom, share)) / freedom, 1e-12) for share in (0.025, 0.975))
     below, above = (np.hypot(np.log(quantile), _DEVIATIONS * relative) for quantile in (upper, lower))
     return Estimate(variance, float(variance * np.exp(-below)), float(variance * np.exp(above)))

@@ -98,32 +98,7 @@ class Optics:
 def displacement_differences(optics: Optics, spacing: float, counts: tuple[int, int], window: float) -> Float64Array:
     """Mean square difference of the displacements of blocks, for a Cn² of 1 m^(-2/3).
 
-    Parameters
-    ----------
-    optics : Optics
-        With a distance.
-    spacing : float
-        Distance of neighbouring blocks, pixels.
-    counts : tuple of int
-        Rows and columns of blocks.
-    window : float
-        b, pixels.
-
-    Returns
-    -------
-    ndarray, float64, shape (rows, columns, 2)
-        D_x and D_y of blocks so many rows and columns apart, squared pixels.
-
-    Raises
-    ------
-    ConfigurationError
-        The distance is not given.
-
-    Examples
-    --------
-    >>> optics = Optics(2.75e-6, aperture=0.1, wavelength=550e-9, distance=2000.0)
-    >>> (1e-14 * displacement_differences(optics, 16.0, (1, 2), 16.0))[0, 1].round(2)
-    array([1.27, 0.49])
+    Returns (rows, columns, 2).
     """
     require(optics.distance is not None, "distance: expected that of the scene, found none")
     distance = float(optics.distance or 0.0)
@@ -153,24 +128,7 @@ def displacement_differences(optics: Optics, spacing: float, counts: tuple[int, 
 
 
 def strength_of_tilt(variance: float, optics: Optics) -> tuple[float, float, float]:
-    """D/r0 from the whole displacement, when the distance is not known.
-
-    Parameters
-    ----------
-    variance : float
-        Of the displacement along one axis, squared pixels.
-    optics : Optics
-
-    Returns
-    -------
-    usual, least, largest : float
-        For an outer scale of 100, 1000 and 20 apertures.
-
-    Examples
-    --------
-    >>> [round(value, 2) for value in strength_of_tilt(2.2, Optics(2.75e-6, aperture=0.1))]
-    [2.42, 2.13, 3.01]
-    """
+    """D/r0 from the whole displacement, when the distance is not known."""
     found = []
     for scale in (_OUTER_SCALES[1], _OUTER_SCALES[2], _OUTER_SCALES[0]):
         aperture = optics.aperture

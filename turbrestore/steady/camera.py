@@ -28,23 +28,7 @@ _LEAST_DISTANCE = 1e-3
 def fit_camera(flow: FloatArray) -> Matrix:
     """Fit an affine flow that outliers hardly influence.
 
-    Parameters
-    ----------
-    flow : ndarray, float32, shape (H, W, 2)
-        F, pixels.
-
-    Returns
-    -------
-    ndarray, float64, shape (2, 3)
-        M.
-
-    Examples
-    --------
-    >>> flow = np.full((64, 64, 2), (2.0, -1.0), np.float32)
-    >>> flow[16:32, 16:32] += 30
-    >>> fit_camera(flow).round(3) + 0.0
-    array([[ 0.,  0.,  2.],
-           [ 0.,  0., -1.]])
+    ``flow`` (H, W, 2); returns (2, 3).
     """
     height, width = flow.shape[:2]
     step = max(min(_STEP, height // 8, width // 8), 1)
@@ -64,24 +48,7 @@ def fit_camera(flow: FloatArray) -> Matrix:
 def camera_flow(matrix: Matrix, shape: tuple[int, ...]) -> FloatArray:
     """Affine flow of an image.
 
-    Parameters
-    ----------
-    matrix : ndarray, float64, shape (2, 3)
-        M.
-    shape : tuple of int
-        (H, W).
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W, 2)
-        A, pixels.
-
-    Examples
-    --------
-    >>> camera_flow(np.array([[0.1, 0, 0], [0, 0, 2.0]]), (1, 3))[0]
-    array([[-0.1,  2. ],
-           [ 0. ,  2. ],
-           [ 0.1,  2. ]], dtype=float32)
+    ``matrix`` (2, 3); returns (H, W, 2).
     """
     height, width = shape[:2]
     x = np.arange(width, dtype=np.float64) - (width - 1) / 2
@@ -93,21 +60,7 @@ def camera_flow(matrix: Matrix, shape: tuple[int, ...]) -> FloatArray:
 def camera_size(matrix: Matrix, shape: tuple[int, ...]) -> float:
     """Root mean square of an affine flow over an image, pixels.
 
-    Parameters
-    ----------
-    matrix : ndarray, float64, shape (2, 3)
-        M.
-    shape : tuple of int
-        (H, W).
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> camera_size(np.array([[0, 0, 3.0], [0, 0, 4.0]]), (10, 10))
-    5.0
+    ``matrix`` (2, 3).
     """
     height, width = shape[:2]
     # Variance of the coordinates of a grid about its centre.

@@ -38,29 +38,7 @@ def deblur(
 ) -> FloatArray:
     """Remove a blur from an image by linear filters.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-    sigma : tuple of float
-        Widths of the blur of a frame and of what is remembered, pixels; 0 for that of a frame removes none.
-    exponent : float
-        Shape of the blur, see :func:`turbrestore.blur.psf.blur_otf`.
-    noise : tuple of float
-        Standard deviation of the noise of a frame and of what is remembered, intensity.
-    held : ndarray, float32, shape (H, W)
-        n.
-
-    Returns
-    -------
-    ndarray, float32, shape of ``image``
-
-    Examples
-    --------
-    >>> edge = np.repeat(np.float32([[0.2, 0.8]]), 16, 1).repeat(8, 0)
-    >>> soft = cv2.GaussianBlur(edge, (0, 0), 1.0)
-    >>> sharp = deblur(soft, (1.0, 1.0), 2.0, (0.0, 0.0), np.ones((8, 32), np.float32))
-    >>> bool(np.ptp(sharp[4, 14:18]) > np.ptp(soft[4, 14:18]))
-    True
+    ``image`` (H, W) or (H, W, 3); ``held`` (H, W).
     """
     if sigma[0] == 0:
         return image

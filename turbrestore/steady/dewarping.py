@@ -102,31 +102,7 @@ class DewarpedFrame:
 
 
 def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
-    """Free a frame of its turbulent displacement, and fuse it with its neighbours.
-
-    Parameters
-    ----------
-    window : Window
-    params : SteadyParams
-
-    Returns
-    -------
-    DewarpedFrame
-        The camera is not locked.
-
-    Raises
-    ------
-    DataError
-        The frame is smaller than 16×16.
-
-    Examples
-    --------
-    >>> from turbrestore.steady.windows import iter_windows
-    >>> frames = np.random.default_rng(0).random((1, 32, 32)).repeat(3, 0)
-    >>> first, *_ = iter_windows(frames, (1,))
-    >>> dewarp_frame(first, SteadyParams()).displacement
-    0.0
-    """
+    """Free a frame of its turbulent displacement, and fuse it with its neighbours."""
     image, shape = window.frame.image, window.frame.levels.shape
     flows, cameras = _measure(window)
     own = without_camera(flows, cameras)
@@ -168,22 +144,7 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
 def measure_flow(reference: FloatArray, image: FloatArray, start: FloatArray) -> FloatArray:
     """Flow between two images, searched for near where it starts.
 
-    Parameters
-    ----------
-    reference, image : ndarray, float32, shape (H, W) or (H, W, 3)
-    start : ndarray, float32, shape (H, W, 2)
-        Pixels.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W, 2)
-        From ``reference`` to ``image``, pixels.
-
-    Examples
-    --------
-    >>> image = np.random.default_rng(0).random((32, 32)).astype(np.float32)
-    >>> float(abs(measure_flow(image, image, np.zeros((32, 32, 2), np.float32))).max())
-    0.0
+    ``reference, image`` (H, W) or (H, W, 3); ``start`` (H, W, 2); returns (H, W, 2).
     """
     return _solver(contrast_levels(reference))(contrast_levels(image)[None], [start])[0]
 

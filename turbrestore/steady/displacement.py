@@ -47,26 +47,7 @@ _WHOLE = 1.4
 def mean_displacement(flows: Mapping[int, FloatArray], largest: float) -> FloatArray:
     """Weighted mean D of flows without the motion of the camera.
 
-    Parameters
-    ----------
-    flows : mapping of int to ndarray, float32, shape (H, W, 2)
-        F_i − A_i by i, pixels; not empty.
-    largest : float
-        c, pixels.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W, 2)
-        D, pixels.
-
-    Examples
-    --------
-    >>> still, steady = np.zeros((8, 8, 2), np.float32), np.full((8, 8, 2), 5.0, np.float32)
-    >>> float(mean_displacement({1: steady, -1: -steady}, 1.0).max())
-    0.0
-    >>> jolt = np.full((8, 8, 2), 0.2, np.float32)
-    >>> round(float(mean_displacement({1: jolt, -1: jolt}, 1.0).max()), 2)
-    0.13
+    ``flows`` (H, W, 2); returns (H, W, 2).
     """
     total, weights = 0.0, _OWN_SHARE
     for offset in sorted({abs(offset) for offset in flows}):
@@ -80,90 +61,26 @@ def mean_displacement(flows: Mapping[int, FloatArray], largest: float) -> FloatA
 def displacement_size(flows: Mapping[int, FloatArray]) -> float:
     """Median of |S_i| over the image, mean over i.
 
-    Parameters
-    ----------
-    flows : mapping of int to ndarray, float32, shape (H, W, 2)
-        F_i − A_i by i, pixels; not empty.
-
-    Returns
-    -------
-    float
-        Pixels.
-
-    Examples
-    --------
-    >>> jolt = np.full((8, 8, 2), (0.6, 0.8), np.float32)
-    >>> round(displacement_size({-1: jolt, 1: jolt}), 3)
-    1.0
+    ``flows`` (H, W, 2).
     """
     means = [_symmetric(flows, distance)[::_SAMPLE, ::_SAMPLE] for distance in {abs(offset) for offset in flows}]
     return float(np.mean([np.median(np.hypot(mean[..., 0], mean[..., 1])) for mean in means]))
 
 
 def largest_displacement(size: float, steadiness: float) -> float:
-    """Tell what turbulence displaces at most.
-
-    Parameters
-    ----------
-    size : float
-        Median of |S_i|, pixels.
-    steadiness : float
-        Of the camera, 0 to 1.
-
-    Returns
-    -------
-    float
-        c, pixels.
-
-    Examples
-    --------
-    >>> largest_displacement(1.0, 1.0), largest_displacement(1.0, 0.0)
-    (2.5, 1.0)
-    """
+    """Tell what turbulence displaces at most."""
     return _LEAST + (float(np.clip(_SIZES * size, _LEAST, _MOST)) - _LEAST) * steadiness
 
 
 def whole_displacement(size: float, largest: float) -> float:
-    """Tell by what turbulence moves whole frames.
-
-    Parameters
-    ----------
-    size : float
-        Median of |S_i|, pixels.
-    largest : float
-        c, pixels.
-
-    Returns
-    -------
-    float
-        Pixels.
-
-    Examples
-    --------
-    >>> whole_displacement(1.0, 2.5)
-    1.4
-    """
+    """Tell by what turbulence moves whole frames."""
     return _WHOLE * min(size, largest / _SIZES)
 
 
 def expected_motion(cameras: Mapping[int, Matrix], offset: int) -> Matrix:
     """Motion of the camera to a neighbour if it goes on as to the others.
 
-    Parameters
-    ----------
-    cameras : mapping of int to ndarray, float64, shape (2, 3)
-        M of A_i by i.
-    offset : int
-        The neighbour.
-
-    Returns
-    -------
-    ndarray, float64, shape (2, 3)
-
-    Examples
-    --------
-    >>> expected_motion({1: np.array([[0, 0, 2.0], [0, 0, 0]])}, 3)[0, 2].round(6)
-    np.float64(6.0)
+    ``cameras`` (2, 3); returns (2, 3).
     """
     line = _straight_path(cameras)[2]
     return (line[0] + offset * line[1]).reshape(2, 3)
@@ -172,25 +89,7 @@ def expected_motion(cameras: Mapping[int, Matrix], offset: int) -> Matrix:
 def camera_steadiness(cameras: Mapping[int, Matrix], shape: tuple[int, ...]) -> float:
     """Tell whether the camera moves at constant velocity within the window.
 
-    Parameters
-    ----------
-    cameras : mapping of int to ndarray, float64, shape (2, 3)
-        M of A_i by i; empty if the camera is known to stand still.
-    shape : tuple of int
-        (H, W) of the frames.
-
-    Returns
-    -------
-    float
-        1 for a camera that stands still or pans evenly, near 0 for one that shakes.
-
-    Examples
-    --------
-    >>> pan, jolt = np.array([[0, 0, 7.0], [0, 0, 0]]), np.array([[0, 0, 9.0], [0, 0, 0]])
-    >>> camera_steadiness({-1: -pan, 1: pan}, (8, 8))
-    1.0
-    >>> camera_steadiness({-1: jolt, 1: jolt}, (8, 8)) < 0.01
-    True
+    ``cameras`` (2, 3).
     """
     if not cameras:
         return 1.0
@@ -203,20 +102,7 @@ def camera_steadiness(cameras: Mapping[int, Matrix], shape: tuple[int, ...]) -> 
 def without_camera(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix]) -> dict[int, FloatArray]:
     """Flows less the motion of the camera.
 
-    Parameters
-    ----------
-    flows : mapping of int to ndarray, float32, shape (H, W, 2)
-    cameras : mapping of int to ndarray, float64, shape (2, 3)
-
-    Returns
-    -------
-    dict of int to ndarray
-
-    Examples
-    --------
-    >>> flow = np.ones((4, 4, 2), np.float32)
-    >>> float(without_camera({1: flow}, {1: np.array([[0, 0, 1.0], [0, 0, 1.0]])})[1].max())
-    0.0
+    ``flows`` (H, W, 2); ``cameras`` (2, 3).
     """
     return {offset: flow - camera_flow(cameras[offset], flow.shape) for offset, flow in flows.items()}
 

@@ -32,27 +32,7 @@ _DIFFERENCE, _MISREGISTRATION, _NOISE_SHARE = 0.02, 1.0, 0.5
 def fuse(frame: FloatArray, neighbours: Iterable[FloatArray], noise: float) -> tuple[FloatArray, FloatArray]:
     """Average a frame with the neighbours that agree with it.
 
-    Parameters
-    ----------
-    frame : ndarray, float32, shape (H, W) or (H, W, 3)
-        J.
-    neighbours : iterable of ndarray, shape of ``frame``
-        J_i.
-    noise : float
-        Standard deviation of the noise of a frame, intensity.
-
-    Returns
-    -------
-    image : ndarray, float32, shape of ``frame``
-    agreement : ndarray, float32, shape (H, W)
-        Mean of w over the neighbours, 1 if there are none.
-
-    Examples
-    --------
-    >>> frame, other = np.full((9, 9), 0.5, np.float32), np.full((9, 9), 0.9, np.float32)
-    >>> image, agreement = fuse(frame, [frame, other], 0.0)
-    >>> float(image[4, 4]), float(agreement[4, 4])
-    (0.5, 0.5)
+    ``frame`` (H, W) or (H, W, 3); returns ``agreement`` (H, W).
     """
     total, weights, count = frame.copy(), np.ones(frame.shape[:2], np.float32), 0
     tolerance = explained_difference(frame, noise)
@@ -68,23 +48,7 @@ def fuse(frame: FloatArray, neighbours: Iterable[FloatArray], noise: float) -> t
 def explained_difference(frame: FloatArray, noise: float) -> FloatArray:
     """Squared difference that misregistration and noise explain.
 
-    Parameters
-    ----------
-    frame : ndarray, float32, shape (H, W) or (H, W, 3)
-        The image that others are compared with.
-    noise : float
-        Standard deviation of the noise of a frame, intensity.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W)
-        t², squared intensity.
-
-    Examples
-    --------
-    >>> edge = np.float32([[0.2] * 8 + [0.8] * 8]).repeat(9, 0)
-    >>> np.sqrt(explained_difference(edge, 0.0)[4, [0, 8]]).round(2)
-    array([0.02, 0.11], dtype=float32)
+    ``frame`` (H, W) or (H, W, 3); returns (H, W).
     """
     along_x, along_y = sobel_gradient(cv2.GaussianBlur(frame, (0, 0), _DIFFERENCE_WINDOW))
     square = along_x**2 + along_y**2
@@ -95,24 +59,7 @@ def explained_difference(frame: FloatArray, noise: float) -> FloatArray:
 def agreement_weight(neighbour: FloatArray, frame: FloatArray, tolerance: FloatArray) -> FloatArray:
     """Weight of a registered image beside another.
 
-    Parameters
-    ----------
-    neighbour, frame : ndarray, float32, shape (H, W) or (H, W, 3)
-        J_i and J.
-    tolerance : ndarray, float32, shape (H, W)
-        t², see :func:`explained_difference`.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W)
-        w, 0 to 1.
-
-    Examples
-    --------
-    >>> frame = np.full((9, 9), 0.5, np.float32)
-    >>> tolerance = explained_difference(frame, 0.0)
-    >>> [float(agreement_weight(other, frame, tolerance)[4, 4]) for other in (frame, frame + 0.4)]
-    [1.0, 0.0]
+    ``neighbour, frame`` (H, W) or (H, W, 3); ``tolerance`` (H, W); returns (H, W).
     """
     difference = cv2.GaussianBlur(neighbour - frame, (0, 0), _DIFFERENCE_WINDOW)
     np.square(difference, out=difference)

@@ -121,37 +121,7 @@ def remember(
 ) -> Memory:
     """Take a frame into the memory, which :func:`shown` then gives as the estimate of this frame.
 
-    Parameters
-    ----------
-    memory : Memory or None
-        None at the start of a scene.
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        F.
-    flow_between : callable
-        From two images and a start to the flow from the first to the second, float32, shape (H, W, 2), pixels.
-    noise : float
-        Standard deviation of the noise of a frame, intensity.
-    largest : float
-        What turbulence displaces at most, pixels.
-    steadiness : float
-        Steadiness of the camera, 0 to 1.
-    moving : ndarray, bool, shape (H, W)
-        Where something moves against the scene.
-    carry, offset : ndarray, float64, shape (3, 3)
-        C and N.
-
-    Returns
-    -------
-    Memory
-
-    Examples
-    --------
-    >>> one, other = np.full((9, 9), 0.5, np.float32), np.full((9, 9), 0.51, np.float32)
-    >>> none = lambda first, second, start: start
-    >>> settings = none, 0.01, 2.0, 1.0, np.zeros((9, 9), bool), np.eye(3), np.eye(3)
-    >>> memory = remember(remember(None, one, *settings), other, *settings)
-    >>> round(float(memory.image[4, 4]), 4), round(float(memory.held[4, 4]), 1)
-    (0.5053, 1.9)
+    ``image`` (H, W) or (H, W, 3); ``moving`` (H, W); ``carry, offset`` (3, 3).
     """
     shape = image.shape[:2]
     steadiness *= float(np.clip((largest - _WEAK) / (_STRONG - _WEAK), 0, 1))
@@ -192,25 +162,7 @@ def remember(
 
 
 def shown(memory: Memory) -> Memory:
-    """Bring a memory from its grid to the steadied frame.
-
-    Parameters
-    ----------
-    memory : Memory
-
-    Returns
-    -------
-    Memory
-        E is the identity.
-
-    Examples
-    --------
-    >>> ramp = np.tile(np.arange(5, dtype=np.float32), (3, 1))
-    >>> pose = np.array([[1, 0, 0.25], [0, 1, 0], [0, 0, 1]])
-    >>> ones = np.ones((3, 5), np.float32)
-    >>> shown(Memory(ramp, ones, 1, pose, ones, ones, 0.0)).image[0, 2].round(1)
-    np.float32(2.2)
-    """
+    """Bring a memory from its grid to the steadied frame."""
     if _corner(memory.pose, memory.held.shape) < _LEAST_MOVE:
         return memory
     flow = camera_flow(motion(memory.pose), memory.held.shape)

@@ -37,31 +37,7 @@ def moving_mask(
 ) -> NDArray[np.bool_]:
     """Mark the points that move.
 
-    Parameters
-    ----------
-    flows : mapping of int to ndarray, float32, shape (H, W, 2)
-        G_i by i, pixels.
-    image : ndarray, float32, shape (H, W)
-        Luminance of I.
-    placed : mapping of int to ndarray, float32, shape (H, W)
-        Luminance of I_i for the furthest pair of neighbours, i and −i; empty if there is no pair.
-    agreement : ndarray, float32, shape (H, W)
-        Agreement of the registered neighbours, 0 to 1.
-    largest : float
-        c, pixels.
-
-    Returns
-    -------
-    ndarray, bool, shape (H, W)
-
-    Examples
-    --------
-    >>> image, fast = np.full((8, 8), 0.5, np.float32), np.full((8, 8, 2), 9.0, np.float32)
-    >>> agreement = np.ones((8, 8), np.float32)
-    >>> bool(moving_mask({1: fast, -1: -fast}, image, {1: image, -1: image}, agreement, 1.0).any())
-    False
-    >>> bool(moving_mask({1: fast, -1: -fast}, image, {1: 0 * image, -1: 0 * image}, agreement, 1.0).all())
-    True
+    ``flows`` (H, W, 2); ``image`` (H, W); ``placed`` (H, W); ``agreement`` (H, W); returns (H, W).
     """
     moving = agreement < _AGREEMENT
     pairs = [offset for offset in flows if offset > 0 and -offset in flows]

@@ -48,22 +48,7 @@ _LEAST = 1e-3
 def camera_position(before: Sequence[Matrix], cameras: Mapping[int, Matrix]) -> Matrix:
     """Position G_k of a frame from those of the frames before it.
 
-    Parameters
-    ----------
-    before : sequence of ndarray, float64, shape (3, 3)
-        G of the frames before, the nearest last; empty for the first frame.
-    cameras : mapping of int to ndarray, float64, shape (2, 3)
-        Motion of the camera from the frame to its neighbours.
-
-    Returns
-    -------
-    ndarray, float64, shape (3, 3)
-
-    Examples
-    --------
-    >>> step = np.array([[0, 0, -2.0], [0, 0, 0]])
-    >>> float(camera_position([np.eye(3)], {-1: step})[0, 2])
-    2.0
+    ``before`` (3, 3) each; ``cameras`` (2, 3); returns (3, 3).
     """
     known = [offset for offset in cameras if -len(before) <= offset < 0]
     if not known:
@@ -74,24 +59,7 @@ def camera_position(before: Sequence[Matrix], cameras: Mapping[int, Matrix]) -> 
 def longer_path(before: Sequence[Matrix], position: Matrix, cameras: Mapping[int, Matrix]) -> dict[int, Matrix]:
     """Motion from a frame to all frames that are known: those before it, and its later neighbours.
 
-    Parameters
-    ----------
-    before : sequence of ndarray, float64, shape (3, 3)
-        G of the frames before, the nearest last.
-    position : ndarray, float64, shape (3, 3)
-        G_k.
-    cameras : mapping of int to ndarray, float64, shape (2, 3)
-        Motion of the camera from the frame to its neighbours.
-
-    Returns
-    -------
-    dict of int to ndarray, float64, shape (2, 3)
-        P_j by j − k.
-
-    Examples
-    --------
-    >>> sorted(longer_path([np.eye(3)] * 3, np.eye(3), {-1: np.zeros((2, 3)), 2: np.zeros((2, 3))}))
-    [-3, -2, -1, 2]
+    ``before`` (3, 3) each; ``position`` (3, 3); ``cameras`` (2, 3); returns (2, 3) each.
     """
     inverse = np.linalg.inv(position)
     past = {number - len(before): motion(other @ inverse) for number, other in enumerate(before)}
@@ -101,27 +69,7 @@ def longer_path(before: Sequence[Matrix], position: Matrix, cameras: Mapping[int
 def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int, ...]) -> Matrix:
     """Motion T − 1 from a frame to where it is on the smooth path.
 
-    Parameters
-    ----------
-    path : mapping of int to ndarray, float64, shape (2, 3)
-        P_j by j − k, pixels.
-    tolerance : float
-        e, pixels.
-    shape : tuple of int
-        (H, W) of the frames.
-
-    Returns
-    -------
-    ndarray, float64, shape (2, 3)
-
-    Examples
-    --------
-    >>> pan = np.array([[0, 0, 0.5], [0, 0, 0]])
-    >>> path = {j: j * pan + [[0, 0, 0.3], [0, 0, 0]] for j in range(-20, 13) if j}
-    >>> float(smooth_motion(path, 1.0, (64, 64))[0, 2].round(1))
-    0.3
-    >>> abs(smooth_motion(path, 0.01, (64, 64))).max() < 0.01
-    np.True_
+    ``path`` (2, 3); returns (2, 3).
     """
     times, seen, weights = _samples(path)
     smooth, share, value, doubt = np.zeros(6), 1.0, None, 0.0
@@ -148,22 +96,7 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
 def without_shake(path: Mapping[int, Matrix], order: int) -> Matrix:
     """Motion from a frame to where it is on the line, or at the point, that fits the path best.
 
-    Parameters
-    ----------
-    path : mapping of int to ndarray, float64, shape (2, 3)
-        P_j by j − k, pixels; not empty.
-    order : int
-        0 for a point, 1 for a line.
-
-    Returns
-    -------
-    ndarray, float64, shape (2, 3)
-
-    Examples
-    --------
-    >>> pan = np.array([[0, 0, 7.0], [0, 0, 0]])
-    >>> bool(abs(without_shake({1: pan, 2: 2 * pan}, 1)).max() < 1e-9)
-    True
+    ``path`` (2, 3); returns (2, 3).
     """
     times, seen, _ = _samples(path)
     # With one neighbour a line fits both: the frame stays.
@@ -173,18 +106,7 @@ def without_shake(path: Mapping[int, Matrix], order: int) -> Matrix:
 def homogeneous(matrix: Matrix) -> Matrix:
     """Map id + A as a matrix of homogeneous coordinates about the centre.
 
-    Parameters
-    ----------
-    matrix : ndarray, float64, shape (2, 3)
-
-    Returns
-    -------
-    ndarray, float64, shape (3, 3)
-
-    Examples
-    --------
-    >>> homogeneous(np.zeros((2, 3))).tolist()
-    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    ``matrix`` (2, 3); returns (3, 3).
     """
     return np.eye(3) + np.vstack([matrix, np.zeros(3)])
 
@@ -192,18 +114,7 @@ def homogeneous(matrix: Matrix) -> Matrix:
 def motion(pose: Matrix) -> Matrix:
     """Undo :func:`homogeneous`.
 
-    Parameters
-    ----------
-    pose : ndarray, float64, shape (3, 3)
-
-    Returns
-    -------
-    ndarray, float64, shape (2, 3)
-
-    Examples
-    --------
-    >>> motion(np.eye(3)).any()
-    np.False_
+    ``pose`` (3, 3); returns (2, 3).
     """
     return pose[:2] - np.eye(3)[:2]
 

@@ -75,27 +75,7 @@ class Window:
 def iter_windows(frames: Iterable[ArrayLike], distances: Sequence[int]) -> Iterator[Window]:
     """Yield the window of every frame, in order, once the last neighbour has been read.
 
-    Parameters
-    ----------
-    frames : iterable of array_like, shape (H, W) or (H, W, 3)
-        Consumed lazily.
-    distances : sequence of int
-        Distances of the neighbours, on both sides, positive.
-
-    Yields
-    ------
-    Window
-
-    Raises
-    ------
-    DataError
-        Frames differ in size, or values are not finite.
-
-    Examples
-    --------
-    >>> frames = np.random.default_rng(0).random((1, 32, 32)).repeat(4, 0)
-    >>> [(window.number, sorted(window.neighbours)) for window in iter_windows(frames, (1, 2))]
-    [(0, [1, 2]), (1, [-1, 1, 2]), (2, [-2, -1, 1]), (3, [-2, -1])]
+    ``frames`` (H, W) or (H, W, 3) each.
     """
     reach = max(distances)
     kept: deque[WindowFrame] = deque()
@@ -116,18 +96,7 @@ def iter_windows(frames: Iterable[ArrayLike], distances: Sequence[int]) -> Itera
 def contrast_levels(image: FloatArray) -> GreyImage:
     """Contrast-normalised image, which flow is measured from.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-
-    Returns
-    -------
-    ndarray, uint8, shape (H, W)
-
-    Examples
-    --------
-    >>> contrast_levels(np.full((2, 2), 0.3, np.float32))[0]
-    array([128, 128], dtype=uint8)
+    ``image`` (H, W) or (H, W, 3); returns (H, W).
     """
     return grey_levels(image, _CONTRAST_WINDOW, _CONTRAST_FLOOR)
 

@@ -236,59 +236,14 @@ class PhaseScreenParams:
 
 
 def fried_parameter(cn2: float, distance: float, wavelength: float, cone: float = 3 / 8) -> float:
-    """Fried parameter of a path of constant Cn²: ``r0 = (0.423 k² Cn² L c)^(-3/5)`` (Fried 1966).
-
-    Parameters
-    ----------
-    cn2 : float
-        m^(-2/3).
-    distance : float
-        L, m.
-    wavelength : float
-        λ, m.
-    cone : float
-        c, mean of γ^(5/3) over the path: 3/8 for a spherical wave, 1 for a plane one.
-
-    Returns
-    -------
-    float
-        m.
-
-    Raises
-    ------
-    ConfigurationError
-        A value is not positive.
-
-    Examples
-    --------
-    >>> round(fried_parameter(1e-15, 2000.0, 550e-9), 4)
-    0.1071
-    """
+    """Fried parameter of a path of constant Cn²: ``r0 = (0.423 k² Cn² L c)^(-3/5)`` (Fried 1966)."""
     for name, value in (("cn2", cn2), ("distance", distance), ("wavelength", wavelength)):
         _positive(name, value)
     return float((_FRIED * (2 * np.pi / wavelength) ** 2 * cn2 * distance * cone) ** (-3 / 5))
 
 
 def phase_spectrum(frequency: ArrayLike, r0: float, outer_scale: float, inner_scale: float) -> Float64Array:
-    """Von Kármán's power spectrum of the phase, Φ.
-
-    Parameters
-    ----------
-    frequency : array_like
-        f, cycles/m.
-    r0, outer_scale, inner_scale : float
-        m; an inner scale of 0 is none.
-
-    Returns
-    -------
-    ndarray, float64, shape of ``frequency``
-        rad² m²: its integral over the plane is the variance of the phase.
-
-    Examples
-    --------
-    >>> float(phase_spectrum(1.0, 0.1, 1e6, 0.0).round(3))
-    1.063
-    """
+    """Von Kármán's power spectrum of the phase, Φ."""
     f2 = np.square(np.asarray(frequency, np.float64))
     cut = (2 * np.pi * inner_scale / 5.92) ** 2
     return _SPECTRUM * r0 ** (-5 / 3) * (f2 + outer_scale**-2) ** (-11 / 6) * np.exp(-f2 * cut)
@@ -300,28 +255,6 @@ def tilt_variance(
     """Variance of the tilt about one axis.
 
     Each layer adds ``(2λ/πD)² 16π ∫ Φ(f) (J2(πγDf)/πγDf)² f df``, with Noll's (1976) filter of Zernike tilt.
-
-    Parameters
-    ----------
-    layers : sequence of Layer
-    aperture : float
-        D, m.
-    wavelength : float
-        λ, at which the r0 of the layers holds, m.
-    outer_scale, inner_scale : float
-        m.
-
-    Returns
-    -------
-    float
-        rad².
-
-    Examples
-    --------
-    >>> one = (Layer(0.0, 1.0, 0.04, (0.0, 0.0)),)
-    >>> variance = tilt_variance(one, 0.1, 550e-9, outer_scale=1e6)
-    >>> round(variance / ((0.1 / 0.04) ** (5 / 3) * (550e-9 / 0.1) ** 2), 3)
-    0.181
     """
     total = 0.0
     for layer in layers:

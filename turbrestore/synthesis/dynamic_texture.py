@@ -217,39 +217,7 @@ def continue_flows(
 ) -> tuple[TextureFlows, FlowDynamics]:
     """Synthesise flows that move like given ones.
 
-    Parameters
-    ----------
-    flows : array_like, shape (τ, h, w, 2)
-        Training flows, pixels; at least three.
-    count : int
-        Number of new flows.
-    rng : numpy.random.Generator
-        Source of randomness.
-    params : DynamicTextureParams, optional
-        Settings; ``flow`` and ``centroid`` have no effect.
-    size : (int, int), optional
-        Height and width of the new flows; by default (h, w).
-
-    Returns
-    -------
-    flows : TextureFlows
-    dynamics : FlowDynamics
-        System identified from the training flows, before its stabilisation.
-
-    Raises
-    ------
-    DataError
-        Fewer than three flows, wrong shape or values that are not finite.
-    ConfigurationError
-        ``count`` is not positive.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> training = np.random.default_rng(0).standard_normal((40, 8, 8, 2)).astype(np.float32)
-    >>> flows, _ = continue_flows(training, 4000, np.random.default_rng(1))
-    >>> bool(abs(np.std(list(flows)) / training.std() - 1) < 0.05)
-    True
+    ``flows`` (τ, h, w, 2).
     """
     params = params or DynamicTextureParams()
     _check_count(count)

@@ -50,30 +50,7 @@ class MovingObject:
 
 
 def draw_objects(count: int, shape: tuple[int, ...], rng: np.random.Generator) -> tuple[MovingObject, ...]:
-    """Draw objects at random places, with random velocities.
-
-    Parameters
-    ----------
-    count : int
-        0 to 100.
-    shape : tuple of int
-        (H, W) of the scene.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    tuple of MovingObject
-
-    Raises
-    ------
-    ConfigurationError
-        The number is out of range.
-
-    Examples
-    --------
-    >>> len(draw_objects(3, (64, 64), np.random.default_rng(0)))
-    3
-    """
+    """Draw objects at random places, with random velocities."""
     require_between("moving", count, 0, MOST_OBJECTS, "objects")
     height, width = shape[:2]
     objects = []
@@ -99,26 +76,7 @@ def with_objects(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Scene with the objects in front of it, at one frame.
 
-    Parameters
-    ----------
-    scene : ndarray, float32, shape (H, W) or (H, W, 3)
-    objects : sequence of MovingObject
-        A later one hides an earlier one.
-    number : int
-        k.
-
-    Returns
-    -------
-    image : ndarray, float32, shape of ``scene``
-    mask : ndarray, bool, shape (H, W)
-        Where an object covers at least half of a pixel.
-
-    Examples
-    --------
-    >>> scene = np.full((9, 9), 0.5, np.float32)
-    >>> one = MovingObject((1.0, 4.0), (2.0, 0.0), (1.5, 1.5), 0.8, 0.0)
-    >>> [int(with_objects(scene, [one], number)[1][4].argmax()) for number in (1, 2)]
-    [2, 4]
+    ``scene`` (H, W) or (H, W, 3); returns ``mask`` (H, W).
     """
     height, width = scene.shape[:2]
     image, mask = scene.copy(), np.zeros((height, width), bool)

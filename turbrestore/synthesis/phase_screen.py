@@ -92,15 +92,7 @@ class Turbulence:
     def drift(self, time: float) -> Float64Array:
         """Displacement of each layer by the wind.
 
-        Parameters
-        ----------
-        time : float
-            s.
-
-        Returns
-        -------
-        ndarray, float64, shape (layers, 2)
-            m.
+        Returns (layers, 2).
         """
         return np.array([layer.velocity for layer in self.layers]) * time
 
@@ -117,41 +109,7 @@ def draw_screen(
     aperture: float,
     turn: float = 0.0,
 ) -> PhaseScreen:
-    """Draw a phase screen.
-
-    Parameters
-    ----------
-    size : int
-        n, points along a side of the lattice.
-    spacing : float
-        Between them, m.
-    r0, outer_scale, inner_scale : float
-        Fried parameter and scales, m.
-    rng : numpy.random.Generator
-        Source of randomness.
-    wavelength : float
-        Wavelength of r0, m.
-    aperture : float
-        Diameter over which the slopes are averaged, m.
-    turn : float
-        Angle of the lattice, rad.
-
-    Returns
-    -------
-    PhaseScreen
-
-    Raises
-    ------
-    ConfigurationError
-        Fewer than 8 points.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> screen = draw_screen(64, 0.01, 0.05, 5.0, 0.0, np.random.default_rng(0), wavelength=5e-7, aperture=0.1)
-    >>> screen.path.shape, screen.frequencies.shape == (len(screen.waves), 2)
-    ((64, 64), True)
-    """
+    """Draw a phase screen."""
     require(size >= 8, f"size: expected at least 8 points, found {size}")
     period = size * spacing
     axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
@@ -174,27 +132,7 @@ def draw_screen(
 
 
 def draw_turbulence(params: PhaseScreenParams, shape: tuple[int, ...], rng: np.random.Generator) -> Turbulence:
-    """Draw a phase screen for every layer, larger than the field of view, so that nothing repeats within it.
-
-    Parameters
-    ----------
-    params : PhaseScreenParams
-    shape : (int, int)
-        Rows and columns of the field of view, pixels.
-    rng : numpy.random.Generator
-        Source of randomness.
-
-    Returns
-    -------
-    Turbulence
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> turbulence = draw_turbulence(PhaseScreenParams(layers=2), (64, 64), np.random.default_rng(0))
-    >>> [screen.path.shape for screen in turbulence.screens]
-    [(512, 512), (512, 512)]
-    """
+    """Draw a phase screen for every layer, larger than the field of view, so that nothing repeats within it."""
     layers, scales, screens = params.path(), (params.outer_scale, params.inner_scale), []
     for number, layer in enumerate(layers):
         diameter = layer.shrink * params.aperture
@@ -213,25 +151,7 @@ def draw_turbulence(params: PhaseScreenParams, shape: tuple[int, ...], rng: np.r
 def tilt_flow(turbulence: Turbulence, x: Float64Array, y: Float64Array, drift: Float64Array) -> FloatArray:
     """Compute the displacement by tilt on a grid of pixels.
 
-    Parameters
-    ----------
-    turbulence : Turbulence
-    x, y : ndarray, float64, shapes (w,) and (h,)
-        Columns and rows, pixels from the line of sight, evenly spaced.
-    drift : ndarray, float64, shape (layers, 2)
-        Of :meth:`Turbulence.drift`, m.
-
-    Returns
-    -------
-    ndarray, float32, shape (h, w, 2)
-        Pixels.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> turbulence = draw_turbulence(PhaseScreenParams(layers=2), (64, 64), np.random.default_rng(0))
-    >>> tilt_flow(turbulence, np.arange(8.0), np.arange(4.0), turbulence.drift(0.5)).shape
-    (4, 8, 2)
+    ``drift`` (layers, 2); returns (h, w, 2).
     """
     angle = turbulence.params.pixel_angle
     (node_x, to_x), (node_y, to_y) = _spline(x), _spline(y)
@@ -256,26 +176,7 @@ def sample_lattice(
 ) -> list[FloatArray]:
     """Interpolate planes on the lattice, bilinear and periodic.
 
-    Parameters
-    ----------
-    screen : PhaseScreen
-    planes : iterable of ndarray, float32, shape (n, n)
-        ``screen.path`` or ``screen.slopes``.
-    x, y : ndarray, float64, shape (a, b)
-        Positions, at most some periods apart, m.
-
-    Returns
-    -------
-    list of ndarray, float32, shape (a, b)
-        One for each plane.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> screen = draw_screen(64, 0.01, 0.05, 5.0, 0.0, np.random.default_rng(0), wavelength=5e-7, aperture=0.1)
-    >>> (at,) = sample_lattice(screen, [screen.path], np.array([[0.02]]), np.array([[0.03]]))
-    >>> bool(np.isclose(at[0, 0], screen.path[3, 2], rtol=1e-3))
-    True
+    ``planes`` (n, n) each; ``x, y`` (a, b); returns (a, b) each.
     """
     size = len(screen.path)
     maps = []

@@ -20,10 +20,7 @@ _SEED = 2026
 def sample_clip() -> tuple[FloatArray, FloatArray]:
     """Make the sample clip.
 
-    Returns
-    -------
-    frames : ndarray, float32, shape (48, 192, 256)
-    truth : ndarray, float32, shape (192, 256)
+    Returns ``frames`` (48, 192, 256), ``truth`` (192, 256).
     """
     rng = np.random.default_rng(_SEED)
     truth = resolution_chart(_HEIGHT, _WIDTH)

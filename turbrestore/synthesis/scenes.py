@@ -38,25 +38,7 @@ _SMALLEST_FONT = 6
 def resolution_chart(height: int = 256, width: int = 256) -> FloatArray:
     """Draw a chart of bars, letters, a Siemens star, a checkerboard and thin lines.
 
-    Parameters
-    ----------
-    height, width : int
-        Size in pixels, at least 64.
-
-    Returns
-    -------
-    ndarray, float32, shape (height, width)
-
-    Raises
-    ------
-    ConfigurationError
-        The size is too small.
-
-    Examples
-    --------
-    >>> chart = resolution_chart(128, 192)
-    >>> chart.shape, round(float(chart.min()), 2), round(float(chart.max()), 2)
-    ((128, 192), 0.12, 0.88)
+    Returns (height, width).
     """
     require(min(height, width) >= SMALLEST, f"size: expected at least {SMALLEST} pixels a side, found {width}×{height}")
     rows = np.linspace(0, height, 3).round().astype(int)
@@ -80,26 +62,7 @@ def resolution_chart(height: int = 256, width: int = 256) -> FloatArray:
 def picture(name: str, height: int, width: int) -> FloatArray:
     """Load a photograph or texture of scikit-image, crop it centrally to the proportions asked for, and resize it.
 
-    Parameters
-    ----------
-    name : str
-        One of ``PICTURES``.
-    height, width : int
-        Size in pixels.  Most pictures have 512 pixels a side and look soft beyond that size.
-
-    Returns
-    -------
-    ndarray, float32, shape (height, width) or (height, width, 3)
-
-    Raises
-    ------
-    ConfigurationError
-        Unknown name, or a size that is not positive.
-
-    Examples
-    --------
-    >>> picture("brick", 100, 300).shape, picture("coffee", 64, 64).shape
-    ((100, 300), (64, 64, 3))
+    Returns (height, width) or (height, width, 3).
     """
     require(name in PICTURES, f"picture: expected one of {', '.join(PICTURES)}, found {name!r}")
     require(min(height, width) >= 1, f"size: expected at least 1 pixel a side, found {width}×{height}")
@@ -117,27 +80,7 @@ def picture(name: str, height: int, width: int) -> FloatArray:
 def printed_words(height: int, width: int, words: Sequence[str] = WORDS) -> FloatArray:
     """Print words on a page, as large as they fit, to measure how much of a text can be read.
 
-    Parameters
-    ----------
-    height, width : int
-        Size in pixels, at least 64.
-    words : sequence of str
-        Printed line by line from the upper left.
-
-    Returns
-    -------
-    ndarray, float32, shape (height, width)
-
-    Raises
-    ------
-    ConfigurationError
-        The size is too small, there are no words, or they do not fit at three pixels of letter height.
-
-    Examples
-    --------
-    >>> page = printed_words(128, 192, ["haze", "mirage"])
-    >>> page.shape, round(float(page.min()), 2), round(float(page.max()), 2)
-    ((128, 192), 0.12, 0.88)
+    Returns (height, width).
     """
     from PIL import Image, ImageDraw
 

@@ -103,27 +103,7 @@ class CameraParams:
 def check_scene(scene: ArrayLike) -> FloatArray:
     """Check that a scene can show turbulence, and return it as float32.
 
-    Parameters
-    ----------
-    scene : array_like, shape (H, W) or (H, W, 3)
-        Floating point intensities in [0, 1], or unsigned integers.
-
-    Returns
-    -------
-    ndarray, float32
-
-    Raises
-    ------
-    DataError
-        Not an image, smaller than 16×16 pixels, values outside [0, 1], or all of one colour.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> check_scene(np.full((32, 32), 0.5))
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.DataError: scene: expected contrast, found one colour only; choose a picture with detail
+    ``scene`` (H, W) or (H, W, 3).
     """
     image = check_image(scene, "scene")
     height, width = image.shape[:2]
@@ -140,24 +120,7 @@ def check_scene(scene: ArrayLike) -> FloatArray:
 def record(image: FloatArray, camera: CameraParams, rng: np.random.Generator) -> FloatArray:
     """Add shot noise and read noise to an image, and quantise it.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Intensities; clipped to [0, 1].
-    camera : CameraParams
-    rng : numpy.random.Generator
-        Source of the noise.
-
-    Returns
-    -------
-    ndarray, float32, shape of ``image``
-        On the 2^bit_depth levels of [0, 1].
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> record(np.full((1, 1), 0.4, np.float32), CameraParams(read_noise=0.0, bit_depth=1), np.random.default_rng(0))
-    array([[0.]], dtype=float32)
+    ``image`` (H, W) or (H, W, 3).
     """
     exposed: FloatArray = np.clip(image, 0, 1)
     if np.isfinite(camera.photons):
@@ -220,29 +183,7 @@ def exposed_frame(
 def flows_between(flows: Iterable[FloatArray], shares: Sequence[float]) -> Iterator[list[FloatArray]]:
     """Interpolate the flows of the sub-frames of each frame linearly in time, between its flow and the next one.
 
-    Parameters
-    ----------
-    flows : iterable of ndarray, float32, shape (H, W, 2)
-        At the start of each frame, one at a time; the last flow only ends the frame before it.
-    shares : sequence of float
-        Instants as shares of the frame time, 0 to 1.
-
-    Yields
-    ------
-    list of ndarray, float32, shape (H, W, 2)
-        One flow for each share; one list fewer than flows.
-
-    Raises
-    ------
-    ConfigurationError
-        No share, or one outside 0 to 1.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> flows = (np.full((1, 1, 2), k, np.float32) for k in range(3))
-    >>> [[float(flow[0, 0, 0]) for flow in frame] for frame in flows_between(flows, (0.0, 0.5))]
-    [[0.0, 0.5], [1.0, 1.5]]
+    ``flows`` (H, W, 2) each; yields (H, W, 2) each.
     """
     require(
         len(shares) > 0 and all(0 <= share <= 1 for share in shares),

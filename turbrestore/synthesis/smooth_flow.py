@@ -51,33 +51,7 @@ def smooth_flows(
 ) -> FloatArray:
     """Draw a sequence of smooth random flows.
 
-    Parameters
-    ----------
-    count : int
-        Number of frames.
-    height, width : int
-        Size in pixels.
-    rng : numpy.random.Generator
-        Source of randomness.
-    params : SmoothFlowParams, optional
-        Statistics.
-
-    Returns
-    -------
-    ndarray, float32, shape (count, height, width, 2)
-        Pixels.
-
-    Raises
-    ------
-    ConfigurationError
-        A size is not positive.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> flows = smooth_flows(50, 64, 64, np.random.default_rng(1), SmoothFlowParams(rms=2.0))
-    >>> flows.shape, bool(1.5 < flows.std() < 2.5)
-    ((50, 64, 64, 2), True)
+    Returns (count, height, width, 2).
     """
     require(min(count, height, width) >= 1, f"size: expected positive numbers, found {count}×{height}×{width}")
     params = params or SmoothFlowParams()
@@ -94,37 +68,7 @@ def distort(
 ) -> FloatArray:
     """Distort a scene by flows: ``I_k = (Kρ) ∘ w_k⁻¹`` plus noise (paper 3, eq. 6).
 
-    Parameters
-    ----------
-    scene : array_like, shape (H, W) or (H, W, 3)
-        ρ.
-    flows : array_like, shape (T, H, W, 2)
-        From the scene to each frame, pixels.
-    rng : numpy.random.Generator
-        Source of the noise.
-    blur : float
-        Standard deviation of the Gaussian K, pixels.
-    noise : float
-        Standard deviation of the noise, intensity.
-
-    Returns
-    -------
-    ndarray, float32, shape (T, H, W) or (T, H, W, 3)
-        Clipped to [0, 1].
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree.
-    ConfigurationError
-        ``blur`` or ``noise`` is negative.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> rng = np.random.default_rng(0)
-    >>> distort(np.full((8, 8), 0.5), np.zeros((3, 8, 8, 2)), rng, blur=1.0).shape
-    (3, 8, 8)
+    ``scene`` (H, W) or (H, W, 3); ``flows`` (T, H, W, 2); returns (T, H, W) or (T, H, W, 3).
     """
     require(blur >= 0, f"blur: expected 0 pixels or more, found {blur}")
     require(noise >= 0, f"noise: expected 0 or more, found {noise}")

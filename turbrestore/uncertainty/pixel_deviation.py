@@ -59,31 +59,7 @@ def pixel_deviation(
 ) -> FloatArray:
     """Compute the standard deviation of every pixel.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        u.
-    variance : ndarray, float32, shape (H, W)
-        Σ, squared intensity.
-    gain : float
-        g, from :func:`posterior_gain`.
-    position_variance : ndarray, float32, shape (H, W)
-        ε², squared pixels, from :func:`position_variance`.
-    known : ndarray, bool, shape (H, W)
-        Where there is information, from :func:`informed_pixels`.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W)
-        Intensity; infinite where nothing is known.
-
-    Examples
-    --------
-    >>> image = np.tile(np.linspace(0.2, 0.8, 32, dtype=np.float32), (32, 1))
-    >>> flat = np.zeros((32, 32), np.float32)
-    >>> deviation = pixel_deviation(image, flat, 1.0, flat + 0.25, flat == 0)
-    >>> bool(abs(deviation[16, 16] - 0.5 * 0.6 / 31) < 1e-4)
-    True
+    ``image`` (H, W) or (H, W, 3); ``variance`` (H, W); ``position_variance`` (H, W); ``known`` (H, W); returns (H, W).
     """
     grey = luminance(image)
     gx, gy = sobel_gradient(grey)
@@ -93,28 +69,7 @@ def pixel_deviation(
 
 
 def posterior_gain(size: tuple[int, int], fidelity: float, sigma: float, exponent: float | None) -> float:
-    """Compute the posterior variance of a deconvolved pixel for noise of unit variance: g.
-
-    Parameters
-    ----------
-    size : tuple of int
-        (H, W) of the image.
-    fidelity : float
-        λ, from :func:`quadratic_fidelity`.
-    sigma : float
-        Width of the blur that was removed, pixels; 0 if none was.
-    exponent : float or None
-        Its shape; None is a Gaussian.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> [round(posterior_gain((32, 32), 900.0, sigma, None)) for sigma in (0.0, 1.0, 2.0)]
-    [1, 102, 209]
-    """
+    """Compute the posterior variance of a deconvolved pixel for noise of unit variance: g."""
     if sigma == 0:
         return 1.0
     shape = (min(size[0], _GRID), min(size[1], _GRID))
@@ -128,25 +83,7 @@ def quadratic_fidelity(fused: FloatArray, method: str, fidelity: float) -> float
 
     It is the automatic weight for wiener, times the ratio of the weight that was used to the automatic one; for wiener
     this is the weight that was used.
-
-    Parameters
-    ----------
-    fused : ndarray, float32, shape (H, W) or (H, W, 3)
-        ρ, with the levels that were deconvolved.
-    method : {"nltv", "tv", "wiener", "tikhonov"}
-        Penalty of the deconvolution.
-    fidelity : float
-        Weight of the data in it.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> step = np.repeat(np.float32([[0.2, 0.8]]), 16, axis=1).repeat(32, axis=0)
-    >>> [round(quadratic_fidelity(step, method, 5000.0)) for method in ("wiener", "nltv")]
-    [5000, 900]
+    ``fused`` (H, W) or (H, W, 3).
     """
     grey = luminance(fused)
     noise = estimate_noise(grey)
@@ -156,21 +93,7 @@ def quadratic_fidelity(fused: FloatArray, method: str, fidelity: float) -> float
 def position_variance(dynamics: FlowDynamics) -> FloatArray:
     """Compute the variance of the position of every pixel along one axis: ε².
 
-    Parameters
-    ----------
-    dynamics : FlowDynamics
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W)
-        Squared pixels.
-
-    Examples
-    --------
-    >>> from turbrestore.dynamics.dynamic_texture import identify
-    >>> dynamics = identify(np.random.default_rng(0).normal(size=(40, 16, 16, 2)))
-    >>> bool(np.isclose(position_variance(dynamics).mean(), 0.7 * dynamics.R, rtol=0.05))
-    True
+    Returns (H, W).
     """
     return cv2.GaussianBlur(dynamics.residual_variance, (0, 0), _SMOOTH) * np.float32(_ERROR_SHARE)
 
@@ -178,26 +101,8 @@ def position_variance(dynamics: FlowDynamics) -> FloatArray:
 def saturation_level(brightest: float, noise: float, step: float) -> float:
     """Return the intensity from which the temporal mean is saturated.
 
-    A camera of 12 bits saturates far below the full scale of a file of 16.  A pixel that has the largest intensity of
+    A camera of 12 bits saturates far below the full scale of a file of 16. A pixel that has the largest intensity of
     the clip in every frame is saturated if the frames are noisy, and else may be a white part of the scene.
-
-    Parameters
-    ----------
-    brightest : float
-        Largest intensity of the frames.
-    noise : float
-        Standard deviation of the noise of a frame, intensity.
-    step : float
-        Difference of two neighbouring intensities of the file.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> [round(saturation_level(4095 / 65535, noise, 1 / 65535), 4) for noise in (0.0, 0.001)]
-    [0.998, 0.0625]
     """
     return min(_SATURATED, brightest - step / 2) if noise >= step else _SATURATED
 
@@ -205,23 +110,7 @@ def saturation_level(brightest: float, noise: float, step: float) -> float:
 def informed_pixels(seen: FloatArray, mean: FloatArray, saturation: float) -> NDArray[np.bool_]:
     """Return the pixels that a frame has shown, and that are not saturated in all of them.
 
-    Parameters
-    ----------
-    seen : ndarray, float32, shape (H, W)
-        Share of the frames that show each pixel.
-    mean : ndarray, float32, shape (H, W) or (H, W, 3)
-        Temporal mean.
-    saturation : float
-        From :func:`saturation_level`.
-
-    Returns
-    -------
-    ndarray, bool, shape (H, W)
-
-    Examples
-    --------
-    >>> informed_pixels(np.float32([[1, 0, 1]]), np.float32([[0.5, 0.5, 1]]), 0.998)
-    array([[ True, False, False]])
+    ``seen`` (H, W); ``mean`` (H, W) or (H, W, 3); returns (H, W).
     """
     saturated = mean >= saturation
     return (seen > 0) & ~(saturated if saturated.ndim == 2 else saturated.any(axis=-1))

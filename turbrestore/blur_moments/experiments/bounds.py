@@ -39,29 +39,7 @@ def image_information(model: BlurModel, states: Float64Array, inputs: Float64Arr
 def posterior_bound(A: Float64Array, Q: Float64Array, start: Float64Array, information: ArrayLike) -> Float64Array:
     """Bound on the covariance of the estimation error after every frame.
 
-    Parameters
-    ----------
-    A, Q : ndarray, float64, shape (n, n)
-        Motion from one exposure to the next, covariance of its disturbance.
-    start : ndarray, float64, shape (n, n)
-        Covariance of the state before the first frame.
-    information : array_like, shape (T, n, n)
-        Mean information of every frame.
-
-    Returns
-    -------
-    ndarray, float64, shape (T, n, n)
-
-    Raises
-    ------
-    DataError
-        The prediction has a singular covariance.
-
-    Examples
-    --------
-    >>> one = np.eye(1)
-    >>> posterior_bound(one, 0.5 * one, one, [one, one]).ravel()
-    array([0.5, 0.5])
+    ``A, Q`` (n, n); ``start`` (n, n); ``information`` (T, n, n); returns (T, n, n).
     """
     before, bounds = start, []
     for gained in np.asarray(information, np.float64):

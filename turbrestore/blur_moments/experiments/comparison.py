@@ -175,31 +175,7 @@ class Experiment:
 
 
 def wavefront(seeds: Sequence[int], params: WavefrontParams = WAVEFRONT) -> Experiment:
-    """Run the wavefront experiment.
-
-    Parameters
-    ----------
-    seeds : sequence of int
-        One run each.
-    params : WavefrontParams
-
-    Returns
-    -------
-    Experiment
-        The error is the norm of the error of the state after the frame.  O1 is the steady-state Kalman filter on the
-        first moment, O2 uses the second, O3 both; the other observers are not in the paper.
-
-    Raises
-    ------
-    ConfigurationError
-        No seeds.
-
-    Examples
-    --------
-    >>> result = wavefront(range(2), WavefrontParams(frames=4, burn_in=1))
-    >>> sorted(result.bounds)
-    ['image', 'moments', 'moments_1_to_4']
-    """
+    """Run the wavefront experiment."""
     model = wavefront_model(params)
     observer, cov = steady_kalman(model)
     start = Gaussian(np.zeros(2), cov)
@@ -223,34 +199,7 @@ def wavefront(seeds: Sequence[int], params: WavefrontParams = WAVEFRONT) -> Expe
 
 
 def mirror(seeds: Sequence[int], params: MirrorParams = MIRROR) -> Experiment:
-    """Run the mirror experiment.
-
-    Parameters
-    ----------
-    seeds : sequence of int
-        One run each.
-    params : MirrorParams
-        With ``deviation`` above 0 every seed has another plant, and the observers do not know it.
-
-    Returns
-    -------
-    Experiment
-        The error is the root mean square error of the output within the exposure.  O1 is a Luenberger observer on the
-        first moment with the Kalman gain, O2 uses moments 1 and 2, O3 predicts the image.  ``augmented`` also
-        estimates gain, frequency and damping; of 200 runs with an unknown plant about three converge to a wrong one,
-        which their innovations show.  Bounds are for the known plant.
-
-    Raises
-    ------
-    ConfigurationError
-        No seeds.
-
-    Examples
-    --------
-    >>> result = mirror([0, 1], MirrorParams(frames=3, burn_in=1, deviation=7.0))
-    >>> list(result.scores)
-    ['O1', 'O2', 'O3', 'O3_map', 'augmented']
-    """
+    """Run the mirror experiment."""
     model = mirror_model(params)
     motion = model.motion
     assert isinstance(motion, LiftedSystem)

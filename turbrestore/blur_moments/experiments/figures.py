@@ -18,17 +18,7 @@ _OVERVIEW = 5.0
 
 
 def new_figure() -> Any:
-    """Create an empty figure; called before a long computation, it shows whether matplotlib is installed.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
-    """
+    """Create an empty figure; called before a long computation, it shows whether matplotlib is installed."""
     try:
         # Loading the optional package by name lets type checkers run without it.
         return importlib.import_module("matplotlib.figure").Figure(figsize=(12, 8), layout="constrained")

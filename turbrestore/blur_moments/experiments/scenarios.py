@@ -73,11 +73,6 @@ class WavefrontParams:
     ------
     ConfigurationError
         No frame is left after the burn-in, or a number is out of range.
-
-    Examples
-    --------
-    >>> WavefrontParams(noise=0.01).frames
-    40
     """
 
     frames: int = 40
@@ -126,11 +121,6 @@ class MirrorParams:
     ------
     ConfigurationError
         No frame is left after the burn-in, or a number is out of range.
-
-    Examples
-    --------
-    >>> MirrorParams(deviation=7.0).frames
-    35
     """
 
     frames: int = 35

@@ -197,31 +197,7 @@ def _of_file(backdrop: Backdrop, source: FrameSource) -> Backdrop:
 
 
 def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Leave out frames that show nothing; a source without any is returned as it is.
-
-    Parameters
-    ----------
-    source : FrameSource
-
-    Returns
-    -------
-    source : FrameSource
-    decisions : tuple of Decision
-        What was left out, if anything.
-
-    Raises
-    ------
-    DataError
-        Frames are damaged.
-
-    Examples
-    --------
-    >>> frames = np.random.default_rng(0).random((4, 20, 20))
-    >>> frames[1] = 0
-    >>> source, (found,) = without_blank(FrameSource.from_array(frames))
-    >>> len(source), found.choice
-    (3, 'frame 1 left out')
-    """
+    """Leave out frames that show nothing; a source without any is returned as it is."""
     contrasts = np.array([thumbnail(frame).std() for frame in source], np.float64)
     blank = np.asarray(source.numbers)[_are_blank(contrasts, _BLANK_CONTRAST)].tolist()
     choice, reason = f"{numbers_text(blank)} left out", f"at most {_BLANK_CONTRAST:.0%} of the usual contrast"
@@ -230,16 +206,7 @@ def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...
 
 
 def keep_all(report: ContentReport) -> ContentReport:
-    """Return the report for a use that keeps every frame: defects are repaired, and nothing is left out.
-
-    Examples
-    --------
-    >>> frames = np.random.default_rng(0).random((4, 20, 20))
-    >>> frames[2] = frames[1]
-    >>> report = check_content(FrameSource.from_array(frames))
-    >>> sorted(report.left_out), sorted(keep_all(report).left_out)
-    ([2], [])
-    """
+    """Return the report for a use that keeps every frame: defects are repaired, and nothing is left out."""
     kept = dataclasses.replace(report, blank=(), duplicated=(), scenes=report.scenes[:1], left_out=frozenset())
     return dataclasses.replace(kept, warnings=tuple(_in_words(kept, False)))
 

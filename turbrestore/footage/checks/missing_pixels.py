@@ -18,13 +18,7 @@ _WIDEST_HOLE = 32
 
 
 def fill_holes(pixels: PixelArray) -> PixelArray:
-    """Fill what is not finite, ring by ring, with the mean of the known values among the eight neighbours.
-
-    Examples
-    --------
-    >>> fill_holes(np.array([[1.0, np.nan, 3.0]], np.float32))
-    array([[1., 2., 3.]], dtype=float32)
-    """
+    """Fill what is not finite, ring by ring, with the mean of the known values among the eight neighbours."""
     missing = ~np.isfinite(pixels)
     if not missing.any():
         return pixels
@@ -59,14 +53,7 @@ class Backdrop:
     unseen: NDArray[np.bool_]
 
     def behind(self, pixels: PixelArray) -> PixelArray:
-        """Fill a few missing pixels from around, many from what other frames show.
-
-        Examples
-        --------
-        >>> backdrop = Backdrop(np.full((1, 2), 7, np.float32), np.zeros((1, 2), bool))
-        >>> backdrop.behind(np.array([[np.nan, 3]], np.float32))
-        array([[7., 3.]], dtype=float32)
-        """
+        """Fill a few missing pixels from around, many from what other frames show."""
         missing = ~np.isfinite(pixels)
         if np.count_nonzero(missing) <= FEW_MISSING * pixels.size:
             return fill_holes(pixels)

@@ -89,12 +89,6 @@ def group_scenes(numbers: NDArray[np.int64], labels: NDArray[np.int32]) -> tuple
     """Group frames into scenes, in the order of their first frames, and mark the frames of the longest one.
 
     ``labels`` are from :meth:`SceneDetector.labels`. If no frame belongs to a scene, all frames are one scene.
-
-    Examples
-    --------
-    >>> scenes, kept = group_scenes(np.arange(4), np.array([0, 0, 0, 1], np.int32))
-    >>> scenes[0], kept.tolist()
-    (Scene(first=0, last=2, count=3), [True, True, True, False])
     """
     scenes: dict[int, Scene] = {}
     for label in dict.fromkeys(labels.tolist()):

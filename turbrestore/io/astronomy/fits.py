@@ -79,19 +79,8 @@ def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, sin
     """Open a FITS cube as a video, with ``single`` also one grey image as a video of one frame.
 
     Frames are read one at a time, those of a ``.gz`` file are loaded as a whole. Where the highest value has to be
-    found, every frame is read once. The errors are those of
-    :func:`turbrestore.io.video.open_frames`; ConfigurationError where Astropy is not installed.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from astropy.io import fits
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     cube = np.arange(24, dtype=np.float32).reshape(4, 2, 3)
-    ...     fits.PrimaryHDU(cube).writeto(folder + "/a.fits")
-    ...     source = open_fits(folder + "/a.fits")
-    ...     source.shape, source.format, float(source.read().max()), source.warnings
-    ((4, 2, 3), 'fits/float32', 1.0, ('values 0 to 23 are scaled: 0 is black, 23 is white',))
+    found, every frame is read once. The errors are those of :func:`turbrestore.io.video.open_frames`;
+    ConfigurationError where Astropy is not installed.
     """
     path = Path(path)
     images = find_images(path, limits)

@@ -115,13 +115,7 @@ class FitsImage:
 
 
 def is_fits(path: Path) -> bool:
-    """Whether a name is that of a FITS file: .fits, .fit or .fts, one of them with .gz or .fz, or .fz alone.
-
-    Examples
-    --------
-    >>> is_fits(Path("Moon.FIT")), is_fits(Path("moon.fits.gz")), is_fits(Path("moon.fz")), is_fits(Path("moon.gz"))
-    (True, True, True, False)
-    """
+    """Whether a name is that of a FITS file: .fits, .fit or .fts, one of them with .gz or .fz, or .fz alone."""
     name = path.name.lower()
     return name.endswith(".fz") or name.removesuffix(".gz").endswith(FITS_SUFFIXES)
 
@@ -136,23 +130,7 @@ def astropy_fits() -> Any:
 
 
 def find_images(path: Path, limits: Limits) -> tuple[FitsImage, ...]:
-    """Find the images of the scene in a FITS file; nothing but headers is read.
-
-    Returns
-    -------
-    tuple of FitsImage
-        The first that is named SCI, or else the first whose name is not that of errors or masks, and, where that is a
-        single image, all others of its size and name: pipelines store one frame per extension.
-
-    Raises
-    ------
-    ConfigurationError
-        Astropy is not installed.
-    InputNotFoundError, StorageError
-        The file does not exist, or cannot be read.
-    DataError
-        Not a FITS file, damaged, cut short, without an image, or larger than the limits.
-    """
+    """Find the images of the scene in a FITS file; nothing but headers is read."""
     found: list[FitsImage] = []
     with format_errors(path, _DAMAGED), warnings.catch_warnings():
         # Astropy warns of cards that break rules, and reads them.

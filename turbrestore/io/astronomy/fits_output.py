@@ -45,49 +45,7 @@ def write_fits(
 ) -> None:
     """Write an image as FITS; the same image and header give the same bytes.
 
-    Parameters
-    ----------
-    path : path-like
-        Ends in ``.fits``.
-    image : array_like, shape (H, W) or (H, W, 3)
-        Intensities; values outside [0, 1] are clipped. Colour is stored as (3, H, W).
-    bit_depth : int, optional
-        1 to 8 gives 8 bits, 9 to 16 gives 16 bits, 32 gives floating point. By default 32.
-    overwrite : bool
-        Replace an existing file.
-    header : sequence of str
-        Cards of the input, as ``FrameSource.header`` has them. Those that describe numbers, axes after the second and
-        checksums are left out.
-    history : iterable of str
-        Lines of HISTORY.
-    origin : tuple of int
-        x and y of the image in the frames of the input; CRPIX1 and CRPIX2 move by them.
-    uncertainty : ndarray, float32, shape (H, W), optional
-        Standard deviation of every pixel, stored as the extension ``UNCERT``.
-    levels : tuple of float, optional
-        Numbers that 0 and 1 become in floating point; ``uncertainty`` is brought to them too.
-    flows : ndarray, float32, shape (T, H, W, 2), optional
-        Displacements (dx, dy) from the image to frames, pixels, stored as the extension ``FLOW`` of shape (T, 2, H, W).
-
-    Raises
-    ------
-    ConfigurationError
-        Unsupported suffix or bit depth, or Astropy is not installed.
-    DataError
-        The image has the wrong shape or is not finite.
-    OutputError, StorageError
-        The file cannot be created or completed; nothing is left behind.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from astropy.io import fits
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     card = fits.Card("OBJECT", "Moon").image
-    ...     write_fits(folder + "/a.fits", np.full((2, 3), 0.5, np.float32), 16, header=[card], history=["made here"])
-    ...     header = fits.getheader(folder + "/a.fits")
-    >>> header["OBJECT"], header["BITPIX"], str(header["HISTORY"])
-    ('Moon', 16, 'made here')
+    ``image`` (H, W) or (H, W, 3); ``uncertainty`` (H, W); ``flows`` (T, H, W, 2).
     """
     path = Path(path)
     check_output(path, overwrite=overwrite, suffixes=(FITS_OUTPUT_SUFFIX,))

@@ -100,15 +100,6 @@ def open_ser(
 
     Frames from ``stop`` on are not needed, so they may be missing. With ``skip_damaged`` the whole frames of a file
     that is cut short are read. The errors are those of :func:`turbrestore.io.video.open_frames`.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_ser(Path(folder, "a.ser"), [np.zeros((2, 3), np.float32)] * 4, bit_depth=12, fps=50)
-    ...     source = open_ser(Path(folder, "a.ser"))
-    >>> source.shape, source.format, source.fps
-    ((4, 2, 3), 'ser/mono12', 50.0)
     """
     header = read_ser_header(path, limits)
     with input_errors(path):

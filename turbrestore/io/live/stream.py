@@ -57,36 +57,7 @@ class FrameStream:
 
 
 def open_pipe(file: BinaryIO, name: str = "standard input", limits: Limits = DEFAULT_LIMITS) -> FrameStream:
-    """Read video from a pipe: Matroska, YUV4MPEG2, NUT or MPEG-TS.
-
-    Parameters
-    ----------
-    file : binary file
-        Need not be seekable.
-    name : str
-        Its name in messages.
-    limits : Limits
-        Largest frame that is read.
-
-    Returns
-    -------
-    FrameStream
-
-    Raises
-    ------
-    DataError
-        Not a video, damaged, or a frame is larger than the limits; also while iterating.
-
-    Examples
-    --------
-    >>> import io
-    >>> from turbrestore.io.encoding import write_pipe
-    >>> file = io.BytesIO()
-    >>> write_pipe(file, [np.full((4, 6), 0.2, np.float32)] * 3, 25)
-    >>> stream = open_pipe(io.BytesIO(file.getvalue()))
-    >>> stream.shape, stream.fps, len(list(stream.frames))
-    ((4, 6), 25.0, 3)
-    """
+    """Read video from a pipe: Matroska, YUV4MPEG2, NUT or MPEG-TS."""
     import av
 
     try:
@@ -119,31 +90,7 @@ def open_pipe(file: BinaryIO, name: str = "standard input", limits: Limits = DEF
 
 
 def read_raw(file: BinaryIO, shape: tuple[int, ...], name: str = "standard input") -> Iterator[FloatArray]:
-    """Read frames of 8 bits without a container, ``gray`` or ``rgb24`` in FFmpeg's words.
-
-    Parameters
-    ----------
-    file : binary file
-    shape : tuple of int
-        (H, W) or (H, W, 3).
-    name : str
-        Its name in messages.
-
-    Yields
-    ------
-    ndarray, float32, shape ``shape``
-
-    Raises
-    ------
-    DataError
-        There is no frame, or the last one is cut short.
-
-    Examples
-    --------
-    >>> import io
-    >>> [frame.ravel().tolist() for frame in read_raw(io.BytesIO(bytes([0, 255, 51, 0])), (1, 2))]
-    [[0.0, 1.0], [0.20000000298023224, 0.0]]
-    """
+    """Read frames of 8 bits without a container, ``gray`` or ``rgb24`` in FFmpeg's words."""
     size = int(np.prod(shape))
     number = 0
     while data := file.read(size):
@@ -158,28 +105,7 @@ def read_raw(file: BinaryIO, shape: tuple[int, ...], name: str = "standard input
 def write_raw(file: BinaryIO, frames: Iterable[FloatArray], name: str = "standard output") -> None:
     r"""Write frames of 8 bits without a container; see :func:`read_raw`.
 
-    Parameters
-    ----------
-    file : binary file
-    frames : iterable of ndarray, float32, shape (H, W) or (H, W, 3)
-        Intensities; values outside [0, 1] are clipped.
-    name : str
-        Its name in messages.
-
-    Raises
-    ------
-    DataError
-        No frames, or frames of two sizes.
-    StorageError
-        The file takes no more.
-
-    Examples
-    --------
-    >>> import io
-    >>> file = io.BytesIO()
-    >>> write_raw(file, [np.float32([[0, 0.2]])])
-    >>> file.getvalue()
-    b'\x003'
+    ``frames`` (H, W) or (H, W, 3) each.
     """
     for frame in frames_of_one_size(frames, name):
         data = from_unit(frame, 8).tobytes()

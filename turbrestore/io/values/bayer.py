@@ -10,21 +10,7 @@ from ..source import FrameSource
 
 
 def as_bayer(source: FrameSource, pattern: str) -> FrameSource:
-    """Take grey frames for mosaics of a Bayer sensor.
-
-    Raises
-    ------
-    ConfigurationError
-        The pattern is unknown.
-    DataError
-        The frames are coloured, or neither of 8 nor of 16 bits.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> as_bayer(FrameSource.from_array(np.zeros((5, 4, 6), np.uint8)), "rggb").shape
-    (5, 4, 6, 3)
-    """
+    """Take grey frames for mosaics of a Bayer sensor."""
     require(pattern in BAYER_CODES, f"bayer: expected one of {', '.join(BAYER_CODES)}, found {pattern!r}")
     if len(source.file_shape) != 3 or source.bit_depth > 16:
         kind = "floating point" if len(source.file_shape) == 3 else "colours"

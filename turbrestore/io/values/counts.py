@@ -54,13 +54,7 @@ class CountRange:
         return text + (", and the few values beyond, which stand alone, are clipped" if clipped else "")
 
     def unit(self, values: PixelArray) -> FloatArray:
-        """Bring numbers to intensities; NaN and infinite ones stay.
-
-        Examples
-        --------
-        >>> CountRange(-10, 90, -10, 4000).unit(np.array([-10, 40, 4000, np.inf]))
-        array([0. , 0.5, 1. , inf], dtype=float32)
-        """
+        """Bring numbers to intensities; NaN and infinite ones stay."""
         scaled = (values.astype(np.float64) - self.black) / (self.white - self.black)
         clipped = np.clip(scaled, 0, 1, where=np.isfinite(scaled), out=scaled)
         return clipped.astype(np.float32)
@@ -80,20 +74,6 @@ def range_of_counts(frames: Iterable[PixelArray], name: str, kind: str | None = 
     """Find the range of the numbers of all frames; None where they are intensities already.
 
     ``kind`` is that of the type in the file, by default that of the frames: integers are no intensities.
-
-    Raises
-    ------
-    DataError
-        No number is finite.
-
-    Examples
-    --------
-    >>> frames = np.tile(np.arange(-5.0, 95.0), (4, 3, 1))
-    >>> frames[1, 1, 50] = 60_000
-    >>> range_of_counts(frames, "a").remark.split(": ")[1]
-    '-5 is black, 94 is white, and the few values beyond, which stand alone, are clipped'
-    >>> range_of_counts(frames[:1] / 100 + 0.05, "a") is None
-    True
     """
     ends: list[tuple[float, float, float, float]] = []
     dtype: np.dtype[Any] = np.dtype(np.float32)
@@ -141,14 +121,7 @@ def _ends(frame: PixelArray) -> tuple[float, float, float, float]:
 def from_counts(source: FrameSource) -> FrameSource:
     """Scale the counts of a video by one range for all its frames; intensities stay as they are.
 
-    Every frame is read once.  What follows a damaged frame is scaled by the range of what comes before.
-
-    Examples
-    --------
-    >>> frame = np.full((4, 4), 7, np.int16)
-    >>> source = FrameSource("a", "array/int16", (2, 4, 4), 1, 16, lambda chosen: (frame for _ in chosen))
-    >>> float(from_counts(source).read().max()), from_counts(source).levels
-    (1.0, (0.0, 7.0))
+    Every frame is read once. What follows a damaged frame is scaled by the range of what comes before.
     """
     read = source.pixels
 

@@ -19,13 +19,6 @@ def in_order(files: Iterable[Path]) -> list[Path]:
 
     Digits after a dot are decimals if they differ in number and none ends in 0, as seconds are printed; those of a
     counter without leading zeros, ``part2.9`` and ``part2.10``, are not.
-
-    Examples
-    --------
-    >>> [path.name for path in in_order(map(Path, ["t1.5.png", "t1.25.png", "t10.125.png"]))]
-    ['t1.25.png', 't1.5.png', 't10.125.png']
-    >>> [path.name for path in in_order(map(Path, ["a2.10.png", "a2.9.png"]))]
-    ['a2.9.png', 'a2.10.png']
     """
     listed = list(files)
     digits = [match[2] for file in listed for match in _FRACTION.finditer(file.stem)]
@@ -43,12 +36,6 @@ def one_of_each_shot(files: Sequence[Path]) -> tuple[list[Path], tuple[str, ...]
     """Leave out files that hold the shot of another, such as JPEG beside DNG; say so in a remark.
 
     Of the kinds of files that every shot has, the one that keeps most is read.
-
-    Examples
-    --------
-    >>> files, remarks = one_of_each_shot([Path("a1.dng"), Path("a1.jpg"), Path("a2.dng"), Path("a2.jpg")])
-    >>> [path.name for path in files], remarks
-    (['a1.dng', 'a2.dng'], ('2 shots are there as .dng and .jpg: .dng is read',))
     """
     shots: dict[str, dict[str, Path]] = {}
     for file in files:

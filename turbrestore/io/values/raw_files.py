@@ -27,15 +27,6 @@ def read_raw_file(path: Path, limits: Limits = DEFAULT_LIMITS, like: Path | None
 
     The white balance is that of the camera, of the file ``like`` for the frames of one video: a camera that chooses it
     for every shot would make them differ.
-
-    Raises
-    ------
-    ConfigurationError
-        The package rawpy is not installed.
-    DataError
-        Not a raw file, damaged, or larger than the limits.
-    InputNotFoundError, StorageError
-        The file does not exist, or cannot be read.
     """
     rawpy = _rawpy(path)
     limits.check_bytes(check_input(path).st_size, str(path))

@@ -36,14 +36,7 @@ CURVES = {PQ: "PQ", HLG: "HLG"}
 
 
 def sdr_of(transfer: int) -> Callable[[PixelArray], PixelArray]:
-    """Return the function that turns HDR codes, RGB of 16 bits, into SDR codes of 16 bits.
-
-    Examples
-    --------
-    >>> grey = np.full((1, 1, 3), round(0.75 * 65535), np.uint16)
-    >>> round(float(sdr_of(HLG)(grey)[0, 0, 1]) / 65535, 2)
-    0.94
-    """
+    """Return the function that turns HDR codes, RGB of 16 bits, into SDR codes of 16 bits."""
     table = _light_of_codes(transfer)
 
     def converted(codes: PixelArray) -> PixelArray:
@@ -61,13 +54,7 @@ def sdr_of(transfer: int) -> Callable[[PixelArray], PixelArray]:
 
 
 def remark_on_curve(transfer: int, metadata: Mapping[str, str], kept: bool) -> tuple[str, ...]:
-    """Say how HDR is read, or that values are codes of a curve for grading.
-
-    Examples
-    --------
-    >>> remark_on_curve(BT709, {"encoder": "x", "gamma": "S-Log3"}, False)[0][:38]
-    'values are S-Log3, which looks flat; c'
-    """
+    """Say how HDR is read, or that values are codes of a curve for grading."""
     if transfer in CURVES:
         name = CURVES[transfer]
         if kept:

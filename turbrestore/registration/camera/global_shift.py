@@ -74,25 +74,7 @@ class ShiftReference:
 def prepare_shift_reference(image: ArrayLike) -> ShiftReference:
     """Prepare an image that the shifts of many frames are measured against.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        Intensities; colour is reduced to luminance.
-
-    Returns
-    -------
-    ShiftReference
-
-    Raises
-    ------
-    DataError
-        Wrong shape, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> prepare_shift_reference(np.zeros((480, 640))).reduced.shape
-    (120, 160)
+    ``image`` (H, W) or (H, W, 3).
     """
     checked = check_image(image)
     reduced = reduce_image(checked)
@@ -102,30 +84,7 @@ def prepare_shift_reference(image: ArrayLike) -> ShiftReference:
 def measure_shift(image: ArrayLike, reference: ShiftReference) -> Shift | None:
     """Shift of a frame against a reference.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W) or (H, W, 3)
-        The frame.
-    reference : ShiftReference
-        From :func:`prepare_shift_reference`.
-
-    Returns
-    -------
-    ndarray, float64, shape (2,), or None
-        (dx, dy) in pixels, zero if no shift explains the frame clearly better; None if the images are not alike with
-        any shift.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, or values are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> scene = np.random.default_rng(0).random((64, 80)).astype(np.float32)
-    >>> measure_shift(scene[3:51, 5:69], prepare_shift_reference(scene[8:56, 9:73])).round(1)
-    array([4., 5.])
+    ``image`` (H, W) or (H, W, 3); returns (2,).
     """
     checked = check_image(image)
     if checked.shape[:2] != reference.shape:
@@ -176,23 +135,7 @@ def global_shifts(frames: ArrayLike) -> Shift:
 def known_shifts(stack: FloatArray, threads: int = 0) -> tuple[Shift, NDArray[np.bool_]]:
     """Shifts of all frames against their mean position, and which of them were found.
 
-    Parameters
-    ----------
-    stack : ndarray, float32, shape (T, H, W) or (T, H, W, 3)
-    threads : int
-        Frames compared side by side; 0 means one for each available core.
-
-    Returns
-    -------
-    shifts : ndarray, float64, shape (T, 2)
-        Pixels.
-    known : ndarray, bool, shape (T,)
-
-    Examples
-    --------
-    >>> scene = np.random.default_rng(0).random((64, 100)).astype(np.float32)
-    >>> known_shifts(np.stack([scene[:, :64], scene[:, 4:68], np.zeros((64, 64), np.float32)]))[1].tolist()
-    [True, True, False]
+    ``stack`` (T, H, W) or (T, H, W, 3); returns ``shifts`` (T, 2), ``known`` (T,).
     """
     numbers = np.arange(len(stack))
     # The middle frame may itself show something else.
@@ -209,19 +152,7 @@ def known_shifts(stack: FloatArray, threads: int = 0) -> tuple[Shift, NDArray[np
 def reduce_image(image: FloatArray) -> FloatArray:
     """Reduce an image to its luminance with zero mean and unit deviation in a Gaussian window.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-
-    Returns
-    -------
-    ndarray, float32, shape (h, w)
-        At most 192 pixels a side.
-
-    Examples
-    --------
-    >>> reduce_image(np.zeros((480, 640), np.float32)).shape
-    (120, 160)
+    ``image`` (H, W) or (H, W, 3); returns (h, w).
     """
     height, width = image.shape[:2]
     factor = -(-max(height, width) // _LONGEST_SIDE)
@@ -234,24 +165,7 @@ def reduce_image(image: FloatArray) -> FloatArray:
 def frame_shift(image: FloatArray, start: FloatArray | None, reference: ShiftReference) -> FloatArray:
     """Shift of a frame in whole pixels, zero if it is so small that dense flow finds it.
 
-    Parameters
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        The frame.
-    start : ndarray, float32, shape (H, W, 2), or None
-        An earlier flow to the frame, pixels; if it moves as a whole, the shift is its median and is not measured again.
-    reference : ShiftReference
-
-    Returns
-    -------
-    ndarray, float32, shape (2,)
-        (dx, dy) in whole pixels.
-
-    Examples
-    --------
-    >>> scene = np.random.default_rng(0).random((64, 80)).astype(np.float32)
-    >>> frame_shift(scene[3:51, 5:69], None, prepare_shift_reference(scene[8:56, 9:73]))
-    array([4., 5.], dtype=float32)
+    ``image`` (H, W) or (H, W, 3); ``start`` (H, W, 2); returns (2,).
     """
     known = None if start is None else _common_shift(start)
     shift = measure_shift(image, reference) if known is None else known
@@ -263,22 +177,7 @@ def frame_shift(image: FloatArray, start: FloatArray | None, reference: ShiftRef
 def shift_frame(frame: Pixels, shift: ArrayLike, outside: Pixels) -> Pixels:
     """Frame moved onto the grid of the reference by whole pixels.
 
-    Parameters
-    ----------
-    frame : ndarray, shape (H, W)
-    shift : array_like, shape (2,)
-        Whole pixels (dx, dy).
-    outside : ndarray, shape (H, W)
-        Supplies the pixels that the frame does not show.
-
-    Returns
-    -------
-    ndarray, shape (H, W)
-
-    Examples
-    --------
-    >>> shift_frame(np.array([[1, 2, 3]]), (1, 0), np.array([[7, 8, 9]]))
-    array([[2, 3, 9]])
+    ``frame`` (H, W); ``shift`` (2,); ``outside`` (H, W); returns (H, W).
     """
     to, origin = overlap(frame.shape, shift)
     result = outside.copy()
@@ -289,22 +188,7 @@ def shift_frame(frame: Pixels, shift: ArrayLike, outside: Pixels) -> Pixels:
 def overlap(shape: tuple[int, ...], shift: ArrayLike) -> tuple[Slices, Slices]:
     """Where a reference and a frame that is shifted by whole pixels overlap.
 
-    Parameters
-    ----------
-    shape : tuple of int
-        (H, W) of both.
-    shift : array_like, shape (2,)
-        Whole pixels (dx, dy), ``reference(x, y) = frame(x + dx, y + dy)``.
-
-    Returns
-    -------
-    reference, frame : tuple of slice
-        Rows and columns in each; empty where they have nothing in common.
-
-    Examples
-    --------
-    >>> overlap((4, 8), (3, -1))
-    ((slice(1, 4, None), slice(0, 5, None)), (slice(0, 3, None), slice(3, 8, None)))
+    ``shift`` (2,).
     """
     dx, dy = (int(step) for step in np.asarray(shift))
     pairs = [_overlap_of_axis(length, step) for length, step in ((shape[0], dy), (shape[1], dx))]
@@ -314,20 +198,7 @@ def overlap(shape: tuple[int, ...], shift: ArrayLike) -> tuple[Slices, Slices]:
 def correlation(a: FloatArray, b: FloatArray) -> float:
     """Correlate two images.
 
-    Parameters
-    ----------
-    a, b : ndarray, float32, shape (H, W)
-
-    Returns
-    -------
-    float
-        From −1 to 1; 0 if one of them is blank.
-
-    Examples
-    --------
-    >>> ramp = np.arange(6, dtype=np.float32).reshape(2, 3)
-    >>> correlation(ramp, 5 - ramp), correlation(ramp, 0 * ramp)
-    (-1.0, 0.0)
+    ``a, b`` (H, W).
     """
     a, b = a - a.mean(), b - b.mean()
     energy = float(np.vdot(a, a)) * float(np.vdot(b, b))

@@ -38,29 +38,7 @@ def mean_stabilised(frames: ArrayLike, threads: int = 0) -> FloatArray:
 
     If all frames lie within two pixels of it they are averaged as they are; otherwise frames whose position is unknown
     are left out.
-
-    Parameters
-    ----------
-    frames : array_like, shape (T, H, W) or (T, H, W, 3)
-        Frames of one scene.
-    threads : int
-        Frames compared side by side; 0 means one for each available core.
-
-    Returns
-    -------
-    ndarray, float32, shape (H, W) or (H, W, 3)
-
-    Raises
-    ------
-    DataError
-        Wrong shape, or values are not finite.
-
-    Examples
-    --------
-    >>> scene = np.random.default_rng(0).random((64, 100)).astype(np.float32)
-    >>> mean = mean_stabilised(np.stack([scene[:, k : k + 64] for k in (0, 10, 20)]))
-    >>> bool(np.allclose(mean, scene[:, 10:74]))
-    True
+    ``frames`` (T, H, W) or (T, H, W, 3); returns (H, W) or (H, W, 3).
     """
     stack = check_frames(frames)
     mean = mean_of(stack)
