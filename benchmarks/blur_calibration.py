@@ -25,7 +25,8 @@ from blur_clips import Case, cases, make_clip
 from scipy import fft
 
 from turbrestore.blind.remove_blur import remove_blur, remove_blur_steps
-from turbrestore.blur.posterior import _shapes, measure_witnesses
+from turbrestore.blur.hypotheses import shapes
+from turbrestore.blur.posterior import BlurWitnesses, measure_witnesses
 from turbrestore.blur.spectral_variation import RINGS, SIDE
 from turbrestore.core.arrays import FloatArray
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
@@ -87,9 +88,9 @@ def measure_case(folder: Path, case: Case) -> Figures:
     frames, flows, image = held["frames"].astype(np.float32) / 255, held["flows"].astype(np.float32), held["filtered"]
     seeing = float(held["seeing"].squeeze())
     moved = float(np.mean(np.square(flows))) if np.isnan(seeing) else seeing
-    witnesses = measure_witnesses(frames, flows, moved, float(len(frames)))
+    witnesses = measure_witnesses(frames, flows, BlurWitnesses(moved, float(len(frames))))
     truth = held["truth"] if case.kind == "quiet" else registered(held["truth"], image)
-    (width,), (exponent,) = _shapes(transfer_function(image, truth)[None])
+    (width,), (exponent,) = shapes(transfer_function(image, truth)[None])
     results = {
         "alone": remove_blur(image, image),
         "posterior": finish(remove_blur_steps(image, image, witnesses=witnesses)),

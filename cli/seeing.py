@@ -8,14 +8,13 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from turbrestore.core.errors import ConfigurationError
 from turbrestore.memory_plan import frames_in_memory, training_share
 from turbrestore.preparation import prepare, seeing_of_picture
 from turbrestore.registration.centroid import CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams
 from turbrestore.runtime.steps import finish, step_counter
 from turbrestore.seeing.strength import Seeing
-from turbrestore.seeing.tilt_theory import Optics
+from turbrestore.seeing.tilt_theory import Optics, known_optics
 from turbrestore.wording import interval_words
 
 from .inputs import open_input
@@ -69,7 +68,7 @@ def seeing(
     flow : FlowParams
         Optical flow.
     """
-    optics = _optics(pixel_scale, aperture, wavelength, distance, path)
+    optics = known_optics(pixel_scale, aperture, wavelength, distance, path)
     source = open_input(input, selection, quiet)
     runtime = machine.runtime()
     most = min(len(source), frames_in_memory(source.shape[1:]))
@@ -91,21 +90,6 @@ def _missing(optics: Optics | None) -> list[str]:
     if optics is None:
         return [f"{'D/r0, r0':<26}need --pixel-scale and --aperture", f"{'Cn²':<26}needs --distance as well"]
     return [f"{'Cn²':<26}needs --distance"] if optics.distance is None else []
-
-
-def _optics(
-    pixel_scale: float | None,
-    aperture: float | None,
-    wavelength: float,
-    distance: float | None,
-    path: Literal["spherical", "plane"],
-) -> Optics | None:
-    if pixel_scale is None and aperture is None and distance is None:
-        return None
-    if pixel_scale is None or aperture is None:
-        missing = "--pixel-scale" if pixel_scale is None else "--aperture"
-        raise ConfigurationError(f"{missing}: expected it for r0, which needs the angle of a pixel and the aperture")
-    return Optics(pixel_scale, aperture, wavelength, distance, path)
 
 
 def _lines(seeing: Seeing) -> list[str]:

@@ -17,6 +17,7 @@ from .footage.frame_selection import Share, check_share
 from .registration.centroid import CentroidParams
 from .registration.flow import FlowParams
 from .registration.opencv_flow import DisParams
+from .seeing.tilt_theory import Optics, known_optics
 
 STAGES = ("centroid", "identify", "filter", "deconvolve")
 BORDERS = ("keep", "crop")
@@ -45,6 +46,15 @@ class RestoreParams:
         What stands in the frame while the scene moves (a field stop, a reticle, a clock) is replaced by the scene
         behind it: auto finds it, off leaves it, and else it is the path of an image that is not black there.  What
         passes through the scene is replaced too, unless it is off.
+    pixel_scale : float, optional
+        Angle of a pixel, rad.  With it and the aperture the blur by the air and by diffraction is better known, and the
+        seeing is reported as D/r0 and r0.
+    aperture : float, optional
+        Diameter of the aperture, m.
+    distance : float, optional
+        From the aperture to the scene, m.  With it Cn² is reported too, and D/r0 is much better known.
+    wavelength : float
+        m.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -74,6 +84,10 @@ class RestoreParams:
     keep_best: Share = _ALL
     border: Literal["keep", "crop"] = "keep"
     static_mask: str = "auto"
+    pixel_scale: float | None = None
+    aperture: float | None = None
+    distance: float | None = None
+    wavelength: float = 550e-9
     flow: FlowParams = field(default_factory=FlowParams)
     centroid: CentroidParams = field(default_factory=CentroidParams)
     dynamics: DynamicsParams = field(default_factory=DynamicsParams)
@@ -94,10 +108,16 @@ class RestoreParams:
             f"static_mask: expected auto, off or an image file, found {self.static_mask!r}",
         )
         check_share(self.keep_best)
+        known_optics(self.pixel_scale, self.aperture, self.wavelength, self.distance)
         require(
             self.keep_best == 1 or self.until in STAGES[2:],
             f"keep_best: has no effect with until = {self.until}; leave one of them out",
         )
+
+    @property
+    def optics(self) -> Optics | None:
+        """Camera and path of the clip, None if they are not known."""
+        return known_optics(self.pixel_scale, self.aperture, self.wavelength, self.distance)
 
     def runs(self, stage: str) -> bool:
         """Tell whether a stage is run.

@@ -8,15 +8,10 @@ import pytest
 
 from turbrestore.blind.decisions import explain_posterior
 from turbrestore.blind.remove_blur import remove_blur_steps
+from turbrestore.blur.hypotheses import hypotheses, shapes
 from turbrestore.blur.image_evidence import image_evidence
-from turbrestore.blur.posterior import (
-    _EXCLUDED,
-    BlurWitnesses,
-    _hypotheses,
-    _shapes,
-    blur_posterior,
-    measure_witnesses,
-)
+from turbrestore.blur.likelihoods import EXCLUDED
+from turbrestore.blur.posterior import BlurWitnesses, blur_posterior, measure_witnesses
 from turbrestore.blur.psf import half_frequency, radial_otf
 from turbrestore.blur.short_exposure import displacement_variance, short_exposures
 from turbrestore.blur.spectral_variation import RINGS, SpectralVariation
@@ -42,8 +37,8 @@ def expected_variation(strength, diffraction):
 def test_theory_leads_back_to_its_blur(strength, diffraction):
     variation, mean = expected_variation(strength, diffraction)
     variance = float(displacement_variance(np.array(strength), np.array(diffraction)))
-    (true,), _ = _shapes(mean[None])
-    found = blur_posterior(None, BlurWitnesses(variation, variance, 40.0))
+    (true,), _ = shapes(mean[None])
+    found = blur_posterior(None, BlurWitnesses(variance, 40.0, variation=variation))
     low, middle, high = found.width
     assert low / 1.1 < true < high * 1.1 and low < middle < high
     assert abs(middle / true - 1) < 0.4
@@ -52,9 +47,21 @@ def test_theory_leads_back_to_its_blur(strength, diffraction):
 
 def test_shapes_of_power_laws_are_found():
     for sigma, exponent in ((0.9, 2.0), (1.5, 1.2), (2.5, 1.6)):
-        (width,), (shape,) = _shapes(radial_otf(RINGS, sigma, exponent)[None])
+        (width,), (shape,) = shapes(radial_otf(RINGS, sigma, exponent)[None])
         assert width == pytest.approx(sigma, rel=0.02) and shape == pytest.approx(exponent, abs=0.05)
     assert half_frequency(width) < 0.5
+
+
+def test_known_optics_narrow_the_blur():
+    strength, diffraction = 2.5, 2.0
+    variation, mean = expected_variation(strength, diffraction)
+    (true,), _ = shapes(mean[None])
+    variance = float(displacement_variance(np.array(strength), np.array(diffraction)))
+    unknown = BlurWitnesses(variance, 40.0, variation=variation)
+    known = replace(unknown, diffraction=diffraction, spread=0.2)
+    before, after = (blur_posterior(None, one).width for one in (unknown, known))
+    assert after[2] / after[0] < 0.7 * before[2] / before[0]
+    assert after[1] == pytest.approx(true, rel=0.15)
 
 
 def still_clip(scene, count=12, noise=0.004):
@@ -65,7 +72,7 @@ def still_clip(scene, count=12, noise=0.004):
 def test_nothing_is_removed_from_a_sharp_clip_that_stands_still():
     frames, flows = still_clip(SCENES["camera"](128, 128))
     image = frames.mean(axis=0)
-    witnesses = measure_witnesses(frames, flows, 0.0, 12.0)
+    witnesses = measure_witnesses(frames, flows, BlurWitnesses(0.0, 12.0))
     result = finish(remove_blur_steps(image, image, witnesses=witnesses))
     assert result.deconvolution.sigma == 0 and result.posterior.removed == 0
     np.testing.assert_array_equal(result.deconvolution.image, np.clip(image, 0, 1))
@@ -75,7 +82,7 @@ def test_nothing_is_removed_from_a_sharp_clip_that_stands_still():
 def test_a_lens_is_told_from_the_air():
     frames, flows = still_clip(cv2.GaussianBlur(SCENES["camera"](128, 128), (0, 0), 2.0))
     image = frames.mean(axis=0)
-    witnesses = measure_witnesses(frames, flows, 0.0, 12.0)
+    witnesses = measure_witnesses(frames, flows, BlurWitnesses(0.0, 12.0))
     found = blur_posterior(image_evidence(image), witnesses, witnesses.variation.with_power(image))
     assert found.air < 0.2 and found.width[1] == pytest.approx(2.0, rel=0.25)
     assert 0 < found.removed < 2.2 and found.exponent > 1.8
@@ -85,7 +92,7 @@ def test_a_lens_is_told_from_the_air():
 def test_a_wide_blur_that_stands_still_is_found(sigma):
     frames, flows = still_clip(cv2.GaussianBlur(SCENES["camera"](256, 256), (0, 0), sigma))
     image = frames.mean(axis=0)
-    witnesses = measure_witnesses(frames, flows, 0.0, 12.0)
+    witnesses = measure_witnesses(frames, flows, BlurWitnesses(0.0, 12.0))
     found = blur_posterior(image_evidence(image), witnesses, witnesses.variation.with_power(image))
     assert found.width[1] == pytest.approx(sigma, rel=0.3) and 0.4 * sigma < found.removed < 1.2 * sigma
 
@@ -94,18 +101,18 @@ def test_one_wrong_witness_is_outvoted():
     variation, _ = expected_variation(2.5, 2.0)
     frames, _ = still_clip(SCENES["words"](128, 128))
     sharp = image_evidence(frames.mean(axis=0))
-    still = BlurWitnesses(variation, 0.0, 40.0)
+    still = BlurWitnesses(0.0, 40.0, variation=variation)
     assert blur_posterior(sharp, still).width[1] < blur_posterior(None, still).width[1]
-    assert _EXCLUDED[0] < _EXCLUDED[1] < _EXCLUDED[2] < _EXCLUDED[0] + _EXCLUDED[1]
+    assert EXCLUDED[0] < EXCLUDED[1] < EXCLUDED[2] < EXCLUDED[0] + EXCLUDED[1]
     moving = replace(still, displacement=float(displacement_variance(np.array(2.5), np.array(2.0))))
     assert blur_posterior(sharp, moving).width[1] > 1
 
 
 def test_weights_and_quantiles_are_in_order():
     variation, _ = expected_variation(2.0, 1.5)
-    known = _hypotheses()
+    known = hypotheses()
     assert np.exp(known.prior).sum() == pytest.approx(1)
-    found = blur_posterior(None, BlurWitnesses(variation, 0.7, 30.0))
+    found = blur_posterior(None, BlurWitnesses(0.7, 30.0, variation=variation))
     assert (found.lowest <= found.highest).all() and found.transfer[0] == pytest.approx(1)
     assert np.isnan(found.by_image).all()
     for quantiles in (found.width, found.by_displacement, found.by_variation):

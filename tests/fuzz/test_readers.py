@@ -53,7 +53,7 @@ def make_results():
         "filtered": filter_frames(CLIP, CLIP[0], dynamics, FAST),
         "deconvolution": deconvolve(CLIP[0], 1.0, DeconvolutionParams(method="tv", iterations=5)),
         "blur": BlurEstimate(1.0, 0.1, 5 / 3, 0.01, 1, 9.0, np.arange(3.0), np.ones(3)),
-        "posterior": blur_posterior(None, BlurWitnesses(None, 1.0, 9.0)),
+        "posterior": blur_posterior(None, BlurWitnesses(1.0, 9.0)),
     }
 
 

@@ -180,4 +180,4 @@ def test_the_command_prints_every_value_with_its_interval(clip, tmp_path, capsys
     assert run_command(words) == 0
     assert "d over r0" in capsys.readouterr().out
     assert run_command(["seeing", str(video), "--aperture=0.1", "--quiet"]) == 2
-    assert "--pixel-scale" in capsys.readouterr().err
+    assert "--aperture: expected the angle of a pixel as well" in capsys.readouterr().err

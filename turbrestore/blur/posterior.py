@@ -37,52 +37,36 @@ Constants of the likelihoods were set on simulated clips; ``benchmarks/results/b
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
-from .image_evidence import EXPONENTS, ImageEvidence
-from .psf import half_frequency
-from .short_exposure import TILT_SPREAD, displacement_variance, short_exposures
+from .hypotheses import LEAST_TRANSFER, Hypotheses, hypotheses, shapes
+from .image_evidence import ImageEvidence
+from .likelihoods import (
+    EXCLUDED,
+    SHARE_PRIOR,
+    SHIFT_PRIOR,
+    clear_rings,
+    displacement_likelihood,
+    expected,
+    image_likelihood,
+    variation_likelihood,
+)
 from .spectral_variation import RINGS, SpectralVariation, measure_variation
 
 Float64Array = NDArray[np.float64]
 
-# Hypotheses: D/r0, λ/D and σ_l.
-_STRENGTHS = np.geomspace(0.5, 7, 11)
-_DIFFRACTIONS = np.geomspace(0.35, 4.5, 11)
-_LENSES = np.array([0.2, 0.35, 0.5, 0.7, 0.9, 1.1, 1.35, 1.6, 1.9, 2.3, 2.8, 3.4, 4.2, 5.2, 6.5, 8.0, 10.0])
-# Prior: usual λ/D and the standard deviation of its logarithm; share of air that does not blur; weights of the σ_l.
-_USUAL_DIFFRACTION, _DIFFRACTION_SPREAD, _NO_BLUR = 1.4, 0.6, 0.05
-_LENS_PRIOR = np.array([22, 16, 12, 7, 7, 6, 6, 6, 5, 4.5, 4, 3, 1.5, 1, 0.7, 0.5, 0.3])
-# Range of ln V of air that does not blur, V below which a scene stands still, and the least V, squared pixels.
-_RANGE_OF_V, _STILL, _LEAST_V = 7.0, 0.03, 1e-3
-# g and τ: values, and mean and standard deviation of the logarithm.
-_SHARES, _SHARE_PRIOR = np.exp([-2.2, -1.6, -1.1, -0.7, -0.3]), (-1.1, 0.5)
-_SHIFTS, _SHIFT_PRIOR = np.array([0.04, 0.1, 0.2, 0.3, 0.45]), (float(np.log(0.12)), 0.7)
-# Factors of the stretch and of the shift in s and in s_4; errors of s and s_4 by that of the noise, in units of
-# noise over signal; model error, relative and absolute; weight of a ring, as neighbouring rings are not independent.
-_STRETCH, _SHIFT, _NOISE_ERROR = (0.8, 1.36), (1.0, 0.25), (0.15, 0.3)
-_MODEL_ERROR, _LEAST_ERROR, _RING_WEIGHT = 0.3, 1e-3, 0.35
-# Rings that count, as long as the signal exceeds the noise by this factor.
-_FIRST_RING, _LAST_RING, _CLEAR = 2, 25, 2.0
-# κ_m; softness of scenes, pixels, with weights.
-_GRADIENTS = 40.0
-_SOFTNESS = ((0.25, 0.36), (0.5, 0.35), (0.8, 0.2), (1.15, 0.07), (1.6, 0.02))
-# The most that displacement, variation and image count against a hypothesis, as logarithms: the model of a witness may
-# not hold.  Together the two witnesses of the frames outvote the image; alone, the image outvotes either.
-_EXCLUDED = (6.0, 8.0, 10.0)
 # Fidelity of the Wiener filter and exponent of the power of a scene; factors on the width that are tried.
 _FIDELITY, _SCENE = 1500.0, 2.2
 # Share of the energy of the scene that is lost whatever is removed.
 _LEAST_LOSS = 1e-3
 _FACTORS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
-# Widths below this are those of the pixels and of the interpolation, and are not removed, pixels.
-_LEAST_REMOVED = 0.5
-_LEAST_TRANSFER = 1e-5
+# Static widths below this are those of the pixels and of the interpolation, and are not removed, pixels; and the least
+# width that is removed where the air has blurred with this probability.
+_LEAST_REMOVED, _LEAST_BY_AIR, _SURELY = 0.5, 0.2, 0.8
 # Widest blur of frames that are not reduced, pixels, and the factors of the others.
 _WIDEST, _REDUCTIONS = 3.0, (2, 4)
 # Widths that are reported.
@@ -93,13 +77,16 @@ _QUANTILES = (0.16, 0.5, 0.84)
 class BlurWitnesses:
     """What the frames say about their blur: s and s_4, if they could be measured, V, and how many are independent.
 
-    ``picture`` is the part of the image that the frames show, without bars.
+    ``picture`` is the part of the image that the frames show, without bars.  Of known optics, ``diffraction`` is λ/D in
+    pixels, and ``spread`` the standard deviation of ln V if V is what a measured D/r0 makes.
     """
 
-    variation: SpectralVariation | None
     displacement: float
     frames: float
     picture: tuple[slice, slice] | None = None
+    variation: SpectralVariation | None = None
+    diffraction: float | None = None
+    spread: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,36 +135,19 @@ class BlurPosterior:
     expected_power_variation: Float64Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Hypotheses:
-    """Transfer functions (a, l, rings) of airs and lenses, with their widths and exponents (a, l).
-
-    The last air does not blur.  ``amplitude`` and ``power`` are s and s_4 (a, rings), ``prior`` is the logarithm of the
-    prior (a, l), and ``expected_v`` is V (a − 1).
-    """
-
-    transfer: Float64Array
-    width: Float64Array
-    exponent: Float64Array
-    amplitude: Float64Array
-    power: Float64Array
-    prior: Float64Array
-    expected_v: Float64Array
-
-
-def measure_witnesses(frames: FloatArray, flows: FloatArray, displacement: float, independent: float) -> BlurWitnesses:
-    """Measure what frames (T, H, W[, 3]) say that are registered by flows (T, H, W, 2), pixels.
+def measure_witnesses(frames: FloatArray, flows: FloatArray, known: BlurWitnesses) -> BlurWitnesses:
+    """Add to what is known what frames (T, H, W[, 3]) say that are registered by flows (T, H, W, 2), pixels.
 
     Windows of 64 pixels resolve blurs of up to three pixels; for wider ones, frames are reduced.
     """
-    witnesses = BlurWitnesses(measure_variation(frames, flows), displacement, independent)
+    witnesses = replace(known, variation=measure_variation(frames, flows))
     for reduction in _REDUCTIONS:
         if blur_posterior(None, witnesses).width[1] <= _WIDEST * reduction / 2:
             break
         reduced = measure_variation(frames, flows, reduction)
         if reduced is None:
             break
-        witnesses = BlurWitnesses(reduced, displacement, independent)
+        witnesses = replace(witnesses, variation=reduced)
     return witnesses
 
 
@@ -188,13 +158,15 @@ def blur_posterior(
 
     Everything is counted in the pixels of the reduced frames, and the result in those of the image.
     """
-    known, variation = _hypotheses(), witnesses.variation
+    variation, diffraction = witnesses.variation, witnesses.diffraction
     scale = 1 if variation is None else variation.reduction
-    of_v = _displacement_likelihood(witnesses.displacement, witnesses.frames, scale)[:, None] + 0 * known.width
-    of_s = 0 * known.width if variation is None else _variation_likelihood(variation)
-    of_v, of_s = (np.maximum(one, one.max() - most) for one, most in ((of_v, _EXCLUDED[0]), (of_s, _EXCLUDED[1])))
+    known = hypotheses(None if diffraction is None else diffraction / scale)
+    of_v = displacement_likelihood(known, witnesses.displacement, witnesses.frames, scale, witnesses.spread)[:, None]
+    of_v = of_v + 0 * known.width
+    of_s = 0 * known.width if variation is None else variation_likelihood(known, variation)
+    of_v, of_s = (np.maximum(one, one.max() - most) for one, most in ((of_v, EXCLUDED[0]), (of_s, EXCLUDED[1])))
     kappa = _sharper(known, _normalised(known.prior + of_v + of_s), ratio)
-    of_image = 0 * known.width if evidence is None else _image_likelihood(evidence, kappa, scale)
+    of_image = 0 * known.width if evidence is None else image_likelihood(known, evidence, kappa, scale)
     weights = _normalised(known.prior + of_v + of_s + of_image)
     kappa = _sharper(known, weights, ratio)
 
@@ -204,141 +176,35 @@ def blur_posterior(
         return _quantiles(kappa * scale * known.width, _normalised(known.prior + likelihood))
 
     curves = np.array([np.interp(RINGS * kappa, RINGS, curve) for curve in known.transfer.reshape(-1, len(RINGS))])
-    mean = np.exp(weights.ravel() @ np.log(np.maximum(curves, _LEAST_TRANSFER)))
+    mean = np.exp(weights.ravel() @ np.log(np.maximum(curves, LEAST_TRANSFER)))
     width, exponent = _least_loss(curves, weights.ravel(), mean, scale)
     by_image, whole = quantiles(of_image), _quantiles(kappa * scale * known.width, weights)
     width = _less_if_contradicted(width * scale, float(by_image[2]), float(whole[0]))
     low, high = _curve_quantiles(curves, weights.ravel())
+    air = float(1 - weights[-1].sum())
     return BlurPosterior(
-        removed=width if width >= _LEAST_REMOVED else 0.0,
+        removed=width if width >= (_LEAST_BY_AIR if air > _SURELY else _LEAST_REMOVED) else 0.0,
         exponent=exponent,
         width=whole,
         by_displacement=quantiles(of_v),
         by_variation=quantiles(of_s),
         by_image=by_image,
-        air=float(1 - weights[-1].sum()),
+        air=air,
         edge_limited=False,
         frequencies=RINGS / scale,
         transfer=mean,
         lowest=low,
         highest=high,
-        **_measured_and_expected(variation, weights),
+        **_measured_and_expected(known, variation, weights),
     )
 
 
-@functools.cache
-def _hypotheses() -> _Hypotheses:
-    mean, amplitude, power = short_exposures(_STRENGTHS, _DIFFRACTIONS, RINGS)
-    count = len(_STRENGTHS) * len(_DIFFRACTIONS)
-
-    def with_none(values: Float64Array, none: float) -> Float64Array:
-        return np.concatenate([values.reshape(count, -1), np.full((1, len(RINGS)), none)])
-
-    lens = np.exp(-2 * (np.pi * _LENSES[:, None] * RINGS) ** 2)
-    transfer = with_none(mean, 1.0)[:, None] * lens
-    width, exponent = _shapes(transfer)
-    usual = np.exp(-0.5 * (np.log(_DIFFRACTIONS / _USUAL_DIFFRACTION) / _DIFFRACTION_SPREAD) ** 2)
-    air = np.tile((1 - _NO_BLUR) / len(_STRENGTHS) * usual / usual.sum(), len(_STRENGTHS))
-    prior = np.append(air, _NO_BLUR)[:, None] * (_LENS_PRIOR / _LENS_PRIOR.sum())
-    expected = displacement_variance(_STRENGTHS[:, None], _DIFFRACTIONS).ravel()
-    return _Hypotheses(
-        transfer, width, exponent, with_none(amplitude, 0.0), with_none(power, 0.0), np.log(prior), expected
-    )
-
-
-def _shapes(transfer: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Width and exponent of transfer functions (..., rings), by their half frequency and a line through ln(−ln H)."""
-    depth = -np.log(np.clip(transfer, _LEAST_TRANSFER, 1 - 1e-9)) / np.log(2)
-    below = depth >= 1
-    # A blur of less than a pixel has no half frequency below that of the grid; it is close to a Gaussian.
-    last = np.where(below.any(axis=-1), below.argmax(axis=-1), len(RINGS) - 1)
-    last = np.maximum(last, 1)
-    high = np.take_along_axis(depth, last[..., None], -1)[..., 0]
-    low = np.take_along_axis(depth, np.maximum(last - 1, 1)[..., None], -1)[..., 0]
-    apart = np.maximum(np.log(last / np.maximum(last - 1, 1)), 1e-9)
-    slope = np.clip(np.log(high / low) / apart, 0.8, 2.5)
-    slope = np.where((last > 1) & below.any(axis=-1), slope, 2.0)
-    half = RINGS[last] * high ** (-1 / slope)
-    usable = (transfer > 0.08) & (transfer < 0.93) & (RINGS > 0)
-    x = np.log(np.maximum(RINGS, RINGS[1]) / half[..., None])
-    fit = (usable * x * np.log(depth)).sum(axis=-1) / np.maximum((usable * x * x).sum(axis=-1), 1e-9)
-    exponent = np.where(usable.sum(axis=-1) >= 2, np.clip(fit, 1.1, 2.0), 2.0)
-    return half_frequency(1.0) / half, exponent
-
-
-def _displacement_likelihood(variance: float, frames: float, scale: int) -> Float64Array:
-    """Log likelihood of V, in pixels of the image, for every air in reduced pixels; 0 where V is not known."""
-    known = _hypotheses()
-    if not np.isfinite(variance):
-        return np.zeros(len(known.prior))
-    still, measured = variance < _STILL, max(variance, _LEAST_V) / scale**2
-    spread = np.hypot(TILT_SPREAD, 1.4 / max(frames, 1.0) ** 0.5)
-    of_air = -0.5 * (np.log(measured / known.expected_v) / spread) ** 2 - np.log(spread * np.sqrt(2 * np.pi))
-    return np.append(of_air, np.log(0.5 * still + 0.5 / _RANGE_OF_V))
-
-
-def _variation_likelihood(measured: SpectralVariation) -> Float64Array:
-    """Log likelihood of s and s_4 for every hypothesis, mean over g and τ."""
-    known, rings = _hypotheses(), _clear_rings(measured)
-    if len(rings) < 2:
-        return 0 * known.width
-    shares, shifts = (
-        -0.5 * ((np.log(values) - middle) / spread) ** 2
-        for values, (middle, spread) in ((_SHARES, _SHARE_PRIOR), (_SHIFTS, _SHIFT_PRIOR))
-    )
-    total = np.full(known.width.shape, -np.inf)
-    for share, of_share in zip(_SHARES, shares, strict=True):
-        for shift, of_shift in zip(_SHIFTS, shifts, strict=True):
-            likelihood = np.full(known.width.shape, of_share + of_shift)
-            for kind, (found, error) in enumerate(
-                ((measured.amplitude, measured.amplitude_error), (measured.power, measured.power_error))
-            ):
-                expected = _expected(kind, rings, share, shift, measured.stretch)
-                noise = (_NOISE_ERROR[kind] / measured.signal[rings]) ** 2
-                variance = error[rings] ** 2 + noise + (_MODEL_ERROR * expected) ** 2 + _LEAST_ERROR**2
-                misfit = (found[rings] - expected) ** 2 / variance + np.log(variance)
-                likelihood -= _RING_WEIGHT / 2 * misfit.sum(axis=-1)
-            total = np.logaddexp(total, likelihood)
-    return total
-
-
-def _expected(kind: int, rings: NDArray[np.int_], share: float, shift: float, stretch: float) -> Float64Array:
-    """Return s (kind 0) or s_4 (kind 1) of every hypothesis in some rings."""
-    known = _hypotheses()
-    air = (known.amplitude, known.power)[kind][:, None, rings]
-    stretched = _STRETCH[kind] * stretch**2 * np.log(np.maximum(known.transfer[..., rings], 1e-4)) ** 2
-    return share * air + stretched + _SHIFT[kind] * np.expm1((2 * np.pi * shift * RINGS[rings]) ** 2)
-
-
-def _clear_rings(measured: SpectralVariation) -> NDArray[np.int_]:
-    clear = measured.signal > _CLEAR
-    lost = np.flatnonzero(~clear[_FIRST_RING:])
-    end = _FIRST_RING + lost[0] if len(lost) else len(RINGS)
-    return np.arange(_FIRST_RING, min(end, _LAST_RING))
-
-
-def _image_likelihood(evidence: ImageEvidence, kappa: float, scale: int) -> Float64Array:
-    """Log likelihood of the image for every hypothesis, mean over the softness of the scene."""
-    known = _hypotheses()
-    curves = -np.minimum(_GRADIENTS * (evidence.costs - evidence.costs.min()), _EXCLUDED[2])
-    place = np.interp(known.exponent, EXPONENTS, np.arange(len(EXPONENTS)))
-    low = np.minimum(place.astype(int), len(EXPONENTS) - 2)
-    share, logs = place - low, np.log(evidence.widths)
-    total = np.full(known.width.shape, -np.inf)
-    for softness, weight in _SOFTNESS:
-        seen = np.log(np.hypot(kappa * scale * known.width, softness))
-        by_shape = np.array([np.interp(seen, logs, curve, right=-_EXCLUDED[2]) for curve in curves])
-        below, above = (np.take_along_axis(by_shape, (low + step)[None], 0)[0] for step in (0, 1))
-        total = np.logaddexp(total, np.log(weight) + (1 - share) * below + share * above)
-    return total
-
-
-def _sharper(known: _Hypotheses, weights: Float64Array, ratio: Float64Array | None) -> float:
+def _sharper(known: Hypotheses, weights: Float64Array, ratio: Float64Array | None) -> float:
     """κ, by the half frequencies of the mean transfer function with and without the ratio of the spectra."""
     if ratio is None:
         return 1.0
-    mean = np.exp(np.tensordot(weights, np.log(np.maximum(known.transfer, _LEAST_TRANSFER))))
-    (before, after), _ = _shapes(np.clip(np.stack([mean, mean * ratio]), _LEAST_TRANSFER, 1 - 1e-9))
+    mean = np.exp(np.tensordot(weights, np.log(np.maximum(known.transfer, LEAST_TRANSFER))))
+    (before, after), _ = shapes(np.clip(np.stack([mean, mean * ratio]), LEAST_TRANSFER, 1 - 1e-9))
     # Blurs of less than a pixel are not resolved by the ratio.
     return float(np.clip(after / before, 0.6, 1.1)) if mean[-1] < 0.5 and (mean * ratio)[-1] < 0.5 else 1.0
 
@@ -347,7 +213,7 @@ def _least_loss(curves: Float64Array, weights: Float64Array, mean: Float64Array,
     """Width and exponent of the blur whose removal loses least on average, width 0 if removing none does."""
     noise = (2 * np.pi * RINGS / scale) ** 2 / _FIDELITY
     scene = np.append(0.0, RINGS[1:] ** (1 - _SCENE))
-    (width,), (exponent,) = _shapes(mean[None])
+    (width,), (exponent,) = shapes(mean[None])
 
     def loss(wiener: Float64Array | float) -> float:
         left = (scene * (wiener * curves - 1) ** 2).sum(axis=1)
@@ -382,19 +248,21 @@ def _curve_quantiles(curves: Float64Array, weights: Float64Array) -> tuple[Float
     return low, high
 
 
-def _measured_and_expected(measured: SpectralVariation | None, weights: Float64Array) -> dict[str, Float64Array]:
+def _measured_and_expected(
+    known: Hypotheses, measured: SpectralVariation | None, weights: Float64Array
+) -> dict[str, Float64Array]:
     """Return s and s_4 as measured and as the posterior expects them, for the usual g and τ."""
     gaps = np.full(len(RINGS), np.nan)
     names = ("variation", "power_variation")
     found = {key: gaps for name in names for key in (name, f"{name}_error", f"expected_{name}")}
     if measured is None:
         return found
-    rings = _clear_rings(measured)
-    share, shift = float(np.exp(_SHARE_PRIOR[0])), float(np.exp(_SHIFT_PRIOR[0]))
+    rings = clear_rings(measured)
+    share, shift = float(np.exp(SHARE_PRIOR[0])), float(np.exp(SHIFT_PRIOR[0]))
     values = ((measured.amplitude, measured.amplitude_error), (measured.power, measured.power_error))
     for kind, (name, (value, error)) in enumerate(zip(names, values, strict=True)):
-        expected = np.tensordot(weights, _expected(kind, rings, share, shift, measured.stretch))
-        for key, figure in ((name, value[rings]), (f"{name}_error", error[rings]), (f"expected_{name}", expected)):
+        predicted = np.tensordot(weights, expected(known, kind, rings, share, shift, measured.stretch))
+        for key, figure in ((name, value[rings]), (f"{name}_error", error[rings]), (f"expected_{name}", predicted)):
             found[key] = gaps.copy()
             found[key][rings] = figure
     return found

@@ -18,6 +18,7 @@ from .run_record import versions
 
 # Raised where the same frames and settings begin to give another image.
 _RESULTS = 10
+_OPTICS = ("pixel_scale", "aperture", "distance", "wavelength")
 
 
 def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryPlan) -> dict[str, dict[str, Any]]:
@@ -45,7 +46,7 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
         "filtered": {name: settings[name] for name in ("keep_best", "filter")},
         "deblurred": {
             **({} if plan.deconvolution_side is None else {"tile": plan.deconvolution_side}),
-            **{name: settings[name] for name in ("deconvolution", "guards")},
+            **{name: settings[name] for name in (*_OPTICS, "deconvolution", "guards")},
         },
     }
     return json.loads(json.dumps(facts))

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from ..core.errors import require, require_between
+from ..core.errors import ConfigurationError, require, require_between
 from ..synthesis.atmosphere import Layer, fried_parameter, phase_spectrum, tilt_variance
 
 Float64Array = NDArray[np.float64]
@@ -93,6 +93,29 @@ class Optics:
         if self.distance is not None:
             require_between("distance", self.distance, 1, 1e6, "m")
         require(self.path in PATHS, f"path: expected one of {', '.join(PATHS)}, found {self.path!r}")
+
+    @property
+    def diffraction(self) -> float:
+        """λ/D, pixels."""
+        return self.wavelength / (self.aperture * self.pixel_scale)
+
+
+def known_optics(
+    pixel_scale: float | None,
+    aperture: float | None,
+    wavelength: float,
+    distance: float | None,
+    path: Literal["spherical", "plane"] = "spherical",
+) -> Optics | None:
+    """Join what is known of the optics; None if nothing is."""
+    if pixel_scale is None and aperture is None and distance is None:
+        return None
+    if pixel_scale is None or aperture is None:
+        given = {"distance": distance, "pixel_scale": pixel_scale, "aperture": aperture}
+        name = next(name for name, value in given.items() if value is not None)
+        missing = "the angle of a pixel" if pixel_scale is None else "the aperture"
+        raise ConfigurationError(f"{name}: expected {missing} as well, found none; r0 needs both")
+    return Optics(pixel_scale, aperture, wavelength, distance, path)
 
 
 def displacement_differences(optics: Optics, spacing: float, counts: tuple[int, int], window: float) -> Float64Array:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..blur.estimation import estimate_blur
 from ..blur.image_evidence import image_evidence
-from ..blur.posterior import blur_posterior, measure_witnesses
+from ..blur.posterior import BlurWitnesses, blur_posterior, measure_witnesses
 from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray, luminance
 from ..registration.warp import sample_linear, warp
@@ -143,7 +143,7 @@ def _is_sharp_and_still(window: Window, image: FloatArray, runtime: Runtime) -> 
     if displacement > _STILL:
         return False
     grey = luminance(image)
-    witnesses = measure_witnesses(frames, flows, displacement, float(len(frames)))
+    witnesses = measure_witnesses(frames, flows, BlurWitnesses(displacement, float(len(frames))))
     ratio = None if witnesses.variation is None else witnesses.variation.with_power(grey)
     return blur_posterior(image_evidence(grey, runtime), witnesses, ratio).removed == 0
 
