@@ -72,7 +72,7 @@ def command_line(order: Order, bit_depth: int | None, input: Path, output: Path)
 
 def check_outputs(outputs: Outputs, order: Order) -> None:
     """Raise an error if something could not be saved."""
-    inputs = files_read(order.selection, order.path, static_mask=order.params.static_mask)
+    inputs = files_read(order.selection, order.path, params=order.params)
     if outputs.bit_depth is not None:
         check_depth(outputs.bit_depth)
     check_output(outputs.image, inputs, outputs.overwrite)

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from turbrestore.blind.guards import GuardParams, evaluate_guards
 from turbrestore.blind.remove_blur import remove_blur_steps
+from turbrestore.blur.measured_psf import psf_from_image
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.core.errors import ConfigurationError, require, require_between
 from turbrestore.core.gradient import sobel_gradient
@@ -44,6 +45,7 @@ def deconvolve(
     /,
     *,
     sigma: float | None = None,
+    psf: Path | None = None,
     sweep: str | None = None,
     guide: Path | None = None,
     deconvolution: DeconvolutionParams = DeconvolutionParams(),
@@ -65,6 +67,9 @@ def deconvolve(
         the folder of the run.
     sigma : float
         Width of the blur, pixels.  A Gaussian unless --deconvolution.exponent says otherwise; estimated by default.
+    psf : Path
+        Image of a star, or a measured point spread function, in pixels of the input.  It is removed instead of a blur
+        of some width.
     sweep : str
         Widths to compare, such as ``1,1.4,2``.  The contact sheet shows the part of the image with the most detail
         after each, without guards; what they object to stands in the title.
@@ -87,7 +92,7 @@ def deconvolve(
     source, beside = stage_of_run(input)
     guide = beside if guide is None else guide
     if sweep is not None:
-        require(sigma is None, "--sigma: contradicts --sweep; leave one of them out")
+        require(sigma is None and psf is None, "--sweep: contradicts --sigma and --psf; leave one of them out")
         sheet = _sheet_path(input, output)
         check_output(sheet, [source], overwrite, (".png",))
         images = _read(source, guide, limits_of(max_pixels))
@@ -98,15 +103,17 @@ def deconvolve(
     require(output is not None, "OUTPUT: expected an image or a stage file to write, found none")
     assert output is not None
     deconvolution = known_sigma(sigma, deconvolution)
+    require(psf is None or deconvolution.sigma is None, "--psf: contradicts --sigma; leave one of them out")
     if bit_depth is not None:
         check_depth(bit_depth)
         require(output.suffix.lower() not in STAGE_FILE, "--bit-depth: has no effect on a stage file; leave it out")
-    inputs = [path for path in (source, guide) if path is not None]
+    inputs = [path for path in (source, guide, psf) if path is not None]
     check_output(output, inputs, overwrite, STAGE_FILE + tuple(IMAGE_OUTPUT_SUFFIXES))
     limits = limits_of(max_pixels)
     image, guide_image = _read(source, guide, limits)
+    kernel = None if psf is None else psf_from_image(read_input_image(psf, limits), str(psf))
     with progress_bars(quiet) as progress:
-        steps = remove_blur_steps(image, guide_image, deconvolution, guards, machine.runtime())
+        steps = remove_blur_steps(image, guide_image, deconvolution, guards, machine.runtime(), psf=kernel)
         deblurred = finish(steps, step_counter(progress, "deconvolve", deconvolution.iterations))
     if bit_depth is None:
         bit_depth = 16 if source.suffix.lower() in STAGE_FILE else read_image(source, limits).bit_depth

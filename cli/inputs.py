@@ -57,11 +57,12 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
     return source, check_content(source, ContentParams(strict=selection.strict))
 
 
-def files_read(selection: Selection, *named: Path | None, static_mask: str = "auto") -> list[Path]:
+def files_read(selection: Selection, *named: Path | None, params: RestoreParams | None = None) -> list[Path]:
     """List the files and folders that a command reads, which no output may replace: those it names, and settings do."""
     calibration = (None if name is None else Path(name) for name in (selection.dark, selection.flat))
-    mask = None if static_mask in ("auto", "off") else Path(static_mask)
-    return [path for path in (*named, *calibration, mask) if path is not None]
+    names = () if params is None else (params.static_mask, params.psf)
+    of_settings = (Path(name) for name in names if name not in (None, "auto", "off"))
+    return [path for path in (*named, *calibration, *of_settings) if path is not None]
 
 
 def with_absolute_paths(selection: Selection, params: RestoreParams) -> tuple[Selection, RestoreParams]:
@@ -70,7 +71,8 @@ def with_absolute_paths(selection: Selection, params: RestoreParams) -> tuple[Se
     mask = params.static_mask
     if mask not in ("auto", "off"):
         mask = str(Path(mask).absolute())
-    return dataclasses.replace(selection, dark=dark, flat=flat), dataclasses.replace(params, static_mask=mask)
+    psf = None if params.psf is None else str(Path(params.psf).absolute())
+    return dataclasses.replace(selection, dark=dark, flat=flat), dataclasses.replace(params, static_mask=mask, psf=psf)
 
 
 def frames_to_train(source: FrameSource, selection: Selection, train: int | None) -> int:

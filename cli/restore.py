@@ -92,7 +92,7 @@ class Order:
     @property
     def inputs(self) -> list[Path]:
         """Files and folders to read."""
-        return files_read(self.selection, self.input, self.config, self.truth, static_mask=self.params.static_mask)
+        return files_read(self.selection, self.input, self.config, self.truth, params=self.params)
 
     @property
     def outputs(self) -> list[Path]:

@@ -10,6 +10,7 @@ from itertools import chain
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .agreement.last_guard import FEWEST, Halves, registered_halves
 from .blind.structure import StructureReading, compare_structure
@@ -82,6 +83,7 @@ class Run:
     progress: Progress | None
     on_decision: Callable[[Decision], None] | None
     map_tiles: TileMap | None = None
+    psf: NDArray[np.float64] | None = None
     decisions: list[Decision] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -213,7 +215,7 @@ def _compare_structure(
 def _halves(run: Run, training: FloatArray, centroid: Centroid, mean_flow: FloatArray) -> Halves | None:
     """Average two halves of the training frames, in the geometry of the filtered image."""
     # No guard overrides a width that was asked for.
-    if len(training) < FEWEST or not run.params.runs("deconvolve") or run.params.deconvolution.sigma is not None:
+    if len(training) < FEWEST or not run.params.finds_blur:
         return None
     found = registered_halves(training, centroid.flows, training.shape[1:], len(training), run.plan.runtime.threads)
     halves = (run.levels.original(recentre(half, mean_flow)) for half in (found.first, found.second))
@@ -233,7 +235,7 @@ def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seein
 
 def _find_witnesses(run: Run, training: FloatArray, centroid: Centroid, seeing: Seeing | None) -> BlurWitnesses | None:
     """Measure what the frames say about their blur, if it is to be estimated."""
-    if not run.params.runs("deconvolve") or run.params.deconvolution.sigma is not None:
+    if not run.params.finds_blur:
         return None
     begun, known = time.perf_counter(), None if seeing is None else seeing.displacement_variance
     rows, columns = picture = run.prepared.picture

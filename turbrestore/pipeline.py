@@ -12,14 +12,17 @@ from numpy.typing import ArrayLike
 from .agreement.last_guard import keep_agreed
 from .blind.blur_to_remove import SIGMAS_A_SIDE
 from .blind.remove_blur import Deblurred, remove_blur_steps
+from .blur.measured_psf import psf_from_image
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.errors import require
+from .deconvolution.problem import read_blur
 from .footage.bars import Bars
 from .footage.checks.content import without_blank
 from .footage.levels import Levels
 from .footage.overlays import Title
 from .fusion import Fused, Run, fuse
+from .io.images import read_image
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import plan_memory
@@ -41,6 +44,7 @@ from .uncertainty.pixel_deviation import (
     position_variance,
     posterior_gain,
     quadratic_fidelity,
+    variance_by_blur,
 )
 from .wording import explain_border
 
@@ -88,9 +92,10 @@ def restore(
     Raises
     ------
     DataError
-        Too few, too small, damaged or constant frames, or a static mask of another size.
+        Too few, too small, damaged or constant frames, a static mask of another size, or no point in the image of the
+        point spread function.
     InputNotFoundError
-        The static mask does not exist.
+        The static mask or the image of the point spread function does not exist.
     ConfigurationError
         More training frames than frames, a device that is not there, or a memory limit that cannot be kept.
     StorageError
@@ -113,7 +118,8 @@ def restore(
         (frames, ()) if isinstance(frames, FrameSource) else without_blank(FrameSource.from_array(frames))
     )
     plan = plan_memory(source.shape, params, runtime)
-    _check_sigma(params.deconvolution.sigma, source.shape)
+    psf = None if params.psf is None else psf_from_image(read_image(params.psf).image, params.psf)
+    _check_sigma(params.deconvolution.sigma if psf is None else read_blur(psf)[1], source.shape)
     _check_training(params, plan.train, len(source))
     if plan.runtime.scratch is not None:
         check_space(plan.runtime.scratch, plan.scratch_bytes)
@@ -121,7 +127,7 @@ def restore(
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
     prepared = prepare(source, plan.train, params.static_mask)
     stretched, bars = _stretched_params(params, prepared.levels), prepared.bars
-    run = Run(prepared, stretched, plan, tiles, store or NoStore(), progress, on_decision, map_tiles)
+    run = Run(prepared, stretched, plan, tiles, store or NoStore(), progress, on_decision, map_tiles, psf)
     run.seconds["read"] = time.perf_counter() - begun
     run.decide(*on_blank, *plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
     run.decide(*prepared.decisions)
@@ -187,7 +193,7 @@ def _deblur(run: Run, fused: Fused) -> Deblurred:
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
-    steps = remove_blur_steps(image, guide, *settings, fused.witnesses)
+    steps = remove_blur_steps(image, guide, *settings, fused.witnesses, run.psf)
     deblurred = finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
     deconvolution, blur = levels.original_result(deblurred.deconvolution), levels.original_result(deblurred.blur)
     return replace(deblurred, deconvolution=deconvolution, blur=blur)
@@ -206,7 +212,8 @@ def _measure_uncertainty(
     known = informed_pixels(seen, fused.mean, fused.saturation)
     if run.prepared.hidden is not None:
         known &= ~run.prepared.hidden
-    deviation = pixel_deviation(image, filtered.variance, _gain(run, filtered.image, deblurred), position, known)
+    gain, by_blur = _gain(run, filtered.image, deblurred), _variance_by_blur(run, filtered.image, deblurred)
+    deviation = pixel_deviation(image, filtered.variance, gain, position, known, by_blur)
     run.seconds["uncertainty"] = time.perf_counter() - begun
     return deviation
 
@@ -220,6 +227,17 @@ def _gain(run: Run, fused: FloatArray, deblurred: Deblurred | None) -> float:
     exponent = blur.exponent if params.exponent is None and blur is not None else params.exponent
     fidelity = quadratic_fidelity(run.levels.stretched(fused), params.method, done.fidelity)
     return posterior_gain(fused.shape[:2], fidelity, done.sigma, exponent)
+
+
+def _variance_by_blur(run: Run, fused: FloatArray, deblurred: Deblurred | None) -> FloatArray | float:
+    """Return the variance of pixels, at the levels of the clip, that the posterior of the blur leaves."""
+    posterior = None if deblurred is None else deblurred.posterior
+    if deblurred is None or posterior is None:
+        return 0.0
+    params, done = run.params.deconvolution, deblurred.deconvolution
+    fidelity = quadratic_fidelity(run.levels.stretched(fused), params.method, done.fidelity)
+    low, _, high = posterior.width
+    return variance_by_blur(fused, fidelity, (float(low), float(high)), params.exponent or posterior.exponent)
 
 
 def _crop(image: FloatArray, seen: FloatArray, border: str, deblurred: Deblurred | None) -> tuple[Rectangle, Decision]:

@@ -55,6 +55,9 @@ class RestoreParams:
         From the aperture to the scene, m.  With it Cn² is reported too, and D/r0 is much better known.
     wavelength : float
         m.
+    psf : str, optional
+        Image of a star, or a measured point spread function, in pixels of the clip.  It is removed instead of an
+        estimated blur.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -88,6 +91,7 @@ class RestoreParams:
     aperture: float | None = None
     distance: float | None = None
     wavelength: float = 550e-9
+    psf: str | None = None
     flow: FlowParams = field(default_factory=FlowParams)
     centroid: CentroidParams = field(default_factory=CentroidParams)
     dynamics: DynamicsParams = field(default_factory=DynamicsParams)
@@ -104,6 +108,10 @@ class RestoreParams:
             f"deconvolution.sigma: has no effect with until = {self.until}; leave one of them out",
         )
         require(
+            self.psf is None or (self.until == STAGES[-1] and self.deconvolution.sigma is None),
+            "psf: contradicts deconvolution.sigma, and until without a deconvolution; leave one of them out",
+        )
+        require(
             self.static_mask in ("auto", "off") or "." in self.static_mask,
             f"static_mask: expected auto, off or an image file, found {self.static_mask!r}",
         )
@@ -118,6 +126,11 @@ class RestoreParams:
     def optics(self) -> Optics | None:
         """Camera and path of the clip, None if they are not known."""
         return known_optics(self.pixel_scale, self.aperture, self.wavelength, self.distance)
+
+    @property
+    def finds_blur(self) -> bool:
+        """Whether a blur is removed, and is to be estimated."""
+        return self.runs("deconvolve") and self.deconvolution.sigma is None and self.psf is None
 
     def runs(self, stage: str) -> bool:
         """Tell whether a stage is run.

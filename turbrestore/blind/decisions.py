@@ -14,11 +14,13 @@ from .guards import GuardParams, GuardReading
 _MOSTLY = 0.8
 
 
-def explain_blur(blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None = None) -> Decision:
-    """Explain which width is removed."""
+def explain_blur(
+    blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None = None, given: str = "asked for"
+) -> Decision:
+    """Explain which width is removed; ``given`` is the reason if none was estimated."""
     choice = f"{sigma:.2f} pixels removed" if sigma > 0 else "none removed"
     if blur is None:
-        return Decision("blur", choice, "asked for")
+        return Decision("blur", choice, given)
     if tiles is not None and tiles.varies:
         choice = f"{tiles.removable.min():.2f} to {tiles.removable.max():.2f} pixels removed"
     width = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels"

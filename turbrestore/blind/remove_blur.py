@@ -15,12 +15,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..blur.estimation import BlurEstimate
 from ..blur.posterior import BlurPosterior, BlurWitnesses
 from ..core.arrays import FloatArray
 from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, DeconvolutionState
 from ..deconvolution.memory import deconvolution_memory
+from ..deconvolution.problem import read_blur
 from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
@@ -32,6 +36,7 @@ from .guards import GuardParams, GuardReading, evaluate_guards
 from .tiled_deconvolution import MOST_THREADS, tiled_deconvolution_steps
 
 Result = TypeVar("Result")
+Float64Array = NDArray[np.float64]
 
 # Bytes per pixel, and per pixel and channel, of what is computed before and after the deconvolution; the guards take
 # most.
@@ -112,9 +117,12 @@ def remove_blur_steps(
     runtime: Runtime = DEFAULT,
     side: int | None = None,
     witnesses: BlurWitnesses | None = None,
+    psf: Float64Array | None = None,
 ) -> Steps[Deblurred]:
-    """Remove a blur step by step; see :func:`remove_blur`."""
+    """Remove a blur step by step, or a point spread function (h, w); see :func:`remove_blur`."""
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
+    if psf is not None:
+        params = replace(params, sigma=read_blur(psf)[1])
     blur, posterior = find_blur(image, params, runtime, witnesses)
     if posterior is None:
         sigma, params = blur_to_remove(blur, params)
@@ -125,7 +133,8 @@ def remove_blur_steps(
     numbers = itertools.count(1)
 
     def remove(width: float) -> Generator[DeconvolutionState, None, Deconvolution]:
-        return tiled_deconvolution_steps(image, width, params, guide, runtime, in_tiles)
+        kernel = width if psf is None or width == 0 else psf
+        return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles)
 
     tiles, first = None, None
     # The likelihood of a tile is unreliable where that of the image is, and where frames tell the blur they decide.
@@ -153,7 +162,10 @@ def remove_blur_steps(
     else:
         result, readings = yield from guarded_steps(attempt, image, sigma, guards, first)
     on_guards = explain_guards(result.sigma, readings, guards)
-    on_blur = explain_blur(blur, sigma, tiles) if posterior is None else explain_posterior(posterior, result.sigma)
+    if posterior is not None:
+        on_blur = explain_posterior(posterior, result.sigma)
+    else:
+        on_blur = explain_blur(blur, sigma, tiles, "asked for" if psf is None else "the point spread function is given")
     decisions = (on_blur, *explain_blur_map(tiles), *on_guards)
     return Deblurred(result, blur, tiles, readings, decisions, posterior)
 

@@ -34,7 +34,7 @@ MOST_THREADS = 4
 
 def tiled_deconvolution_steps(
     image: ArrayLike,
-    sigma: float,
+    sigma: float | ArrayLike,
     params: DeconvolutionParams | None = None,
     guide: ArrayLike | None = None,
     runtime: Runtime = DEFAULT,
@@ -42,11 +42,11 @@ def tiled_deconvolution_steps(
 ) -> Generator[DeconvolutionState, None, Deconvolution]:
     """Deconvolve an image tile by tile.
 
-    ``image`` (H, W) or (H, W, 3); ``guide`` (H, W) or (H, W, 3).
+    ``image`` (H, W) or (H, W, 3); ``sigma`` may be a PSF (h, w); ``guide`` (H, W) or (H, W, 3).
     """
     pixels = check_image(image)
     around = None if guide is None else check_image(guide, "guide")
-    if sigma == 0 or len(tiles) < 2:
+    if not np.any(sigma) or len(tiles) < 2:
         whole = yield from deconvolve_steps(pixels, sigma, params, around, runtime)
         return replace(whole, image=to_scratch(whole.image, runtime.scratch))
     params = params or DeconvolutionParams()

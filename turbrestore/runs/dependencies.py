@@ -46,6 +46,7 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
         "filtered": {name: settings[name] for name in ("keep_best", "filter")},
         "deblurred": {
             **({} if plan.deconvolution_side is None else {"tile": plan.deconvolution_side}),
+            "psf": None if params.psf is None else _digest(params.psf),
             **{name: settings[name] for name in (*_OPTICS, "deconvolution", "guards")},
         },
     }
@@ -60,10 +61,13 @@ def filter_key(facts: dict[str, dict[str, Any]]) -> str:
 
 def _mask_digest(mask: str) -> str:
     """Return the setting of the mask, or the checksum of its file."""
-    if mask in ("auto", "off"):
-        return mask
-    with input_errors(Path(mask)):
-        return file_digest(Path(mask))
+    return mask if mask in ("auto", "off") else _digest(mask)
+
+
+def _digest(path: str) -> str:
+    """Return the checksum of a file that a setting names."""
+    with input_errors(Path(path)):
+        return file_digest(Path(path))
 
 
 def _span(numbers: Sequence[int]) -> list[int]:

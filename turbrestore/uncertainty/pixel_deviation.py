@@ -9,7 +9,7 @@ H : transfer function of the blur that was removed; k² : symbol of the negative
 
 Model
 -----
-    var u = g Σ + ε² ⟨|∇u|²⟩
+    var u = g Σ + ε² ⟨|∇u|²⟩ + ⟨(u_low − u_high)²⟩ / 4
 
 *Deconvolution.*  Near its result, deconvolution is taken for a linear one with a Gaussian prior.  The posterior
 variance of ``min λ/2 ‖Hu − ρ‖² + ½‖∇u‖²`` with noise Σ is ``g Σ`` with ``g = mean 1 / (|H|² + k²/λ)``, a mean over all
@@ -21,6 +21,9 @@ outside the subspace of its model, of variance R along one axis, is partly motio
 ``ε² = 0.7 R`` is taken for error.  This share is the only constant that is taken from data: on three simulated clips 97
 to 98 % of the pixels lie within two deviations of the scene at the mean geometry (``benchmarks/uncertainty.py``); from
 0.5 on it is 95 % and more.
+
+*Blur.*  u_low and u_high are the Wiener solutions for the 16 % and 84 % quantiles of the width of the blur, where a
+posterior of it is known: what more or less sharpening would change.
 
 *Geometry.*  The deviation is that from the scene at the mean geometry of the frames.  The mean geometry itself bends
 the scene by :func:`turbrestore.dynamics.flow_model.mean_flow_error`; this is a length in pixels, the same error for
@@ -41,7 +44,7 @@ from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol, wiener_fidelity
 from ..core.arrays import FloatArray, luminance
 from ..core.gradient import sobel_gradient
 from ..core.noise import estimate_noise
-from ..deconvolution.problem import automatic_fidelity
+from ..deconvolution.problem import MARGIN_SIGMAS, automatic_fidelity, margin_around
 from ..dynamics.flow_model import FlowDynamics
 
 # Full scale, less half a grey level of 8 bits.
@@ -55,16 +58,21 @@ _GRID = 256
 
 
 def pixel_deviation(
-    image: FloatArray, variance: FloatArray, gain: float, position_variance: FloatArray, known: NDArray[np.bool_]
+    image: FloatArray,
+    variance: FloatArray,
+    gain: float,
+    position_variance: FloatArray,
+    known: NDArray[np.bool_],
+    blur_variance: FloatArray | float = 0.0,
 ) -> FloatArray:
     """Compute the standard deviation of every pixel.
 
-    ``image`` (H, W) or (H, W, 3); ``variance`` (H, W); ``position_variance`` (H, W); ``known`` (H, W); returns (H, W).
+    ``image`` (H, W) or (H, W, 3); the variances and ``known`` (H, W); returns (H, W).
     """
     grey = luminance(image)
     gx, gy = sobel_gradient(grey)
     square = cv2.GaussianBlur(gx * gx + gy * gy, (0, 0), _WINDOW)
-    found = np.sqrt(np.float32(gain) * variance + position_variance * square)
+    found = np.sqrt(np.float32(gain) * variance + position_variance * square + blur_variance)
     return np.where(known, found, np.float32(np.inf)).astype(np.float32)
 
 
@@ -76,6 +84,21 @@ def posterior_gain(size: tuple[int, int], fidelity: float, sigma: float, exponen
     power = np.abs(blur_otf(shape, sigma, exponent or GAUSSIAN)) ** 2
     # The first value of the inverse transform is the mean over all frequencies, of which half are stored.
     return float(fft.irfft2(1 / (power + laplacian_symbol(*shape) / fidelity), s=shape)[0, 0])
+
+
+def variance_by_blur(fused: FloatArray, fidelity: float, widths: tuple[float, float], exponent: float) -> FloatArray:
+    """Compute the variance that the uncertainty of the width leaves, from its 16 % and 84 % quantiles, pixels.
+
+    ``fused`` (H, W) or (H, W, 3); returns (H, W).
+    """
+    reach = int(np.ceil(MARGIN_SIGMAS * widths[1]))
+    margin = margin_around((fused.shape[0], fused.shape[1]), reach)
+    spectrum = fft.rfft2(margin.pad(luminance(fused)))
+    prior = laplacian_symbol(*margin.shape) / fidelity
+    otfs = (blur_otf(margin.shape, width, exponent) for width in widths)
+    low, high = (otf / (otf**2 + prior) for otf in otfs)
+    between = fft.irfft2(spectrum * (high - low), s=margin.shape)[margin.inside()] / 2
+    return cv2.GaussianBlur(np.square(between).astype(np.float32), (0, 0), _WINDOW)
 
 
 def quadratic_fidelity(fused: FloatArray, method: str, fidelity: float) -> float:
