@@ -14,7 +14,13 @@ from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import picture
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
-from turbrestore.uncertainty.pixel_deviation import informed_pixels, pixel_deviation, posterior_gain, quadratic_fidelity
+from turbrestore.uncertainty.pixel_deviation import (
+    informed_pixels,
+    pixel_deviation,
+    posterior_gain,
+    quadratic_fidelity,
+    variance_by_blur,
+)
 from turbrestore_cli.application import run as run_command
 
 
@@ -58,6 +64,16 @@ def test_position_makes_edges_uncertain_and_flat_parts_not():
     deviation = pixel_deviation(image, flat + 1e-6, 4.0, flat + 0.04, flat == 0)
     assert deviation[16, 4] == pytest.approx(2e-3)
     assert deviation[16, 15] > 10 * deviation[16, 4]
+
+
+def test_the_posterior_of_the_blur_makes_edges_uncertain_and_flat_parts_not():
+    step = np.zeros((48, 48), np.float32)
+    step[:, 24:] = 0.5
+    fidelity = 500.0
+    narrow, wide = (variance_by_blur(step, fidelity, widths, 1.5) for widths in ((1.0, 1.1), (0.8, 1.4)))
+    assert (np.sqrt(narrow[4:-4, 22:27]) > 10 * np.sqrt(narrow[4:-4, 4:8].max())).all()
+    assert (wide[:, 22:27] > 10 * narrow[:, 22:27]).all()
+    assert not variance_by_blur(step, fidelity, (1.2, 1.2), 1.5).any()
 
 
 def test_saturated_and_unseen_pixels_are_infinite():

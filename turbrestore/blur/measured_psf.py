@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from ..core.arrays import check_image, luminance
 from ..core.errors import DataError
@@ -48,6 +47,8 @@ def psf_from_image(image: ArrayLike, name: str = "psf") -> Float64Array:
 
 def _point(light: Float64Array, noise: float, peak: float, name: str) -> NDArray[np.bool_]:
     """Pixels of the point: those above the noise that hang together with the peak, with two pixels around."""
+    from scipy import ndimage
+
     labels, count = ndimage.label(light > max(_SEEN * noise, 1e-4 * peak), np.ones((3, 3)))
     peaks = np.array(ndimage.maximum(light, labels, range(1, count + 1)))
     brightest = int(peaks.argmax()) + 1
@@ -63,6 +64,8 @@ def _point(light: Float64Array, noise: float, peak: float, name: str) -> NDArray
 
 def _centred(light: Float64Array) -> Float64Array:
     """Move the centroid to the middle pixel of an image with odd sides."""
+    from scipy import ndimage
+
     sides = [side + 1 - side % 2 for side in light.shape]
     odd = np.pad(light, [(0, odd - side) for odd, side in zip(sides, light.shape, strict=True)])
     shift = [side // 2 - middle for side, middle in zip(sides, ndimage.center_of_mass(odd), strict=True)]

@@ -18,9 +18,8 @@ blur has left undetermined.
 
 *Registration.*  A position that is uncertain by ε makes an intensity uncertain by ε times the gradient.  The flow
 outside the subspace of its model, of variance R along one axis, is partly motion and partly error of the flow.
-``ε² = 0.7 R`` is taken for error.  This share is the only constant that is taken from data: on three simulated clips 97
-to 98 % of the pixels lie within two deviations of the scene at the mean geometry (``benchmarks/uncertainty.py``); from
-0.5 on it is 95 % and more.
+``ε² = 0.7 R`` is taken for error.  This share is the only constant that is taken from data: on three simulated clips 93
+to 100 % of the pixels lie within two deviations of the scene at the mean geometry (``benchmarks/uncertainty.py``).
 
 *Blur.*  u_low and u_high are the Wiener solutions for the 16 % and 84 % quantiles of the width of the blur, where a
 posterior of it is known: what more or less sharpening would change.
