@@ -18,6 +18,8 @@ Float64Array = NDArray[np.float64]
 # Width of the border whose median is the background, in shares of the side; a standard deviation in median absolute
 # deviations; deviations of the noise above which light is that of the point, and least ratio of peak and noise.
 _BORDER, _NORMAL, _SEEN, _CLEAR = 0.1, 1.4826, 3.0, 20.0
+# Width of the rim that sinks into the noise, in radii of what stands out of it.
+_RIM = 0.4
 # Share of the light that may lie beyond the border, share of the peak that a second point may have, and radius of the
 # largest PSF, pixels.
 _LOST, _SECOND, _LARGEST = 0.02, 0.2, 84
@@ -46,7 +48,7 @@ def psf_from_image(image: ArrayLike, name: str = "psf") -> Float64Array:
 
 
 def _point(light: Float64Array, noise: float, peak: float, name: str) -> NDArray[np.bool_]:
-    """Pixels of the point: those above the noise that hang together with the peak, with two pixels around."""
+    """Pixels of the point: those above the noise that hang together with the peak, and its faint rim around them."""
     from scipy import ndimage
 
     labels, count = ndimage.label(light > max(_SEEN * noise, 1e-4 * peak), np.ones((3, 3)))
@@ -59,7 +61,8 @@ def _point(light: Float64Array, noise: float, peak: float, name: str) -> NDArray
     edge[1:-1, 1:-1] = False
     if light[point & edge].sum() > _LOST * light[point].sum():
         raise DataError(f"{name}: expected a point with dark sky around, found light up to the border; cut it larger")
-    return ndimage.binary_dilation(point, np.ones((3, 3)), 2)
+    radius = np.sqrt(point.sum() / np.pi)
+    return ndimage.binary_dilation(point, np.ones((3, 3)), 2 + int(_RIM * radius))
 
 
 def _centred(light: Float64Array) -> Float64Array:

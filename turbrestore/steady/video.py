@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..blur.estimation import estimate_blur
 from ..blur.image_evidence import image_evidence
 from ..blur.posterior import BlurWitnesses, blur_posterior, measure_witnesses
 from ..blur.psf import KOLMOGOROV
@@ -36,17 +35,9 @@ from .path import LONGEST, camera_position, homogeneous, longer_path, motion, sm
 from .settings import SteadyParams
 from .windows import Window, iter_windows
 
-# Share of the estimated width that is removed: on the two videos of docs/steady.md, a width
-# too small by 15 % costs 0.1 dB, one too large by as much 0.4 dB, and estimates are too large by up to a third.
-_CAUTION = 0.8
-# What is added to the estimated width of what is remembered, pixels, because a quadratic prior keeps some blur.  It
-# gains 0.1 to 0.6 dB on six still scenes through phase screens, and loses 0.1 dB on one whose blur is 3 pixels wide.
-_ADDED = 0.15
 # Frames that the memory holds on average when the width of its blur is estimated, and frames over which the width that
 # is removed goes there, so that no frame is suddenly sharper.
 _REMEMBERED, _GRADUALLY = 24, 16
-# Variance of the displacement below which frames stand still, squared pixels.
-_STILL = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,44 +108,51 @@ def steady_frames(
     head = list(islice(windows, params.reach // 2 + 1))
     if not head:
         return
-    sigma = params.sigma
+    sigma, exponent, witnesses = params.sigma, KOLMOGOROV, None
     if sigma is None:
-        # Of the shape that is removed: a width is that of one shape.
-        middle = dewarp_frame(head[-1], params)
-        sigma = _CAUTION * estimate_blur(middle.image, exponent=KOLMOGOROV, runtime=runtime).removable
-        if sigma > 0 and _is_sharp_and_still(head[-1], middle.image, runtime):
-            params, sigma = replace(params, sigma=0.0), 0.0
-    scenes = _Scenes(params, sigma, runtime)
+        image = dewarp_frame(head[-1], params).image
+        witnesses = _find_witnesses(head[-1], image)
+        sigma, exponent = _find_blur(image, witnesses, runtime)
+    scenes = _Scenes(params, sigma, witnesses, runtime)
     yield from map_in_turns(
         lambda window: dewarp_frame(window, params),
         lambda frame: (frame, scenes.estimate(frame)),
-        lambda pair: _sharpened(*pair, sigma),
+        lambda pair: _sharpened(*pair, sigma, exponent),
         chain(head, windows),
         runtime.threads,
     )
 
 
-def _is_sharp_and_still(window: Window, image: FloatArray, runtime: Runtime) -> bool:
-    """Whether the frames of a window neither move nor vary, and the image fused from them is not clearly blurred."""
+def _find_witnesses(window: Window, image: FloatArray) -> BlurWitnesses:
+    """Measure what the frames of a window, registered to the image fused from them, say about their blur."""
     frames = np.stack([window.frame.image, *(frame.image for frame in window.neighbours.values())])
-    still = np.zeros((*image.shape[:2], 2), np.float32)
-    flows = np.stack([measure_flow(frames[0], frame, still) for frame in frames])
+    still = np.zeros((*frames.shape[1:3], 2), np.float32)
+    flows = np.stack([measure_flow(image, frame, still) for frame in frames])
     displacement = float(np.square(flows - np.median(flows, axis=(1, 2), keepdims=True)).mean())
-    if displacement > _STILL:
-        return False
+    return measure_witnesses(frames, flows, BlurWitnesses(displacement, float(len(frames))))
+
+
+def _find_blur(image: FloatArray, witnesses: BlurWitnesses, runtime: Runtime) -> tuple[float, float]:
+    """Return width and exponent of the blur to remove: the smaller width of the posterior and of the image alone.
+
+    A window has few frames, and where they are registered badly they seem to vary; edges tell that nothing has blurred.
+    """
     grey = luminance(image)
-    witnesses = measure_witnesses(frames, flows, BlurWitnesses(displacement, float(len(frames))))
+    evidence = image_evidence(grey, runtime)
+    if evidence is None:
+        return 0.0, KOLMOGOROV
     ratio = None if witnesses.variation is None else witnesses.variation.with_power(grey)
-    return blur_posterior(image_evidence(grey, runtime), witnesses, ratio).removed == 0
+    posterior = blur_posterior(evidence, witnesses, ratio)
+    return min(posterior.removed, evidence.estimate.removable), posterior.exponent
 
 
 class _Scenes:
     """What is carried from frame to frame of a scene."""
 
-    def __init__(self, params: SteadyParams, sigma: float, runtime: Runtime) -> None:
+    def __init__(self, params: SteadyParams, sigma: float, witnesses: BlurWitnesses | None, runtime: Runtime) -> None:
         self._params = params
         self._memory: Memory | None = None
-        self._given, self._runtime = params.sigma is not None, runtime
+        self._witnesses, self._runtime = witnesses, runtime
         self._first = self._width = sigma
         self._found: float | None = None
         self._positions: deque[Matrix] = deque(maxlen=LONGEST)
@@ -199,10 +197,9 @@ class _Scenes:
 
     def _remembered_width(self, memory: Memory) -> float:
         """Width to remove from what is remembered, which gradually becomes the one that its own image needs."""
-        if not self._given and self._found is None and memory.held.mean() >= _REMEMBERED:
-            found = estimate_blur(memory.image, exponent=KOLMOGOROV, runtime=self._runtime)
+        if self._witnesses is not None and self._found is None and memory.held.mean() >= _REMEMBERED:
             # An image that does not determine its width says nothing against the one that was found before.
-            self._found = max(found.removable + _ADDED if found.removable else 0.0, self._first)
+            self._found = max(_find_blur(memory.image, self._witnesses, self._runtime)[0], self._first)
         if self._found is not None:
             self._width += (self._found - self._width) / _GRADUALLY
         return self._width
@@ -216,13 +213,15 @@ def _placed(image: FloatArray, moving: NDArray[np.bool_], offset: Matrix) -> tup
     return warp(image, flow), sample_linear((moving.astype(np.float32),), flow) > 0.5
 
 
-def _sharpened(frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_], float], sigma: float) -> SteadyFrame:
+def _sharpened(
+    frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_], float], sigma: float, exponent: float
+) -> SteadyFrame:
     memory, moving, width = estimate
     noise = frame.noise * frame.share
     remembered = noise / float(np.sqrt(memory.held.mean()))
     return SteadyFrame(
         number=frame.number,
-        image=deblur(memory.image, (sigma, round(width, 2)), KOLMOGOROV, (noise, remembered), memory.held),
+        image=deblur(memory.image, (sigma, round(width, 2)), exponent, (noise, remembered), memory.held),
         moving=moving,
         displacement=frame.displacement,
         sigma=sigma,
