@@ -24,7 +24,7 @@ def test_a_star_gives_a_centred_psf_of_its_width(x, y, sigma):
     assert psf.sum() == pytest.approx(1) and psf.min() >= 0 and psf.shape[0] == psf.shape[1]
     middle = np.arange(len(psf)) - len(psf) // 2
     assert abs(psf.sum(axis=0) @ middle) < 0.05 and abs(psf.sum(axis=1) @ middle) < 0.05
-    assert read_blur(psf)[1] == pytest.approx(sigma, rel=0.06)
+    assert read_blur(psf)[1] == pytest.approx(sigma, rel=0.03)
 
 
 def test_a_background_that_is_bright_changes_nothing():

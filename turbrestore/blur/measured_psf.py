@@ -1,7 +1,7 @@
 """A point spread function from its image: a star, a pinhole, or a sampled PSF.
 
 The background is the median of the border, and the noise its median absolute deviation.  What lies above the background
-is centred by its centroid, with a shift of less than a pixel by Fourier interpolation, and cut where it sinks into the
+is centred by its centroid, by cubic splines, and cut where it sinks into the
 noise; what remains is clipped at 0 and divided by its sum.
 """
 
@@ -18,8 +18,6 @@ Float64Array = NDArray[np.float64]
 # Width of the border whose median is the background, in shares of the side; a standard deviation in median absolute
 # deviations; deviations of the noise above which light is that of the point, and least ratio of peak and noise.
 _BORDER, _NORMAL, _SEEN, _CLEAR = 0.1, 1.4826, 3.0, 20.0
-# Width of the rim that sinks into the noise, in radii of what stands out of it.
-_RIM = 0.4
 # Share of the light that may lie beyond the border, share of the peak that a second point may have, and radius of the
 # largest PSF, pixels.
 _LOST, _SECOND, _LARGEST = 0.02, 0.2, 84
@@ -43,7 +41,7 @@ def psf_from_image(image: ArrayLike, name: str = "psf") -> Float64Array:
     if (light >= 0.999 * peak).sum() > max(4, 1e-3 * light.size):
         raise DataError(f"{name}: expected a point that is not saturated, found a plateau; expose it for less time")
     point = _point(light, noise, peak, name)
-    kernel = _cut(_centred(np.where(point, light, 0.0)))
+    kernel = _cut(_centred(light, point))
     return kernel / kernel.sum()
 
 
@@ -61,21 +59,19 @@ def _point(light: Float64Array, noise: float, peak: float, name: str) -> NDArray
     edge[1:-1, 1:-1] = False
     if light[point & edge].sum() > _LOST * light[point].sum():
         raise DataError(f"{name}: expected a point with dark sky around, found light up to the border; cut it larger")
-    radius = np.sqrt(point.sum() / np.pi)
-    return ndimage.binary_dilation(point, np.ones((3, 3)), 2 + int(_RIM * radius))
+    return ndimage.binary_dilation(point, np.ones((3, 3)), 2)
 
 
-def _centred(light: Float64Array) -> Float64Array:
-    """Move the centroid to the middle pixel of an image with odd sides."""
+def _centred(light: Float64Array, point: NDArray[np.bool_]) -> Float64Array:
+    """Move the centroid of the point to the middle pixel of an image with odd sides, and remove what is around it."""
     from scipy import ndimage
 
-    sides = [side + 1 - side % 2 for side in light.shape]
-    odd = np.pad(light, [(0, odd - side) for odd, side in zip(sides, light.shape, strict=True)])
-    shift = [side // 2 - middle for side, middle in zip(sides, ndimage.center_of_mass(odd), strict=True)]
-    whole = np.rint(shift).astype(int)
-    moved = np.roll(odd, whole, (0, 1))
-    spectrum = ndimage.fourier_shift(np.fft.fft2(moved), np.array(shift) - whole)
-    return np.maximum(np.fft.ifft2(spectrum).real, 0.0)
+    odd = [(0, 1 - side % 2) for side in light.shape]
+    light, point = np.pad(light, odd), np.pad(point, odd)
+    middle = ndimage.center_of_mass(np.where(point, light, 0.0))
+    shift = [side // 2 - at for side, at in zip(light.shape, middle, strict=True)]
+    moved, seen = ndimage.shift(light, shift), ndimage.shift(point.astype(np.uint8), np.rint(shift), order=0)
+    return np.where(seen > 0, np.maximum(moved, 0.0), 0.0)
 
 
 def _cut(light: Float64Array) -> Float64Array:
