@@ -120,7 +120,9 @@ class Restoration:
         Recentred: its image is at the mean geometry of all frames; the centroid and its flows are at that of the
         training frames.
     blur : BlurEstimate or None
-        Estimated blur of the filtered image; None where sigma was given.
+        Blur of the filtered image by its edges alone; None where it was given.
+    posterior : BlurPosterior or None
+        Blur by the frames and the image together, which decides on the width that is removed; None where it was given.
     deconvolution : Deconvolution or None
     guard_readings : tuple of GuardReading
         What the guards saw of every width of the blur that was tried.
