@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps, whole_image_fidelity
+from turbrestore_cli.deblurring import compared_widths
+from turbrestore_cli.options import Machine
 
 from .restoring import Restored
 
@@ -118,6 +120,16 @@ def impressions(
             except StopIteration as end:
                 yield end.value.image
                 break
+
+
+def sweep(
+    restored: Restored, params: DeconvolutionParams, widths: tuple[float, ...]
+) -> Iterator[tuple[str, FloatArray]]:
+    """Deblur the part of the image with the most detail by each width, as ``turbrestore deconvolve --sweep`` does."""
+    order = restored.order.params
+    settings = dataclasses.replace(params, sigma=None)
+    guide = restored.restoration.centroid.image
+    return compared_widths(_fused(restored), guide, widths, settings, order.guards, Machine().runtime())
 
 
 def _fused(restored: Restored) -> FloatArray:

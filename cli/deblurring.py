@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -96,9 +97,9 @@ def deconvolve(
         sheet = _sheet_path(input, output)
         check_output(sheet, [source], overwrite, (".png",))
         images = _read(source, guide, limits_of(max_pixels))
-        figure = contact_sheet(*images, widths_of(sweep), deconvolution, guards, machine.runtime())
-        write_figure(sheet, figure, overwrite)
-        say(f"{sheet}: {len(widths_of(sweep))} widths side by side", quiet)
+        widths = widths_of(sweep, images[0].shape)
+        write_figure(sheet, contact_sheet(*images, widths, deconvolution, guards, machine.runtime()), overwrite)
+        say(f"{sheet}: {len(widths)} widths side by side", quiet)
         return
     require(output is not None, "OUTPUT: expected an image or a stage file to write, found none")
     assert output is not None
@@ -133,13 +134,15 @@ def stage_of_run(path: Path) -> tuple[Path, Path | None]:
     return filtered, centroid
 
 
-def widths_of(sweep: str) -> tuple[float, ...]:
-    """Read widths that are separated by commas."""
+def widths_of(sweep: str, shape: tuple[int, ...], name: str = "--sweep") -> tuple[float, ...]:
+    """Read widths for an image of this shape that are separated by commas; ``name`` is what errors call them."""
     try:
         widths = tuple(float(part) for part in sweep.split(","))
     except ValueError:
-        raise ConfigurationError(f"--sweep: expected widths such as 1,1.4,2, found {sweep!r}") from None
-    require(len(widths) <= MOST_WIDTHS, f"--sweep: expected at most {MOST_WIDTHS} widths, found {len(widths)}")
+        raise ConfigurationError(f"{name}: expected widths such as 1,1.4,2, found {sweep!r}") from None
+    require(len(widths) <= MOST_WIDTHS, f"{name}: expected at most {MOST_WIDTHS} widths, found {len(widths)}")
+    for width in widths:
+        require_between(name, width, 0, min(shape[:2]) / _SIGMAS_A_SIDE, "pixels")
     return widths
 
 
@@ -153,15 +156,24 @@ def contact_sheet(
 ) -> Figure:
     """Draw the part of an image with the most detail as it is, and deblurred by each width."""
     new_figure()
-    for width in widths:
-        require_between("--sweep", width, 0, min(image.shape[:2]) / _SIGMAS_A_SIDE, "pixels")
+    return plot_images(dict(compared_widths(image, guide, widths, params, guards, runtime)), COLUMNS)
+
+
+def compared_widths(
+    image: FloatArray,
+    guide: FloatArray,
+    widths: tuple[float, ...],
+    params: DeconvolutionParams,
+    guards: GuardParams,
+    runtime: Runtime,
+) -> Iterator[tuple[str, FloatArray]]:
+    """Deblur the most detailed part of an image by each width, with a title; the part itself comes first."""
     window = detailed_window(luminance(image))
     part, guided = image[window], guide[window]
-    panels = {"not deblurred": part}
+    yield "not deblurred", part
     for width in widths:
         result = deconvolve_image(part, width, params, guided, runtime).image
-        panels[f"{width:g} px{_faults(result, part, width, guards)}"] = result
-    return plot_images(panels, COLUMNS)
+        yield f"{width:g} px{_faults(result, part, width, guards)}", result
 
 
 def _faults(result: FloatArray, part: FloatArray, width: float, guards: GuardParams) -> str:

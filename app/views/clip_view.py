@@ -31,7 +31,7 @@ _IN_STRIP, _SMALL = 8, 160
 
 
 class ClipView:
-    """One frame, a scrubber under it, and a rectangle that is drawn with the mouse.
+    """One frame, a scrubber under it, and a rectangle that is drawn with mouse, pen or finger.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class ClipView:
             with ui.element("div").classes("clip") as self._frame:
                 self._image = (
                     ui.interactive_image(
-                        on_mouse=self._mouse, events=["mousedown", "mousemove", "mouseup"], sanitize=False
+                        on_mouse=self._pointed, events=["pointerdown", "pointermove", "pointerup"], sanitize=False
                     )
                     .props("id=frame")
                     .classes("picture")
@@ -125,13 +125,13 @@ class ClipView:
         clip = self._tab.clip
         return 1.0 if clip is None else max(max(clip.size) / LONGEST, 1.0)
 
-    def _mouse(self, event: events.MouseEventArguments) -> None:
+    def _pointed(self, event: events.MouseEventArguments) -> None:
         x, y = event.image_x, event.image_y
-        if event.type == "mousedown":
+        if event.type == "pointerdown":
             self._from = x, y
         elif self._from is not None:
             roi = self._rectangle(self._from, (x, y))
-            if event.type == "mouseup" or not event.buttons:
+            if event.type == "pointerup" or not event.buttons:
                 self._from = None
                 self._on_region(roi)
             self.draw(roi)

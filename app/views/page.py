@@ -24,6 +24,7 @@ from .run_view import RunView
 from .save_view import SaveView
 from .several_view import SeveralView
 from .steady_view import SteadyView
+from .sweep_view import SweepView
 from .tune_view import TuneView
 from .video_view import VideoView
 
@@ -47,9 +48,10 @@ class Page:
         self.clip_view = ClipView(tab, self.notices, on_region=self._drawn)
         self.compare_view = CompareView(tab, on_show=lambda: self.look_at("compare"))
         self.video_view = VideoView(tab)
+        self.sweep_view = SweepView(tab, on_show=self._swept, on_choose=self._chosen)
         self.open_view = OpenView(tab, self.notices, on_open=self.open)
         self.run_view = RunView(tab, self.notices, on_region=self.clip_view.draw)
-        self.tune_view = TuneView(tab, self.notices, self.compare_view, on_change=self._tuned)
+        self.tune_view = TuneView(tab, self.notices, self.compare_view, self.sweep_view, on_change=self._tuned)
         self.save_view = SaveView(tab, self.notices)
         self.steady_view = SteadyView(tab, self.notices, selection=lambda: self.run_view.order().selection)
         self.several_view = SeveralView(tab, self.notices, like=self.run_view.order)
@@ -79,13 +81,15 @@ class Page:
             with self.notices.waiting(f"Reading {path.name} …"):
                 clip = await asyncio.to_thread(self.tab.open, path)
             self.compare_view.clear()
+            self.sweep_view.clear()
             self.video_view.fill()
             await self._opened(clip)
 
     def look_at(self, what: str) -> None:
-        """Show the frames of the clip (``clip``), the images of the stages (``compare``), the ``video``, or nothing."""
+        """Show the ``clip``, the stages (``compare``), several widths of the blur (``sweep``), or the ``video``."""
         self.clip_view.place.visible = what == "clip"
         self.compare_view.place.visible = what == "compare"
+        self.sweep_view.place.visible = what == "sweep"
         self.video_view.place.visible = what == "video"
         ui.run_javascript(f"turbrestore.look('{what}')")
         for name, button in self._tabs.items():
@@ -152,6 +156,14 @@ class Page:
         if result is self.tab.restored:
             await self.tune_view.restored()
 
+    def _swept(self) -> None:
+        self._refresh()
+        self.look_at("sweep")
+
+    def _chosen(self, sigma: float) -> None:
+        self.look_at("compare")
+        self.tune_view.choose(sigma)
+
     def _tuned(self) -> None:
         self.save_view.refresh()
         self.run_view.show_method(self.tab.tuned)
@@ -163,6 +175,7 @@ class Page:
             view.place.visible = opened
         self.tune_view.place.visible = self.save_view.place.visible = restored
         self._tabs["clip"].visible, self._tabs["compare"].visible = opened, self.compare_view.filled
+        self._tabs["sweep"].visible = self.sweep_view.filled
         self._tabs["video"].visible = self.tab.steadied is not None
         self._tab_row.visible = self.compare_view.filled or self.tab.steadied is not None
         self.open_view.empty.visible = not opened
@@ -172,11 +185,12 @@ class Page:
         with ui.element("div").classes("tabs").props('role=group aria-label="What is shown"') as self._tab_row:
             self._tabs = {
                 name: ui.button(words, on_click=partial(self.look_at, name)).props("flat dense padding='4px 12px'")
-                for name, words in (("clip", "Clip"), ("compare", "Compare"), ("video", "Video"))
+                for name, words in (("clip", "Clip"), ("compare", "Compare"), ("sweep", "Widths"), ("video", "Video"))
             }
         self.open_view.build_empty()
         self.clip_view.build()
         self.compare_view.build()
+        self.sweep_view.build()
         self.video_view.build()
         self.look_at("")
 

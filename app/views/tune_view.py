@@ -13,11 +13,13 @@ from nicegui import background_tasks, ui
 
 from turbrestore.blur.psf import GAUSSIAN
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore_cli.deblurring import widths_of
 
 from ..tab import Tab
 from ..tuning import SLOW, automatic_fidelity, impressions, part_around, tuned_params
 from .compare_view import CompareView
 from .elements import Notices, named_slider, set_most
+from .sweep_view import SweepView
 
 if TYPE_CHECKING:
     from turbrestore.core.arrays import FloatArray
@@ -38,12 +40,22 @@ class TuneView:
     notices : Notices
     compare_view : CompareView
         Shows the part that is deblurred anew.
+    sweep_view : SweepView
+        Shows several widths side by side.
     on_change : callable
         Called when something was tuned.
     """
 
-    def __init__(self, tab: Tab, notices: Notices, compare_view: CompareView, on_change: Callable[[], None]) -> None:
-        self._tab, self._notices, self._compare, self._on_change = tab, notices, compare_view, on_change
+    def __init__(
+        self,
+        tab: Tab,
+        notices: Notices,
+        compare_view: CompareView,
+        sweep_view: SweepView,
+        on_change: Callable[[], None],
+    ) -> None:
+        self._tab, self._notices, self._on_change = tab, notices, on_change
+        self._compare, self._sweep = compare_view, sweep_view
         self._setting = False
         self._wanted, self._working = 0, False
         self._automatic = True
@@ -57,6 +69,10 @@ class TuneView:
             self._fidelity, self._fidelity_text = named_slider(
                 "Strength", *_FIDELITIES, 0.02, "Strength, the weight λ of the data, logarithm"
             )
+            with ui.element("div").classes("fields"):
+                self._widths = ui.input("Widths to compare, pixels", value="0.8, 1.2, 1.6, 2")
+                self._widths.props("dense outlined").classes("grow").on("keydown.enter", self._compare_widths)
+                ui.button("Compare widths", on_click=self._compare_widths).props("outline no-wrap")
             self._sigma.on_value_change(self._changed)
             self._exponent.on_value_change(self._changed)
             self._fidelity.on_value_change(self._weighed)
@@ -94,6 +110,11 @@ class TuneView:
             return
         await self._show(tab.tuned)
         self._ask_for_part()
+
+    def choose(self, sigma: float) -> None:
+        """Set the width of the blur."""
+        set_most(self._sigma, max(6.0, sigma))
+        self._sigma.value = sigma
 
     def apply(self) -> None:
         """Deconvolve the whole image by what was chosen."""
@@ -191,6 +212,14 @@ class TuneView:
         if more:
             return f"Quick preview of {size}; the exact one follows …"
         return f"{size}; press Apply for the whole image"
+
+    async def _compare_widths(self) -> None:
+        """Show several widths side by side, with the other settings as they are."""
+        restored = self._tab.restored
+        if restored is not None:
+            with self._notices.catching():
+                widths = widths_of(self._widths.value or "", restored.frame.shape, "Widths to compare")
+                await self._sweep.show(restored, self._tab.tuned or tuned_params(restored), widths)
 
     async def _measure(self) -> None:
         """Go back to what is measured."""
