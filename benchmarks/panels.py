@@ -77,7 +77,7 @@ def main() -> int:
         lines.append(row(images))
         print(name)
         for decision in restoration.decisions:
-            print(f"  {decision.subject}: {decision.choice} ({decision.reason})", flush=True)
+            print(f"  {decision}", flush=True)
     width = max(line.shape[1] for line in lines)
     padded = [np.pad(line, ((0, GAP), (0, width - line.shape[1])), constant_values=1) for line in lines]
     write_image(options.picture, np.vstack(padded), 8, overwrite=True)

@@ -120,7 +120,7 @@ def deconvolve(
         bit_depth = 16 if source.suffix.lower() in STAGE_FILE else read_image(source, limits).bit_depth
     write_stage(output, deblurred.deconvolution, bit_depth, overwrite)
     for decision in deblurred.decisions:
-        say(f"{output}: {decision.subject}: {decision.choice} ({decision.reason})", quiet)
+        say(f"{output}: {decision}", quiet)
 
 
 def stage_of_run(path: Path) -> tuple[Path, Path | None]:

@@ -251,7 +251,7 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
 
 
 def _say_decision(decision: Decision) -> None:
-    say(f"{decision.subject}: {decision.choice} ({decision.reason})", quiet=False)
+    say(str(decision), quiet=False)
 
 
 def _expected_times(source: FrameSource, params: RestoreParams) -> dict[str, float]:

@@ -36,7 +36,7 @@ from .progress import progress_bars, say
 
 # Frames per second of inputs that do not say.
 USUAL_RATE = 25.0
-# Share of the image from which it is worth saying that the memory strayed.
+# Share of the image from which it is worth saying that the long average drifted.
 _ASTRAY = 0.02
 _MOST_BITS = {"h264": 8, "hevc": 10, ".gif": 8, ".webp": 8}
 
@@ -283,11 +283,11 @@ class _Facts:
         )
 
     def _astray(self) -> str:
-        """Say where the output would have strayed from the input."""
+        """Say where less is averaged, so that the output keeps to the input."""
         share = float(np.mean(self.let_go))
         if share < _ASTRAY:
             return ""
-        return f"; in {100 * share:.0f} % the memory strayed from the input and was let go, so less is averaged there"
+        return f"; {100 * share:.0f} % of the image is averaged less, because its long average had drifted from the input"
 
 
 def _images(frames: Iterable[SteadyFrame], masks: BinaryIO | None) -> Iterator[FloatArray]:

@@ -52,7 +52,7 @@ def test_every_doubt_is_named(restoration):
         },
         "could not be measured": {"blur": replace(restoration.blur, uncertainty=math.inf)},
         "motion that the flow has missed": {"seeing": missed},
-        "noise of 1.0 frames averaged": {"filtered": replace(restoration.filtered, shares=np.eye(24)[0])},
+        "as noisy as the average of 1.0 frames": {"filtered": replace(restoration.filtered, shares=np.eye(24)[0])},
         "100% of the pixels are saturated or seen in no frame": {"uncertainty": restoration.uncertainty + np.inf},
         "3% are at full scale": {"decisions": (Decision("saturation", "", "3% are at full scale"),)},
         "may have left traces": {"decisions": (Decision("passers", "", ""),)},

@@ -84,7 +84,7 @@ def test_flow_and_blur_agree_only_where_their_intervals_overlap():
         for by_blur in [*values, Estimate(2.2, 1.8, math.inf)]:
             seeing = replace(measured, displacement_by_flow=by_flow, displacement_by_blur=by_blur, remarks=())
             said = [one.choice for one in explain_seeing(seeing)]
-            assert ("by blur as by flow" in said) == (by_flow.low <= by_blur.high and by_blur.low <= by_flow.high)
+            assert ("flow and blur agree" in said) == (by_flow.low <= by_blur.high and by_blur.low <= by_flow.high)
             assert all("inf" not in one.reason.split() for one in explain_seeing(seeing))
 
 

@@ -231,7 +231,7 @@ def _gained(restoration: Restoration, motion: float, gain: float) -> str:
 
 def _checks(restoration: Restoration, motion: float, gain: float) -> Iterator[str]:
     if restoration.is_mean:
-        yield "the frames contradict the filtered image, as where the scene itself moves"
+        yield "the frames contradict the filtered image; the scene itself may move"
     elif motion < _STILL:
         yield f"the frames hardly move ({motion:.2f} pixels), so there was little to undo"
     elif gain < _NO_GAIN:
@@ -240,13 +240,13 @@ def _checks(restoration: Restoration, motion: float, gain: float) -> Iterator[st
         yield "the centroid has not converged"
     yield from (decision.reason for decision in restoration.decisions if decision.subject in _DOUBTS)
     if any(decision.subject == "passers" for decision in restoration.decisions):
-        yield "what passed was replaced by the background, and may have left traces"
+        yield "objects that passed were replaced by the background and may have left traces"
     if restoration.seeing is not None and (doubt := restoration.seeing.disagreement):
         yield doubt
     if restoration.filtered is not None and not restoration.is_mean:
         effective = 1 / float(np.square(restoration.filtered.shares).sum())
         if effective < _FEW_FRAMES:
-            yield f"the image has the noise of {effective:.1f} frames averaged"
+            yield f"the image is as noisy as the average of {effective:.1f} frames"
     yield from _checks_of_blur(restoration)
     deviation = restoration.uncertainty
     if deviation is not None and not restoration.is_mean and (unknown := np.isinf(deviation).mean()) > _UNKNOWN:

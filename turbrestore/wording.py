@@ -40,7 +40,7 @@ def explain_training(train: int, frame_count: int, wanted: int | None) -> Decisi
     elif train > half:
         reason = "more than half of a short clip"
     else:
-        reason = "half of the clip would be more than trains by default, or than memory holds"
+        reason = "half of the clip exceeds the default limit, or the memory"
     return Decision("training", f"first {train} of {frame_count} frames", reason)
 
 
@@ -66,7 +66,7 @@ def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
     side = min(flows.shape[1:3])
     if rms < _LARGE_MOTION * side:
         return ()
-    reason = f"{rms:.1f} pixels, with {side} a side, is too large for optical flow in places; details may be doubled"
+    reason = f"{rms:.1f} pixels in an image of {side} pixels a side: optical flow fails in places, which doubles details"
     return (Decision("motion", "taken as measured", reason),)
 
 
@@ -98,8 +98,8 @@ def explain_dynamics(dynamics: FlowDynamics, modelled: bool = False) -> tuple[De
     modes = Decision(
         "flow model",
         f"{dynamics.rank} modes",
-        f"{100 * dynamics.energy_share:.1f} % of the energy of the motion, largest eigenvalue {largest:.3f}; frames "
-        f"are registered by {'the flow of the model' if modelled else 'the measured flow'}",
+        f"they hold {100 * dynamics.energy_share:.1f} % of the energy of the motion; the largest eigenvalue is "
+        f"{largest:.3f}; frames are registered by {'the flow of the model' if modelled else 'the measured flow'}",
     )
     return modes, *(Decision("flow model", "adjusted", note) for note in dynamics.notes)
 
@@ -110,8 +110,8 @@ def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
     mean = 1 / (count if chosen is None else chosen)
     counting = int(np.sum(filtered.shares >= _COUNTS * mean))
     reason = f"weighted by sharpness (β = {filtered.sharpness_weight:.1f}), registration and outliers"
-    reason += f"; a frame counts if its weight is at least {_COUNTS:g} times the average"
-    largest = f"the largest is {filtered.shares.max() / mean:.1f} times the average"
+    reason += f"; a frame counts from {_COUNTS:g} times the average weight"
+    largest = f"the largest weight is {filtered.shares.max() / mean:.1f} times the average"
     asked = "" if chosen is None else f"; only the {chosen} sharpest were asked for"
     return Decision("frames", f"{counting} of {count} frames count", f"{reason}; {largest}{asked}")
 
@@ -120,7 +120,7 @@ def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
     """Say how far the image was moved onto the mean geometry, and how well that is known."""
     moved = float(np.sqrt(2 * np.mean(np.square(recentring_flow(filtered.mean_flow)), dtype=np.float64)))
     error = mean_flow_error(dynamics, int(np.isfinite(filtered.sharpness).sum()))
-    reason = f"mean flow to all frames, root mean square; its standard error is {error:.2f} pixels"
+    reason = f"onto the mean geometry of all frames, which is known to {error:.2f} pixels (standard error)"
     return Decision("geometry", f"moved by {moved:.2f} pixels", reason)
 
 
@@ -129,27 +129,27 @@ def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
     if reading.passed:
         return ()
     reason = (
-        f"{reading.unseen:.0%} of the edges of the filtered image are in fewer than half of the frames "
-        f"(bound {UNSEEN:.0%}), which differ by {reading.left:.0%} as much as before registration (bound {LEFT:.0%})"
+        f"{reading.unseen:.0%} of the edges of the filtered image occur in fewer than half of the frames (bound "
+        f"{UNSEEN:.0%}), and registration leaves {reading.left:.0%} of the differences of the frames (bound {LEFT:.0%})"
     )
     return (Decision("structure", "the mean of the frames is the result", reason),)
 
 
 def explain_seeing(seeing: Seeing) -> tuple[Decision, ...]:
     """Compare the displacement by flow with that by blur, and pass on the remarks."""
-    remarks = tuple(Decision("displacement", "to be looked at", remark) for remark in seeing.remarks)
+    remarks = tuple(Decision("displacement", "uncertain", remark) for remark in seeing.remarks)
     by_flow, by_blur = seeing.displacement_by_flow, seeing.displacement_by_blur
     if remarks or by_flow is None or by_blur is None:
         return remarks
     if not by_flow.overlaps(by_blur):
         reason = f"variance {by_flow.value:.2f} squared pixels; no more than {LARGEST_BLUR:g} can be told by blur"
-        return (Decision("displacement", "by flow alone", reason),)
+        return (Decision("displacement", "measured by flow alone", reason),)
     bound = "at least " if math.isinf(by_blur.high) else ""
     reason = (
         f"variance {by_flow.value:.2f} squared pixels by flow and {bound}{by_blur.value:.2f} by blur: "
         "their 95 % intervals overlap"
     )
-    return (Decision("displacement", "by blur as by flow", reason),)
+    return (Decision("displacement", "flow and blur agree", reason),)
 
 
 def interval_words(estimate: Estimate, spec: str = ".2f") -> str:

@@ -114,7 +114,7 @@ print(
     f"{100 * result.dynamics.energy_share:.0f} % of its variance"
 )
 for decision in result.decisions:
-    print(f"{decision.subject}: {decision.choice} ({decision.reason})")
+    print(decision)
 
 # %% [markdown]
 # The mean flow falls once and then no further; the rest is the bias of the flow method, and the iteration stops. The

@@ -23,8 +23,13 @@ class Decision:
     >>> decision = Decision("blur", "none removed", "width 0.42 ± 0.30 px is no more than that of a sharp image")
     >>> decision.subject, decision.choice
     ('blur', 'none removed')
+    >>> print(decision)
+    blur: none removed; width 0.42 ± 0.30 px is no more than that of a sharp image
     """
 
     subject: str
     choice: str
     reason: str
+
+    def __str__(self) -> str:
+        return f"{self.subject}: {self.choice}; {self.reason}"

@@ -78,8 +78,8 @@ def without_bars(source: FrameSource) -> tuple[FrameSource, Bars | None, tuple[D
 
     filled = dataclasses.replace(source, adjust=adjust)
     text = ", ".join(f"{side} {size}" for side, size in found.items())
-    choice = f"bars filled for the work, and put back: {text}"
-    decision = Decision("bars", choice, "even and dark in every frame; pixels")
+    choice = f"left out of the computation and put back: {text} pixels"
+    decision = Decision("bars", choice, "they are even and dark in every frame")
     return filled, Bars(picture, mean), (decision,)
 
 

@@ -220,7 +220,7 @@ def _seeing_facts(restoration: Restoration) -> Iterator[Fact]:
             value = f"{interval_words(estimate)} {unit}"
             yield Fact(name.replace("_", " ").capitalize(), value, notes[name])
     for remark in seeing.remarks:
-        yield Fact("Displacement", "to be looked at", remark, True)
+        yield Fact("Displacement", "uncertain", remark, True)
 
 
 def _uncertainty_facts(restoration: Restoration) -> Iterator[Fact]:

@@ -237,8 +237,8 @@ def measure_seeing(
     remarks: tuple[str, ...] = ()
     if whole.slow:
         remarks += (
-            f"the clip spans few correlation times ({whole.independent_frames:.1f} independent frames): the variance "
-            "over a long time is a lower bound, and more frames would tell more",
+            f"the clip holds only {whole.independent_frames:.1f} independent frames, so the variance is a lower bound; "
+            "a longer clip gives more",
         )
     strength: dict[str, Any] = {}
     if optics is not None and np.isnan(rotation):
