@@ -287,7 +287,7 @@ class _Facts:
         share = float(np.mean(self.let_go))
         if share < _ASTRAY:
             return ""
-        return f"; {100 * share:.0f} % of the image is averaged less, because its long average had drifted from the input"
+        return f"; {100 * share:.0f} % of the image is averaged less, because the long average drifted from the input"
 
 
 def _images(frames: Iterable[SteadyFrame], masks: BinaryIO | None) -> Iterator[FloatArray]:

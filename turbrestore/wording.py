@@ -66,7 +66,7 @@ def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
     side = min(flows.shape[1:3])
     if rms < _LARGE_MOTION * side:
         return ()
-    reason = f"{rms:.1f} pixels in an image of {side} pixels a side: optical flow fails in places, which doubles details"
+    reason = f"{rms:.1f} pixels in an image of {side} pixels a side: optical flow fails in places and doubles details"
     return (Decision("motion", "taken as measured", reason),)
 
 
