@@ -71,6 +71,8 @@ def test_everything_loads_and_stays_inside(open_page):
     maps = page.evaluate("[...document.querySelectorAll('svg image')].map((image) => image.getBBox().width)")
     assert len(maps) >= 2
     assert min(maps) > 0
+    # Labels that are wider than planned are not cut.
+    assert page.locator(".maps svg").first.evaluate("(plot) => getComputedStyle(plot).overflow") == "visible"
     assert page.evaluate("getComputedStyle(document.querySelector('h1')).overflowWrap") == "anywhere"
 
 
