@@ -34,7 +34,7 @@ MEANINGS = {
     "psnr": "dB, higher is better",
     "psnr_fit": "dB after the best gain and offset, higher is better",
     "ssim": "structural similarity, 1 is best",
-    "sharpness": "times that compared with, 1 is best against the truth",
+    "sharpness": "ratio to the second image, 1 is best if that is the truth",
     "overshoot": "share of the pixels, lower is better",
     "endpoint_error": "pixels, lower is better",
     "endpoint_error_centred": "pixels about the mean error, lower is better",

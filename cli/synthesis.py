@@ -171,7 +171,9 @@ def synthesize(
         print_json({**facts, "output": str(output)})
     else:
         along_x, along_y = facts["flow_rms"]
-        say(f"{output}: {frames} frames, flow of {along_x:.2f} and {along_y:.2f} pixels along x and y", quiet)
+        say(
+            f"{output}: {frames} frames, displaced by {along_x:.2f} and {along_y:.2f} pixels along x and y (rms)", quiet
+        )
 
 
 def _outputs(output: Path, has_diffraction: bool, has_objects: bool) -> dict[str, Path]:

@@ -126,7 +126,7 @@ def commands_before(page: str, files: list[str]) -> list[str]:
     commands = re.findall(r"(?m)^ *(turbrestore .*)$", text)
     last = max(index for index, command in enumerate(commands) if set(files) & set(shlex.split(command)[3:4]))
     # The Moon of the page for planets, and files of the reader's own, are not shown.
-    return [command for command in commands[: last + 1] if not re.search(r"moon|night|sweep|evaluate", command)]
+    return [command for command in commands[: last + 1] if not re.search(r"crater|night|moon|sweep|evaluate", command)]
 
 
 def picture_of(path: Path, frame: int | None) -> FloatArray:
@@ -143,7 +143,7 @@ RECIPES: dict[str, dict[str, tuple[str, int | None]]] = {
     },
     "text": {
         "frame": ("plate.mkv", 50),
-        "temporal mean": ("stages/mean.png", None),
+        "temporal mean": ("plate_stages/mean.png", None),
         "restored": ("plate.png", None),
     },
     "planet": {
