@@ -115,14 +115,11 @@ def make_recipes() -> None:
                 subprocess.run(shlex.split(command), check=True)
             panels = {title: picture_of(Path(name), frame) for title, (name, frame) in shown.items()}
         save(f"recipe_{page}", row(panels, 288), LARGEST_RECIPE)
-    truth = gallery_clip("photographer").truth
-    strengths = {f"{name}, D/r0 = {ratio:g}": film(truth, ratio, 1)[0] for name, ratio in STRENGTHS.items()}
-    save("recipe_simulate", row({"scene": truth} | strengths), LARGEST_RECIPE)
 
 
 def commands_before(page: str, files: list[str]) -> list[str]:
     """Commands of a recipe up to the last that writes one of the files."""
-    text = (Path(__file__).parent / "recipes" / f"{page}.md").read_text("utf-8")
+    text = (Path(__file__).parent / "recipes" / f"{page}.md").read_text("utf-8").replace("\\\n", " ")
     commands = re.findall(r"(?m)^ *(turbrestore .*)$", text)
     last = max(index for index, command in enumerate(commands) if set(files) & set(shlex.split(command)[3:4]))
     # The Moon of the page for planets, and files of the reader's own, are not shown.
@@ -150,6 +147,12 @@ RECIPES: dict[str, dict[str, tuple[str, int | None]]] = {
         "frame": ("planet.ser", 60),
         "restored": ("planet.png", None),
         "restored, --sigma 1.6": ("planet_sharp.png", None),
+    },
+    "simulate": {
+        "scene": ("clip.truth.png", None),
+        "frame": ("clip.mkv", 30),
+        "another scene moves alike": ("more.mkv", 30),
+        "moving objects": ("moving.mkv", 30),
     },
 }
 GROUPS = {"film": make_film, "gallery": make_gallery, "stages": make_stages, "recipes": make_recipes}
