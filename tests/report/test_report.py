@@ -213,7 +213,7 @@ class TestPage:
         guards = [fact for fact in found if fact.name.startswith("Guards")]
         assert [fact.doubtful for fact in guards] == [True, False]
         assert guards[0].name == "Guards at 2.00 px"
-        assert guards[0].value == "25% of edges ring, 12% overshoots, noise ×7.0"
+        assert guards[0].value == "25% of edges ring, 12% of pixels near them overshoot, noise ×7.0"
 
     def test_laps_follow_each_other(self, whole):
         laps = facts.laps(whole)

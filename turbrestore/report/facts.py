@@ -173,7 +173,7 @@ def _filter_facts(restoration: Restoration) -> Iterator[Fact]:
     yield Fact(
         "Effective frames",
         f"{effective:.1f} of {filtered.shares.size}",
-        "if all had equal weight",
+        "as many frames of equal weight would have the same noise",
     )
 
 
@@ -198,7 +198,7 @@ def _blur_facts(restoration: Restoration) -> Iterator[Fact]:
 
 def _guard_facts(restoration: Restoration) -> Iterator[Fact]:
     for reading in restoration.guard_readings:
-        shares = f"{reading.ringing:.0%} of edges ring, {reading.overshoot:.0%} overshoots"
+        shares = f"{reading.ringing:.0%} of edges ring, {reading.overshoot:.0%} of pixels near them overshoot"
         value = f"{shares}, noise ×{reading.noise_gain:.1f}"
         note = "passed" if reading.passed else "failed: less blur is removed"
         yield Fact(f"Guards at {reading.sigma:.2f} px", value, note, not reading.passed)
@@ -213,7 +213,7 @@ def _seeing_facts(restoration: Restoration) -> Iterator[Fact]:
         "displacement_by_flow": "over this clip",
         "displacement_by_blur": "over this clip, from the blur of the mean; a lower bound above 2 px²",
         "isoplanatic_patch": "separation at which the motion is half correlated",
-        "coherence_time": "until the motion is correlated by 1/e",
+        "coherence_time": "lag at which the correlation of the motion falls to 1/e",
     }
     for name, (estimate, unit) in seeing.estimates().items():
         if estimate is not None and name in notes:
@@ -231,7 +231,9 @@ def _uncertainty_facts(restoration: Restoration) -> Iterator[Fact]:
     if known.any():
         middle, high = (100 * float(value) for value in np.quantile(deviation[known], (0.5, 0.95)))
         yield Fact(
-            "Standard deviation of a pixel", f"{middle:.2f} %", f"of full scale, median; {high:.2f} % at most for 95 %"
+            "Standard deviation of a pixel",
+            f"{middle:.2f} %",
+            f"of full scale in the median; below {high:.2f} % in 95 % of the pixels",
         )
     if not known.all():
         value = f"{100 * (1 - known.mean()):.1f} % of the pixels"

@@ -134,11 +134,11 @@ def _witnesses(posterior: BlurPosterior) -> Iterator[Panel]:
     }
     widths = {name: found for name, found in widths.items() if np.isfinite(found).all()}
     figure = plot_witnesses(widths, posterior.removed)
-    caption = "Bars hold the width with a probability of 68 %. Dashed: the width that is removed."
+    caption = "Each bar holds 68 % of the probability. Dashed: the width that is removed."
     yield make_panel(figure, "witnesses", "Widths of the blur by each witness", caption)
     curves = {"lowest": posterior.lowest, "mean": posterior.transfer, "highest": posterior.highest}
     removed = radial_otf(posterior.frequencies, posterior.removed, posterior.exponent)
-    caption = "With 68 % of the probability. Dashed: the transfer function that is removed."
+    caption = "The band holds 68 % of the probability. Dashed: the transfer function that is removed."
     figure = plot_transfer(posterior.frequencies, curves, removed)
     yield make_panel(figure, "transfer", "Transfer function of the blur", caption)
     rows = {
