@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import ConfigurationError, DataError
+from ...core.errors import DataError
+from ...core.extras import missing_package
 from ..limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
 from ..pixels import PixelArray
 
@@ -67,7 +68,5 @@ def _rawpy(path: Path) -> Any:
     try:
         import rawpy
     except ImportError as error:
-        raise ConfigurationError(
-            f"{path}: a raw file needs rawpy, which is not installed; run pip install 'turbrestore[raw]'"
-        ) from error
+        raise missing_package(str(path), "rawpy", "raw") from error
     return rawpy
