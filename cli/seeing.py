@@ -54,7 +54,7 @@ def seeing(
     distance : float
         From the aperture to the scene, m.  With it Cn² is reported too, and D/r0 is much better known.
     wavelength : float
-        m.
+        Wavelength of the light, m.
     path : {"spherical", "plane"}
         Plane where the scene lies far beyond the turbulence; the distance is then the length of the turbulent path.
     train : int

@@ -54,9 +54,9 @@ class RestoreParams:
     distance : float, optional
         From the aperture to the scene, m.  With it Cn² is reported too, and D/r0 is much better known.
     wavelength : float
-        m.
+        Wavelength of the light, m.
     psf : str, optional
-        Image of a star, or a measured point spread function, in pixels of the clip.  It is removed instead of an
+        Image whose blur is removed: a star or a measured point spread function, in pixels of the clip, instead of an
         estimated blur.
     flow : FlowParams
         Optical flow.
