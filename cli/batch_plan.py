@@ -80,6 +80,8 @@ def plan(orders: Sequence[Order], out: Path, resume: bool, overwrite: bool) -> t
     OutputError
         An output exists that no earlier batch has made, or is an input.
     """
+    if (out / JOURNAL).exists() and not resume and not overwrite:
+        raise OutputError(f"{out}: holds a batch; choose another folder, add --overwrite, or --resume the batch in it")
     earlier = read_journal(out / JOURNAL) if resume else {}
     read = {path.resolve() for order in orders for path in order.inputs}
     for name in (JOURNAL, TABLE, PAGE):

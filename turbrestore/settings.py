@@ -56,8 +56,8 @@ class RestoreParams:
     wavelength : float
         Wavelength of the light, m.
     psf : str, optional
-        Image whose blur is removed: a star or a measured point spread function, in pixels of the clip, instead of an
-        estimated blur.
+        Image of a star or of a measured blur to remove, in pixels of the clip.  It takes the place of an estimated
+        blur.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams

@@ -181,6 +181,8 @@ class TestBatch:
         assert [path.name for path in tmp_path.iterdir()] == ["0.png"]
         assert run(clips / "0.mkv", "--out", tmp_path, "--overwrite", "--reports")[0] == 0
         assert (tmp_path / "0.html").read_text().startswith("<!doctype html>")
+        code, _, err = run(clips / "0.mkv", "--out", tmp_path)
+        assert code == 73 and "holds a batch; choose another folder, add --overwrite, or --resume" in err
 
     def test_a_static_mask_is_an_input_of_every_clip(self, run, clips, tmp_path):
         out, mask = tmp_path / "out", np.zeros((64, 64), np.float32)
