@@ -259,7 +259,7 @@ def _checks_of_blur(restoration: Restoration) -> Iterator[str]:
         return
     if readings and not readings[-1].passed:
         if done.sigma > 0:
-            yield "edges ring, overshoot or carry noise at the width that was given"
+            yield "at the width that was given, edges ring or overshoot, or noise is amplified"
         else:
             yield "no blur is removed, because every width made edges ring or overshoot"
     if restoration.blur is not None and not math.isfinite(restoration.blur.uncertainty):
