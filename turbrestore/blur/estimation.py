@@ -147,21 +147,11 @@ class BlurEstimate:
 
 @dataclass(frozen=True, eq=False)
 class BlurCandidate:
-    """Blur found at one reduction of an image.
+    """Blur found at one reduction of an image."""
 
-    Attributes
-    ----------
-    estimate : BlurEstimate
-        Its uncertainty is infinite until :func:`choose_blur` has computed it.
-    part : ndarray, float32, shape (h, w)
-        The part of the reduced image that was analysed.
-    asked : float or None
-        Exponent that was asked for; None for that of fused frames.
-    """
-
-    estimate: BlurEstimate
-    part: FloatArray
-    asked: float | None = None
+    estimate: BlurEstimate  # its uncertainty is infinite until :func:`choose_blur` has computed it
+    part: FloatArray  # (h, w): the part of the reduced image that was analysed
+    asked: float | None = None  # exponent that was asked for; None for that of fused frames
 
     @property
     def plausible(self) -> bool:

@@ -48,32 +48,22 @@ _NO_ESTIMATE = 100.0
 
 @dataclass(frozen=True, eq=False)
 class RelativeBlur:
-    """How much wider the first of two images is blurred than the second; negative where it is sharper.
+    """How much wider the first of two images is blurred than the second; negative where it is sharper."""
 
-    Attributes
-    ----------
-    variance, deviation : float
-        Σ₁ − Σ₂ per axis if it is the same in all directions, and its standard deviation, squared pixels.  If it is
-        not, directions with more structure count more, and ``matrix`` should be used.
-    matrix, matrix_deviation : ndarray, float64, shape (2, 2)
-        Σ₁ − Σ₂ with axes (x, y), and the standard deviation of each entry, squared pixels.
-    tile_variance, tile_deviation : ndarray, float64, shape (m, n)
-        The same for every tile; 0 with an infinite deviation where the tile has no structure.
-    tile_matrix, tile_matrix_deviation : ndarray, float64, shape (m, n, 2, 2)
-        The same for every tile.
-    grid : TileGrid
-        Positions of the tiles.
-    """
-
+    # Σ₁ − Σ₂ per axis if it is the same in all directions, and its standard deviation, squared pixels. If it is not,
+    # directions with more structure count more, and ``matrix`` should be used.
     variance: float
     deviation: float
+    # (2, 2): Σ₁ − Σ₂ with axes (x, y), and the standard deviation of each entry, squared pixels.
     matrix: Float64Array
     matrix_deviation: Float64Array
+    # (m, n): the same for every tile; 0 with an infinite deviation where the tile has no structure.
     tile_variance: Float64Array
     tile_deviation: Float64Array
+    # (m, n, 2, 2): the same for every tile.
     tile_matrix: Float64Array
     tile_matrix_deviation: Float64Array
-    grid: TileGrid
+    grid: TileGrid  # positions of the tiles
 
 
 def relative_blur(

@@ -32,21 +32,11 @@ _FLOW_NOISE_FLOOR = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ProjectedFlow:
-    """A measured flow, as far as the update of the state needs it.
+    """A measured flow, as far as the update of the state needs it."""
 
-    Attributes
-    ----------
-    state : ndarray, float64, shape (n,)
-        z.
-    squared : float
-        Sum of squares of W^meas − W̄, squared pixels.
-    size : int
-        Components of the flow, 2 H W.
-    """
-
-    state: Float64Array
-    squared: float
-    size: int
+    state: Float64Array  # (n,): z
+    squared: float  # sum of squares of W^meas − W̄, squared pixels
+    size: int  # components of the flow, 2 H W
 
 
 def project_measured(measured: FloatArray, dynamics: FlowDynamics) -> ProjectedFlow:

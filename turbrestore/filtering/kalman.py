@@ -27,23 +27,11 @@ _LOG_2PI = float(np.log(2 * np.pi))
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """Mean and covariance of a state.
+    """Mean and covariance of a state."""
 
-    Parameters
-    ----------
-    mean : ndarray, float64, shape (..., n)
-        ξ̂.
-    cov : ndarray, float64, shape (..., n, n)
-        P, symmetric positive semi-definite. Its leading axes may be fewer than those of the mean: one covariance
-        then holds for all of them.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, values are not finite, or the covariance is no covariance.
-    """
-
-    mean: Float64Array
+    mean: Float64Array  # (..., n): ξ̂
+    # (..., n, n): P, symmetric positive semi-definite. Its leading axes may be fewer than those of the mean: one
+    # covariance then holds for all of them.
     cov: Float64Array
 
     def __post_init__(self) -> None:
@@ -64,27 +52,16 @@ class Innovation:
 
     If the model is right, the mean of ``normalised_squared`` over many updates is that of ``observed``, and the sum of
     ``log_likelihood`` is the log-density of all measurements.
-
-    Parameters
-    ----------
-    values : ndarray, float64, shape (..., m) or (..., n)
-        Covariance form: z − H ξ̂, NaN where the component is missing. Information form: its projection
-        Hᵀ R⁻¹ (z − H ξ̂), which is all that the update needs.
-    cov : ndarray, float64, shape (..., m, m) or (..., n, n)
-        Covariance of ``values``, NaN where a component is missing.
-    normalised_squared : ndarray, float64, shape (...)
-        Squared innovation in units of its covariance; chi-squared with ``observed`` degrees of freedom.
-    log_likelihood : ndarray, float64, shape (...)
-        Log-density of the measurement given all before it.
-    observed : ndarray, int, shape (...)
-        Number of components that are not missing.
     """
 
+    # (..., m) or (..., n). Covariance form: z − H ξ̂, NaN where the component is missing. Information form: its
+    # projection Hᵀ R⁻¹ (z − H ξ̂), which is all that the update needs.
     values: Float64Array
-    cov: Float64Array
+    cov: Float64Array  # (..., m, m) or (..., n, n): covariance of ``values``, NaN where a component is missing
+    # (...): squared innovation in units of its covariance; chi-squared with ``observed`` degrees of freedom.
     normalised_squared: Float64Array
-    log_likelihood: Float64Array
-    observed: NDArray[np.intp]
+    log_likelihood: Float64Array  # (...): log-density of the measurement given all before it
+    observed: NDArray[np.intp]  # (...): number of components that are not missing
 
 
 def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
