@@ -29,7 +29,7 @@ STEPS = ["--deconvolution.iterations", "3", "--quiet"]
 QUICK = ["--centroid.iterations", "1", "--filter.inner-iterations", "1", *STEPS]
 # Examples as they stand, but on fewer frames and fewer runs.
 SMALLER = {("--frames", "0:24"): "0:4", ("--frames", "120"): "6", ("--frames", "300"): "6", ("--train", "40"): "5"}
-SMALLER |= {("--seeds", "20"): "2"}
+SMALLER |= {("--seeds", "20"): "2", ("--roi", "64,32,96,96"): "16,8,64,64"}
 
 
 @pytest.fixture
@@ -37,9 +37,10 @@ def folder(tmp_path, monkeypatch):
     """A folder to work in, with a corner of six frames of the sample clip and of the truth."""
     samples = tmp_path / "sample_data"
     samples.mkdir()
-    corner = open_frames(ROOT / "sample_data" / "chart.mkv", roi=(0, 0, 160, 128))
+    corner = open_frames(ROOT / "sample_data" / "chart.mkv", roi=(64, 48, 96, 80))
     write_video(samples / "chart.mkv", corner.read(0, 6), 25)
-    write_image(samples / "chart_truth.png", read_image(ROOT / "sample_data" / "chart_truth.png").image[:128, :160], 16)
+    truth = read_image(ROOT / "sample_data" / "chart_truth.png").image[48:128, 64:160]
+    write_image(samples / "chart_truth.png", truth, 16)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("SHELL", "/bin/bash")
