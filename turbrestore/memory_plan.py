@@ -203,8 +203,8 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget
     if choice.in_scratch:
         in_hand = (2 * threads + 2) / train
         frames, flows, modes = frames * in_hand, flows * in_hand, min(modes, 4.0 * _IN_HAND * threads)
-    # While tiles are processed the images of the whole lie in files, but for the frame that is being read.
-    held = frames + flows + (0.0 if choice.tile is None else 10.5 * _pixels(shape) * _channels(shape))
+    # The sum of the frames; in tiles the frame that is being read, while the other images of the whole lie in files.
+    held = frames + flows + (8.0 if choice.tile is None else 10.5) * _pixels(shape) * _channels(shape)
     flow, side = flow_memory(part, threads), _deconvolution_side(shape, params, choice, budget)
     results = _held_by_deconvolution(shape, params, choice)
     prepared = _pixels(shape) * float(_PREPARED + _PREPARED_COLOUR * _channels(shape))
