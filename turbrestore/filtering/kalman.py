@@ -76,7 +76,7 @@ def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
     _check_batches(state.mean.shape[:-1], A=A.shape[:-2], Q=Q.shape[:-2])
     # Gaussian raises a DataError where the result overflows, so NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
-        return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ _transposed(A) + Q))
+        return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ _transposed(A) + Q))  # (14b), (14d)
 
 
 def update(
@@ -103,7 +103,7 @@ def update(
     HP = H @ state.cov
     S = _symmetric(HP @ _transposed(H) + R)
     lower = _cholesky(S, "innovation covariance H P Hᵀ + R", "positive definite")
-    M = _transposed(_solve(S, HP))
+    M = _transposed(_solve(S, HP))  # P Hᵀ (H P Hᵀ + R)⁻¹, (18)
     F = np.eye(n) - M @ H
     after = Gaussian(
         state.mean + _apply(M, residual),
@@ -155,10 +155,10 @@ def _information_step(
 ) -> tuple[Gaussian, Innovation]:
     """Update from the normal equations G = Hᵀ R⁻¹ H, Hz = Hᵀ R⁻¹ z, zz = zᵀ R⁻¹ z."""
     T, gained = _posterior_root(state.cov, G)
-    cov = _symmetric(T @ _transposed(T))
+    cov = _symmetric(T @ _transposed(T))  # (G + P⁻¹)⁻¹, of M in (19)
     G_mean = _apply(G, state.mean)
     score = Hz - G_mean
-    step = _apply(cov, score)
+    step = _apply(cov, score)  # M (z − H ξ̂), (17)
     # zᵀR⁻¹z − 2 ξ̂ᵀHᵀR⁻¹z + ξ̂ᵀGξ̂ needs no further pass over H; rounding may leave it a little below zero.
     weighted = zz - (state.mean * (Hz + score)).sum(-1)
     squared = np.maximum(weighted - (score * step).sum(-1), 0.0)
