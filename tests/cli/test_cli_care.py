@@ -160,7 +160,7 @@ class TestSettings:
         assert "run.toml: expected settings as TOML" in err
 
     def test_written_file_is_what_a_restoration_without_it_uses(self, run, folder):
-        write_video("small.mkv", open_frames("sample_data/chart.mkv", roi=(96, 0, 64, 64)).read(0, 4), 25)
+        write_video("small.mkv", open_frames("sample_data/chart.mkv", roi=(16, 8, 64, 64)).read(0, 4), 25)
         assert run("config", "--init", "run.toml")[0] == 0
         assert run("restore", "small.mkv", "a.png", "--quiet", "--config", "run.toml")[0] == 0
         assert tomllib.loads(Path("a.png.toml").read_text()) == tomllib.loads(Path("run.toml").read_text())
