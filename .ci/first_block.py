@@ -1,8 +1,12 @@
-"""Run the first block of README.md as a newcomer does: in a fresh clone, with nothing installed."""
+"""Run the first block of README.md as a newcomer does: in a fresh clone, with nothing installed.
+
+``first_block.py FOLDER`` leaves the clone and its environment in the folder.
+"""
 
 import os
 import re
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -11,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
-        clone = Path(folder, "turbrestore")
+        clone = Path(*(sys.argv[1:] or [folder]), "turbrestore")
         subprocess.run(["git", "clone", "--quiet", "--depth", "1", ROOT.as_uri(), str(clone)], check=True)
         block = re.search(r"(?ms)^```\w*\n(.*?)^```$", (clone / "README.md").read_text("utf-8"))[1]
         # An environment that is active here is not the newcomer's.

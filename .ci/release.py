@@ -1,8 +1,8 @@
 """Build source archive and wheel into dist/, twice, and keep them if both times gave the same bytes.
 
 The wheel is then installed alone into a new environment, where a clip is synthesized and restored, and the source
-archive after it. ``--tag v0.2.0``
-checks that the tag is the version; ``--no-trial`` leaves the installation out.
+archive after it. ``--environment FOLDER`` takes an environment that has what the wheel asks for instead of a new one.
+``--tag v0.2.0`` checks that the tag is the version; ``--no-trial`` leaves the installation out.
 """
 
 import argparse
@@ -25,6 +25,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tag")
     parser.add_argument("--no-trial", action="store_true")
+    parser.add_argument("--environment", type=Path)
     options = parser.parse_args()
     version = re.search(r'__version__ = "(.+)"', (ROOT / "turbrestore" / "__init__.py").read_text())[1]
     if options.tag not in (None, f"v{version}"):
@@ -37,7 +38,9 @@ def main() -> None:
         (ROOT / "dist").mkdir(exist_ok=True)
         kept = [Path(shutil.copy(path, ROOT / "dist")) for path in first]
         if not options.no_trial:
-            try_out(Path(folder, "trial"), *sorted(kept, key=lambda path: path.suffix != ".whl"))
+            trial = Path(folder, "trial")
+            trial.mkdir()
+            try_out(trial, options.environment, *sorted(kept, key=lambda path: path.suffix != ".whl"))
     print("\n".join(str(path.relative_to(ROOT)) for path in kept))
 
 
@@ -72,19 +75,24 @@ def settle(path: Path, time: int) -> None:
     path.write_bytes(gzip.compress(settled.getvalue(), mtime=time))
 
 
-def try_out(folder: Path, wheel: Path, archive: Path) -> None:
+def try_out(folder: Path, environment: Path | None, wheel: Path, archive: Path) -> None:
     """Install the wheel alone, with what it asks for, and restore a clip; then the source archive in its place."""
-    venv.create(folder, with_pip=True)
-    scripts = folder / ("Scripts" if sys.platform == "win32" else "bin")
-    subprocess.run([scripts / "python", "-m", "pip", "install", "--quiet", f"{wheel}[report]"], check=True)
+    scripts = (environment or folder / "environment").absolute() / ("Scripts" if sys.platform == "win32" else "bin")
+    pip = [scripts / "python", "-m", "pip"]
+    replace = [*pip, "install", "--quiet", "--no-deps", "--force-reinstall"]
+    if environment is None:
+        venv.create(scripts.parent, with_pip=True)
+        subprocess.run([*pip, "install", "--quiet", f"{wheel}[report]"], check=True)
+    else:
+        subprocess.run([*replace, wheel], check=True)
+        subprocess.run([*pip, "check"], check=True)
     for words in (
         ["synthesize", "chart", "haze.mkv", "--frames", "12", "--size", "96x96", "--strength", "weak"],
         ["restore", "haze.mkv", "sharp.png", "--report", "sharp.html"],
     ):
         subprocess.run([scripts / "turbrestore", *words], cwd=folder, check=True)
     assert (folder / "sharp.html").stat().st_size > 10_000
-    words = ["install", "--quiet", "--no-deps", "--force-reinstall", str(archive)]
-    subprocess.run([scripts / "python", "-m", "pip", *words], check=True)
+    subprocess.run([*replace, archive], check=True)
     subprocess.run([scripts / "turbrestore", "sample", "sample"], cwd=folder, check=True)
     assert (folder / "sample" / "chart.mkv").exists()
 

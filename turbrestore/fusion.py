@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -141,7 +142,10 @@ class Fused:
 
 def fuse(run: Run) -> Fused:
     """Run the stages up to the filter; the training frames are freed when this function returns."""
-    params, train, stream = run.params, run.plan.train, iter(run.source)
+    params, train = run.params, run.plan.train
+    total = np.zeros(run.source.shape[1:])
+    # Tiles read their parts of the frames themselves.
+    stream = iter(run.source) if run.tiles else _added_up(run.source, total)
     begun, levels = time.perf_counter(), run.levels
     training = fill_stack((train, *run.source.shape[1:]), stream, run.plan.runtime.scratch)
     run.seconds["read"] += time.perf_counter() - begun
@@ -160,7 +164,8 @@ def fuse(run: Run) -> Fused:
 
     start = levels.stretched_result(centroid)
     filtered = run.stage("filter", "filtered", lambda: _filter(run, start, dynamics, training, stream).recentred())
-    mean = run.stage("filter", "mean", lambda: levels.original(temporal_mean(run.source)))
+    unread = _added_up(run.source, total) if run.tiles else stream
+    mean = run.stage("filter", "mean", lambda: levels.original(_mean(unread, total, len(run.source))))
     # The sharpness is NaN for frames that do not count.
     chosen = int(np.isfinite(filtered.sharpness).sum())
     run.decide(
@@ -335,6 +340,17 @@ def _observe_filter(run: Run, tile: int, step: FilterStep) -> None:
 def temporal_mean(source: FrameSource) -> FloatArray:
     """Mean of the frames, read one after the other."""
     total = np.zeros(source.shape[1:])
-    for frame in source:
+    return _mean(_added_up(source, total), total, len(source))
+
+
+def _added_up(frames: Iterable[FloatArray], total: NDArray[np.float64]) -> Iterator[FloatArray]:
+    """Pass frames on, and add them to ``total``, (H, W) or (H, W, 3)."""
+    for frame in frames:
         total += frame
-    return (total / len(source)).astype(np.float32)
+        yield frame
+
+
+def _mean(unread: Iterator[FloatArray], total: NDArray[np.float64], count: int) -> FloatArray:
+    """Mean of frames that have been added up but for those that nobody has read yet."""
+    deque(unread, 0)
+    return (total / count).astype(np.float32)

@@ -67,30 +67,16 @@ _THREADS_OF_TILES = 2
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """What is done to keep within a memory limit.
+    """What is done to keep within a memory limit."""
 
-    Attributes
-    ----------
-    train : int
-        Number of training frames.
-    runtime : Runtime
-        For the stages: the threads that work, the device that was found, and the folder of the scratch files or None.
-    tile : int or None
-        Longest side of the tiles in which frames are processed, pixels; None for whole frames.
-    scratch_bytes : int
-        Size of all scratch files.
-    deconvolution_side : int or None
-        Longest side of the tiles in which the image is deconvolved, pixels; None for the whole image.
-    decisions : tuple of Decision
-        What is done to save memory, in words.
-    """
-
-    train: int
+    train: int  # number of training frames
+    # For the stages: the threads that work, the device that was found, and the folder of the scratch files or None.
     runtime: Runtime
-    tile: int | None = None
-    scratch_bytes: int = 0
+    tile: int | None = None  # longest side of the tiles in which frames are processed, pixels; None for whole frames
+    scratch_bytes: int = 0  # size of all scratch files
+    # Longest side of the tiles in which the image is deconvolved, pixels; None for the whole image.
     deconvolution_side: int | None = None
-    decisions: tuple[Decision, ...] = ()
+    decisions: tuple[Decision, ...] = ()  # what is done to save memory, in words
 
 
 @dataclass(frozen=True)
@@ -217,8 +203,8 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget
     if choice.in_scratch:
         in_hand = (2 * threads + 2) / train
         frames, flows, modes = frames * in_hand, flows * in_hand, min(modes, 4.0 * _IN_HAND * threads)
-    # While tiles are processed the images of the whole lie in files, but for the frame that is being read.
-    held = frames + flows + (0.0 if choice.tile is None else 10.5 * _pixels(shape) * _channels(shape))
+    # The sum of the frames; in tiles the frame that is being read, while the other images of the whole lie in files.
+    held = frames + flows + (8.0 if choice.tile is None else 10.5) * _pixels(shape) * _channels(shape)
     flow, side = flow_memory(part, threads), _deconvolution_side(shape, params, choice, budget)
     results = _held_by_deconvolution(shape, params, choice)
     prepared = _pixels(shape) * float(_PREPARED + _PREPARED_COLOUR * _channels(shape))

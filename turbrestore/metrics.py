@@ -26,62 +26,31 @@ _SMALLEST = 2 * BORDER + 8
 
 @dataclass(frozen=True)
 class Comparison:
-    """Quality of a result compared with the truth.
+    """Quality of a result compared with the truth."""
 
-    Attributes
-    ----------
-    psnr : float
-        Peak signal-to-noise ratio after alignment, dB.
-    psnr_fit : float
-        The same after a fit of gain and offset, dB.
-    ssim : float
-        Structural similarity after that fit.
-    sharpness : float
-        Mean gradient magnitude relative to that of the truth, after alignment.
-    overshoot : float
-        Share of pixels outside the local range of the truth, after alignment; see :func:`overshoot`.
-    """
-
-    psnr: float
-    psnr_fit: float
-    ssim: float
-    sharpness: float
-    overshoot: float
+    psnr: float  # peak signal-to-noise ratio after alignment, dB
+    psnr_fit: float  # the same after a fit of gain and offset, dB
+    ssim: float  # structural similarity after that fit
+    sharpness: float  # mean gradient magnitude relative to that of the truth, after alignment
+    overshoot: float  # share of pixels outside the local range of the truth, after alignment; see :func:`overshoot`
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """Quality of a result without a truth.
+    """Quality of a result without a truth."""
 
-    Attributes
-    ----------
-    sharpness : float
-        Mean gradient magnitude relative to that of the reference.
-    overshoot : float
-        Share of pixels outside the local range of the reference; see :func:`overshoot`.
-    """
-
-    sharpness: float
-    overshoot: float
+    sharpness: float  # mean gradient magnitude relative to that of the reference
+    overshoot: float  # share of pixels outside the local range of the reference; see :func:`overshoot`
 
 
 @dataclass(frozen=True)
 class FlowComparison:
-    """Errors of flows compared with the true ones, pixels.
+    """Errors of flows compared with the true ones, pixels."""
 
-    Attributes
-    ----------
-    endpoint_error : float
-        Mean length of the difference.
-    endpoint_error_centred : float
-        The same after subtraction of the mean difference over time at every pixel; NaN for a single flow.
-    true_length : float
-        Mean length of the true flows, for comparison.
-    """
-
-    endpoint_error: float
+    endpoint_error: float  # mean length of the difference
+    # The same after subtraction of the mean difference over time at every pixel; NaN for a single flow.
     endpoint_error_centred: float
-    true_length: float
+    true_length: float  # mean length of the true flows, for comparison
 
 
 def compare(result: ArrayLike, truth: ArrayLike) -> Comparison:

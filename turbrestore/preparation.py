@@ -25,26 +25,14 @@ from .seeing.tilt_theory import Optics
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Frames as the stages take them, and what was changed.
-
-    Attributes
-    ----------
-    source : FrameSource
-    levels : Levels
-        From the levels of the clip to those of the stages.
-    bars : Bars or None
-    hidden : ndarray, bool, shape (H, W), or None
-        Pixels of the scene that no frame shows, because an overlay covers them or the file lacks them; None without.
-    title : Title or None
-        Overlay that is put back into results.
-    decisions : tuple of Decision
-    """
+    """Frames as the stages take them, and what was changed."""
 
     source: FrameSource
-    levels: Levels
+    levels: Levels  # from the levels of the clip to those of the stages
     bars: Bars | None
+    # (H, W): pixels of the scene that no frame shows, because an overlay covers them or the file lacks them.
     hidden: NDArray[np.bool_] | None
-    title: Title | None
+    title: Title | None  # overlay that is put back into results
     decisions: tuple[Decision, ...]
 
     @property

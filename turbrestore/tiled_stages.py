@@ -45,54 +45,28 @@ _RECORDED = (
 
 @dataclass(frozen=True, eq=False)
 class CentroidTask:
-    """The centroid of a tile, to be found in another process.
+    """The centroid of a tile, to be found in another process."""
 
-    Attributes
-    ----------
-    source : FrameSource
-        All frames of the tile.
-    train : int
-        Number of training frames.
-    params : CentroidParams
-    flow_params : FlowParams
-    runtime : Runtime
-        Where it has a scratch folder, that of temporary files is used.
-    """
-
-    source: FrameSource
-    train: int
+    source: FrameSource  # all frames of the tile
+    train: int  # number of training frames
     params: CentroidParams
     flow_params: FlowParams
-    runtime: Runtime
+    runtime: Runtime  # where it has a scratch folder, that of temporary files is used
 
 
 @dataclass(frozen=True, eq=False)
 class FilterTask:
-    """The filter of a tile, to be run in another process.
+    """The filter of a tile, to be run in another process."""
 
-    Attributes
-    ----------
-    source : FrameSource
-        All frames of the tile.
-    image, flows : ndarray
-        Centroid of the tile, and flows to the training frames.
-    counted : ndarray, bool, shape (T,)
-        Frames that count.
-    dynamics_params : DynamicsParams
-    params : FilterParams
-    flow_params : FlowParams
-    runtime : Runtime
-        Where it has a scratch folder, that of temporary files is used.
-    """
-
-    source: FrameSource
+    source: FrameSource  # all frames of the tile
+    # Centroid of the tile, and flows to the training frames.
     image: FloatArray
     flows: FloatArray
-    counted: NDArray[np.bool_]
+    counted: NDArray[np.bool_]  # (T,): frames that count
     dynamics_params: DynamicsParams
     params: FilterParams
     flow_params: FlowParams
-    runtime: Runtime
+    runtime: Runtime  # where it has a scratch folder, that of temporary files is used
 
 
 def centroid_tasks(

@@ -1,42 +1,25 @@
 """A sample of what benchmarks/hostile_input.py feeds the command line in full, and rules that hold everywhere."""
 
 import ast
-import importlib.util
 import os
-import struct
-import sys
 import tracemalloc
 import zipfile
-from itertools import product
 from pathlib import Path
 
 import cv2
+import hostile_content as odd
+import hostile_files as hostile
 import numpy as np
 import pytest
-import tifffile
 
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError
-from turbrestore.io.images import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.npy import map_npy, read_npz
 from turbrestore.io.source import FrameSource
-from turbrestore.io.tiff import _decode_lzw, _unlzw, open_tiff
 from turbrestore.io.video import open_frames, write_video
 from turbrestore_cli.__main__ import main
 
 ROOT = Path(__file__).parents[2]
-
-
-def _load(name):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-hostile = _load("hostile_files")
-odd = _load("hostile_content")
 
 
 @pytest.fixture
@@ -190,161 +173,6 @@ class TestArrayFiles:
         for read in (map_npy, read_npz):
             with pytest.raises(DataError, match="Python objects"):
                 read(tmp_path / f"a.{'npy' if read is map_npy else 'npz'}")
-
-
-class TestInflation:
-    def test_tiff_whose_pixels_inflate_beyond_its_page(self, tmp_path):
-        import zlib
-
-        packed = zlib.compress(bytes(5 * 10**7))
-        tifffile.imwrite(
-            tmp_path / "a.tif", iter([packed]), shape=(40, 50), dtype=np.uint8, compression="zlib", metadata=None
-        )
-        source = open_tiff(tmp_path / "a.tif")
-        tracemalloc.start()
-        with pytest.raises(DataError, match="more than the 2000 bytes"):
-            source.read()
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert peak < 5e6
-
-    @pytest.mark.parametrize("compression", ["zlib", "lzma"])
-    @pytest.mark.parametrize("options", [{}, {"tile": (16, 16)}, {"rowsperstrip": 5}, {"planarconfig": "separate"}])
-    def test_whole_tiffs_are_read(self, tmp_path, compression, options):
-        stack = np.random.default_rng(0).integers(0, 65536, (3, 33, 35, 3), dtype=np.uint16)
-        pages = np.moveaxis(stack, -1, 1) if "planarconfig" in options else stack
-        with tifffile.TiffWriter(tmp_path / "a.tif") as tiff:
-            for page in pages:
-                tiff.write(page, photometric="rgb", compression=compression, metadata=None, **options)
-        np.testing.assert_array_equal(open_tiff(tmp_path / "a.tif").read(), stack / np.float32(65535))
-
-    @pytest.mark.parametrize("compression", [1, 5, 8, 32773, 32946])
-    def test_whole_still_tiffs_are_read(self, tmp_path, compression):
-        for form, dtype in product([(33, 35), (33, 35, 3), (33, 35, 4)], [np.uint8, np.uint16, np.float32]):
-            pixels = np.random.default_rng(0).integers(0, 2, form).astype(dtype)
-            cv2.imwrite(str(tmp_path / "a.tif"), pixels, [cv2.IMWRITE_TIFF_COMPRESSION, compression])
-            with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
-                assert tiff.pages.first.compression == compression
-            assert np.ptp(read_image(tmp_path / "a.tif").image) > 0, (form, dtype)
-
-    # OpenCV does not read tiles of RGB that are not compressed.
-    @pytest.mark.parametrize(
-        ("options", "compression"),
-        [
-            ({"tile": (16, 16)}, "zlib"),
-            ({"rowsperstrip": 5}, "zlib"),
-            ({"rowsperstrip": 5}, None),
-            ({"planarconfig": "separate"}, "zlib"),
-            ({"planarconfig": "separate"}, None),
-        ],
-    )
-    def test_still_tiffs_of_tiles_strips_and_planes_are_read(self, tmp_path, options, compression):
-        pixels = np.random.default_rng(0).integers(0, 256, (33, 35, 3), dtype=np.uint8)
-        stored = np.moveaxis(pixels, -1, 0) if "planarconfig" in options else pixels
-        tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", compression=compression, **options)
-        np.testing.assert_array_equal(read_image(tmp_path / "a.tif").image, pixels / np.float32(255))
-
-    @pytest.mark.parametrize("compression", ["raw", "packbits", "tiff_lzw", "tiff_adobe_deflate", "jpeg"])
-    def test_still_tiffs_of_other_kinds_are_read(self, tmp_path, compression):
-        import PIL.Image
-
-        image = PIL.Image.fromarray(np.uint8(np.arange(63).reshape(7, 9)))
-        for mode in ("L", "RGB") if compression == "jpeg" else ("1", "P", "L", "RGBA"):
-            image.convert(mode).save(tmp_path / "a.tif", compression=compression)
-            assert read_image(tmp_path / "a.tif").image.shape[:2] == (7, 9), mode
-
-    @pytest.mark.parametrize("compression", ["zlib", "lzma"])
-    def test_stacks_of_flipped_or_short_parts_are_refused(self, tmp_path, compression):
-        frames = np.random.default_rng(0).integers(0, 256, (2, 40, 50), dtype=np.uint8)
-        tifffile.imwrite(tmp_path / "a.tif", frames, photometric="minisblack", compression=compression)
-        with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
-            start, size = tiff.pages[1].dataoffsets[0], tiff.pages[1].databytecounts[0]
-        data = (tmp_path / "a.tif").read_bytes()
-        for place, length in ((start + size - 20, 20), (start + size // 2, 1)):
-            (tmp_path / "a.tif").write_bytes(data[:place] + bytes(length) + data[place + length :])
-            with pytest.raises(DataError, match="damaged"):
-                open_tiff(tmp_path / "a.tif").read()
-
-    def test_every_flip_in_a_deflated_still_is_found(self, tmp_path):
-        span = hostile.write_still(tmp_path / "a.tif", "deflate")
-        for data in hostile.flipped_still(tmp_path / "a.tif", span, 40):
-            (tmp_path / "b.tif").write_bytes(data)
-            with pytest.raises(DataError, match="compressed pixels are damaged"):
-                read_image(tmp_path / "b.tif")
-
-    @pytest.mark.parametrize("levels", [1, 2, 20, 256])
-    def test_whole_lzw_is_decoded(self, tmp_path, capfd, levels):
-        import PIL.Image
-
-        for shape in ((1, 1), (7, 300), (150, 200), (300, 400)):
-            pixels = np.random.default_rng(levels).integers(0, levels, shape, dtype=np.uint8)
-            PIL.Image.fromarray(pixels).save(tmp_path / "a.tif", compression="tiff_lzw")
-            with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
-                page = tiff.pages.first
-                found = 0
-                for start, size in zip(page.dataoffsets, page.databytecounts, strict=True):
-                    data = (tmp_path / "a.tif").read_bytes()[start : start + size]
-                    found += len(_unlzw(tmp_path, data, 10**6))
-            assert found == pixels.size
-            np.testing.assert_array_equal(read_image(tmp_path / "a.tif").image, pixels / np.float32(255))
-            assert capfd.readouterr().err == ""
-
-    def test_compiled_lzw_agrees_with_plain_python(self):
-        rng = np.random.default_rng(0)
-        for levels in (2, 256):
-            # Any bits are codes; most begin with known ones.
-            packed = np.packbits(rng.integers(0, 2, 9 * 300)) if levels == 2 else rng.integers(0, 64, 400, np.uint8)
-            found = [(np.zeros(5000, np.uint8), np.zeros(2, np.int64)) for _ in range(2)]
-            _decode_lzw(packed, *found[0])
-            _decode_lzw.py_func(packed, *found[1])
-            for one, other in zip(*found, strict=True):
-                np.testing.assert_array_equal(one, other)
-
-    @pytest.mark.parametrize("compression", ["LZW", "PackBits"])
-    def test_what_a_decoder_would_complain_of_is_refused(self, tmp_path, capfd, compression):
-        span, refusals = hostile.write_still(tmp_path / "a.tif", compression), 0
-        for data in hostile.flipped_still(tmp_path / "a.tif", span, 60):
-            (tmp_path / "b.tif").write_bytes(data)
-            try:
-                read_image(tmp_path / "b.tif")
-            except DataError:
-                refusals += 1
-        assert capfd.readouterr().err == ""
-        assert refusals
-
-    def test_a_still_whose_end_is_zeroed_is_refused(self, tmp_path):
-        _, stop = hostile.write_still(tmp_path / "a.tif", "deflate")
-        data = (tmp_path / "a.tif").read_bytes()
-        (tmp_path / "a.tif").write_bytes(data[: stop - 30] + bytes(30) + data[stop:])
-        with pytest.raises(DataError, match="damaged"):
-            read_image(tmp_path / "a.tif")
-
-    @pytest.mark.parametrize("form", [(), (5, 7), (5, 7, 3), (5, 7, 4)])
-    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-    def test_whole_pngs_are_read(self, tmp_path, form, dtype):
-        pixels = np.random.default_rng(0).integers(0, 255, form or (1, 1)).astype(dtype)
-        cv2.imwrite(str(tmp_path / "a.png"), pixels)
-        assert read_image(tmp_path / "a.png").image.shape[:2] == pixels.shape[:2]
-
-    @pytest.mark.parametrize("mode", ["1", "P", "L", "RGBA"])
-    def test_pngs_of_other_kinds_are_read(self, tmp_path, mode):
-        import PIL.Image
-
-        PIL.Image.fromarray(np.uint8(np.arange(63).reshape(7, 9))).convert(mode).save(tmp_path / "a.png")
-        assert read_image(tmp_path / "a.png").image.shape[:2] == (7, 9)
-
-    @pytest.mark.parametrize("lost", [1, 40])
-    def test_png_of_too_few_rows_is_refused_without_a_word_from_libpng(self, tmp_path, capfd, lost):
-        hostile._png(tmp_path / "a.png", 32, extra=b"")
-        data = (tmp_path / "a.png").read_bytes()
-        header = struct.pack(">IIBBBBB", 32, 2000 // 33 + lost, 8, 0, 0, 0, 0)
-        import zlib
-
-        data = data[:16] + header + struct.pack(">I", zlib.crc32(b"IHDR" + header)) + data[33:]
-        (tmp_path / "a.png").write_bytes(data)
-        with pytest.raises(DataError, match="truncated"):
-            read_image(tmp_path / "a.png")
-        assert capfd.readouterr() == ("", "")
 
 
 class TestSkippingDamage:

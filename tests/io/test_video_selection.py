@@ -1,6 +1,7 @@
 """Videos in: ranges of frames, and one frame at a time in memory."""
 
 import itertools
+import sys
 import tracemalloc
 
 import av
@@ -13,6 +14,7 @@ from turbrestore.core.errors import (
     ConfigurationError,
     DataError,
 )
+from turbrestore.io.container import _Scan
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 from videos import encode, grey_ffv1, refused, scene
@@ -27,12 +29,37 @@ def sources(tmp_path_factory):
     paths = [
         grey_ffv1(folder / "intra.mkv", frames, g="1"),
         grey_ffv1(folder / "ffv1.mkv", frames),
-        encode(folder / "b-frames.mp4", scene(), "libx264", "yuv420p", "rgb24"),
+        encode(folder / "b-frames.mp4", scene(), "libx264", "yuv420p", "rgb24", x264_params="keyint=4:open-gop=1"),
     ]
     write_video(folder / "a.tif", stack / np.float32(255), 30)
     write_video(folder / "a.npy", stack / np.float32(255), 30)
     write_video(folder / "a.ser", stack / np.float32(255), 30)
     return {path.name: path for path in [*paths, folder / "a.tif", folder / "a.npy", folder / "a.ser"]}
+
+
+@pytest.mark.parametrize("name", ["long.mp4", "long.mkv"])
+def test_decoding_begins_at_the_keyframe_before_the_range(tmp_path, name):
+    path = encode(tmp_path / name, scene(60), "libx264", "yuv420p", "rgb24", x264_params="keyint=10:bframes=3")
+    part = open_frames(path, frames=(35, 40))
+    decoded = 0
+
+    def count(_, event, argument):
+        nonlocal decoded
+        decoded += event == "c_call" and argument.__qualname__ == "Packet.decode"
+
+    sys.setprofile(count)
+    frames = part.read()
+    sys.setprofile(None)
+    assert np.array_equal(frames, open_frames(path).read()[35:40])
+    # From frame 30, and some packets ahead of their frames.
+    assert 5 <= decoded < 35
+
+
+def test_an_index_that_leads_elsewhere_is_not_followed(sources, monkeypatch):
+    path = sources["b-frames.mp4"]
+    whole, part = open_frames(path).read(), open_frames(path, frames=(6, 11))
+    monkeypatch.setattr(_Scan, "entry", lambda scan, _: int(scan.stamps[-1]) if scan.entries else None)
+    assert np.array_equal(part.read(), whole[6:11])
 
 
 class TestSelection:

@@ -43,31 +43,19 @@ _CLEAR, _REMARKED = 0.5, 0.15
 
 @dataclass(frozen=True, eq=False)
 class Halves:
-    """Means of the registered frames of two halves of a clip, in the geometry of the result.
+    """Means of the registered frames of two halves of a clip, in the geometry of the result."""
 
-    Attributes
-    ----------
-    first, second : ndarray, float32, shape (H, W) or (H, W, 3)
-    """
-
+    # (H, W) or (H, W, 3).
     first: FloatArray
     second: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Guarded:
-    """The image that is left, and what gave way.
+    """The image that is left, and what gave way."""
 
-    Attributes
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-    share : ndarray, float32, shape (H, W)
-        Largest g of the bands, 0 to 1.
-    decisions : tuple of Decision
-    """
-
-    image: FloatArray
-    share: FloatArray
+    image: FloatArray  # (H, W) or (H, W, 3)
+    share: FloatArray  # (H, W): largest g of the bands, 0 to 1
     decisions: tuple[Decision, ...]
 
 

@@ -47,21 +47,12 @@ _STRIP_ROWS = 256
 
 @dataclass(frozen=True)
 class BlurMap:
-    """Width of the blur by tiles.
+    """Width of the blur by tiles."""
 
-    Attributes
-    ----------
-    sigmas : ndarray, float64, shape (rows, columns)
-        Width of each tile, pixels; that of the whole image if the tile does not determine it.
-    uncertainties : ndarray, float64, shape (rows, columns)
-        Uncertainty of each, pixels; infinite if the widths agree without it.
-    varies : bool
-        Whether the widths differ clearly.
-    """
-
+    # (rows, columns): width of each tile, pixels; that of the whole image if the tile does not determine it.
     sigmas: np.ndarray
-    uncertainties: np.ndarray
-    varies: bool
+    uncertainties: np.ndarray  # (rows, columns): uncertainty of each, pixels; infinite if the widths agree without it
+    varies: bool  # whether the widths differ clearly
 
     @property
     def removable(self) -> np.ndarray:

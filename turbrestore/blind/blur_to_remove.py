@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..blur.edges import limit_to_edges
-from ..blur.estimation import BlurEstimate, estimate_blur
+from ..blur.estimation import BlurEstimate, estimate_blur, limit_to_edges
 from ..blur.image_evidence import image_evidence
 from ..blur.posterior import BlurPosterior, BlurWitnesses, blur_posterior
 from ..core.arrays import FloatArray, luminance

@@ -94,27 +94,13 @@ class GuardParams:
 
 @dataclass(frozen=True)
 class GuardReading:
-    """What the guards measured on one deconvolved image.
+    """What the guards measured on one deconvolved image."""
 
-    Attributes
-    ----------
-    sigma : float
-        Width that was removed, pixels.
-    ringing : float
-        Share of strong edges along which the image rings.
-    overshoot : float
-        Share of pixels beyond the local range, of those near edges.
-    noise_gain : float
-        Ratio of the standard deviations in flat regions, after to before.
-    passed : bool
-        Whether all are within their bounds.
-    """
-
-    sigma: float
-    ringing: float
-    overshoot: float
-    noise_gain: float
-    passed: bool
+    sigma: float  # width that was removed, pixels
+    ringing: float  # share of strong edges along which the image rings
+    overshoot: float  # share of pixels beyond the local range, of those near edges
+    noise_gain: float  # ratio of the standard deviations in flat regions, after to before
+    passed: bool  # whether all are within their bounds
 
 
 def evaluate_guards(

@@ -47,48 +47,23 @@ _WIDTHS_BYTES, _RESULTS_BYTES = 8, 8
 
 @dataclass(frozen=True)
 class DeblurState:
-    """Progress of :func:`remove_blur_steps`.
+    """Progress of :func:`remove_blur_steps`."""
 
-    Attributes
-    ----------
-    sigma : float
-        Width of the blur that is being removed, pixels; the largest one if it differs between pixels.
-    attempt : int
-        Number of the attempt, from 1.
-    iteration : int
-        Iterations done in this attempt, over all its tiles and widths.
-    """
-
-    sigma: float
-    attempt: int
-    iteration: int
+    sigma: float  # width of the blur that is being removed, pixels; the largest one if it differs between pixels
+    attempt: int  # number of the attempt, from 1
+    iteration: int  # iterations done in this attempt, over all its tiles and widths
 
 
 @dataclass(frozen=True)
 class Deblurred:
-    """A deblurred image and the decisions on the way to it.
-
-    Attributes
-    ----------
-    deconvolution : Deconvolution
-    blur : BlurEstimate or None
-        None if the width was given.
-    tiles : BlurMap or None
-        Widths of tiles; None if the width was given, or the image is not blurred or small.
-    readings : tuple of GuardReading
-        One for each width that was removed; empty if no blur was removed.
-    decisions : tuple of Decision
-        On the blur and on the guards.
-    posterior : BlurPosterior or None
-        None if the width was given, or nothing is known but the image.
-    """
+    """A deblurred image and the decisions on the way to it."""
 
     deconvolution: Deconvolution
-    blur: BlurEstimate | None
-    tiles: BlurMap | None
-    readings: tuple[GuardReading, ...]
-    decisions: tuple[Decision, ...]
-    posterior: BlurPosterior | None = None
+    blur: BlurEstimate | None  # none if the width was given
+    tiles: BlurMap | None  # widths of tiles; None if the width was given, or the image is not blurred or small
+    readings: tuple[GuardReading, ...]  # one for each width that was removed; empty if no blur was removed
+    decisions: tuple[Decision, ...]  # on the blur and on the guards
+    posterior: BlurPosterior | None = None  # none if the width was given, or nothing is known but the image
 
 
 Steps = Generator[DeblurState, None, Result]

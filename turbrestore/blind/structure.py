@@ -48,18 +48,10 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True)
 class StructureReading:
-    """How far the registered frames agree with a fused image.
+    """How far the registered frames agree with a fused image."""
 
-    Attributes
-    ----------
-    unseen : float
-        Share of the edges of the image that fewer than half of the registered frames have.
-    left : float
-        Variance over the registered frames, relative to that over the frames as they are.
-    """
-
-    unseen: float
-    left: float
+    unseen: float  # share of the edges of the image that fewer than half of the registered frames have
+    left: float  # variance over the registered frames, relative to that over the frames as they are
 
     @property
     def passed(self) -> bool:

@@ -16,8 +16,8 @@ R = M(1) / M(A), A = 1.75 σ
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,9 +27,6 @@ from ..core.arrays import FloatArray
 from ..core.gradient import sobel_gradient
 from ..core.noise import estimate_noise
 from .psf import GAUSSIAN, half_frequency
-
-if TYPE_CHECKING:
-    from .estimation import BlurEstimate
 
 # Gradients count from this multiple of the noise; most samples of all profiles; rows in which edges are looked for at a
 # time.
@@ -123,20 +120,18 @@ def largest_fall(profiles: NDArray[Any]) -> NDArray[Any]:
     return (np.maximum.accumulate(profiles, axis=1) - profiles).max(axis=1)
 
 
-def limit_to_edges(estimate: BlurEstimate, image: FloatArray) -> BlurEstimate:
-    """Correct an estimated width that the edges of the image rule out.
+def edge_limit(image: FloatArray, sigma: float, exponent: float) -> tuple[float, float] | None:
+    """Width and uncertainty that the edges of an image (H, W) allow; None where they do not rule out the given width.
 
-    The width becomes the largest that the edges allow to a Gaussian, since wings of a blur cannot be told from a soft
-    limb; its uncertainty is the difference to the width that they allow to the shape that was assumed.
-    ``image`` (H, W).
+    The width is the largest that the edges allow to a Gaussian, since wings of a blur cannot be told from a soft limb;
+    its uncertainty is the difference to the width that they allow to the shape that was assumed.
     """
-    width = _widest_blur(image, GAUSSIAN, estimate.sigma)
-    if width >= estimate.sigma:
-        return estimate
-    unsure = _widest_blur(image, estimate.exponent, estimate.sigma) - width
+    width = _widest_blur(image, GAUSSIAN, sigma)
+    if width >= sigma:
+        return None
     if width < _SOFT:
-        width, unsure = _SHARP, _PIXEL_UNCERTAINTY
-    return replace(estimate, sigma=width, uncertainty=unsure, exponent=GAUSSIAN, edge_limited=True)
+        return _SHARP, _PIXEL_UNCERTAINTY
+    return width, _widest_blur(image, exponent, sigma) - width
 
 
 def _widest_blur(image: FloatArray, exponent: float, widest: float) -> float:

@@ -41,9 +41,9 @@ from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import ThreadTeam, one_thread_each
 from .assumed_noise import LEAST_NOISE, assumed_noise, noise_multiple
-from .edges import limit_to_edges
+from .edges import edge_limit
 from .marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
-from .psf import check_exponent, fused_exponent
+from .psf import GAUSSIAN, check_exponent, fused_exponent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,7 +98,7 @@ class BlurEstimate:
     costs : ndarray, float64, shape (k,)
         L of each.
     edge_limited : bool
-        Whether the edges of the image rule out the likeliest width; see :func:`turbrestore.blur.edges.limit_to_edges`.
+        Whether the edges of the image rule out the likeliest width; see :func:`turbrestore.blur.edges.edge_limit`.
     """
 
     sigma: float
@@ -147,21 +147,11 @@ class BlurEstimate:
 
 @dataclass(frozen=True, eq=False)
 class BlurCandidate:
-    """Blur found at one reduction of an image.
+    """Blur found at one reduction of an image."""
 
-    Attributes
-    ----------
-    estimate : BlurEstimate
-        Its uncertainty is infinite until :func:`choose_blur` has computed it.
-    part : ndarray, float32, shape (h, w)
-        The part of the reduced image that was analysed.
-    asked : float or None
-        Exponent that was asked for; None for that of fused frames.
-    """
-
-    estimate: BlurEstimate
-    part: FloatArray
-    asked: float | None = None
+    estimate: BlurEstimate  # its uncertainty is infinite until :func:`choose_blur` has computed it
+    part: FloatArray  # (h, w): the part of the reduced image that was analysed
+    asked: float | None = None  # exponent that was asked for; None for that of fused frames
 
     @property
     def plausible(self) -> bool:
@@ -215,6 +205,14 @@ def estimate_blur(
             return BlurEstimate(0.0, float("inf"), shape, noise or 0.0, 1, 0.0, nothing, nothing)
         found = choose_blur(candidates, runtime)
         return limit_to_edges(found, luminance(check_image(image))) if found.blurred else found
+
+
+def limit_to_edges(estimate: BlurEstimate, image: FloatArray) -> BlurEstimate:
+    """Correct an estimated width that the edges of the image (H, W) rule out."""
+    limit = edge_limit(image, estimate.sigma, estimate.exponent)
+    if limit is None:
+        return estimate
+    return replace(estimate, sigma=limit[0], uncertainty=limit[1], exponent=GAUSSIAN, edge_limited=True)
 
 
 def removable_width(sigma: ArrayLike, uncertainty: ArrayLike) -> Float64Array:

@@ -59,20 +59,11 @@ class ImageGradients:
     """Gradients of an image, y.
 
     Both planes go through one complex transform, because a symmetric kernel does not mix real and imaginary parts.
-
-    Attributes
-    ----------
-    planes : ndarray, float32, shape (h, w, 2)
-        Differences along x and along y, intensity per pixel.
-    spectrum : ndarray, float32, shape (h, w, 2)
-        Fourier transform of ``planes`` read as complex numbers.
-    frequency : ndarray, float32, shape (h, w)
-        Spatial frequency of each entry of ``spectrum``, cycles per pixel.
     """
 
-    planes: FloatArray
-    spectrum: FloatArray
-    frequency: FloatArray
+    planes: FloatArray  # (h, w, 2): differences along x and along y, intensity per pixel
+    spectrum: FloatArray  # (h, w, 2): Fourier transform of ``planes`` read as complex numbers
+    frequency: FloatArray  # (h, w): spatial frequency of each entry of ``spectrum``, cycles per pixel
 
 
 def image_gradients(image: FloatArray) -> ImageGradients:

@@ -91,45 +91,28 @@ class BlurWitnesses:
 
 @dataclass(frozen=True, eq=False)
 class BlurPosterior:
-    """Posterior of the blur of a fused image.
+    """Posterior of the blur of a fused image."""
 
-    Attributes
-    ----------
-    removed, exponent : float
-        Width and shape of the blur to remove, pixels; see :func:`turbrestore.blur.psf.blur_otf`.
-    width : ndarray, float64, shape (3,)
-        16 %, 50 % and 84 % quantiles of the width, pixels.
-    by_displacement, by_variation, by_image : ndarray, float64, shape (3,)
-        The same by each witness alone; NaN where it says nothing.
-    air : float
-        Probability that the air has blurred the image.
-    edge_limited : bool
-        Whether less is removed because the edges of the image are too steep for more.
-    frequencies : ndarray, float64, shape (k,)
-        Of the arrays that follow, cycles per pixel.
-    transfer, lowest, highest : ndarray, float64, shape (k,)
-        Mean transfer function and its 16 % and 84 % quantiles.
-    variation, variation_error, expected_variation : ndarray, float64, shape (k,)
-        s, its error, and what the posterior expects; NaN where the signal is lost in noise.
-    power_variation, power_variation_error, expected_power_variation : ndarray, float64, shape (k,)
-        The same of s_4.
-    """
-
+    # Width and shape of the blur to remove, pixels; see :func:`turbrestore.blur.psf.blur_otf`.
     removed: float
     exponent: float
-    width: Float64Array
+    width: Float64Array  # (3,): 16 %, 50 % and 84 % quantiles of the width, pixels
+    # (3,): the same by each witness alone; NaN where it says nothing.
     by_displacement: Float64Array
     by_variation: Float64Array
     by_image: Float64Array
-    air: float
-    edge_limited: bool
-    frequencies: Float64Array
+    air: float  # probability that the air has blurred the image
+    edge_limited: bool  # whether less is removed because the edges of the image are too steep for more
+    frequencies: Float64Array  # (k,): of the arrays that follow, cycles per pixel
+    # (k,): mean transfer function and its 16 % and 84 % quantiles.
     transfer: Float64Array
     lowest: Float64Array
     highest: Float64Array
+    # (k,): s, its error, and what the posterior expects; NaN where the signal is lost in noise.
     variation: Float64Array
     variation_error: Float64Array
     expected_variation: Float64Array
+    # (k,): the same of s_4.
     power_variation: Float64Array
     power_variation_error: Float64Array
     expected_power_variation: Float64Array

@@ -29,26 +29,11 @@ from .sensor import ExposureTiming, Float64Array
 
 @dataclass(frozen=True)
 class Oscillator:
-    """Second-order system ``ÿ + 2ζω ẏ + ω² y = g ω² u``.
+    """Second-order system ``ÿ + 2ζω ẏ + ω² y = g ω² u``."""
 
-    Parameters
-    ----------
-    gain : float
-        g.
-    frequency : float
-        ω, rad/s, above 0.
-    damping : float
-        ζ, above 0.
-
-    Raises
-    ------
-    ConfigurationError
-        A number is not above 0.
-    """
-
-    gain: float
-    frequency: float
-    damping: float
+    gain: float  # g
+    frequency: float  # ω, rad/s, above 0
+    damping: float  # ζ, above 0
 
     def __post_init__(self) -> None:
         for name in ("gain", "frequency", "damping"):
@@ -58,24 +43,11 @@ class Oscillator:
 
 @dataclass(frozen=True, eq=False)
 class OscillatorMotion:
-    """Motion with the state (y, ẏ, ln g/g₀, ln ω/ω₀, ln ζ/ζ₀), a :class:`.lifting.Motion`.
+    """Motion with the state (y, ẏ, ln g/g₀, ln ω/ω₀, ln ζ/ζ₀), a :class:`.lifting.Motion`."""
 
-    Parameters
-    ----------
-    nominal : Oscillator
-        g₀, ω₀ and ζ₀.
-    timing : ExposureTiming
-    Q : ndarray, float64, shape (5, 5)
-        Covariance of the disturbance between two exposures; its last three variances allow the plant to change.
-
-    Raises
-    ------
-    ConfigurationError
-        Q has the wrong shape.
-    """
-
-    nominal: Oscillator
+    nominal: Oscillator  # g₀, ω₀ and ζ₀
     timing: ExposureTiming
+    # (5, 5): covariance of the disturbance between two exposures; its last three variances allow the plant to change.
     Q: Float64Array
 
     def __post_init__(self) -> None:

@@ -48,32 +48,22 @@ _NO_ESTIMATE = 100.0
 
 @dataclass(frozen=True, eq=False)
 class RelativeBlur:
-    """How much wider the first of two images is blurred than the second; negative where it is sharper.
+    """How much wider the first of two images is blurred than the second; negative where it is sharper."""
 
-    Attributes
-    ----------
-    variance, deviation : float
-        Σ₁ − Σ₂ per axis if it is the same in all directions, and its standard deviation, squared pixels.  If it is
-        not, directions with more structure count more, and ``matrix`` should be used.
-    matrix, matrix_deviation : ndarray, float64, shape (2, 2)
-        Σ₁ − Σ₂ with axes (x, y), and the standard deviation of each entry, squared pixels.
-    tile_variance, tile_deviation : ndarray, float64, shape (m, n)
-        The same for every tile; 0 with an infinite deviation where the tile has no structure.
-    tile_matrix, tile_matrix_deviation : ndarray, float64, shape (m, n, 2, 2)
-        The same for every tile.
-    grid : TileGrid
-        Positions of the tiles.
-    """
-
+    # Σ₁ − Σ₂ per axis if it is the same in all directions, and its standard deviation, squared pixels. If it is not,
+    # directions with more structure count more, and ``matrix`` should be used.
     variance: float
     deviation: float
+    # (2, 2): Σ₁ − Σ₂ with axes (x, y), and the standard deviation of each entry, squared pixels.
     matrix: Float64Array
     matrix_deviation: Float64Array
+    # (m, n): the same for every tile; 0 with an infinite deviation where the tile has no structure.
     tile_variance: Float64Array
     tile_deviation: Float64Array
+    # (m, n, 2, 2): the same for every tile.
     tile_matrix: Float64Array
     tile_matrix_deviation: Float64Array
-    grid: TileGrid
+    grid: TileGrid  # positions of the tiles
 
 
 def relative_blur(
@@ -253,17 +243,20 @@ def _fit_difference(
     D = np.zeros((*first.shape[:-1], design.shape[1]))
     spread = (averaging.T > 0).astype(np.float64)
     cell_size = np.maximum(spread.sum(axis=1) / CORRELATED**2, 1.0)
+    averaging = averaging.astype(np.float64)
+    products = (design[:, :, None] * design[:, None, :]).reshape(len(design), -1)
+    square = (*D.shape, design.shape[1])
     for _ in range(NEWTON_STEPS):
         q = np.clip(D @ design.T, -LARGEST_EXPONENT, LARGEST_EXPONENT)
-        grown, shrunk = one * np.exp(q / 2), two * np.exp(-q / 2)
+        growth = np.exp(q / 2)
+        grown, shrunk = one * growth, two / growth
         cells = (grown @ averaging, shrunk @ averaging, q @ averaging)
         weight, signal = (part @ spread for part in fit_weights(cells, floors, tiles, cell_size, params))
-        information = np.einsum("...b,bi,bj->...ij", weight * signal, design, design)
-        information += 1e-9 * np.eye(design.shape[1])
+        information = ((weight * signal) @ products).reshape(square) + 1e-9 * np.eye(design.shape[1])
         pull = weight * (shrunk - grown)
         step = np.linalg.solve(information, (pull @ design)[..., None])[..., 0]
         D = D + np.clip(step, -LARGEST_STEP, LARGEST_STEP)
-    scatter = np.einsum("...b,bi,bj->...ij", pull**2, design, design)
+    scatter = (pull**2 @ products).reshape(square)
     inverse = np.linalg.inv(information)
     # The scatter of few values is itself uncertain, and the expected one rests on assumptions: take half of each.
     cov = CORRELATED**2 * (inverse @ scatter @ inverse + inverse) / 2

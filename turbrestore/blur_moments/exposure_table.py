@@ -26,25 +26,14 @@ _LARGEST = 20_000_000
 
 @dataclass(frozen=True, eq=False)
 class ExposureTable:
-    """Responses of the P pixels to a point at M positions ``first + step · m``, made by :func:`tabulate`.
+    """Responses of the P pixels to a point at M positions ``first + step · m``, made by :func:`tabulate`."""
 
-    Parameters
-    ----------
-    first, step : float
-        Positions of the table.
-    response : ndarray, float64, shape (M, P)
-        Image of a point at each position; the first and last rows are zero.
-    slope : ndarray, float64, shape (M, P)
-        Derivative of ``response`` with respect to the position.
-    blocks : tuple of (slice, slice)
-        Runs of pixels, and the positions from which light reaches them.
-    """
-
+    # Positions of the table.
     first: float
     step: float
-    response: Float64Array
-    slope: Float64Array
-    blocks: tuple[tuple[slice, slice], ...]
+    response: Float64Array  # (M, P): image of a point at each position; the first and last rows are zero
+    slope: Float64Array  # (M, P): derivative of ``response`` with respect to the position
+    blocks: tuple[tuple[slice, slice], ...]  # runs of pixels, and the positions from which light reaches them
 
     def image_and_jacobian(self, path: Float64Array, jacobian: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Image of a path, and its derivative with respect to the state.

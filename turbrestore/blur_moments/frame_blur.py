@@ -46,60 +46,30 @@ _WINDOW_ERROR = 0.05
 
 @dataclass(frozen=True, eq=False)
 class FrameBlur:
-    """Blur variance of every frame in every tile, relative to the other frames.
+    """Blur variance of every frame in every tile, relative to the other frames."""
 
-    Attributes
-    ----------
-    relative : ndarray, float32, shape (T, m, n)
-        s, squared pixels; the mean over the frames is 0.
-    deviation : ndarray, float32, shape (T, m, n)
-        Standard deviation of ``relative``; 2 squared pixels, that of the prior, where a tile has no structure.
-    extra : ndarray, float32, shape (T, m, n)
-        Best estimate of s above that of the sharpest frame, at least 0: ``relative`` shrunk towards 0 as far as noise
-        explains it, minus its minimum over the frames.
-    grid : TileGrid
-        Positions of the tiles.
-    """
-
-    relative: FloatArray
+    relative: FloatArray  # (T, m, n): s, squared pixels; the mean over the frames is 0
+    # (T, m, n): standard deviation of ``relative``; 2 squared pixels, that of the prior, where a tile has no structure.
     deviation: FloatArray
+    # (T, m, n): best estimate of s above that of the sharpest frame, at least 0: ``relative`` shrunk towards 0 as far
+    # as noise explains it, minus its minimum over the frames.
     extra: FloatArray
-    grid: TileGrid
+    grid: TileGrid  # positions of the tiles
 
 
 @dataclass(frozen=True, eq=False)
 class BlurReference:
-    """Common spectrum and statistics of the frames of a sequence, with which other frames can be compared.
+    """Common spectrum and statistics of the frames of a sequence, with which other frames can be compared."""
 
-    Attributes
-    ----------
-    spectrum : ndarray, float64, shape (tiles, rings)
-        P̄ above the noise, squared intensity.
-    misfit : ndarray, float64, shape (tiles, rings)
-        Factor on the expected squared error of each ring; the fit divides its weight by this.
-    residual : ndarray, float64, shape (tiles, rings)
-        Mean squared residual of each ring, in units of the expected one.
-    offset : ndarray, float64, shape (tiles,)
-        Mean of s over the frames before centring, squared pixels.
-    spread : ndarray, float64, shape (tiles,)
-        Variance of s over the frames beyond that of its error, pixels to the fourth.
-    sharpest : ndarray, float64, shape (tiles,)
-        Best estimate of s of the sharpest frame, squared pixels.
-    noise : float
-        Standard deviation of the white noise of a frame, intensity.
-    shape : tuple of int
-        Height and width of a frame, pixels.
-    params : CueParams
-    """
-
-    spectrum: Float64Array
+    spectrum: Float64Array  # (tiles, rings): P̄ above the noise, squared intensity
+    # (tiles, rings): factor on the expected squared error of each ring; the fit divides its weight by this.
     misfit: Float64Array
-    residual: Float64Array
-    offset: Float64Array
-    spread: Float64Array
-    sharpest: Float64Array
-    noise: float
-    shape: tuple[int, int]
+    residual: Float64Array  # (tiles, rings): mean squared residual of each ring, in units of the expected one
+    offset: Float64Array  # (tiles,): mean of s over the frames before centring, squared pixels
+    spread: Float64Array  # (tiles,): variance of s over the frames beyond that of its error, pixels to the fourth
+    sharpest: Float64Array  # (tiles,): best estimate of s of the sharpest frame, squared pixels
+    noise: float  # standard deviation of the white noise of a frame, intensity
+    shape: tuple[int, int]  # height and width of a frame, pixels
     params: CueParams
 
 

@@ -48,29 +48,13 @@ _WEAK = 1e-6
 
 @dataclass(frozen=True)
 class ImageFilter:
-    """Observer on the whole image.
+    """Observer on the whole image."""
 
-    Parameters
-    ----------
-    norm : {"map", "two", "infinity"}
-        Misfit of the image with the prior; without it; largest misfit of a pixel.
-    iterations : int
-        Of the search; 1 from a single start with ``norm="map"`` is the extended Kalman filter on the image.
-    multistart : bool
-        Whether to start from the negative and from shifted states as well.
-    kept : int
-        Number of starts that continue after a few iterations.
-
-    Raises
-    ------
-    ConfigurationError
-        Unknown norm, or less than one iteration or start.
-    """
-
-    norm: str = "map"
+    norm: str = "map"  # "map" misfit with the prior, "two" without it, "infinity" largest misfit of a pixel
+    # Of the search. One of them from a single start with ``norm="map"`` is the extended Kalman filter on the image.
     iterations: int = 20
-    multistart: bool = True
-    kept: int = 3
+    multistart: bool = True  # whether to start from the negative and from shifted states as well
+    kept: int = 3  # number of starts that continue after a few iterations
 
     def __post_init__(self) -> None:
         if self.norm not in NORMS:

@@ -71,22 +71,10 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FastSystem:
-    """Linear system with one input and one output, at the fast rate.
+    """Linear system with one input and one output, at the fast rate."""
 
-    Parameters
-    ----------
-    A : ndarray, float64, shape (n, n)
-        A_f, discrete.
-    B, C : ndarray, float64, shape (n,)
-        B_f and C_f.
-
-    Raises
-    ------
-    ConfigurationError
-        Shapes do not agree, values are not finite, or the system is unstable.
-    """
-
-    A: Float64Array
+    A: Float64Array  # (n, n): a_f, discrete
+    # (n,): b_f and C_f.
     B: Float64Array
     C: Float64Array
 
@@ -112,35 +100,16 @@ class FastSystem:
 
 @dataclass(frozen=True, eq=False)
 class LiftedSystem:
-    """A fast system observed once per frame, made by :func:`lift`.
-
-    Parameters
-    ----------
-    timing : ExposureTiming
-    A : ndarray, float64, shape (n, n)
-        A_s, from the start of an exposure to the start of the next.
-    B : ndarray, float64, shape (n, N)
-        B_s.
-    C : ndarray, float64, shape (n,)
-        C_s, average output over the exposure.
-    D : ndarray, float64, shape (N,)
-        D_s.
-    free : ndarray, float64, shape (N, n)
-        Output at every fast step as a function of the state at the start of the exposure.
-    forced : ndarray, float64, shape (N, N)
-        Output at every fast step as a function of the inputs.
-    Q : ndarray, float64, shape (n, n)
-        Covariance of the disturbance between two exposures.
-    """
+    """A fast system observed once per frame, made by :func:`lift`."""
 
     timing: ExposureTiming
-    A: Float64Array
-    B: Float64Array
-    C: Float64Array
-    D: Float64Array
-    free: Float64Array
-    forced: Float64Array
-    Q: Float64Array
+    A: Float64Array  # (n, n): a_s, from the start of an exposure to the start of the next
+    B: Float64Array  # (n, N): b_s
+    C: Float64Array  # (n,): c_s, average output over the exposure
+    D: Float64Array  # (N,): d_s
+    free: Float64Array  # (N, n): output at every fast step as a function of the state at the start of the exposure
+    forced: Float64Array  # (N, N): output at every fast step as a function of the inputs
+    Q: Float64Array  # (n, n): covariance of the disturbance between two exposures
 
     @property
     def order(self) -> int:

@@ -40,13 +40,7 @@ BASES = ("monomial", "legendre")
 
 @dataclass(frozen=True, eq=False)
 class BlurModel:
-    """A motion and the sensor that records it.
-
-    Parameters
-    ----------
-    motion : Motion
-    sensor : LineSensor
-    """
+    """A motion and the sensor that records it."""
 
     motion: Motion
     sensor: LineSensor

@@ -58,14 +58,9 @@ class FixedGain:
     """Luenberger observer on the first moment (paper 2, O1), made by :func:`luenberger` or :func:`steady_kalman`.
 
     The covariance is that of the error for any gain: ``(I − L C) P (I − L C)ᵀ + L R Lᵀ``.
-
-    Parameters
-    ----------
-    gain : ndarray, float64, shape (n,)
-        L.
     """
 
-    gain: Float64Array
+    gain: Float64Array  # (n,): L
 
     def step(
         self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
@@ -84,29 +79,14 @@ class FixedGain:
 
 @dataclass(frozen=True)
 class MomentFilter:
-    """Kalman filter on moments of the frame (paper 1, O1 to O3; paper 2, O1 and O2).
+    """Kalman filter on moments of the frame (paper 1, O1 to O3; paper 2, O1 and O2)."""
 
-    Parameters
-    ----------
-    orders : tuple of int
-        Moments to use: (1,) is the linear Kalman filter, (2,) the second moment only, (1, 2) both.
-    basis : {"monomial", "legendre"}
-        Legendre moments have less noise, see :mod:`.moments`.
-    method : {"extended", "iterated", "unscented"}
-        Linearisation at the prediction, repeated linearisation at the estimate, or sigma points.
-    iterations : int
-        Of the iterated method.
-
-    Raises
-    ------
-    ConfigurationError
-        No orders, orders below 1 or not ascending, unknown basis or method.
-    """
-
+    # Moments to use: (1,) is the linear Kalman filter, (2,) the second moment only, (1, 2) both.
     orders: tuple[int, ...] = (1, 2)
-    basis: str = "monomial"
+    basis: str = "monomial"  # or "legendre", whose moments have less noise, see :mod:`.moments`
+    # Linearisation at the prediction, repeated at the estimate ("iterated"), or sigma points ("unscented").
     method: str = "extended"
-    iterations: int = 5
+    iterations: int = 5  # of the iterated method
 
     def __post_init__(self) -> None:
         ascending = all(a < b for a, b in zip((0, *self.orders), self.orders, strict=False))

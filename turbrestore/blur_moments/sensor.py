@@ -33,33 +33,13 @@ _SQRT_2PI = float(np.sqrt(2 * np.pi))
 
 @dataclass(frozen=True)
 class ExposureTiming:
-    """When the sensor is exposed (paper 2, section II-A).
+    """When the sensor is exposed (paper 2, section II-A)."""
 
-    Parameters
-    ----------
-    fast_period : float
-        T_f, s: step of the fast system.
-    exposure : float
-        T_e, s: length of the exposure.
-    readout : float
-        T_r, s: time to read the image out.
-    frame_period : float
-        T_s, s: time from one exposure to the next, at least T_e + T_r.
-    trigger : float
-        T_a, s: start of the first exposure.
-
-    Raises
-    ------
-    ConfigurationError
-        A time is not positive or not a whole number of fast steps, the frame period is shorter than exposure and
-        readout, or the exposure is shorter than one fast step.
-    """
-
-    fast_period: float
-    exposure: float
-    readout: float
-    frame_period: float
-    trigger: float = 0.0
+    fast_period: float  # t_f, s: step of the fast system
+    exposure: float  # t_e, s: length of the exposure
+    readout: float  # t_r, s: time to read the image out
+    frame_period: float  # t_s, s: time from one exposure to the next, at least T_e + T_r
+    trigger: float = 0.0  # t_a, s: start of the first exposure
     frame_steps: int = field(init=False)
     exposure_steps: int = field(init=False)
 
@@ -94,27 +74,13 @@ class ExposureTiming:
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """A row of pixels of equal width.
+    """A row of pixels of equal width."""
 
-    Parameters
-    ----------
-    start, stop : float
-        Outer edges of the first and the last pixel, in units of the output y.
-    count : int
-        Number of pixels.
-    integrating : bool
-        Whether a pixel averages the light over its width Δ or samples the density at its centre.
-
-    Raises
-    ------
-    ConfigurationError
-        No pixel, or no width.
-    """
-
+    # Outer edges of the first and the last pixel, in units of the output y.
     start: float
     stop: float
-    count: int
-    integrating: bool = True
+    count: int  # number of pixels
+    integrating: bool = True  # whether a pixel averages the light over its width Δ or samples the density at its centre
 
     def __post_init__(self) -> None:
         require(self.count >= 1, f"count: expected at least 1 pixel, found {self.count}")
@@ -136,23 +102,10 @@ class PixelGrid:
 
 @dataclass(frozen=True)
 class GaussianKernel:
-    """Gaussian image of a point at rest at y = 0 (paper 1, eq. 4; paper 2, section II-C).
+    """Gaussian image of a point at rest at y = 0 (paper 1, eq. 4; paper 2, section II-C)."""
 
-    Parameters
-    ----------
-    sigma : float
-        σ; 0 is an ideal point.
-    offset : float
-        η₀, the position at which the point appears.
-
-    Raises
-    ------
-    ConfigurationError
-        The width is negative, or a number is not finite.
-    """
-
-    sigma: float
-    offset: float = 0.0
+    sigma: float  # σ; 0 is an ideal point
+    offset: float = 0.0  # η₀, the position at which the point appears
 
     def __post_init__(self) -> None:
         require(0 <= self.sigma < np.inf, f"sigma: expected a width of at least 0, found {self.sigma:g}")
@@ -181,27 +134,12 @@ class GaussianKernel:
 
 @dataclass(frozen=True)
 class LineSensor:
-    """A row of pixels that records one point.
-
-    Parameters
-    ----------
-    kernel : GaussianKernel
-    pixels : PixelGrid
-    noise : float
-        V, density of the white noise, above 0.
-    total : float
-        Known total intensity of an exposure.
-
-    Raises
-    ------
-    ConfigurationError
-        Noise or total is not above 0.
-    """
+    """A row of pixels that records one point."""
 
     kernel: GaussianKernel
     pixels: PixelGrid
-    noise: float
-    total: float = 1.0
+    noise: float  # V, density of the white noise, above 0
+    total: float = 1.0  # known total intensity of an exposure
 
     def __post_init__(self) -> None:
         require(0 < self.noise < np.inf, f"noise: expected a density above 0, found {self.noise:g} (singular R)")

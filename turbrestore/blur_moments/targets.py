@@ -43,20 +43,9 @@ _ORDERS = {1: ((1, 0), (0, 1)), 2: ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))}
 
 @dataclass(frozen=True)
 class RandomWalk:
-    """A target that performs a random walk.
+    """A target that performs a random walk."""
 
-    Parameters
-    ----------
-    diffusion : float
-        Growth of the variance of each coordinate, squared pixels per second.
-
-    Raises
-    ------
-    ConfigurationError
-        Not above 0.
-    """
-
-    diffusion: float
+    diffusion: float  # growth of the variance of each coordinate, squared pixels per second
 
     def __post_init__(self) -> None:
         _check_positive(diffusion=self.diffusion)
@@ -76,20 +65,9 @@ class RandomWalk:
 
 @dataclass(frozen=True)
 class ConstantVelocity:
-    """A target whose velocity changes little.
+    """A target whose velocity changes little."""
 
-    Parameters
-    ----------
-    acceleration : float
-        Growth of the variance of each velocity, pixels² per second³.
-
-    Raises
-    ------
-    ConfigurationError
-        Not above 0.
-    """
-
-    acceleration: float
+    acceleration: float  # growth of the variance of each velocity, pixels² per second³
 
     def __post_init__(self) -> None:
         _check_positive(acceleration=self.acceleration)
@@ -109,32 +87,14 @@ class ConstantVelocity:
 
 @dataclass(frozen=True)
 class Oscillation:
-    """A target that vibrates about a centre, which may drift.
+    """A target that vibrates about a centre, which may drift."""
 
-    Parameters
-    ----------
-    frequency : float
-        Hz; with ``highest`` the lower end of the range to search.
-    damping : float
-        Damping ratio, 0 to below 1.
-    drive : float
-        Growth of the variance of each velocity by the random force, pixels² per second³.
-    drift : float
-        Growth of the variance of the centre, squared pixels per second.
-    highest : float, optional
-        Upper end of the range; the most likely frequency in the range is used.  Above half the frame rate the
-        centroids are aliased, and the second moments tell the aliases apart.
-
-    Raises
-    ------
-    ConfigurationError
-        A number is not above 0, the damping is not below 1, or the range is empty.
-    """
-
-    frequency: float
-    damping: float
-    drive: float
-    drift: float = 1e-4
+    frequency: float  # Hz; with ``highest`` the lower end of the range to search
+    damping: float  # damping ratio, 0 to below 1
+    drive: float  # growth of the variance of each velocity by the random force, pixels² per second³
+    drift: float = 1e-4  # growth of the variance of the centre, squared pixels per second
+    # Upper end of the range; the most likely frequency in the range is used. Above half the frame rate the centroids
+    # are aliased, and the second moments tell the aliases apart.
     highest: float | None = None
 
     def __post_init__(self) -> None:
@@ -179,35 +139,15 @@ def lift_motion(motion: TargetMotion, timing: ExposureTiming) -> LiftedSystem:
 
 @dataclass(frozen=True, eq=False)
 class PlaneModel:
-    """A motion that both axes follow independently, and the pixels that record it.
+    """A motion that both axes follow independently, and the pixels that record it."""
 
-    Parameters
-    ----------
-    axis : LiftedSystem
-        Motion of one axis.
-    sigma : float
-        σ of the round Gaussian image of the still target, pixels.
-    columns, rows : PixelGrid
-    noise : float
-        V, density of the white noise, above 0.
-    total : float
-        Known total intensity of an exposure, above 0.
-    centre : tuple of two floats
-        Position of the origin of the pixels.
-
-    Raises
-    ------
-    ConfigurationError
-        Noise or total is not above 0.
-    """
-
-    axis: LiftedSystem
-    sigma: float
+    axis: LiftedSystem  # motion of one axis
+    sigma: float  # σ of the round Gaussian image of the still target, pixels
     columns: PixelGrid
     rows: PixelGrid
-    noise: float
-    total: float = 1.0
-    centre: tuple[float, float] = (0.0, 0.0)
+    noise: float  # V, density of the white noise, above 0
+    total: float = 1.0  # known total intensity of an exposure, above 0
+    centre: tuple[float, float] = (0.0, 0.0)  # position of the origin of the pixels
 
     def __post_init__(self) -> None:
         _check_positive(noise=self.noise, total=self.total)
@@ -224,21 +164,9 @@ class PlaneModel:
 
 @dataclass(frozen=True)
 class PlaneMomentFilter:
-    """Kalman filter on the moments of a frame, exact in the mean and covariance of the moments.
+    """Kalman filter on the moments of a frame, exact in the mean and covariance of the moments."""
 
-    Parameters
-    ----------
-    order : {1, 2}
-        Highest order: 1 is the linear Kalman filter on centroids.
-    basis : {"legendre", "monomial"}
-
-    Raises
-    ------
-    ConfigurationError
-        Unknown order or basis.
-    """
-
-    order: int = 2
+    order: int = 2  # highest order: 1 is the linear Kalman filter on centroids
     basis: str = "legendre"
 
     def __post_init__(self) -> None:

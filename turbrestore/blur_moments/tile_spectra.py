@@ -40,27 +40,15 @@ _LEAST_NOISE = 1e-6
 
 @dataclass(frozen=True)
 class CueParams:
-    """Settings of the comparison of spectra.
+    """Settings of the comparison of spectra."""
 
-    Parameters
-    ----------
-    tile : int
-        Side of the square tiles, pixels; neighbouring tiles overlap by half.  An image smaller than a tile is one
-        tile.
-    lowest : float
-        Lowest frequency used, periods in a tile; below 1.5 the mean brightness of the tile leaks in.
-    highest : float
-        Highest frequency used, cycles per pixel.
-    misfit : float
-        Relative error of the spectrum of a tile besides noise, from structure blurred across its border.
-    departure : float
-        Error of an exponent as a share of its square, because a blur is Gaussian at low frequency only.
-    """
-
+    # Side of the square tiles, pixels; neighbouring tiles overlap by half. An image smaller than a tile is one tile.
     tile: int = 48
-    lowest: float = 1.5
-    highest: float = 0.35
+    lowest: float = 1.5  # lowest frequency used, periods in a tile; below 1.5 the mean brightness of the tile leaks in
+    highest: float = 0.35  # highest frequency used, cycles per pixel
+    # Relative error of the spectrum of a tile besides noise, from structure blurred across its border.
     misfit: float = 0.2
+    # Error of an exponent as a share of its square, because a blur is Gaussian at low frequency only.
     departure: float = 0.1
 
     def __post_init__(self) -> None:
@@ -74,42 +62,23 @@ class CueParams:
 
 @dataclass(frozen=True, eq=False)
 class TileGrid:
-    """Positions of the tiles of an image.
+    """Positions of the tiles of an image."""
 
-    Attributes
-    ----------
-    rows, columns : ndarray, int, shapes (m,) and (n,)
-        First row and first column of the tiles.
-    size : tuple of int
-        Height and width of a tile, pixels.
-    shape : tuple of int
-        Height and width of the image, pixels.
-    """
-
+    # First row and first column of the tiles.
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
-    size: tuple[int, int]
-    shape: tuple[int, int]
+    size: tuple[int, int]  # height and width of a tile, pixels
+    shape: tuple[int, int]  # height and width of the image, pixels
 
 
 @dataclass(frozen=True, eq=False)
 class TileSpectra:
-    """Power spectra of the windowed tiles of images of one size, at the frequencies used.
-
-    Attributes
-    ----------
-    grid : TileGrid
-    window : ndarray, float32, shape (h, w)
-        Hann window of the tiles, of unit energy.
-    used : ndarray, int, shape (f,)
-        Flat indices of the frequencies in the half-plane that a real transform gives.
-    kx, ky : ndarray, float64, shape (f,)
-        The frequencies, radians per pixel.
-    """
+    """Power spectra of the windowed tiles of images of one size, at the frequencies used."""
 
     grid: TileGrid
-    window: FloatArray
-    used: NDArray[np.intp]
+    window: FloatArray  # (h, w): Hann window of the tiles, of unit energy
+    used: NDArray[np.intp]  # (f,): flat indices of the frequencies in the half-plane that a real transform gives
+    # (f,): the frequencies, radians per pixel.
     kx: Float64Array
     ky: Float64Array
 

@@ -89,43 +89,22 @@ class TrackParams:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Motion of a target.
+    """Motion of a target."""
 
-    Attributes
-    ----------
-    positions : ndarray, float64, shape (T, 2)
-        (x, y) in the middle of the exposures, estimated from this and all earlier frames, pixels.
-    position_cov : ndarray, float64, shape (T, 2, 2)
-        Covariance of ``positions``, squared pixels.
-    velocities : ndarray, float64, shape (T, 2)
-        Velocity in the middle of the exposures, pixels per second; NaN for a random walk.
-    paths : ndarray, float64, shape (T, steps, 2)
-        (x, y) in the middle of the fast steps of each frame period, pixels.
-    states : tuple of Gaussian
-        State at the start of every exposure, after its frame.
-    innovations : tuple of Innovation
-    log_likelihood : float
-        Log-likelihood of all frames.
-    frequency : float or None
-        Frequency of an oscillation, Hz; the most likely one if a range was searched.
-    centroids : ndarray, float64, shape (T, 2)
-        First moments of the frames alone, pixels.
-    spreads : ndarray, float64, shape (T, 2, 2)
-        Central second moments of the frames alone, which contain still target and motion, squared pixels.
-    background, noise, total : float
-        Measured intensity beside the target, standard deviation of a pixel, and total light of the target.
-    """
-
+    # (T, 2): (x, y) in the middle of the exposures, estimated from this and all earlier frames, pixels.
     positions: Float64Array
-    position_cov: Float64Array
+    position_cov: Float64Array  # (T, 2, 2): covariance of ``positions``, squared pixels
+    # (T, 2): velocity in the middle of the exposures, pixels per second; NaN for a random walk.
     velocities: Float64Array
-    paths: Float64Array
-    states: tuple[Gaussian, ...]
+    paths: Float64Array  # (T, steps, 2): (x, y) in the middle of the fast steps of each frame period, pixels
+    states: tuple[Gaussian, ...]  # state at the start of every exposure, after its frame
     innovations: tuple[Innovation, ...]
-    log_likelihood: float
-    frequency: float | None
-    centroids: Float64Array
+    log_likelihood: float  # log-likelihood of all frames
+    frequency: float | None  # frequency of an oscillation, Hz; the most likely one if a range was searched
+    centroids: Float64Array  # (T, 2): first moments of the frames alone, pixels
+    # (T, 2, 2): central second moments of the frames alone, which contain still target and motion, squared pixels.
     spreads: Float64Array
+    # Measured intensity beside the target, standard deviation of a pixel, and total light of the target.
     background: float
     noise: float
     total: float

@@ -23,16 +23,10 @@ class NoiseCurve:
     """Variance of the noise against the level: the photon transfer curve of a recording.
 
     It is affine for raw frames, whose light comes in photons, and of any form after a tone curve.
-
-    Attributes
-    ----------
-    levels : ndarray, float64, shape (K,)
-        Ascending intensities.
-    variances : ndarray, float64, shape (K,)
-        Squared intensity; between the levels the variance is linear, and constant beyond them.
     """
 
-    levels: NDArray[np.float64]
+    levels: NDArray[np.float64]  # (K,): ascending intensities
+    # (K,): squared intensity; between the levels the variance is linear, and constant beyond them.
     variances: NDArray[np.float64]
 
     def variance(self, image: FloatArray) -> FloatArray:

@@ -22,25 +22,14 @@ _PARALLEL_PIXELS = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class ArrayOps:
-    """Operations of one library.
+    """Operations of one library."""
 
-    Attributes
-    ----------
-    arrays : module
-        ``numpy`` or ``torch``.
-    load, store : callable
-        Convert from a NumPy array of real or complex numbers, and back to one.
-    forward : callable
-        Half-spectrum of a real image, as :func:`scipy.fft.rfft2`.
-    back : callable
-        ``back(spectrum, shape)`` is the image of a half-spectrum.
-    """
-
-    arrays: Any
+    arrays: Any  # ``numpy`` or ``torch``
+    # Convert from a NumPy array of real or complex numbers, and back to one.
     load: Callable[[NDArray[Any]], Array]
     store: Callable[[Array], NDArray[Any]]
-    forward: Callable[[Array], Array]
-    back: Callable[[Array, tuple[int, int]], Array]
+    forward: Callable[[Array], Array]  # half-spectrum of a real image, as :func:`scipy.fft.rfft2`
+    back: Callable[[Array, tuple[int, int]], Array]  # ``back(spectrum, shape)`` is the image of a half-spectrum
 
     def total(self, values: Array) -> float:
         """Sum all values in double precision."""

@@ -32,28 +32,16 @@ _START_STEPS = 40
 
 
 class GradientState(NamedTuple):
-    """State between two iterations.
-
-    Attributes
-    ----------
-    problem : Problem
-    deviation, residual, direction : array, complex64, shape (P, Q // 2 + 1)
-        Half-spectra of u − m, r and d.
-    inverse : array, float32, shape (P, Q // 2 + 1)
-        Preconditioner.
-    decrease : float
-        Inner product of r and the preconditioned r.
-    enough : float
-        Value of ``decrease`` at which the problem is solved to rounding.
-    """
+    """State between two iterations."""
 
     problem: Problem
+    # (P, Q // 2 + 1): half-spectra of u − m, r and d.
     deviation: Array
     residual: Array
     direction: Array
-    inverse: Array
-    decrease: float
-    enough: float
+    inverse: Array  # (P, Q // 2 + 1): preconditioner
+    decrease: float  # inner product of r and the preconditioned r
+    enough: float  # value of ``decrease`` at which the problem is solved to rounding
 
     @property
     def image(self) -> Array:
@@ -63,15 +51,9 @@ class GradientState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ConjugateGradients:
-    """Solver for wiener and tikhonov.
+    """Solver for wiener and tikhonov."""
 
-    Attributes
-    ----------
-    symbol : array, float32, shape (P, Q // 2 + 1) or (1, 1)
-        R in Fourier.
-    """
-
-    symbol: Array
+    symbol: Array  # (P, Q // 2 + 1) or (1, 1): R in Fourier
 
     # Number of iterations over which a change is measured, as a single step may be short by chance.
     window: ClassVar[int] = 2

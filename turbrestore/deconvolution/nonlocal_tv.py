@@ -50,17 +50,10 @@ class PairDual(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NonlocalPenalty:
-    """J(u) with the weights of a graph.
-
-    Attributes
-    ----------
-    graph : NonlocalGraph
-    team : ThreadTeam, optional
-        Threads that work on bands side by side.
-    """
+    """J(u) with the weights of a graph."""
 
     graph: NonlocalGraph
-    team: ThreadTeam | None = None
+    team: ThreadTeam | None = None  # threads that work on bands side by side
 
     @cached_property
     def norm_squared(self) -> float:

@@ -98,30 +98,14 @@ class NonlocalParams:
 
 @dataclass(frozen=True, eq=False)
 class NonlocalGraph:
-    """Symmetric weighted graph over the pixels of an image; each pair is stored once, by its tail.
+    """Symmetric weighted graph over the pixels of an image; each pair is stored once, by its tail."""
 
-    Attributes
-    ----------
-    shape : (int, int)
-        Rows and columns of the image.
-    starts : ndarray, int32, shape (H · W + 1,)
-        Where the pairs of each tail start, and where the last end.
-    heads : ndarray, int32, shape (E,)
-        Pixel (row · W + column) at which each pair ends.
-    roots : ndarray, float32, shape (E,)
-        √w of each pair.
-    reach : int
-        Largest number of rows from a tail to its heads.
-    h : float
-        Filtering parameter that was used, intensity.
-    """
-
-    shape: tuple[int, int]
-    starts: NDArray[np.int32]
-    heads: NDArray[np.int32]
-    roots: FloatArray
-    reach: int
-    h: float
+    shape: tuple[int, int]  # rows and columns of the image
+    starts: NDArray[np.int32]  # (H · W + 1,): where the pairs of each tail start, and where the last end
+    heads: NDArray[np.int32]  # (E,): pixel (row · W + column) at which each pair ends
+    roots: FloatArray  # (E,): √w of each pair
+    reach: int  # largest number of rows from a tail to its heads
+    h: float  # filtering parameter that was used, intensity
 
     def norm_squared(self, iterations: int = 10) -> float:
         """Upper bound of ‖∇_w‖² = 2‖D‖², with D the differences of pairs.

@@ -97,12 +97,7 @@ class PrimalDualState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PrimalDual:
-    """Solver for nltv and tv.
-
-    Attributes
-    ----------
-    regulariser : Penalty
-    """
+    """Solver for nltv and tv."""
 
     regulariser: Penalty
 

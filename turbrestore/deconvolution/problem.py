@@ -38,27 +38,13 @@ MARGIN_SIGMAS = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Data term ``λ/2 ‖M(Bu − f)‖²`` on the padded domain.
+    """Data term ``λ/2 ‖M(Bu − f)‖²`` on the padded domain."""
 
-    Attributes
-    ----------
-    observed : array, float32, shape (P, Q)
-        f, extended by reflection into the margin.
-    seen : array, float32, shape (P, Q)
-        M.
-    otf : array, float32 or complex64, shape (P, Q // 2 + 1)
-        H.
-    fidelity : float
-        λ.
-    ops : ArrayOps
-        Library that the arrays belong to.
-    """
-
-    observed: Array
-    seen: Array
-    otf: Array
-    fidelity: float
-    ops: ArrayOps
+    observed: Array  # (P, Q): f, extended by reflection into the margin
+    seen: Array  # (P, Q): M
+    otf: Array  # (P, Q // 2 + 1): H
+    fidelity: float  # λ
+    ops: ArrayOps  # library that the arrays belong to
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -87,18 +73,10 @@ class Problem:
 
 @dataclass(frozen=True)
 class Margin:
-    """Margin of pixels around an image, in which nothing was observed.
+    """Margin of pixels around an image, in which nothing was observed."""
 
-    Attributes
-    ----------
-    size : (int, int)
-        H and W of the image.
-    widths : tuple of (int, int)
-        Pixels before and after the image along each axis.
-    """
-
-    size: tuple[int, int]
-    widths: tuple[tuple[int, int], tuple[int, int]]
+    size: tuple[int, int]  # H and W of the image
+    widths: tuple[tuple[int, int], tuple[int, int]]  # pixels before and after the image along each axis
 
     @property
     def shape(self) -> tuple[int, int]:

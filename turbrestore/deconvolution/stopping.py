@@ -47,18 +47,11 @@ _RECORD_EVERY = 10
 
 @dataclass(frozen=True)
 class DeconvolutionState:
-    """Progress of a deconvolution.
+    """Progress of a deconvolution."""
 
-    Attributes
-    ----------
-    iteration : int
-        Iterations done.
-    change : float
-        Latest change for each iteration, of the tile that changes most and relative to the brightest tile; infinite
-        until the first is known.
-    """
-
-    iteration: int
+    iteration: int  # iterations done
+    # Latest change for each iteration, of the tile that changes most and relative to the brightest tile; infinite until
+    # the first is known.
     change: float
 
 

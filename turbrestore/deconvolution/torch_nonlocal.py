@@ -33,28 +33,17 @@ _LAST = np.iinfo(np.int32).max
 
 @dataclass(frozen=True, eq=False)
 class TorchNonlocalPenalty:
-    """J(u) with the weights of a graph whose arrays are on a device.
+    """J(u) with the weights of a graph whose arrays are on a device."""
 
-    Attributes
-    ----------
-    shape : (int, int)
-        Rows and columns of the image.
-    tails, heads : tensor, int32, shape (E,)
-        Pixel (row · W + column) at which each pair starts and ends.
-    root : tensor, float32, shape (E,)
-        √w.
-    tables : tuple of tensors, int32, shape (n, degree)
-        Which of the 2E values on pairs leave each pixel, for pixels of similar degree; 2E where there is none.
-    places : tensor, int32, shape (H · W,)
-        Row of each pixel in the tables, one below the other.
-    """
-
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # rows and columns of the image
+    # (E,): pixel (row · W + column) at which each pair starts and ends.
     tails: Tensor
     heads: Tensor
-    root: Tensor
+    root: Tensor  # (E,): √w
+    # (n, degree): which of the 2E values on pairs leave each pixel, for pixels of similar degree; 2E where there is
+    # none.
     tables: tuple[Tensor, ...]
-    places: Tensor
+    places: Tensor  # (H · W,): row of each pixel in the tables, one below the other
 
     def gradient(self, u: Tensor) -> Tensor:
         """``(∇_w u)(x, y) = [u(y) − u(x)] √w(x, y)``, shape (2, E)."""

@@ -29,15 +29,9 @@ def local_divergence(v: Array, ops: ArrayOps) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LocalPenalty:
-    """J(u) = Σ|∇u|.
+    """J(u) = Σ|∇u|."""
 
-    Attributes
-    ----------
-    ops : ArrayOps
-        Library of its images.
-    """
-
-    ops: ArrayOps
+    ops: ArrayOps  # library of its images
 
     @property
     def norm_squared(self) -> float:

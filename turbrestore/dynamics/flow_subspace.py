@@ -35,22 +35,15 @@ _STRIP_BYTES, _STRIP_BYTES_MADE = 2**22, 2**25
 
 @dataclass(frozen=True)
 class FlowStrips:
-    """Reads all flows strip by strip of image rows, whatever container the flows are in.
+    """Reads all flows strip by strip of image rows, whatever container the flows are in."""
 
-    Parameters
-    ----------
-    flows : ndarray of shape (τ, H, W, 2), or iterable of arrays of shape (H, W, 2)
-    count, height, width : int
-        τ, H and W.
-    threads : int
-        Strips of an array that are worked on side by side, 0 for one per available core; flows in other containers may
-        be computed on the fly and are read by one thread.
-    """
-
-    flows: FloatArray | Iterable[FloatArray]
+    flows: FloatArray | Iterable[FloatArray]  # (τ, H, W, 2), or iterable of arrays of shape (H, W, 2)
+    # τ, H and W.
     count: int
     height: int
     width: int
+    # Strips of an array that are worked on side by side, 0 for one per available core; flows in other containers may be
+    # computed on the fly and are read by one thread.
     threads: int = 0
 
     @classmethod

@@ -29,31 +29,17 @@ _LENGTHS, _RANKS = (1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0), (1 / 8, 1 / 4, 1 / 2, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class PredictionStudy:
-    """Models of several τ and n, and how well they predict the same flows, which none of them was trained on.
+    """Models of several τ and n, and how well they predict the same flows, which none of them was trained on."""
 
-    Attributes
-    ----------
-    lengths : ndarray, int64, shape (a,)
-        τ; the flows right before the predicted ones train.
-    ranks : ndarray, int64, shape (b,)
-        n.
-    errors : ndarray, float64, shape (a, b)
-        Root mean square error of the predicted flow, pixels for each component; NaN where n ≥ τ.
-    eigenvalues : tuple of tuple of ndarray, complex128
-        Of A, by τ and n; none where n ≥ τ.
-    repeated, mean : float
-        Errors of repeating the flow before, and of the mean of all training flows, pixels.
-    count : int
-        Number of predicted flows.
-    """
-
-    lengths: NDArray[np.int64]
-    ranks: NDArray[np.int64]
+    lengths: NDArray[np.int64]  # (a,): τ; the flows right before the predicted ones train
+    ranks: NDArray[np.int64]  # (b,): n
+    # (a, b): root mean square error of the predicted flow, pixels for each component; NaN where n ≥ τ.
     errors: Float64Array
-    eigenvalues: tuple[tuple[NDArray[np.complex128], ...], ...]
+    eigenvalues: tuple[tuple[NDArray[np.complex128], ...], ...]  # of A, by τ and n; none where n ≥ τ
+    # Errors of repeating the flow before, and of the mean of all training flows, pixels.
     repeated: float
     mean: float
-    count: int
+    count: int  # number of predicted flows
 
 
 def study_prediction(

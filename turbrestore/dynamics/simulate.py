@@ -24,18 +24,10 @@ from .flow_model import Float64Array, FlowDynamics, check_state, flow_of
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFlows:
-    """Sequence of simulated flows, each computed on access.
+    """Sequence of simulated flows, each computed on access."""
 
-    Parameters
-    ----------
-    dynamics : FlowDynamics
-        Has C and W̄.
-    states : ndarray, float64, shape (n, length)
-        One state in each column.
-    """
-
-    dynamics: FlowDynamics
-    states: Float64Array
+    dynamics: FlowDynamics  # has C and W̄
+    states: Float64Array  # (n, length): one state in each column
 
     def __len__(self) -> int:
         return self.states.shape[1]

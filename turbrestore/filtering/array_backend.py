@@ -26,21 +26,11 @@ Warped = tuple[Stack, Stack, Stack]
 
 @dataclass(frozen=True, eq=False)
 class ArrayBackend:
-    """Arrays of one library on one device.
+    """Arrays of one library on one device."""
 
-    Attributes
-    ----------
-    device : str
-        ``"cpu"`` is NumPy and OpenCV; any other is the name of a device of torch.
-    ops : StackOps
-        Operations on its arrays.
-    warp : callable
-        From a frame (a NumPy array) and a flow to the registered frame.
-    """
-
-    device: str
-    ops: StackOps
-    warp: Callable[[FloatArray, Stack], Warped]
+    device: str  # ``"cpu"`` is NumPy and OpenCV; any other is the name of a device of torch
+    ops: StackOps  # operations on its arrays
+    warp: Callable[[FloatArray, Stack], Warped]  # from a frame (a NumPy array) and a flow to the registered frame
 
     @property
     def is_cpu(self) -> bool:

@@ -93,79 +93,43 @@ class FilterParams:
 
 @dataclass(frozen=True)
 class FilterState:
-    """Image and flow state after a frame.
+    """Image and flow state after a frame."""
 
-    Attributes
-    ----------
-    image : PixelGaussian
-        ρ̂ and Σ.
-    flow : Gaussian
-        ξ̂ and P.
-    flow_sum : ndarray, float32, shape (H, W, 2)
-        Sum of W^meas over the frames so far that count, pixels.
-    training_flow : ndarray, float32, shape (H, W, 2)
-        Mean of W^meas over the frames with known flows, pixels; 0 before they are done, or if there are none.
-    """
-
-    image: PixelGaussian
-    flow: Gaussian
-    flow_sum: FloatArray
+    image: PixelGaussian  # ρ̂ and Σ
+    flow: Gaussian  # ξ̂ and P
+    flow_sum: FloatArray  # (H, W, 2): sum of W^meas over the frames so far that count, pixels
+    # (H, W, 2): mean of W^meas over the frames with known flows, pixels; 0 before they are done, or if there are none.
     training_flow: FloatArray
 
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """Figures of one frame; :class:`Filtered` says what each means.
+    """Figures of one frame; :class:`Filtered` says what each means."""
 
-    Attributes
-    ----------
-    flow_state : ndarray, float64, shape (n,)
-    gain, innovation, sharpness : float
-    information : float
-        Mean of 1 / Z over the pixels, before it becomes a share.
-    """
-
-    flow_state: np.ndarray
+    flow_state: np.ndarray  # (n,)
     gain: float
     innovation: float
     sharpness: float
-    information: float
+    information: float  # mean of 1 / Z over the pixels, before it becomes a share
 
 
 @dataclass(frozen=True)
 class FilterCheckpoint:
-    """The filter between two blocks of frames, from which it can be resumed with the same frames.
+    """The filter between two blocks of frames, from which it can be resumed with the same frames."""
 
-    Attributes
-    ----------
-    state : FilterState
-        After the blocks that are done.
-    records : tuple of FrameRecord
-        One for each of their frames.
-    reference : ndarray, float32, shape (H, W) or (H, W, 3)
-        Image that the flows of the next block are first measured from.
-    """
-
-    state: FilterState
-    records: tuple[FrameRecord, ...]
-    reference: FloatArray
+    state: FilterState  # after the blocks that are done
+    records: tuple[FrameRecord, ...]  # one for each of their frames
+    reference: FloatArray  # (H, W) or (H, W, 3): image that the flows of the next block are first measured from
 
 
 @dataclass(frozen=True)
 class FilterStep:
-    """Progress of the filter: there is one after each measured flow, and one at the end of each block.
+    """Progress of the filter: there is one after each measured flow, and one at the end of each block."""
 
-    Attributes
-    ----------
-    flows_measured : int
-        Flows measured so far, including frames that do not count and the run that was resumed; of N frames, the first
-        K of which have known flows, ``inner_iterations * N - K`` in all.
-    checkpoint : FilterCheckpoint or None
-        At the end of a block, the state from which the filter can be resumed.
-    """
-
+    # Flows measured so far, including frames that do not count and the run that was resumed; of N frames, the first K
+    # of which have known flows, ``inner_iterations * N - K`` in all.
     flows_measured: int
-    checkpoint: FilterCheckpoint | None = None
+    checkpoint: FilterCheckpoint | None = None  # at the end of a block, the state from which the filter can be resumed
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ W^meas : measured flow (eq. 17)
 M : gain (eq. 19)
 z : Cᵀ(W^meas − W̄)
 
-As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R = P (P + R I)⁻¹ Cᵀ``: a measured flow enters the
-update only through z, which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the
-expensive part and needs no state, and predictions and updates have the size n.
+As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R``: a measured flow enters the update only through
+z, which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the expensive part and
+needs no state, and predictions and updates have the size n.  Eqs. 14 and 19 themselves are in :mod:`.kalman`.
 
 The paper measures the flow by C ξ alone (eq. 17); here ``W^meas = W̄ + C ξ + r``, as the states are identified around
 the mean flow.
@@ -24,7 +24,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray
 from ..dynamics.flow_model import Float64Array, FlowDynamics, project_deviation
-from .kalman import Gaussian, predict
+from .kalman import Gaussian, predict, update_information
 
 # Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
 _FLOW_NOISE_FLOOR = 1e-6
@@ -32,21 +32,11 @@ _FLOW_NOISE_FLOOR = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ProjectedFlow:
-    """A measured flow, as far as the update of the state needs it.
+    """A measured flow, as far as the update of the state needs it."""
 
-    Attributes
-    ----------
-    state : ndarray, float64, shape (n,)
-        z.
-    squared : float
-        Sum of squares of W^meas − W̄, squared pixels.
-    size : int
-        Components of the flow, 2 H W.
-    """
-
-    state: Float64Array
-    squared: float
-    size: int
+    state: Float64Array  # (n,): z
+    squared: float  # sum of squares of W^meas − W̄, squared pixels
+    size: int  # components of the flow, 2 H W
 
 
 def project_measured(measured: FloatArray, dynamics: FlowDynamics) -> ProjectedFlow:
@@ -71,12 +61,8 @@ def predict_state(state: Gaussian, dynamics: FlowDynamics) -> Gaussian:
 
 def update_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
     """Update the state of the flow by a measured flow (paper 3, eqs. 17 and 19)."""
-    R = flow_noise(dynamics)
-    p, V = np.linalg.eigh(predicted.cov)
-    p = np.maximum(p, 0)  # Rounding may leave the variance of a known direction slightly negative.
-    gain = (V * (p / (p + R))) @ V.T  # P (P + R I)⁻¹, of M in (19)
-    mean = predicted.mean + gain @ (measured.state - predicted.mean)
-    state = Gaussian(mean, R * (gain + gain.T) / 2)  # (I − M C) P = R P (P + R I)⁻¹
-    # |W − W̄ − C ξ̂|² without the product C ξ̂, by CᵀC = I.
+    # Cᵀ(W^meas − W̄) = ξ + noise of covariance R I, by CᵀC = I.
+    state, _ = update_information(predicted, measured.state, np.eye(len(measured.state)), flow_noise(dynamics))
+    # |W − W̄ − C ξ̂|² without the product C ξ̂.
     squared = measured.squared - float(predicted.mean @ (2 * measured.state - predicted.mean))
     return state, (max(squared, 0.0) / measured.size) ** 0.5

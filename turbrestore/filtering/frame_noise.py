@@ -52,48 +52,23 @@ _BOX = np.ones(2 * _AROUND_FOLD + 1, np.float32)
 
 @dataclass(frozen=True, eq=False)
 class FrameStatistics:
-    """Temporal statistics of the registered frames of the first block, which Z of every frame is measured against.
+    """Temporal statistics of the registered frames of the first block, which Z of every frame is measured against."""
 
-    Attributes
-    ----------
-    image_noise : float
-        Z₀, squared intensity.
-    template : tuple of two arrays, float32, shape (H, W)
-        Gradient of the image that the frames are registered to, along x and y, intensity per pixel.
-    template_energy : float
-        Sum of its square.
-    mean_sharpness : array, float32, shape (H, W)
-        Mean over the frames of the local sharpness where they agree, see :func:`project_gradient`.
-    score_scale : array, float32, shape (H, W)
-        Factor from a deviation of the local sharpness to z; 0 where something has passed.
-    score_variance : array, float32, shape (H, W)
-        v, variance of z over the frames.
-    window : float
-        Standard deviation of the Gaussian window in which sharpness is measured, pixels.
-    left_out : float
-        κ, 0 to 1/4.
-    sharpness_weight : float
-        β for which the noise that the weights add is worth the sharpness that they gain.
-    mean_frame : array, float32, shape (H, W)
-        Mean luminance of the registered frames without outliers.
-    deviation : array, float32, shape (H, W)
-        Variance of the registered frames about it, locally averaged, squared intensity.
-    median, spread : arrays, float32, shape (H, W)
-        Median luminance of the registered frames, and the square of their median deviation from it, scaled to a
-        variance and averaged in a small window.
-    """
-
-    image_noise: float
+    image_noise: float  # Z₀, squared intensity
+    # (H, W): gradient of the image that the frames are registered to, along x and y, intensity per pixel.
     template: tuple[Stack, Stack]
-    template_energy: float
+    template_energy: float  # sum of its square
+    # (H, W): mean over the frames of the local sharpness where they agree, see :func:`project_gradient`.
     mean_sharpness: Stack
-    score_scale: Stack
-    score_variance: Stack
-    window: float
-    left_out: float
-    sharpness_weight: float
-    mean_frame: Stack
-    deviation: Stack
+    score_scale: Stack  # (H, W): factor from a deviation of the local sharpness to z; 0 where something has passed
+    score_variance: Stack  # (H, W): v, variance of z over the frames
+    window: float  # standard deviation of the Gaussian window in which sharpness is measured, pixels
+    left_out: float  # κ, 0 to 1/4
+    sharpness_weight: float  # β for which the noise that the weights add is worth the sharpness that they gain
+    mean_frame: Stack  # (H, W): mean luminance of the registered frames without outliers
+    deviation: Stack  # (H, W): variance of the registered frames about it, locally averaged, squared intensity
+    # (H, W): median luminance of the registered frames, and the square of their median deviation from it, scaled to a
+    # variance and averaged in a small window.
     median: Stack
     spread: Stack
 

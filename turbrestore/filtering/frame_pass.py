@@ -34,25 +34,12 @@ Frame = FloatArray | FlowFrame | None
 
 @dataclass(frozen=True, eq=False)
 class PassSettings:
-    """Model, statistics and settings that are the same for every frame.
-
-    Attributes
-    ----------
-    dynamics : FlowDynamics
-    statistics : FrameStatistics
-        Its arrays are on the backend.
-    modelled : bool
-        Whether frames are registered by C ξ̂ + W̄ and not by W^meas.
-    sharpness, drift : float
-        β, and S in squared intensity.
-    flow : FlowParams
-    runtime : Runtime
-    backend : ArrayBackend
-    """
+    """Model, statistics and settings that are the same for every frame."""
 
     dynamics: FlowDynamics
-    statistics: FrameStatistics
-    modelled: bool
+    statistics: FrameStatistics  # its arrays are on the backend
+    modelled: bool  # whether frames are registered by C ξ̂ + W̄ and not by W^meas
+    # β, and S in squared intensity.
     sharpness: float
     drift: float
     flow: FlowParams
@@ -62,45 +49,22 @@ class PassSettings:
 
 @dataclass(frozen=True, eq=False)
 class RegisteredFrame:
-    """A frame registered to the image (eq. 15).
+    """A frame registered to the image (eq. 15)."""
 
-    Attributes
-    ----------
-    channels : array, float32, shape (C, H, W)
-        I ∘ ŵ.
-    noise : array, float32, shape (H, W)
-        Z, squared intensity.
-    sharpness : float
-    """
-
-    channels: Stack
-    noise: Stack
+    channels: Stack  # (C, H, W): I ∘ ŵ
+    noise: Stack  # (H, W): Z, squared intensity
     sharpness: float
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """A frame after the update of the flow state.
+    """A frame after the update of the flow state."""
 
-    Attributes
-    ----------
-    frame : Frame
-        The frame for the next pass, with a flow to start from; None if no other pass follows.
-    state : Gaussian
-        ξ̂ and P after the frame.
-    innovation : float
-        Root mean square of W^meas − W̄ − C A ξ̂, pixels; NaN if the frame does not count.
-    measured : ndarray, float32, shape (H, W, 2), or None
-        W^meas, pixels; None if the frame does not count.
-    registered : callable or None
-        Returns the RegisteredFrame; None if the frame does not count.
-    """
-
-    frame: Frame
-    state: Gaussian
-    innovation: float
-    measured: FloatArray | None
-    registered: Callable[[], RegisteredFrame] | None
+    frame: Frame  # the frame for the next pass, with a flow to start from; None if no other pass follows
+    state: Gaussian  # ξ̂ and P after the frame
+    innovation: float  # root mean square of W^meas − W̄ − C A ξ̂, pixels; NaN if the frame does not count
+    measured: FloatArray | None  # (H, W, 2), or None: w^meas, pixels; None if the frame does not count
+    registered: Callable[[], RegisteredFrame] | None  # returns the RegisteredFrame; None if the frame does not count
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,23 +25,10 @@ from ..runtime.image_stacks import Stack
 
 @dataclass(frozen=True, eq=False)
 class PixelGaussian:
-    """Mean and variance of every pixel.
+    """Mean and variance of every pixel."""
 
-    Parameters
-    ----------
-    mean : ndarray, float32 or float64, shape (H, W) or (H, W, 3)
-        ρ̂, intensities.
-    variance : ndarray, dtype of ``mean``, shape (H, W)
-        Σ, squared intensities, not negative.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, values are not finite, or a variance is negative.
-    """
-
-    mean: NDArray[np.floating]
-    variance: NDArray[np.floating]
+    mean: NDArray[np.floating]  # (H, W) or (H, W, 3): ρ̂, intensities
+    variance: NDArray[np.floating]  # (H, W): Σ, squared intensities, not negative
 
     def __post_init__(self) -> None:
         mean = np.asarray(self.mean)

@@ -27,23 +27,11 @@ _LOG_2PI = float(np.log(2 * np.pi))
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """Mean and covariance of a state.
+    """Mean and covariance of a state."""
 
-    Parameters
-    ----------
-    mean : ndarray, float64, shape (..., n)
-        ξ̂.
-    cov : ndarray, float64, shape (..., n, n)
-        P, symmetric positive semi-definite. Its leading axes may be fewer than those of the mean: one covariance
-        then holds for all of them.
-
-    Raises
-    ------
-    DataError
-        Shapes do not agree, values are not finite, or the covariance is no covariance.
-    """
-
-    mean: Float64Array
+    mean: Float64Array  # (..., n): ξ̂
+    # (..., n, n): P, symmetric positive semi-definite. Its leading axes may be fewer than those of the mean: one
+    # covariance then holds for all of them.
     cov: Float64Array
 
     def __post_init__(self) -> None:
@@ -64,27 +52,16 @@ class Innovation:
 
     If the model is right, the mean of ``normalised_squared`` over many updates is that of ``observed``, and the sum of
     ``log_likelihood`` is the log-density of all measurements.
-
-    Parameters
-    ----------
-    values : ndarray, float64, shape (..., m) or (..., n)
-        Covariance form: z − H ξ̂, NaN where the component is missing. Information form: its projection
-        Hᵀ R⁻¹ (z − H ξ̂), which is all that the update needs.
-    cov : ndarray, float64, shape (..., m, m) or (..., n, n)
-        Covariance of ``values``, NaN where a component is missing.
-    normalised_squared : ndarray, float64, shape (...)
-        Squared innovation in units of its covariance; chi-squared with ``observed`` degrees of freedom.
-    log_likelihood : ndarray, float64, shape (...)
-        Log-density of the measurement given all before it.
-    observed : ndarray, int, shape (...)
-        Number of components that are not missing.
     """
 
+    # (..., m) or (..., n). Covariance form: z − H ξ̂, NaN where the component is missing. Information form: its
+    # projection Hᵀ R⁻¹ (z − H ξ̂), which is all that the update needs.
     values: Float64Array
-    cov: Float64Array
+    cov: Float64Array  # (..., m, m) or (..., n, n): covariance of ``values``, NaN where a component is missing
+    # (...): squared innovation in units of its covariance; chi-squared with ``observed`` degrees of freedom.
     normalised_squared: Float64Array
-    log_likelihood: Float64Array
-    observed: NDArray[np.intp]
+    log_likelihood: Float64Array  # (...): log-density of the measurement given all before it
+    observed: NDArray[np.intp]  # (...): number of components that are not missing
 
 
 def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
@@ -99,7 +76,7 @@ def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
     _check_batches(state.mean.shape[:-1], A=A.shape[:-2], Q=Q.shape[:-2])
     # Gaussian raises a DataError where the result overflows, so NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
-        return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ _transposed(A) + Q))
+        return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ _transposed(A) + Q))  # (14b), (14d)
 
 
 def update(
@@ -126,7 +103,7 @@ def update(
     HP = H @ state.cov
     S = _symmetric(HP @ _transposed(H) + R)
     lower = _cholesky(S, "innovation covariance H P Hᵀ + R", "positive definite")
-    M = _transposed(_solve(S, HP))
+    M = _transposed(_solve(S, HP))  # P Hᵀ (H P Hᵀ + R)⁻¹, (18)
     F = np.eye(n) - M @ H
     after = Gaussian(
         state.mean + _apply(M, residual),
@@ -178,10 +155,10 @@ def _information_step(
 ) -> tuple[Gaussian, Innovation]:
     """Update from the normal equations G = Hᵀ R⁻¹ H, Hz = Hᵀ R⁻¹ z, zz = zᵀ R⁻¹ z."""
     T, gained = _posterior_root(state.cov, G)
-    cov = _symmetric(T @ _transposed(T))
+    cov = _symmetric(T @ _transposed(T))  # (G + P⁻¹)⁻¹, of M in (19)
     G_mean = _apply(G, state.mean)
     score = Hz - G_mean
-    step = _apply(cov, score)
+    step = _apply(cov, score)  # M (z − H ξ̂), (17)
     # zᵀR⁻¹z − 2 ξ̂ᵀHᵀR⁻¹z + ξ̂ᵀGξ̂ needs no further pass over H; rounding may leave it a little below zero.
     weighted = zz - (state.mean * (Hz + score)).sum(-1)
     squared = np.maximum(weighted - (score * step).sum(-1), 0.0)

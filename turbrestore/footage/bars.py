@@ -27,18 +27,10 @@ _NARROWEST, _LEAST_PICTURE = 2, 0.25
 
 @dataclass(frozen=True, eq=False)
 class Bars:
-    """The picture between the bars.
+    """The picture between the bars."""
 
-    Attributes
-    ----------
-    picture : tuple of slice
-        Rows and columns of the frame.
-    frame : ndarray, float32, shape (H, W) or (H, W, 3)
-        Mean of some frames, which has the bars.
-    """
-
-    picture: Window
-    frame: FloatArray
+    picture: Window  # rows and columns of the frame
+    frame: FloatArray  # (H, W) or (H, W, 3): mean of some frames, which has the bars
 
     def put_back(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:
         """Give an image, whose first pixel is at (left, top) of the frame, its bars."""

@@ -36,16 +36,9 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Levels:
-    """Stretched intensities are ``gain * (intensity - low)``.
+    """Stretched intensities are ``gain * (intensity - low)``."""
 
-    Attributes
-    ----------
-    low : float
-        Intensity that becomes 0.
-    gain : float
-    """
-
-    low: float = 0.0
+    low: float = 0.0  # intensity that becomes 0
     gain: float = 1.0
 
     @property

@@ -46,21 +46,11 @@ _NODES, _FEW, _LEAST_GAIN = 64, 5, 0.05
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Gain and offset of frames.
+    """Gain and offset of frames."""
 
-    Attributes
-    ----------
-    gains : dict of int to ndarray, float64, shape (J,)
-        Constant and cosines of g, by the number of the frame in the file.
-    offsets : dict of int to float
-        b, intensity.
-    rows : slice
-        Rows of the file that the cosines span.
-    """
-
-    gains: dict[int, NDArray[np.float64]]
-    offsets: dict[int, float]
-    rows: slice
+    gains: dict[int, NDArray[np.float64]]  # (J,): constant and cosines of g, by the number of the frame in the file
+    offsets: dict[int, float]  # b, intensity
+    rows: slice  # rows of the file that the cosines span
 
     def steady(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Correct the rows of a frame.

@@ -30,23 +30,15 @@ _SKY = ("CRPIX", "CRVAL", "CTYPE", "CDELT", "CUNIT", "CROTA", "CD1_", "CD2_", "P
 
 @dataclasses.dataclass(frozen=True)
 class ObjectPlace:
-    """Where the object is in a frame.
+    """Where the object is in a frame."""
 
-    Attributes
-    ----------
-    x, y : float
-        Centre of its light, pixels.
-    width, height : int
-        Size of the box around it, pixels.
-    cut : bool
-        Whether it touches the border of the frame.
-    """
-
+    # Centre of its light, pixels.
     x: float
     y: float
+    # Size of the box around it, pixels.
     width: int
     height: int
-    cut: bool
+    cut: bool  # whether it touches the border of the frame
 
 
 def find_object(frame: FloatArray) -> ObjectPlace | None:

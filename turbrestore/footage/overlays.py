@@ -60,29 +60,14 @@ _NOISELESS = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """Pixels that stand, and what is behind them.
+    """Pixels that stand, and what is behind them."""
 
-    Attributes
-    ----------
-    mask : ndarray, bool, shape (H, W)
-    scene : ndarray, float32, shape (H', W') or (H', W', 3)
-        Mean of the frames at one place, without the overlay.
-    hidden : ndarray, bool, shape (H, W)
-        Pixels of the scene, at its mean position, that no frame shows.
-    origin : tuple of int
-        Row and column of the scene at which a frame without shift begins.
-    shifts : dict of int to tuple of int
-        (dx, dy) of each frame by its number in the file, pixels.
-    window : tuple of slice
-        Rows and columns of the file that the mask spans.
-    """
-
-    mask: NDArray[np.bool_]
-    scene: FloatArray
-    hidden: NDArray[np.bool_]
-    origin: tuple[int, int]
-    shifts: dict[int, tuple[int, int]]
-    window: Window
+    mask: NDArray[np.bool_]  # (H, W)
+    scene: FloatArray  # (H', W') or (H', W', 3): mean of the frames at one place, without the overlay
+    hidden: NDArray[np.bool_]  # (H, W): pixels of the scene, at its mean position, that no frame shows
+    origin: tuple[int, int]  # row and column of the scene at which a frame without shift begins
+    shifts: dict[int, tuple[int, int]]  # (dx, dy) of each frame by its number in the file, pixels
+    window: Window  # rows and columns of the file that the mask spans
 
     def without(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Replace the pixels that stand in a frame, or in a window of it, by the scene behind them."""
@@ -98,20 +83,11 @@ class Overlay:
 
 @dataclass(frozen=True, eq=False)
 class Title:
-    """Pixels that stand while the air bends the scene around them.
+    """Pixels that stand while the air bends the scene around them."""
 
-    Attributes
-    ----------
-    mask : ndarray, bool, shape (H, W)
-    frame : ndarray, float32, shape (H, W) or (H, W, 3)
-        Mean of the frames.
-    window : tuple of slice
-        Rows and columns of the file that the mask spans.
-    """
-
-    mask: NDArray[np.bool_]
-    frame: FloatArray
-    window: Window
+    mask: NDArray[np.bool_]  # (H, W)
+    frame: FloatArray  # (H, W) or (H, W, 3): mean of the frames
+    window: Window  # rows and columns of the file that the mask spans
 
     def without(self, _: int, values: FloatArray, window: Window) -> FloatArray:
         """Continue a frame, or a window of it, over the pixels that stand."""

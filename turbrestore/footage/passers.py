@@ -61,27 +61,15 @@ _LARGEST_SCENE, _FOLLOWED = 4.0, 0.5
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """The scene behind what passes, and where something does.
+    """The scene behind what passes, and where something does."""
 
-    Attributes
-    ----------
-    image : ndarray, float32, shape (H', W') or (H', W', 3)
-    known : ndarray, uint8, shape (H', W')
-        1 where enough frames show the background, else 0.
-    weights : dict of int to ndarray, uint8
-        Share of the background in a frame from which something is taken, by the number of the frame in the file: a PNG
-        of shape (H, W) with 255 for the background alone.
-    placement : Placement
-        Where frames lie in the image.
-    window : tuple of slice
-        Rows and columns of the file that the frames are.
-    """
-
-    image: FloatArray
-    known: NDArray[np.uint8]
+    image: FloatArray  # (H', W') or (H', W', 3)
+    known: NDArray[np.uint8]  # (H', W'): 1 where enough frames show the background, else 0
+    # Share of the background in a frame from which something is taken, by the number of the frame in the file: a PNG of
+    # shape (H, W) with 255 for the background alone.
     weights: dict[int, NDArray[np.uint8]]
-    placement: Placement
-    window: Window
+    placement: Placement  # where frames lie in the image
+    window: Window  # rows and columns of the file that the frames are
 
     def shown(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Replace what passes in a frame, or in a window of it.

@@ -19,18 +19,10 @@ _SIDE = 192
 
 @dataclass(frozen=True)
 class Placement:
-    """Shifts of frames, and the part of the scene that they show together.
+    """Shifts of frames, and the part of the scene that they show together."""
 
-    Attributes
-    ----------
-    shifts : dict of int to tuple of int
-        (dx, dy) of each frame by its number in the file, pixels.
-    size : tuple of int
-        (H, W) of a frame.
-    """
-
-    shifts: dict[int, tuple[int, int]]
-    size: tuple[int, int]
+    shifts: dict[int, tuple[int, int]]  # (dx, dy) of each frame by its number in the file, pixels
+    size: tuple[int, int]  # (H, W) of a frame
 
     @classmethod
     def still(cls, source: FrameSource) -> Placement:

@@ -11,6 +11,7 @@ Losses within a packet of a lossy codec that its decoder conceals are not found.
 
 from __future__ import annotations
 
+import bisect
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -41,6 +42,8 @@ CONTAINER_SUFFIXES = (
 OPEN_OPTIONS = {
     "format_whitelist": "matroska,webm,mov,mp4,avi,gif,mpegts,asf,mpeg,mpegvideo,flv,ogg,yuv4mpegpipe,dv,mxf,ivf,nut"
 }
+# Formats with an index, which leads to a frame exactly.
+_INDEXED = {"matroska,webm", "mov,mp4,m4a,3gp,3g2,mj2"}
 # Codecs whose packets are decoded independently of each other.
 _INTRA_CODECS = {"ffv1", "mjpeg", "rawvideo", "png", "huffyuv", "ffvhuff", "utvideo", "prores", "dnxhd"}
 
@@ -57,6 +60,14 @@ class _Scan:
     tick: float
     last: float
     starts_whole: bool
+    stamps: NDArray[np.int64]  # (count,): ascending time stamps, ticks
+    entries: tuple[int, ...]  # those of the keyframes; none where they do not lead to a frame
+
+    def entry(self, number: int) -> int | None:
+        """Time stamp of the keyframe to begin with for a frame; None for the first."""
+        # What follows a keyframe in the file and comes before it in time needs frames before the keyframe.
+        place = bisect.bisect_right(self.entries, self.stamps[number]) - 1 if self.entries else 0
+        return self.entries[place] if place > 0 else None
 
 
 def open_container(
@@ -108,7 +119,7 @@ def open_container(
         file_shape=(scan.intact, *_upright_size(frame, layout), *layout.channels),
         full_scale=layout.full_scale,
         bit_depth=layout.bit_depth,
-        pixels=lambda chosen: _frames(path, layout, chosen, intra, interlaced, limits),
+        pixels=lambda chosen: _frames(path, layout, chosen, intra, interlaced, limits, scan),
         path=path,
         fps=fps,
         timestamps=scan.times,
@@ -173,13 +184,14 @@ def _upright_size(frame: av.VideoFrame, layout: PixelFormat) -> tuple[int, int]:
 def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
     """Read all packets without decoding them."""
     stamps: list[int | None] = []
+    entries: list[int | None] = []
     damaged: list[int] = []
     unchecked: list[int] = []
-    keyframes, last, intact, starts_whole = 0, 0.0, None, True
+    last, intact, starts_whole = 0.0, None, True
     with _open(path) as container:
         stream = _video_stream(path, container, limits)
         codec = stream.codec_context.name
-        tick = float(stream.time_base or 0)
+        tick, indexed = float(stream.time_base or 0), container.format.name in _INDEXED
         for packet in container.demux(stream):
             # Empty packets end the stream or mark frames that the camera dropped; the edit list of an MP4 file discards
             # packets.
@@ -190,15 +202,16 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
             if codec == "ffv1":
                 verdict = ffv1_slices_intact(bytes(packet))
                 (unchecked if verdict is None else damaged if not verdict else []).append(len(stamps))
-            keyframes += packet.is_keyframe
             starts_whole = starts_whole and bool(stamps or packet.is_keyframe or codec in _INTRA_CODECS)
             stamps.append(packet.dts if packet.pts is None else packet.pts)
+            if packet.is_keyframe:
+                entries.append(packet.pts)
             limits.check_count(len(stamps), str(path))
             if stamps[-1] is not None:
                 last = max(last, stamps[-1] * tick)
     if not stamps:
         raise DataError(f"{path}: expected at least one frame, found none")
-    times = None
+    times, ticks = None, np.zeros(0, np.int64)
     if None not in stamps:
         ticks = np.sort(np.array(stamps, np.int64))
         # Time stamps that are all the same say nothing.
@@ -211,7 +224,10 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
         # A truncated last frame of a GIF file is decoded without complaint.
         intact = count - 1 if cut and codec == "gif" else count
     times = None if times is None else times[:intact]
-    return _Scan(count, intact, keyframes, tuple(damaged), times, tick, last, starts_whole)
+    known = [entry for entry in entries if entry is not None]
+    leads = indexed and len(known) == len(entries) and len(ticks) == len(stamps) and np.diff(ticks).all()
+    leading = tuple(sorted(known)) if leads else ()
+    return _Scan(count, intact, len(entries), tuple(damaged), times, tick, last, starts_whole, ticks, leading)
 
 
 def _decoded_scan(path: Path, scan: _Scan, limits: Limits) -> tuple[_Scan, int]:
@@ -225,7 +241,8 @@ def _decoded_scan(path: Path, scan: _Scan, limits: Limits) -> tuple[_Scan, int]:
         raise DataError(f"{path}: expected at least one whole frame, found none")
     times = np.sort(stamps) - np.min(stamps)
     count = len(stamps)
-    whole = replace(scan, count=count, intact=count, times=times if np.isfinite(times).all() else None)
+    known = times if np.isfinite(times).all() else None
+    whole = replace(scan, count=count, intact=count, times=known, entries=())
     return whole, scan.count - count
 
 
@@ -253,7 +270,13 @@ def _declared_duration(stream: av.VideoStream) -> float | None:
 
 
 def _frames(
-    path: Path, layout: PixelFormat, chosen: Sequence[int], intra: bool, interlaced: bool, limits: Limits
+    path: Path,
+    layout: PixelFormat,
+    chosen: Sequence[int],
+    intra: bool,
+    interlaced: bool,
+    limits: Limits,
+    scan: _Scan,
 ) -> Iterator[PixelArray]:
     import av
 
@@ -272,6 +295,13 @@ def _frames(
             if interlaced:
                 checked = (_check(path, frame, layout, index) for index, frame in enumerate(frames))
                 frames = _deinterlaced(stream, checked)
+            elif not intra and (entry := scan.entry(chosen[0])) is not None:
+                container.seek(entry, stream=stream)
+                if (first := _frame_at(int(scan.stamps[chosen[0]]), frames)) is None:
+                    # The index has led somewhere else.
+                    yield from _frames(path, layout, chosen, intra, interlaced, limits, replace(scan, entries=()))
+                    return
+                numbers, frames = itertools.count(chosen[0]), itertools.chain([first], frames)
             for number, frame in zip(numbers, frames, strict=False):
                 if number in wanted:
                     whole = frame if interlaced else _check(path, frame, layout, number)
@@ -280,6 +310,17 @@ def _frames(
                     return
     except av.error.FFmpegError as error:
         raise DataError(f"{path}: frame {number + 1} or after cannot be decoded ({error.strerror})") from error
+
+
+def _frame_at(stamp: int, frames: Iterator[av.VideoFrame]) -> av.VideoFrame | None:
+    """Decode up to the frame with a time stamp; None where there is none, or where it lacks others."""
+    import av
+
+    with suppress(av.error.FFmpegError):
+        for frame in frames:
+            if frame.pts is not None and frame.pts >= stamp:
+                return None if frame.pts > stamp or frame.is_corrupt else frame
+    return None
 
 
 def _check(path: Path, frame: av.VideoFrame, layout: PixelFormat, number: int) -> av.VideoFrame:

@@ -44,22 +44,11 @@ _TICKS, _IRREGULAR = 90000, 0.1
 
 @dataclass(frozen=True)
 class Encoding:
-    """How a video file is compressed.
+    """How a video file is compressed."""
 
-    Parameters
-    ----------
-    codec : {"h264", "hevc", "ffv1"}, optional
-        By default FFV1 for .mkv and H.264 for .mp4; H.264 for .mkv too if ``crf`` is given.
-    crf : int, optional
-        Constant rate factor of H.264 and HEVC, 0 to 51: smaller is better and larger.  By default 14 and 18.
-
-    Raises
-    ------
-    ConfigurationError
-        The codec is unknown, or the factor is out of range.
-    """
-
+    # By default FFV1 for .mkv and H.264 for .mp4; H.264 for .mkv too if ``crf`` is given.
     codec: Literal["h264", "hevc", "ffv1"] | None = None
+    # Constant rate factor of H.264 and HEVC, 0 to 51: smaller is better and larger. By default 14 and 18.
     crf: int | None = None
 
     def __post_init__(self) -> None:
@@ -79,17 +68,10 @@ BY_SUFFIX = Encoding()
 
 @dataclass(frozen=True, eq=False)
 class Soundtrack:
-    """File whose audio is copied, and the times of its frames.
-
-    Attributes
-    ----------
-    path : Path
-    times : ndarray, float64, shape (T,)
-        Times of the frames that are written, seconds since the first frame of the file.
-    """
+    """File whose audio is copied, and the times of its frames."""
 
     path: Path
-    times: NDArray[np.float64]
+    times: NDArray[np.float64]  # (T,): times of the frames that are written, seconds since the first frame of the file
 
 
 def write_container(

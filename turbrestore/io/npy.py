@@ -95,20 +95,11 @@ class MappedFrames:
     """Where the frames of a video lie in a file; called with numbers of frames, it yields them.
 
     A mapped array travels to another process as all its bytes; this travels as the name of the file and a place in it.
-
-    Attributes
-    ----------
-    path : Path
-        Absolute.
-    start : int
-        Place of the first number, bytes.
-    shape, strides : tuple of int
-        Of all frames; strides in bytes.
-    dtype : dtype
     """
 
-    path: Path
-    start: int
+    path: Path  # absolute
+    start: int  # place of the first number, bytes
+    # Of all frames; strides in bytes.
     shape: tuple[int, ...]
     strides: tuple[int, ...]
     dtype: np.dtype[Any]

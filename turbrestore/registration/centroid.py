@@ -128,18 +128,10 @@ class Centroid:
 
 @dataclass(frozen=True)
 class CentroidState:
-    """How far the iteration is.
+    """How far the iteration is."""
 
-    Attributes
-    ----------
-    iteration : int
-        From 1.
-    measured : int
-        Flows measured so far in this iteration.
-    """
-
-    iteration: int
-    measured: int
+    iteration: int  # from 1
+    measured: int  # flows measured so far in this iteration
 
 
 def find_centroid(

@@ -62,15 +62,10 @@ Planes = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class FlowConfidence:
-    """What the texture of a reference tells about displacements.
+    """What the texture of a reference tells about displacements."""
 
-    Attributes
-    ----------
-    tensors : tuple of ndarray, float32, shape (3, h, w)
-        J as planes xx, xy and yy, squared intensity per squared pixel: of the image, then of ever twice as wide windows
-        and grids.
-    """
-
+    # (3, h, w): J as planes xx, xy and yy, squared intensity per squared pixel: of the image, then of ever twice as
+    # wide windows and grids.
     tensors: tuple[FloatArray, ...]
 
 

@@ -95,51 +95,27 @@ class FlowParams:
 
 @dataclass(frozen=True)
 class FlowFrame:
-    """A frame and everything that is computed from it once, whatever reference it is compared with.
+    """A frame and everything that is computed from it once, whatever reference it is compared with."""
 
-    Attributes
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-    levels : ndarray, uint8, shape (H, W)
-        The contrast-normalised image that the solvers see.
-    noise : float
-        Standard deviation of the noise, intensity.
-    noisy : bool
-        Whether the solvers see this frame and the reference smoothed.
-    start : ndarray, shape (H, W, 2) or on a coarser grid, or None
-        Flow to this frame from a similar reference, pixels, from which the solver starts.
-    """
-
-    image: FloatArray
-    levels: GreyImage
-    noise: float
-    noisy: bool = False
+    image: FloatArray  # (H, W) or (H, W, 3)
+    levels: GreyImage  # (H, W): the contrast-normalised image that the solvers see
+    noise: float  # standard deviation of the noise, intensity
+    noisy: bool = False  # whether the solvers see this frame and the reference smoothed
+    # (H, W, 2) or on a coarser grid, or None; flow to this frame from a similar reference, pixels, from which the
+    # solver starts.
     start: NDArray[np.floating] | None = None
 
 
 @dataclass(frozen=True)
 class FlowReference:
-    """The image that flows start from, and everything that is computed from it once.
+    """The image that flows start from, and everything that is computed from it once."""
 
-    Attributes
-    ----------
-    prepare : callable
-        From an image of the size of the reference to a FlowFrame; the same for all references with these settings.
-    solve : callable
-        From a list of FlowFrame to the list of their flows, pixels.
-    shape : tuple of int
-        (H, W).
-    batch : int
-        Frames to hand to ``solve`` together.
-    threads : int
-        Batches to solve side by side; 0 means one for each available core.
-    """
-
+    # From an image of the size of the reference to a FlowFrame; the same for all references with these settings.
     prepare: Callable[[FloatArray], FlowFrame]
-    solve: Callable[[list[FlowFrame]], list[FloatArray]]
-    shape: tuple[int, int]
-    batch: int
-    threads: int
+    solve: Callable[[list[FlowFrame]], list[FloatArray]]  # from a list of FlowFrame to the list of their flows, pixels
+    shape: tuple[int, int]  # (H, W)
+    batch: int  # frames to hand to ``solve`` together
+    threads: int  # batches to solve side by side; 0 means one for each available core
 
 
 def estimate_flow(

@@ -114,57 +114,31 @@ class TvL1Params:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceLevel:
-    """One level of the pyramid of a reference.
+    """One level of the pyramid of a reference."""
 
-    Attributes
-    ----------
-    image : stack, shape (1, H, W)
-    gradient : stack, shape (1, 2, H, W)
-    x, y : stack, shape (H, W)
-        Pixel coordinates.
-    """
-
-    image: Stack
-    gradient: Stack
+    image: Stack  # (1, H, W)
+    gradient: Stack  # (1, 2, H, W)
+    # (H, W): pixel coordinates.
     x: Stack
     y: Stack
 
 
 @dataclass(frozen=True, eq=False)
 class TvL1Reference:
-    """A reference and everything that is computed from it once for all frames; threads may share it.
+    """A reference and everything that is computed from it once for all frames; threads may share it."""
 
-    Attributes
-    ----------
-    levels : tuple of ReferenceLevel
-        From the image to the coarsest.
-    params : TvL1Params
-    ops : StackOps
-        Operations of the CPU, or of the device.
-    """
-
-    levels: tuple[ReferenceLevel, ...]
+    levels: tuple[ReferenceLevel, ...]  # from the image to the coarsest
     params: TvL1Params
-    ops: StackOps
+    ops: StackOps  # operations of the CPU, or of the device
 
 
 @dataclass(frozen=True, eq=False)
 class TvL1Flows:
-    """Flows of frames.
+    """Flows of frames."""
 
-    Attributes
-    ----------
-    flows : ndarray, float32, shape (T, H, W, 2)
-        (dx, dy), pixels.
-    warps : ndarray, int, shape (T,)
-        Warps of each frame at full resolution.
-    settled : ndarray, bool, shape (T,)
-        Whether the last of them moved half of the pixels by less than the tolerance.
-    """
-
-    flows: FloatArray
-    warps: NDArray[np.intp]
-    settled: NDArray[np.bool_]
+    flows: FloatArray  # (T, H, W, 2): (dx, dy), pixels
+    warps: NDArray[np.intp]  # (T,): warps of each frame at full resolution
+    settled: NDArray[np.bool_]  # (T,): whether the last of them moved half of the pixels by less than the tolerance
 
 
 def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device: str = CPU) -> TvL1Reference:

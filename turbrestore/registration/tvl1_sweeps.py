@@ -42,40 +42,20 @@ _SQUARED_NORM = 8.0
 
 @dataclass(frozen=True, eq=False)
 class FlowProblem:
-    """Data term of B frames, divided by |g|.
+    """Data term of B frames, divided by |g|."""
 
-    Attributes
-    ----------
-    direction : stack, shape (B, 2, H, W)
-        ĝ.
-    offset : stack, shape (B, H, W)
-        ρ₀/|g|, pixels.
-    bound : stack, shape (B, H, W)
-        λ|g|.
-    """
-
-    direction: Stack
-    offset: Stack
-    bound: Stack
+    direction: Stack  # (B, 2, H, W): ĝ
+    offset: Stack  # (B, H, W): ρ₀/|g|, pixels
+    bound: Stack  # (B, H, W): λ|g|
 
 
 @dataclass(frozen=True)
 class SweepParams:
-    """Step and count of sweeps.
+    """Step and count of sweeps."""
 
-    Parameters
-    ----------
-    count : int
-        Sweeps.
-    step : float
-        τ, pixels.
-    huber : float
-        α, pixels per pixel.
-    """
-
-    count: int
-    step: float
-    huber: float
+    count: int  # sweeps
+    step: float  # τ, pixels
+    huber: float  # α, pixels per pixel
 
     @property
     def dual_step(self) -> float:

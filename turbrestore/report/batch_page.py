@@ -19,43 +19,24 @@ _LONGEST, _QUALITY = 320, 90
 
 @dataclass(frozen=True)
 class ClipRow:
-    """What became of one clip.
+    """What became of one clip."""
 
-    Attributes
-    ----------
-    input, output : str
-        Paths as they were given.
-    state : str
-        planned, done or failed.
-    reason : str
-        Why it failed, in one line.
-    frames, width, height : int
-        Frames that were read, and size of the result.
-    blur : float
-        Width of the blur that was removed, pixels.
-    seconds : float
-        Time of all stages.
-    remarks : str
-        What was repaired, left out or unusual.
-    before, after : str
-        Pictures of a frame and of the result, as data URIs.
-    key : str
-        Stands for input and settings; a clip with another key has to be restored again.
-    """
-
+    # Paths as they were given.
     input: str
     output: str
-    state: str = "planned"
-    reason: str = ""
+    state: str = "planned"  # planned, done or failed
+    reason: str = ""  # why it failed, in one line
+    # Frames that were read, and size of the result.
     frames: int = 0
     width: int = 0
     height: int = 0
-    blur: float = 0.0
-    seconds: float = 0.0
-    remarks: str = ""
+    blur: float = 0.0  # width of the blur that was removed, pixels
+    seconds: float = 0.0  # time of all stages
+    remarks: str = ""  # what was repaired, left out or unusual
+    # Pictures of a frame and of the result, as data URIs.
     before: str = ""
     after: str = ""
-    key: str = ""
+    key: str = ""  # stands for input and settings; a clip with another key has to be restored again
 
 
 def thumbnail_uri(image: FloatArray) -> str:

@@ -36,52 +36,31 @@ _USUAL_RUN = {
 
 @dataclass(frozen=True)
 class Fact:
-    """One measured value.
+    """One measured value."""
 
-    Attributes
-    ----------
-    name, value, note : str
-        The note says how to read the value, or is empty.
-    doubtful : bool
-        Whether the value should be checked by a person.
-    """
-
+    # The note says how to read the value, or is empty.
     name: str
     value: str
     note: str = ""
-    doubtful: bool = False
+    doubtful: bool = False  # whether the value should be checked by a person
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One setting.
-
-    Attributes
-    ----------
-    name, value : str
-    changed : bool
-        Whether it differs from the default.
-    """
+    """One setting."""
 
     name: str
     value: str
-    changed: bool
+    changed: bool  # whether it differs from the default
 
 
 @dataclass(frozen=True)
 class Lap:
-    """Time that one stage took.
-
-    Attributes
-    ----------
-    name : str
-    seconds : float
-    start, share : float
-        Percent of the time of the whole run.
-    """
+    """Time that one stage took."""
 
     name: str
     seconds: float
+    # Percent of the time of the whole run.
     start: float
     share: float
 

@@ -24,28 +24,15 @@ _ENLARGED, _DIMMED = 2.0, 0.3
 
 @dataclass(frozen=True)
 class Film:
-    """What a page has to know of a film.
+    """What a page has to know of a film."""
 
-    Attributes
-    ----------
-    panels : tuple of str
-        What is shown, two in a row.
-    width, height : int
-        Size of a panel, pixels.
-    count : int
-        Frames.
-    fps : float
-        Frames per second.
-    stretch : Stretch
-        Of the first frame of the output.
-    """
-
-    panels: tuple[str, ...]
+    panels: tuple[str, ...]  # what is shown, two in a row
+    # Size of a panel, pixels.
     width: int
     height: int
-    count: int
-    fps: float
-    stretch: Stretch
+    count: int  # frames
+    fps: float  # frames per second
+    stretch: Stretch  # of the first frame of the output
 
     @property
     def layers(self) -> list[Layer]:

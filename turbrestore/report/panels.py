@@ -40,23 +40,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot.
-
-    Attributes
-    ----------
-    title : str
-    svg : Markup
-        The ``<svg>`` element.
-    caption : str
-        What the plot shows, and what to look for.
-    is_map : bool
-        Whether it has the shape of the image; maps stand before the curves.
-    """
+    """One plot."""
 
     title: str
-    svg: Markup
-    caption: str
-    is_map: bool
+    svg: Markup  # the ``<svg>`` element
+    caption: str  # what the plot shows, and what to look for
+    is_map: bool  # whether it has the shape of the image; maps stand before the curves
 
 
 def make_panel(figure: Figure, name: str, description: str, caption: str) -> Panel:

@@ -42,21 +42,13 @@ _TITLES = {
 
 @dataclass(frozen=True)
 class Picture:
-    """An image of the report.
+    """An image of the report."""
 
-    Attributes
-    ----------
-    key, title : str
-        Name in the page's code, and name that is shown.
-    address : str
-        Data URI.
-    width, height : int
-        Pixels.
-    """
-
+    # Name in the page's code, and name that is shown.
     key: str
     title: str
-    address: str
+    address: str  # data URI
+    # Pixels.
     width: int
     height: int
 

@@ -37,26 +37,14 @@ _USUAL_RATE = 25.0
 
 @dataclass(eq=False)
 class SteadyFigures:
-    """What is known about the frames of a run, in order.
+    """What is known about the frames of a run, in order."""
 
-    Attributes
-    ----------
-    displacement : list of float
-        Root mean square of the displacement that was removed, pixels.
-    moving : list of float
-        Share of the image that moves.
-    scenes : int
-    sigma : float
-        Width of the blur that was removed, pixels.
-    seconds : float
-        Time of the run.
-    """
-
+    # Root mean square of the displacement that was removed, pixels.
     displacement: list[float] = field(default_factory=list)
-    moving: list[float] = field(default_factory=list)
+    moving: list[float] = field(default_factory=list)  # share of the image that moves
     scenes: int = 0
-    sigma: float = 0.0
-    seconds: float = 0.0
+    sigma: float = 0.0  # width of the blur that was removed, pixels
+    seconds: float = 0.0  # time of the run
 
 
 def write_steady_report(

@@ -18,18 +18,10 @@ Kind = TypeVar("Kind")
 
 @dataclass(frozen=True)
 class JsonFields:
-    """Part of a JSON record; every method raises :class:`turbrestore.core.errors.DataError` on what is of another type.
+    """Part of a JSON record; every method raises a DataError on what is of another type."""
 
-    Attributes
-    ----------
-    path : Path
-        File of the record, for messages.
-    record : dict
-        What it says.
-    """
-
-    path: Path
-    record: dict[str, Any]
+    path: Path  # file of the record, for messages
+    record: dict[str, Any]  # what it says
 
     def value(self, name: str, kind: type[Kind]) -> Kind:
         """Return a value that is no flag; whole numbers count as numbers."""

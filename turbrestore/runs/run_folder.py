@@ -75,33 +75,8 @@ class RunFolder:
     It is a :class:`turbrestore.results.Store`.  The folder should be held by
     :func:`turbrestore.runs.folder_lock.lock_folder`.
 
-    Parameters
-    ----------
-    folder : path
-        An existing folder.
-    source : FrameSource
-        Frames to restore.
-    params : RestoreParams
-        Settings.
-    runtime : Runtime
-        What the restoration may use of the machine.
-    resume : bool
-        Take over what still holds; otherwise everything starts anew.
-    every : int
-        Frames between two checkpoints of the filter.
-
-    Attributes
-    ----------
-    folder : Path
-    notes : tuple of str
-        What was taken over, and what starts again and why.
-
-    Raises
-    ------
-    ConfigurationError
-        ``every`` is below 1.
-    OutputError
-        The folder cannot be written to.
+    With ``resume`` it takes over what still holds, and ``notes`` say what that is, what starts again and why;
+    otherwise everything starts anew.  ``every`` is the number of frames between two checkpoints of the filter.
     """
 
     def __init__(

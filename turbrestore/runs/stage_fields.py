@@ -36,40 +36,22 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Array:
-    """An array of a stage file.
+    """An array of a stage file."""
 
-    Attributes
-    ----------
-    dtype : str
-        As NumPy abbreviates it.
-    shape : str
-        Names and lengths of the axes; shapes that are possible too follow after ``|``.
-    low, high : float
-        Least and largest value; infinite ones are allowed where a bound is infinite.
-    gaps : bool
-        Whether NaN is allowed.
-    """
-
-    dtype: str
-    shape: str
+    dtype: str  # as NumPy abbreviates it
+    shape: str  # names and lengths of the axes; shapes that are possible too follow after ``|``
+    # Least and largest value; infinite ones are allowed where a bound is infinite.
     low: float = -_MOST
     high: float = _MOST
-    gaps: bool = False
+    gaps: bool = False  # whether NaN is allowed
 
 
 @dataclass(frozen=True)
 class Number:
-    """A number of a stage file.
+    """A number of a stage file."""
 
-    Attributes
-    ----------
-    whole : bool
-        Whether it is whole.
-    low, high : float
-        Least and largest value; infinite ones are allowed where a bound is infinite.
-    """
-
-    whole: bool = False
+    whole: bool = False  # whether it is whole
+    # Least and largest value; infinite ones are allowed where a bound is infinite.
     low: float = 0
     high: float = _MOST
 

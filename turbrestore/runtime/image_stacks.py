@@ -37,35 +37,20 @@ Shape = tuple[int, ...]
 
 @dataclass(frozen=True, eq=False)
 class StackOps:
-    """The operations of one library.
+    """The operations of one library."""
 
-    Attributes
-    ----------
-    arrays : module
-        ``numpy`` or ``torch``, for arithmetic.
-    load, store : callable
-        From a NumPy array to a stack, and back.
-    zeros : callable
-        ``zeros(shape)`` is a stack of zeros.
-    filter : callable
-        ``filter(stack, kernel_x, kernel_y)`` correlates along both axes with kernels of odd length.
-    resize : callable
-        ``resize(stack, (H, W))`` interpolates linearly.
-    sample : callable
-        ``sample(coefficients, flow)`` evaluates the cubic B-spline with these coefficients, shape (B, H, W), where each
-        pixel leads by its flow, shape (B, 2, H, W), pixels; positions outside the image are moved to its border.
-    median : callable
-        ``median(stack, side)`` of windows of 3×3 or 5×5 pixels.
-    """
-
-    arrays: Any
+    arrays: Any  # ``numpy`` or ``torch``, for arithmetic
+    # From a NumPy array to a stack, and back.
     load: Callable[[FloatArray], Stack]
     store: Callable[[Stack], FloatArray]
-    zeros: Callable[[Shape], Stack]
+    zeros: Callable[[Shape], Stack]  # ``zeros(shape)`` is a stack of zeros
+    # ``filter(stack, kernel_x, kernel_y)`` correlates along both axes with kernels of odd length.
     filter: Callable[[Stack, FloatArray, FloatArray], Stack]
-    resize: Callable[[Stack, Shape], Stack]
+    resize: Callable[[Stack, Shape], Stack]  # ``resize(stack, (H, W))`` interpolates linearly
+    # ``sample(coefficients, flow)`` evaluates the cubic B-spline with these coefficients, shape (B, H, W), where each
+    # pixel leads by its flow, shape (B, 2, H, W), pixels; positions outside the image are moved to its border.
     sample: Callable[[Stack, Stack], Stack]
-    median: Callable[[Stack, int], Stack]
+    median: Callable[[Stack, int], Stack]  # ``median(stack, side)`` of windows of 3×3 or 5×5 pixels
 
 
 @functools.cache

@@ -23,21 +23,13 @@ HALO = 96
 
 @dataclass(frozen=True, eq=False)
 class HaloTile:
-    """A part of the frames.
+    """A part of the frames."""
 
-    Attributes
-    ----------
-    rows, columns : slice
-        Its pixels, with the halo.
-    row_weights : ndarray, float32, shape (h,)
-    column_weights : ndarray, float32, shape (w,)
-        What the tile counts in the whole is the product of both.
-    """
-
+    # Its pixels, with the halo.
     rows: slice
     columns: slice
-    row_weights: FloatArray
-    column_weights: FloatArray
+    row_weights: FloatArray  # (h,)
+    column_weights: FloatArray  # (w,): what the tile counts in the whole is the product of both
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -65,26 +65,13 @@ _TINY = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Displacement:
-    """Displacement of the blocks of a clip.
+    """Displacement of the blocks of a clip."""
 
-    Attributes
-    ----------
-    blocks : ndarray, float64, shape (T, m, n, 2)
-        w, pixels.
-    counts : ndarray, bool, shape (m, n)
-        Which blocks have enough structure.
-    spacing : int
-        Distance of neighbouring blocks, pixels.
-    window : float
-        b, pixels.
-    noise_variance : float
-        What noise adds at most to the variance of w, mean over the blocks that count, squared pixels.
-    """
-
-    blocks: Float64Array
-    counts: NDArray[np.bool_]
-    spacing: int
-    window: float
+    blocks: Float64Array  # (T, m, n, 2): w, pixels
+    counts: NDArray[np.bool_]  # (m, n): which blocks have enough structure
+    spacing: int  # distance of neighbouring blocks, pixels
+    window: float  # b, pixels
+    # What noise adds at most to the variance of w, mean over the blocks that count, squared pixels.
     noise_variance: float
 
     @property
@@ -95,23 +82,12 @@ class Displacement:
 
 @dataclass(frozen=True, eq=False)
 class MotionStatistics:
-    """Variance of displacements, and how well it is known.
+    """Variance of displacements, and how well it is known."""
 
-    Attributes
-    ----------
-    variance : ndarray, float64, shape (2,)
-        Along x and y over a long time, without noise, squared pixels.
-    freedom : float
-        ν of the mean of both.
-    independent_frames : float
-        N.
-    autocorrelation : ndarray, float64, shape (K,)
-        ρ(k) for k = 0, 1, …, up to its first zero, or to the largest lag that is used.
-    """
-
-    variance: Float64Array
-    freedom: float
-    independent_frames: float
+    variance: Float64Array  # (2,): along x and y over a long time, without noise, squared pixels
+    freedom: float  # ν of the mean of both
+    independent_frames: float  # N
+    # (K,): ρ(k) for k = 0, 1, …, up to its first zero, or to the largest lag that is used.
     autocorrelation: Float64Array
 
     @property

@@ -56,49 +56,22 @@ _HALVED = 128
 
 @dataclass(frozen=True, eq=False)
 class DewarpedFrame:
-    """A frame that has been dewarped and fused.
+    """A frame that has been dewarped and fused."""
 
-    Attributes
-    ----------
-    number : int
-        Number of the frame in the stream, from 0.
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Not deblurred.
-    moving : ndarray, bool, shape (H, W)
-        Where something moves against the scene.
-    displacement : float
-        Root mean square of the displacement that was removed, pixels.
-    noise : float
-        Standard deviation of the noise of the frame before it was fused, intensity.
-    share : float
-        What fusion has left of it.
-    largest : float
-        What turbulence displaces at most, pixels; infinite without neighbours.
-    size : float
-        Median size of the displacement of turbulence, pixels.
-    steadiness : float
-        Whether the camera moves at constant velocity, 0 to 1.
-    starts_scene : bool
-        Whether a new scene starts here.
-    cameras : mapping of int to ndarray, float64, shape (2, 3)
-        Affine motion of the camera from the frame to each neighbour, by its distance in frames, pixels about the centre
-        of the image.
-    removed_camera : ndarray, float64, shape (2, 3)
-        Its part in the displacement that was removed.
-    """
-
-    number: int
-    image: FloatArray
-    moving: NDArray[np.bool_]
-    displacement: float
-    noise: float
-    share: float
-    largest: float
-    size: float
-    steadiness: float
-    starts_scene: bool
+    number: int  # number of the frame in the stream, from 0
+    image: FloatArray  # (H, W) or (H, W, 3): not deblurred
+    moving: NDArray[np.bool_]  # (H, W): where something moves against the scene
+    displacement: float  # root mean square of the displacement that was removed, pixels
+    noise: float  # standard deviation of the noise of the frame before it was fused, intensity
+    share: float  # what fusion has left of it
+    largest: float  # what turbulence displaces at most, pixels; infinite without neighbours
+    size: float  # median size of the displacement of turbulence, pixels
+    steadiness: float  # whether the camera moves at constant velocity, 0 to 1
+    starts_scene: bool  # whether a new scene starts here
+    # (2, 3): affine motion of the camera from the frame to each neighbour, by its distance in frames, pixels about the
+    # centre of the image.
     cameras: Mapping[int, Matrix]
-    removed_camera: Matrix
+    removed_camera: Matrix  # (2, 3): its part in the displacement that was removed
 
 
 def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:

@@ -79,33 +79,15 @@ _LEAST_STEADINESS = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """What is remembered of a scene.
+    """What is remembered of a scene."""
 
-    Attributes
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-        Z, at the mean geometry of the frames.
-    held : ndarray, float32, shape (H, W)
-        n, frames.
-    frames : int
-        Number of frames since the memory began, at most the longest memory.
-    pose : ndarray, float64, shape (3, 3)
-        E.
-    mean : ndarray, float32, shape (H, W)
-        B.
-    distances : ndarray, float32, shape (H, W, 2)
-        e_Z and e_F, squared intensity.
-    let_go : float
-        Share of the memory that its distance from B has let go at the last frame.
-    """
-
-    image: FloatArray
-    held: FloatArray
-    frames: int
-    pose: Matrix
-    mean: FloatArray
-    distances: FloatArray
-    let_go: float
+    image: FloatArray  # (H, W) or (H, W, 3): Z, at the mean geometry of the frames
+    held: FloatArray  # (H, W): n, frames
+    frames: int  # number of frames since the memory began, at most the longest memory
+    pose: Matrix  # (3, 3): E
+    mean: FloatArray  # (H, W): B
+    distances: FloatArray  # (H, W, 2): e_Z and e_F, squared intensity
+    let_go: float  # share of the memory that its distance from B has let go at the last frame
 
 
 def remember(

@@ -32,44 +32,22 @@ _SHADING = 5.0
 
 @dataclass(frozen=True, eq=False)
 class WindowFrame:
-    """A frame of a stream.
+    """A frame of a stream."""
 
-    Attributes
-    ----------
-    image : ndarray, float32, shape (H, W) or (H, W, 3)
-    levels : ndarray, uint8, shape (H, W)
-        Contrast-normalised image, which flow is measured from.
-    scene : int
-        Number of the scene, from 0.
-    shift_reference : ShiftReference
-        What shifts of the whole image are measured against.
-    """
-
-    image: FloatArray
-    levels: GreyImage
-    scene: int
-    shift_reference: ShiftReference
+    image: FloatArray  # (H, W) or (H, W, 3)
+    levels: GreyImage  # (H, W): contrast-normalised image, which flow is measured from
+    scene: int  # number of the scene, from 0
+    shift_reference: ShiftReference  # what shifts of the whole image are measured against
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A frame and its neighbours in the same scene.
+    """A frame and its neighbours in the same scene."""
 
-    Attributes
-    ----------
-    number : int
-        Number of the frame in the stream, from 0.
-    frame : WindowFrame
-    neighbours : mapping of int to WindowFrame
-        By their distance in frames, negative before the frame.
-    starts_scene : bool
-        Whether the frame is the first of its scene.
-    """
-
-    number: int
+    number: int  # number of the frame in the stream, from 0
     frame: WindowFrame
-    neighbours: Mapping[int, WindowFrame]
-    starts_scene: bool
+    neighbours: Mapping[int, WindowFrame]  # by their distance in frames, negative before the frame
+    starts_scene: bool  # whether the frame is the first of its scene
 
 
 def iter_windows(frames: Iterable[ArrayLike], distances: Sequence[int]) -> Iterator[Window]:

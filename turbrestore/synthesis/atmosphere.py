@@ -47,24 +47,12 @@ _QUADRATURE = 6000
 
 @dataclass(frozen=True)
 class Layer:
-    """Thin layer of turbulence that drifts with the wind.
+    """Thin layer of turbulence that drifts with the wind."""
 
-    Attributes
-    ----------
-    distance : float
-        z, from the aperture, m.
-    shrink : float
-        γ = 1 − z/L.
-    r0 : float
-        Fried parameter of a plane wave through this layer alone, at the wavelength of the path, m.
-    velocity : (float, float)
-        Wind (x to the right, y down) across the line of sight, m/s.
-    """
-
-    distance: float
-    shrink: float
-    r0: float
-    velocity: tuple[float, float]
+    distance: float  # z, from the aperture, m
+    shrink: float  # γ = 1 − z/L
+    r0: float  # Fried parameter of a plane wave through this layer alone, at the wavelength of the path, m
+    velocity: tuple[float, float]  # wind (x to the right, y down) across the line of sight, m/s
 
 
 @dataclass(frozen=True)

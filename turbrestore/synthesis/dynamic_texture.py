@@ -93,27 +93,13 @@ class DynamicTextureParams:
 
 @dataclass(frozen=True, eq=False)
 class TextureFlows:
-    """Sequence of synthetic flows, each computed when it is requested.
+    """Sequence of synthetic flows, each computed when it is requested."""
 
-    Parameters
-    ----------
-    modes : ndarray, float32, shape (2 h w, m)
-        C and D: orthonormal columns, one for each state, on the grid of the training flows.
-    states : ndarray, float64, shape (m, count)
-        ξ and η, one column for each flow.
-    grid : (int, int)
-        Height h and width w of the training flows.
-    size : (int, int)
-        Height H and width W of the resulting flows.
-    fit : {"mirror", "stretch"}
-        How a flow is fitted from the grid to that size.
-    """
-
-    modes: FloatArray
-    states: Float64Array
-    grid: tuple[int, int]
-    size: tuple[int, int]
-    fit: str
+    modes: FloatArray  # (2 h w, m): C and D: orthonormal columns, one for each state, on the grid of the training flows
+    states: Float64Array  # (m, count): ξ and η, one column for each flow
+    grid: tuple[int, int]  # height h and width w of the training flows
+    size: tuple[int, int]  # height H and width W of the resulting flows
+    fit: str  # how a flow is fitted from the grid to that size
 
     def __len__(self) -> int:
         return self.states.shape[1]

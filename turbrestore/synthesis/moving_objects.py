@@ -28,25 +28,14 @@ MOST_OBJECTS = 100
 
 @dataclass(frozen=True)
 class MovingObject:
-    """An ellipse that moves at constant velocity.
+    """An ellipse that moves at constant velocity."""
 
-    Attributes
-    ----------
-    start, velocity : tuple of float
-        Centre at frame 0, pixels, and velocity, pixels a frame, (x, y).
-    semi_axes : tuple of float
-        Pixels, along x and y.
-    brightness : float
-        Mean intensity.
-    direction : float
-        Of the stripes, rad.
-    """
-
+    # Centre at frame 0, pixels, and velocity, pixels a frame, (x, y).
     start: tuple[float, float]
     velocity: tuple[float, float]
-    semi_axes: tuple[float, float]
-    brightness: float
-    direction: float
+    semi_axes: tuple[float, float]  # pixels, along x and y
+    brightness: float  # mean intensity
+    direction: float  # of the stripes, rad
 
 
 def draw_objects(count: int, shape: tuple[int, ...], rng: np.random.Generator) -> tuple[MovingObject, ...]:

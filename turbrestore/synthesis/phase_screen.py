@@ -45,45 +45,23 @@ _WAVE_SPACING = 8
 
 @dataclass(frozen=True, eq=False)
 class PhaseScreen:
-    """Difference of optical path over an unbounded plane, and its slope averaged over an aperture.
+    """Difference of optical path over an unbounded plane, and its slope averaged over an aperture."""
 
-    Attributes
-    ----------
-    path : ndarray, float32, shape (n, n)
-        Lattice part, m.
-    slopes : ndarray, float32, shape (2, n, n)
-        Tilt (x, y) of the plane fitted to the lattice part over the aperture around each point, rad.
-    spacing : float
-        Between lattice points, m.
-    axes : ndarray, float64, shape (2, 2)
-        Rows are the unit vectors of the lattice in the coordinates of the scene.
-    frequencies : ndarray, float64, shape (m, 2)
-        Of the plane waves, cycles/m, in the coordinates of the scene.
-    waves : ndarray, complex128, shape (m,)
-        Amplitudes, m: the wave is ``Re(a exp(−2πi f·x))``, that is Re a cos + Im a sin.
-    wave_slopes : ndarray, complex128, shape (2, m)
-        Amplitudes of the tilts of the waves over the aperture, in the same form, rad.
-    """
-
-    path: FloatArray
+    path: FloatArray  # (n, n): lattice part, m
+    # (2, n, n): tilt (x, y) of the plane fitted to the lattice part over the aperture around each point, rad.
     slopes: FloatArray
-    spacing: float
-    axes: Float64Array
-    frequencies: Float64Array
+    spacing: float  # between lattice points, m
+    axes: Float64Array  # (2, 2): rows are the unit vectors of the lattice in the coordinates of the scene
+    frequencies: Float64Array  # (m, 2): of the plane waves, cycles/m, in the coordinates of the scene
+    # (m,): amplitudes, m: the wave is ``Re(a exp(−2πi f·x))``, that is Re a cos + Im a sin.
     waves: NDArray[np.complex128]
+    # (2, m): amplitudes of the tilts of the waves over the aperture, in the same form, rad.
     wave_slopes: NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
 class Turbulence:
-    """Layers of a path, each with a phase screen.
-
-    Attributes
-    ----------
-    params : PhaseScreenParams
-    layers : tuple of Layer
-    screens : tuple of PhaseScreen
-    """
+    """Layers of a path, each with a phase screen."""
 
     params: PhaseScreenParams
     layers: tuple[Layer, ...]

@@ -30,41 +30,23 @@ _KEPT_VARIANCE, _MOST_COMPONENTS = 0.99, 32
 
 @dataclass(frozen=True, eq=False)
 class Pupil:
-    """Samples of a circular aperture, and the curvature of the plane waves of each screen over it.
+    """Samples of a circular aperture, and the curvature of the plane waves of each screen over it."""
 
-    Attributes
-    ----------
-    mask : ndarray, bool, shape (N, N)
-        Mask of the P samples inside the aperture.
-    x, y : ndarray, float64, shape (P,)
-        Positions ρ of these samples, m.
-    planes : ndarray, float32, shape (3, P)
-        Orthonormal basis of piston and tilts.
-    bends : tuple of (complex128 (m, r), float32 (r, P))
-        For each layer, ``exp(−2πi γ f·ρ)`` of each wave without its piston and tilt, as a product of two factors.
-    """
-
-    mask: NDArray[np.bool_]
+    mask: NDArray[np.bool_]  # (N, N): mask of the P samples inside the aperture
+    # (P,): positions ρ of these samples, m.
     x: Float64Array
     y: Float64Array
-    planes: FloatArray
+    planes: FloatArray  # (3, P): orthonormal basis of piston and tilts
+    # For each layer, ``exp(−2πi γ f·ρ)`` of each wave without its piston and tilt, as a product of two factors.
     bends: tuple[tuple[NDArray[np.complex128], FloatArray], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class PsfBasis:
-    """Low-rank basis of the point spread functions at one wavelength.
+    """Low-rank basis of the point spread functions at one wavelength."""
 
-    Attributes
-    ----------
-    mean : ndarray, float32, shape (K, K)
-        Sums to 1.
-    components : ndarray, float32, shape (r, K, K)
-        Orthonormal; each sums to 0.
-    """
-
-    mean: FloatArray
-    components: FloatArray
+    mean: FloatArray  # (K, K): sums to 1
+    components: FloatArray  # (r, K, K): orthonormal; each sums to 0
 
 
 def pupil_mask(params: PhaseScreenParams) -> NDArray[np.bool_]:

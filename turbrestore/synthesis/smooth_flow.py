@@ -21,21 +21,12 @@ from ..registration.warp import warp
 
 @dataclass(frozen=True)
 class SmoothFlowParams:
-    """Statistics of a smooth random flow.
+    """Statistics of a smooth random flow."""
 
-    Parameters
-    ----------
-    rms : float
-        Root mean square of each component, pixels.
-    correlation_length : float
-        Standard deviation of the Gaussian that smooths white noise into the field, pixels.
-    persistence : float
-        Correlation of one frame with the next, 0 (independent) to below 1.
-    """
-
-    rms: float = 1.5
+    rms: float = 1.5  # root mean square of each component, pixels
+    # Standard deviation of the Gaussian that smooths white noise into the field, pixels.
     correlation_length: float = 16.0
-    persistence: float = 0.8
+    persistence: float = 0.8  # correlation of one frame with the next, 0 (independent) to below 1
 
     def __post_init__(self) -> None:
         require(self.rms >= 0, f"rms: expected 0 pixels or more, found {self.rms}")

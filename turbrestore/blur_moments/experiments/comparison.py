@@ -46,84 +46,43 @@ _LEGENDRE = "legendre"
 
 @dataclass(frozen=True, eq=False)
 class Contestant:
-    """An observer, the model it uses, and its prior.
-
-    Parameters
-    ----------
-    observer : Observer
-    model : BlurModel
-    start : Gaussian
-        State before the first frame, shape (n,).
-    bound : str
-        Name of the Cramér–Rao bound that holds for it.
-    """
+    """An observer, the model it uses, and its prior."""
 
     observer: Observer
     model: BlurModel
-    start: Gaussian
-    bound: str = ""
+    start: Gaussian  # state before the first frame, shape (n,)
+    bound: str = ""  # name of the Cramér–Rao bound that holds for it
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Errors of an observer on a recording of T frames and S seeds.
+    """Errors of an observer on a recording of T frames and S seeds."""
 
-    Parameters
-    ----------
-    errors : ndarray, float64, shape (T, S)
-        Of the state, or of the output within the exposure.
-    between : ndarray, float64, shape (T, S)
-        Root mean square error of the output over all fast steps until the next exposure.
-    misfits : ndarray, float64, shape (T, S)
-        Normalised innovation squared.
-    observed : int
-        Degrees of freedom of one of them.
-    example : ndarray, float64, shape (T, N)
-        Estimated output of the first seed.
-    """
-
-    errors: Float64Array
-    between: Float64Array
-    misfits: Float64Array
-    observed: int
-    example: Float64Array
+    errors: Float64Array  # (T, S): of the state, or of the output within the exposure
+    between: Float64Array  # (T, S): root mean square error of the output over all fast steps until the next exposure
+    misfits: Float64Array  # (T, S): normalised innovation squared
+    observed: int  # degrees of freedom of one of them
+    example: Float64Array  # (T, N): estimated output of the first seed
 
 
 @dataclass(frozen=True)
 class Score:
-    """Accuracy of an observer over all seeds, after the frames in which it settles.
+    """Accuracy of an observer over all seeds, after the frames in which it settles."""
 
-    Parameters
-    ----------
-    error : float
-        Mean error.
-    ratio, ratio_error : float
-        Mean error over that of the first observer, and its standard error.
-    rms, rms_error : float
-        Root mean square error, and its standard error.
-    bound : float
-        Cramér–Rao bound on ``rms``; NaN where none is known.
-    between : float
-        Mean error of the output over all fast steps until the next exposure.
-    innovation : float
-        Normalised innovation squared per degree of freedom.
-    innovation_low, innovation_high : float
-        Band that contains it in 95 % of all runs if the model fits.
-    of_image : bool
-        Whether the observer uses the whole image, and not its moments.
-    """
-
-    error: float
+    error: float  # mean error
+    # Mean error over that of the first observer, and its standard error.
     ratio: float
     ratio_error: float
+    # Root mean square error, and its standard error.
     rms: float
     rms_error: float
-    bound: float
-    between: float
-    innovation: float
+    bound: float  # Cramér–Rao bound on ``rms``; NaN where none is known
+    between: float  # mean error of the output over all fast steps until the next exposure
+    innovation: float  # normalised innovation squared per degree of freedom
+    # Band that contains it in 95 % of all runs if the model fits.
     innovation_low: float
     innovation_high: float
-    of_image: bool = False
+    of_image: bool = False  # whether the observer uses the whole image, and not its moments
 
     @property
     def consistent(self) -> bool:
@@ -133,35 +92,17 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """Outcome of an experiment.
+    """Outcome of an experiment."""
 
-    Parameters
-    ----------
-    seeds : int
-        Number of runs.
-    scores : dict of str to Score
-        By observer; ratios are to the first.
-    bounds : dict of str to float
-        Cramér–Rao bounds on the root mean square error: ``moments`` (orders 1 and 2), ``moments_1_to_4``, ``image``.
-    timing : ExposureTiming
-    truth : ndarray, float64, shape (T, N)
-        Output of the first seed.
-    estimates : dict of str to ndarray, float64, shape (T, N)
-        Of the first seed, by observer.
-    errors : dict of str to ndarray, float64, shape (T,)
-        Error after every frame, mean over the seeds, by observer.
-    lit : float
-        Share of the exposures, over all seeds, in which the spot is on the sensor.
-    """
-
-    seeds: int
-    scores: dict[str, Score]
+    seeds: int  # number of runs
+    scores: dict[str, Score]  # by observer; ratios are to the first
+    # Cramér–Rao bounds on the root mean square error: ``moments`` (orders 1 and 2), ``moments_1_to_4``, ``image``.
     bounds: dict[str, float]
     timing: ExposureTiming
-    truth: Float64Array
-    estimates: dict[str, Float64Array]
-    errors: dict[str, Float64Array]
-    lit: float
+    truth: Float64Array  # (T, N): output of the first seed
+    estimates: dict[str, Float64Array]  # (T, N): of the first seed, by observer
+    errors: dict[str, Float64Array]  # (T,): error after every frame, mean over the seeds, by observer
+    lit: float  # share of the exposures, over all seeds, in which the spot is on the sensor
 
     @property
     def warnings(self) -> tuple[str, ...]:

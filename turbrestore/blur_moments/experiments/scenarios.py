@@ -147,22 +147,12 @@ WAVEFRONT_AS_PRINTED = WavefrontParams(slope_disturbance=0.1**0.5)
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Simulated truth and the frames that the sensor recorded; T frames, S seeds.
+    """Simulated truth and the frames that the sensor recorded; T frames, S seeds."""
 
-    Parameters
-    ----------
-    inputs : ndarray, float64, shape (T, S, N)
-    states : ndarray, float64, shape (T, S, n)
-        At the start of every exposure.
-    outputs : ndarray, float64, shape (T, S, N)
-        At every fast step.
-    frames : ndarray, float64, shape (T, S, count)
-    """
-
-    inputs: Float64Array
-    states: Float64Array
-    outputs: Float64Array
-    frames: Float64Array
+    inputs: Float64Array  # (T, S, N)
+    states: Float64Array  # (T, S, n): at the start of every exposure
+    outputs: Float64Array  # (T, S, N): at every fast step
+    frames: Float64Array  # (T, S, count)
 
 
 def wavefront_model(params: WavefrontParams = WAVEFRONT) -> BlurModel:

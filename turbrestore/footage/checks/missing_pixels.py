@@ -39,18 +39,11 @@ def fill_holes(pixels: PixelArray) -> PixelArray:
 
 @dataclass(frozen=True, eq=False)
 class Backdrop:
-    """What frames show behind the pixels that others lack.
+    """What frames show behind the pixels that others lack."""
 
-    Attributes
-    ----------
-    values : ndarray, float32, shape (H, W) or (H, W, 3)
-        Mean over the frames that have a value; where none has one, that of the pixels around.
-    unseen : ndarray, bool, shape (H, W)
-        Pixels that no frame has.
-    """
-
+    # (H, W) or (H, W, 3): mean over the frames that have a value; where none has one, that of the pixels around.
     values: FloatArray
-    unseen: NDArray[np.bool_]
+    unseen: NDArray[np.bool_]  # (H, W): pixels that no frame has
 
     def behind(self, pixels: PixelArray) -> PixelArray:
         """Fill a few missing pixels from around, many from what other frames show."""

@@ -45,44 +45,20 @@ _CUT = "the file is cut short; copy it again"
 
 @dataclass(frozen=True, eq=False)
 class FitsImage:
-    """An image of a FITS file.
-
-    Attributes
-    ----------
-    path : Path
-    cards : tuple of str
-        The header, 80 characters each.
-    shape : tuple of int
-        In the order of NumPy, the fastest axis last.
-    dtype : dtype
-        Of the numbers in the file.
-    offset : int
-        Of the first number, bytes.
-    scale : tuple of float
-        BSCALE and BZERO: the value of a number is BSCALE · number + BZERO.
-    blank : int or None
-        Integer that stands for a missing value.
-    notes : tuple of str
-        What is unusual.
-    bayer : str or None
-        Colours of the first pixels of the file, where the header says that they are those of a Bayer sensor.
-    name : str
-        EXTNAME without a number at its end, in capitals.
-    tiles : int or None
-        Number of the extension, if the image is compressed in tiles.
-    """
+    """An image of a FITS file."""
 
     path: Path
-    cards: tuple[str, ...]
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    offset: int
-    scale: tuple[float, float]
-    blank: int | None
-    notes: tuple[str, ...]
+    cards: tuple[str, ...]  # the header, 80 characters each
+    shape: tuple[int, ...]  # in the order of NumPy, the fastest axis last
+    dtype: np.dtype[Any]  # of the numbers in the file
+    offset: int  # of the first number, bytes
+    scale: tuple[float, float]  # BSCALE and BZERO: the value of a number is BSCALE · number + BZERO
+    blank: int | None  # integer that stands for a missing value
+    notes: tuple[str, ...]  # what is unusual
+    # Colours of the first pixels of the file, where the header says that they are those of a Bayer sensor.
     bayer: str | None = None
-    name: str = ""
-    tiles: int | None = None
+    name: str = ""  # EXTNAME without a number at its end, in capitals
+    tiles: int | None = None  # number of the extension, if the image is compressed in tiles
 
     @property
     def kind(self) -> tuple[object, ...]:

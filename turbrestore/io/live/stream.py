@@ -33,27 +33,13 @@ class Capture(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FrameStream:
-    """Frames that can be iterated over once.
+    """Frames that can be iterated over once."""
 
-    Attributes
-    ----------
-    name : str
-        For messages.
-    shape : tuple of int
-        (H, W) or (H, W, 3) of a frame.
-    bit_depth : int
-        Bits per channel of the source.
-    fps : float or None
-        Frames per second.
-    frames : iterator of ndarray, float32
-        Intensities in [0, 1].
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    bit_depth: int
-    fps: float | None
-    frames: Iterator[FloatArray] = field(repr=False)
+    name: str  # for messages
+    shape: tuple[int, ...]  # (H, W) or (H, W, 3) of a frame
+    bit_depth: int  # bits per channel of the source
+    fps: float | None  # frames per second
+    frames: Iterator[FloatArray] = field(repr=False)  # intensities in [0, 1]
 
 
 def open_pipe(file: BinaryIO, name: str = "standard input", limits: Limits = DEFAULT_LIMITS) -> FrameStream:

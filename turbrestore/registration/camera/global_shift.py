@@ -54,21 +54,11 @@ Pixels = TypeVar("Pixels", bound=NDArray[Any])
 
 @dataclass(frozen=True)
 class ShiftReference:
-    """An image that shifts are measured against.
+    """An image that shifts are measured against."""
 
-    Attributes
-    ----------
-    reduced : ndarray, float32, shape (h, w)
-        The reduced image with normalised contrast.
-    spectrum : ndarray, complex64, shape (h, w // 2 + 1)
-        Its conjugate spectrum under a Hann window.
-    shape : tuple of int
-        (H, W) of the image at full size.
-    """
-
-    reduced: FloatArray
-    spectrum: NDArray[np.complex64]
-    shape: tuple[int, int]
+    reduced: FloatArray  # (h, w): the reduced image with normalised contrast
+    spectrum: NDArray[np.complex64]  # (h, w // 2 + 1): its conjugate spectrum under a Hann window
+    shape: tuple[int, int]  # (H, W) of the image at full size
 
 
 def prepare_shift_reference(image: ArrayLike) -> ShiftReference:
