@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
-from ..core.noise import estimate_noise
+from ..footage.moments import Moments, measure_moments
 from ..io.source import FrameSource, Window
 
-# Frames from which stripes are found, and the fewest.
-_SAMPLES, _FEWEST = 60, 8
+# Fewest frames from which stripes are found.
+_FEWEST = 8
 # Smoothing across the stripes, pixels.
 _ACROSS = 3.0
 # Least offset, in standard errors of the mean of the frames and in intensity, that is worth a correction.
@@ -61,26 +61,21 @@ class _Stripes:
         return _filled(flat.swapaxes(0, 1), self.dead[1][rows]).swapaxes(0, 1)
 
 
-def without_stripes(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Take stripes of the sensor out of the frames; a source without them is returned as it is."""
+def without_stripes(source: FrameSource, moments: Moments | None = None) -> tuple[FrameSource, tuple[Decision, ...]]:
+    """Take stripes of the sensor out of the frames; a source without them is returned as it is.
+
+    ``moments`` are those of the source, if they are known.
+    """
     if len(source) < _FEWEST:
         return source, ()
-    part = source.select((0, len(source), max(1, len(source) // _SAMPLES)))
-    sums, noise = np.zeros((2, *source.shape[1:3])), []
-    for frame in part:
-        grey = luminance(frame)
-        cv2.accumulate(grey, sums[0])
-        cv2.accumulateSquare(grey, sums[1])
-        noise.append(estimate_noise(grey))
-    sums /= len(part)
-    mean, variance = sums[0].astype(np.float32), np.maximum(sums[1] - np.square(sums[0]), 0).astype(np.float32)
-    usual = max(float(np.median(noise)), 1e-4)
+    moments = moments or measure_moments(source)
+    mean, variance, usual = luminance(moments.mean), moments.variance, max(moments.noise, 1e-4)
     motion = _motion(mean, variance, usual)
     if motion < _LEAST_MOTION:
         return source, ()
     dead = (_dead(variance, usual), _dead(variance.T, usual))
     offsets = tuple(
-        _offsets(_filled(image, gone), spread, usual / np.sqrt(len(part)), motion)
+        _offsets(_filled(image, gone), spread, usual / np.sqrt(moments.count), motion)
         for image, spread, gone in ((mean, variance, dead[0]), (mean.T, variance.T, dead[1]))
     )
     count = int(dead[0].sum() + dead[1].sum())
