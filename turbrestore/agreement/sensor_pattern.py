@@ -2,7 +2,7 @@
 
 Symbols
 -------
-m, v : mean and variance of the frames over time; n² variance of the noise, the floor of v
+m, v : mean of the frames, and variance from one to the next, which shadows hardly raise; n² that of the noise
 c : offset of a column: median over the rows of m minus m smoothed across the columns
 s : motion of the edges of the scene, pixels
 
@@ -69,7 +69,7 @@ def without_stripes(source: FrameSource, moments: Moments | None = None) -> tupl
     if len(source) < _FEWEST:
         return source, ()
     moments = moments or measure_moments(source)
-    mean, variance, usual = luminance(moments.mean), moments.variance, max(moments.noise, 1e-4)
+    mean, variance, usual = luminance(moments.mean), moments.change, max(moments.noise, 1e-4)
     motion = _motion(mean, variance, usual)
     if motion < _LEAST_MOTION:
         return source, ()
