@@ -1,4 +1,4 @@
-"""Clips with more than the scene in them: snow, rain, noise of photons, titles, stripes, a car before a moving camera.
+"""Clips with more than the scene in them: weather, photons, titles, pictures in pictures, sensors, shadows, a car.
 
     python benchmarks/recordings_kinds.py
 
@@ -83,6 +83,59 @@ def titled(frames: FloatArray) -> np.ndarray:
     return result
 
 
+def written(frames: FloatArray) -> np.ndarray:
+    """Draw a clock whose last digit changes in every frame."""
+    result = as_8_bits(frames)
+    for number, frame in enumerate(result):
+        for shade, width in ((0, 3), (255, 1)):
+            place, text = (8, 136), f"09:48:{number // 10:02d}.{number % 10}"
+            cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, shade, width)
+    return result
+
+
+def with_logo(frames: FloatArray) -> np.ndarray:
+    """Lay a logo over the frames through which the scene shines."""
+    cover = np.zeros((SIDE, SIDE), np.float32)
+    cv2.ellipse(cover, (24, 22), (16, 11), 0, 0, 360, 0.65, -1, cv2.LINE_AA)
+    cv2.rectangle(cover, (18, 17), (30, 27), 0, -1)
+    return as_8_bits(frames + cover * (0.85 - frames))
+
+
+def side_by_side(frames: FloatArray) -> np.ndarray:
+    """Show the same part of the scene twice, once mirrored."""
+    part = frames[:, :, SIDE // 3 : SIDE // 3 + SIDE // 2]
+    return as_8_bits(np.concatenate([part, part[:, :, ::-1]], axis=2))
+
+
+def in_picture(frames: FloatArray) -> np.ndarray:
+    """Show the whole scene once more in a frame in a corner."""
+    result, side = as_8_bits(frames), SIDE // 3
+    for frame in result:
+        small = cv2.copyMakeBorder(
+            cv2.resize(frame, (side, side), interpolation=cv2.INTER_AREA), 2, 2, 2, 2, 0, None, 255
+        )
+        frame[6 : 10 + side, -10 - side : -6] = small
+    return result
+
+
+def warm(frames: FloatArray) -> np.ndarray:
+    """Raise some pixels of the sensor."""
+    rng, excess = RNG(25), np.zeros((SIDE, SIDE), np.float32)
+    excess.ravel()[rng.choice(SIDE * SIDE, 70, replace=False)] = rng.uniform(0.08, 0.4, 70)
+    return as_8_bits(0.6 * frames + excess)
+
+
+def lit(frames: FloatArray, kind: str) -> np.ndarray:
+    """Let a shadow creep over the scene, or a lamp go on and off; the mean over time stays."""
+    y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32) / SIDE
+    if kind == "shadow":
+        gain = np.stack([1 - 0.3 / (1 + np.exp((y + 0.2 * x - edge) / 0.03)) for edge in np.linspace(-0.1, 1.3, COUNT)])
+    else:
+        spot = np.exp(-((x - 0.6) ** 2 + (y - 0.4) ** 2) / (2 * 0.2**2))
+        gain = 1 + 0.4 * spot * (np.cumsum(RNG(26).random(COUNT) < 0.3) % 2)[:, None, None]
+    return as_8_bits(0.7 * frames * np.float32(gain / gain.mean(axis=0)))
+
+
 def striped(frames: FloatArray, dead: bool = False) -> np.ndarray:
     """Columns with offsets of their own, or two that are dead."""
     if not dead:
@@ -101,6 +154,16 @@ KINDS: dict[str, Callable[[FloatArray], np.ndarray]] = {
     "title": titled,
     "stripes": striped,
     "dead columns": lambda f: striped(f, dead=True),
+    "warm pixels": warm,
+    "shadow": lambda f: lit(f, "shadow"),
+    "lamp": lambda f: lit(f, "lamp"),
+}
+# What is drawn into the picture is part of what is right.
+DRAWN: dict[str, Callable[[FloatArray], np.ndarray]] = {
+    "clock": written,
+    "logo": with_logo,
+    "side by side": side_by_side,
+    "picture in picture": in_picture,
 }
 
 
@@ -112,6 +175,8 @@ def clips() -> Iterator[tuple[str, np.ndarray, FloatArray]]:
         still = make_sequence(19, COUNT, SIDE, scene, blur=0.8, noise=0.008, rms=1.2)
         for kind, record in KINDS.items():
             yield f"{scene}, {kind}", record(still.frames), still.scene
+        for kind, record in DRAWN.items():
+            yield f"{scene}, {kind}", record(still.frames), record(still.scene[None])[0] / np.float32(255)
     wide = make_sequence(20, COUNT, SIDE + 48, "camera", blur=0.8, noise=0.008, rms=0.8)
     places = np.arange(COUNT) * 3 // 2
     frames = np.stack([frame[24 : 24 + SIDE, x : x + SIDE] for frame, x in zip(wide.frames, places, strict=True)])

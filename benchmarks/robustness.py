@@ -162,7 +162,7 @@ def recordings_kinds(slack: float) -> Row:
         if row.result < row.bound(slack)
     )
     rule = f"the result is no more than {slack} dB worse than the temporal mean; in snow and rain above the median"
-    title = "clips with more than the scene: snow, rain, photons, titles, stripes, a car before a moving camera"
+    title = "clips with more than the scene: weather, photons, titles, pictures in pictures, sensors, shadows, a car"
     return Row(title, len(rows), rule, len(rows) - len(worse), worse)
 
 

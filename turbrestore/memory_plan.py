@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .agreement.last_guard import halves_memory, keep_agreed_memory
 from .blind.remove_blur import remove_blur_memory
 from .blind.tiled_deconvolution import SMALLEST_SIDE
 from .core.decision import Decision
@@ -53,8 +54,8 @@ _BASE = 1.6e8
 _PREPARED, _PREPARED_COLOUR = 44, 34
 # Images and maps that the stages leave, bytes a pixel and bytes a pixel and channel; with tiles most of them lie in
 # scratch files.
-_RESULTS, _RESULTS_COLOUR = 60, 40
-_RESULTS_OF_TILES, _RESULTS_OF_TILES_COLOUR = 3, 15
+_RESULTS, _RESULTS_COLOUR = 60, 48
+_RESULTS_OF_TILES, _RESULTS_OF_TILES_COLOUR = 3, 23
 # A report with its pictures, which are at most 2048 pixels wide: bytes, bytes a pixel and a pixel that is shown.
 _REPORT, _REPORT_PIXEL, _REPORT_SHOWN, _SHOWN_SIDE = 6e7, 40, 50, 2048
 # Numbers of the modes that a thread has in hand while they lie in a file.
@@ -208,11 +209,13 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget
     flow, side = flow_memory(part, threads), _deconvolution_side(shape, params, choice, budget)
     results = _held_by_deconvolution(shape, params, choice)
     prepared = _pixels(shape) * float(_PREPARED + _PREPARED_COLOUR * _channels(shape))
+    deblurred = results + max(remove_blur_memory(shape[1:], params.deconvolution, side), keep_agreed_memory(shape[1:]))
+    halves = held + halves_memory(shape[1:], threads)
     stages = {
         "centroid": max(held + flow, prepared),
         "identify": held + modes + identify_memory(part, train),
         "filter": held + modes + flow + filter_memory(part, train, params.filter, threads),
-        "deconvolve": results + remove_blur_memory(shape[1:], params.deconvolution, side),
+        "deconvolve": max(deblurred, halves),
     }
     return max(results + _report(shape), *(size for name, size in stages.items() if params.runs(name)))
 

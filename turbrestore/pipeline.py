@@ -9,13 +9,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .agreement.last_guard import keep_agreed
+from .agreement.last_guard import Halves, keep_agreed
 from .blind.blur_to_remove import SIGMAS_A_SIDE
 from .blind.remove_blur import Deblurred, remove_blur_steps
 from .blur.measured_psf import psf_from_image
-from .core.arrays import FloatArray
+from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
 from .core.errors import require
+from .core.noise import NoiseCurve, photon_noise
 from .deconvolution.problem import read_blur
 from .footage.bars import Bars
 from .footage.checks.content import without_blank
@@ -50,6 +51,8 @@ from .wording import explain_border
 
 # Every pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
+# Least noise of dark parts relative to bright ones that is told in words.
+_LEAST_SHARE = 0.01
 
 
 def restore(
@@ -154,7 +157,8 @@ def _restored(run: Run) -> Restoration:
     fused = fuse(run)
     image, centroid, deblurred = fused.image, fused.centroid, None
     if params.runs("deconvolve") and not fused.is_mean:
-        deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused))
+        photons = None if fused.halves is None else _photon_noise(run, fused.halves)
+        deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused, photons))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
     agreed = None if deblurred is None or fused.halves is None else keep_agreed(image, fused.halves)
@@ -187,16 +191,26 @@ def _restored(run: Run) -> Restoration:
     )
 
 
-def _deblur(run: Run, fused: Fused) -> Deblurred:
+def _deblur(run: Run, fused: Fused, photons: NoiseCurve | None) -> Deblurred:
     params, plan, levels = run.params, run.plan, run.levels
     image, guide = levels.stretched(fused.image), levels.stretched(fused.centroid.image)
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
-    steps = remove_blur_steps(image, guide, *settings, fused.witnesses, run.psf)
+    steps = remove_blur_steps(image, guide, *settings, fused.witnesses, run.psf, photons)
     deblurred = finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
     deconvolution, blur = levels.original_result(deblurred.deconvolution), levels.original_result(deblurred.blur)
     return replace(deblurred, deconvolution=deconvolution, blur=blur)
+
+
+def _photon_noise(run: Run, halves: Halves) -> NoiseCurve | None:
+    """Measure how the noise of the image depends on its level, at the levels of the stages."""
+    curve = photon_noise(*(run.levels.stretched(luminance(half)) for half in (halves.first, halves.second)))
+    if curve is not None:
+        times = float(curve.variances[-1] / max(curve.variances[0], _LEAST_SHARE * curve.variances[-1]))
+        reason = f"its variance is {times:.0f} times as large where the scene is bright, as that of photons"
+        run.decide(Decision("noise", "dark parts count more than bright ones in the deconvolution", reason))
+    return curve
 
 
 def _measure_uncertainty(

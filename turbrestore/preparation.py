@@ -13,7 +13,8 @@ from .core.decision import Decision
 from .footage.bars import Bars, without_bars
 from .footage.levels import Levels, stretch_levels
 from .footage.light import steady_light
-from .footage.overlays import Title, read_static_mask, without_overlay
+from .footage.moments import measure_moments
+from .footage.overlays import FEWEST, Title, read_static_mask, without_overlay
 from .footage.passers import without_passers
 from .footage.white_balance import steady_white_balance
 from .io.source import FrameSource, Window
@@ -46,13 +47,17 @@ def prepare(source: FrameSource, train: int, static_mask: str = "auto") -> Prepa
     mask = None if static_mask in ("auto", "off") else read_static_mask(static_mask, source)
     # Before the light, because a stop would be taken for bands of it.
     source, bars, on_bars = without_bars(source)
+    moments = measure_moments(source) if len(source) >= FEWEST else None
+    # Before what stands is looked for, because a dead column stands.
+    source, on_stripes = without_stripes(source, moments)
     source, hidden, title, on_overlay = (
-        without_overlay(source, mask) if static_mask != "off" else (source, None, None, ())
+        without_overlay(source, mask, None if on_stripes else moments)
+        if static_mask != "off"
+        else (source, None, None, ())
     )
     if source.unseen is not None:
         unseen = source.unseen[source.window]
         hidden = unseen if hidden is None else hidden | unseen
-    source, on_stripes = without_stripes(source)
     source, on_colours = steady_white_balance(source)
     source, on_light = steady_light(source)
     source, levels, on_range = stretch_levels(source, train)
@@ -63,7 +68,7 @@ def prepare(source: FrameSource, train: int, static_mask: str = "auto") -> Prepa
         bars,
         hidden,
         title,
-        (*on_bars, *on_overlay, *on_stripes, *on_colours, *on_light, *on_range, *on_passers),
+        (*on_bars, *on_stripes, *on_overlay, *on_colours, *on_light, *on_range, *on_passers),
     )
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from turbrestore.agreement import last_guard
 from turbrestore.agreement.last_guard import Halves, keep_agreed, registered_halves
 from turbrestore.metrics import psnr
 from turbrestore.synthesis.scenes import SCENES
@@ -41,6 +42,29 @@ def test_a_result_that_is_smoother_than_the_mean_stays():
     flat = np.full((64, 64, 3), 0.5, np.float32)
     guarded = keep_agreed(flat, halves_of(flat))
     assert np.abs(guarded.image - flat).max() < 1e-5
+
+
+def test_colours_are_those_of_the_mean_and_detail_stays():
+    scene = 0.1 + 0.8 * np.repeat(SCENES["brick"](96, 96)[..., None], 3, axis=2)
+    tinted = scene + np.float32([0.03, 0, -0.03])
+    guarded = keep_agreed(tinted, Halves(scene, scene.copy()))
+    # Luminance stays, to which red adds more than blue.
+    assert np.abs(guarded.image - scene).max() < 0.01 and np.ptp(guarded.image - scene, axis=2).max() < 1e-4
+    assert guarded.share.min() == 1
+    slightly = scene + np.float32([0.003, 0, -0.003])
+    assert np.abs(keep_agreed(slightly, Halves(scene, scene.copy())).image - slightly).max() < 1e-5
+
+
+def test_rows_are_worked_on_in_parts_as_if_in_one(monkeypatch):
+    rng = np.random.default_rng(3)
+    scene = np.float32(rng.random((560, 24)))
+    halves, result = halves_of(scene, noise=0.2), np.float32(scene + rng.normal(0, 0.3, scene.shape))
+    parts = keep_agreed(result, halves)
+    monkeypatch.setattr(last_guard, "_ROWS", 1000)
+    whole = keep_agreed(result, halves)
+    np.testing.assert_allclose(parts.image, whole.image, atol=1e-6)
+    np.testing.assert_allclose(parts.share, whole.share, atol=1e-4)
+    assert 0.01 < whole.share.mean() < 0.99
 
 
 def test_halves_are_means_of_frames_moved_in_place():

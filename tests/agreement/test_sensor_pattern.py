@@ -23,7 +23,7 @@ def test_offsets_of_columns_and_rows_are_subtracted():
             np.diff(pattern + np.zeros((SIDE, SIDE)), axis=0).std()
             + np.diff(pattern + np.zeros((SIDE, SIDE)), axis=1).std()
         )
-        assert decision.subject == "stripes"
+        assert decision.subject == "sensor"
 
 
 def test_dead_columns_and_rows_are_filled_in_windows_as_in_whole_frames():
@@ -35,6 +35,30 @@ def test_dead_columns_and_rows_are_filled_in_windows_as_in_whole_frames():
     assert np.abs(whole - frames)[:, 61].mean() < 0.06 and np.abs(whole - frames)[:, :, 40].mean() < 0.06
     assert "2 dead" in decision.choice
     np.testing.assert_allclose(source.select(roi=(30, 50, 20, 20)).read(), whole[:, 50:70, 30:50], atol=1e-6)
+
+
+def test_warm_pixels_are_evened_out_and_points_of_the_scene_stay():
+    frames, rng = 0.6 * clip(), np.random.default_rng(2)
+    places = rng.choice(SIDE * SIDE, 60, replace=False)
+    warm = frames.copy()
+    warm.reshape(len(warm), -1)[:, places] += rng.uniform(0.1, 0.4, 60).astype(np.float32)
+    warm = warm.clip(0, 1)
+    for colours in (1, 3):
+        seen, still = (np.squeeze(np.repeat(some[..., None], colours, axis=3)) for some in (warm, frames))
+        source, (decision,) = without_stripes(FrameSource.from_array(seen))
+        assert "warm pixels" in decision.choice
+        left = (source.read() - still).reshape(len(warm), SIDE * SIDE, -1)
+        assert np.abs(left[:, places]).mean() < 0.2 * np.abs((warm - frames).reshape(len(warm), -1)[:, places]).mean()
+        assert np.count_nonzero(np.abs(left).max(axis=(0, 2)) > 1e-6) <= 60
+    # A star moves with the air.
+    flows = np.random.default_rng(0).normal(0, 0.6, (24, 2))
+    y, x = np.mgrid[:64, :64]
+    stars = np.zeros((24, 64, 64))
+    for number, (dx, dy) in enumerate(flows):
+        for place in ((20, 20), (40, 31), (11, 50)):
+            stars[number] += np.exp(-((x - place[0] - dx) ** 2 + (y - place[1] - dy) ** 2) / 0.5)
+    source = FrameSource.from_array(np.float32(0.1 + 0.6 * stars + rng.normal(0, 0.005, stars.shape)))
+    assert without_stripes(source) == (source, ())
 
 
 def test_stripes_of_the_scene_are_left():

@@ -358,12 +358,14 @@ class TestFiles:
         same(load_run(tmp_path)[0], part)
         assert not (tmp_path / "filtered.npz").exists()
 
-    def test_infinite_uncertainty_and_gaps_come_back(self, whole, run, tmp_path):
+    def test_maps_and_gaps_come_back(self, whole, run, tmp_path):
         blur = dataclasses.replace(whole.blur, uncertainty=math.inf)
         filtered = dataclasses.replace(whole.filtered, innovations=np.full(6, np.nan))
-        found = dataclasses.replace(whole, blur=blur, filtered=filtered)
+        share = np.full(whole.image.shape[:2], 0.25, np.float32)
+        found = dataclasses.replace(whole, blur=blur, filtered=filtered, disagreement=share)
         save_run(tmp_path, found, run)
         same(load_run(tmp_path)[0], found)
+        assert "Detail taken from the mean" in render_report(dataclasses.replace(whole, disagreement=share), run)
 
     def test_names_need_not_be_text(self, whole, run, tmp_path):
         odd = dataclasses.replace(run, name="bad\udcff.mkv", command=("turbrestore", "restore", "bad\udcff.mkv"))
@@ -413,6 +415,12 @@ def swap_image(folder):
     np.savez(folder / "images.npz", **{**arrays, "frame": arrays["frame"][:-3]})
 
 
+def swap_share(folder):
+    with np.load(folder / "images.npz") as archive:
+        arrays = dict(archive)
+    np.savez(folder / "images.npz", **arrays, disagreement=np.full(arrays["image"].shape[:2], 1.5, np.float32))
+
+
 DAMAGE = {
     "no record": (lambda folder: (folder / "run.json").unlink(), InputNotFoundError),
     "no folder": (lambda folder: folder.rename(folder.with_name("gone")), InputNotFoundError),
@@ -441,6 +449,7 @@ DAMAGE = {
     "cut images": (cut("images.npz"), DataError),
     "no images": (lambda folder: (folder / "images.npz").unlink(), InputNotFoundError),
     "sizes": (swap_image, DataError),
+    "more than the whole": (swap_share, DataError),
     "lost stage": (lambda folder: (folder / "filtered.npz").unlink(), InputNotFoundError),
     "cut stage": (cut("centroid.npz"), DataError),
 }

@@ -12,6 +12,9 @@ What stands in the scene is in both halves.  Noise is not, nor are waves, clouds
 deconvolution sharpens them all the same, and so do weights that follow sharpness.  Where ρ is low and the result has
 more energy in a band than the mean of the registered frames, ``g = (1 − ρ')(E / E₀ − 1)``, with ρ' and g between 0 and
 1, goes from the one to the other.  Where the halves agree, and where the result is smoother than the mean, it stays.
+
+What is left of the colours below the bands is that of the mean where it differs by more than two grey levels: weights
+may have preferred a frame that is tinted.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..registration.warp import warp
 from ..runtime.scratch import iter_frames
-from ..runtime.threads import sum_in_threads
+from ..runtime.threads import map_ahead
 
 # Parts of the clip that belong to one half and the other in turn.
 _PARTS = 4
@@ -37,6 +40,12 @@ _WINDOWS, _WINDOW = 2.0, 1.0
 _NONE, _ALL = 0.3, 0.8
 # Energy that is nothing, squared intensity; fewest frames that have two halves.
 _NOTHING, FEWEST = 1e-8, 8
+# Difference of colours, intensity, from which those of the mean begin to count, and from which they alone do.
+_LEAST_TINT, _TINT = 1 / 255, 2 / 255
+# Rows that are worked on at once, and those around that count: the Gaussians of all bands and of the widest window.
+_ROWS, _AROUND = 256, 128
+# Bytes a pixel, and a pixel and channel, of these rows.
+_BYTES, _CHANNEL_BYTES = 64, 40
 # Least g, and the share of the image that has it, that is worth a remark.
 _CLEAR, _REMARKED = 0.5, 0.15
 
@@ -55,7 +64,7 @@ class Guarded:
     """The image that is left, and what gave way."""
 
     image: FloatArray  # (H, W) or (H, W, 3)
-    share: FloatArray  # (H, W): largest g of the bands, 0 to 1
+    share: FloatArray  # (H, W): largest g of the bands and of the tint, 0 to 1
     decisions: tuple[Decision, ...]
 
 
@@ -66,18 +75,13 @@ def registered_halves(
 
     ``frames`` (H, W) or (H, W, 3) each; ``flows`` (H, W, 2) each.
     """
-
-    def add(numbered: list[tuple[int, FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
-        sums, counts = np.zeros((2, *shape)), np.zeros(2)
-        for number, frame, flow in numbered:
-            half = number * _PARTS // count % 2
-            cv2.accumulate(warp(frame, flow), sums[half])
-            counts[half] += 1
-        return sums, counts
-
-    numbered = zip(range(count), iter_frames(frames), iter_frames(flows), strict=True)
-    sums, counts = sum_in_threads(add, numbered, threads)
-    return Halves(*(total.astype(np.float32) / np.float32(some) for total, some in zip(sums, counts, strict=True)))
+    sums, counts = np.zeros((2, *shape), np.float32), [0, 0]
+    pairs = zip(iter_frames(frames), iter_frames(flows), strict=True)
+    for number, (_, registered) in enumerate(map_ahead(lambda pair: warp(*pair), pairs, threads)):
+        half = number * _PARTS // count % 2
+        sums[half] += registered
+        counts[half] += 1
+    return Halves(*(total / np.float32(some) for total, some in zip(sums, counts, strict=True)))
 
 
 def keep_agreed(result: FloatArray, halves: Halves) -> Guarded:
@@ -85,8 +89,33 @@ def keep_agreed(result: FloatArray, halves: Halves) -> Guarded:
 
     ``result`` (H, W) or (H, W, 3).
     """
-    first, second = luminance(halves.first), luminance(halves.second)
-    mean, left = (halves.first + halves.second) / np.float32(2), result
+    image, share = np.empty_like(result), np.empty(result.shape[:2], np.float32)
+    for top in range(0, len(result), _ROWS):
+        first, above = max(top - _AROUND, 0), min(top, _AROUND)
+        rows, own = slice(first, top + _ROWS + _AROUND), slice(above, above + _ROWS)
+        parts = _agreed(result[rows], halves.first[rows], halves.second[rows])
+        image[top : top + _ROWS], share[top : top + _ROWS] = (part[own] for part in parts)
+    return Guarded(image, share, explain_agreement(share))
+
+
+def halves_memory(shape: tuple[int, ...], threads: int) -> float:
+    """Bytes that :func:`registered_halves` takes for frames of (H, W) or (H, W, 3) pixels, its result among them."""
+    values = float(np.prod(shape))
+    # Two sums, and registered frames of which some wait in each thread; the flow and the frame that are read.
+    return 4 * values * (4 + 2 * (threads + 1)) + 8.0 * shape[0] * shape[1]
+
+
+def keep_agreed_memory(shape: tuple[int, ...]) -> float:
+    """Bytes that :func:`keep_agreed` takes for an image of (H, W) or (H, W, 3) pixels, its result among them."""
+    channels = shape[2] if len(shape) == 3 else 1
+    rows = min(shape[0], _ROWS + 2 * _AROUND)
+    return shape[1] * float(shape[0] * 4 * (1 + channels) + rows * (_BYTES + _CHANNEL_BYTES * channels))
+
+
+def _agreed(result: FloatArray, first_half: FloatArray, second_half: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return some rows of the guarded image, and the largest g of each pixel."""
+    first, second = luminance(first_half), luminance(second_half)
+    mean, left = (first_half + second_half) / np.float32(2), result
     image, share = np.zeros_like(result), np.zeros(result.shape[:2], np.float32)
     for scale in _SCALES:
         (first, a), (second, b), (mean, usual), (left, detail) = (
@@ -101,7 +130,12 @@ def keep_agreed(result: FloatArray, halves: Halves) -> Guarded:
         given = (unlike * np.clip(more, 0, 1)).astype(np.float32)
         image += detail + (usual - detail) * (given if result.ndim == 2 else given[..., None])
         np.maximum(share, given, out=share)
-    return Guarded(np.clip(image + left, 0, 1), share, explain_agreement(share))
+    if result.ndim == 3:
+        tint = (left - luminance(left)[..., None]) - (mean - luminance(mean)[..., None])
+        given = np.clip((np.abs(tint).max(axis=2) - _LEAST_TINT) / (_TINT - _LEAST_TINT), 0, 1).astype(np.float32)
+        left = left - tint * given[..., None]
+        np.maximum(share, given, out=share)
+    return np.clip(image + left, 0, 1), share
 
 
 def explain_agreement(share: FloatArray) -> tuple[Decision, ...]:

@@ -1,14 +1,15 @@
-"""Stripes of the sensor: columns and rows with an offset of their own, and dead ones.
+"""What stands on the sensor: columns, rows and lone pixels with an offset of their own, and dead columns and rows.
 
 Symbols
 -------
-m, v : mean and variance of the frames over time; n² variance of the noise, the floor of v
+m, v : mean of the frames, and variance from one to the next, which shadows hardly raise; n² that of the noise
 c : offset of a column: median over the rows of m minus m smoothed across the columns
 s : motion of the edges of the scene, pixels
 
 Stripes of the scene move with the air, so v exceeds n² by s² times the squared slope of c.  Those of the sensor stand,
 and v knows nothing of them.  They are subtracted from every frame; a column that does not change while others do is
-filled from beside it.  Rows are the columns of the transposed frames.
+filled from beside it.  Rows are the columns of the transposed frames.  A warm pixel is one that stands out of m alone,
+which no detail does that moves, and does not vary by its height times the motion.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
-from ..core.noise import estimate_noise
+from ..footage.moments import Moments, measure_moments
 from ..io.source import FrameSource, Window
 
-# Frames from which stripes are found, and the fewest.
-_SAMPLES, _FEWEST = 60, 8
+# Fewest frames from which stripes are found.
+_FEWEST = 8
 # Smoothing across the stripes, pixels.
 _ACROSS = 3.0
 # Least offset, in standard errors of the mean of the frames and in intensity, that is worth a correction.
@@ -36,6 +37,8 @@ _STANDS = 0.25
 _EDGE, _LEAST_MOTION = 8.0, 0.3
 # Parts along the stripes, and the least correlation of their offsets.
 _PARTS, _ALIKE = 3, 0.4
+# Share of the height of a warm pixel over the median around by which it exceeds each neighbour; most that are warm.
+_ALONE, _MOST_WARM = 0.7, 0.005
 # A dead column varies less than this share of the noise and of the columns around; dead ones are few, and told
 # from others where there is noise of some size.
 _DEAD, _AROUND, _MOST_DEAD, _LEAST_NOISE = 0.3, 9, 0.05, 1 / 1020
@@ -43,8 +46,9 @@ _DEAD, _AROUND, _MOST_DEAD, _LEAST_NOISE = 0.3, 9, 0.05, 1 / 1020
 
 @dataclass(frozen=True, eq=False)
 class _Stripes:
-    """Offsets of columns and rows, and those that are dead, of a window of the file."""
+    """Offsets of columns and rows, those that are dead, and (H, W) or (H, W, 3) of warm pixels, of a window."""
 
+    warm: FloatArray | None
     offsets: tuple[FloatArray, FloatArray]
     dead: tuple[NDArray[np.bool_], NDArray[np.bool_]]
     window: Window
@@ -57,42 +61,42 @@ class _Stripes:
         )
         pattern = self.offsets[0][None, columns] + self.offsets[1][rows, None]
         flat = values - (pattern if values.ndim == 2 else pattern[..., None])
+        if self.warm is not None:
+            flat -= self.warm[rows, columns]
         flat = _filled(flat, self.dead[0][columns])
         return _filled(flat.swapaxes(0, 1), self.dead[1][rows]).swapaxes(0, 1)
 
 
-def without_stripes(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Take stripes of the sensor out of the frames; a source without them is returned as it is."""
+def without_stripes(source: FrameSource, moments: Moments | None = None) -> tuple[FrameSource, tuple[Decision, ...]]:
+    """Take stripes of the sensor out of the frames; a source without them is returned as it is.
+
+    ``moments`` are those of the source, if they are known.
+    """
     if len(source) < _FEWEST:
         return source, ()
-    part = source.select((0, len(source), max(1, len(source) // _SAMPLES)))
-    sums, noise = np.zeros((2, *source.shape[1:3])), []
-    for frame in part:
-        grey = luminance(frame)
-        cv2.accumulate(grey, sums[0])
-        cv2.accumulateSquare(grey, sums[1])
-        noise.append(estimate_noise(grey))
-    sums /= len(part)
-    mean, variance = sums[0].astype(np.float32), np.maximum(sums[1] - np.square(sums[0]), 0).astype(np.float32)
-    usual = max(float(np.median(noise)), 1e-4)
+    moments = moments or measure_moments(source)
+    mean, variance, usual = luminance(moments.mean), moments.change, max(moments.noise, 1e-4)
     motion = _motion(mean, variance, usual)
     if motion < _LEAST_MOTION:
         return source, ()
     dead = (_dead(variance, usual), _dead(variance.T, usual))
     offsets = tuple(
-        _offsets(_filled(image, gone), spread, usual / np.sqrt(len(part)), motion)
+        _offsets(_filled(image, gone), spread, usual / np.sqrt(moments.count), motion)
         for image, spread, gone in ((mean, variance, dead[0]), (mean.T, variance.T, dead[1]))
     )
     count = int(dead[0].sum() + dead[1].sum())
     size = float(np.sqrt(sum(np.mean(offset**2) for offset in offsets)))
-    if not count and size == 0:
+    warm = _warm(mean, variance, usual, motion)
+    if not count and size == 0 and not warm.any():
         return source, ()
-    stripes = _Stripes((offsets[0], offsets[1]), dead, source.window)
+    excess = _above_around(moments.mean) * (warm if moments.mean.ndim == 2 else warm[..., None]) if warm.any() else None
+    stripes = _Stripes(excess, (offsets[0], offsets[1]), dead, source.window)
     kinds = [
         *([f"offsets of {100 * size:.2g} % of full scale subtracted"] if size else ()),
         *([f"{count} dead columns or rows filled from beside them"] if count else ()),
+        *([f"{warm.sum()} warm pixels evened out"] if warm.any() else ()),
     ]
-    decision = Decision("stripes", "; ".join(kinds), "they stand while the air moves the scene")
+    decision = Decision("sensor", "; ".join(kinds), "they stand while the air moves the scene")
     return source.adjusted(stripes.without), (decision,)
 
 
@@ -139,6 +143,22 @@ def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
     alive = np.flatnonzero(~dead)
     dead[: alive[0]] = dead[alive[-1] + 1 :] = False
     return dead
+
+
+def _warm(mean: FloatArray, variance: FloatArray, noise: float, motion: float) -> NDArray[np.bool_]:
+    """Mark pixels that stand out alone of what is around them, and stand."""
+    height, least = _above_around(mean), max(_CLEARLY * noise, 2 * _LEAST)
+    ring = np.ones((3, 3), np.uint8)
+    ring[1, 1] = 0
+    over = np.where(height > 0, mean - cv2.dilate(mean, ring), cv2.erode(mean, ring) - mean)
+    alone = (np.abs(height) > least) & (over > _ALONE * np.abs(height))
+    warm = alone & (variance - noise**2 < _STANDS * (motion * height) ** 2)
+    return warm if warm.mean() <= _MOST_WARM else np.zeros_like(warm)
+
+
+def _above_around(image: FloatArray) -> FloatArray:
+    """Difference from the median of nine, in which a lone pixel does not count."""
+    return image - cv2.medianBlur(image, 3)
 
 
 def _filled(image: FloatArray, dead: NDArray[np.bool_]) -> FloatArray:

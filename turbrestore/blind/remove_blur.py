@@ -22,6 +22,7 @@ from ..blur.estimation import BlurEstimate
 from ..blur.posterior import BlurPosterior, BlurWitnesses
 from ..core.arrays import FloatArray
 from ..core.decision import Decision
+from ..core.noise import NoiseCurve
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, DeconvolutionState
 from ..deconvolution.memory import deconvolution_memory
 from ..deconvolution.problem import read_blur
@@ -93,6 +94,7 @@ def remove_blur_steps(
     side: int | None = None,
     witnesses: BlurWitnesses | None = None,
     psf: Float64Array | None = None,
+    photons: NoiseCurve | None = None,
 ) -> Steps[Deblurred]:
     """Remove a blur step by step, or a point spread function (h, w); see :func:`remove_blur`."""
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
@@ -109,7 +111,7 @@ def remove_blur_steps(
 
     def remove(width: float) -> Generator[DeconvolutionState, None, Deconvolution]:
         kernel = width if psf is None or width == 0 else psf
-        return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles)
+        return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles, photons)
 
     tiles, first = None, None
     # The likelihood of a tile is unreliable where that of the image is, and where frames tell the blur they decide.

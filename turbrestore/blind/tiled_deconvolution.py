@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image
+from ..core.noise import NoiseCurve
 from ..deconvolution.deconvolve import (
     Deconvolution,
     DeconvolutionParams,
@@ -39,6 +40,7 @@ def tiled_deconvolution_steps(
     guide: ArrayLike | None = None,
     runtime: Runtime = DEFAULT,
     tiles: tuple[HaloTile, ...] = (),
+    photons: NoiseCurve | None = None,
 ) -> Generator[DeconvolutionState, None, Deconvolution]:
     """Deconvolve an image tile by tile.
 
@@ -47,7 +49,7 @@ def tiled_deconvolution_steps(
     pixels = check_image(image)
     around = None if guide is None else check_image(guide, "guide")
     if not np.any(sigma) or len(tiles) < 2:
-        whole = yield from deconvolve_steps(pixels, sigma, params, around, runtime)
+        whole = yield from deconvolve_steps(pixels, sigma, params, around, runtime, photons)
         return replace(whole, image=to_scratch(whole.image, runtime.scratch))
     params = params or DeconvolutionParams()
     # Each tile chooses its own h for the nonlocal weights, from its guide after sharpening; that of the whole guide
@@ -56,7 +58,7 @@ def tiled_deconvolution_steps(
     restored, parts = new_mosaic(pixels.shape, runtime.scratch), list[Deconvolution]()
     for tile in tiles:
         guide_part = None if around is None else _part(around, tile)
-        part = yield from deconvolve_steps(_part(pixels, tile), sigma, params, guide_part, runtime)
+        part = yield from deconvolve_steps(_part(pixels, tile), sigma, params, guide_part, runtime, photons)
         add_tile(restored, tile, part.image)
         parts.append(replace(part, image=restored))
     noise = float(np.sqrt(np.mean([part.noise**2 for part in parts])))

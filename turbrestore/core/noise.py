@@ -16,6 +16,9 @@ _NOISE_ROWS = 256
 # Levels at which a curve of the noise is known at most, fewest pixels for one of them, and share of these pixels, the
 # flattest, in each of two groups.
 _LEVELS, _PIXELS, _FLATTEST = 12, 200, 0.2
+# Noise is that of photons if the curve has so many levels, a line leaves no more than this share of what it varies by,
+# and it is so many times larger where it is bright.
+_FEWEST_LEVELS, _STRAIGHT, _PHOTONS = 5, 0.5, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,30 @@ def fit_noise_curve(level: FloatArray, variance: FloatArray, energy: FloatArray)
     design[:, -1] = found[..., 2].ravel() / scale
     variances, _ = nnls(design, found[..., 1].ravel())
     return NoiseCurve(known, variances[:-1])
+
+
+def photon_noise(first: FloatArray, second: FloatArray) -> NoiseCurve | None:
+    """Fit the noise of the mean of two images of one scene, relative to its average, as that of photons.
+
+    Its variance is a line that rises with the level.  None where it does not, or hardly: registration and codecs leave
+    differences too, but most at the middle levels.
+    ``first``, ``second`` (H, W).
+    """
+    half = np.float32(0.5)
+    level = np.asarray(cv2.GaussianBlur(half * (first + second), (0, 0), 1.0), np.float32)
+    slope = cv2.Sobel(level, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(level, cv2.CV_32F, 0, 1) ** 2
+    energy = np.asarray(cv2.GaussianBlur(slope, (0, 0), 2.0), np.float32)
+    found = fit_noise_curve(level, (half * (first - second)) ** 2, energy)
+    if len(found.levels) < _FEWEST_LEVELS:
+        return None
+    above = found.levels - float(level.min())
+    line, residual = nnls(np.stack([np.ones_like(above), above], axis=1), found.variances)
+    variances = line[0] + line[1] * above
+    spread = float(np.linalg.norm(found.variances - found.variances.mean()))
+    if residual > _STRAIGHT * spread or variances[-1] < _PHOTONS * max(variances[0], 1e-12):
+        return None
+    curve = NoiseCurve(found.levels, variances)
+    return NoiseCurve(found.levels, variances / float(curve.variance(level).mean()))
 
 
 def estimate_noise(image: ArrayLike) -> float:

@@ -26,7 +26,7 @@ from ..blur.estimation import BlurEstimate
 from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, psf_to_otf
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import ConfigurationError, DataError, require, require_between
-from ..core.noise import estimate_noise
+from ..core.noise import NoiseCurve, estimate_noise
 from ..display.plots import plot_objective
 from ..display.preview import preview
 from ..runtime.device import CPU, find_device, memory_of
@@ -231,8 +231,12 @@ def deconvolve_steps(
     params: DeconvolutionParams | None = None,
     guide: ArrayLike | None = None,
     runtime: Runtime = DEFAULT,
+    photons: NoiseCurve | None = None,
 ) -> DeconvolutionSteps:
-    """Deblur an image step by step; arguments, errors and result as of :func:`deconvolve`."""
+    """Deblur an image step by step; arguments, errors and result as of :func:`deconvolve`.
+
+    ``photons`` is the noise of the image at every level, relative to its mean.
+    """
     params = params or DeconvolutionParams()
     pixels = check_image(image)
     if sigma_or_psf is None:
@@ -257,8 +261,11 @@ def deconvolve_steps(
     device = find_device(runtime.device)
     ops = numpy_ops(runtime.workers) if device == CPU else torch_ops(device)
     with memory_of(device), one_thread_each(), ThreadTeam(runtime.workers) as team:
-        seen, transfer = ops.load(margin.mask()), ops.load(otf)
-        problems = [Problem(ops.load(margin.pad(plane)), seen, transfer, fidelity, ops) for plane in planes]
+        transfer = ops.load(otf)
+        problems = [
+            Problem(ops.load(margin.pad(plane)), ops.load(margin.weights(plane, photons)), transfer, fidelity, ops)
+            for plane in planes
+        ]
         measured = ops.load(margin.mask(rim))
         around = _padded_guide(guide, margin)
         solution = yield from _solve(problems, around, measured, params, _Resources(team, runtime.workers, device))

@@ -8,12 +8,12 @@ q : dual variable of the data term, an image; at the solution q = λM(Bu − f).
 
 Iteration
 ---------
-With ``h(z) = λ/2 ‖M(z − f)‖²`` the problem is the saddle point ``min_u max_{p,q} ⟨Ku, p⟩ + ⟨Bu, q⟩ − h*(q)`` over
+With ``h(z) = λ/2 Σ M(z − f)²`` the problem is the saddle point ``min_u max_{p,q} ⟨Ku, p⟩ + ⟨Bu, q⟩ − h*(q)`` over
 |p|(x) ≤ 1.  It is found by primal-dual splitting (Chambolle and Pock 2011) in the metric P = I/τ + tBᵀB:
 
     u' = u − P⁻¹(Kᵀp + Bᵀq)
     p' = projection of p + sK(2u' − u) on |p|(x) ≤ 1
-    q' = λ/(λ + t) M [q + t(B(2u' − u) − f)],  the proximal step of th*
+    q' = λM/(λM + t) [q + t(B(2u' − u) − f)],  the proximal step of th*
     (u, p, q) ← (u, p, q) + ρ(u' − u, p' − p, q' − q)
 
 P is diagonal in Fourier space.  An iteration needs four Fourier transforms: Bu is not computed anew but updated by
@@ -120,7 +120,7 @@ class PrimalDual:
         spectrum = (forward(adjoint) + otf.conj() * forward(q)) / (1 / tau + t * problem.power)
         d, blurred_d = problem.ops.back(spectrum, problem.shape), problem.blur(spectrum)
         p, adjoint = self.regulariser.ascend(p, u - 2 * d, s, RELAXATION)
-        q_new = problem.seen * (q + t * (blurred - 2 * blurred_d - problem.observed)) / (1 + share)
+        q_new = problem.seen * (q + t * (blurred - 2 * blurred_d - problem.observed)) / (problem.seen + share)
         q = q + RELAXATION * (q_new - q)
         return PrimalDualState(u - RELAXATION * d, blurred - RELAXATION * blurred_d, q, p, adjoint, k + 1)
 

@@ -4,10 +4,11 @@ Symbols
 -------
 f : observed image; u : unknown image.
 k : point spread function; B : convolution with k; H : its transfer function; Bᵀ : adjoint of B.
-M : 1 where a pixel was observed, 0 in the margin around the image.
+M : 1 where a pixel was observed, 0 in the margin around the image; where the noise n depends on the level of the
+    image, mean(n²) / n² in place of 1.
 λ : fidelity, the weight of the data.  The paper's μ is 1 here.
 
-The data term ``λ/2 ‖M(Bu − f)‖²`` is that of F_λ,μ in paper 3, section 5, for the model ``f = k∗u + n`` (eq. 20), with
+The data term ``λ/2 Σ M(Bu − f)²`` is that of F_λ,μ in paper 3, section 5, for the model ``f = k∗u + n`` (eq. 20), with
 the mask M added.
 
 Boundary
@@ -23,6 +24,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
@@ -30,15 +32,18 @@ from scipy import fft
 from ..blur.psf import check_psf, wiener_fidelity
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import require
+from ..core.noise import NoiseCurve
 from .array_ops import Array, ArrayOps
 
 # Smallest margin, in widths of the blur.
 MARGIN_SIGMAS = 4.0
+# Largest weight of a pixel, and the inverse of the least.
+_MOST_WEIGHT = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Data term ``λ/2 ‖M(Bu − f)‖²`` on the padded domain."""
+    """Data term ``λ/2 Σ M(Bu − f)²`` on the padded domain."""
 
     observed: Array  # (P, Q): f, extended by reflection into the margin
     seen: Array  # (P, Q): M
@@ -66,9 +71,9 @@ class Problem:
         return self.ops.back(self.otf * spectrum, self.shape)
 
     def misfit(self, u: Array) -> float:
-        """``λ/2 ‖M(Bu − f)‖²``."""
-        residual = self.seen * (self.blur(self.ops.forward(u)) - self.observed)
-        return self.fidelity / 2 * self.ops.total(residual**2)
+        """``λ/2 Σ M(Bu − f)²``."""
+        residual = self.blur(self.ops.forward(u)) - self.observed
+        return self.fidelity / 2 * self.ops.total(self.seen * residual**2)
 
 
 @dataclass(frozen=True)
@@ -93,6 +98,14 @@ class Margin:
         """1 in :meth:`inside`, 0 elsewhere; with ``rim`` 0 it is M."""
         mask = np.zeros(self.shape, np.float32)
         mask[self.inside(rim)] = 1
+        return mask
+
+    def weights(self, plane: FloatArray, photons: NoiseCurve | None) -> FloatArray:
+        """M of an image whose noise, relative to its mean, is known at every level."""
+        mask = self.mask()
+        if photons is not None:
+            variance = photons.variance(cv2.GaussianBlur(plane, (0, 0), 1.0))
+            mask[self.inside()] = 1 / np.clip(variance, 1 / _MOST_WEIGHT, _MOST_WEIGHT)
         return mask
 
     def pad(self, image: FloatArray) -> FloatArray:

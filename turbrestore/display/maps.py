@@ -74,6 +74,14 @@ def plot_uncertainty(deviation: ArrayLike, image: ArrayLike | None = None) -> Fi
     return _draw_map(np.minimum(percent, np.float32(top)), image, "Standard deviation, % of full scale")[0]
 
 
+def plot_disagreement(share: ArrayLike, image: ArrayLike | None = None) -> Figure:
+    """Show how much of the detail of every pixel gave way to the mean of the frames as colour.
+
+    ``share`` (H, W); ``image`` (H, W) or (H, W, 3).
+    """
+    return _draw_map(100 * np.asarray(share, np.float32), image, "Detail taken from the mean, %")[0]
+
+
 def plot_images(images: Mapping[str, ArrayLike], columns: int | None = None) -> Figure:
     """Show images side by side.
 

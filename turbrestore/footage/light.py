@@ -12,7 +12,7 @@ average, row by row, so that the mean of the frames stays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
+from .shadows import measure_shade
 
 # Longest side of the reduced frames, pixels, of up to that many frames, and of more.
 _SIDE, _MANY, _SIDE_OF_MANY = 96, 4000, 48
@@ -67,16 +68,19 @@ class Light:
 
 def steady_light(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
     """Take changes of the light out of the frames; a source whose light is steady is returned as it is."""
-    light, decisions = _measure_light(source)
-    if light is None:
-        return source, ()
-    return source.adjusted(light.steady), decisions
-
-
-def _measure_light(source: FrameSource) -> tuple[Light | None, tuple[Decision, ...]]:
     if len(source) < 2:
-        return None, ()
+        return source, ()
     frames = _reduced_frames(source)
+    light, on_light = _measure_light(source, frames)
+    if light is not None:
+        source, rows = source.adjusted(light.steady), slice(0, frames.shape[1])
+        for number, frame in zip(source.numbers, frames, strict=True):
+            frame[...] = replace(light, rows=rows).steady(number, frame, (rows, slice(0, frames.shape[2])))
+    shade, on_shade = measure_shade(frames, source.numbers, source.window, _blur_of(source))
+    return source if shade is None else source.adjusted(shade.lit), (*on_light, *on_shade)
+
+
+def _measure_light(source: FrameSource, frames: FloatArray) -> tuple[Light | None, tuple[Decision, ...]]:
     reference = None if _is_steady(frames) else _reference_of(frames)
     if reference is None:
         return None, ()
@@ -147,14 +151,22 @@ def _evened_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _reduced_frames(source: FrameSource) -> FloatArray:
     """Reduced, blurred luminance of all frames, (T, h, w)."""
-    height, width = source.shape[1:3]
-    factor = max(1.0, max(height, width) / (_SIDE if len(source) <= _MANY else _SIDE_OF_MANY))
+    (height, width), factor = source.shape[1:3], _reduction(source)
     size = max(1, round(width / factor)), max(1, round(height / factor))
     stack = np.empty((len(source), size[1], size[0]), np.float32)
     for small, frame in zip(stack, source, strict=True):
         reduced = luminance(cv2.resize(frame, size, interpolation=cv2.INTER_AREA))
-        small[...] = cv2.GaussianBlur(reduced, (0, 0), max(_LEAST_BLUR, _BLUR / factor))
+        small[...] = cv2.GaussianBlur(reduced, (0, 0), _blur_of(source))
     return stack
+
+
+def _reduction(source: FrameSource) -> float:
+    return max(1.0, max(source.shape[1:3]) / (_SIDE if len(source) <= _MANY else _SIDE_OF_MANY))
+
+
+def _blur_of(source: FrameSource) -> float:
+    """Blur of the reduced frames, in their pixels."""
+    return max(_LEAST_BLUR, _BLUR / _reduction(source))
 
 
 def _is_steady(frames: FloatArray) -> bool:

@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.errors import DataError
-from ..core.noise import estimate_noise
 from ..io.images import read_image
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import global_shifts
+from .moments import Moments, measure_moments
 
-# Frames from which the overlay is found, and most frames of a clip in which one is looked for.
-_SAMPLES, _MOST = 60, 1500
+# Fewest and most frames of a clip in which an overlay is looked for.
+FEWEST, _MOST = 3, 1500
 # Longest side of the reduced frames whose shifts are measured.
 _SIDE = 192
 # Root mean square of the shifts from which a scene moves, pixels.
@@ -125,16 +125,17 @@ def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArr
 
 
 def without_overlay(
-    source: FrameSource, mask: NDArray[np.bool_] | None = None
+    source: FrameSource, mask: NDArray[np.bool_] | None = None, moments: Moments | None = None
 ) -> tuple[FrameSource, NDArray[np.bool_] | None, Title | None, tuple[Decision, ...]]:
     """Replace what stands in the frames while the scene moves; a source without it is returned as it is.
 
     Return the source, the pixels (H, W) of the scene that no frame shows, the title that has to be put back into
-    results because the camera stands as well, and the decisions. ``mask`` (H, W) names the pixels that are replaced.
+    results because the camera stands as well, and the decisions. ``mask`` (H, W) names the pixels that are replaced;
+    ``moments`` are those of the source, if they are known.
     """
     given, title = mask is not None, None
-    if mask is None and 3 <= len(source) <= _MOST:
-        mask, title = _standing(source)
+    if mask is None and FEWEST <= len(source) <= _MOST:
+        mask, title = _standing(source, moments or measure_moments(source))
     if mask is None:
         return source, None, None, ()
     shifts = _shifts_of(source, mask)
@@ -155,19 +156,9 @@ def without_overlay(
     return source.adjusted(overlay.without), overlay.hidden, None, (decision,)
 
 
-def _standing(source: FrameSource) -> tuple[NDArray[np.bool_] | None, Title | None]:
+def _standing(source: FrameSource, moments: Moments) -> tuple[NDArray[np.bool_] | None, Title | None]:
     """Find connected regions with edges that stand: for a camera that moves and, if edges move, for one that stands."""
-    part = source.select((0, len(source), max(1, len(source) // _SAMPLES)))
-    total, sums, noise = np.zeros(source.shape[1:]), np.zeros((2, *source.shape[1:3])), []
-    for frame in part:
-        grey = luminance(frame)
-        cv2.accumulate(frame, total)
-        cv2.accumulate(grey, sums[0])
-        cv2.accumulateSquare(grey, sums[1])
-        noise.append(estimate_noise(grey))
-    sums /= len(part)
-    mean, usual = sums[0].astype(np.float32), float(np.median(noise))
-    deviation = np.sqrt(np.maximum(sums[1] - np.square(sums[0]), 0))
+    mean, usual, deviation = luminance(moments.mean), moments.noise, np.sqrt(moments.variance)
     floor = max(_STILL * usual, _LEAST_STILL)
     still = deviation < floor
     gradient = np.hypot(cv2.Sobel(mean, cv2.CV_32F, 1, 0), cv2.Sobel(mean, cv2.CV_32F, 0, 1)) / 8
@@ -192,7 +183,7 @@ def _standing(source: FrameSource) -> tuple[NDArray[np.bool_] | None, Title | No
     letters = _connected((constant & near) | edges, edges).astype(np.uint8)
     letters = cv2.morphologyEx(letters, cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
     letters = cv2.dilate(letters, np.ones((3, 3), np.uint8)) > 0
-    return mask, Title(letters, (total / len(part)).astype(np.float32), source.window)
+    return mask, Title(letters, moments.mean, source.window)
 
 
 def _motion(deviation: NDArray[np.float64], gradient: FloatArray, noise: float) -> float:

@@ -14,6 +14,7 @@ from ..deconvolution.deconvolve import Deconvolution
 from ..display.plots import (
     plot_blur,
     plot_convergence,
+    plot_disagreement,
     plot_displacements,
     plot_eigenvalues,
     plot_filter,
@@ -78,6 +79,10 @@ def draw_panels(restoration: Restoration, run: RunRecord) -> list[Panel]:
         figure = plot_uncertainty(restoration.uncertainty, restoration.image)
         caption = "Where not to trust the result: bright means uncertain, and brightest also where nothing is known."
         panels.append(make_panel(figure, "uncertainty", "Map of the standard deviation of every pixel", caption))
+    if restoration.disagreement is not None and restoration.disagreement.any():
+        figure = plot_disagreement(restoration.disagreement, restoration.image)
+        caption = "Bright: the frames do not agree on the detail of the result, or it rings; the mean takes its place."
+        panels.append(make_panel(figure, "agreement", "Map of the share of the mean in the detail", caption))
     return panels
 
 

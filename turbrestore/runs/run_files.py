@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -39,6 +40,8 @@ RESULTS = ("centroid", "dynamics", "filtered", "blur", "posterior", "deconvoluti
 # All files of a kept run.
 RUN_FILES = (*(f"{name}.npz" for name in RESULTS), MEAN, IMAGES, RECORD)
 _ANEW = "start anew without resuming, or keep the stages in another folder"
+# Maps of the size of the result: the largest value, and what it is.
+_MAPS = {"uncertainty": (math.inf, "deviations"), "disagreement": (1.0, "shares")}
 # Where `turbrestore report` writes by default.
 REPORT = "report.html"
 
@@ -96,8 +99,7 @@ def save_results(folder: Path, restoration: Restoration, run: RunRecord, stored:
             save_artifact(folder / f"{name}.npz", result, overwrite=True)
     with atomic_output(folder / IMAGES, overwrite=True) as temporary, temporary.open("wb") as stream:
         images = {"frame": run.frame, "mean": restoration.mean, "image": restoration.image}
-        if restoration.uncertainty is not None:
-            images["uncertainty"] = restoration.uncertainty
+        images |= {name: part for name in _MAPS if (part := getattr(restoration, name)) is not None}
         write_npz(stream, images)
     described = {item.name: getattr(run, item.name) for item in dataclasses.fields(run) if item.name != "frame"}
     restored = {
@@ -213,7 +215,7 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
         frame_count=facts.value("frame_count", int),
         seconds=facts.numbers("seconds"),
         seeing=facts.seeing("seeing"),
-        uncertainty=images.get("uncertainty"),
+        **{name: images.get(name) for name in _MAPS},
     )
     return restoration, RunRecord(
         name=run.value("name", str),
@@ -273,9 +275,9 @@ def _read_images(path: Path, crop: Rectangle) -> dict[str, FloatArray]:
         raise DataError(f"{path}: expected images of one size, found {[image.shape for image in images.values()]}")
     if x + width > images["mean"].shape[1] or y + height > images["mean"].shape[0]:
         raise DataError(f"{path}: expected the result to lie within the frames, found it at {crop}")
-    uncertainty = found.get("uncertainty")
-    if uncertainty is not None:
-        if uncertainty.shape != (height, width) or uncertainty.dtype.str != "<f4" or not (uncertainty >= 0).all():
-            raise DataError(f"{path}: expected deviations of shape {(height, width)}, found {uncertainty.shape}")
-        images["uncertainty"] = uncertainty
+    for name in found.keys() & _MAPS.keys():
+        part, (most, what) = found[name], _MAPS[name]
+        if part.shape != (height, width) or part.dtype.str != "<f4" or not ((part >= 0) & (part <= most)).all():
+            raise DataError(f"{path}: expected {what} of shape {(height, width)}, found {part.shape}")
+        images[name] = part
     return images
