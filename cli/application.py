@@ -22,6 +22,7 @@ from .streams import flush, silence, tell
 COMMANDS = {
     "restore": ("restore:restore", "Restore one sharp image from a video."),
     "steady": ("steady:steady", "Steady and sharpen a video."),
+    "register": ("register:register", "Write the frames registered, not stacked."),
     "batch": ("batch:batch", "Restore many videos side by side."),
     "report": ("report:report", "Write the report of a kept run."),
     "seeing": ("seeing:seeing", "Measure the strength of the turbulence."),

@@ -13,6 +13,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore restore sample_data/chart.mkv all.png --keep stages --truth sample_data/chart_truth.png --json",
         "turbrestore restore sample_data/chart.mkv later.png --keep kept --resume",
     ),
+    "register": (
+        "turbrestore register sample_data/chart.mkv registered.ser",
+        "turbrestore register sample_data/chart.mkv frames.tif --flows flows.npz --bit-depth 16",
+    ),
     "steady": (
         "turbrestore steady sample_data/chart.mkv steady.mp4",
         "turbrestore steady sample_data/chart.mkv still.mkv --camera lock --mask moving.mkv --json",
