@@ -60,7 +60,7 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
 def files_read(selection: Selection, *named: Path | None, params: RestoreParams | None = None) -> list[Path]:
     """List the files and folders that a command reads, which no output may replace: those it names, and settings do."""
     calibration = (None if name is None else Path(name) for name in (selection.dark, selection.flat))
-    names = () if params is None else (params.static_mask, params.psf)
+    names = () if params is None else (params.static_mask, params.psf, params.reference, params.like)
     of_settings = (Path(name) for name in names if name not in (None, "auto", "off"))
     return [path for path in (*named, *calibration, *of_settings) if path is not None]
 
@@ -71,8 +71,11 @@ def with_absolute_paths(selection: Selection, params: RestoreParams) -> tuple[Se
     mask = params.static_mask
     if mask not in ("auto", "off"):
         mask = str(Path(mask).absolute())
-    psf = None if params.psf is None else str(Path(params.psf).absolute())
-    return dataclasses.replace(selection, dark=dark, flat=flat), dataclasses.replace(params, static_mask=mask, psf=psf)
+    psf, reference, like = (
+        None if name is None else str(Path(name).absolute()) for name in (params.psf, params.reference, params.like)
+    )
+    placed = dataclasses.replace(params, static_mask=mask, psf=psf, reference=reference, like=like)
+    return dataclasses.replace(selection, dark=dark, flat=flat), placed
 
 
 def frames_to_train(source: FrameSource, selection: Selection, train: int | None) -> int:

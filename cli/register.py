@@ -29,6 +29,7 @@ from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.scratch import drop_pages, new_stack
 from turbrestore.settings import Preset, RestoreParams
+from turbrestore.stacking.placement import settings_of_known_flows
 from turbrestore.stacking.registered import RegisteredFrame, registered_frames
 
 from .inputs import files_read, open_input
@@ -98,7 +99,7 @@ def register(
     """
     require(keep is not None or not resume, "--resume: expected --keep with the folder of the run to go on with")
     table = output.with_suffix(".csv")
-    inputs = files_read(selection, input, config, static_mask=params.static_mask)
+    inputs = files_read(selection, input, config, params=params)
     outputs = [path for path in (output, table, flows) if path is not None]
     check_distinct(outputs)
     check_output(output, inputs, overwrite, SUFFIXES)
@@ -110,6 +111,7 @@ def register(
         check_depth(bit_depth)
     runtime = machine.runtime(memory_limit, keep)
     source = open_input(input, selection, quiet)
+    params = settings_of_known_flows(params, len(source))
     check_room(source, params, runtime, output, keep)
     flow_bytes = 8 * len(source) * source.shape[1] * source.shape[2]
     if flows is not None:

@@ -37,6 +37,7 @@ from .runtime.runtime import DEFAULT, Runtime
 from .runtime.steps import Progress, finish
 from .runtime.tiling import halo_tiles
 from .settings import RestoreParams
+from .stacking.placement import settings_of_known_flows
 from .tiled_stages import TileMap
 from .uncertainty.pixel_deviation import (
     informed_pixels,
@@ -117,6 +118,7 @@ def restore(
     source, on_blank = (
         (frames, ()) if isinstance(frames, FrameSource) else without_blank(FrameSource.from_array(frames))
     )
+    params = settings_of_known_flows(params, len(source))
     plan = plan_memory(source.shape, params, runtime)
     psf = None if params.psf is None else psf_from_image(read_image(params.psf).image, params.psf)
     _check_sigma(params.deconvolution.sigma if psf is None else read_blur(psf)[1], source.shape)

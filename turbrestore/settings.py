@@ -58,6 +58,12 @@ class RestoreParams:
     psf : str, optional
         Image of a star or of a measured blur to remove, in pixels of the clip.  It takes the place of an estimated
         blur.
+    reference : str, optional
+        Image, or folder of a kept run, whose geometry the result has.  Its brightness and contrast may differ, as those
+        of another filter or camera do.
+    like : str, optional
+        Flows of another recording of the same instants, which are applied as they are.  The folder of a kept run that
+        trained on all of its frames, or the file of ``register --flows``.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -92,6 +98,8 @@ class RestoreParams:
     distance: float | None = None
     wavelength: float = 550e-9
     psf: str | None = None
+    reference: str | None = None
+    like: str | None = None
     flow: FlowParams = field(default_factory=FlowParams)
     centroid: CentroidParams = field(default_factory=CentroidParams)
     dynamics: DynamicsParams = field(default_factory=DynamicsParams)
@@ -114,6 +122,14 @@ class RestoreParams:
         require(
             self.static_mask in ("auto", "off") or "." in self.static_mask,
             f"static_mask: expected auto, off or an image file, found {self.static_mask!r}",
+        )
+        require(
+            self.reference is None or self.like is None,
+            "like: its flows lead from a geometry of their own, which contradicts reference; leave one of them out",
+        )
+        require(
+            self.like is None or self.filter.training == "filter",
+            "like: expected filter.training = filter, because the known flows are those of all frames",
         )
         check_share(self.keep_best)
         known_optics(self.pixel_scale, self.aperture, self.wavelength, self.distance)

@@ -37,6 +37,11 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
             "region": [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start],
             "device": plan.runtime.device,
             "static_mask": _mask_digest(params.static_mask),
+            **{
+                name: _geometry_digest(Path(path))
+                for name, path in (("reference", params.reference), ("like", params.like))
+                if path is not None
+            },
             "flow": settings["flow"],
             "centroid": settings["centroid"],
             "versions": versions(),
@@ -68,6 +73,13 @@ def _digest(path: str) -> str:
     """Return the checksum of a file that a setting names."""
     with input_errors(Path(path)):
         return file_digest(Path(path))
+
+
+def _geometry_digest(path: Path) -> str:
+    """Return the checksum of an image, of flows, or of the stages of a run that have its geometry."""
+    with input_errors(path):
+        files = [path / name for name in ("centroid.npz", "filtered.npz")] if path.is_dir() else [path]
+        return " ".join(file_digest(file) for file in files if file.exists())
 
 
 def _span(numbers: Sequence[int]) -> list[int]:

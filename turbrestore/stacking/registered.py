@@ -6,8 +6,8 @@ q : centroid of the training frames; W_k : flow from q to frame I_k, pixels
 V : flow that moves q onto the mean geometry of all frames, see :mod:`turbrestore.registration.recentring`
 
 A registered frame is ``I_k ∘ (id + W'_k)`` with ``W'_k = W_k ∘ (id + V) + V``: the two flows are joined, so that a
-frame is interpolated once.  The flows of the training frames are those that the centroid was averaged with, so the mean of
-their registered frames is the centroid.  Those of later frames are measured from it.
+frame is interpolated once.  The flows of the training frames are those that the centroid was averaged with, so the mean
+of their registered frames is the centroid.  Those of later frames are measured from it.
 """
 
 from __future__ import annotations
