@@ -25,6 +25,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore batch sample_data/chart.mkv results",
         "turbrestore batch sample_data 'sample_data/*.mkv' results --resume",
     ),
+    "align": (
+        "turbrestore align sharp.png quick.png aligned",
+        "turbrestore align sharp.png quick.png onto --onto sharp.png",
+        "turbrestore align --rgb sharp.png quick.png again.png colour",
+    ),
     "report": ("turbrestore report stages", "turbrestore report stages report.html"),
     "seeing": (
         "turbrestore seeing sample_data/chart.mkv",

@@ -187,7 +187,7 @@ def _edges(image: FloatArray) -> FloatArray:
 
 
 def _energy(feature: FloatArray) -> FloatArray:
-    return sum(np.square(cv2.Sobel(feature, cv2.CV_32F, *axis)) for axis in ((1, 0), (0, 1)))  # type: ignore[return-value]
+    return sum(np.square(cv2.Sobel(feature, cv2.CV_32F, *axis)) for axis in ((1, 0), (0, 1)))
 
 
 def _unit(feature: FloatArray) -> FloatArray:
@@ -204,19 +204,20 @@ def _similarity(a: FloatArray, b: FloatArray, features: _Features) -> tuple[floa
     coarse = [function(_reduced(image, _LEVELS[1])) for function, image in ((first, a), (second, b))]
     shift = measure_shift(_unit(coarse[1]), prepare_shift_reference(_unit(coarse[0])))
     found = np.zeros(2) if shift is None else shift * (a.shape[1] / coarse[0].shape[1])
-    warped, alike = np.column_stack([np.eye(2), found]), -1.0
+    warped = np.column_stack([np.eye(2), found])
     for side in _LEVELS:
         pair = first(_reduced(a, side)), second(_reduced(b, side))
         enlarged = _pixels_of(a.shape, pair[0].shape)
         start = (np.linalg.inv(enlarged) @ np.vstack([warped, (0, 0, 1)]) @ enlarged)[:2].astype(np.float32)
         try:
-            alike, affine = cv2.findTransformECC(*pair, start, cv2.MOTION_AFFINE, _CRITERIA, None, 5)
+            _, affine = cv2.findTransformECC(*pair, start, cv2.MOTION_AFFINE, _CRITERIA, None, 5)
         except cv2.error:
             # It does not converge where nothing is alike.
             continue
         whole = enlarged @ np.vstack([affine.astype(np.float64), (0, 0, 1)]) @ np.linalg.inv(enlarged)
         warped = _closest_similarity(whole, a.shape)
-    return float(alike), warped
+    alike = correlation(first(a), warp(second(b), _joined(warped, np.zeros((*a.shape, 2), np.float32))))
+    return alike, warped
 
 
 _FEATURES: tuple[_Features, ...] = ((_levels, _levels), (_levels, _negative), (_edges, _edges))
