@@ -9,7 +9,7 @@ from typing import Literal
 
 from .blind.guards import GuardParams
 from .blur.psf import GAUSSIAN
-from .core.errors import require
+from .core.errors import require, require_between
 from .deconvolution.deconvolve import DeconvolutionParams
 from .dynamics.dynamic_texture import DynamicsParams
 from .filtering.alternating import FilterParams
@@ -64,6 +64,9 @@ class RestoreParams:
     like : str, optional
         Flows of another recording of the same instants, which are applied as they are.  The folder of a kept run that
         trained on all of its frames, or the file of ``register --flows``.
+    scale : float
+        How much finer the grid of the result is, 1 to 3.  Frames are fused there by their motion of fractions of
+        pixels, which gains detail where the lens is sharper than the pixels are small.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -100,6 +103,7 @@ class RestoreParams:
     psf: str | None = None
     reference: str | None = None
     like: str | None = None
+    scale: float = 1.0
     flow: FlowParams = field(default_factory=FlowParams)
     centroid: CentroidParams = field(default_factory=CentroidParams)
     dynamics: DynamicsParams = field(default_factory=DynamicsParams)
@@ -130,6 +134,11 @@ class RestoreParams:
         require(
             self.like is None or self.filter.training == "filter",
             "like: expected filter.training = filter, because the known flows are those of all frames",
+        )
+        require_between("scale", self.scale, 1, 3)
+        require(
+            self.scale == 1 or self.until in STAGES[2:],
+            f"scale: has no effect with until = {self.until}; leave one of them out",
         )
         check_share(self.keep_best)
         known_optics(self.pixel_scale, self.aperture, self.wavelength, self.distance)
