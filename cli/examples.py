@@ -2,7 +2,7 @@
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "sample": ("turbrestore sample sample_data --overwrite",),
-    "info": ("turbrestore info sample_data/chart.mkv", "turbrestore info sample_data/chart.mkv --json"),
+    "info": ("turbrestore info sample_data/chart.mkv", "turbrestore info sample_data/chart.mkv --quality"),
     "app": ("turbrestore app sample_data/chart.mkv", "turbrestore app --allow results --port 8123 --no-browser"),
     "config": ("turbrestore config --init run.toml", "turbrestore config --check run.toml"),
     "restore": (
