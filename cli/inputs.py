@@ -21,6 +21,7 @@ from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
 from turbrestore.runs.stage_files import load_guide, load_stage_image
 from turbrestore.settings import RestoreParams
+from turbrestore.stacking.derotation import derotated, read_rotation
 
 from .options import Selection
 from .progress import say
@@ -54,6 +55,8 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
     )
     source = _calibrated(source, selection)
     source = crop_to_object(source) if selection.crop_to_object else source
+    if selection.derotate is not None:
+        source = derotated(source, read_rotation(selection.derotate))
     return source, check_content(source, ContentParams(strict=selection.strict))
 
 
