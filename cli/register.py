@@ -100,22 +100,16 @@ def register(
     require(keep is not None or not resume, "--resume: expected --keep with the folder of the run to go on with")
     table = output.with_suffix(".csv")
     inputs = files_read(selection, input, config, params=params)
-    outputs = [path for path in (output, table, flows) if path is not None]
-    check_distinct(outputs)
-    check_output(output, inputs, overwrite, SUFFIXES)
-    check_output(table, inputs, overwrite, (".csv",))
-    if flows is not None:
-        check_output(flows, inputs, overwrite, (".npz",))
-    check_keep(keep, [*inputs, *outputs], overwrite, resume)
+    _check_outputs(inputs, output, table, flows, overwrite)
+    check_keep(keep, [*inputs, output, table, *([] if flows is None else [flows])], overwrite, resume)
     if bit_depth is not None:
         check_depth(bit_depth)
     runtime = machine.runtime(memory_limit, keep)
     source = open_input(input, selection, quiet)
     params = settings_of_known_flows(params, len(source))
     check_room(source, params, runtime, output, keep)
-    flow_bytes = 8 * len(source) * source.shape[1] * source.shape[2]
     if flows is not None:
-        check_space(flows, flow_bytes)
+        check_space(flows, 8 * len(source) * source.shape[1] * source.shape[2])
     with kept_stages(keep, source, params, runtime, resume, checkpoint_every, quiet) as stages:
         # A kept run that has been deblurred stays complete.
         whole = stages is not None and "deconvolution.npz" in stages.stored
@@ -140,6 +134,14 @@ def register(
         with atomic_output(flows, overwrite) as temporary, temporary.open("wb") as stream:
             write_npz(stream, {"flows": writer.flows, "numbers": np.array(source.numbers)})
     say(f"{output}: {len(source)} frames registered, {restoration.motion:.2f} pixels of motion removed", quiet)
+
+
+def _check_outputs(inputs: list[Path], output: Path, table: Path, flows: Path | None, overwrite: bool) -> None:
+    check_distinct(path for path in (output, table, flows) if path is not None)
+    check_output(output, inputs, overwrite, SUFFIXES)
+    check_output(table, inputs, overwrite, (".csv",))
+    if flows is not None:
+        check_output(flows, inputs, overwrite, (".npz",))
 
 
 class _Writer:

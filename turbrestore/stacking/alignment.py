@@ -135,11 +135,6 @@ def _smoothed(flow: FloatArray, weight: FloatArray) -> FloatArray:
     return smooth
 
 
-def moved(image: FloatArray, alignment: Alignment) -> FloatArray:
-    """Image in the geometry of the reference."""
-    return warp(image, alignment.flow)
-
-
 def _described(F: FloatArray, likeness: float) -> Alignment:
     """Take shift, rotation and scale off a flow, by the similarity that fits it best."""
     fitted = fit_camera(F)

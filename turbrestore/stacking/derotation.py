@@ -81,7 +81,8 @@ def read_rotation(text: str) -> Rotation:
     )
     try:
         period, flattening = PLANETS[name] if name in PLANETS else (float(name.removesuffix("h")), 0.0)
-        angle, latitude = [*(float(word) for word in rest), *[None] * (2 - len(rest))]
+        numbers: list[float | None] = [*map(float, rest), *[None] * (2 - len(rest))]
+        angle, latitude = numbers
     except ValueError as error:
         raise wrong from error
     if not (period > 0 and np.isfinite(period)) or not -90 < (latitude or 0) < 90:
@@ -107,7 +108,7 @@ def derotated(source: FrameSource, rotation: Rotation) -> FrameSource:
             warp(image, rotation_flow(image.shape, disc, rotation, way * time))
             for image, time in zip((images[0], images[2]), (early, late), strict=True)
         ]
-        turned[way] = _likeness(*ends, disc)
+        turned[way] = _likeness(ends[0], ends[1], disc)
     way = max(turned, key=lambda one: turned[one])
     after = dict(zip(source.numbers, way * (times - middle), strict=True))
     angle = float(np.degrees(2 * np.pi * (times[-1] - times[0]) / (3600 * rotation.period)))

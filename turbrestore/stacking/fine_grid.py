@@ -110,7 +110,7 @@ def fuse_finely(
         sums, held = np.zeros((2, *fine)), np.zeros((2, *fine[:2]))
         for number, (frame, flow) in numbered:
             half = number * _PARTS // count % 2
-            sample, weight = _samples(frame, flow, fine[:2], scale)
+            sample, weight = _samples(frame, flow, (fine[0], fine[1]), scale)
             weight *= np.float32(weights[number])
             sums[half] += sample * (weight if frame.ndim == 2 else weight[..., None])
             held[half] += weight
@@ -136,7 +136,7 @@ def fine_psf(sigma: float, exponent: float, scale: float) -> NDArray[np.float64]
     return np.clip(np.fft.fftshift(np.fft.irfft2(otf, s=(side, side))), 0, None)
 
 
-def _sampling(frequencies: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+def _sampling(frequencies: NDArray[np.floating], scale: float) -> NDArray[np.float64]:
     """Transfer function of g, cut off at half a pixel."""
     d = np.linspace(-0.5, 0.5, 201)
     g = np.exp(-2 * (scale * d) ** 2)

@@ -141,7 +141,8 @@ def _median(images: Sequence[FloatArray], found: Sequence[Alignment | str]) -> F
     pairs = [(image, one.flow) for image, one in zip(images, found, strict=True) if isinstance(one, Alignment)]
     V = invert_flow(np.mean([flow for _, flow in pairs], axis=0, dtype=np.float32))
     chosen = [pairs[place] for place in np.unique(np.linspace(0, len(pairs) - 1, _MEDIAN_OF).round().astype(int))]
-    return np.median([warp(luminance(image), compose_flows(flow, V)) for image, flow in chosen], axis=0)
+    moved = [warp(luminance(image), compose_flows(flow, V)) for image, flow in chosen]
+    return np.median(moved, axis=0).astype(np.float32)
 
 
 def _on_canvas(image: FloatArray, canvas: tuple[int, ...]) -> FloatArray:
