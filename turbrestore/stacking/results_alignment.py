@@ -120,7 +120,7 @@ def contact_sheet(images: Sequence[FloatArray], labels: Sequence[str]) -> FloatA
     columns = int(np.ceil(np.sqrt(len(cells))))
     cells += [np.zeros_like(cells[0])] * (-len(cells) % columns)
     rows = [np.hstack(cells[start : start + columns]) for start in range(0, len(cells), columns)]
-    return np.vstack(rows).astype(np.float32) / 255
+    return np.vstack(rows).astype(np.float32) / np.float32(255)
 
 
 def _aligned(images: Sequence[FloatArray], reference: FloatArray, runtime: Runtime) -> list[Alignment | str]:
@@ -142,7 +142,8 @@ def _median(images: Sequence[FloatArray], found: Sequence[Alignment | str]) -> F
     V = invert_flow(np.mean([flow for _, flow in pairs], axis=0, dtype=np.float32))
     chosen = [pairs[place] for place in np.unique(np.linspace(0, len(pairs) - 1, _MEDIAN_OF).round().astype(int))]
     moved = [warp(luminance(image), compose_flows(flow, V)) for image, flow in chosen]
-    return np.median(moved, axis=0).astype(np.float32)
+    median = np.median(moved, axis=0)
+    return np.asarray(median, np.float32)
 
 
 def _on_canvas(image: FloatArray, canvas: tuple[int, ...]) -> FloatArray:
