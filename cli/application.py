@@ -22,7 +22,9 @@ from .streams import flush, silence, tell
 COMMANDS = {
     "restore": ("restore:restore", "Restore one sharp image from a video."),
     "steady": ("steady:steady", "Steady and sharpen a video."),
+    "register": ("register:register", "Write the frames registered, not stacked."),
     "batch": ("batch:batch", "Restore many videos side by side."),
+    "align": ("align:align", "Align results to each other."),
     "report": ("report:report", "Write the report of a kept run."),
     "seeing": ("seeing:seeing", "Measure the strength of the turbulence."),
     "centroid": ("stages:centroid", "Find the centroid of a video."),
@@ -44,6 +46,7 @@ COMMANDS = {
 }
 
 USAGES = {
+    "align": "Usage: turbrestore align [OPTIONS] RESULT... FOLDER",
     "batch": "Usage: turbrestore batch [OPTIONS] INPUT... FOLDER",
     "deconvolve": "Usage: turbrestore deconvolve [OPTIONS] INPUT [OUTPUT]",
 }

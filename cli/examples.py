@@ -2,7 +2,7 @@
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "sample": ("turbrestore sample sample_data --overwrite",),
-    "info": ("turbrestore info sample_data/chart.mkv", "turbrestore info sample_data/chart.mkv --json"),
+    "info": ("turbrestore info sample_data/chart.mkv", "turbrestore info sample_data/chart.mkv --quality"),
     "app": ("turbrestore app sample_data/chart.mkv", "turbrestore app --allow results --port 8123 --no-browser"),
     "config": ("turbrestore config --init run.toml", "turbrestore config --check run.toml"),
     "restore": (
@@ -13,6 +13,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "turbrestore restore sample_data/chart.mkv all.png --keep stages --truth sample_data/chart_truth.png --json",
         "turbrestore restore sample_data/chart.mkv later.png --keep kept --resume",
     ),
+    "register": (
+        "turbrestore register sample_data/chart.mkv registered.ser",
+        "turbrestore register sample_data/chart.mkv frames.tif --flows flows.npz --bit-depth 16",
+    ),
     "steady": (
         "turbrestore steady sample_data/chart.mkv steady.mp4",
         "turbrestore steady sample_data/chart.mkv still.mkv --camera lock --mask moving.mkv --json",
@@ -20,6 +24,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "batch": (
         "turbrestore batch sample_data/chart.mkv results",
         "turbrestore batch sample_data 'sample_data/*.mkv' results --resume",
+    ),
+    "align": (
+        "turbrestore align sharp.png quick.png aligned",
+        "turbrestore align sharp.png quick.png onto --onto sharp.png",
+        "turbrestore align --rgb sharp.png quick.png again.png colour",
     ),
     "report": ("turbrestore report stages", "turbrestore report stages report.html"),
     "seeing": (

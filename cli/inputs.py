@@ -21,6 +21,7 @@ from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
 from turbrestore.runs.stage_files import load_guide, load_stage_image
 from turbrestore.settings import RestoreParams
+from turbrestore.stacking.derotation import derotated, read_rotation
 
 from .options import Selection
 from .progress import say
@@ -54,13 +55,15 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
     )
     source = _calibrated(source, selection)
     source = crop_to_object(source) if selection.crop_to_object else source
+    if selection.derotate is not None:
+        source = derotated(source, read_rotation(selection.derotate))
     return source, check_content(source, ContentParams(strict=selection.strict))
 
 
 def files_read(selection: Selection, *named: Path | None, params: RestoreParams | None = None) -> list[Path]:
     """List the files and folders that a command reads, which no output may replace: those it names, and settings do."""
     calibration = (None if name is None else Path(name) for name in (selection.dark, selection.flat))
-    names = () if params is None else (params.static_mask, params.psf)
+    names = () if params is None else (params.static_mask, params.psf, params.reference, params.like)
     of_settings = (Path(name) for name in names if name not in (None, "auto", "off"))
     return [path for path in (*named, *calibration, *of_settings) if path is not None]
 
@@ -71,8 +74,11 @@ def with_absolute_paths(selection: Selection, params: RestoreParams) -> tuple[Se
     mask = params.static_mask
     if mask not in ("auto", "off"):
         mask = str(Path(mask).absolute())
-    psf = None if params.psf is None else str(Path(params.psf).absolute())
-    return dataclasses.replace(selection, dark=dark, flat=flat), dataclasses.replace(params, static_mask=mask, psf=psf)
+    psf, reference, like = (
+        None if name is None else str(Path(name).absolute()) for name in (params.psf, params.reference, params.like)
+    )
+    placed = dataclasses.replace(params, static_mask=mask, psf=psf, reference=reference, like=like)
+    return dataclasses.replace(selection, dark=dark, flat=flat), placed
 
 
 def frames_to_train(source: FrameSource, selection: Selection, train: int | None) -> int:

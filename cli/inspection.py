@@ -22,6 +22,7 @@ from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import appearance, compare, compare_flows
 from turbrestore.runs.stage_files import load_flows
+from turbrestore.stacking.quality import quality_list, quality_table
 
 from .inputs import open_checked, read_input_image
 from .options import Flag, Selection, limits_of
@@ -49,6 +50,7 @@ def info(
     /,
     *,
     selection: Annotated[Selection, Parameter(name="*")] = Selection(),
+    quality: Flag = False,
     json: Flag = False,
 ) -> None:
     """Say what a video is: size, frames, rate, bit depth, what is wrong with it, and how many frames train by default.
@@ -58,11 +60,24 @@ def info(
     input : Path
         Video (mp4, mkv, mov, avi, mts, wmv, …), animated PNG or WebP, TIFF stack, SER, FITS cube, .npy, or folder of
         images or FITS files.
+    quality : bool
+        Sort the frames by quality, and say what keeping 10, 25 and 50 % of them costs in noise and gains in sharpness,
+        and which share is best.
     json : bool
         Print JSON.
     """
     source, content = open_checked(input, selection)
-    _report({"input": str(input), **describe_clip(clean_source(source, content), content)}, json)
+    cleaned = clean_source(source, content)
+    record: dict[str, object] = {"input": str(input), **describe_clip(cleaned, content)}
+    found = quality_list(cleaned) if quality else None
+    if found is None or not json:
+        _report(record, json)
+    if found is not None and json:
+        figures = dataclasses.asdict(found)
+        ranked = [{"frame": cleaned.numbers[place], "quality": float(found.quality[place])} for place in found.order]
+        print_json({**record, "quality": {**figures, "quality": ranked}})
+    elif found is not None:
+        put(f"\n{quality_table(found, cleaned.numbers)}")
 
 
 def describe_clip(source: FrameSource, content: ContentReport) -> dict[str, object]:

@@ -49,6 +49,10 @@ class Selection:
         Frames of an even surface.  A video, an image or a folder; their mean is divided out.
     crop_to_object : bool
         Follow a planet on a dark field.  Any bright object there will do; the window just holds it.
+    derotate : str, optional
+        Turn the surface of a planet back to the middle of the clip: jupiter, mars, saturn or a period in hours, and
+        perhaps the angle of the equator in the image and the latitude of the middle of the disc in degrees, such as
+        mars,-20,8.  By default the flattening of the disc tells the angle.  Saturn's rings must not cross the globe.
     """
 
     frames: str | None = None
@@ -61,6 +65,7 @@ class Selection:
     dark: str | None = None
     flat: str | None = None
     crop_to_object: Flag = False
+    derotate: str | None = None
 
     def frame_range(self) -> FrameRange | None:
         """Return (start, stop, step), None where left out."""

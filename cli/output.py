@@ -18,6 +18,7 @@ import tomli_w
 from turbrestore import __version__
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import OutputError
+from turbrestore.footage.object_crop import without_sky
 from turbrestore.io.astronomy.fits_header import is_fits
 from turbrestore.io.astronomy.fits_output import FITS_OUTPUT_SUFFIX, write_fits
 from turbrestore.io.images import write_image
@@ -116,24 +117,29 @@ def write_result(
     path: Path, restoration: Restoration, source: FrameSource, bit_depth: int, command: tuple[str, ...], overwrite: bool
 ) -> None:
     """Write the restored image; a FITS file also has the header of the input, the history of the run and UNCERT."""
+    finer, header, uncertainty = restoration.finer, source.header, restoration.uncertainty
+    image = restoration.image if finer is None else finer
     if not is_fits(path):
-        write_image(path, restoration.image, bit_depth, overwrite, source.levels)
+        write_image(path, image, bit_depth, overwrite, source.levels)
         return
+    if finer is not None:
+        # Both are those of the grid of the frames.
+        header, uncertainty = without_sky(header), None
     x, y, *_ = restoration.crop
     history = [f"turbrestore {__version__}: {shlex.join(command)}", *source.warnings]
     history += [f"{decision.subject}: {decision.choice}" for decision in restoration.decisions]
-    if restoration.uncertainty is not None:
+    if uncertainty is not None:
         history.append("UNCERT: standard deviation of each pixel, infinite where nothing is known")
     rows, columns = source.window
     write_fits(
         path,
-        restoration.image,
+        image,
         bit_depth,
         overwrite,
-        header=source.header,
+        header=header,
         history=history,
         origin=(columns.start + x, rows.start + y),
-        uncertainty=restoration.uncertainty,
+        uncertainty=uncertainty,
         levels=source.levels,
     )
 

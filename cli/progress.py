@@ -13,6 +13,7 @@ TITLES = {
     "centroid": "centroid",
     "filter": "alternating filter",
     "deconvolve": "deconvolution",
+    "register": "registered frames",
     "steady": "frames",
     "synthesize": "frames",
     "batch": "clips",

@@ -25,6 +25,7 @@ from turbrestore.results import Restoration
 from turbrestore.runs.run_record import describe_run
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.settings import Preset, RestoreParams
+from turbrestore.stacking.placement import settings_of_known_flows
 from turbrestore.tiled_stages import TileMap
 
 from .cluster import check_cluster, connected, over_workers
@@ -215,16 +216,15 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     source = open_input(place, order.selection, order.quiet)
     if order.truth is not None:
         comparable(source.read(0, 1)[0], source.name)
-    check_room(source, order.params, runtime, order.output, order.keep)
-    with kept_stages(
-        order.keep, source, order.params, runtime, order.resume, order.checkpoint_every, order.quiet
-    ) as stages:
+    params = settings_of_known_flows(order.params, len(source))
+    check_room(source, params, runtime, order.output, order.keep)
+    with kept_stages(order.keep, source, params, runtime, order.resume, order.checkpoint_every, order.quiet) as stages:
         with (
             _elsewhere(order, source) as map_tiles,
-            progress_bars(order.quiet, _expected_times(source, order.params)) as progress,
+            progress_bars(order.quiet, _expected_times(source, params)) as progress,
         ):
             tell_decision = _say_decision if order.verbose else None
-            restoration = run_pipeline(source, order.params, runtime, stages, progress, tell_decision, map_tiles)
+            restoration = run_pipeline(source, params, runtime, stages, progress, tell_decision, map_tiles)
         record = settings_record(
             order.params, order.selection, order.bit_depth, order.machine, order.memory_limit, order.preset, order.tile
         )

@@ -63,6 +63,11 @@ from .seeing.strength import measure_seeing as measure_seeing
 from .seeing.tilt_theory import Optics as Optics
 from .settings import RestoreParams as RestoreParams
 from .settings import preset as preset
+from .stacking.alignment import Alignment as Alignment
+from .stacking.registered import RegisteredFrame as RegisteredFrame
+from .stacking.registered import registered_frames as registered_frames
+from .stacking.results_alignment import AlignedResults as AlignedResults
+from .stacking.results_alignment import align_results as align_results
 from .steady.settings import SteadyParams as SteadyParams
 from .steady.video import SteadyFrame as SteadyFrame
 from .steady.video import steady_frames as steady_frames

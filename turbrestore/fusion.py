@@ -39,6 +39,7 @@ from .runtime.tiling import HaloTile, cut_tile
 from .seeing.displacement import LEAST_FRAMES
 from .seeing.strength import Seeing
 from .settings import RestoreParams
+from .stacking.placement import centroid_of_known_flows, onto_reference
 from .tiled_stages import (
     TileMap,
     centroid_tasks,
@@ -163,7 +164,7 @@ def fuse(run: Run) -> Fused:
         return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation, dynamics)
 
     start = levels.stretched_result(centroid)
-    filtered = run.stage("filter", "filtered", lambda: _filter(run, start, dynamics, training, stream).recentred())
+    filtered = run.stage("filter", "filtered", lambda: _placed(run, _filter(run, start, dynamics, training, stream)))
     unread = _added_up(run.source, total) if run.tiles else stream
     mean = run.stage("filter", "mean", lambda: levels.original(_mean(unread, total, len(run.source))))
     # The sharpness is NaN for frames that do not count.
@@ -181,6 +182,18 @@ def fuse(run: Run) -> Fused:
 
 
 def _find_centroid(run: Run, training: FloatArray) -> Centroid:
+    params, runtime = run.params, run.plan.runtime
+    if params.like is not None:
+        return centroid_of_known_flows(training, run.source, params.like, runtime)
+    found = _own_centroid(run, training)
+    if params.reference is None:
+        return found
+    placed, on_reference = onto_reference(found, training, params.reference, runtime)
+    run.decide(on_reference)
+    return placed
+
+
+def _own_centroid(run: Run, training: FloatArray) -> Centroid:
     params, runtime, train = run.params, run.plan.runtime, len(training)
     if run.tiles:
         parts = _centroids_here(run, training) if run.map_tiles is None else _centroids_elsewhere(run, train)
@@ -275,6 +288,13 @@ def _find_saturation(run: Run, training: FloatArray) -> float:
     brightest = run.levels.original(np.array([max(frame.max() for frame in iter_frames(training))], np.float32))
     noise, bits = estimate_noise(training[0]) / run.levels.gain, min(run.source.bit_depth, _MOST_BITS)
     return saturation_level(float(brightest[0]), noise, 1 / (2**bits - 1))
+
+
+def _placed(run: Run, filtered: Filtered) -> Filtered:
+    """Move a filtered image onto the mean geometry of its frames, unless its geometry is that of another clip."""
+    if run.params.reference is None and run.params.like is None:
+        return filtered.recentred()
+    return replace(filtered, mean_flow=np.zeros_like(filtered.mean_flow))
 
 
 def _filter(

@@ -217,7 +217,15 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget
         "filter": held + modes + flow + filter_memory(part, train, params.filter, threads),
         "deconvolve": max(deblurred, halves),
     }
-    return max(results + _report(shape), *(size for name, size in stages.items() if params.runs(name)))
+    finer = 0.0 if params.scale == 1 else results + _on_finer_grid(shape, params, threads)
+    return max(finer, results + _report(shape), *(size for name, size in stages.items() if params.runs(name)))
+
+
+def _on_finer_grid(shape: tuple[int, ...], params: RestoreParams, threads: int) -> float:
+    """Bytes of the sums of two halves, which every thread has too, and of the deconvolution there."""
+    side = round(params.scale * shape[1]), round(params.scale * shape[2]), *shape[3:]
+    sums = side[0] * side[1] * 16.0 * (_channels(shape) + 1) * (threads + 2)
+    return max(sums, remove_blur_memory(side, params.deconvolution) + 8.0 * side[0] * side[1] * _channels(shape))
 
 
 def _deconvolution_side(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget: float) -> int | None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -38,6 +39,8 @@ from .runtime.runtime import DEFAULT, Runtime
 from .runtime.steps import Progress, finish
 from .runtime.tiling import halo_tiles
 from .settings import RestoreParams
+from .stacking.fine_grid import fine_image, fine_shape
+from .stacking.placement import settings_of_known_flows
 from .tiled_stages import TileMap
 from .uncertainty.pixel_deviation import (
     informed_pixels,
@@ -120,6 +123,7 @@ def restore(
     source, on_blank = (
         (frames, ()) if isinstance(frames, FrameSource) else without_blank(FrameSource.from_array(frames))
     )
+    params = settings_of_known_flows(params, len(source))
     plan = plan_memory(source.shape, params, runtime)
     psf = None if params.psf is None else psf_from_image(read_image(params.psf).image, params.psf)
     _check_sigma(params.deconvolution.sigma if psf is None else read_blur(psf)[1], source.shape)
@@ -136,19 +140,39 @@ def restore(
     run.decide(*prepared.decisions)
     with returning_freed_memory(runtime.memory_limit is not None):
         restoration = _restored(run)
+    if params.scale > 1:
+        restoration = _refined(run, restoration)
     for kept in (prepared.title, bars):
         restoration = restoration if kept is None else _put_back(restoration, kept)
     return restoration
 
 
+def _refined(run: Run, restoration: Restoration) -> Restoration:
+    """Add the image on the finer grid."""
+    begun = time.perf_counter()
+    found = fine_image(run.prepared, restoration, run.params, run.plan.runtime)
+    run.decide(*found.decisions)
+    x, y, width, height = restoration.crop
+    upper, left = fine_shape((y, x), run.params.scale)
+    lower, right = fine_shape((y + height, x + width), run.params.scale)
+    run.seconds["scale"] = time.perf_counter() - begun
+    return replace(restoration, finer=found.image[upper:lower, left:right], decisions=tuple(run.decisions))
+
+
 def _put_back(restoration: Restoration, kept: Bars | Title) -> Restoration:
     """Give the images of a restoration what is no scene."""
     image, uncertainty = kept.put_back(restoration.image, *restoration.crop[:2]), restoration.uncertainty
+    finer = restoration.finer
+    if finer is not None:
+        changed, usual = (image != restoration.image).astype(np.float32), image
+        size = finer.shape[1::-1]
+        hidden, usual = (cv2.resize(one, size, interpolation=cv2.INTER_LINEAR) for one in (changed, usual))
+        finer = np.where(hidden > 0.5, usual, finer)
     if uncertainty is not None:
         # What lies under it was not seen.
         hidden = kept.put_back(np.full_like(restoration.image, -1), *restoration.crop[:2]) >= 0
         uncertainty = np.where(hidden if hidden.ndim == 2 else hidden[..., 0], np.float32(np.inf), uncertainty)
-    return replace(restoration, image=image, mean=kept.put_back(restoration.mean), uncertainty=uncertainty)
+    return replace(restoration, image=image, mean=kept.put_back(restoration.mean), uncertainty=uncertainty, finer=finer)
 
 
 def _restored(run: Run) -> Restoration:

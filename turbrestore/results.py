@@ -139,6 +139,8 @@ class Restoration:
     uncertainty : ndarray, float32, shape (H, W), or None
         Standard deviation of every pixel of the image, intensity; infinite where nothing is known, and everywhere
         where the mean of the frames is the result; None unless the filter has run.
+    finer : ndarray, float32, shape (s·H, s·W) or (s·H, s·W, 3), or None
+        The image on a grid that is ``RestoreParams.scale`` times as fine; None where that is 1.
     disagreement : ndarray, float32, shape (H, W), or None
         Share, 0 to 1, of the mean of the registered frames in the detail of the image, because they do not agree on it;
         None unless the image was deblurred.
@@ -160,6 +162,7 @@ class Restoration:
     seeing: Seeing | None = None
     uncertainty: FloatArray | None = None
     posterior: BlurPosterior | None = None
+    finer: FloatArray | None = None
     disagreement: FloatArray | None = None
 
     @property

@@ -9,7 +9,7 @@ from typing import Literal
 
 from .blind.guards import GuardParams
 from .blur.psf import GAUSSIAN
-from .core.errors import require
+from .core.errors import require, require_between
 from .deconvolution.deconvolve import DeconvolutionParams
 from .dynamics.dynamic_texture import DynamicsParams
 from .filtering.alternating import FilterParams
@@ -58,6 +58,15 @@ class RestoreParams:
     psf : str, optional
         Image of a star or of a measured blur to remove, in pixels of the clip.  It takes the place of an estimated
         blur.
+    reference : str, optional
+        Image, or folder of a kept run, whose geometry the result has.  Its brightness and contrast may differ, as those
+        of another filter or camera do.
+    like : str, optional
+        Flows of another recording of the same instants, which are applied as they are.  The folder of a kept run that
+        trained on all of its frames, or the file of ``register --flows``.
+    scale : float
+        How much finer the grid of the result is, 1 to 3.  Frames are fused there by their motion of fractions of
+        pixels, which gains detail where the lens is sharper than the pixels are small.
     flow : FlowParams
         Optical flow.
     centroid : CentroidParams
@@ -92,6 +101,9 @@ class RestoreParams:
     distance: float | None = None
     wavelength: float = 550e-9
     psf: str | None = None
+    reference: str | None = None
+    like: str | None = None
+    scale: float = 1.0
     flow: FlowParams = field(default_factory=FlowParams)
     centroid: CentroidParams = field(default_factory=CentroidParams)
     dynamics: DynamicsParams = field(default_factory=DynamicsParams)
@@ -114,6 +126,19 @@ class RestoreParams:
         require(
             self.static_mask in ("auto", "off") or "." in self.static_mask,
             f"static_mask: expected auto, off or an image file, found {self.static_mask!r}",
+        )
+        require(
+            self.reference is None or self.like is None,
+            "like: its flows lead from a geometry of their own, which contradicts reference; leave one of them out",
+        )
+        require(
+            self.like is None or self.filter.training == "filter",
+            "like: expected filter.training = filter, because the known flows are those of all frames",
+        )
+        require_between("scale", self.scale, 1, 3)
+        require(
+            self.scale == 1 or self.until in STAGES[2:],
+            f"scale: has no effect with until = {self.until}; leave one of them out",
         )
         check_share(self.keep_best)
         known_optics(self.pixel_scale, self.aperture, self.wavelength, self.distance)

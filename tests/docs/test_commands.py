@@ -32,13 +32,14 @@ VIDEOS = {
     "moon.fits",
     "clip.npy",
 }
-VIDEOS |= {"night/first.ser", "night/second.ser"}
+VIDEOS |= {"night/first.ser", "night/second.ser", "red.ser", "green.ser", "blue.ser", "infrared.ser"}
 FOLDERS = {"flats", "frames"}
 IMAGES = {"photo.png", "mask.png"}
 # Settings that take less time.  Numbers of frames become those of the stand-ins.
 STEPS = ["--deconvolution.iterations", "3", "--quiet"]
 QUICK = {
     "restore": ["--centroid.iterations", "1", "--filter.inner-iterations", "1", *STEPS],
+    "register": ["--centroid.iterations", "1", "--filter.inner-iterations", "1", "--quiet"],
     "batch": ["--centroid.iterations", "1", "--filter.inner-iterations", "1", *STEPS, "--workers", "1"],
     "deconvolve": STEPS,
     "synthesize": ["--frames", "6", "--quiet"],

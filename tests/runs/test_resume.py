@@ -202,7 +202,7 @@ def test_every_setting_belongs_to_one_stage_or_changes_nothing_that_is_kept():
     facts = stage_dependencies(source, params, plan_memory(source.shape, params, DEFAULT))
     held = {name for stage in facts.values() for name in stage}
     # What the number of training frames changes is which frames these are.
-    idle = {"until", "border", "train"}
+    idle = {"until", "border", "train", "scale"}
     assert {item.name for item in dataclasses.fields(RestoreParams)} - held == idle
     assert sum(len(stage) for stage in facts.values()) == len(held)
     assert set(dataclasses.asdict(params.flow)) == set(facts["centroid"]["flow"])

@@ -118,10 +118,15 @@ def crop_to_object(source: FrameSource) -> FrameSource:
         window=(slice(0, window[0]), slice(0, window[1])),
         pixels=pixels,
         repair=_unchanged,
-        header=tuple(card for card in source.header if not card.startswith(_SKY)),
+        header=without_sky(source.header),
         warnings=(*source.warnings, remark),
     )
     return cropped.without(lost, f"the object is cut or not there: {numbers_text(lost)} left out")
+
+
+def without_sky(header: tuple[str, ...]) -> tuple[str, ...]:
+    """Leave out the cards that say where pixels lie in the sky."""
+    return tuple(card for card in header if not card.startswith(_SKY))
 
 
 def _corner(place: ObjectPlace, window: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:

@@ -37,6 +37,8 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
             "region": [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start],
             "device": plan.runtime.device,
             "static_mask": _mask_digest(params.static_mask),
+            "reference": _geometry_digest(params.reference),
+            "like": _geometry_digest(params.like),
             "flow": settings["flow"],
             "centroid": settings["centroid"],
             "versions": versions(),
@@ -68,6 +70,16 @@ def _digest(path: str) -> str:
     """Return the checksum of a file that a setting names."""
     with input_errors(Path(path)):
         return file_digest(Path(path))
+
+
+def _geometry_digest(named: str | None) -> str | None:
+    """Return the checksum of an image, of flows, or of the stages of a run that have its geometry."""
+    if named is None:
+        return None
+    path = Path(named)
+    with input_errors(path):
+        files = [path / name for name in ("centroid.npz", "filtered.npz")] if path.is_dir() else [path]
+        return " ".join(file_digest(file) for file in files if file.exists())
 
 
 def _span(numbers: Sequence[int]) -> list[int]:

@@ -7,6 +7,7 @@ import re
 import unicodedata
 import warnings
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arrays import FloatArray, check_image
-from ..output import atomic_output, check_output, check_space
+from ..output import atomic_output, check_output, check_space, frames_of_one_size
 from ..pixels import PixelArray, at_levels, check_depth, from_unit_to_type
 from .fits_header import astropy_fits
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from astropy.io.fits import Header
 
 FITS_OUTPUT_SUFFIX = ".fits"
+# Headers and data fill blocks of so many bytes.
+_BLOCK = 2880
 # What describes the numbers and axes of the input, and not the scene.
 _STRUCTURE = re.compile(
     r"SIMPLE|XTENSION|EXTEND|EXTNAME|EXTVER|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|GROUPS|BSCALE|BZERO|BLANK|BUNIT|DATAMIN|"
@@ -68,6 +71,41 @@ def write_fits(
             images[-1].header["BUNIT"] = "pixel"
         with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
             fits.HDUList(images).writeto(file, output_verify="silentfix+ignore")
+
+
+def write_fits_cube(
+    path: str | os.PathLike[str],
+    frames: Iterable[FloatArray],
+    count: int,
+    bit_depth: int,
+    overwrite: bool = False,
+    *,
+    history: Iterable[str] = (),
+    levels: tuple[float, float] | None = None,
+) -> None:
+    """Write a known number of frames, taken one at a time, as a cube (T, H, W), or (T, 3, H, W) in colour.
+
+    ``frames`` (H, W) or (H, W, 3) each.
+    """
+    fits, stream = astropy_fits(), frames_of_one_size(frames, path)
+    depth, first = check_depth(bit_depth), next(stream)
+    middle = 0.0
+    with warnings.catch_warnings(), atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+        warnings.simplefilter("ignore")
+        for number, frame in enumerate(chain([first], stream)):
+            pixels = _planes_first(at_levels(from_unit_to_type(frame, depth), levels))
+            if number == 0:
+                header = fits.PrimaryHDU(np.zeros((1, *pixels.shape), pixels.dtype)).header
+                header[f"NAXIS{pixels.ndim + 1}"] = count
+                for line in history:
+                    header.add_history(_ascii(line))
+                check_space(path, count * pixels.nbytes)
+                file.write(header.tostring().encode("ascii"))
+                middle = header.get("BZERO", 0)
+            # FITS has no unsigned numbers of 16 bits: zero is written as the least signed one.
+            stored = (pixels.astype(np.int64) - int(middle)).astype("i2") if middle else pixels
+            file.write(stored.astype(stored.dtype.newbyteorder(">")).tobytes())
+        file.write(bytes(-file.tell() % _BLOCK))
 
 
 def _kept(cards: Sequence[str], origin: tuple[int, int], fits: Any) -> Header:

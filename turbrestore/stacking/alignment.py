@@ -1,0 +1,247 @@
+"""Alignment of a result to an image of the same scene: shift, rotation and scale, and the smooth flow that remains.
+
+Symbols
+-------
+r, q : reference and image; W : smooth flow, pixels
+A : similarity from the reference to the image, ``A x = c (cos φ, −sin φ; sin φ, cos φ) x + s``
+F : the whole alignment, ``id + F = A ∘ (id + W)``, so that ``q ∘ (id + F) ≈ r``
+
+Results of other clips have another brightness and contrast, perhaps another sign of it: bands of Jupiter in methane,
+leaves in the infrared.  So neither image is compared by its intensities.  Both are reduced to the same sharpness, and
+to their deviation from a local mean in units of the local spread; where that does not correlate, to its negative, and
+to the length of its gradient, which has no sign.
+
+A maximises the enhanced correlation coefficient (Evangelidis and Psarakis 2008) on three levels of a pyramid, from the
+shift that phase correlation finds.  W is the dense flow after that, averaged in Gaussian windows with the energy of the
+gradient as weight, because what remains between two results is the mean displacement by air, which is smooth; where a
+window has little gradient, the average of a wider one stands in.  W is measured twice, the second time from the image
+that the first has moved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.arrays import FloatArray, luminance
+from ..core.errors import DataError
+from ..registration.camera.global_shift import correlation, measure_shift, prepare_shift_reference
+from ..registration.flow import FlowParams, estimate_flow
+from ..registration.warp import inside, warp
+from ..runtime.runtime import DEFAULT, Runtime
+from ..steady.camera import camera_flow, fit_camera
+
+Matrix = NDArray[np.float64]
+# What reference and image are reduced to before they are compared.
+_Features = tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]
+
+# Longest sides of the levels on which the similarity is found, pixels.
+_LEVELS = (64, 160, 640)
+# Least sharpness that images are compared at, and the window of their local mean and spread, pixels.
+_LEAST_BLUR, _WINDOW, _FLOOR = 1.0, 8.0, 0.02
+# Blurs that are tried on the sharper image, pixels.
+_BLURS = np.arange(0.0, 3.01, 0.25)
+# Correlation below which features say nothing, and above which no other features are tried.
+_ALIKE, _CLEARLY = 0.2, 0.6
+# Iterations of the correlation and the change that ends them.
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)
+# Standard deviations of the windows in which the flow is averaged, pixels, and the share of the usual weight below
+# which a window holds little.
+_WINDOWS, _LITTLE = (32.0, 16.0, 8.0, 4.0), 0.1
+# Distance from its neighbourhood beyond which a displacement counts little, pixels.
+_FAR = 1.0
+# Largest displacement that remains after the similarity, pixels, and how often the flow is measured.
+_LARGEST, _PASSES = 4.0, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Where an image lies against a reference.
+
+    Attributes
+    ----------
+    shift : tuple of float
+        Of the centre of the reference, pixels to the right and down.
+    rotation : float
+        Degrees, from the x axis towards the y axis.
+    scale : float
+        Of the image relative to the reference.
+    flow : ndarray, float32, shape (H, W, 2)
+        F, from the reference to the image, pixels.
+    residual : float
+        Root mean square of what F has beyond shift, rotation and scale, pixels.
+    likeness : float
+        Correlation of reference and aligned image, after their local contrast is made equal.
+    """
+
+    shift: tuple[float, float]
+    rotation: float
+    scale: float
+    flow: FloatArray
+    residual: float
+    likeness: float
+
+
+def align_to(image: FloatArray, reference: FloatArray, runtime: Runtime = DEFAULT) -> Alignment:
+    """Find where an image of the same scene lies against a reference.
+
+    ``image``, ``reference`` (H, W) or (H, W, 3) of one size; DataError where they are not alike.
+    """
+    if image.shape[:2] != reference.shape[:2]:
+        raise DataError(f"image: expected the size of the reference {reference.shape[:2]}, found {image.shape[:2]}")
+    a, b = _equally_sharp(luminance(reference), luminance(image))
+    best, A, features = -1.0, np.eye(2, 3), _FEATURES[0]
+    for tried in _FEATURES:
+        likeness, found = _similarity(a, b, tried)
+        if likeness > best:
+            best, A, features = likeness, found, tried
+        if best > _CLEARLY:
+            break
+    if best < _ALIKE:
+        raise DataError(f"image: expected the scene of the reference, found a likeness of {max(best, 0):.2f} with it")
+    first, second = (feature(image) for feature, image in zip(features, (a, b), strict=True))
+    W, weight = np.zeros((*a.shape, 2), np.float32), _energy(a)
+    for _ in range(_PASSES):
+        F = _joined(A, W)
+        there = warp(second, F)
+        rest = estimate_flow(_unit(first), _unit(there)[None], FlowParams(global_shift=False), runtime)[0]
+        # Where the contrast differs in kind, edges of the two do not lie in one place.
+        trusted = weight * np.square(_local_correlation(first, there)) * inside(F)
+        W += _smoothed(np.clip(rest, -_LARGEST, _LARGEST), trusted)
+    F = _joined(A, W)
+    return _described(F, correlation(first, warp(second, F)))
+
+
+def _local_correlation(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Correlation in a window about every pixel; negative ones count as none."""
+    product, *squares = (cv2.GaussianBlur(one, (0, 0), _WINDOW) for one in (a * b, a * a, b * b))
+    return np.clip(product / np.sqrt(squares[0] * squares[1] + np.float32(1e-12)), 0, 1)
+
+
+def _smoothed(flow: FloatArray, weight: FloatArray) -> FloatArray:
+    """Average a flow in windows of one size after the other; where a window holds little, that of the one before."""
+    smooth, usual = np.zeros_like(flow), np.float32(_LITTLE * weight.mean() + 1e-30)
+    for width in _WINDOWS:
+        # What lies far from its neighbourhood has followed another period of a pattern.
+        trusted = weight / (1 + np.square(flow - smooth).sum(axis=-1) / np.float32(_FAR**2))
+        held = cv2.GaussianBlur(trusted, (0, 0), width)[..., None]
+        total = cv2.GaussianBlur(flow * trusted[..., None], (0, 0), width)
+        smooth = (total + usual * smooth) / (held + usual)
+    return smooth
+
+
+def _described(F: FloatArray, likeness: float) -> Alignment:
+    """Take shift, rotation and scale off a flow, by the similarity that fits it best."""
+    fitted = fit_camera(F)
+    along, across = 1 + (fitted[0, 0] + fitted[1, 1]) / 2, (fitted[1, 0] - fitted[0, 1]) / 2
+    matrix = np.array([[along - 1, -across, fitted[0, 2]], [across, along - 1, fitted[1, 2]]])
+    rest = F - camera_flow(matrix, F.shape)
+    return Alignment(
+        shift=(float(fitted[0, 2]), float(fitted[1, 2])),
+        rotation=math.degrees(math.atan2(across, along)),
+        scale=math.hypot(along, across),
+        flow=F,
+        residual=float(np.sqrt(np.square(rest).sum(axis=-1).mean())),
+        likeness=likeness,
+    )
+
+
+def _equally_sharp(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Blur both images a little, and the sharper one until both have the same share of fine detail."""
+    a, b = (cv2.GaussianBlur(image, (0, 0), _LEAST_BLUR) for image in (a, b))
+    sharper, other = (a, b) if _fineness(a) > _fineness(b) else (b, a)
+    wanted = _fineness(other)
+    tried = [sharper, *(cv2.GaussianBlur(sharper, (0, 0), blur) for blur in _BLURS[1:])]
+    softened = min(tried, key=lambda image: abs(_fineness(image) - wanted))
+    return (softened, b) if sharper is a else (a, softened)
+
+
+def _fineness(image: FloatArray) -> float:
+    """Energy of the second derivative over that of the first: the squared frequency that carries the gradient."""
+    gradient = sum(float(np.square(cv2.Sobel(image, cv2.CV_32F, *axis)).mean()) for axis in ((1, 0), (0, 1)))
+    return float(np.square(cv2.Laplacian(image, cv2.CV_32F)).mean()) / max(gradient, 1e-12)
+
+
+def _levels(image: FloatArray) -> FloatArray:
+    """Deviation from the local mean in units of the local spread."""
+    image = image / np.float32(max(float(np.ptp(image)), 1e-6))
+    centred = image - cv2.GaussianBlur(image, (0, 0), _WINDOW)
+    return centred / np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), _WINDOW) + np.float32(_FLOOR**2))
+
+
+def _edges(image: FloatArray) -> FloatArray:
+    """Length of the gradient, without its local mean."""
+    levels = _levels(image)
+    length = cv2.magnitude(*(cv2.Sobel(levels, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1))))
+    return _levels(cv2.GaussianBlur(length, (0, 0), 1.0))
+
+
+def _energy(feature: FloatArray) -> FloatArray:
+    return sum(np.square(cv2.Sobel(feature, cv2.CV_32F, *axis)) for axis in ((1, 0), (0, 1)))
+
+
+def _unit(feature: FloatArray) -> FloatArray:
+    return np.clip(0.5 + feature / 8, 0, 1)
+
+
+def _negative(image: FloatArray) -> FloatArray:
+    return -_levels(image)
+
+
+def _similarity(a: FloatArray, b: FloatArray, features: _Features) -> tuple[float, Matrix]:
+    """Similarity A, with the correlation that it reaches."""
+    first, second = features
+    coarse = [function(_reduced(image, _LEVELS[1])) for function, image in ((first, a), (second, b))]
+    shift = measure_shift(_unit(coarse[1]), prepare_shift_reference(_unit(coarse[0])))
+    found = np.zeros(2) if shift is None else shift * (a.shape[1] / coarse[0].shape[1])
+    warped = np.column_stack([np.eye(2), found])
+    for side in _LEVELS:
+        pair = first(_reduced(a, side)), second(_reduced(b, side))
+        enlarged = _pixels_of(a.shape, pair[0].shape)
+        start = (np.linalg.inv(enlarged) @ np.vstack([warped, (0, 0, 1)]) @ enlarged)[:2].astype(np.float32)
+        try:
+            _, affine = cv2.findTransformECC(*pair, start, cv2.MOTION_AFFINE, _CRITERIA, None, 5)
+        except cv2.error:
+            # It does not converge where nothing is alike.
+            continue
+        whole = enlarged @ np.vstack([affine.astype(np.float64), (0, 0, 1)]) @ np.linalg.inv(enlarged)
+        warped = _closest_similarity(whole, a.shape)
+    alike = correlation(first(a), warp(second(b), _joined(warped, np.zeros((*a.shape, 2), np.float32))))
+    return alike, warped
+
+
+_FEATURES: tuple[_Features, ...] = ((_levels, _levels), (_levels, _negative), (_edges, _edges))
+
+
+def _reduced(image: FloatArray, side: int) -> FloatArray:
+    factor = max(1.0, max(image.shape) / side)
+    size = round(image.shape[1] / factor), round(image.shape[0] / factor)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _pixels_of(shape: tuple[int, ...], reduced: tuple[int, ...]) -> Matrix:
+    """From pixels of a reduced image to those of the image; centres of pixels lie at half of their side."""
+    x, y = shape[1] / reduced[1], shape[0] / reduced[0]
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
+
+
+def _closest_similarity(affine: Matrix, shape: tuple[int, ...]) -> Matrix:
+    """Rotation and scale of an affine map, which agrees with it at the centre of the image."""
+    centre = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    along, across = (affine[0, 0] + affine[1, 1]) / 2, (affine[1, 0] - affine[0, 1]) / 2
+    linear = np.array([[along, -across], [across, along]])
+    return np.column_stack([linear, affine[:2, :2] @ centre + affine[:2, 2] - linear @ centre])
+
+
+def _joined(A: Matrix, W: FloatArray) -> FloatArray:
+    """Flow F of ``A ∘ (id + W)``."""
+    y, x = np.mgrid[: W.shape[0], : W.shape[1]].astype(np.float64)
+    u, v = x + W[..., 0], y + W[..., 1]
+    return np.stack([A[0, 0] * u + A[0, 1] * v + A[0, 2] - x, A[1, 0] * u + A[1, 1] * v + A[1, 2] - y], -1).astype(
+        np.float32
+    )

@@ -1,0 +1,128 @@
+"""Frames sorted by quality, and what keeping a share of them costs and gains, as people who stack know it.
+
+Symbols
+-------
+q_k : quality of frame k, :func:`turbrestore.footage.frame_selection.frame_quality`, without what noise adds to it
+a_k : √q_k, amplitude of its fine detail over its brightness; ā(n) mean of the n largest
+z : noise of a frame over the mean brightness; f : 0.002 over that brightness, what models are wrong by
+n : frames that are kept, of T
+
+The mean of n registered frames has the mean amplitude of their detail and the noise ``z / √n``.  So sharpness gains
+``ā(n) / ā(T)`` and noise costs ``√(T / n)``.  The suggested share has the largest ``ā(n) / √(z² / n + f²)``: there
+detail stands highest above noise and error.  Frames that barely differ are all worth keeping, and a few that the air
+has spared are worth more than the rest only where noise is low.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.arrays import FloatArray, luminance
+from ..core.noise import estimate_noise
+from ..footage.frame_selection import best_frames, frame_quality
+
+SHARES = (0.1, 0.25, 0.5)
+# Error of the models of blur and registration, intensity, as in Wiener deconvolution.
+_ERROR, _DARK = 0.002, 1e-3
+# Side of the image that the filter of the quality is tried on, pixels.
+_SIDE = 64
+
+
+@dataclass(frozen=True)
+class KeptShare:
+    """What keeping the best frames means.
+
+    Attributes
+    ----------
+    share : float
+        Share of the frames, 0 to 1.
+    frames : int
+    noise : float
+        Noise of their mean over that of the mean of all frames.
+    sharpness : float
+        Fine detail of their mean over that of all frames, if both are registered.
+    """
+
+    share: float
+    frames: int
+    noise: float
+    sharpness: float
+
+
+@dataclass(frozen=True, eq=False)
+class QualityList:
+    """Quality of the frames of a clip.
+
+    Attributes
+    ----------
+    quality : ndarray, float64, shape (T,)
+        q_k, in the order of the frames.
+    kept : tuple of KeptShare
+        For 10, 25 and 50 % of the frames.
+    suggested : KeptShare
+    """
+
+    quality: NDArray[np.float64]
+    kept: tuple[KeptShare, ...]
+    suggested: KeptShare
+
+    @property
+    def order(self) -> NDArray[np.int64]:
+        """Places of the frames, the best first."""
+        return np.argsort(-self.quality, kind="stable")
+
+
+def quality_list(frames: Iterable[FloatArray]) -> QualityList:
+    """Sort the frames of a clip, which are taken one at a time, by quality."""
+    raw, noise, level = np.array([_facts(luminance(frame)) for frame in frames]).T
+    quality = np.maximum(raw - _noise_energy() * (noise / level) ** 2, 0.0)
+    z, f = float(np.median(noise / level)), _ERROR / float(np.median(level))
+    sizes = np.arange(1, len(quality) + 1)
+    means = np.cumsum(np.sort(np.sqrt(quality))[::-1]) / sizes
+    best = int(np.argmax(means / np.sqrt(z**2 / sizes + f**2)))
+
+    def keeping(count: int) -> KeptShare:
+        gain = means[count - 1] / means[-1] if means[-1] > 0 else 1.0
+        return KeptShare(count / len(quality), count, float(np.sqrt(len(quality) / count)), float(gain))
+
+    kept = tuple(keeping(int(best_frames(quality, share).sum())) for share in SHARES)
+    return QualityList(quality, kept, keeping(best + 1))
+
+
+def quality_table(found: QualityList, numbers: Iterable[int], listed: int = 10) -> str:
+    """Write the list for a terminal: what shares cost and gain, and the best and the worst frames."""
+    names = list(numbers)
+    lines = ["share kept   frames   noise   sharpness"]
+    rows = [*((f"{one.share:.0%}", one) for one in found.kept), (f"{found.suggested.share:.0%} *", found.suggested)]
+    lines += [f"{name:<10} {one.frames:>8} {one.noise:>6.2f}× {one.sharpness:>10.2f}×" for name, one in rows]
+    lines += ["* suggested: there detail stands highest above noise; restore weighs frames by itself", ""]
+    top = float(found.quality.max()) or 1.0
+    order = found.order
+    places: list[int | None] = list(range(len(order)))
+    if len(order) > 2 * listed:
+        places[listed:-listed] = [None]
+    lines.append("rank    frame   quality")
+    for place in places:
+        if place is None:
+            lines.append("   …")
+            continue
+        share = found.quality[order[place]] / top
+        lines.append(f"{place + 1:>4} {names[order[place]]:>8}   {share:>6.1%} {'▇' * round(30 * share)}")
+    return "\n".join(lines)
+
+
+def _facts(grey: FloatArray) -> tuple[float, float, float]:
+    """Quality, noise and mean brightness of a frame."""
+    return float(frame_quality([grey])[0]), estimate_noise(grey), max(float(grey.mean()), _DARK)
+
+
+def _noise_energy() -> float:
+    """Energy of the filter of the quality: its response to one bright pixel, squared and summed."""
+    impulse = np.zeros((_SIDE, _SIDE), np.float32)
+    impulse[_SIDE // 2, _SIDE // 2] = 1
+    # The quality of an image is its energy a pixel over its squared mean.
+    return float(frame_quality([impulse])[0]) * max(float(impulse.mean()), _DARK) ** 2 * impulse.size
