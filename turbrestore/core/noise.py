@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import nnls
+import scipy
 
 from .arrays import FloatArray, check_image, luminance
 
@@ -68,7 +68,7 @@ def fit_noise_curve(level: FloatArray, variance: FloatArray, energy: FloatArray)
     design[np.arange(2 * len(found)), np.repeat(np.arange(len(found)), 2)] = 1
     scale = max(float(found[..., 2].max()), 1e-18)
     design[:, -1] = found[..., 2].ravel() / scale
-    variances, _ = nnls(design, found[..., 1].ravel())
+    variances, _ = scipy.optimize.nnls(design, found[..., 1].ravel())
     return NoiseCurve(known, variances[:-1])
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+import scipy
 
 # ndarray or torch tensor.
 Array = Any
@@ -46,8 +46,8 @@ def numpy_ops(threads: int = 1) -> ArrayOps:
         arrays=np,
         load=lambda array: array,
         store=lambda array: array,
-        forward=lambda image: fft.rfft2(image, workers=workers(image.shape)),
-        back=lambda spectrum, shape: fft.irfft2(spectrum, s=shape, workers=workers(shape)),
+        forward=lambda image: scipy.fft.rfft2(image, workers=workers(image.shape)),
+        back=lambda spectrum, shape: scipy.fft.irfft2(spectrum, s=shape, workers=workers(shape)),
     )
 
 

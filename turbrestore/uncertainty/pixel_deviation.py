@@ -37,7 +37,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+import scipy
 
 from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol, wiener_fidelity
 from ..core.arrays import FloatArray, luminance
@@ -82,7 +82,7 @@ def posterior_gain(size: tuple[int, int], fidelity: float, sigma: float, exponen
     shape = (min(size[0], _GRID), min(size[1], _GRID))
     power = np.abs(blur_otf(shape, sigma, exponent or GAUSSIAN)) ** 2
     # The first value of the inverse transform is the mean over all frequencies, of which half are stored.
-    return float(fft.irfft2(1 / (power + laplacian_symbol(*shape) / fidelity), s=shape)[0, 0])
+    return float(scipy.fft.irfft2(1 / (power + laplacian_symbol(*shape) / fidelity), s=shape)[0, 0])
 
 
 def variance_by_blur(fused: FloatArray, fidelity: float, widths: tuple[float, float], exponent: float) -> FloatArray:
