@@ -31,8 +31,8 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 import scipy
+from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import require

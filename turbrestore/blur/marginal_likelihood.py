@@ -34,8 +34,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 import scipy
+from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..runtime.jit import jit

@@ -26,8 +26,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 import scipy
+from numpy.typing import ArrayLike, NDArray
 
 from ..blur.psf import check_psf, wiener_fidelity
 from ..core.arrays import FloatArray, luminance

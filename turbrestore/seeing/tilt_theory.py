@@ -32,8 +32,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 import scipy
+from numpy.typing import NDArray
 
 from ..core.errors import ConfigurationError, require, require_between
 from ..synthesis.atmosphere import Layer, fried_parameter, phase_spectrum, tilt_variance
@@ -134,7 +134,12 @@ def displacement_differences(optics: Optics, spacing: float, counts: tuple[int, 
         f = np.geomspace(1e-3 / (pixel * spacing * max(counts) + cone), 30 / cone, _FREQUENCIES)
         x, y = (f[:, None] * part(angles) for part in (np.cos, np.sin))
         response = (
-            cone / optics.aperture * optics.wavelength * 8 * scipy.special.jv(2, np.pi * cone * f) / (np.pi * cone * f) ** 2
+            cone
+            / optics.aperture
+            * optics.wavelength
+            * 8
+            * scipy.special.jv(2, np.pi * cone * f)
+            / (np.pi * cone * f) ** 2
         )
         r0 = fried_parameter(1.0, thickness, optics.wavelength, 1.0)
         # d²f = f df dangle, and df = f d(log f).

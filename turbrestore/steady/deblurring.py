@@ -54,7 +54,9 @@ def deblur(
     def filtered(kind: int) -> FloatArray:
         power, otf, laplacian = _transfer(shape, sigma[kind], exponent)
         fidelity = max(_FIDELITY * contrast / float(np.hypot(noise[kind], _LEAST_NOISE[kind])), 1.0)
-        return scipy.fft.irfft2(planes * (fidelity * otf / (fidelity * power + laplacian)), shape)[inner].astype(np.float32)
+        return scipy.fft.irfft2(planes * (fidelity * otf / (fidelity * power + laplacian)), shape)[inner].astype(
+            np.float32
+        )
 
     result = filtered(0)
     share = 1 - 1 / np.sqrt(held)

@@ -22,8 +22,8 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 import scipy
+from numpy.typing import ArrayLike, NDArray
 
 from ...core.arrays import FloatArray, check_frames, check_image, luminance
 from ...core.errors import DataError
