@@ -1,6 +1,6 @@
 """Milliseconds of every stage on the CPU and on a device, transfers, a whole restoration, and agreement.
 
-    python benchmarks/device.py --device cuda --size 1080 1920 --frames 100 --runs 1 --write benchmarks/results/device.md
+    python benchmarks/device.py --device cuda --size 1080 1920 --frames 100 --runs 1 --write FILE
 
 prints a Markdown document, writes it, and exits with 1 where device and CPU differ by more than 0.02 dB or 0.02 px.
 Without ``--device`` it takes a GPU where torch sees one, else torch on the CPU.  Times are the best of some runs, all
@@ -156,8 +156,13 @@ def transfers(clip: Clip, device: str) -> list[str]:
     """Bandwidth of bringing a flow to the device and back, and what both take."""
     ops, flow = torch_ops(device), np.ascontiguousarray(clip.flows[0])
     there = ops.load(flow)
+
+    def load() -> None:
+        # Reading a number waits for the device.
+        ops.load(flow)[0, 0, 0].item()
+
     rows = []
-    for name, run in (("to the device", lambda: ops.load(flow)[0, 0].cpu()), ("back", lambda: ops.store(there))):
+    for name, run in (("to the device", load), ("back", lambda: ops.store(there))):
         taken = milliseconds(run, 5)
         rows.append(f"| {name} | {flow.nbytes / 1e6:.1f} | {taken:.2f} | {flow.nbytes / 1e6 / taken:.1f} |")
     return ["\n| a flow | MB | ms | GB/s |", "|---|---:|---:|---:|", *rows]
@@ -165,11 +170,8 @@ def transfers(clip: Clip, device: str) -> list[str]:
 
 def whole(clip: Clip, device: str, count: int) -> list[str]:
     """Seconds of a restoration by tvl1 on the device, by stage, after a small one that compiles what has to be."""
-    rng, params, runtime = (
-        np.random.default_rng(1),
-        RestoreParams(flow=FlowParams(method="tvl1")),
-        Runtime(device=device),
-    )
+    rng, runtime = np.random.default_rng(1), Runtime(device=device)
+    params = RestoreParams(flow=FlowParams(method="tvl1"))
     noise = (0.01 * rng.standard_normal(clip.scene.shape)).astype(np.float32)
     moved = (np.roll(noise, (37 * k, 91 * k), (0, 1)) for k in range(count))
     frames = np.stack([np.clip(clip.frames[k % FRAMES] + grain, 0, 1) for k, grain in enumerate(moved)])
