@@ -92,11 +92,11 @@ def variance_by_blur(fused: FloatArray, fidelity: float, widths: tuple[float, fl
     """
     reach = int(np.ceil(MARGIN_SIGMAS * widths[1]))
     margin = margin_around((fused.shape[0], fused.shape[1]), reach)
-    spectrum = fft.rfft2(margin.pad(luminance(fused)))
+    spectrum = scipy.fft.rfft2(margin.pad(luminance(fused)))
     prior = laplacian_symbol(*margin.shape) / fidelity
     otfs = (blur_otf(margin.shape, width, exponent) for width in widths)
     low, high = (otf / (otf**2 + prior) for otf in otfs)
-    between = fft.irfft2(spectrum * (high - low), s=margin.shape)[margin.inside()] / 2
+    between = scipy.fft.irfft2(spectrum * (high - low), s=margin.shape)[margin.inside()] / 2
     return cv2.GaussianBlur(np.square(between).astype(np.float32), (0, 0), _WINDOW)
 
 
