@@ -177,8 +177,8 @@ class RestoreParams:
 
 
 # ``standard`` lies where more time no longer gains quality, and ``fast`` gives up little of it to save a third of the
-# time; ``benchmarks/flow_calls.py --presets`` shows both on the curve.  ``paper`` is paper 3 as it is printed, with this
-# project's flow; there the width of the blur is chosen by hand, and here it is estimated where none is given.
+# time; ``benchmarks/flow_calls.py --presets`` shows both on the curve.  ``paper`` is paper 3 as it is printed, with
+# this project's flow; there the width of the blur is chosen by hand, and here it is estimated where none is given.
 PRESETS: Mapping[Preset, RestoreParams] = MappingProxyType(
     {
         "fast": RestoreParams(
