@@ -1,6 +1,6 @@
-"""Milliseconds of every stage on the CPU and on a device, its share of the memory bandwidth, and agreement.
+"""Milliseconds of every stage on the CPU and on a device, transfers, a whole restoration, and agreement.
 
-    python benchmarks/device.py --device cuda --size 1080 1920 --write benchmarks/results/device.md
+    python benchmarks/device.py --device cuda --size 1080 1920 --frames 100 --runs 1 --write FILE
 
 prints a Markdown document, writes it, and exits with 1 where device and CPU differ by more than 0.02 dB or 0.02 px.
 Without ``--device`` it takes a GPU where torch sees one, else torch on the CPU.  Times are the best of some runs, all
@@ -34,8 +34,10 @@ from turbrestore.registration.flow import FlowParams, estimate_flow
 from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.device import CPU, find_device
+from turbrestore.runtime.image_stacks import torch_ops
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.steps import finish
+from turbrestore.runtime.threads import available_cores
 from turbrestore.settings import RestoreParams
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
@@ -150,6 +152,37 @@ def copy_bandwidth(device: str) -> float:
     return 10 * 2e3 * 4 * 2**26 / milliseconds(copy, 5)
 
 
+def transfers(clip: Clip, device: str) -> list[str]:
+    """Bandwidth of bringing a flow to the device and back, and what both take."""
+    ops, flow = torch_ops(device), np.ascontiguousarray(clip.flows[0])
+    there = ops.load(flow)
+
+    def load() -> None:
+        # Reading a number waits for the device.
+        ops.load(flow)[0, 0, 0].item()
+
+    rows = []
+    for name, run in (("to the device", load), ("back", lambda: ops.store(there))):
+        taken = milliseconds(run, 5)
+        rows.append(f"| {name} | {flow.nbytes / 1e6:.1f} | {taken:.2f} | {flow.nbytes / 1e6 / taken:.1f} |")
+    return ["\n| a flow | MB | ms | GB/s |", "|---|---:|---:|---:|", *rows]
+
+
+def whole(clip: Clip, device: str, count: int) -> list[str]:
+    """Seconds of a restoration by tvl1 on the device, by stage, after a small one that compiles what has to be."""
+    rng, runtime = np.random.default_rng(1), Runtime(device=device)
+    params = RestoreParams(flow=FlowParams(method="tvl1"))
+    noise = (0.01 * rng.standard_normal(clip.scene.shape)).astype(np.float32)
+    moved = (np.roll(noise, (37 * k, 91 * k), (0, 1)) for k in range(count))
+    frames = np.stack([np.clip(clip.frames[k % FRAMES] + grain, 0, 1) for k, grain in enumerate(moved)])
+    restore(frames[:12, :256, :256], params, runtime)
+    begun = time.perf_counter()
+    restored = restore(frames, params, runtime)
+    taken = time.perf_counter() - begun
+    stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in restored.seconds.items())
+    return [f"\nA restoration of {count} frames on {device} takes {taken:.1f} s: {stages}."]
+
+
 def agreement(clip: Clip, device: str) -> tuple[float, float, float]:
     """Difference of a restoration in dB, and of its flows in pixels, mean and largest."""
     params, image = RestoreParams(flow=FlowParams(method="tvl1")), clip.frames.mean(axis=0)
@@ -160,7 +193,7 @@ def agreement(clip: Clip, device: str) -> tuple[float, float, float]:
     return psnr(there.image, clip.scene) - psnr(here.image, clip.scene), float(apart.mean()), float(apart.max())
 
 
-def document(size: tuple[int, int], device: str, runs: int) -> tuple[str, bool]:
+def document(size: tuple[int, int], device: str, runs: int, count: int) -> tuple[str, bool]:
     """Markdown of the table, and whether device and CPU agree."""
     clip = make_clip(*size)
     bandwidth = copy_bandwidth(device)
@@ -168,7 +201,7 @@ def document(size: tuple[int, int], device: str, runs: int) -> tuple[str, bool]:
         "# Computing on a device\n",
         "What `python benchmarks/device.py --write benchmarks/results/device.md` measures: every stage on the CPU "
         "and on the device, against the bandwidth of copying.\n",
-        f"{size[1]}×{size[0]}; device {device} copies {bandwidth / 1e9:.1f} GB/s\n",
+        f"{size[1]}×{size[0]}; {name_of(device)} copies {bandwidth / 1e9:.1f} GB/s; {available_cores()} cores.\n",
         "| stage, one frame or iteration | CPU, ms | device, ms | ratio | GB/s | share of copying |",
         "|---|---:|---:|---:|---:|---:|",
     ]
@@ -181,6 +214,7 @@ def document(size: tuple[int, int], device: str, runs: int) -> tuple[str, bool]:
         moved = 4e3 * a_pixel * clip.scene.size / on_device
         cells = f"{on_cpu:.1f} | {on_device:.1f} | {on_cpu / on_device:.2f} | {moved / 1e9:.1f}"
         lines.append(f"| {name} | {cells} | {moved / bandwidth:.0%} |")
+    lines += [*transfers(clip, device), *whole(clip, device, count)]
     decibels, mean, largest = agreement(clip, device)
     good = abs(decibels) <= DECIBELS and mean <= PIXELS
     lines.append(f"\nRestoration {decibels:+.4f} dB; flows {mean:.5f} px apart, {largest:.3f} at most.")
@@ -188,16 +222,24 @@ def document(size: tuple[int, int], device: str, runs: int) -> tuple[str, bool]:
     return "\n".join(lines) + "\n", good
 
 
+def name_of(device: str) -> str:
+    """Name of the GPU, or of the device."""
+    import torch
+
+    return torch.cuda.get_device_name(device) if device.startswith("cuda") else f"torch {torch.__version__} on the CPU"
+
+
 def main() -> int:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device")
     parser.add_argument("--size", type=int, nargs=2, default=(256, 256), metavar=("HEIGHT", "WIDTH"))
+    parser.add_argument("--frames", type=int, default=24, help="frames of the whole restoration")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
     options = parser.parse_args()
     device = find_device(options.device or "auto")
-    text, good = document(options.size, "cpu:0" if device == CPU else device, options.runs)
+    text, good = document(options.size, "cpu:0" if device == CPU else device, options.runs, options.frames)
     print(text, end="")
     if options.write is not None:
         atomic_write(options.write, text.encode(), overwrite=True)

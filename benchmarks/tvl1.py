@@ -207,9 +207,9 @@ def compare_clips() -> None:
 
     started = FLOW_METHODS["tvl1"]
 
-    def begin_anew(params: FlowParams, reference: GreyImage, start_level: int, device: str) -> FlowSolver:
-        solve = started(params, reference, start_level, device)
-        return lambda frames, starts: solve(frames, [None] * len(starts))
+    def begin_anew(params: FlowParams, reference: GreyImage, device: str) -> FlowSolver:
+        solve = started(params, reference, device)
+        return lambda frames, starts, draft: solve(frames, [None] * len(starts), draft)
 
     # What the others take is not to be that of the compiler.
     restore(phase_screens(12).frames, RestoreParams(flow=FlowParams(method="tvl1")))

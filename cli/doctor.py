@@ -5,7 +5,7 @@ Nothing but the standard library is imported at the top: a broken library is a f
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import json as json_format
 import os
 import platform
@@ -22,6 +22,7 @@ from cyclopts import Parameter
 from turbrestore import __version__
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.core.extras import install_command
+from turbrestore.runtime.device import needs_torch
 
 from .streams import put
 
@@ -154,19 +155,14 @@ def check_cores() -> Iterator[Finding]:
 
 
 def check_extras() -> Iterator[Finding]:
-    """Libraries that add something and may be missing."""
+    """Libraries that add something and may be missing; loading all of them takes seconds, so none is loaded."""
     for module, extra in EXTRAS.items():
-        install = install_command(extra)
-        try:
-            library = importlib.import_module(module)
-        except ModuleNotFoundError:
-            yield Finding(module, "missing", "optional", install)
-        except Exception as error:  # a library that is damaged may raise anything
-            yield Finding(module, "warning", f"does not load: {_line(error)}", f"{install} --force-reinstall")
-        else:
-            yield Finding(module, "ok", str(getattr(library, "__version__", "")))
-            if module == "torch":
-                yield _gpu(library)
+        if importlib.util.find_spec(module) is None:
+            yield Finding(module, "missing", "optional", install_command(extra))
+            continue
+        yield Finding(module, "ok", metadata.version(module))
+        if module == "torch":
+            yield _gpu(install_command(extra))
 
 
 def required_versions(distribution: str) -> str:
@@ -205,9 +201,16 @@ def _has_codec(codec: ModuleType, name: str, mode: str) -> bool:
     return True
 
 
-def _gpu(torch: ModuleType) -> Finding:
-    if torch.cuda.is_available():
-        return Finding("GPU", "ok", torch.cuda.get_device_name(0))
+def _gpu(install: str) -> Finding:
+    """Ask torch for its GPU, unless the machine has no device that could be one."""
+    if needs_torch("auto"):
+        try:
+            import torch
+
+            if torch.cuda.is_available():
+                return Finding("GPU", "ok", torch.cuda.get_device_name(0))
+        except Exception as error:  # a library that is damaged may raise anything
+            return Finding("GPU", "warning", f"torch does not load: {_line(error)}", f"{install} --force-reinstall")
     return Finding("GPU", "missing", "optional; torch sees none and computes on the CPU")
 
 

@@ -91,7 +91,7 @@ def test_frames_that_do_not_count(device):
     ],
 )
 def test_what_to_do_is_said_where_the_memory_of_the_device_is_too_small(device, place, advice, params, monkeypatch):
-    def fail(*_):
+    def fail(*_, **__):
         raise RuntimeError("CUDA out of memory.")
 
     frames = frames_of(SCENES["camera"](48, 48), 3, seed=17)

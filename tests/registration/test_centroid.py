@@ -77,7 +77,7 @@ def test_flows_start_from_the_centroid_and_average_out(sequence, mode):
 def test_a_mean_flow_that_stalls_has_converged_and_one_that_grows_has_not(monkeypatch, sizes, converged):
     found = iter(sizes)
 
-    def measure(reference, frames, starts):
+    def measure(reference, frames, starts, draft):
         size = next(found)
         return [
             (reference.prepare(frame), np.full((16, 16, 2), (size, 0.0), np.float32))
@@ -155,17 +155,19 @@ def test_bad_input_is_refused(sequence):
             CentroidParams(**bad)
 
 
-def test_starts_from_a_blurred_mean_are_mended_a_level_above_the_finest(monkeypatch):
-    levels, prepare = [], centroid.prepare_reference
+@pytest.mark.parametrize(("mode", "iterations", "drafts"), [("fused", 3, 1), ("fused", 1, 0), ("single", 2, 0)])
+def test_flows_from_the_blurred_mean_are_drafts(monkeypatch, mode, iterations, drafts):
+    asked, measure = [], centroid.measure_flows
 
-    def spied(image, params, runtime, start_level=0):
-        levels.append(start_level)
-        return prepare(image, params, runtime, start_level)
+    def spied(reference, frames, starts, draft):
+        asked.append(draft)
+        return measure(reference, frames, starts, draft)
 
-    monkeypatch.setattr(centroid, "prepare_reference", spied)
+    monkeypatch.setattr(centroid, "measure_flows", spied)
     frames = np.random.default_rng(0).random((3, 32, 32)).astype(np.float32)
-    centroid.find_centroid(frames, centroid.CentroidParams(iterations=2))
-    assert set(levels) == {1}
+    centroid.find_centroid(frames, centroid.CentroidParams(mode=mode, iterations=iterations, tolerance=0))
+    assert asked[0] == bool(drafts)
+    assert sum(asked) == drafts
 
 
 def test_a_state_follows_each_flow_and_the_result_is_returned(sequence):

@@ -16,7 +16,7 @@ from turbrestore.registration.flow import (
     measure_flows,
     prepare_reference,
 )
-from turbrestore.registration.opencv_flow import DisParams, FarnebackParams, flow_memory
+from turbrestore.registration.opencv_flow import DisParams, FarnebackParams, dis_solver, flow_memory
 from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.runtime import Runtime
@@ -165,14 +165,15 @@ def test_what_is_prepared_of_a_frame_serves_every_reference():
     assert np.array_equal(again, estimate_flow(other, stack))
 
 
-@pytest.mark.parametrize("method", ["dis", "tvl1"])
-def test_a_flow_from_a_good_start_is_as_good_as_one_from_none(method):
+@pytest.mark.parametrize(("method", "worse"), [("dis", 0.04), ("tvl1", 0.011)])
+def test_a_flow_from_a_good_start_errs_by_hardly_more_than_one_from_none(method, worse):
+    """What dense inverse search loses, by patches that lie further apart, does not show in restored images."""
     reference, frame, truth = pair(rms=2.0)
     params, found = FlowParams(method=method, confidence=False), (truth + np.float32(0.5))[None]
     anew = estimate_flow(reference, frame[None], params)[0]
     found = measure(prepare_reference(reference, params), [frame], found)
     errors = [endpoint_error(one[8:-8, 8:-8], truth[8:-8, 8:-8]) for one in (found[0], anew)]
-    assert errors[0] <= 1.05 * errors[1] + 0.005
+    assert errors[0] <= errors[1] + worse
 
 
 @pytest.mark.parametrize("finest", [0, 1])
@@ -199,7 +200,7 @@ def test_a_start_includes_the_shift_of_the_frame(method):
     assert again[inside] == pytest.approx(flows[inside], abs=0.2)
 
 
-@pytest.mark.parametrize(("method", "most"), [("dis", 0.05), ("tvl1", 0.5)])
+@pytest.mark.parametrize(("method", "most"), [("dis", 0.15), ("tvl1", 0.5)])
 def test_the_shift_of_a_start_is_not_measured_again(monkeypatch, method, most):
     reference, params = texture(size=128), FlowParams(method=method)
     frame, target = np.roll(reference, 20, axis=1), prepare_reference(reference, params)
@@ -226,26 +227,54 @@ def test_where_half_of_the_scene_moves_the_other_stays(motion):
         assert np.abs(flows[0, :, :12]).max() < 0.05
 
 
-@pytest.mark.parametrize(("refinements", "half", "level"), [(8, 4, 0), (8, 4, 1), (5, 3, 0), (1, 1, 1), (0, 0, 0)])
-def test_a_flow_with_a_start_begins_at_its_level_and_is_refined_half_as_often(refinements, half, level):
+@pytest.mark.parametrize(("refinements", "quarter", "half"), [(8, 2, 4), (5, 2, 3), (1, 1, 1), (0, 0, 0)])
+def test_what_dis_does_with_a_start_and_for_a_draft(refinements, quarter, half):
     image, params = texture(size=64), FlowParams(confidence=False, dis=DisParams(refinements=refinements))
     frame, start = np.roll(image, 2, axis=1), np.full((1, 64, 64, 2), (1, 0), np.float32)
-    found = measure(prepare_reference(image, params, start_level=level), [frame], start)
+    target = prepare_reference(image, params)
+    levels = [target.prepare(one).levels for one in (image, frame)]
     solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    solver.setCoarsestScale(level)
-    solver.setFinestScale(0)
+    solver.setVariationalRefinementAlpha(params.dis.smoothness)
+    solver.setFinestScale(1)
     solver.setPatchStride(params.dis.patch_stride)
     solver.setVariationalRefinementIterations(half)
-    solver.setVariationalRefinementAlpha(params.dis.smoothness)
-    levels = [prepare_reference(image, params).prepare(one).levels for one in (image, frame)]
-    assert np.array_equal(found[0], solver.calc(*levels, start[0].copy()))
+    draft = next(flow for _, flow in measure_flows(target, [frame], draft=True))
+    assert np.array_equal(draft, solver.calc(*levels, None))
+    solver.setCoarsestScale(0)
+    solver.setFinestScale(0)
+    solver.setPatchStride(params.dis.patch_stride + 2)
+    solver.setVariationalRefinementIterations(quarter)
+    assert np.array_equal(measure(target, [frame], start)[0], solver.calc(*levels, start[0].copy()))
 
 
-@pytest.mark.parametrize("level", [0, 1])
-def test_tvl1_with_a_start_goes_through_two_levels(level):
+def test_a_start_that_is_a_guess_is_searched_for_from_the_level_that_is_asked_for():
+    image = (255 * texture(size=64)).astype(np.uint8)
+    frame, start = np.roll(image, 2, axis=1), np.full((64, 64, 2), (1, 0), np.float32)
+    solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    solver.setCoarsestScale(1)
+    solver.setFinestScale(0)
+    solver.setPatchStride(DisParams().patch_stride)
+    solver.setVariationalRefinementIterations(4)
+    solver.setVariationalRefinementAlpha(DisParams().smoothness)
+    found = dis_solver(DisParams(), image, 1)(frame[None], [start.copy()], False)[0]
+    assert np.array_equal(found, solver.calc(image, frame, start))
+
+
+def test_a_draft_of_tvl1_is_the_flow_of_the_next_coarser_level():
     reference, frame, truth = pair(rms=2.0)
     params = FlowParams(method="tvl1", confidence=False)
-    found = measure(prepare_reference(reference, params, start_level=level), [frame], [truth])
+    draft = next(flow for _, flow in measure_flows(prepare_reference(reference, params), [frame], draft=True))
+    whole = measure(prepare_reference(reference, params), [frame], [None])[0]
+    errors = [endpoint_error(one[8:-8, 8:-8], truth[8:-8, 8:-8]) for one in (whole, draft)]
+    assert errors[0] < errors[1] < errors[0] + 0.3
+    # Between every second pixel it is interpolated.
+    assert np.abs(np.diff(draft, 2, axis=0)).mean() < 0.7 * np.abs(np.diff(whole, 2, axis=0)).mean()
+
+
+def test_tvl1_with_a_start_goes_through_two_levels():
+    reference, frame, truth = pair(rms=2.0)
+    params = FlowParams(method="tvl1", confidence=False)
+    found = measure(prepare_reference(reference, params), [frame], [truth])
     grey = [
         prepare_reference(reference, params).prepare(image).levels.astype(np.float32) for image in (reference, frame)
     ]
@@ -271,7 +300,7 @@ def test_of_a_batch_some_have_a_start_and_some_have_none(method):
 def test_a_start_in_the_smallest_images(shape, method):
     image = texture(size=64)[: shape[0], : shape[1]]
     flows, params = np.zeros((1, *shape, 2), np.float32), FlowParams(method=method)
-    flows = measure(prepare_reference(image, params, start_level=1), [image], flows)
+    flows = measure(prepare_reference(image, params), [image], flows)
     assert np.abs(flows).max() < 0.1
 
 

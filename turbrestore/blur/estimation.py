@@ -31,8 +31,8 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
 
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import require
@@ -331,5 +331,5 @@ def _detail(image: FloatArray, start: int, stop: int) -> FloatArray:
 
 def _fast_size(size: int) -> int:
     """Largest size up to ``size`` whose transform is fast."""
-    fast = (n for n in range(size // 2, size + 1) if fft.next_fast_len(n, real=True) == n)
+    fast = (n for n in range(size // 2, size + 1) if scipy.fft.next_fast_len(n, real=True) == n)
     return max(n for n in fast if n != _SLOW_SIZE)

@@ -34,8 +34,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from ..core.arrays import FloatArray
 from ..runtime.jit import jit
@@ -74,7 +74,7 @@ def image_gradients(image: FloatArray) -> ImageGradients:
     dx, dy = image[:-1, 1:] - image[:-1, :-1], image[1:, :-1] - image[:-1, :-1]
     rows, columns = (_taper(size) for size in dx.shape)
     planes = np.stack([dx, dy], axis=-1) * np.outer(rows, columns)[..., None]
-    frequency = np.hypot(fft.fftfreq(len(rows))[:, None], fft.fftfreq(len(columns)))
+    frequency = np.hypot(scipy.fft.fftfreq(len(rows))[:, None], scipy.fft.fftfreq(len(columns)))
     return ImageGradients(planes, cv2.dft(planes), frequency.astype(np.float32))
 
 

@@ -18,8 +18,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
 
 from ..core.arrays import FloatArray
 from ..core.errors import DataError, require
@@ -111,7 +111,7 @@ def psf_to_otf(psf: ArrayLike, shape: tuple[int, int]) -> NDArray[np.complex64]:
     grid = np.zeros(shape)
     grid[:height, :width] = kernel
     grid = np.roll(grid, (-(height // 2), -(width // 2)), axis=(0, 1))
-    return fft.rfft2(grid).astype(np.complex64)
+    return scipy.fft.rfft2(grid).astype(np.complex64)
 
 
 def check_psf(psf: ArrayLike) -> Float64Array:
@@ -150,7 +150,7 @@ def wiener_fidelity(image: FloatArray, noise: float) -> float:
 
 
 def _frequencies(shape: tuple[int, ...]) -> tuple[Float64Array, Float64Array]:
-    return fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])
+    return scipy.fft.fftfreq(shape[0])[:, None], scipy.fft.rfftfreq(shape[1])
 
 
 def _check_sigma(sigma: float) -> None:

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from ..core.arrays import FloatArray, luminance
 from ..registration.warp import warp
@@ -119,7 +119,7 @@ def window_power(image: FloatArray, reduction: int = 1) -> Float64Array:
         _reduced(image, top, left, SIDE, reduction)[_BORDER:-_BORDER, _BORDER:-_BORDER]
         for top, left in _corners(height, width)
     ]
-    return np.mean([_by_ring(np.square(np.abs(fft.fft2(_windowed(part))))) for part in parts], axis=0)
+    return np.mean([_by_ring(np.square(np.abs(scipy.fft.fft2(_windowed(part))))) for part in parts], axis=0)
 
 
 def _corners(height: int, width: int) -> list[tuple[int, int]]:
@@ -161,7 +161,7 @@ def _around(
 
 
 def _spectrum(plane: FloatArray) -> NDArray[np.complex64]:
-    return fft.fft2(_windowed(plane[_BORDER:-_BORDER, _BORDER:-_BORDER]))
+    return scipy.fft.fft2(_windowed(plane[_BORDER:-_BORDER, _BORDER:-_BORDER]))
 
 
 def _windowed(part: FloatArray) -> FloatArray:
@@ -172,7 +172,7 @@ def _windowed(part: FloatArray) -> FloatArray:
 @functools.cache
 def _rings() -> tuple[NDArray[np.int_], NDArray[np.int_]]:
     """Ring of every frequency of a window, and the number of frequencies in each ring."""
-    nu = fft.fftfreq(SIDE)
+    nu = scipy.fft.fftfreq(SIDE)
     ring = np.rint(np.hypot(nu[:, None], nu) * SIDE).astype(int).ravel()
     return ring, np.bincount(ring, minlength=len(RINGS))[: len(RINGS)]
 

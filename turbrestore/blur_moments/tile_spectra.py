@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
 
 from ..core.arrays import FloatArray
 from ..core.errors import DataError, require, require_between
@@ -92,7 +92,7 @@ class TileSpectra:
         grid = TileGrid(rows, columns, (height, width), (shape[0], shape[1]))
         window = np.outer(_hann(height), _hann(width))
         window /= np.sqrt(np.sum(window**2))
-        ky, kx = np.meshgrid(fft.fftfreq(height), fft.rfftfreq(width), indexing="ij")
+        ky, kx = np.meshgrid(scipy.fft.fftfreq(height), scipy.fft.rfftfreq(width), indexing="ij")
         radius = np.hypot(kx, ky)
         # Half of the plane suffices, because the power spectrum of an image is symmetric.
         half = (kx > 0) | (ky > 0)
@@ -110,7 +110,9 @@ class TileSpectra:
         power = np.empty((len(self.grid.rows), len(self.grid.columns), len(self.used)), image.dtype)
         # One row of tiles at a time: all windowed and transformed tiles take fifteen times the memory of the image.
         for row, found in zip(self.grid.rows, power, strict=True):
-            spectrum = fft.rfft2(tiles[row, self.grid.columns] * self.window).reshape(len(found), -1)[:, self.used]
+            spectrum = scipy.fft.rfft2(tiles[row, self.grid.columns] * self.window).reshape(len(found), -1)[
+                :, self.used
+            ]
             np.add(spectrum.real**2, spectrum.imag**2, out=found)
         return power.reshape(-1, len(self.used))
 

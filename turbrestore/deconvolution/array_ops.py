@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
+
+from ..runtime.image_stacks import from_device
 
 # ndarray or torch tensor.
 Array = Any
@@ -46,8 +48,8 @@ def numpy_ops(threads: int = 1) -> ArrayOps:
         arrays=np,
         load=lambda array: array,
         store=lambda array: array,
-        forward=lambda image: fft.rfft2(image, workers=workers(image.shape)),
-        back=lambda spectrum, shape: fft.irfft2(spectrum, s=shape, workers=workers(shape)),
+        forward=lambda image: scipy.fft.rfft2(image, workers=workers(image.shape)),
+        back=lambda spectrum, shape: scipy.fft.irfft2(spectrum, s=shape, workers=workers(shape)),
     )
 
 
@@ -59,7 +61,7 @@ def torch_ops(device: str) -> ArrayOps:
         arrays=torch,
         # torch shares no memory that is read-only.
         load=lambda array: torch.from_numpy(np.require(array, requirements=["C", "W"])).to(device),
-        store=lambda tensor: tensor.cpu().numpy(),
+        store=from_device,
         forward=torch.fft.rfft2,
         back=lambda spectrum, shape: torch.fft.irfft2(spectrum, s=shape),
     )

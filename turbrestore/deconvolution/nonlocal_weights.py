@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
 
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import DataError, require
@@ -114,7 +114,7 @@ class NonlocalGraph:
         (Collatz–Wielandt).  The bound falls with each power of A that is applied to x.
         """
         size = self.shape[0] * self.shape[1]
-        weights = sparse.csr_array((self.roots**2, self.heads, self.starts), shape=(size, size))
+        weights = scipy.sparse.csr_array((self.roots**2, self.heads, self.starts), shape=(size, size))
         x, bound = np.ones(size, np.float32), np.inf
         degrees = weights @ x + weights.T @ x
         for _ in range(iterations):

@@ -26,8 +26,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
 
 from ..blur.psf import check_psf, wiener_fidelity
 from ..core.arrays import FloatArray, luminance
@@ -117,7 +117,7 @@ def margin_around(size: tuple[int, int], least: int | None) -> Margin:
     """Margin of at least ``least`` pixels on each side, enlarged to a size with a fast Fourier transform."""
     if least is None:
         return Margin(size, ((0, 0), (0, 0)))
-    extra = [fft.next_fast_len(length + 2 * least, real=True) - length for length in size]
+    extra = [scipy.fft.next_fast_len(length + 2 * least, real=True) - length for length in size]
     top, left = (total // 2 for total in extra)
     return Margin(size, ((top, extra[0] - top), (left, extra[1] - left)))
 

@@ -87,8 +87,8 @@ def _warp_in_torch(frame: FloatArray, flow: Stack, ops: StackOps) -> Warped:
     weights = luminance(np.eye(3, dtype=np.float32)[None])[0].tolist() if len(registered) == 3 else [1.0]
     grey = sum(weight * channel for weight, channel in zip(weights, registered, strict=True))
     height, width = flow.shape[:2]
-    y, x = (ops.load(axis) for axis in np.mgrid[:height, :width].astype(np.float32))
-    seen = _within(x + flow[..., 0], width) * _within(y + flow[..., 1], height)
+    x, y = (ops.arrays.arange(length, dtype=flow.dtype, device=flow.device) for length in (width, height))
+    seen = _within(x + flow[..., 0], width) * _within(y[:, None] + flow[..., 1], height)
     return registered, grey, seen
 
 

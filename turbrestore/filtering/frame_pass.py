@@ -145,7 +145,9 @@ def _prepare(item: _Item, reference: FlowReference) -> _Item:
     if item.frame is None:
         return item
     frame = item.frame if isinstance(item.frame, FlowFrame) else reference.prepare(item.frame)
-    return replace(item, frame=frame if item.start is None else replace(frame, start=item.start))
+    frame = frame if item.start is None else replace(frame, start=item.start)
+    # The first of several flows is where the next one starts.
+    return replace(item, frame=replace(frame, draft=item.kept and frame.start is None))
 
 
 def _with_flow(item: _Item, flow: FloatArray) -> _Item:

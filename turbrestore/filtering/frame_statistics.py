@@ -22,7 +22,7 @@ from ..core.noise import fit_noise_curve
 from ..registration.warp import warp
 from ..runtime.image_stacks import numpy_ops
 from ..runtime.scratch import iter_frames
-from ..runtime.threads import sum_in_threads
+from ..runtime.threads import map_ahead, sum_in_threads
 from .frame_noise import (
     AGREEMENT_WINDOW,
     LEVEL_WINDOW,
@@ -90,7 +90,7 @@ def measure_frame_statistics(
     count = float(number)
     mean, variance = _mean_and_variance(total, squares, count)
     variance *= count / max(count - 1, 1)
-    centre, usual, fine = _median_and_spread(frames, flows, mean.shape, int(count))
+    centre, usual, fine = _median_and_spread(frames, flows, mean.shape, int(count), threads)
     mean, variance, passed = _robust_start(mean, variance, centre, usual)
 
     square = template[0] ** 2 + template[1] ** 2
@@ -132,7 +132,7 @@ def _mean_and_variance(
 
 
 def _median_and_spread(
-    frames: Iterable[FloatArray], flows: Iterable[FloatArray], shape: tuple[int, ...], count: int
+    frames: Iterable[FloatArray], flows: Iterable[FloatArray], shape: tuple[int, ...], count: int, threads: int
 ) -> tuple[FloatArray, FloatArray, np.ndarray]:
     """Median of some registered frames, their squared median deviation as a variance, and their variance in detail."""
     picked = set(np.linspace(0, count - 1, min(count, _RESERVOIR)).round().astype(int).tolist())
@@ -142,14 +142,19 @@ def _median_and_spread(
         for number, pair in enumerate(zip(iter_frames(frames), iter_frames(flows), strict=True))
         if number in picked
     )
-    for plane, (frame, flow) in zip(stack, chosen, strict=True):
-        plane[...] = luminance(warp(frame, flow))
+    warped = map_ahead(lambda pair: luminance(warp(*pair)), chosen, threads)
+    for plane, (_, registered) in zip(stack, warped, strict=True):
+        plane[...] = registered
     centre, spread = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    for top in range(0, shape[0], _ROWS):
+
+    def fill(top: int) -> None:
         rows = np.s_[top : top + _ROWS]
         values = stack[:, rows].astype(np.float32)
         centre[rows] = np.median(values, axis=0)
         spread[rows] = (_MEDIAN_DEVIATION * np.median(np.abs(values - centre[rows]), axis=0)) ** 2
+
+    for _ in map_ahead(fill, range(0, shape[0], _ROWS), threads):
+        pass
     fine = np.zeros(shape)
     for plane in stack:
         difference = plane.astype(np.float32) - centre

@@ -41,6 +41,8 @@ _SATURATED = 0.995
 # Weight of a cosine of order j against its square, relative to the information of the frame.
 _SMOOTHNESS = 1e-4
 _ROUNDS = 4
+# Frames that tell whether there are bands.
+_SOME = 24
 # Rows at which gains are compared, the percentage of frames beyond the range that they wander in, and the least gain.
 _NODES, _FEW, _LEAST_GAIN = 64, 5, 0.05
 
@@ -81,12 +83,16 @@ def steady_light(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]
 
 
 def _measure_light(source: FrameSource, frames: FloatArray) -> tuple[Light | None, tuple[Decision, ...]]:
-    reference = None if _is_steady(frames) else _reference_of(frames)
+    as_a_whole, along_rows = _hardly_change(frames)
+    reference = None if as_a_whole and along_rows else _reference_of(frames)
     if reference is None:
         return None, ()
     anchor = _shift_reference(np.nan_to_num(reference))
-    fits = [_fit_frame(frame, reference, anchor) for frame in frames]
-    light = _chosen(fits)
+    # Bands are in all frames or in none, so that some of them tell.
+    some = frames[:: max(len(frames) // _SOME, 1)] if as_a_whole else frames
+    light = _chosen([_fit_frame(frame, reference, anchor) for frame in some])
+    if light is not None and len(some) < len(frames):
+        light = _chosen([_fit_frame(frame, reference, anchor) for frame in frames])
     if light is None:
         return None, ()
     gains, offsets, with_rows = light
@@ -169,15 +175,15 @@ def _blur_of(source: FrameSource) -> float:
     return max(_LEAST_BLUR, _BLUR / _reduction(source))
 
 
-def _is_steady(frames: FloatArray) -> bool:
-    """Whether level, contrast and rows of the frames hardly change, so that no model of the light has to be fitted."""
+def _hardly_change(frames: FloatArray) -> tuple[bool, bool]:
+    """Whether level and contrast of the frames hardly change, and whether their rows do."""
     mean, rows, contrasts = frames.mean(axis=0), frames.mean(axis=2), frames.std(axis=(1, 2))
     level = float(np.sqrt(np.mean(mean**2))) / max(float(mean.std()), 1e-9)
     gains = rows / np.maximum(rows.mean(axis=0), 1e-6)
     extent = gains.mean(axis=1)
     bands = float((gains - extent[:, None]).std())
     changes = max(float(extent.std()) * level, float(contrasts.std()) / max(float(contrasts.mean()), 1e-9))
-    return changes < _CLEARLY * _LEAST_CHANGE and bands * level < _CLEARLY * _LEAST_BANDS
+    return changes < _CLEARLY * _LEAST_CHANGE, bands * level < _CLEARLY * _LEAST_BANDS
 
 
 def _reference_of(frames: FloatArray) -> FloatArray | None:

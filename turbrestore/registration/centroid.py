@@ -192,9 +192,11 @@ def centroid_steps(
     prepared: list[FlowFrame] = []
     sizes: list[float] = []
     while True:
-        # The first image is a blurred mean; flows that start from its flows must be corrected on a coarser level.
-        reference = prepare_reference(image, flow_params, runtime, start_level=1)
-        solved = measure_flows(reference, prepared or iter_frames(stack), iter_frames(flows) if sizes else repeat(None))
+        # The first image is a blurred mean, and does not deserve flows at full resolution.
+        draft = not sizes and params.mode == "fused" and params.iterations > 1
+        starts = iter_frames(flows) if sizes else repeat(None)
+        reference = prepare_reference(image, flow_params, runtime)
+        solved = measure_flows(reference, prepared or iter_frames(stack), starts, draft)
         # Prepared frames are kept for the next iteration, unless memory is so short that stacks are in files.
         keep = runtime.scratch is None and not prepared
         for measured in fill_frames(flows, _flows_of(solved, prepared if keep else None)):

@@ -46,6 +46,8 @@ from .opencv_flow import DisParams, FarnebackParams, FlowSolver, GreyImage, dis_
 from .tvl1 import TvL1Params, tvl1_solver
 
 MIN_SIDE = 16
+# Most batches that are prepared for a device side by side.
+_BATCHES = 8
 # Share of the gradients of a frame above which noise makes it one that is smoothed, by so many pixels.
 _NOISY, _SMOOTHING = 0.08, 1.0
 
@@ -104,6 +106,7 @@ class FlowFrame:
     # (H, W, 2) or on a coarser grid, or None; flow to this frame from a similar reference, pixels, from which the
     # solver starts.
     start: NDArray[np.floating] | None = None
+    draft: bool = False  # whether a flow at half the resolution will do, because another will start from it
 
 
 @dataclass(frozen=True)
@@ -187,6 +190,7 @@ def measure_flows(
     reference: FlowReference,
     frames: Iterable[FloatArray | FlowFrame],
     starts: Iterable[FloatArray | None] = repeat(None),
+    draft: bool = False,
 ) -> Iterator[tuple[FlowFrame, FloatArray]]:
     """Measure flows from a prepared reference while threads solve a few frames ahead.
 
@@ -195,7 +199,7 @@ def measure_flows(
 
     def solve(batch: list[tuple[FloatArray | FlowFrame, FloatArray | None]]) -> list[tuple[FlowFrame, FloatArray]]:
         prepared = [
-            replace(frame if isinstance(frame, FlowFrame) else reference.prepare(frame), start=start)
+            replace(frame if isinstance(frame, FlowFrame) else reference.prepare(frame), start=start, draft=draft)
             for frame, start in batch
         ]
         return list(zip(prepared, reference.solve(prepared), strict=True))
@@ -209,7 +213,6 @@ def prepare_reference(
     reference: ArrayLike,
     params: FlowParams | None = None,
     runtime: Runtime = DEFAULT,
-    start_level: int = 0,
 ) -> FlowReference:
     """Prepare the image that flows start from.
 
@@ -229,7 +232,7 @@ def prepare_reference(
 
     def prepared(noisy: bool) -> tuple[GreyImage, FlowSolver]:
         levels = grey_levels(target, *contrast, _SMOOTHING * noisy)
-        return levels, FLOW_METHODS[params.method](params, levels, start_level, device)
+        return levels, FLOW_METHODS[params.method](params, levels, device)
 
     solvers = {noisy: prepared(noisy) for noisy in (False, True)}
 
@@ -241,21 +244,21 @@ def prepare_reference(
         return FlowFrame(image, grey_levels(image, *contrast, _SMOOTHING * noisy), noise, noisy)
 
     def solve(batch: list[FlowFrame]) -> list[FloatArray]:
-        alike = groupby(batch, lambda frame: frame.noisy)
-        return [flow for noisy, frames in alike for flow in solve_alike(noisy, list(frames))]
+        alike = groupby(batch, lambda frame: (frame.noisy, frame.draft))
+        return [flow for kind, frames in alike for flow in solve_alike(*kind, list(frames))]
 
-    def solve_alike(noisy: bool, batch: list[FlowFrame]) -> list[FloatArray]:
+    def solve_alike(noisy: bool, draft: bool, batch: list[FlowFrame]) -> list[FloatArray]:
         levels, solver = solvers[noisy]
         # Farneback's method takes no start.
         usable = [replace(frame, start=None) for frame in batch] if params.method == "farneback" else batch
         placed = [_place(frame, levels, position) for frame in usable]
-        flows = list(solver(np.stack([p.levels for p in placed]), [p.start for p in placed]))
+        flows = list(solver(np.stack([p.levels for p in placed]), [p.start for p in placed], draft))
         if confidence is not None:
             flows = [regularise_flow(f, confidence, frame.noise) for f, frame in zip(flows, batch, strict=True)]
         return [flow + p.shift if p.shift.any() else flow for flow, p in zip(flows, placed, strict=True)]
 
-    # A device solves a batch at once while the next one is prepared; on the CPU every frame has a thread.
-    batch, threads = (1, runtime.threads) if device == CPU else (params.tvl1.batch, 2)
+    # A device solves a batch at once while others are prepared; on the CPU every frame has a thread.
+    batch, threads = (1, runtime.threads) if device == CPU else (params.tvl1.batch, min(runtime.workers, _BATCHES))
     return FlowReference(prepare, solve, shape, batch, threads)
 
 
@@ -280,8 +283,8 @@ def _place(frame: FlowFrame, outside: GreyImage, position: ShiftReference | None
     return _PlacedFrame(shift_frame(frame.levels, shift, outside), None if start is None else start - shift, shift)
 
 
-FLOW_METHODS: dict[str, Callable[[FlowParams, GreyImage, int, str], FlowSolver]] = {
-    "dis": lambda params, reference, start_level, _: dis_solver(params.dis, reference, start_level),
-    "tvl1": lambda params, reference, _, device: tvl1_solver(params.tvl1, reference, device),
+FLOW_METHODS: dict[str, Callable[[FlowParams, GreyImage, str], FlowSolver]] = {
+    "dis": lambda params, reference, _: dis_solver(params.dis, reference),
+    "tvl1": lambda params, reference, device: tvl1_solver(params.tvl1, reference, device),
     "farneback": lambda params, reference, *_: farneback_solver(params.farneback, reference),
 }

@@ -2,9 +2,9 @@
 
 Dense inverse search with variational refinement (Kroeger et al. 2016) is the default method of
 :mod:`turbrestore.registration.flow`.  A flow that starts from an earlier one skips the coarse levels of the pyramid,
-which only serve to find a start, and half of the refinements, because the start is smooth already: two thirds of the
-time.  If the start was measured from a much blurrier image, the level above the finest has to correct it first
-(``start_level``).  Farneback's method (2003) takes no start.
+which only serve to find a start, and three quarters of the refinements, because the start is smooth already, and puts
+patches further apart: a third of the time.  A draft, which a flow of the same frame will start from, ends at half the
+resolution: a fifth of the time.  Farneback's method (2003) takes no start and makes no drafts.
 """
 
 from __future__ import annotations
@@ -20,8 +20,11 @@ from ..core.arrays import FloatArray
 from ..core.errors import require, require_between
 
 GreyImage = NDArray[np.uint8]
-# From frames (B, H, W) and the flow that each starts from, or None, to flows (B, H, W, 2).  Threads share a solver.
-FlowSolver = Callable[[GreyImage, list[FloatArray | None]], FloatArray]
+# From frames (B, H, W), the flow that each starts from, or None, and whether drafts will do, to flows (B, H, W, 2).
+# Threads share a solver.
+FlowSolver = Callable[[GreyImage, list[FloatArray | None], bool], FloatArray]
+# Pixels by which the patches of a flow with a start lie further apart.
+_WIDER_STRIDE = 2
 
 
 @dataclass(frozen=True)
@@ -35,9 +38,10 @@ class DisParams:
     patch_size : int
         Side of the matched patches, pixels.
     patch_stride : int
-        Distance between patches, pixels.
+        Distance between patches, pixels; two more where a flow starts from an earlier one.
     refinements : int
-        Iterations of the variational refinement; half as many where a flow starts from an earlier one.
+        Iterations of the variational refinement; half of them for a draft, and a quarter where a flow starts from an
+        earlier one.
     smoothness : float
         Weight of the smoothness term in the refinement.
     """
@@ -87,28 +91,36 @@ class FarnebackParams:
         require(self.neighbourhood in (5, 7), f"neighbourhood: expected 5 or 7 pixels, found {self.neighbourhood}")
 
 
-def dis_solver(params: DisParams, reference: GreyImage, start_level: int) -> FlowSolver:
+def dis_solver(params: DisParams, reference: GreyImage, start_level: int | None = None) -> FlowSolver:
     """Prepare dense inverse search from a reference.
 
-    ``reference`` (H, W).
+    A start that is only a guess is searched for from a coarser level, ``start_level`` above the finest, as thoroughly
+    as without a start.  ``reference`` (H, W).
     """
 
-    def solve(frame: GreyImage, start: FloatArray | None) -> FloatArray:
+    def solve(frame: GreyImage, start: FloatArray | None, draft: bool) -> FloatArray:
         # A solver object keeps buffers that threads must not share; making one is cheap beside a flow.
         solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        solver.setFinestScale(params.finest_scale)
-        refinements = params.refinements
-        if start is not None:
-            # Restored images differ by hundredths of a dB from those made with all refinements.
+        finest, stride, refinements = params.finest_scale + draft, params.patch_stride, params.refinements
+        if draft:
             refinements -= refinements // 2
-            solver.setCoarsestScale(params.finest_scale + start_level)
+        if start is not None and start_level is not None:
+            refinements -= refinements // 2
+            solver.setCoarsestScale(finest + start_level)
+        elif start is not None:
+            refinements = -(-refinements // 4)
+            stride = min(stride + _WIDER_STRIDE, params.patch_size)
+            solver.setCoarsestScale(finest)
+        solver.setFinestScale(finest)
         solver.setPatchSize(params.patch_size)
-        solver.setPatchStride(params.patch_stride)
+        solver.setPatchStride(stride)
         solver.setVariationalRefinementIterations(refinements)
         solver.setVariationalRefinementAlpha(params.smoothness)
         return solver.calc(reference, frame, start)
 
-    return lambda frames, starts: np.stack([solve(*pair) for pair in zip(frames, starts, strict=True)])
+    return lambda frames, starts, draft: np.stack(
+        [solve(frame, start, draft) for frame, start in zip(frames, starts, strict=True)]
+    )
 
 
 def farneback_solver(params: FarnebackParams, reference: GreyImage) -> FlowSolver:
@@ -132,7 +144,7 @@ def farneback_solver(params: FarnebackParams, reference: GreyImage) -> FlowSolve
             cv2.OPTFLOW_FARNEBACK_GAUSSIAN,
         )
 
-    return lambda frames, _: np.stack([solve(frame) for frame in frames])
+    return lambda frames, *_: np.stack([solve(frame) for frame in frames])
 
 
 def flow_memory(shape: tuple[int, ...], threads: int) -> float:

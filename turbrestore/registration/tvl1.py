@@ -38,6 +38,8 @@ Everything but the sweeps is written once for the CPU and for devices (:mod:`tur
 
 from __future__ import annotations
 
+import threading
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,6 +59,8 @@ _LEAST_SIDE = 32
 _FLAT = 1e-6
 # Finest levels that a flow with a start goes through.  One alone loses 0.1 dB on some clips, three save half as much.
 _STARTED_LEVELS = 2
+# Batches that a device works on at a time: one computes while the next comes and the last goes.
+_BATCHES_AT_A_TIME = 2
 _ONE = np.ones(1, np.float32)
 # Exact for polynomials of degree four.
 _DERIVATIVE = (np.array([1, -8, 0, 8, -1]) / 12).astype(np.float32)
@@ -157,9 +161,13 @@ def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device:
 
 
 def tvl1_flows(
-    frames: ArrayLike, reference: TvL1Reference, start: ArrayLike | None = None, levels: int | None = None
+    frames: ArrayLike,
+    reference: TvL1Reference,
+    start: ArrayLike | None = None,
+    levels: int | None = None,
+    draft: bool = False,
 ) -> TvL1Flows:
-    """Flows from the reference to each of some frames, in the calling thread.
+    """Flows from the reference to each of some frames, in the calling thread; a draft leaves out the finest level.
 
     ``frames`` (T, H, W) or (T, H, W, 3); ``start`` (T, H, W, 2).
     """
@@ -176,7 +184,7 @@ def tvl1_flows(
     # On the CPU a single frame stays in the cache.
     size = 1 if reference.ops.arrays is np else len(stack)
     groups = [slice(first, first + size) for first in range(0, len(stack), size)]
-    parts = [_solve(stack[group], reference, None if flows is None else flows[group]) for group in groups]
+    parts = [_solve(stack[group], reference, None if flows is None else flows[group], draft) for group in groups]
     return TvL1Flows(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("flows", "warps", "settled")))
 
 
@@ -187,14 +195,15 @@ def tvl1_solver(params: TvL1Params, reference: GreyImage, device: str) -> FlowSo
     """
     with memory_of(device):
         prepared = prepare_tvl1(reference.astype(np.float32), params, device)
+    admitted = threading.Semaphore(_BATCHES_AT_A_TIME) if device != CPU else nullcontext()
 
-    def solve(frames: GreyImage, starts: list[FloatArray | None]) -> FloatArray:
+    def solve(frames: GreyImage, starts: list[FloatArray | None], draft: bool) -> FloatArray:
         flows = np.empty((*frames.shape, 2), np.float32)
         started = [number for number, start in enumerate(starts) if start is not None]
         others = [number for number, start in enumerate(starts) if start is None]
-        with memory_of(device, "lower flow.tvl1.batch"):
+        with admitted, memory_of(device, "lower flow.tvl1.batch"):
             if others:
-                flows[others] = tvl1_flows(frames[others].astype(np.float32), prepared).flows
+                flows[others] = tvl1_flows(frames[others].astype(np.float32), prepared, draft=draft).flows
             if started:
                 known = np.stack([start for start in starts if start is not None])
                 grey = frames[started].astype(np.float32)
@@ -222,7 +231,7 @@ def _pyramid(images: Stack, levels: int, ops: StackOps) -> list[Stack]:
     return pyramid
 
 
-def _solve(frames: FloatArray, reference: TvL1Reference, start: FloatArray | None) -> TvL1Flows:
+def _solve(frames: FloatArray, reference: TvL1Reference, start: FloatArray | None, draft: bool) -> TvL1Flows:
     """Flows of a batch, from the coarsest level to the finest."""
     ops = reference.ops
     pyramid = _pyramid(ops.load(frames), len(reference.levels), ops)
@@ -230,11 +239,13 @@ def _solve(frames: FloatArray, reference: TvL1Reference, start: FloatArray | Non
     flow, dual = ops.zeros((count, 2, *size)), ops.zeros((count, 2, 2, *size))
     if start is not None:
         flow = _resized(ops.load(np.moveaxis(start, -1, 1)), tuple(size), ops)
-    for level, images in zip(reference.levels[::-1], pyramid[::-1], strict=True):
+    finest = int(draft and len(pyramid) > 1)
+    for level, images in zip(reference.levels[finest:][::-1], pyramid[finest:][::-1], strict=True):
         shape = tuple(images.shape[-2:])
         if tuple(flow.shape[-2:]) != shape:
             flow, dual = _resized(flow, shape, ops), resize_dual(dual, shape, ops)
         warps, settled = _settle(level, spline_coefficients(images, ops), flow, dual, reference)
+    flow = _resized(flow, tuple(pyramid[0].shape[-2:]), ops) if finest else flow
     return TvL1Flows(np.moveaxis(ops.store(flow), 1, -1), warps, settled)
 
 

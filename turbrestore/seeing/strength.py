@@ -24,10 +24,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from ..blur_moments.cues import relative_blur
 from ..blur_moments.tile_spectra import CueParams
@@ -56,7 +57,7 @@ _COMPARED, _TILES = 512, CueParams(tile=64, departure=1.0)
 # Share of rotation from which the displacement is not that of turbulence; without any relation of x and y it is 0.5.
 _ROTATING = 0.4
 _HALF, _E_FOLD = 0.5, float(np.exp(-1))
-_DEVIATIONS = float(special.ndtri(0.975))
+_DEVIATIONS = NormalDist().inv_cdf(0.975)
 
 
 @dataclass(frozen=True)
@@ -273,7 +274,7 @@ def measure_seeing(
 
 def chi_square_interval(variance: float, freedom: float, relative: float = 0.0) -> Estimate:
     """95 % interval of a variance with ν degrees of freedom and an independent relative error."""
-    upper, lower = (max(float(special.chdtri(freedom, share)) / freedom, 1e-12) for share in (0.025, 0.975))
+    upper, lower = (max(float(scipy.special.chdtri(freedom, share)) / freedom, 1e-12) for share in (0.025, 0.975))
     below, above = (np.hypot(np.log(quantile), _DEVIATIONS * relative) for quantile in (upper, lower))
     return Estimate(variance, float(variance * np.exp(-below)), float(variance * np.exp(above)))
 

@@ -32,8 +32,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import special
 
 from ..core.errors import ConfigurationError, require, require_between
 from ..synthesis.atmosphere import Layer, fried_parameter, phase_spectrum, tilt_variance
@@ -133,9 +133,8 @@ def displacement_differences(optics: Optics, spacing: float, counts: tuple[int, 
         pixel = optics.pixel_scale * z
         f = np.geomspace(1e-3 / (pixel * spacing * max(counts) + cone), 30 / cone, _FREQUENCIES)
         x, y = (f[:, None] * part(angles) for part in (np.cos, np.sin))
-        response = (
-            cone / optics.aperture * optics.wavelength * 8 * special.jv(2, np.pi * cone * f) / (np.pi * cone * f) ** 2
-        )
+        phase = np.pi * cone * f
+        response = cone / optics.aperture * optics.wavelength * 8 * scipy.special.jv(2, phase) / phase**2
         r0 = fried_parameter(1.0, thickness, optics.wavelength, 1.0)
         # d²f = f df dangle, and df = f d(log f).
         power = response**2 * phase_spectrum(f, r0, _NO_OUTER_SCALE, 0.0) * f**2 * np.log(f[1] / f[0])

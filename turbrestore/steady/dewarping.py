@@ -119,7 +119,7 @@ def measure_flow(reference: FloatArray, image: FloatArray, start: FloatArray) ->
 
     ``reference, image`` (H, W) or (H, W, 3); ``start`` (H, W, 2); returns (H, W, 2).
     """
-    return _solver(contrast_levels(reference))(contrast_levels(image)[None], [start])[0]
+    return _solver(contrast_levels(reference))(contrast_levels(image)[None], [start], False)[0]
 
 
 def _solver(levels: GreyImage) -> FlowSolver:
@@ -145,7 +145,7 @@ def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
             expected = expected_motion(cameras, offset)
         else:
             expected = _first_guess(window.frame, neighbour)
-        flows[offset] = solve(neighbour.levels[None], [camera_flow(expected, levels.shape)])[0]
+        flows[offset] = solve(neighbour.levels[None], [camera_flow(expected, levels.shape)], False)[0]
         cameras[offset] = fit_camera(flows[offset])
     return flows, cameras
 

@@ -24,12 +24,13 @@ constant is 0.112 at L0 = 50 D, 0.149 at 500 D and 0.170 at 10⁴ D.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from ..core.errors import ConfigurationError, require, require_between
 
@@ -37,8 +38,8 @@ Float64Array = NDArray[np.float64]
 
 # The structure function 2.914 k² r^(5/3) ∫ Cn² dz = 6.884 (r/r0)^(5/3) implies r0^(-5/3) = 0.423 k² ∫ Cn² dz.
 _FRIED = 0.423
-_STRUCTURE = 2 * (24 / 5 * special.gamma(6 / 5)) ** (5 / 6)
-_SPECTRUM = (_STRUCTURE / 2) * special.gamma(11 / 6) ** 2 / (2 * np.pi ** (11 / 3))
+_STRUCTURE = 2 * (24 / 5 * math.gamma(6 / 5)) ** (5 / 6)
+_SPECTRUM = (_STRUCTURE / 2) * math.gamma(11 / 6) ** 2 / (2 * np.pi ** (11 / 3))
 # Names of D/r0 of a spherical wave.
 STRENGTHS = {"weak": 1.2, "medium": 2.5, "strong": 5.0}
 # Nodes of the quadrature over log frequency.
@@ -251,7 +252,7 @@ def tilt_variance(
         highest = 30 / diameter if inner_scale == 0 else min(30 / diameter, 4 / inner_scale)
         f = np.geomspace(1e-3 / outer_scale, max(highest, 10 / outer_scale), _QUADRATURE)
         x = np.pi * diameter * f
-        power = phase_spectrum(f, layer.r0, outer_scale, inner_scale) * (special.jv(2, x) / x) ** 2 * f
+        power = phase_spectrum(f, layer.r0, outer_scale, inner_scale) * (scipy.special.jv(2, x) / x) ** 2 * f
         total += float(np.trapezoid(power * f, np.log(f)))
     return total * 16 * np.pi * (2 * wavelength / (np.pi * aperture)) ** 2
 

@@ -36,8 +36,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol, wiener_fidelity
 from ..core.arrays import FloatArray, luminance
@@ -82,7 +82,7 @@ def posterior_gain(size: tuple[int, int], fidelity: float, sigma: float, exponen
     shape = (min(size[0], _GRID), min(size[1], _GRID))
     power = np.abs(blur_otf(shape, sigma, exponent or GAUSSIAN)) ** 2
     # The first value of the inverse transform is the mean over all frequencies, of which half are stored.
-    return float(fft.irfft2(1 / (power + laplacian_symbol(*shape) / fidelity), s=shape)[0, 0])
+    return float(scipy.fft.irfft2(1 / (power + laplacian_symbol(*shape) / fidelity), s=shape)[0, 0])
 
 
 def variance_by_blur(fused: FloatArray, fidelity: float, widths: tuple[float, float], exponent: float) -> FloatArray:
@@ -92,11 +92,11 @@ def variance_by_blur(fused: FloatArray, fidelity: float, widths: tuple[float, fl
     """
     reach = int(np.ceil(MARGIN_SIGMAS * widths[1]))
     margin = margin_around((fused.shape[0], fused.shape[1]), reach)
-    spectrum = fft.rfft2(margin.pad(luminance(fused)))
+    spectrum = scipy.fft.rfft2(margin.pad(luminance(fused)))
     prior = laplacian_symbol(*margin.shape) / fidelity
     otfs = (blur_otf(margin.shape, width, exponent) for width in widths)
     low, high = (otf / (otf**2 + prior) for otf in otfs)
-    between = fft.irfft2(spectrum * (high - low), s=margin.shape)[margin.inside()] / 2
+    between = scipy.fft.irfft2(spectrum * (high - low), s=margin.shape)[margin.inside()] / 2
     return cv2.GaussianBlur(np.square(between).astype(np.float32), (0, 0), _WINDOW)
 
 
