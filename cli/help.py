@@ -21,6 +21,8 @@ RARE = {
     *("--inner-scale", "--outer-scale", "--layers", "--pupil-samples", "--field-spacing", "--sub-frames"),
     *("--channel-wavelengths", "--nyquist"),
 }
+# Options that few people need of a command with presets, and that are the point of others.
+RARE_IN_RESTORE = {"--pixel-scale", "--aperture", "--distance", "--wavelength", "--psf"}
 # Columns for the names of options, and for the text if the terminal does not say.
 _NAMES, _WIDEST = 30, 110
 _ENDS = (". ", "; ", ": ", ", ", " (")
@@ -39,15 +41,17 @@ class Formatter(PlainFormatter):
             return
         width = min(options.max_width, _WIDEST)
         entries = [(entry, _text(console, options, entry.description)) for entry in panel.entries]
-        shown = entries if self.full or panel.format == "command" else [one for one in entries if _usual(one[0])]
+        names = {name for entry in panel.entries for name in entry.positive_names}
+        rare = RARE | RARE_IN_RESTORE if "--preset" in names else RARE
+        everything = self.full or panel.format == "command"
+        shown = entries if everything else [one for one in entries if _usual(one[0], rare)]
         title = "Options" if panel.title == "Parameters" else panel.title
         lines: list[str] = []
         for section, group in _by_stage(shown):
             lines += ["", f"{title}:" if not section else f"{section}:"] if lines or not section else [f"{section}:"]
             for entry, text in group:
                 # The summary of a command is written to fit.
-                whole = self.full or panel.format == "command"
-                lines += _rows(entry, text, width, whole)
+                lines += _rows(entry, text, width, everything)
         if len(shown) < len(entries):
             lines += [
                 "",
@@ -57,8 +61,8 @@ class Formatter(PlainFormatter):
         console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
 
 
-def _usual(entry: HelpEntry) -> bool:
-    return not any("." in name or name in RARE for name in entry.positive_names)
+def _usual(entry: HelpEntry, rare: set[str]) -> bool:
+    return not any("." in name or name in rare for name in entry.positive_names)
 
 
 def _by_stage(entries: Iterable[tuple[HelpEntry, str]]) -> Iterator[tuple[str, list[tuple[HelpEntry, str]]]]:
