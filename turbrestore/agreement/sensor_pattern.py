@@ -35,8 +35,9 @@ _CLEARLY, _LEAST = 4.0, 5e-4
 _STANDS = 0.25
 # Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion, pixels.
 _EDGE, _LEAST_MOTION = 8.0, 0.3
-# Parts along the stripes, and the least correlation of their offsets.
-_PARTS, _ALIKE = 3, 0.4
+# Parts along the stripes, and the least correlation of their offsets; offsets of a sensor, root mean square, are smaller
+# than those of strokes and bars.
+_PARTS, _ALIKE, _LARGEST = 3, 0.5, 0.04
 # Share of the height of a warm pixel over the median around by which it exceeds each neighbour; most that are warm.
 _ALONE, _MOST_WARM = 0.7, 0.005
 # A dead column varies less than this share of the noise and of the columns around; dead ones are few, and told
@@ -116,7 +117,8 @@ def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float
     offsets = np.median(fine, axis=0).astype(np.float32)
     size = float(np.sqrt(np.mean(np.median(np.abs(offsets)) ** 2)))
     parts = [np.median(part, axis=0) for part in np.array_split(fine, _PARTS)]
-    if size < max(_CLEARLY * 1.25 * error / np.sqrt(len(mean)), _LEAST) or np.corrcoef(parts).min() < _ALIKE:
+    clear = size >= max(_CLEARLY * 1.25 * error / np.sqrt(len(mean)), _LEAST) and offsets.std() <= _LARGEST
+    if not clear or np.corrcoef(parts).min() < _ALIKE:
         return np.zeros_like(offsets)
     slope = np.gradient(offsets) ** 2
     level = np.median(variance, axis=0)
