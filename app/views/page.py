@@ -88,7 +88,7 @@ class Page:
             await self._opened(clip)
 
     def look_at(self, what: str) -> None:
-        """Show the ``clip``, stages (``compare``), widths of the blur (``sweep``), the ``video`` or a camera (``live``)."""
+        """Show ``clip``, stages (``compare``), widths of the blur (``sweep``), ``video`` or a camera (``live``)."""
         self.clip_view.place.visible = what == "clip"
         self.compare_view.place.visible = what == "compare"
         self.sweep_view.place.visible = what == "sweep"

@@ -25,12 +25,14 @@ _STEP, _FITS = 8, 4
 _LEAST_DISTANCE = 1e-3
 
 
-def fit_camera(flow: FloatArray, shape: tuple[int, ...]) -> Matrix:
+def fit_camera(flow: FloatArray, shape: tuple[int, ...] | None = None) -> Matrix:
     """Fit an affine flow that outliers hardly influence.
 
-    ``flow`` (h, w, 2) on a grid over an image of this shape (:mod:`turbrestore.steady.grid`); returns (2, 3).
+    ``flow`` (H, W, 2), or (h, w, 2) on a grid over an image of this shape (:mod:`turbrestore.steady.grid`); returns
+    (2, 3).
     """
     height, width = flow.shape[:2]
+    shape = shape or flow.shape
     step = max(min(_STEP * height // shape[0], height // 8, width // 8), 1)
     every = np.s_[step // 2 :: step]
     samples = flow[every, every].reshape(-1, 2).astype(np.float64)
