@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from turbrestore.core.decision import Decision
 
 Result_co = TypeVar("Result_co", covariant=True)
-Kind = Literal["restore", "steady", "several"]
+Kind = Literal["restore", "steady", "several", "live"]
 
 
 class Stopped(BaseException):
@@ -61,7 +61,7 @@ class Job(Generic[Result_co]):
     ----------
     work : callable
         Takes the job, which it reports to, and returns its result.
-    kind : {"restore", "steady", "several"}
+    kind : {"restore", "steady", "several", "live"}
 
     Attributes
     ----------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -112,6 +113,23 @@ def steady_order(order: SteadyOrder, job: Job[object], film_path: Path) -> Stead
     film_path.unlink(missing_ok=True)
     film = write_film(film_path, _pairs(source, order.output, count, job), count, fps, _RATE_FACTOR)
     return Steadied(order.output, film, film_path)
+
+
+def watch_camera(name: str, job: Job[None]) -> None:
+    """Steady what a camera films, and show every frame beside the steadied one, until the job is stopped."""
+    from turbrestore.io.live.stream import open_camera
+    from turbrestore.steady.video import steady_frames
+
+    camera, waiting = open_camera(name), deque[FloatArray]()
+
+    def filmed() -> Iterator[FloatArray]:
+        for frame in camera.frames:
+            waiting.append(frame)
+            yield frame
+
+    for steadied in steady_frames(filmed(), SteadyParams(live=True), Machine().runtime()):
+        job.show("camera", waiting.popleft())
+        job.show("steadied", steadied.image)
 
 
 def _images(source: FrameSource, params: SteadyParams, machine: Machine, job: Job[object]) -> Iterator[FloatArray]:

@@ -18,7 +18,7 @@ from .job import Job, Kind
 from .pictures import Pictures
 from .restoring import Order, Restored, preview_order, restore_order
 from .several import Row, Task, restore_all
-from .steadying import Steadied, SteadyOrder, steady_order
+from .steadying import Steadied, SteadyOrder, steady_order, watch_camera
 
 if TYPE_CHECKING:
     from turbrestore.deconvolution.deconvolve import DeconvolutionParams
@@ -151,6 +151,10 @@ class Tab:
             return steadied
 
         return self._start("steady", work)
+
+    def watch(self, camera: str) -> Job[None]:
+        """Steady what a camera films, in a thread, until it is stopped."""
+        return self._start("live", lambda job: watch_camera(camera, job))
 
     def restore_all(self, tasks: Sequence[Task]) -> Job[None]:
         """Restore several clips in a thread, one after the other."""

@@ -6,9 +6,12 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TypeVar
+
+Item = TypeVar("Item")
 
 # Windows knows no SIGHUP.
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
@@ -57,3 +60,21 @@ def termination_raises(heard: list[KeyboardInterrupt], ends_process: bool = Fals
     finally:
         for number in caught:
             signal.signal(number, signal.SIG_IGN if heard and ends_process else before[number])
+
+
+def until_interrupted(items: Iterable[Item]) -> Iterator[Item]:
+    """Yield items until Ctrl-C, which ends a camera as its end does a file; the second one interrupts."""
+    before, stopped = signal.getsignal(signal.SIGINT), threading.Event()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        stopped.set()
+        signal.signal(number, before)
+
+    signal.signal(signal.SIGINT, stop)
+    try:
+        for item in items:
+            if stopped.is_set():
+                return
+            yield item
+    finally:
+        signal.signal(signal.SIGINT, before)

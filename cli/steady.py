@@ -18,7 +18,7 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import ConfigurationError, require
 from turbrestore.footage.checks.content import clean_source, keep_all
 from turbrestore.io.encoding import BY_SUFFIX, Encoding, write_pipe
-from turbrestore.io.live.stream import open_pipe, read_raw, write_raw
+from turbrestore.io.live.stream import open_camera, open_pipe, read_raw, write_raw
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.io.source import FrameSource
@@ -33,6 +33,7 @@ from .inputs import files_read, open_checked
 from .options import Flag, Machine, Selection
 from .output import check_distinct, print_json, write_settings
 from .progress import progress_bars, say
+from .signals import until_interrupted
 
 # Frames per second of inputs that do not say.
 USUAL_RATE = 25.0
@@ -88,8 +89,8 @@ def steady(
     ----------
     input : Path
         Video, SER, FITS, TIFF, .npy or folder of images.  A video is what FFmpeg reads (mp4, mkv, mov, avi, mts, wmv,
-        …) or an animated PNG or WebP; a folder may hold FITS files; or ``-`` for Matroska or YUV4MPEG2 on standard
-        input.
+        …) or an animated PNG or WebP; a folder may hold FITS files; ``-`` for Matroska or YUV4MPEG2 on standard input;
+        or ``/dev/video0`` and alike for a camera, until Ctrl-C.
     output : Path
         Video to write, of the same length.  .mp4 (H.264), .mkv (lossless), .ser, .tif, .npy, .gif or .webp; or ``-``
         for lossless Matroska on standard output.  .mp4 and .mkv take over audio and time stamps of a video file.
@@ -113,20 +114,24 @@ def steady(
         Print neither progress nor remarks.
     """
     piped_in, piped_out = str(input) == "-", str(output) == "-"
+    is_camera = re.fullmatch(r"/dev/video\d+", str(input)) is not None
+    streamed = piped_in or is_camera
     encoding, shape = written.encoding(), _raw_shape(raw)
     require(raw is None or piped_in, "--raw: has no effect unless the input is -; leave it out")
     require(not (piped_out and json), "--json: contradicts the output -, which is standard output; leave it out")
     require(not piped_out or encoding == BY_SUFFIX, "--codec, --crf: have no effect on the output -; leave them out")
-    require(not (report and (piped_in or piped_out)), "--report: compares two files, and - is none; leave it out")
+    require(
+        not (report and (streamed or piped_out)), "--report: compares two files, and a stream is none; leave it out"
+    )
     _check_depth(written, output, piped_out and raw is not None)
-    inputs = files_read(selection, None if piped_in else input, config)
+    inputs = files_read(selection, None if streamed else input, config)
     settings_path = output.with_name(output.name + ".toml")
     if not piped_out:
         check_output(output, inputs, overwrite, VIDEO_OUTPUT_SUFFIXES)
         others = [path for path in inputs if path != config]
         check_output(settings_path, others, overwrite or config == settings_path, suffixes=None)
     _check_companions(mask, report, None if piped_out else output, inputs, overwrite)
-    source = _from_pipe(selection, shape) if piped_in else _from_file(input, selection, quiet)
+    source = _from_stream(input, selection, shape) if streamed else _from_file(input, selection, quiet)
     fps, depth = source.fps or USUAL_RATE, source.bit_depth if written.bit_depth is None else written.bit_depth
     companion = source.frames if isinstance(source.frames, FrameSource) else None
     if companion is not None and companion.colour is not None and companion.colour[1] in CURVES:
@@ -205,9 +210,12 @@ def _from_file(input: Path, selection: Selection, quiet: bool) -> _Source:
     return _Source(source.name, source.shape[1:], source.bit_depth, source.fps, source)
 
 
-def _from_pipe(selection: Selection, shape: tuple[int, ...] | None) -> _Source:
+def _from_stream(input: Path, selection: Selection, shape: tuple[int, ...] | None) -> _Source:
     idle = dataclasses.replace(selection, max_pixels=None) == Selection()
-    require(idle, "-: a pipe is read as it comes; leave out the options that select or repair frames")
+    require(idle, f"{input}: a stream is read as it comes; leave out the options that select or repair frames")
+    if str(input) != "-":
+        camera = open_camera(str(input), selection.limits())
+        return _Source(camera.name, camera.shape, 8, camera.fps, until_interrupted(camera.frames))
     if shape is not None:
         limits = selection.limits()
         limits.check_size(shape[1], shape[0], "--raw")
@@ -287,7 +295,7 @@ class _Facts:
         share = float(np.mean(self.let_go))
         if share < _ASTRAY:
             return ""
-        return f"; {100 * share:.0f} % of the image is averaged less, because the long average drifted from the input"
+        return f"; {100 * share:.0f} % of the image is averaged less, because the result drifted from the input"
 
 
 def _images(frames: Iterable[SteadyFrame], masks: BinaryIO | None) -> Iterator[FloatArray]:

@@ -19,6 +19,7 @@ from ..tab import Tab
 from .clip_view import ClipView
 from .compare_view import CompareView
 from .elements import Notices
+from .live_view import LiveView
 from .open_view import OpenView
 from .run_view import RunView
 from .save_view import SaveView
@@ -54,6 +55,7 @@ class Page:
         self.tune_view = TuneView(tab, self.notices, self.compare_view, self.sweep_view, on_change=self._tuned)
         self.save_view = SaveView(tab, self.notices)
         self.steady_view = SteadyView(tab, self.notices, selection=lambda: self.run_view.order().selection)
+        self.live_view = LiveView(tab, self.notices, on_start=lambda: self.look_at("live"))
         self.several_view = SeveralView(tab, self.notices, like=self.run_view.order)
         # The run whose images are shown, and how many of them.
         self._seen: tuple[Job[object] | None, int] = (None, 0)
@@ -66,7 +68,7 @@ class Page:
             with ui.element("div").classes("view"):
                 self._build_viewer()
             with ui.element("aside").classes("side").props('aria-label="Steps"'):
-                for view in self._steps():
+                for view in (*self._steps(), self.live_view):
                     view.build()
         self._refresh()
         ui.timer(_BEAT, self._look)
@@ -86,11 +88,12 @@ class Page:
             await self._opened(clip)
 
     def look_at(self, what: str) -> None:
-        """Show the ``clip``, the stages (``compare``), several widths of the blur (``sweep``), or the ``video``."""
+        """Show ``clip``, stages (``compare``), widths of the blur (``sweep``), ``video`` or a camera (``live``)."""
         self.clip_view.place.visible = what == "clip"
         self.compare_view.place.visible = what == "compare"
         self.sweep_view.place.visible = what == "sweep"
         self.video_view.place.visible = what == "video"
+        self.live_view.place.visible = what == "live"
         ui.run_javascript(f"turbrestore.look('{what}')")
         for name, button in self._tabs.items():
             button.classes(add="chosen" if name == what else "", remove="" if name == what else "chosen")
@@ -192,12 +195,14 @@ class Page:
         self.compare_view.build()
         self.sweep_view.build()
         self.video_view.build()
+        self.live_view.build_pictures()
         self.look_at("")
 
     async def _look(self) -> None:
         """Follow the run; called again and again."""
         await self._show_images()
-        for view in (self.run_view, self.steady_view, self.several_view):
+        await self.live_view.refresh()
+        for view in (self.run_view, self.steady_view, self.several_view, self.live_view):
             ended = view.follow()
             if ended is not None:
                 await self._ended(ended)
@@ -205,7 +210,7 @@ class Page:
     async def _show_images(self) -> None:
         """Show the images of the stages that are done."""
         job = self.tab.job
-        if job is None or job.state != "running" or not job.images:
+        if job is None or job.kind == "live" or job.state != "running" or not job.images:
             return
         shown = len(job.images)
         if self._seen != (job, shown):

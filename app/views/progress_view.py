@@ -26,7 +26,7 @@ class ProgressView:
     Parameters
     ----------
     tab : Tab
-    kind : {"restore", "steady", "several"}
+    kind : {"restore", "steady", "several", "live"}
         Runs that are shown; while another one is running, none can be started.
     """
 

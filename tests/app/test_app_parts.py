@@ -309,6 +309,39 @@ class TestSeveral:
 
 
 class TestSteady:
+    def test_a_camera_is_watched_until_it_is_stopped(self, tmp_path, monkeypatch):
+        released = threading.Event()
+
+        class Camera:
+            def __init__(self, name):
+                self.frames = 0 if name == "/dev/video0" else None
+
+            def read(self):
+                if self.frames is None:
+                    return False, None
+                self.frames += 1
+                return True, np.full((32, 48, 3), self.frames % 200, np.uint8)
+
+            set = get = lambda *_: 0
+
+            def release(self):
+                released.set()
+
+        monkeypatch.setattr("cv2.VideoCapture", Camera)
+        tab = Tab(Folders(tmp_path))
+        watched = tab.watch("/dev/video0")
+        for _ in range(600):
+            if "steadied" in watched.images or watched.state != "running":
+                break
+            watched.join(0.1)
+        seen, steadied = watched.images["camera"], watched.images["steadied"]
+        assert steadied.shape == (32, 48, 3)
+        assert np.abs(seen - steadied).max() < 0.05
+        tab.stop()
+        assert ended(watched).state == "stopped"
+        assert released.wait(10)
+        assert "/dev/video1: expected a camera" in ended(tab.watch("/dev/video1")).message
+
     def test_the_command_gives_the_same_files(self, folder, tmp_path):
         tab = Tab(Folders(folder))
         order = SteadyOrder(

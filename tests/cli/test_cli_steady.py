@@ -2,6 +2,7 @@
 
 import io
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -91,7 +92,8 @@ def test_pipes_of_matroska_stand_in_a_row(tmp_path):
     ("words", "code", "part"),
     [
         (["-", "o.mkv"], 65, "standard input"),
-        (["-", "o.mkv", "--roi", "0,0,9,9"], 2, "pipe"),
+        (["-", "o.mkv", "--roi", "0,0,9,9"], 2, "stream"),
+        (["/dev/video99", "o.mkv", "--live"], 65, "/dev/video99: expected a camera"),
         (["-", "o.mkv", "--raw", "20"], 2, "--raw"),
         (["-", "-", "--json"], 2, "--json"),
         (["-", "-", "--crf", "20"], 2, "--crf"),
@@ -107,6 +109,39 @@ def test_wrong_words_about_pipes(run, tmp_path, monkeypatch, words, code, part):
     assert (found, out) == (code, "")
     assert part in err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_camera_is_recorded_until_it_is_interrupted(run, tmp_path, monkeypatch):
+    frames = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
+
+    class Camera:
+        taken = 0
+
+        def __init__(self, name):
+            assert name == "/dev/video3"
+
+        def set(self, *_):
+            pass
+
+        def get(self, _):
+            return 12.5
+
+        def release(self):
+            Camera.taken = -Camera.taken
+
+        def read(self):
+            Camera.taken += 1
+            if Camera.taken == 6:
+                signal.raise_signal(signal.SIGINT)
+            return True, frames[..., ::-1]
+
+    monkeypatch.setattr("cv2.VideoCapture", Camera)
+    output = tmp_path / "o.mkv"
+    assert run("steady", "/dev/video3", output, "--live", "--sigma", "0", "--quiet") == (0, "", "")
+    written = open_frames(output)
+    # The first frame only tells the size, and the last one arrives with the interruption.
+    assert (Camera.taken, len(written), written.fps) == (-6, 4, 12.5)
+    assert np.abs(written.read(2, 3)[0] * 255 - frames).max() <= 2
 
 
 def test_an_empty_pipe_is_named(tmp_path):

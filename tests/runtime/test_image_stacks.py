@@ -51,9 +51,9 @@ def test_filter_correlates_and_reflects_the_image():
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (2, 2), (9, 1), (31, 45)])
 def test_the_compiled_spline_does_what_it_says(shape):
-    coefficients = RNG.random((shape[0] + 3, shape[1] + 3), np.float32)
+    coefficients = RNG.random((2, shape[0] + 3, shape[1] + 3), np.float32)
     flow = RNG.normal(0, 3, (*shape, 2)).astype(np.float32)
-    fast, slow = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    fast, slow = np.empty((2, *shape), np.float32), np.empty((2, *shape), np.float32)
     sample_spline(coefficients, flow, fast)
     sample_spline.py_func(coefficients, flow, slow)
     assert fast == pytest.approx(slow, abs=1e-6)

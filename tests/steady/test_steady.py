@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import skimage.data
 
-from turbrestore.blur.estimation import estimate_blur
-from turbrestore.blur.psf import KOLMOGOROV
+from turbrestore.blur.posterior import BlurWitnesses
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.steady.dewarping import measure_flow
 from turbrestore.steady.memory import Memory, remember
 from turbrestore.steady.settings import SteadyParams
-from turbrestore.steady.video import _ADDED, _Scenes, steady_frames
+from turbrestore.steady.video import _find_blur, _Scenes, steady_frames
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
 from turbrestore.synthesis.scenes import resolution_chart
@@ -135,7 +134,8 @@ class TestMemory:
 
 def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
     soft, short = cv2.GaussianBlur(photo(), (0, 0), 2.0), np.ones((SIZE, SIZE), np.float32)
-    scenes = _Scenes(SteadyParams(), 0.8, Runtime(threads=1))
+    said, runtime = BlurWitnesses(0.5, 24.0), Runtime(threads=1)
+    scenes = _Scenes(SteadyParams(), 0.8, said, runtime)
 
     def width(scenes, image, held):
         return scenes._remembered_width(Memory(image, held * short, held, STILL, image, np.zeros((SIZE, SIZE, 2)), 0.0))
@@ -143,11 +143,10 @@ def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
     assert width(scenes, soft, 1) == 0.8
     widths = [width(scenes, soft, 30) for _ in range(80)]
     assert 0 < max(np.diff([0.8, *widths])) < 0.1
-    needed = estimate_blur(soft, exponent=KOLMOGOROV).removable + _ADDED
-    assert widths[-1] == pytest.approx(needed, abs=0.02)
-    given = _Scenes(SteadyParams(sigma=0.8), 0.8, Runtime(threads=1))
+    assert widths[-1] == pytest.approx(_find_blur(soft, said, runtime)[0], abs=0.02)
+    given = _Scenes(SteadyParams(sigma=0.8), 0.8, None, runtime)
     assert width(given, soft, 30) == 0.8
-    flat = _Scenes(SteadyParams(), 0.8, Runtime(threads=1))
+    flat = _Scenes(SteadyParams(), 0.8, said, runtime)
     assert width(flat, 0 * soft, 30) == 0.8
 
 
@@ -288,7 +287,8 @@ class TestCamera:
 
 
 class TestStream:
-    def test_delay_and_memory_are_bounded(self):
+    @pytest.mark.parametrize(("live", "delay"), [(False, 7), (True, 2)])
+    def test_delay_and_memory_are_bounded(self, live, delay):
         scene, read, alive, ahead, kept = photo(size=32), 0, [], [], []
 
         def stream():
@@ -299,15 +299,28 @@ class TestStream:
                 read += 1
                 yield frame
 
-        params = SteadyParams(sigma=0, reach=4)
+        params = SteadyParams(sigma=0, reach=4, live=live)
         for steadied in steady_frames(stream(), params, Runtime(threads=1)):
             ahead.append(read - 1 - steadied.number)
             kept.append(sum(frame() is not None for frame in alive))
         assert len(ahead) == 60
         # Two frames for the thread, and half of the reach at the start.
-        assert max(ahead) <= params.reach + params.reach // 2 + 3
-        assert max(ahead[10:]) <= params.reach + 3
+        assert max(ahead) <= (2 if live else delay + params.reach // 2)
+        assert max(ahead[10:]) <= delay
         assert max(kept) <= 4 * params.reach + 6
+
+    def test_a_live_stream_is_deblurred_once_its_blur_is_known(self):
+        soft = cv2.GaussianBlur(photo(), (0, 0), 1.6)
+        sigmas = [frame.sigma for frame in steady_frames(shaken([soft] * 9), SteadyParams(reach=6, live=True))]
+        assert sigmas[:3] == [0, 0, 0]
+        assert min(sigmas[3:]) > 0.5
+
+    def test_a_live_stream_gains_from_the_frames_before(self):
+        scene = photo()
+        frames = shaken([scene] * 20)
+        live, near = (images(frames, sigma=0, **kw) for kw in ({"live": True}, {"reach": 2}))
+        gains = [np.mean([psnr(image, scene) for image in ours[10:]]) for ours in (live, near)]
+        assert gains[0] > gains[1] + 0.5
 
     def test_a_cut_starts_anew(self):
         first, second = photo(), photo("brick")

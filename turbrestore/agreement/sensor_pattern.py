@@ -35,8 +35,8 @@ _CLEARLY, _LEAST = 4.0, 5e-4
 _STANDS = 0.25
 # Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion, pixels.
 _EDGE, _LEAST_MOTION = 8.0, 0.3
-# Parts along the stripes, and the least correlation of their offsets; offsets of a sensor, root mean square, are smaller
-# than those of strokes and bars.
+# Parts along the stripes, and the least correlation of their offsets; offsets of a sensor, root mean square, are
+# smaller than those of strokes and bars.
 _PARTS, _ALIKE, _LARGEST = 3, 0.5, 0.04
 # Share of the height of a warm pixel over the median around by which it exceeds each neighbour; most that are warm.
 _ALONE, _MOST_WARM = 0.7, 0.005

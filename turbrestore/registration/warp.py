@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import ConfigurationError, DataError
 from ..runtime.device import CPU, find_device, memory_of
-from ..runtime.image_stacks import numpy_ops, torch_ops, warp_stack
+from ..runtime.image_stacks import bordered, numpy_ops, sample_spline, spline_coefficients, torch_ops, warp_stack
 
 INTERPOLATIONS = ("linear", "cubic")
 # Pixels of a strip.  A dozen arrays of a smaller one would stay in the cache of a core, but with two threads, taking
@@ -44,12 +44,32 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device
     if interpolation == "linear":
         # OpenCV 5 is exact for one and three channels; for the two of a flow it still rounds positions to 1/32 px.
         return sample_linear(cv2.split(image) if image.shape[2:] == (2,) else (image,), flow)
-    planes = image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)
     found = find_device(device)
-    ops = numpy_ops() if found == CPU else torch_ops(found)
+    if found == CPU:
+        return sample_splines(spline_planes(image), flow)
+    planes, ops = image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0), torch_ops(found)
     with memory_of(found):
         warped = ops.store(warp_stack(ops.load(planes), ops.load(flow), ops))
     return warped[0] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(warped, 0, -1))
+
+
+def spline_planes(image: FloatArray) -> FloatArray:
+    """Splines through the channels of an image that is sampled several times.
+
+    ``image`` (H, W) or (H, W, 3); returns their coefficients (1, H + 3, W + 3) or (3, H + 3, W + 3).
+    """
+    planes = (image,) if image.ndim == 2 else cv2.split(image)
+    return np.stack([bordered(spline_coefficients(plane, numpy_ops())) for plane in planes])
+
+
+def sample_splines(planes: FloatArray, flow: FloatArray) -> FloatArray:
+    """Sample splines where a flow leads, as :func:`warp` does.
+
+    ``planes`` (C, H + 3, W + 3); ``flow`` (H, W, 2); returns (H, W) or (H, W, 3).
+    """
+    result = np.empty((*flow.shape[:2], len(planes)), np.float32)
+    sample_spline(planes, np.ascontiguousarray(flow), np.moveaxis(result, -1, 0))
+    return result[..., 0] if len(planes) == 1 else result
 
 
 def inside(flow: ArrayLike) -> FloatArray:

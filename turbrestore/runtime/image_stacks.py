@@ -72,8 +72,7 @@ def numpy_ops() -> StackOps:
     def sampled(coefficients: FloatArray, flow: FloatArray) -> FloatArray:
         result = np.empty(coefficients.shape, np.float32)
         for plane, displacement, out in zip(coefficients, flow, result, strict=True):
-            around = cv2.copyMakeBorder(plane, _BEFORE, _BEYOND, _BEFORE, _BEYOND, cv2.BORDER_REFLECT_101)
-            sample_spline(around, np.ascontiguousarray(np.moveaxis(displacement, 0, -1)), out)
+            sample_spline(bordered(plane)[None], np.ascontiguousarray(np.moveaxis(displacement, 0, -1)), out[None])
         return result
 
     return StackOps(
@@ -149,6 +148,11 @@ def spline_coefficients(stack: Stack, ops: StackOps) -> Stack:
     return ops.filter(stack, PREFILTER, PREFILTER)
 
 
+def bordered(coefficients: FloatArray) -> FloatArray:
+    """Continue the coefficients of a plane (H, W) by what samples at its border need, (H + 3, W + 3)."""
+    return cv2.copyMakeBorder(coefficients, _BEFORE, _BEYOND, _BEFORE, _BEYOND, cv2.BORDER_REFLECT_101)
+
+
 def warp_stack(stack: Stack, flow: Stack, ops: StackOps) -> Stack:
     """Backward warp by cubic B-splines: the equation behind :func:`turbrestore.registration.warp.warp`.
 
@@ -160,15 +164,15 @@ def warp_stack(stack: Stack, flow: Stack, ops: StackOps) -> Stack:
 
 @jit
 def sample_spline(coefficients: FloatArray, flow: FloatArray, result: FloatArray) -> None:
-    """Sum 4×4 B-spline coefficients at each position that a flow leads to.
+    """Sum 4×4 B-spline coefficients of every plane at each position that a flow leads to.
 
-    ``coefficients`` (H + 3, W + 3); ``flow`` (H, W, 2); ``result`` (H, W).
+    ``coefficients`` (C, H + 3, W + 3); ``flow`` (H, W, 2); ``result`` (C, H, W).
     """
     zero, one, sixth = np.float32(0), np.float32(1), np.float32(1 / 6)
     three, four, six = np.float32(3), np.float32(4), np.float32(6)
-    bottom, right = np.float32(result.shape[0] - 1), np.float32(result.shape[1] - 1)
-    for row in range(result.shape[0]):
-        for column in range(result.shape[1]):
+    bottom, right = np.float32(result.shape[1] - 1), np.float32(result.shape[2] - 1)
+    for row in range(result.shape[1]):
+        for column in range(result.shape[2]):
             x = min(max(np.float32(column) + flow[row, column, 0], zero), right)
             y = min(max(np.float32(row) + flow[row, column, 1], zero), bottom)
             # An unsigned index cannot count from the end, which would be checked at every access.
@@ -178,12 +182,14 @@ def sample_spline(coefficients: FloatArray, flow: FloatArray, result: FloatArray
             centre, middle = (four - (six - three * t) * t * t) * sixth, (four - (six - three * u) * u * u) * sixth
             far, lower = t * t * t * sixth, u * u * u * sixth
             beside, below = one - left - centre - far, one - upper - middle - lower
-            rows = coefficients[i], coefficients[i + 1], coefficients[i + 2], coefficients[i + 3]
-            a = rows[0][j] * left + rows[0][j + 1] * centre + rows[0][j + 2] * beside + rows[0][j + 3] * far
-            b = rows[1][j] * left + rows[1][j + 1] * centre + rows[1][j + 2] * beside + rows[1][j + 3] * far
-            c = rows[2][j] * left + rows[2][j + 1] * centre + rows[2][j + 2] * beside + rows[2][j + 3] * far
-            d = rows[3][j] * left + rows[3][j + 1] * centre + rows[3][j + 2] * beside + rows[3][j + 3] * far
-            result[row, column] = a * upper + b * middle + c * below + d * lower
+            for plane in range(coefficients.shape[0]):
+                field = coefficients[plane]
+                rows = field[i], field[i + 1], field[i + 2], field[i + 3]
+                a = rows[0][j] * left + rows[0][j + 1] * centre + rows[0][j + 2] * beside + rows[0][j + 3] * far
+                b = rows[1][j] * left + rows[1][j + 1] * centre + rows[1][j + 2] * beside + rows[1][j + 3] * far
+                c = rows[2][j] * left + rows[2][j + 1] * centre + rows[2][j + 2] * beside + rows[2][j + 3] * far
+                d = rows[3][j] * left + rows[3][j + 1] * centre + rows[3][j + 2] * beside + rows[3][j + 3] * far
+                result[plane, row, column] = a * upper + b * middle + c * below + d * lower
 
 
 def _sample_gathered(coefficients: Stack, flow: Stack, torch: Any) -> Stack:

@@ -25,36 +25,39 @@ _STEP, _FITS = 8, 4
 _LEAST_DISTANCE = 1e-3
 
 
-def fit_camera(flow: FloatArray) -> Matrix:
+def fit_camera(flow: FloatArray, shape: tuple[int, ...] | None = None) -> Matrix:
     """Fit an affine flow that outliers hardly influence.
 
-    ``flow`` (H, W, 2); returns (2, 3).
+    ``flow`` (H, W, 2), or (h, w, 2) on a grid over an image of this shape (:mod:`turbrestore.steady.grid`); returns
+    (2, 3).
     """
     height, width = flow.shape[:2]
-    step = max(min(_STEP, height // 8, width // 8), 1)
-    rows, columns = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
-    samples = flow[np.ix_(rows, columns)].reshape(-1, 2).astype(np.float64)
-    x, y = np.meshgrid(columns - (width - 1) / 2, rows - (height - 1) / 2)
+    shape = shape or flow.shape
+    step = max(min(_STEP * height // shape[0], height // 8, width // 8), 1)
+    every = np.s_[step // 2 :: step]
+    samples = flow[every, every].reshape(-1, 2).astype(np.float64)
+    x, y = np.meshgrid(*(places[every] for places in _places(flow.shape, shape)))
     basis = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1)
-    root_weights = np.ones((len(samples), 1))
+    weighted = basis
     for _ in range(_FITS):
-        solution = np.linalg.lstsq(basis * root_weights, samples * root_weights, rcond=None)[0]
+        solution = np.linalg.solve(weighted.T @ basis, weighted.T @ samples)
         distance = np.linalg.norm(samples - basis @ solution, axis=1)
         scale = 2 * max(float(np.median(distance)), _LEAST_DISTANCE)
-        root_weights = 1 / np.sqrt(1 + (distance[:, None] / scale) ** 2)
-    return solution.T
+        weighted = basis / (1 + (distance[:, None] / scale) ** 2)
+    return np.asarray(solution.T, np.float64)
 
 
-def camera_flow(matrix: Matrix, shape: tuple[int, ...]) -> FloatArray:
-    """Affine flow of an image.
+def camera_flow(matrix: Matrix, shape: tuple[int, ...], grid: tuple[int, ...] | None = None) -> FloatArray:
+    """Affine flow of an image, sampled at its pixels or on a grid over it.
 
-    ``matrix`` (2, 3); returns (H, W, 2).
+    ``matrix`` (2, 3); returns (H, W, 2) or (h, w, 2).
     """
-    height, width = shape[:2]
-    x = np.arange(width, dtype=np.float64) - (width - 1) / 2
-    y = (np.arange(height, dtype=np.float64) - (height - 1) / 2)[:, None]
-    planes = [matrix[axis, 0] * x + matrix[axis, 1] * y + matrix[axis, 2] for axis in (0, 1)]
-    return np.stack(planes, -1).astype(np.float32)
+    x, y = _places(grid or shape, shape)
+    flow = np.empty((len(y), len(x), 2), np.float32)
+    for axis, (along_x, along_y, shift) in enumerate(matrix):
+        across, down = (along_x * x + shift).astype(np.float32), (along_y * y).astype(np.float32)
+        np.add(across, down[:, None], out=flow[..., axis])
+    return flow
 
 
 def camera_size(matrix: Matrix, shape: tuple[int, ...]) -> float:
@@ -66,3 +69,10 @@ def camera_size(matrix: Matrix, shape: tuple[int, ...]) -> float:
     # Variance of the coordinates of a grid about its centre.
     spread = np.array([(width**2 - 1) / 12, (height**2 - 1) / 12, 1.0])
     return float(np.sqrt((matrix**2 * spread).sum()))
+
+
+def _places(grid: tuple[int, ...], shape: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coordinates x and y of a grid over an image, pixels about the centre of the image."""
+    pairs = zip(grid[:2], shape[:2], strict=True)
+    y, x = ((np.arange(count) + 0.5) * length / count - length / 2 for count, length in pairs)
+    return x, y

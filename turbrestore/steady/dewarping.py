@@ -16,20 +16,19 @@ V : its inverse map, ``(id + D) ∘ (id + V) = id``, about d_k
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import FloatArray
 from ..core.errors import DataError
 from ..core.noise import estimate_noise
 from ..registration.camera.global_shift import LEAST_CORRELATION, correlation, measure_shift
 from ..registration.flow import MIN_SIDE
-from ..registration.flow_algebra import invert_flow
-from ..registration.opencv_flow import DisParams, FlowSolver, GreyImage, dis_solver
-from ..registration.warp import sample_linear, warp
+from ..registration.opencv_flow import DisParams, GreyImage, dis_solver
+from ..registration.warp import sample_splines
 from .camera import Matrix, camera_flow, fit_camera
 from .displacement import (
     camera_steadiness,
@@ -41,17 +40,16 @@ from .displacement import (
     without_camera,
 )
 from .fusion import fuse
-from .motion import moving_mask
+from .grid import enlarged, follow, grid_of, inverted, pixel_of
+from .motion import moving_mask, path_length, witnesses
 from .path import smooth_motion, without_shake
 from .settings import SteadyParams
 from .windows import Window, WindowFrame, contrast_levels
 
-# Half of the resolution is enough for displacements as smooth as those of turbulence, and five times as fast.
-_FLOW = DisParams(finest_scale=1, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
+# Patches this sparse lose nothing on phase screens; closer ones take a fifth longer.
+_FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=5, refinements=5, smoothness=10.0)
 # Level of the pyramid, above the finest, at which a search with a start begins.
 _START_LEVEL = 1
-# Smallest side of a frame that is registered at half of the resolution.
-_HALVED = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +70,18 @@ class DewarpedFrame:
     # centre of the image.
     cameras: Mapping[int, Matrix]
     removed_camera: Matrix  # (2, 3): its part in the displacement that was removed
+    seen: WindowFrame  # the frame as it was
+    mean: FloatArray  # (h, w): luminance of its neighbours on the grid, which the camera alone has brought to it
 
 
 def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
     """Free a frame of its turbulent displacement, and fuse it with its neighbours."""
-    image, shape = window.frame.image, window.frame.levels.shape
+    image, shape = window.frame.image, window.frame.image.shape[:2]
+    grid = grid_of(shape)
     flows, cameras = _measure(window)
-    own = without_camera(flows, cameras)
-    removed_camera, displacement, largest = np.zeros((2, 3)), np.zeros((*shape, 2), np.float32), np.inf
-    size, steadiness = 0.0, 1.0
+    own = without_camera(flows, cameras, shape)
+    removed_camera, displacement, largest = np.zeros((2, 3)), np.zeros((*grid, 2), np.float32), np.inf
+    size, steadiness, path = 0.0, 1.0, np.zeros(grid, np.float32)
     if flows:
         size = displacement_size(own)
         steadiness = camera_steadiness({} if params.camera == "lock" else cameras, shape)
@@ -90,18 +91,23 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
             if params.camera == "keep"
             else without_shake(cameras, order=params.camera == "steady")
         )
-        displacement = mean_displacement(own, largest) + camera_flow(removed_camera, shape)
-    inverse = invert_flow(displacement)
+        path = path_length(own)
+        displacement = mean_displacement(own, largest, path, pixel_of(shape))
+        displacement += camera_flow(removed_camera, shape, grid)
+    inverse = inverted(displacement, shape)
     registered = (
-        warp(frame.image, inverse + sample_linear((flows[offset][..., 0], flows[offset][..., 1]), inverse))
+        sample_splines(frame.planes, enlarged(inverse + follow(flows[offset], inverse, shape), shape))
         for offset, frame in window.neighbours.items()
     )
     noise = estimate_noise(image)
-    fused, agreement = fuse(warp(image, inverse), registered, noise)
+    fused, agreement = fuse(sample_splines(window.frame.planes, enlarged(inverse, shape)), registered, noise)
+    placed = _placed(window, cameras)
+    there = [placed[offset] for offset in witnesses(placed)]
+    moving = moving_mask(path / np.float32(largest), window.frame.grey, there, agreement, pixel_of(shape))
     return DewarpedFrame(
         number=window.number,
         image=fused,
-        moving=moving_mask(own, luminance(image), _placed(window, cameras), agreement, largest),
+        moving=enlarged(moving.astype(np.float32), shape) > 0.5,
         displacement=float(np.sqrt(np.mean(np.sum(displacement**2, -1)))),
         noise=noise,
         share=float(1 / np.sqrt(1 + len(flows) * float(agreement.mean()))),
@@ -111,19 +117,22 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
         starts_scene=window.starts_scene,
         cameras=cameras,
         removed_camera=removed_camera,
+        seen=window.frame,
+        mean=np.asarray(np.mean([*placed.values()] or [window.frame.grey], 0), np.float32),
     )
 
 
 def measure_flow(reference: FloatArray, image: FloatArray, start: FloatArray) -> FloatArray:
-    """Flow between two images, searched for near where it starts.
+    """Flow between two images on their grid, searched for near where it starts.
 
-    ``reference, image`` (H, W) or (H, W, 3); ``start`` (H, W, 2); returns (H, W, 2).
+    ``reference, image`` (H, W) or (H, W, 3); ``start`` (h, w, 2); returns (h, w, 2).
     """
-    return _solver(contrast_levels(reference))(contrast_levels(image)[None], [start], False)[0]
+    return _solver(contrast_levels(reference), reference.shape)(contrast_levels(image), start)
 
 
-def _solver(levels: GreyImage) -> FlowSolver:
-    return dis_solver(_FLOW if min(levels.shape) >= _HALVED else replace(_FLOW, finest_scale=0), levels, _START_LEVEL)
+def _solver(levels: GreyImage, shape: tuple[int, ...]) -> Callable[[GreyImage, FloatArray], FloatArray]:
+    solve, pixel = dis_solver(_FLOW, levels, _START_LEVEL), np.float32(pixel_of(shape))
+    return lambda other, start: pixel * solve(other[None], [start / pixel], False)[0]
 
 
 def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
@@ -132,11 +141,11 @@ def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
     A pan leads far in a dozen frames, so the search for a far neighbour starts where the camera would be if it went on
     as it went to the one before.
     """
-    levels = window.frame.levels
-    if min(levels.shape) < MIN_SIDE:
-        found = f"{levels.shape[1]}×{levels.shape[0]}"
+    levels, shape = window.frame.levels, window.frame.image.shape
+    if min(shape[:2]) < MIN_SIDE:
+        found = f"{shape[1]}×{shape[0]}"
         raise DataError(f"frames: expected at least {MIN_SIDE}×{MIN_SIDE} pixels for optical flow, found {found}")
-    solve = _solver(levels)
+    solve = _solver(levels, shape)
     flows: dict[int, FloatArray] = {}
     cameras: dict[int, Matrix] = {}
     for offset in sorted(window.neighbours, key=abs):
@@ -145,8 +154,8 @@ def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
             expected = expected_motion(cameras, offset)
         else:
             expected = _first_guess(window.frame, neighbour)
-        flows[offset] = solve(neighbour.levels[None], [camera_flow(expected, levels.shape)], False)[0]
-        cameras[offset] = fit_camera(flows[offset])
+        flows[offset] = solve(neighbour.levels, camera_flow(expected, shape, levels.shape))
+        cameras[offset] = fit_camera(flows[offset], shape)
     return flows, cameras
 
 
@@ -161,11 +170,9 @@ def _first_guess(frame: WindowFrame, neighbour: WindowFrame) -> Matrix:
 
 
 def _placed(window: Window, cameras: dict[int, Matrix]) -> dict[int, FloatArray]:
-    """Luminance of the furthest pair of neighbours, without the motion of the camera; none if there is no pair."""
-    furthest = max((offset for offset in cameras if -offset in cameras), default=0)
-    pair = (furthest, -furthest) if furthest else ()
-    shape = window.frame.levels.shape
+    """Luminance of the neighbours on the grid, without the motion of the camera."""
+    shape, grid = window.frame.image.shape, window.frame.grey.shape
     return {
-        offset: sample_linear((luminance(window.neighbours[offset].image),), camera_flow(cameras[offset], shape))
-        for offset in pair
+        offset: follow(frame.grey, camera_flow(cameras[offset], shape, grid), shape)
+        for offset, frame in window.neighbours.items()
     }

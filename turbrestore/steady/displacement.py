@@ -16,7 +16,9 @@ with a the acceleration of the point.  Over several i the displacements of the n
     D = Σ w_i S_i / (½ + Σ w_i) ≈ −d_k,      w_i = 1 / (1 + (|S_i|² / c²)²)
 
 with |S_i|² averaged in a small window.  A large S_i is motion rather than turbulence: it has little weight, and where
-all are large the frame passes as it is.  The ½ is the share of the frame itself, whose flow to itself is zero.
+all are large the frame passes as it is.  Without a neighbour on the other side motion does not cancel, so such an S_i
+counts less where something moves (:mod:`turbrestore.steady.motion`).  The ½ is the share of the frame itself, whose
+flow to itself is zero.
 
 Curved motion and turbulence cannot be told apart in a few frames.  While the camera stands still, most of a scene does,
 and c follows the median of |S_i| between 1 and 4 pixels; while it moves, c is 1 pixel.
@@ -38,22 +40,30 @@ _WINDOW, _OWN_SHARE = 4.0, 0.5
 _SIZES, _LEAST, _MOST = 2.5, 1.0, 4.0
 # Distance of the camera from motion at constant velocity, pixels, at which it counts as half shaking.
 _SHAKE = 2.0
-# Every so many pixels enter the median.
-_SAMPLE = 4
+# Path, in units of c, at which an S_i of one neighbour counts half.
+_PATH = 1.5
+# Every so many pixels of the grid enter the median.
+_SAMPLE = 3
 # What turbulence moves whole frames by, in medians of |S_i|.
 _WHOLE = 1.4
 
 
-def mean_displacement(flows: Mapping[int, FloatArray], largest: float) -> FloatArray:
+def mean_displacement(
+    flows: Mapping[int, FloatArray], largest: float, path: FloatArray, pixel: float = 1.0
+) -> FloatArray:
     """Weighted mean D of flows without the motion of the camera.
 
-    ``flows`` (H, W, 2); returns (H, W, 2).
+    ``flows`` (h, w, 2) on a grid whose pixel is so many of the image wide; ``path`` (h, w) of
+    :func:`turbrestore.steady.motion.path_length`; returns (h, w, 2).
     """
+    stands = 1 / (1 + (path / (_PATH * largest)) ** 4)
     total, weights = 0.0, _OWN_SHARE
     for offset in sorted({abs(offset) for offset in flows}):
         mean = _symmetric(flows, offset)
-        size = cv2.GaussianBlur(np.einsum("yxc,yxc->yx", mean, mean), (0, 0), _WINDOW)
+        size = cv2.GaussianBlur(np.einsum("yxc,yxc->yx", mean, mean), (0, 0), _WINDOW / pixel)
         weight = (1 / (1 + (size / largest**2) ** 2))[..., None]
+        if offset not in flows or -offset not in flows:
+            weight *= stands[..., None]
         total, weights = total + weight * mean, weights + weight
     return np.asarray(total / weights, np.float32)
 
@@ -99,12 +109,14 @@ def camera_steadiness(cameras: Mapping[int, Matrix], shape: tuple[int, ...]) -> 
     return float(1 / (1 + (size / _SHAKE) ** 8))
 
 
-def without_camera(flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix]) -> dict[int, FloatArray]:
+def without_camera(
+    flows: Mapping[int, FloatArray], cameras: Mapping[int, Matrix], shape: tuple[int, ...]
+) -> dict[int, FloatArray]:
     """Flows less the motion of the camera.
 
-    ``flows`` (H, W, 2); ``cameras`` (2, 3).
+    ``flows`` (h, w, 2) on a grid over an image of this shape; ``cameras`` (2, 3).
     """
-    return {offset: flow - camera_flow(cameras[offset], flow.shape) for offset, flow in flows.items()}
+    return {offset: flow - camera_flow(cameras[offset], shape, flow.shape) for offset, flow in flows.items()}
 
 
 def _straight_path(cameras: Mapping[int, Matrix]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -47,10 +47,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
-from ..registration.flow_algebra import invert_flow
 from ..registration.warp import inside, sample_linear, warp
 from .camera import Matrix, camera_flow, fit_camera
-from .fusion import agreement_weight, explained_difference
+from .fusion import agreement_weight, explained_difference, for_channels
+from .grid import enlarged, grid_of, inverted, pixel_of, reduced
 from .path import motion
 
 # Longest memory, frames: a change of the light is followed as fast.
@@ -113,34 +113,33 @@ def remember(
     memory = _carried(memory, carry, offset, image)
     start = offset @ np.linalg.inv(memory.pose)
     expected = motion(start)
-    flow = flow_between(memory.image, image, camera_flow(expected, shape))
-    camera = fit_camera(flow)
-    affine = camera_flow(camera, shape)
-    own = flow - affine
+    grid, pixel = grid_of(shape), pixel_of(shape)
+    flow = flow_between(memory.image, image, camera_flow(expected, shape, grid))
+    camera = fit_camera(flow, shape)
+    own = flow - camera_flow(camera, shape, grid)
     placed = sample_linear((luminance(image),), camera_flow(expected, shape))
     found = [_distance(one, memory.mean) for one in (luminance(memory.image), placed)]
     distances = memory.distances + _CHECKED * (np.stack(found, -1) - memory.distances)
     agrees = 1 / (1 + (distances[..., 0] / (distances[..., 1] + _EVEN)) ** 4)
     tolerance = explained_difference(memory.image, noise)
-    weight = agreement_weight(sample_linear((image,), flow), memory.image, tolerance)
-    weight /= 1 + (cv2.GaussianBlur(np.einsum("yxc,yxc->yx", own, own), (0, 0), _WINDOW) / largest**2) ** 2
+    weight = agreement_weight(sample_linear((image,), enlarged(flow, shape)), memory.image, tolerance)
+    weight /= 1 + (cv2.GaussianBlur(np.einsum("yxc,yxc->yx", own, own), (0, 0), _WINDOW / pixel) / largest**2) ** 2
     # R follows a slow object from frame to frame, and would hold it back, and with it the flat background beside it.
     near = cv2.dilate(moving.astype(np.uint8), _MARGIN) > 0
-    weight *= 1 - cv2.GaussianBlur(near.astype(np.float32), (0, 0), _MARGIN_EDGE)
-    weight *= agrees
-    trusted = np.where(cv2.dilate(near.astype(np.uint8), _BESIDE) > 0, 0, weight)
-    own = _filled(own, trusted)
+    weight *= reduced((1 - cv2.GaussianBlur(near.astype(np.float32), (0, 0), _MARGIN_EDGE)) * agrees)
+    beside = reduced(cv2.dilate(near.astype(np.uint8), _BESIDE).astype(np.float32))
+    own = _filled(own, np.where(beside > 0, 0, weight), pixel)
     frames = min(memory.frames + 1, _LONGEST)
     kept = steadiness * (1 - 1 / frames)
-    held = 1 + weight * np.minimum(memory.held, kept / (1 - kept))
-    innovation = warp(image, own + affine) - memory.image
-    estimate = memory.image + innovation / (held if image.ndim == 2 else held[..., None])
-    inverse = invert_flow((1 - kept) * own + camera_flow(max(1 - kept, _PULL) * (camera - expected), shape))
+    held = 1 + enlarged(weight, shape) * np.minimum(memory.held, kept / (1 - kept))
+    innovation = warp(image, enlarged(own, shape) + camera_flow(camera, shape)) - memory.image
+    innovation /= for_channels(held, image)
+    pulled = camera_flow(max(1 - kept, _PULL) * (camera - expected), shape, grid)
+    inverse = enlarged(inverted((1 - kept) * own + pulled, shape), shape)
     mean = memory.mean + (placed - memory.mean) / np.float32(min(frames, _RECENT))
     let_go = float(1 - agrees.mean())
-    return Memory(
-        warp(estimate, inverse), sample_linear((held,), inverse), frames, memory.pose, mean, distances, let_go
-    )
+    estimate = warp(memory.image + innovation, inverse)
+    return Memory(estimate, sample_linear((held,), inverse), frames, memory.pose, mean, distances, let_go)
 
 
 def shown(memory: Memory) -> Memory:
@@ -185,8 +184,9 @@ def _distance(image: FloatArray, mean: FloatArray) -> FloatArray:
     return np.asarray(cv2.GaussianBlur(difference**2, (0, 0), _DISTANCE_WINDOW), np.float32)
 
 
-def _filled(flow: FloatArray, weight: FloatArray) -> FloatArray:
+def _filled(flow: FloatArray, weight: FloatArray, pixel: float) -> FloatArray:
     """Replace a flow by that of its surroundings where its weight is small."""
-    total = cv2.GaussianBlur(weight, (0, 0), _SURROUNDINGS) + _LEAST_WEIGHT
-    around = cv2.GaussianBlur(flow * weight[..., None], (0, 0), _SURROUNDINGS) / total[..., None]
+    window = _SURROUNDINGS / pixel
+    total = cv2.GaussianBlur(weight, (0, 0), window) + _LEAST_WEIGHT
+    around = cv2.GaussianBlur(flow * weight[..., None], (0, 0), window) / total[..., None]
     return np.asarray(around + weight[..., None] * (flow - around), np.float32)

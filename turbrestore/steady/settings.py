@@ -8,6 +8,8 @@ from typing import Literal
 from ..core.errors import require, require_between
 
 CAMERAS = ("keep", "steady", "lock")
+# Frames that a live stream may lag behind.
+_LAG = 2
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,9 @@ class SteadyParams:
         Standard deviation of the blur to remove, pixels; 0 removes none.  Estimated by default.
     reach : int
         Distance of the furthest neighbours of a frame, frames: the delay of a stream.
+    live : bool
+        Give every frame before more than two others have been read: neighbours after a frame are at most two frames
+        away, and no blur is removed until it has been estimated.
     largest : float, optional
         What turbulence displaces at most, pixels; larger displacements pass for motion and are kept.  By default it is
         measured while the camera stands still or is locked, and 1 while it moves.
@@ -41,6 +46,7 @@ class SteadyParams:
     camera: Literal["keep", "steady", "lock"] = "keep"
     sigma: float | None = None
     reach: int = 12
+    live: bool = False
     largest: float | None = None
 
     def __post_init__(self) -> None:
@@ -52,6 +58,11 @@ class SteadyParams:
             require_between("sigma", self.sigma, 0, 20, "pixels")
 
     @property
+    def later(self) -> tuple[int, ...]:
+        """Distances of the neighbours after a frame, frames."""
+        return tuple(range(1, min(self.reach, _LAG) + 1)) if self.live else self.distances
+
+    @property
     def distances(self) -> tuple[int, ...]:
-        """Distances of the neighbours in frames: 1, and the quarters of ``reach``."""
+        """Distances of the neighbours before a frame, and after it, frames: 1, and the quarters of ``reach``."""
         return tuple(sorted({1, *(max(self.reach * quarter // 4, 1) for quarter in (1, 2, 3, 4))}))

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 
 import numpy as np
@@ -25,11 +26,13 @@ from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray, luminance
 from ..registration.warp import sample_linear, warp
 from ..runtime.runtime import DEFAULT, Runtime
-from ..runtime.threads import map_in_turns
+from ..runtime.threads import map_in_turns, one_thread_each
 from .camera import Matrix, camera_flow
 from .deblurring import deblur
 from .dewarping import DewarpedFrame, dewarp_frame, measure_flow
 from .displacement import whole_displacement
+from .fusion import for_channels, share_of_estimate
+from .grid import enlarged, follow, grid_of, pixel_of, reduced
 from .memory import Memory, remember, shown
 from .path import LONGEST, camera_position, homogeneous, longer_path, motion, smooth_motion
 from .settings import SteadyParams
@@ -58,7 +61,8 @@ class SteadyFrame:
     starts_scene : bool
         Whether a new scene starts here.
     let_go : float
-        Share of the memory of the scene that was let go here, because the frames lay nearer to their own mean.
+        Share of the memory of the scene that was let go here, or of the estimate that the frame replaces, because the
+        frames lay nearer to their own mean or were sharper (:mod:`turbrestore.steady.fusion`).
     """
 
     number: int
@@ -76,7 +80,8 @@ def steady_frames(
     """Steady a stream of frames, one output frame for each input frame.
 
     The output lags behind the input by ``params.reach`` frames and two for each thread, and at the start by half of
-    ``params.reach`` more, because the blur is estimated there.  Memory does not grow with the length of the stream.
+    ``params.reach`` more, because the blur is estimated there; with ``params.live`` by two frames.  Memory does not
+    grow with the length of the stream.
 
     Parameters
     ----------
@@ -103,31 +108,51 @@ def steady_frames(
     [0, 1, 2]
     """
     params = params or SteadyParams()
-    windows = iter_windows(frames, params.distances)
+    windows = iter_windows(frames, params.distances, params.later)
+    if params.live:
+        yield from _one_by_one(windows, params, runtime)
+        return
     # The first frame that has neighbours on both sides.
     head = list(islice(windows, params.reach // 2 + 1))
-    if not head:
-        return
     sigma, exponent, witnesses = params.sigma, KOLMOGOROV, None
-    if sigma is None:
-        image = dewarp_frame(head[-1], params).image
-        witnesses = _find_witnesses(head[-1], image)
-        sigma, exponent = _find_blur(image, witnesses, runtime)
-    scenes = _Scenes(params, sigma, witnesses, runtime)
+    if head and sigma is None:
+        sigma, exponent, witnesses = _find_first(head[-1], params, runtime)
+    width = sigma or 0.0
+    scenes = _Scenes(params, width, witnesses, runtime)
     yield from map_in_turns(
         lambda window: dewarp_frame(window, params),
         lambda frame: (frame, scenes.estimate(frame)),
-        lambda pair: _sharpened(*pair, sigma, exponent),
+        lambda pair: _sharpened(*pair, width, exponent),
         chain(head, windows),
         runtime.threads,
     )
 
 
+def _one_by_one(windows: Iterable[Window], params: SteadyParams, runtime: Runtime) -> Iterator[SteadyFrame]:
+    """Frames of a live stream, each before the next is asked for.  OpenCV shares out what one frame takes."""
+    sigma, exponent = params.sigma or 0.0, KOLMOGOROV
+    scenes = _Scenes(params, sigma, None, runtime)
+    with nullcontext() if runtime.threads != 1 else one_thread_each():
+        for window in windows:
+            if params.sigma is None and window.number == params.reach // 2:
+                sigma, exponent, witnesses = _find_first(window, params, runtime)
+                scenes.remove(sigma, witnesses)
+            frame = dewarp_frame(window, params)
+            yield _sharpened(frame, scenes.estimate(frame), sigma, exponent)
+
+
+def _find_first(window: Window, params: SteadyParams, runtime: Runtime) -> tuple[float, float, BlurWitnesses]:
+    """Width and exponent of the blur of all frames, from one with neighbours on both sides, and what witnesses say."""
+    image = dewarp_frame(window, params).image
+    witnesses = _find_witnesses(window, image)
+    return *_find_blur(image, witnesses, runtime), witnesses
+
+
 def _find_witnesses(window: Window, image: FloatArray) -> BlurWitnesses:
     """Measure what the frames of a window, registered to the image fused from them, say about their blur."""
     frames = np.stack([window.frame.image, *(frame.image for frame in window.neighbours.values())])
-    still = np.zeros((*frames.shape[1:3], 2), np.float32)
-    flows = np.stack([measure_flow(image, frame, still) for frame in frames])
+    still = np.zeros((*grid_of(image.shape), 2), np.float32)
+    flows = np.stack([enlarged(measure_flow(image, frame, still), image.shape) for frame in frames])
     displacement = float(np.square(flows - np.median(flows, axis=(1, 2), keepdims=True)).mean())
     return measure_witnesses(frames, flows, BlurWitnesses(displacement, float(len(frames))))
 
@@ -152,12 +177,16 @@ class _Scenes:
     def __init__(self, params: SteadyParams, sigma: float, witnesses: BlurWitnesses | None, runtime: Runtime) -> None:
         self._params = params
         self._memory: Memory | None = None
-        self._witnesses, self._runtime = witnesses, runtime
-        self._first = self._width = sigma
+        self._runtime = runtime
         self._found: float | None = None
+        self.remove(sigma, witnesses)
         self._positions: deque[Matrix] = deque(maxlen=LONGEST)
         # From the frame before to the steadied one.
         self._steadied = np.eye(3)
+
+    def remove(self, sigma: float, witnesses: BlurWitnesses | None) -> None:
+        """Set the width of the blur of frames, and what is known of that of what is remembered if it may be another."""
+        self._witnesses, self._first, self._width = witnesses, sigma, sigma
 
     def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_], float]:
         """Estimate of the scene at a frame, what moves, and the width of the blur of what is remembered."""
@@ -172,7 +201,10 @@ class _Scenes:
         self._memory = remember(
             self._memory, image, measure_flow, frame.noise, frame.largest, frame.steadiness, moving, carry, offset
         )
-        return shown(self._memory), moving, self._remembered_width(self._memory)
+        estimate = shown(self._memory)
+        if self._params.camera == "keep":
+            estimate = _checked(estimate, frame, self._steadied)
+        return estimate, moving, self._remembered_width(self._memory)
 
     def _follow(self, frame: DewarpedFrame) -> tuple[Matrix, Matrix]:
         """Follow the camera: maps from the steadied frame to the one before, and to the dewarped frame."""
@@ -203,6 +235,19 @@ class _Scenes:
         if self._found is not None:
             self._width += (self._found - self._width) / _GRADUALLY
         return self._width
+
+
+def _checked(estimate: Memory, frame: DewarpedFrame, steadied: Matrix) -> Memory:
+    """Estimate with as much of the frame as it was as the check asks for."""
+    seen, shape = frame.seen, frame.moving.shape
+    mean = follow(
+        frame.mean, camera_flow(motion(np.asarray(np.linalg.inv(steadied), np.float64)), shape, frame.mean.shape), shape
+    )
+    share = share_of_estimate(luminance(reduced(estimate.image)), seen.grey, mean, frame.noise / pixel_of(shape))
+    share = enlarged(share, shape)
+    image = seen.image + for_channels(share, seen.image) * (estimate.image - seen.image)
+    held = 1 + share * (estimate.held - 1)
+    return replace(estimate, image=image, held=held, let_go=max(estimate.let_go, float(1 - share.mean())))
 
 
 def _placed(image: FloatArray, moving: NDArray[np.bool_], offset: Matrix) -> tuple[FloatArray, NDArray[np.bool_]]:

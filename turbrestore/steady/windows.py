@@ -15,12 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_image
+from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import DataError
 from ..footage.checks.scene_cuts import similarity_at, thumbnail
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
 from ..registration.contrast import grey_levels
 from ..registration.opencv_flow import GreyImage
+from ..registration.warp import spline_planes
+from .grid import pixel_of, reduced
 
 # Likeness of two successive frames below which the second starts a new scene.
 _CUT = 0.5
@@ -35,7 +37,9 @@ class WindowFrame:
     """A frame of a stream."""
 
     image: FloatArray  # (H, W) or (H, W, 3)
-    levels: GreyImage  # (H, W): contrast-normalised image, which flow is measured from
+    planes: FloatArray  # (C, H + 3, W + 3): splines through its channels, which are sampled for each of its neighbours
+    grey: FloatArray  # (h, w): luminance on the grid of the image
+    levels: GreyImage  # (h, w): contrast-normalised image, which flow is measured from
     scene: int  # number of the scene, from 0
     shift_reference: ShiftReference  # what shifts of the whole image are measured against
 
@@ -50,42 +54,48 @@ class Window:
     starts_scene: bool  # whether the frame is the first of its scene
 
 
-def iter_windows(frames: Iterable[ArrayLike], distances: Sequence[int]) -> Iterator[Window]:
+def iter_windows(
+    frames: Iterable[ArrayLike], earlier: Sequence[int], later: Sequence[int] | None = None
+) -> Iterator[Window]:
     """Yield the window of every frame, in order, once the last neighbour has been read.
 
-    ``frames`` (H, W) or (H, W, 3) each.
+    ``frames`` (H, W) or (H, W, 3) each; distances of the neighbours before a frame, and after it if they are others.
     """
-    reach = max(distances)
+    offsets = sorted([-distance for distance in earlier] + list(earlier if later is None else later), key=abs)
+    before, after = -min(offsets), max(offsets)
     kept: deque[WindowFrame] = deque()
     # Number of the first frame that is kept, and of the next one whose window is due.
     first = due = 0
     for frame in _prepared(frames):
         kept.append(frame)
-        if len(kept) + first > due + reach:
-            yield _window(kept, first, due, distances)
+        if len(kept) + first > due + after:
+            yield _window(kept, first, due, offsets)
             due += 1
-        if len(kept) > 2 * reach:
+        if len(kept) > before + after:
             kept.popleft()
             first += 1
     for number in range(due, first + len(kept)):
-        yield _window(kept, first, number, distances)
+        yield _window(kept, first, number, offsets)
 
 
 def contrast_levels(image: FloatArray) -> GreyImage:
-    """Contrast-normalised image, which flow is measured from.
+    """Contrast-normalised image on its grid, which flow is measured from.
 
-    ``image`` (H, W) or (H, W, 3); returns (H, W).
+    ``image`` (H, W) or (H, W, 3); returns (h, w).
     """
-    return grey_levels(image, _CONTRAST_WINDOW, _CONTRAST_FLOOR)
+    return _levels(luminance(reduced(image)), image.shape)
 
 
-def _window(kept: deque[WindowFrame], first: int, number: int, distances: Sequence[int]) -> Window:
+def _levels(grey: FloatArray, shape: tuple[int, ...]) -> GreyImage:
+    return grey_levels(grey, _CONTRAST_WINDOW / pixel_of(shape), _CONTRAST_FLOOR)
+
+
+def _window(kept: deque[WindowFrame], first: int, number: int, offsets: Sequence[int]) -> Window:
     place = number - first
     frame = kept[place]
     neighbours = {
         offset: kept[place + offset]
-        for distance in distances
-        for offset in (-distance, distance)
+        for offset in offsets
         if 0 <= place + offset < len(kept) and kept[place + offset].scene == frame.scene
     }
     return Window(number, frame, neighbours, number == 0 or kept[place - 1].scene != frame.scene)
@@ -103,4 +113,6 @@ def _prepared(frames: Iterable[ArrayLike]) -> Iterator[WindowFrame]:
         if before is not None and np.any(before) and np.any(detail):
             scene += similarity_at(detail, before)[0] < _CUT
         before = detail
-        yield WindowFrame(image, contrast_levels(image), scene, prepare_shift_reference(image))
+        grey = luminance(reduced(image))
+        levels = _levels(grey, image.shape)
+        yield WindowFrame(image, spline_planes(image), grey, levels, scene, prepare_shift_reference(image))

@@ -75,6 +75,29 @@ def open_pipe(file: BinaryIO, name: str = "standard input", limits: Limits = DEF
     return FrameStream(name, shape, layout.bit_depth, float(rate) if rate else None, frames())
 
 
+def open_camera(name: str, limits: Limits = DEFAULT_LIMITS) -> FrameStream:
+    """Read from a camera that OpenCV opens, such as ``/dev/video0``; its frames are never older than the newest two."""
+    import cv2
+
+    camera = cv2.VideoCapture(name)
+    # What is not fetched in time is dropped, instead of waiting in a queue.
+    camera.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+    there, first = camera.read()
+    if not there or first is None:
+        camera.release()
+        raise DataError(f"{name}: expected a camera that OpenCV opens, found none; is it used by another program?")
+    limits.check_size(first.shape[1], first.shape[0], name)
+    fps = camera.get(cv2.CAP_PROP_FPS)
+
+    def frames() -> Iterator[FloatArray]:
+        try:
+            yield from live_frames(camera)
+        finally:
+            camera.release()
+
+    return FrameStream(name, first.shape, 8, fps if fps > 0 else None, frames())
+
+
 def read_raw(file: BinaryIO, shape: tuple[int, ...], name: str = "standard input") -> Iterator[FloatArray]:
     """Read frames of 8 bits without a container, ``gray`` or ``rgb24`` in FFmpeg's words."""
     size = int(np.prod(shape))

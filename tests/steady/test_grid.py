@@ -1,0 +1,33 @@
+"""The coarser grid that displacements live on."""
+
+import cv2
+import numpy as np
+import pytest
+
+from turbrestore.registration.flow_algebra import compose_flows
+from turbrestore.steady.camera import camera_flow, fit_camera
+from turbrestore.steady.grid import enlarged, follow, grid_of, inverted, reduced
+
+TURN = np.array([[0.01, 0.02, 1.5], [-0.02, 0.005, -0.7]])
+
+
+@pytest.mark.parametrize("shape", [(64, 90), (128, 160), (131, 257)])
+def test_a_motion_of_the_camera_is_the_same_on_the_grid_and_on_the_image(shape):
+    grid, whole = grid_of(shape), camera_flow(TURN, shape)
+    on_grid = camera_flow(TURN, shape, grid)
+    assert on_grid.shape == (*grid, 2)
+    assert np.abs(enlarged(on_grid, shape) - whole)[2:-2, 2:-2].max() < 1e-4
+    mean = cv2.resize(whole, grid[::-1], interpolation=cv2.INTER_AREA)
+    assert np.abs(on_grid - mean).max() < 1e-4
+    assert np.allclose(fit_camera(on_grid, shape), TURN, atol=1e-5)
+
+
+def test_flows_of_the_grid_are_pixels_of_the_image():
+    shape = (131, 257)
+    ramp = np.tile(np.arange(shape[1], dtype=np.float32), (shape[0], 1))
+    moved = follow(reduced(ramp), np.full((*grid_of(shape), 2), (3.0, 0.0), np.float32), shape)
+    assert np.abs(moved - reduced(ramp) - 3)[:, 2:-4].max() < 1e-3
+    flow = camera_flow(TURN, shape, grid_of(shape))
+    # What leads out of the image has no inverse.
+    both = compose_flows(enlarged(flow, shape), enlarged(inverted(flow, shape), shape))
+    assert np.abs(both)[8:-8, 8:-8].max() < 5e-3
