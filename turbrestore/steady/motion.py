@@ -49,6 +49,10 @@ def path_length(flows: Mapping[int, FloatArray]) -> FloatArray:
 
     ``flows`` (h, w, 2), at least one; returns (h, w).
     """
+    pairs = {offset: flow for offset, flow in flows.items() if -offset in flows}
+    if 3 * max(pairs, default=0) >= max(map(abs, flows)):
+        # The displacement of the frame itself cancels in pairs.
+        flows = pairs
     moments = [np.float32(offset) * flow for offset, flow in flows.items()]
     velocity = np.add.reduce(moments)
     furthest, squares = max(map(abs, flows)), sum(offset**2 for offset in flows)
