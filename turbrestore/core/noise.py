@@ -87,7 +87,7 @@ def photon_noise(first: FloatArray, second: FloatArray) -> NoiseCurve | None:
     if len(found.levels) < _FEWEST_LEVELS:
         return None
     above = found.levels - float(level.min())
-    line, residual = nnls(np.stack([np.ones_like(above), above], axis=1), found.variances)
+    line, residual = scipy.optimize.nnls(np.stack([np.ones_like(above), above], axis=1), found.variances)
     variances = line[0] + line[1] * above
     spread = float(np.linalg.norm(found.variances - found.variances.mean()))
     if residual > _STRAIGHT * spread or variances[-1] < _PHOTONS * max(variances[0], 1e-12):
