@@ -93,7 +93,7 @@ def test_a_centroid_is_that_of_the_cpu_and_repeats_to_the_byte(device):
     ],
 )
 def test_lack_of_memory_says_what_to_do(device, place, advice, params, monkeypatch):
-    def fail(*_):
+    def fail(*_, **__):
         raise RuntimeError("CUDA out of memory.")
 
     frames, _ = frames_of(SCENES["camera"](48, 48), 3, seed=17)

@@ -53,7 +53,7 @@ def test_frames_beyond_the_training_lie_in_the_geometry_of_the_filtered_image(so
     # In another geometry the two would differ at every edge.
     inner = np.s_[8:-8, 8:-8]
     there = np.abs(mean - restoration.filtered.image)[inner].mean()
-    assert there < 0.6 * np.abs(mean - restoration.centroid.image)[inner].mean()
+    assert there < 0.7 * np.abs(mean - restoration.centroid.image)[inner].mean()
 
 
 def test_frames_have_the_levels_of_the_clip(source):

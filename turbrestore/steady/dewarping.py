@@ -47,7 +47,7 @@ from .settings import SteadyParams
 from .windows import Window, WindowFrame, contrast_levels
 
 # Patches this sparse lose nothing on phase screens; closer ones take a fifth longer.
-_FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=5, refinements=5, smoothness=10.0)
+_FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
 # Level of the pyramid, above the finest, at which a search with a start begins.
 _START_LEVEL = 1
 
