@@ -19,7 +19,7 @@ def test_the_bar_only_moves_on_and_ends_full(sequence):
         assert {stage for stage, *_ in calls} <= set(weights) <= set(TITLES)
         assert shares == sorted(shares)
         # Without a blur to remove, the bar jumps over the deconvolution.
-            assert 0 < shares[0] < 0.1 and 0.3 < shares[-1] <= 1
+        assert 0 < shares[0] < 0.1 and 0.3 < shares[-1] <= 1
         # No stage counts as done before the next begins.
         assert len({round(share, 3) for share in shares}) > len(weights)
 

@@ -22,7 +22,9 @@ def test_widths_of_a_kept_run_stand_side_by_side(run, clip, tmp_path):
     assert 2.5 < width / height < 3.2
     fails(run("deconvolve", kept, "--sweep", "0.8,1.2", *quick), 73, "--overwrite")
     fails(run("deconvolve", kept, tmp_path / "b.png", "--sweep", "1,wide"), 2, "--sweep: expected widths such as")
-    fails(run("deconvolve", kept, tmp_path / "b.png", "--sweep", "1", "--sigma", "1"), 2, "--sweep: contradicts --sigma")
+    fails(
+        run("deconvolve", kept, tmp_path / "b.png", "--sweep", "1", "--sigma", "1"), 2, "--sweep: contradicts --sigma"
+    )
     fails(run("deconvolve", kept, tmp_path / "b.png", "--sweep", "1,50"), 2, "--sweep: expected 0 to 10")
     fails(run("deconvolve", tmp_path, tmp_path / "b.png"), 2, "restore --keep")
     fails(run("deconvolve", kept), 2, "OUTPUT")
