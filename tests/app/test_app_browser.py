@@ -164,7 +164,8 @@ def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
     stage, before = page.locator("#stage"), pixels(page.locator("#stage"))
     begun = time.monotonic()
     push(page, "Width of the blur, pixels", "PageUp")
-    page.get_by_text("the exact one follows").wait_for()
+    # On a quick machine the exact one is there before the page is looked at.
+    page.get_by_text(re.compile("the exact one follows|press Apply for the whole")).first.wait_for()
     assert time.monotonic() - begun < 10
     page.get_by_text("press Apply for the whole image").wait_for()
     page.wait_for_timeout(200)

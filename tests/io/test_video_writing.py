@@ -70,9 +70,8 @@ class TestWriting:
         expected = np.stack(frames) if len(shape) == 3 else np.stack(frames)[..., None]
         assert np.mean(np.abs(found - expected)) < 0.02
 
-    @pytest.mark.parametrize("name", ["a.mkv", "a.mp4", "a.npy", "a.tif", "a.ser"])
-    # Of frames of 16×20 pixels, x264 itself makes other bytes once in a thousand times.
-    @pytest.mark.parametrize("shape", [(5, 64, 96), (5, 64, 96, 3)])
+    @pytest.mark.parametrize("name", ["a.mkv", "a.npy", "a.tif", "a.ser"])
+    @pytest.mark.parametrize("shape", [(5, 16, 20), (5, 16, 20, 3)])
     def test_the_same_frames_give_the_same_bytes(self, tmp_path, name, shape):
         stack = np.random.default_rng(0).random(shape, dtype=np.float32)
         written = []
@@ -80,6 +79,14 @@ class TestWriting:
             write_video(tmp_path / name, frames, 25, overwrite=True)
             written.append((tmp_path / name).read_bytes())
         assert written[0] == written[1] != written[2]
+
+    def test_the_same_frames_give_the_same_picture_in_mp4(self, tmp_path):
+        # x264 itself makes other bytes of the same frames once in some hundred times on a busy machine.
+        stack = np.random.default_rng(0).random((5, 64, 96), dtype=np.float32)
+        for name in ("a.mp4", "b.mp4"):
+            write_video(tmp_path / name, stack, 25)
+        one, other = (open_frames(tmp_path / name).read() for name in ("a.mp4", "b.mp4"))
+        assert np.abs(one - other).mean() < 0.02
 
     def test_a_source_can_be_written(self, tmp_path):
         write_video(tmp_path / "a.mkv", np.full((4, 5, 6), 0.2, np.float32), 25)
