@@ -64,9 +64,9 @@ _FIDELITY, _SCENE = 1500.0, 2.2
 # Share of the energy of the scene that is lost whatever is removed.
 _LEAST_LOSS = 1e-3
 _FACTORS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
-# Static widths below this are those of the pixels and of the interpolation, and are not removed, pixels; and the least
-# width that is removed where the air has blurred with this probability.
-_LEAST_REMOVED, _LEAST_BY_AIR, _SURELY = 0.5, 0.2, 0.8
+# Static widths below this are those of the pixels and of the interpolation, and are not removed, pixels.  Where the air
+# has blurred with this probability, of smaller widths the lowest that is likely is removed.
+_LEAST_REMOVED, _SURELY = 0.5, 0.8
 # Widest blur of frames that are not reduced, pixels, and the factors of the others.
 _WIDEST, _REDUCTIONS = 3.0, (2, 4)
 # Widths that are reported.
@@ -166,7 +166,7 @@ def blur_posterior(
     low, high = _curve_quantiles(curves, weights.ravel())
     air = float(1 - weights[-1].sum())
     return BlurPosterior(
-        removed=width if width >= (_LEAST_BY_AIR if air > _SURELY else _LEAST_REMOVED) else 0.0,
+        removed=width if width >= _LEAST_REMOVED else min(width, float(whole[0])) * (air > _SURELY),
         exponent=exponent,
         width=whole,
         by_displacement=quantiles(of_v),
