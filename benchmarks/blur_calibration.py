@@ -1,7 +1,7 @@
 """Calibration of the witnesses of the blur by simulation.
 
 ``python benchmarks/blur_calibration.py --table`` computes the mean and the variation of short exposures through
-Kolmogorov turbulence, and writes ``turbrestore/blur/short_exposure.csv``.
+Kolmogorov turbulence, and writes ``turbrestore/blur/witnesses/short_exposure.csv``.
 
 ``python benchmarks/blur_calibration.py FOLDER [--write benchmarks/results/blur_calibration.md]`` synthesizes clips into
 a folder, those that are there are kept: scenes through phase screens of random D/r0, diffraction, noise, codec, lens
@@ -25,16 +25,16 @@ from blur_clips import Case, cases, make_clip
 from scipy import fft
 
 from turbrestore.blind.remove_blur import remove_blur, remove_blur_steps
-from turbrestore.blur.hypotheses import shapes
 from turbrestore.blur.posterior import BlurWitnesses, measure_witnesses
-from turbrestore.blur.spectral_variation import RINGS, SIDE
+from turbrestore.blur.witnesses.hypotheses import shapes
+from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
 from turbrestore.core.arrays import FloatArray
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.atmosphere import phase_spectrum
 
-TABLE = Path(__file__).resolve().parent.parent / "turbrestore" / "blur" / "short_exposure.csv"
+TABLE = Path(__file__).resolve().parent.parent / "turbrestore" / "blur" / "witnesses" / "short_exposure.csv"
 STRENGTHS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0)
 # Pixels that are compared: the border is left out.
 CORE = np.s_[14:-14, 14:-14]

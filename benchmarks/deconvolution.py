@@ -26,7 +26,7 @@ from scipy import fft
 from turbrestore.blind.remove_blur import remove_blur
 from turbrestore.blur.psf import KOLMOGOROV, blur_otf
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps
-from turbrestore.deconvolution.nonlocal_weights import nonlocal_weights
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import nonlocal_weights
 from turbrestore.deconvolution.problem import MARGIN_SIGMAS
 from turbrestore.runtime.steps import finish
 from turbrestore.runtime.threads import available_cores

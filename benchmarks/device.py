@@ -23,8 +23,8 @@ import numpy as np
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps
-from turbrestore.deconvolution.nonlocal_weights import NonlocalParams, nonlocal_weights
-from turbrestore.deconvolution.torch_nonlocal import torch_nonlocal_penalty
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
+from turbrestore.deconvolution.nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import FilterParams, filter_frames
 from turbrestore.io.output import atomic_write

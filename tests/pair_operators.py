@@ -6,7 +6,7 @@ the tail.
 
 import numpy as np
 
-from turbrestore.deconvolution.nonlocal_weights import NonlocalGraph
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalGraph
 
 
 def tails(graph: NonlocalGraph) -> np.ndarray:

@@ -11,7 +11,7 @@ from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.bars import without_bars
 from turbrestore.footage.checks.content import check_content
 from turbrestore.footage.levels import stretch_levels
-from turbrestore.footage.light import steady_light
+from turbrestore.footage.lighting.light import steady_light
 from turbrestore.footage.overlays import read_static_mask, without_overlay
 from turbrestore.io.images import write_image
 from turbrestore.io.source import FrameSource

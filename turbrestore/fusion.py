@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .agreement.last_guard import FEWEST, Halves, registered_halves
 from .blind.structure import StructureReading, compare_structure
 from .blur.posterior import BlurWitnesses, measure_witnesses
-from .blur.short_exposure import displacement_variance
+from .blur.witnesses.short_exposure import displacement_variance
 from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
 from .core.noise import estimate_noise

@@ -12,11 +12,11 @@ from .core.arrays import FloatArray
 from .core.decision import Decision
 from .footage.bars import Bars, without_bars
 from .footage.levels import Levels, stretch_levels
-from .footage.light import steady_light
+from .footage.lighting.light import steady_light
+from .footage.lighting.white_balance import steady_white_balance
 from .footage.moments import measure_moments
 from .footage.overlays import FEWEST, Title, read_static_mask, without_overlay
 from .footage.passers import without_passers
-from .footage.white_balance import steady_white_balance
 from .io.source import FrameSource, Window
 from .registration.centroid import Centroid
 from .runtime.scratch import mean_of

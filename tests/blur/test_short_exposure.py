@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from turbrestore.blur.short_exposure import displacement_variance, short_exposures
+from turbrestore.blur.witnesses.short_exposure import displacement_variance, short_exposures
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from turbrestore.blur.spectral_variation import RINGS, SIDE, measure_variation, window_power
+from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE, measure_variation, window_power
 from turbrestore.synthesis.scenes import SCENES
 
 CLEAR = slice(2, 12)

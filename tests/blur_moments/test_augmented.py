@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blur_moments.augmented import Oscillator, OscillatorMotion
-from turbrestore.blur_moments.lifting import FastSystem, discretise, lift
 from turbrestore.blur_moments.sensor import ExposureTiming
+from turbrestore.blur_moments.state_estimation.augmented import Oscillator, OscillatorMotion
+from turbrestore.blur_moments.state_estimation.lifting import FastSystem, discretise, lift
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.filtering.kalman import Gaussian
 

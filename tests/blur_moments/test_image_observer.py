@@ -12,10 +12,10 @@ from turbrestore.blur_moments.experiments.scenarios import (
     record_wavefront,
     wavefront_model,
 )
-from turbrestore.blur_moments.image_observer import ImageFilter
 from turbrestore.blur_moments.moments import BlurModel
-from turbrestore.blur_moments.observers import run_observer, steady_kalman
 from turbrestore.blur_moments.sensor import GaussianKernel, LineSensor, expose
+from turbrestore.blur_moments.state_estimation.image_observer import ImageFilter
+from turbrestore.blur_moments.state_estimation.observers import run_observer, steady_kalman
 from turbrestore.filtering.kalman import Gaussian
 
 MODEL = wavefront_model()

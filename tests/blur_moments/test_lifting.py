@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blur_moments.lifting import FastSystem, check_inputs, discretise, is_observable, lift
 from turbrestore.blur_moments.moments import BlurModel, image_moments, predicted_moments
 from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid, expose
+from turbrestore.blur_moments.state_estimation.lifting import FastSystem, check_inputs, discretise, is_observable, lift
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.filtering.kalman import Gaussian
 

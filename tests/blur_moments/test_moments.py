@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from turbrestore.blur_moments.lifting import FastSystem, lift
 from turbrestore.blur_moments.moments import (
     BlurModel,
     basis_change,
@@ -17,6 +16,7 @@ from turbrestore.blur_moments.moments import (
     predicted_moments,
 )
 from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid, expose
+from turbrestore.blur_moments.state_estimation.lifting import FastSystem, lift
 from turbrestore.core.errors import ConfigurationError, DataError
 
 V = 0.1

@@ -7,18 +7,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blur_moments.augmented import Oscillator, OscillatorMotion
 from turbrestore.blur_moments.experiments.scenarios import (
     WavefrontParams,
     mirror_model,
     record_wavefront,
     wavefront_model,
 )
-from turbrestore.blur_moments.image_observer import ImageFilter
-from turbrestore.blur_moments.lifting import FastSystem, discretise, lift
 from turbrestore.blur_moments.moments import BlurModel, image_moments, moment_noise, predicted_moments
-from turbrestore.blur_moments.observers import FixedGain, MomentFilter, luenberger, run_observer, steady_kalman
 from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid, expose
+from turbrestore.blur_moments.state_estimation.augmented import Oscillator, OscillatorMotion
+from turbrestore.blur_moments.state_estimation.image_observer import ImageFilter
+from turbrestore.blur_moments.state_estimation.lifting import FastSystem, discretise, lift
+from turbrestore.blur_moments.state_estimation.observers import (
+    FixedGain,
+    MomentFilter,
+    luenberger,
+    run_observer,
+    steady_kalman,
+)
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.filtering.kalman import Gaussian, update
 

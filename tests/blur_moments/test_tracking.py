@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from turbrestore.blur_moments.lifting import FastSystem, lift
 from turbrestore.blur_moments.moments import BlurModel, predicted_moments
-from turbrestore.blur_moments.observers import MomentFilter, run_observer
 from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid
+from turbrestore.blur_moments.state_estimation.lifting import FastSystem, lift
+from turbrestore.blur_moments.state_estimation.observers import MomentFilter, run_observer
 from turbrestore.blur_moments.targets import (
     ConstantVelocity,
     Oscillation,

@@ -7,7 +7,7 @@ import pytest
 
 from turbrestore.deconvolution.deconvolve import METHODS, DeconvolutionParams, deconvolve
 from turbrestore.deconvolution.memory import deconvolution_memory
-from turbrestore.deconvolution.nonlocal_weights import NonlocalParams
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalParams
 from turbrestore.deconvolution.primal_dual import REST, PrimalDual
 from turbrestore.runtime.runtime import Runtime
 

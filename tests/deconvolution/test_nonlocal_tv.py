@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbrestore.deconvolution import nonlocal_tv
-from turbrestore.deconvolution.nonlocal_tv import NonlocalPenalty, add_adjoint, add_gradient, add_squares
-from turbrestore.deconvolution.nonlocal_weights import NonlocalGraph, NonlocalParams, nonlocal_weights
+from turbrestore.deconvolution.nonlocal_prior import nonlocal_tv
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_tv import NonlocalPenalty, add_adjoint, add_gradient, add_squares
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalGraph, NonlocalParams, nonlocal_weights
 from turbrestore.runtime.threads import ThreadTeam
 
 SMALL = NonlocalParams(patch=3, search=5, best=3)

@@ -7,7 +7,7 @@ from pair_operators import tails, weight_matrix
 from small_problems import dense
 
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.deconvolution.nonlocal_weights import (
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import (
     NonlocalParams,
     join_pairs,
     mark_pairs,
@@ -15,7 +15,7 @@ from turbrestore.deconvolution.nonlocal_weights import (
     place_pairs,
     search_patches,
 )
-from turbrestore.deconvolution.patch_search import search_tile
+from turbrestore.deconvolution.nonlocal_prior.patch_search import search_tile
 
 SMALL = NonlocalParams(patch=3, search=5, best=3)
 
@@ -57,8 +57,8 @@ def test_weights_match_a_double_loop(nearest, shape):
 def test_tiles_leave_no_seam(monkeypatch):
     guide = np.random.default_rng(1).random((40, 31)).astype(np.float32)
     whole = nonlocal_weights(guide, SMALL)
-    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_weights._TILE_ROWS", 7)
-    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_weights._TILE_COLUMNS", 6)
+    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_prior.nonlocal_weights._TILE_ROWS", 7)
+    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_prior.nonlocal_weights._TILE_COLUMNS", 6)
     parts = nonlocal_weights(guide, SMALL, threads=3)
     assert weight_matrix(parts) == pytest.approx(weight_matrix(whole), abs=1e-5)
 
@@ -150,7 +150,7 @@ def test_the_compiled_search_does_what_is_written(monkeypatch, shape, chosen):
     guide, (nearest, best) = np.random.default_rng(9).random(shape, np.float32), chosen
     params = NonlocalParams(patch=3, search=7, nearest=nearest, best=best)
     mask, fast = params.rank_mask, search_patches(guide, params)
-    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_weights.search_tile", search_tile.py_func)
+    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_prior.nonlocal_weights.search_tile", search_tile.py_func)
     slow = search_patches(guide, params)
     assert fast.shape == slow.shape == (guide.size, nearest + best)
     assert np.array_equal(fast[:, :nearest] & mask, slow[:, :nearest] & mask)
@@ -175,7 +175,7 @@ def test_pairs_are_those_that_either_pixel_chooses(monkeypatch, shape, chosen, f
         chosen_pairs.add(tuple(sorted((int(pixel), int(pixel + dy * shape[1] + dx)))))
     fast = join_pairs(keys.copy(), shape[1], params)
     for name, loop in (("mark_pairs", mark_pairs), ("place_pairs", place_pairs)):
-        monkeypatch.setattr(f"turbrestore.deconvolution.nonlocal_weights.{name}", loop.py_func)
+        monkeypatch.setattr(f"turbrestore.deconvolution.nonlocal_prior.nonlocal_weights.{name}", loop.py_func)
     slow = join_pairs(keys, shape[1], params)
     for one, other in zip(fast, slow, strict=True):
         assert np.array_equal(one, other)

@@ -11,8 +11,8 @@ from small_problems import OPS, dense, dense_blur, small_problem
 
 from turbrestore.blur.psf import gaussian_otf
 from turbrestore.deconvolution import primal_dual
-from turbrestore.deconvolution.nonlocal_tv import NonlocalPenalty
-from turbrestore.deconvolution.nonlocal_weights import NonlocalParams, nonlocal_weights
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_tv import NonlocalPenalty
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
 from turbrestore.deconvolution.primal_dual import PrimalDual, PrimalDualState
 from turbrestore.deconvolution.problem import Problem
 from turbrestore.deconvolution.tv import LocalPenalty, local_divergence, local_gradient

@@ -11,10 +11,10 @@ from blurred_images import psnr
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
-from turbrestore.deconvolution.nonlocal_tv import NonlocalPenalty
-from turbrestore.deconvolution.nonlocal_weights import NonlocalParams, nonlocal_weights
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_tv import NonlocalPenalty
+from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
+from turbrestore.deconvolution.nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from turbrestore.deconvolution.primal_dual import WINDOW
-from turbrestore.deconvolution.torch_nonlocal import torch_nonlocal_penalty
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.scenes import SCENES, resolution_chart
 

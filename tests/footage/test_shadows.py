@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from conftest import make_sequence
-from turbrestore.footage.light import steady_light
+from turbrestore.footage.lighting.light import steady_light
 from turbrestore.io.source import FrameSource
 
 COUNT, SIDE = 24, 128

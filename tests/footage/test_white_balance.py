@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from usual_files import clip, tinted
 
-from turbrestore.footage.white_balance import steady_white_balance
+from turbrestore.footage.lighting.white_balance import steady_white_balance
 from turbrestore.io.source import FrameSource
 from turbrestore.preparation import prepare
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..blur.estimation import BlurEstimate, estimate_blur, limit_to_edges
-from ..blur.image_evidence import image_evidence
 from ..blur.posterior import BlurPosterior, BlurWitnesses, blur_posterior
+from ..blur.witnesses.image_evidence import image_evidence
 from ..core.arrays import FloatArray, luminance
 from ..deconvolution.deconvolve import DeconvolutionParams
 from ..runtime.runtime import Runtime

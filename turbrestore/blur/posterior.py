@@ -4,12 +4,12 @@ Symbols
 -------
 D/r0, λ/D : strength of the air, and diffraction, pixels
 σ_l : width of a Gaussian, which stands for the lens, the pixels, the codec and what registration leaves, pixels
-H : transfer function, ``H_air(ν; D/r0, λ/D) exp(−2π² σ_l² ν²)`` (:mod:`turbrestore.blur.short_exposure`)
+H : transfer function, ``H_air(ν; D/r0, λ/D) exp(−2π² σ_l² ν²)`` (:mod:`.witnesses.short_exposure`)
 V : variance of the displacement along one axis, squared pixels
-s, s_4, ε : variation of the spectra, and stretch by the registration (:mod:`turbrestore.blur.spectral_variation`)
+s, s_4, ε : variation of the spectra, and stretch by the registration (:mod:`.witnesses.spectral_variation`)
 g : share of the variation that is left where a window covers several isoplanatic patches
 τ : displacement that registration leaves, pixels; κ : width of the fused image over that of the mean of the frames
-L : cost of a width for the image (:mod:`turbrestore.blur.image_evidence`)
+L : cost of a width for the image (:mod:`turbrestore.blur.witnesses.image_evidence`)
 
 Witnesses
 ---------
@@ -43,9 +43,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
-from .hypotheses import LEAST_TRANSFER, Hypotheses, hypotheses, shapes
-from .image_evidence import ImageEvidence
-from .likelihoods import (
+from .witnesses.hypotheses import LEAST_TRANSFER, Hypotheses, hypotheses, shapes
+from .witnesses.image_evidence import ImageEvidence
+from .witnesses.likelihoods import (
     EXCLUDED,
     SHARE_PRIOR,
     SHIFT_PRIOR,
@@ -55,7 +55,7 @@ from .likelihoods import (
     image_likelihood,
     variation_likelihood,
 )
-from .spectral_variation import RINGS, SpectralVariation, measure_variation
+from .witnesses.spectral_variation import RINGS, SpectralVariation, measure_variation
 
 Float64Array = NDArray[np.float64]
 

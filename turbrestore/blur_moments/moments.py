@@ -32,8 +32,8 @@ from scipy.special import comb
 
 from ..core.errors import ConfigurationError, DataError, require
 from .exposure_table import ExposureTable, tabulate
-from .lifting import Motion
 from .sensor import Float64Array, GaussianKernel, LineSensor, PixelGrid
+from .state_estimation.lifting import Motion
 
 BASES = ("monomial", "legendre")
 

@@ -33,9 +33,9 @@ from scipy.linalg import block_diag, expm
 
 from ..core.errors import DataError, require
 from ..filtering.kalman import Gaussian, Innovation, update
-from .lifting import FastSystem, LiftedSystem, lift
 from .moments import BASES, basis_change, basis_functions, kernel_relation
 from .sensor import ExposureTiming, Float64Array, GaussianKernel, PixelGrid
+from .state_estimation.lifting import FastSystem, LiftedSystem, lift
 
 # (p, q) of the moments, x^p y^q; the path has one more, that of order 0.
 _ORDERS = {1: ((1, 0), (0, 1)), 2: ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))}

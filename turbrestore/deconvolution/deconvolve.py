@@ -35,12 +35,12 @@ from ..runtime.steps import finish
 from ..runtime.threads import ThreadTeam, one_thread_each
 from .array_ops import Array, numpy_ops, torch_ops
 from .conjugate_gradient import quadratic_solver, wiener_image
-from .nonlocal_tv import NonlocalPenalty
-from .nonlocal_weights import NonlocalParams, nonlocal_weights
+from .nonlocal_prior.nonlocal_tv import NonlocalPenalty
+from .nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
+from .nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from .primal_dual import Penalty, PrimalDual
 from .problem import Margin, Problem, automatic_fidelity, join_planes, margin_around, read_blur, split_planes
 from .stopping import DeconvolutionState, Solution, iterate
-from .torch_nonlocal import torch_nonlocal_penalty
 from .tv import LocalPenalty
 
 if TYPE_CHECKING:

@@ -20,9 +20,9 @@ from itertools import chain, islice
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..blur.image_evidence import image_evidence
 from ..blur.posterior import BlurWitnesses, blur_posterior, measure_witnesses
 from ..blur.psf import KOLMOGOROV
+from ..blur.witnesses.image_evidence import image_evidence
 from ..core.arrays import FloatArray, luminance
 from ..registration.warp import sample_linear, warp
 from ..runtime.runtime import DEFAULT, Runtime

@@ -8,7 +8,7 @@ import pytest
 from turbrestore.blur_moments.experiments.bounds import image_information, moment_information, posterior_bound
 from turbrestore.blur_moments.experiments.scenarios import wavefront_model
 from turbrestore.blur_moments.moments import predicted_moments
-from turbrestore.blur_moments.observers import steady_kalman
+from turbrestore.blur_moments.state_estimation.observers import steady_kalman
 from turbrestore.core.errors import DataError
 
 

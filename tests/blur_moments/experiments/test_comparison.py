@@ -14,8 +14,8 @@ from turbrestore.blur_moments.experiments.scenarios import (
     record_mirror,
     wavefront_model,
 )
-from turbrestore.blur_moments.image_observer import ImageFilter
-from turbrestore.blur_moments.observers import steady_kalman
+from turbrestore.blur_moments.state_estimation.image_observer import ImageFilter
+from turbrestore.blur_moments.state_estimation.observers import steady_kalman
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.filtering.kalman import Gaussian
 

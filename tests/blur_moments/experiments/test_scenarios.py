@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from turbrestore.blur_moments.augmented import Oscillator
 from turbrestore.blur_moments.experiments.scenarios import (
     MirrorParams,
     WavefrontParams,
@@ -14,6 +13,7 @@ from turbrestore.blur_moments.experiments.scenarios import (
     wavefront_model,
 )
 from turbrestore.blur_moments.sensor import expose
+from turbrestore.blur_moments.state_estimation.augmented import Oscillator
 from turbrestore.core.errors import ConfigurationError
 
 

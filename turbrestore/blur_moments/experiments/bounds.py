@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import DataError
-from ..lifting import LiftedSystem
 from ..moments import BlurModel, predicted_moments
 from ..sensor import Float64Array
+from ..state_estimation.lifting import LiftedSystem
 from .scenarios import Recording
 
 

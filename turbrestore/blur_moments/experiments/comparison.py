@@ -16,11 +16,11 @@ from scipy.stats import chi2
 from ...core.errors import require
 from ...filtering.kalman import Gaussian
 from ...runtime.threads import map_ahead
-from ..image_observer import ImageFilter
-from ..lifting import LiftedSystem
 from ..moments import BlurModel
-from ..observers import MomentFilter, Observer, luenberger, run_observer, steady_kalman
 from ..sensor import ExposureTiming, Float64Array
+from ..state_estimation.image_observer import ImageFilter
+from ..state_estimation.lifting import LiftedSystem
+from ..state_estimation.observers import MomentFilter, Observer, luenberger, run_observer, steady_kalman
 from .bounds import error_bound, recorded_information
 from .scenarios import (
     MIRROR,

@@ -26,11 +26,11 @@ import numpy as np
 
 from ...core.errors import require, require_between
 from ...filtering.kalman import Gaussian
-from ..augmented import Oscillator, OscillatorMotion
-from ..lifting import FastSystem, LiftedSystem, discretise, lift
 from ..moments import BlurModel
-from ..observers import steady_kalman
 from ..sensor import ExposureTiming, Float64Array, GaussianKernel, LineSensor, PixelGrid, expose
+from ..state_estimation.augmented import Oscillator, OscillatorMotion
+from ..state_estimation.lifting import FastSystem, LiftedSystem, discretise, lift
+from ..state_estimation.observers import steady_kalman
 
 # Frequencies in rad/s at which the plant of a seed is compared with the nominal one.
 _COMPARED = 2 * np.pi * np.linspace(0.2, 10.0, 50)

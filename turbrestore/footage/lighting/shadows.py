@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
-from ..core.decision import Decision
-from ..io.source import Window
-from ..registration.camera.global_shift import global_shifts
+from ...core.arrays import FloatArray
+from ...core.decision import Decision
+from ...io.source import Window
+from ...registration.camera.global_shift import global_shifts
 
 # Deviation of the Gaussian average: as a share of the longer side of a frame, and in those of the blur of the frames.
 _REACH, _REACH_BLURS = 0.045, 2.0

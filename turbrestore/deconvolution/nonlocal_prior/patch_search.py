@@ -1,6 +1,6 @@
 """The compiled search for the most similar patches around every pixel of a tile.
 
-Symbols as in :mod:`turbrestore.deconvolution.nonlocal_weights`, and
+Symbols as in :mod:`.nonlocal_weights`, and
 
 key : bits of a distance d, the last of which hold the rank of the offset, nearest first.
 
@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
-from ..runtime.jit import jit
+from ...core.arrays import FloatArray
+from ...runtime.jit import jit
 
 # Sorts after all keys.
 NO_KEY = int(np.iinfo(np.int32).max)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .psf import half_frequency
+from ..psf import half_frequency
 from .short_exposure import displacement_variance, short_exposures
 from .spectral_variation import RINGS
 

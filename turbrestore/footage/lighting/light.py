@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
-from ..core.decision import Decision
-from ..io.source import FrameSource, Window
-from ..registration.camera.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
+from ...core.arrays import FloatArray, luminance
+from ...core.decision import Decision
+from ...io.source import FrameSource, Window
+from ...registration.camera.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
 from .shadows import measure_shade
 
 # Longest side of the reduced frames, pixels, of up to that many frames, and of more.

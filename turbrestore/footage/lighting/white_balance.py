@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
-from ..core.decision import Decision
-from ..io.source import FrameSource, Window
-from ..registration.camera.global_shift import global_shifts
+from ...core.arrays import FloatArray, luminance
+from ...core.decision import Decision
+from ...io.source import FrameSource, Window
+from ...registration.camera.global_shift import global_shifts
 
 # Longest side of the reduced frames, pixels, and their blur.
 _SIDE, _BLUR = 64, 1.5

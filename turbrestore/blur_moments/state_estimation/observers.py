@@ -31,11 +31,11 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solve_discrete_are
 from scipy.signal import place_poles
 
-from ..core.errors import ConfigurationError, DataError, require
-from ..filtering.kalman import Gaussian, Innovation, predict, update
+from ...core.errors import ConfigurationError, DataError, require
+from ...filtering.kalman import Gaussian, Innovation, predict, update
+from ..moments import BASES, BlurModel, image_moments, moment_noise, predicted_moments
+from ..sensor import Float64Array
 from .lifting import LiftedSystem, check_inputs
-from .moments import BASES, BlurModel, image_moments, moment_noise, predicted_moments
-from .sensor import Float64Array
 
 METHODS = ("extended", "iterated", "unscented")
 

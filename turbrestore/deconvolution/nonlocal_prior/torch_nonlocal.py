@@ -1,7 +1,7 @@
 """Nonlocal weights and nonlocal TV in torch.
 
-Symbols and definitions as in :mod:`turbrestore.deconvolution.nonlocal_weights`, which finds the same graph on the CPU,
-and :mod:`turbrestore.deconvolution.nonlocal_tv`.
+Symbols and definitions as in :mod:`.nonlocal_weights`, which finds the same graph on the CPU,
+and :mod:`.nonlocal_tv`.
 
 All patches of a strip of rows are compared with all of their neighbours at once, and the best are found by one partial
 sort of integers that hold distance and offset.  Sums over the pairs of a pixel are gathers: the numbers of the pairs of
@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from ..core.arrays import FloatArray
-from ..runtime.image_stacks import torch_ops
+from ...core.arrays import FloatArray
+from ...runtime.image_stacks import torch_ops
 from .nonlocal_weights import SMALLEST_WEIGHT, NonlocalParams, automatic_h
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class TorchNonlocalPenalty:
 
     @cached_property
     def norm_squared(self) -> float:
-        """Upper bound of ‖∇_w‖², as of :class:`turbrestore.deconvolution.nonlocal_weights.NonlocalGraph`."""
+        """Upper bound of ‖∇_w‖², as of :class:`.nonlocal_weights.NonlocalGraph`."""
         x, bound = self.root.new_ones(self.shape[0] * self.shape[1]), np.inf
         for _ in range(10):
             x = (x / x.max()).clamp(min=1e-6)
@@ -182,7 +182,7 @@ def _neighbours(guide: FloatArray, params: NonlocalParams, device: str) -> tuple
 def _best_keys(padded: Tensor, top: int, rows: int, height: int, params: NonlocalParams) -> Tensor:
     """Distance and rank of offset in one integer, for the nearest and the best offsets of the pixels of a strip.
 
-    Integers as in :mod:`turbrestore.deconvolution.nonlocal_weights`: of like distances the nearer offset comes first.
+    Integers as in :mod:`.nonlocal_weights`: of like distances the nearer offset comes first.
     """
     import torch
 

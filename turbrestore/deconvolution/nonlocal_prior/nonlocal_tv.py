@@ -1,6 +1,6 @@
 """Nonlocal total variation as a penalty of the primal-dual splitting (paper 3, section 5).
 
-Symbols as in :mod:`turbrestore.deconvolution.primal_dual` and :mod:`turbrestore.deconvolution.nonlocal_weights`, and
+Symbols as in :mod:`turbrestore.deconvolution.primal_dual` and :mod:`.nonlocal_weights`, and
 
 ∇_w u : nonlocal gradient, ``(∇_w u)(x, y) = [u(y) − u(x)] √w(x, y)``; it is K.
 div_w v : nonlocal divergence, ``(div_w v)(x) = Σ_y [v(x, y) − v(y, x)] √w(x, y)``; Kᵀ = −div_w.
@@ -31,9 +31,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
-from ..runtime.jit import jit
-from ..runtime.threads import ThreadTeam
+from ...core.arrays import FloatArray
+from ...runtime.jit import jit
+from ...runtime.threads import ThreadTeam
 from .nonlocal_weights import NonlocalGraph
 
 # Bands of an image, which have at least so many rows; and pixels from which on threads share them.

@@ -8,7 +8,7 @@ h : filtering parameter, intensity.
 w(x, y) : weight of the pair of pixels x, y, ``exp(−d(x, y)/h²)``; 0 for pairs outside the graph (eq. 23).
 tail, head : the pixels x < y of a pair, in the order of the image.
 
-Neighbours are integers (keys) that hold a distance and an offset, see :mod:`turbrestore.deconvolution.patch_search`.
+Neighbours are integers (keys) that hold a distance and an offset, see :mod:`.patch_search`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_image, luminance
-from ..core.errors import DataError, require
-from ..core.noise import estimate_noise
-from ..runtime.jit import jit
-from ..runtime.threads import map_ahead
+from ...core.arrays import FloatArray, check_image, luminance
+from ...core.errors import DataError, require
+from ...core.noise import estimate_noise
+from ...runtime.jit import jit
+from ...runtime.threads import map_ahead
 from .patch_search import NO_KEY, PLACES, Keys, search_tile
 
 # A weight must be positive for its pair to stay in the graph.

@@ -5,7 +5,7 @@ Symbols
 D : diameter of the aperture; r0 : Fried parameter; λ/D : diffraction, here in pixels
 u : spatial frequency over that at which diffraction ends, ``u = ν λ/D``
 H : mean transfer function of exposures without tilt, diffraction included
-s, s_4 : variation of amplitudes and of powers, see :mod:`turbrestore.blur.spectral_variation`
+s, s_4 : variation of amplitudes and of powers, see :mod:`turbrestore.blur.witnesses.spectral_variation`
 
 All three are functions of u and D/r0 alone.  ``short_exposure.csv`` holds them for a circular aperture, as means over a
 thousand phase screens; ``python benchmarks/blur_calibration.py --table`` makes it.
@@ -66,7 +66,7 @@ def displacement_variance(strength: Float64Array, diffraction: Float64Array) -> 
 @functools.cache
 def _table() -> tuple[Float64Array, Float64Array, Float64Array]:
     """Values of D/r0 and of u, and H, s and s_4 as an array (3, D/r0, u)."""
-    text = files("turbrestore.blur").joinpath("short_exposure.csv").read_text("utf-8")
+    text = files("turbrestore.blur.witnesses").joinpath("short_exposure.csv").read_text("utf-8")
     rows = np.array([[float(cell) for cell in line.split(",")] for line in text.splitlines()[1:]])
     strengths, u = np.unique(rows[:, 0]), np.unique(rows[:, 1])
     return strengths, u, rows[:, 2:].reshape(len(strengths), len(u), 3).transpose(2, 0, 1)

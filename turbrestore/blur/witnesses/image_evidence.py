@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
-from ..runtime.runtime import DEFAULT, Runtime
-from ..runtime.threads import ThreadTeam, one_thread_each
-from .estimation import BlurEstimate, choose_blur, find_candidates, unreduced_width
-from .marginal_likelihood import WIDTHS, image_gradients, width_costs
+from ...core.arrays import FloatArray
+from ...runtime.runtime import DEFAULT, Runtime
+from ...runtime.threads import ThreadTeam, one_thread_each
+from ..estimation import BlurEstimate, choose_blur, find_candidates, unreduced_width
+from ..marginal_likelihood import WIDTHS, image_gradients, width_costs
 
 Float64Array = NDArray[np.float64]
 

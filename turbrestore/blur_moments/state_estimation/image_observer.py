@@ -25,11 +25,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.errors import ConfigurationError, DataError, require
-from ..filtering.kalman import Gaussian, Innovation, update_information
+from ...core.errors import ConfigurationError, DataError, require
+from ...filtering.kalman import Gaussian, Innovation, update_information
+from ..moments import BlurModel
+from ..sensor import Float64Array
 from .lifting import check_inputs
-from .moments import BlurModel
-from .sensor import Float64Array
 
 NORMS = ("map", "two", "infinity")
 _POWERS = {"map": (2,), "two": (2,), "infinity": (2, 8, 32)}

@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from ..core.errors import ConfigurationError, DataError, require
-from ..filtering.kalman import Gaussian, predict
-from .sensor import ExposureTiming, Float64Array
+from ...core.errors import ConfigurationError, DataError, require
+from ...filtering.kalman import Gaussian, predict
+from ..sensor import ExposureTiming, Float64Array
 
 # A direction of the state counts as unobservable below this share of the strongest effect on the output (float64).
 _OBSERVABLE = 1e-9

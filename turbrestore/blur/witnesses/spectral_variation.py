@@ -23,9 +23,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
-from ..registration.warp import warp
-from ..runtime.scratch import drop_pages
+from ...core.arrays import FloatArray, luminance
+from ...registration.warp import warp
+from ...runtime.scratch import drop_pages
 
 Float64Array = NDArray[np.float64]
 

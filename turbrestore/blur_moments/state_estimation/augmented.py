@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
-from ..core.errors import require
-from ..filtering.kalman import Gaussian
-from .sensor import ExposureTiming, Float64Array
+from ...core.errors import require
+from ...filtering.kalman import Gaussian
+from ..sensor import ExposureTiming, Float64Array
 
 
 @dataclass(frozen=True)

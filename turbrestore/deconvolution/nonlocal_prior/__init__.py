@@ -1,0 +1,1 @@
+"""Nonlocal total variation: patches, weights, and the penalty."""

@@ -1,0 +1,1 @@
+"""Light that changes from frame to frame: exposure, rows, white balance, shadows."""
