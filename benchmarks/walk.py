@@ -29,6 +29,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -113,13 +114,9 @@ def counted(native: Callable[..., Iterator[Any]], tally: Counter[str]) -> Callab
 def restored(*words: object, everything: bool = False) -> tuple[Walk, int]:
     """Run ``turbrestore restore`` and follow it; also the number of frames that were read."""
     tally: Counter[str] = Counter()
-    native = FrameSource._native
-    FrameSource._native = counted(native, tally)  # type: ignore[method-assign,assignment]
-    try:
-        with tempfile.TemporaryDirectory() as folder, Walk(everything) as walk:
-            code = command(["restore", *map(str, words), f"{folder}/out.png", "--threads", "1", "--quiet"])
-    finally:
-        FrameSource._native = native  # type: ignore[method-assign]
+    counting = patch.object(FrameSource, "_native", counted(FrameSource._native, tally))
+    with counting, tempfile.TemporaryDirectory() as folder, Walk(everything) as walk:
+        code = command(["restore", *map(str, words), f"{folder}/out.png", "--threads", "1", "--quiet"])
     assert code == 0, words
     return walk, tally["frames"]
 
