@@ -184,7 +184,11 @@ def test_a_deconvolution_that_is_left_early_ends_its_threads():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch, method):
-    for place in ("deconvolve._PARALLEL_PIXELS", "nonlocal_prior.nonlocal_tv._PARALLEL_PIXELS", "array_ops._PARALLEL_PIXELS"):
+    for place in (
+        "deconvolve._PARALLEL_PIXELS",
+        "nonlocal_prior.nonlocal_tv._PARALLEL_PIXELS",
+        "array_ops._PARALLEL_PIXELS",
+    ):
         monkeypatch.setattr(f"turbrestore.deconvolution.{place}", 1)
     _, blurred = camera(72, 1.5, 0.002)
     params, guide = DeconvolutionParams(method=method, iterations=10), blurred[::-1]

@@ -38,7 +38,7 @@ class ImageEvidence:
 def image_evidence(image: FloatArray, runtime: Runtime = DEFAULT) -> ImageEvidence | None:
     """Compute the costs of an image (H, W); None if it is too small or uniform."""
     with one_thread_each():
-        candidates = find_candidates(image, exponent=EXPONENTS[1])
+        candidates = find_candidates(image)
         if not candidates:
             return None
         estimate = choose_blur(candidates, runtime)
