@@ -8,7 +8,6 @@ import pytest
 
 from turbrestore.blind.decisions import explain_posterior
 from turbrestore.blind.remove_blur import remove_blur_steps
-from turbrestore.blur.estimation import estimate_blur
 from turbrestore.blur.posterior import BlurWitnesses, blur_posterior, measure_witnesses
 from turbrestore.blur.psf import half_frequency, radial_otf
 from turbrestore.blur.witnesses.hypotheses import hypotheses, shapes
@@ -95,13 +94,6 @@ def test_a_wide_blur_that_stands_still_is_found(sigma):
     witnesses = measure_witnesses(frames, flows, BlurWitnesses(0.0, 12.0))
     found = blur_posterior(image_evidence(image), witnesses, witnesses.variation.with_power(image))
     assert found.width[1] == pytest.approx(sigma, rel=0.3) and 0.4 * sigma < found.removed < 1.2 * sigma
-
-
-def test_the_image_is_judged_at_the_reduction_of_its_own_estimate():
-    blurred = cv2.GaussianBlur(SCENES["words"](192, 192), (0, 0), 3.0)
-    # Blocks of a codec look sharp at full size.
-    image = np.float32(np.kron(blurred.reshape(96, 2, 96, 2).mean(axis=(1, 3)), np.ones((2, 2))))
-    assert image_evidence(image).estimate.reduction == estimate_blur(image).reduction > 1
 
 
 def test_one_wrong_witness_is_outvoted():

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...core.arrays import FloatArray
 from ...runtime.runtime import DEFAULT, Runtime
 from ...runtime.threads import ThreadTeam, one_thread_each
-from ..estimation import BlurEstimate, choose_blur, find_candidates, unreduced_width
+from ..estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidates, unreduced_width
 from ..marginal_likelihood import WIDTHS, image_gradients, width_costs
 
 Float64Array = NDArray[np.float64]
@@ -24,6 +24,8 @@ Float64Array = NDArray[np.float64]
 EXPONENTS = (1.2, 1.55, 2.0)
 # Rises of the cost after which wider blurs are not tried, and the cost of those above the smallest.
 _RISES, _BEYOND = 4, 3.0
+# Width from which the reduction is chosen by two shapes, pixels.
+_WIDE = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +40,14 @@ class ImageEvidence:
 def image_evidence(image: FloatArray, runtime: Runtime = DEFAULT) -> ImageEvidence | None:
     """Compute the costs of an image (H, W); None if it is too small or uniform."""
     with one_thread_each():
-        candidates = find_candidates(image)
-        if not candidates:
+        found = find_candidates(image)
+        if not found:
             return None
-        estimate = choose_blur(candidates, runtime)
-        [chosen] = [one for one in candidates if one.estimate.reduction == estimate.reduction]
+        estimate, chosen = _chosen(found, runtime)
+        if max(estimate.sigma, found[0].estimate.sigma) > _WIDE:
+            # A wrong shape can make the image look sharper than it is where it is reduced less.
+            other = _chosen(find_candidates(image, exponent=EXPONENTS[1]), runtime)
+            estimate, chosen = max((estimate, chosen), other, key=lambda one: one[0].reduction)
         gradients, noise = image_gradients(chosen.part), chosen.estimate.noise
         with ThreadTeam(min(runtime.workers, 2)) as team:
             curves = list(team.map(lambda shape: width_costs(gradients, shape, noise, rises=_RISES), EXPONENTS))
@@ -51,3 +56,9 @@ def image_evidence(image: FloatArray, runtime: Runtime = DEFAULT) -> ImageEviden
         row[: len(curve)] = curve
     widths = np.array([unreduced_width(width, estimate.reduction) for width in WIDTHS])
     return ImageEvidence(widths, np.minimum(costs, costs.min() + _BEYOND), estimate)
+
+
+def _chosen(candidates: tuple[BlurCandidate, ...], runtime: Runtime) -> tuple[BlurEstimate, BlurCandidate]:
+    """Return the estimate of an image and the candidate that it comes from."""
+    estimate = choose_blur(candidates, runtime)
+    return estimate, next(one for one in candidates if one.estimate.reduction == estimate.reduction)
