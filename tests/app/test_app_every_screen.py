@@ -10,9 +10,9 @@ import pytest
 from conftest import make_sequence
 from turbrestore.io.video import write_video
 
+from .conftest import LONG, press, tabs
+
 SIZES = ((390, 844), (768, 1024), (1280, 860), (1440, 900))
-# Seconds until a run must have ended, on a machine that does other things too.
-LONG = 60_000
 pytestmark = pytest.mark.long
 
 
@@ -29,23 +29,8 @@ def address(tmp_path_factory):
 
 @pytest.fixture
 def open_tab(browser, address):
-    contexts = []
-
-    def call(size, **options):
-        contexts.append(browser.new_context(viewport={"width": size[0], "height": size[1]}, **options))
-        page = contexts[-1].new_page()
-        page.goto(address)
-        page.locator("#frame img").wait_for()
-        page.locator("svg.quality").wait_for(state="attached")
-        return page
-
-    yield call
-    for context in contexts:
-        context.close()
-
-
-def press(page, name):
-    page.get_by_role("button", name=name, exact=True).click()
+    with tabs(browser, address) as open_one:
+        yield open_one
 
 
 def serious(page):

@@ -1,15 +1,9 @@
 """The app in a browser, from the opening of a clip to the saved image, as a person would use it."""
 
-import base64
 import contextlib
-import http.client
-import os
 import re
 import shlex
 import shutil
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -18,127 +12,16 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import make_sequence
 from turbrestore.io.images import write_image
-from turbrestore.io.video import write_video
 from turbrestore_cli.__main__ import main
 
-EVIL = "<img src=x onerror=document.title='taken'>.mkv"
-SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
-# Seconds until a run must have ended, on a machine that does other things too.
-LONG = 60_000
+from .conftest import EVIL, LONG, SAMPLE, draw, drop, press, push
+
 pytestmark = pytest.mark.long
-
-
-class App:
-    """A server in a process of its own, in a folder with one good clip and one that is broken."""
-
-    def __init__(self, folder: Path, temporary: Path):
-        self.folder, self.temporary = folder, temporary
-        words = [sys.executable, "-m", "turbrestore_cli", "app", "chart.mkv", "--no-browser"]
-        environment = {**os.environ, "TMPDIR": str(temporary)}
-        self.process = subprocess.Popen(
-            words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-        )
-        self.address = self.process.stdout.readline().strip()
-
-    def ask(self, path="", method="GET", **headers):
-        """Status of the answer to a request."""
-        parts = urlsplit(self.address)
-        connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=10)
-        connection.putrequest(method, path or parts.path, skip_host="Host" in headers)
-        for name, value in headers.items():
-            connection.putheader(name.replace("_", "-"), value)
-        connection.endheaders()
-        status = connection.getresponse().status
-        connection.close()
-        return status
-
-
-@pytest.fixture(scope="module")
-def app(tmp_path_factory):
-    folder, temporary = tmp_path_factory.mktemp("start"), tmp_path_factory.mktemp("temporary")
-    shutil.copy(SAMPLE, folder)
-    (folder / EVIL).write_bytes(SAMPLE.read_bytes()[:3000])
-    write_video(folder / "small.mkv", make_sequence(seed=4, count=8, size=64).frames, 25)
-    (folder / "images").mkdir()
-    for number, frame in enumerate(make_sequence(seed=3, count=4, size=64).frames):
-        write_image(folder / "images" / f"{number}.png", frame, 8)
-    # Not every file system takes a name that is no text.
-    with contextlib.suppress(OSError):
-        (folder / os.fsdecode(b"broken\xff.mkv")).touch()
-    app = App(folder, temporary)
-    yield app
-    if app.process.poll() is None:
-        app.process.send_signal(signal.SIGINT)
-    _, complaints = app.process.communicate(timeout=20)
-    # A bug would have left its traceback.
-    assert (app.process.returncode, complaints) == (130, "turbrestore: interrupted\n")
-    assert list(temporary.iterdir()) == []
-    made = {path.name for path in folder.iterdir() if path.is_file() and path.suffix != ".mkv"}
-    assert made <= {f"{name}.png{suffix}" for name in ("saved", "again") for suffix in ("", ".toml")}
-
-
-@pytest.fixture
-def open_tab(browser, app):
-    """Open a tab; afterwards nothing must have been complained of, and nobody else asked."""
-    contexts, complaints, addresses = [], [], []
-
-    def call(size=(1280, 860), **options):
-        contexts.append(browser.new_context(viewport={"width": size[0], "height": size[1]}, **options))
-        page = contexts[-1].new_page()
-        page.on("console", lambda message: complaints.append(message.text))
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", lambda request: addresses.append(request.url))
-        page.on("websocket", lambda opened: addresses.append(opened.url.replace("ws://", "http://")))
-        page.goto(app.address)
-        page.locator("#frame img").wait_for()
-        page.locator("svg.quality").wait_for(state="attached")
-        return page
-
-    yield call
-    for context in contexts:
-        context.close()
-    assert complaints == []
-    assert [address for address in addresses if not address.startswith((app.address, "data:", "blob:"))] == []
 
 
 def pixels(element):
     return cv2.imdecode(np.frombuffer(element.screenshot(), np.uint8), cv2.IMREAD_COLOR).astype(int)
-
-
-def draw(page, left, top, right, bottom):
-    """Draw a region, in shares of the frame."""
-    box = page.locator("#frame").bounding_box()
-    x, y = ([box[start] + share * box[length] for share in ends] for start, length, ends in (
-        ("x", "width", (left, right)), ("y", "height", (top, bottom))
-    ))  # fmt: skip
-    page.mouse.move(x[0], y[0])
-    page.mouse.down()
-    page.mouse.move(x[1], y[1], steps=3)
-    page.mouse.up()
-
-
-def push(page, name, key):
-    """Move a slider by the keyboard."""
-    page.get_by_role("slider", name=name, exact=True).locator("[tabindex='0']").press(key)
-
-
-def press(page, name):
-    page.get_by_role("button", name=name, exact=True).click()
-
-
-def drop(page, name, data):
-    """Drop a file anywhere on the page."""
-    dragged = """([name, data]) => {
-      const dragged = new DataTransfer();
-      dragged.items.add(new File([Uint8Array.from(atob(data), (sign) => sign.charCodeAt(0))], name));
-      return dragged;
-    }"""
-    files = page.evaluate_handle(dragged, [name, base64.b64encode(data).decode()])
-    page.dispatch_event(".view", "dragenter", {"dataTransfer": files})
-    page.get_by_text("Drop the clip to open it").wait_for()
-    page.dispatch_event(".view", "drop", {"dataTransfer": files})
 
 
 def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
@@ -377,94 +260,6 @@ def test_what_is_uploaded_goes_with_its_tab(open_tab, app):
     while place.exists() and time.monotonic() < until:
         time.sleep(0.1)
     assert not place.exists()
-
-
-# Texts whose contrast with what is behind them is too low by WCAG AA; what is disabled may be.
-FAINT = """() => {
-  const channels = (colour) => colour.match(/[\\d.]+/g).map(Number);
-  const linear = (value) => value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
-  const light = ([r, g, b]) => 0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
-  const over = ([r, g, b, a = 1], [x, y, z]) => [a * r + (1 - a) * x, a * g + (1 - a) * y, a * b + (1 - a) * z];
-  const parse = (colour) => {
-    const context = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
-    context.fillStyle = colour;
-    context.fillRect(0, 0, 1, 1);
-    const [r, g, b, a] = context.getImageData(0, 0, 1, 1).data;
-    return [r, g, b, a / 255];
-  };
-  const ground = (element) => {
-    if (!element) return [255, 255, 255];
-    const own = parse(getComputedStyle(element).backgroundColor);
-    return own[3] === 1 ? own : over(own, ground(element.parentElement));
-  };
-  const faint = [];
-  for (const element of document.querySelectorAll("body *")) {
-    const style = getComputedStyle(element);
-    const text = [...element.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim());
-    const idle = element.closest("[disabled], .disabled, [aria-disabled=true], figcaption, option");
-    if (!text || idle || !element.checkVisibility({ visibilityProperty: true })) continue;
-    const behind = ground(element), one = light(behind), other = light(over(parse(style.color), behind));
-    const ratio = (Math.max(one, other) + 0.05) / (Math.min(one, other) + 0.05);
-    if (ratio < 4.5) faint.push([element.textContent.trim().slice(0, 40), ratio.toFixed(2)]);
-  }
-  return faint;
-}"""
-# Name of what has the focus, and whether it, its field, its box or its bar looks other than without.
-FOCUS = """() => {
-  const element = document.activeElement;
-  const name = element.ariaLabel || element.labels?.[0]?.textContent || element.closest("[aria-label]")?.ariaLabel;
-  const within = element.querySelectorAll("[class*=track], [class*=bg]");
-  const parts = [element, element.closest(".q-field__control") ?? element, ...within];
-  const look = () => parts.map((part) => getComputedStyle(part)).map((style) => style.outline + style.boxShadow).join();
-  const focused = look();
-  element.blur();
-  const plain = look();
-  element.focus();
-  return [element.tagName, (name || element.textContent).trim(), focused !== plain];
-}"""
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_fits_every_window_in_both_schemes(open_tab, scheme):
-    page = open_tab((1440, 900), color_scheme=scheme)
-    for width, height in ((1440, 900), (1280, 860), (1024, 768), (899, 700), (768, 1024), (390, 844)):
-        page.set_viewport_size({"width": width, "height": height})
-        page.wait_for_timeout(150)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        cut = "(labels) => labels.map((label) => label.scrollWidth - label.clientWidth)"
-        assert page.locator(".four .q-field__label").evaluate_all(cut) == [0] * 4
-        parts = {
-            name: page.locator(name).first.bounding_box() for name in ("#frame img", ".strip", "[aria-label=Frame]")
-        }
-        run = page.get_by_role("button", name="Run", exact=True).bounding_box()
-        if width >= 900:
-            # Without scrolling: the picture, its slider and the button.
-            assert all(box["y"] >= 0 and box["y"] + box["height"] <= height for box in (*parts.values(), run))
-            assert run["x"] > parts["#frame img"]["x"] + parts["#frame img"]["width"]
-        else:
-            assert run["y"] > parts["[aria-label=Frame]"]["y"] > parts["#frame img"]["y"]
-        image = parts["#frame img"]
-        assert image["width"] / image["height"] == pytest.approx(256 / 192, rel=0.02)
-        assert image["width"] > 0.4 * width
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_everything_can_be_read_and_reached(open_tab, scheme):
-    page = open_tab(color_scheme=scheme)
-    page.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
-    page.add_style_tag(content="* { transition: none !important; }")
-    page.wait_for_timeout(400)
-    assert page.evaluate(FAINT) == []
-    page.mouse.click(5, 5)
-    reached = []
-    for _ in range(60):
-        page.keyboard.press("Tab")
-        reached.append(page.evaluate(FOCUS))
-        if reached[-1][0] == "BODY":
-            break
-    stops = [stop for stop in reached if stop[0] != "BODY"]
-    assert len(stops) > 30
-    assert [stop for stop in stops if not stop[1] or not stop[2]] == []
 
 
 def test_strangers_are_refused(app):

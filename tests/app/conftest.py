@@ -1,0 +1,142 @@
+"""A server of the app, tabs of it in a browser, and what a person does in them."""
+
+import base64
+import contextlib
+import http.client
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from conftest import make_sequence
+from turbrestore.io.images import write_image
+from turbrestore.io.video import write_video
+
+EVIL = "<img src=x onerror=document.title='taken'>.mkv"
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
+# Seconds until a run must have ended, on a machine that does other things too.
+LONG = 60_000
+
+
+class App:
+    """A server in a process of its own, in a folder with one good clip and one that is broken."""
+
+    def __init__(self, folder: Path, temporary: Path):
+        self.folder, self.temporary = folder, temporary
+        words = [sys.executable, "-m", "turbrestore_cli", "app", "chart.mkv", "--no-browser"]
+        environment = {**os.environ, "TMPDIR": str(temporary)}
+        self.process = subprocess.Popen(
+            words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+        )
+        self.address = self.process.stdout.readline().strip()
+
+    def ask(self, path="", method="GET", **headers):
+        """Status of the answer to a request."""
+        parts = urlsplit(self.address)
+        connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=10)
+        connection.putrequest(method, path or parts.path, skip_host="Host" in headers)
+        for name, value in headers.items():
+            connection.putheader(name.replace("_", "-"), value)
+        connection.endheaders()
+        status = connection.getresponse().status
+        connection.close()
+        return status
+
+
+@pytest.fixture(scope="module")
+def app(tmp_path_factory):
+    folder, temporary = tmp_path_factory.mktemp("start"), tmp_path_factory.mktemp("temporary")
+    shutil.copy(SAMPLE, folder)
+    (folder / EVIL).write_bytes(SAMPLE.read_bytes()[:3000])
+    write_video(folder / "small.mkv", make_sequence(seed=4, count=8, size=64).frames, 25)
+    (folder / "images").mkdir()
+    for number, frame in enumerate(make_sequence(seed=3, count=4, size=64).frames):
+        write_image(folder / "images" / f"{number}.png", frame, 8)
+    # Not every file system takes a name that is no text.
+    with contextlib.suppress(OSError):
+        (folder / os.fsdecode(b"broken\xff.mkv")).touch()
+    app = App(folder, temporary)
+    yield app
+    if app.process.poll() is None:
+        app.process.send_signal(signal.SIGINT)
+    _, complaints = app.process.communicate(timeout=20)
+    # A bug would have left its traceback.
+    assert (app.process.returncode, complaints) == (130, "turbrestore: interrupted\n")
+    assert list(temporary.iterdir()) == []
+    made = {path.name for path in folder.iterdir() if path.is_file() and path.suffix != ".mkv"}
+    assert made <= {f"{name}.png{suffix}" for name in ("saved", "again") for suffix in ("", ".toml")}
+
+
+@contextlib.contextmanager
+def tabs(browser, address, watch=lambda page: None):
+    """Gives what opens a tab of the app, which ``watch`` sees before it loads; at the end all are closed."""
+    contexts = []
+
+    def open_one(size=(1280, 860), **options):
+        contexts.append(browser.new_context(viewport={"width": size[0], "height": size[1]}, **options))
+        page = contexts[-1].new_page()
+        watch(page)
+        page.goto(address)
+        page.locator("#frame img").wait_for()
+        page.locator("svg.quality").wait_for(state="attached")
+        return page
+
+    yield open_one
+    for context in contexts:
+        context.close()
+
+
+@pytest.fixture
+def open_tab(browser, app):
+    """Open a tab; afterwards nothing must have been complained of, and nobody else asked."""
+    complaints, addresses = [], []
+
+    def watch(page):
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda request: addresses.append(request.url))
+        page.on("websocket", lambda opened: addresses.append(opened.url.replace("ws://", "http://")))
+
+    with tabs(browser, app.address, watch) as open_one:
+        yield open_one
+    assert complaints == []
+    assert [address for address in addresses if not address.startswith((app.address, "data:", "blob:"))] == []
+
+
+def draw(page, left, top, right, bottom):
+    """Draw a region, in shares of the frame."""
+    box = page.locator("#frame").bounding_box()
+    x, y = ([box[start] + share * box[length] for share in ends] for start, length, ends in (
+        ("x", "width", (left, right)), ("y", "height", (top, bottom))
+    ))  # fmt: skip
+    page.mouse.move(x[0], y[0])
+    page.mouse.down()
+    page.mouse.move(x[1], y[1], steps=3)
+    page.mouse.up()
+
+
+def push(page, name, key):
+    """Move a slider by the keyboard."""
+    page.get_by_role("slider", name=name, exact=True).locator("[tabindex='0']").press(key)
+
+
+def press(page, name):
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def drop(page, name, data):
+    """Drop a file anywhere on the page."""
+    dragged = """([name, data]) => {
+      const dragged = new DataTransfer();
+      dragged.items.add(new File([Uint8Array.from(atob(data), (sign) => sign.charCodeAt(0))], name));
+      return dragged;
+    }"""
+    files = page.evaluate_handle(dragged, [name, base64.b64encode(data).decode()])
+    page.dispatch_event(".view", "dragenter", {"dataTransfer": files})
+    page.get_by_text("Drop the clip to open it").wait_for()
+    page.dispatch_event(".view", "drop", {"dataTransfer": files})

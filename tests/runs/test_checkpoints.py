@@ -1,0 +1,96 @@
+"""Checkpoints of the filter: when they are written, what is in them, and what goes on from them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conftest import make_sequence
+from turbrestore.core.errors import DataError
+from turbrestore.filtering.filter_records import FilterCheckpoint, FilterParams, FilterState, FrameRecord
+from turbrestore.filtering.image_state import PixelGaussian
+from turbrestore.filtering.kalman import Gaussian
+from turbrestore.pipeline import RestoreParams, restore
+from turbrestore.registration.centroid import CentroidParams
+from turbrestore.runs.checkpoint import load_checkpoint, save_checkpoint
+from turbrestore_cli.__main__ import main
+
+from .conftest import WORDS
+
+
+def test_a_checkpoint_is_as_far_back_as_asked_for_at_most(place, monkeypatch):
+    saved = []
+    monkeypatch.setattr(
+        "turbrestore.runs.run_folder.save_checkpoint", lambda _, checkpoint, key: saved.append(len(checkpoint.records))
+    )
+    main([word.replace("every=8", "every=18") for word in WORDS])
+    # The next block of eight would end 24 frames after the last checkpoint.
+    assert saved == [16, 28]
+
+
+def test_a_checkpoint_comes_back_bit_for_bit(tmp_path):
+    rng = np.random.default_rng(0)
+    for rank, shape in ((0, (5, 4)), (3, (5, 4, 3))):
+        image = PixelGaussian(rng.normal(size=shape).astype(np.float32), rng.uniform(size=(5, 4)).astype(np.float32))
+        flow = Gaussian(rng.normal(size=rank), 0.1 * np.eye(rank))
+        records = tuple(FrameRecord(rng.normal(size=rank), 0.1 * k, np.nan, np.nan, 3.0) for k in range(4))
+        state = FilterState(image, flow, *rng.normal(size=(2, 5, 4, 2)).astype(np.float32))
+        save_checkpoint(tmp_path / "c.npz", FilterCheckpoint(state, records, 2 * image.mean), "key")
+        found = load_checkpoint(tmp_path / "c.npz", "key")
+        assert np.array_equal(found.reference, 2 * image.mean)
+        assert found.reference.dtype == np.float32
+        assert np.array_equal(found.state.image.mean, image.mean)
+        assert found.state.image.mean.dtype == np.float32
+        assert np.array_equal(found.state.image.variance, image.variance)
+        assert np.array_equal(found.state.flow.cov, flow.cov)
+        assert np.array_equal(found.state.flow_sum, state.flow_sum)
+        assert np.array_equal(found.state.training_flow, state.training_flow)
+        for one, other in zip(found.records, records, strict=True):
+            assert np.array_equal(one.flow_state, other.flow_state)
+            for name in ("gain", "innovation", "sharpness", "information"):
+                assert np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)
+    with pytest.raises(DataError, match="other frames or settings"):
+        load_checkpoint(tmp_path / "c.npz", "other")
+
+
+class Recorder:
+    """A store that keeps everything in memory, and starts from a part of it."""
+
+    def __init__(self, results=(), start=None):
+        self.results, self.start, self.checkpoints = dict(results), start, []
+
+    def get(self, name, compute):
+        if name not in self.results:
+            self.results[name] = compute()
+        return self.results[name]
+
+    def filter_start(self):
+        return self.start
+
+    def checkpoint(self, state):
+        self.checkpoints.append(state)
+
+
+def test_from_every_point_the_library_ends_the_same():
+    grey = make_sequence(seed=42, count=16, size=32, scene="camera", rms=0.6).frames
+    frames = grey[..., None] * np.float32([1, 0.8, 0.6])
+    params = RestoreParams(
+        train=8,
+        keep_best=0.6,
+        centroid=CentroidParams(iterations=1),
+        filter=FilterParams(block=4, image_drift=1e-5),
+    )
+    params = replace(params, deconvolution=replace(params.deconvolution, iterations=2))
+    first = Recorder()
+    expected = restore(frames, params, store=first)
+    names = list(first.results)
+    assert names == ["centroid", "dynamics", "filtered", "mean", "deblurred"]
+    assert [len(state.records) for state in first.checkpoints] == [8, 12, 16]
+    points = [Recorder([(name, first.results[name]) for name in names[:count]]) for count in range(1, len(names) + 1)]
+    points += [Recorder([(name, first.results[name]) for name in names[:2]], state) for state in first.checkpoints]
+    for store in points:
+        found = restore(frames, params, store=store)
+        assert np.array_equal(found.image, expected.image)
+        assert np.array_equal(found.mean, expected.mean)
+        assert np.array_equal(found.filtered.shares, expected.filtered.shares)
+        assert found.decisions == expected.decisions
