@@ -244,7 +244,9 @@ def settings_files():
         (bytes(64), ("run.toml", "TOML")),
     ):
         yield Case(CHECK, holds, text)
-        yield Case([*RESTORE, "--config=run.toml"], holds, text)
+    # A command that is given the file checks it in the same way.
+    yield Case([*RESTORE, "--config=run.toml"], ("trian", "did you mean train?"), "trian = 3\n")
+    yield Case([*RESTORE, "--config=run.toml"], ("run.toml", "TOML"), bytes(64))
 
 
 def write_inputs(folder):

@@ -55,7 +55,7 @@ def test_weights_match_a_double_loop(nearest, shape):
 
 @pytest.mark.long
 def test_tiles_leave_no_seam(monkeypatch):
-    guide = np.random.default_rng(1).random((40, 31)).astype(np.float32)
+    guide = np.random.default_rng(1).random((22, 19)).astype(np.float32)
     whole = nonlocal_weights(guide, SMALL)
     monkeypatch.setattr("turbrestore.deconvolution.nonlocal_prior.nonlocal_weights._TILE_ROWS", 7)
     monkeypatch.setattr("turbrestore.deconvolution.nonlocal_prior.nonlocal_weights._TILE_COLUMNS", 6)
@@ -143,7 +143,7 @@ def test_a_single_pixel_has_no_neighbours():
         nonlocal_weights(np.zeros((1, 1)))
 
 
-@pytest.mark.parametrize("shape", [(1, 9), (30, 41), (67, 12)])
+@pytest.mark.parametrize("shape", [(1, 9), (14, 19), (67, 5)])
 @pytest.mark.parametrize("chosen", [(4, 10), (0, 3), (8, 0), (0, 32)])
 def test_the_compiled_search_does_what_is_written(monkeypatch, shape, chosen):
     """In the image, at its border, and where so many neighbours are chosen that some lie beyond the border."""
@@ -162,7 +162,7 @@ def test_the_compiled_search_does_what_is_written(monkeypatch, shape, chosen):
     assert same.mean() > 0.98
 
 
-@pytest.mark.parametrize("shape", [(1, 9), (5, 1), (4, 9), (30, 41)])
+@pytest.mark.parametrize("shape", [(1, 9), (5, 1), (4, 9), (14, 19)])
 @pytest.mark.parametrize("chosen", [(4, 6), (0, 1), (8, 0), (0, 20)])
 @pytest.mark.parametrize("flat", [True, False])
 def test_pairs_are_those_that_either_pixel_chooses(monkeypatch, shape, chosen, flat):
