@@ -25,7 +25,7 @@ _LENSES = np.array([0.2, 0.35, 0.5, 0.7, 0.9, 1.1, 1.35, 1.6, 1.9, 2.3, 2.8, 3.4
 _FINE_STRENGTHS = np.geomspace(0.5, 7, 41)
 # Prior: usual λ/D and the standard deviation of its logarithm; share of air that does not blur; weights of the σ_l.
 _USUAL_DIFFRACTION, _DIFFRACTION_SPREAD, _NO_BLUR = 1.4, 0.6, 0.05
-_LENS_PRIOR = np.array([22, 16, 12, 7, 7, 6, 6, 6, 5, 4.5, 4, 3, 1.5, 1, 0.7, 0.5, 0.3])
+_LENS_PRIOR = np.array([22, 16, 12, 9, 9, 9, 8, 7, 5, 4.5, 4, 3, 1.5, 1, 0.7, 0.5, 0.3])
 LEAST_TRANSFER = 1e-5
 
 

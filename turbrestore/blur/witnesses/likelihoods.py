@@ -15,8 +15,9 @@ from .spectral_variation import RINGS, SpectralVariation
 
 Float64Array = NDArray[np.float64]
 
-# Range of ln V of air that does not blur, V below which a scene stands still, and the least V, squared pixels.
-_RANGE_OF_V, _STILL, _LEAST_V = 7.0, 0.03, 1e-3
+# V below which a scene stands still, squared pixels; range of ln V of air that does not blur, and the least V.
+STILL = 0.03
+_RANGE_OF_V, _LEAST_V = 7.0, 1e-3
 # g and τ: values, and mean and standard deviation of the logarithm.
 _SHARES, SHARE_PRIOR = np.exp([-2.2, -1.6, -1.1, -0.7, -0.3]), (-1.1, 0.5)
 _SHIFTS, SHIFT_PRIOR = np.array([0.04, 0.1, 0.2, 0.3, 0.45]), (float(np.log(0.12)), 0.7)
@@ -43,7 +44,7 @@ def displacement_likelihood(
     """
     if not np.isfinite(variance):
         return np.zeros(len(known.prior))
-    still, measured = variance < _STILL, max(variance, _LEAST_V) / scale**2
+    still, measured = variance < STILL, max(variance, _LEAST_V) / scale**2
     if spread is None:
         spread = float(np.hypot(TILT_SPREAD, 1.4 / max(frames, 1.0) ** 0.5))
     of_air = -0.5 * (np.log(measured / known.expected_v) / spread) ** 2 - np.log(spread * np.sqrt(2 * np.pi))
