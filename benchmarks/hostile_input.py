@@ -41,7 +41,7 @@ IMPORTED = (
     "tifffile",
     "PIL.Image",
     "imageio.v3",
-    "turbrestore_cli.restore",
+    "turbrestore_cli.restoring",
     "turbrestore_cli.stages",
     "turbrestore_cli.inspection",
 )

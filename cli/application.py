@@ -49,6 +49,8 @@ USAGES = {
     "align": "Usage: turbrestore align [OPTIONS] RESULT... FOLDER",
     "batch": "Usage: turbrestore batch [OPTIONS] INPUT... FOLDER",
     "deconvolve": "Usage: turbrestore deconvolve [OPTIONS] INPUT [OUTPUT]",
+    # Found by the parser, this line would take a tenth of a second: restore has so many options.
+    "restore": "Usage: turbrestore restore [OPTIONS] INPUT OUTPUT",
 }
 BUG = 1
 
@@ -110,7 +112,11 @@ def run(words: list[str]) -> int:
         paths = ["./-" if word == "-" else word for word in words]
         explain_all = EVERYTHING in paths
         paths = ["--help" if word == EVERYTHING else word for word in paths]
-        build(explain_all)(paths, exit_on_error=False, print_error=False)
+        app, command = build(explain_all), _explained_command(paths)
+        if command:
+            app.help_print(command)
+        else:
+            app(paths, exit_on_error=False, print_error=False)
         flush()
     except BrokenPipeError:
         # The reader has seen enough; a second complaint at exit would be about the same.
@@ -120,6 +126,16 @@ def run(words: list[str]) -> int:
         tell(f"turbrestore: {' '.join(as_typed(message, words).split())}")
         return code
     return 0
+
+
+def _explained_command(words: list[str]) -> list[str]:
+    """Words of the command whose help is asked for; none if the parser has to look at what else was typed.
+
+    The parser would read the settings of every stage twice, once to see whether one of them is called help.
+    """
+    if not {"--help", "-h"} & set(words) or "--" in words:
+        return []
+    return next((words[:count] for count in (2, 1) if " ".join(words[:count]) in COMMANDS), [])
 
 
 def _refuse_empty(words: list[str]) -> None:

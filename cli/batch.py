@@ -25,7 +25,7 @@ from .inputs import with_absolute_paths
 from .options import Flag, Machine, Selection, known_sigma
 from .output import print_json
 from .progress import progress_bars, say
-from .restore import Order, restore_clip
+from .restoring import Order, restore_clip
 
 if TYPE_CHECKING:
     from distributed import Client, Future

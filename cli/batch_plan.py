@@ -22,7 +22,7 @@ from turbrestore.io.video import frame_files
 from turbrestore.report.batch_page import ClipRow, write_batch_page
 
 if TYPE_CHECKING:
-    from .restore import Order
+    from .restoring import Order
 
 # In a folder, files of these kinds are clips; images, TIFF and FITS files are the frames of one.
 CLIP_SUFFIXES = (".mkv", ".mp4", ".m4v", ".mov", ".webm", ".avi", ".gif", ".ser", ".npy", ".apng")

@@ -1,104 +1,21 @@
-"""``turbrestore restore``: the whole chain."""
+"""``turbrestore restore``: its options.  What it does is imported when it runs, so that its help comes at once."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
-from turbrestore.core.decision import Decision
 from turbrestore.core.errors import require
-from turbrestore.io.images import write_map
-from turbrestore.io.output import check_output
-from turbrestore.io.pixels import check_depth
-from turbrestore.io.source import FrameSource
-from turbrestore.memory_plan import training_share
-from turbrestore.metrics import comparable
-from turbrestore.pipeline import restore as run_pipeline
-from turbrestore.report import check_report, write_report
-from turbrestore.results import Restoration
-from turbrestore.runs.run_record import describe_run
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.settings import Preset, RestoreParams
-from turbrestore.stacking.placement import settings_of_known_flows
-from turbrestore.tiled_stages import TileMap
 
-from .cluster import check_cluster, connected, over_workers
-from .inputs import files_read, open_input, read_input_image
-from .kept import check_room, kept_stages, own_outputs
 from .options import Flag, Machine, Selection, known_sigma
-from .output import (
-    check_distinct,
-    check_keep,
-    describe,
-    print_json,
-    repeating_command,
-    save_stages,
-    settings_record,
-    summary,
-    write_result,
-    write_settings,
-)
-from .progress import progress_bars, say
 
 # Longest side of the tiles that are shared among processes, pixels: halos of a fifth on either side.
 TILE = 1088
-# Iterations that a centroid usually takes, and flows that are measured in the time of a deconvolution.
-_ITERATIONS, _FLOWS_A_DECONVOLUTION = 2, 60
-
-
-@dataclass(frozen=True)
-class Order:
-    """What to restore, how, and what to write; the fields are the options of :func:`restore`."""
-
-    input: Path
-    output: Path
-    selection: Selection
-    params: RestoreParams
-    machine: Machine
-    bit_depth: int | None = None
-    memory_limit: MemorySize | None = None
-    preset: Preset = "standard"
-    config: Path | None = None
-    keep: Path | None = None
-    resume: bool = False
-    checkpoint_every: int = 50
-    report: Path | None = None
-    uncertainty: Path | None = None
-    truth: Path | None = None
-    overwrite: bool = False
-    quiet: bool = False
-    verbose: bool = False
-    tile: int | None = None
-    scheduler: str | None = None
-    workers: int | None = None
-
-    @property
-    def settings_path(self) -> Path:
-        """File for the effective settings."""
-        return self.output.with_name(self.output.name + ".toml")
-
-    @property
-    def process_limit(self) -> MemorySize | None:
-        """Most memory that one process takes: this one has its share of the limit, as have the workers."""
-        if self.memory_limit is None or self.workers is None:
-            return self.memory_limit
-        return MemorySize(self.memory_limit / (self.workers + 1))
-
-    @property
-    def inputs(self) -> list[Path]:
-        """Files and folders to read."""
-        return files_read(self.selection, self.input, self.config, self.truth, params=self.params)
-
-    @property
-    def outputs(self) -> list[Path]:
-        """Files to write."""
-        return [path for path in (self.output, self.settings_path, self.report, self.uncertainty) if path is not None]
 
 
 def restore(
@@ -184,6 +101,12 @@ def restore(
     verbose : bool
         Print every decision as it is made.
     """
+    from .cluster import check_cluster
+    from .inputs import read_input_image
+    from .output import describe, print_json, summary
+    from .progress import say
+    from .restoring import Order, restore_clip
+
     require(not (quiet and verbose), "--verbose: contradicts --quiet; leave one of them out")
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
     if scheduler is not None or workers is not None:
@@ -201,104 +124,3 @@ def restore(
         print_json({"input": str(input), "output": str(output), "settings": str(order.settings_path), **facts})
     else:
         say(summary(output, restoration), quiet)
-
-
-def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
-    """Restore one clip and write what was ordered; ``turbrestore batch`` calls this in every process."""
-    if order.bit_depth is not None:
-        check_depth(order.bit_depth)
-    left = _check_outputs(order)
-    runtime = dataclasses.replace(order.machine.runtime(order.process_limit, order.keep), tile=order.tile)
-    if order.truth is not None:
-        comparable(read_input_image(order.truth, order.selection.limits()), "truth")
-    # A worker of another machine has another folder to work in.
-    place = order.input if order.scheduler is None else order.input.absolute()
-    source = open_input(place, order.selection, order.quiet)
-    if order.truth is not None:
-        comparable(source.read(0, 1)[0], source.name)
-    params = settings_of_known_flows(order.params, len(source))
-    check_room(source, params, runtime, order.output, order.keep)
-    with kept_stages(order.keep, source, params, runtime, order.resume, order.checkpoint_every, order.quiet) as stages:
-        with (
-            _elsewhere(order, source) as map_tiles,
-            progress_bars(order.quiet, _expected_times(source, params)) as progress,
-        ):
-            tell_decision = _say_decision if order.verbose else None
-            restoration = run_pipeline(source, params, runtime, stages, progress, tell_decision, map_tiles)
-        record = settings_record(
-            order.params, order.selection, order.bit_depth, order.machine, order.memory_limit, order.preset, order.tile
-        )
-        command = repeating_command(order.input, order.output, record)
-        run = describe_run(source, record, command) if order.keep or order.report else None
-        depth = source.bit_depth if order.bit_depth is None else order.bit_depth
-        if stages is not None and run is not None:
-            save_stages(stages, restoration, run, depth)
-            stages.expect(*order.outputs)
-        # Other existing files were refused above.
-        write_result(
-            order.output, restoration, source, depth, command, order.overwrite or order.output.absolute() in left
-        )
-        write_settings(order.settings_path, record)
-        if order.uncertainty is not None and restoration.uncertainty is not None:
-            write_map(
-                order.uncertainty, restoration.uncertainty, order.overwrite or order.uncertainty.absolute() in left
-            )
-        if order.report is not None and run is not None:
-            write_report(order.report, restoration, run, overwrite=order.overwrite or order.report.absolute() in left)
-        if stages is not None:
-            stages.expect()
-    return restoration, source
-
-
-def _say_decision(decision: Decision) -> None:
-    say(str(decision), quiet=False)
-
-
-def _expected_times(source: FrameSource, params: RestoreParams) -> dict[str, float]:
-    """Expect times of the stages, in flows: those that they measure, and what deconvolution takes."""
-    train = training_share(len(source), source.shape[1:], params.train, params.filter.training == "skip")
-    filtered = max(len(source) * params.filter.inner_iterations - train, 1)
-    times = {"centroid": _ITERATIONS * train, "filter": filtered, "deconvolve": _FLOWS_A_DECONVOLUTION}
-    return {stage: float(time) for stage, time in times.items() if params.runs(stage)}
-
-
-@contextmanager
-def _elsewhere(order: Order, source: FrameSource) -> Iterator[TileMap | None]:
-    """Connect to the processes that work on the tiles, if there are to be any."""
-    if order.scheduler is None and order.workers is None:
-        yield None
-    elif order.tile is None or max(source.shape[1:3]) <= order.tile:
-        say(
-            f"frames of {source.shape[2]}×{source.shape[1]} are one tile, so no other process works on them",
-            order.quiet,
-        )
-        yield None
-    else:
-        with connected(order.scheduler, order.workers or 1, order.quiet) as client:
-            yield over_workers(client)
-
-
-def _check_outputs(order: Order) -> set[Path]:
-    """Refuse outputs that cannot be written; return those that a run which died has left."""
-    require(
-        order.keep is not None or not order.resume, "--resume: expected --keep with the folder of the run to go on with"
-    )
-    check_distinct(order.outputs)
-    inputs = order.inputs
-    left = own_outputs(order.keep) if order.resume and order.keep is not None else set()
-    check_output(order.output, inputs, order.overwrite or order.output.absolute() in left)
-    of_before = order.config == order.settings_path or order.settings_path.absolute() in left
-    others = [path for path in inputs if path != order.config]
-    check_output(order.settings_path, others, order.overwrite or of_before, suffixes=None)
-    if order.uncertainty is not None:
-        require(
-            order.params.runs("filter"),
-            f"--uncertainty: expected a run of the filter, found until = {order.params.until}",
-        )
-        check_output(
-            order.uncertainty, inputs, order.overwrite or order.uncertainty.absolute() in left, (".tif", ".tiff")
-        )
-    if order.report is not None:
-        check_report(order.report, inputs, order.overwrite or order.report.absolute() in left)
-    check_keep(order.keep, [*inputs, *order.outputs], order.overwrite, order.resume)
-    return left

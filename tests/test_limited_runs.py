@@ -75,8 +75,9 @@ def test_the_truth_is_not_in_memory_while_the_stages_run(tmp_path, monkeypatch, 
         assert [truth() is None for truth in truths] == [True]
         return pipeline.restore(*words, **more)
 
-    monkeypatch.setattr("turbrestore_cli.restore.read_input_image", read)
-    monkeypatch.setattr("turbrestore_cli.restore.run_pipeline", run)
+    for module in ("inputs", "restoring"):
+        monkeypatch.setattr(f"turbrestore_cli.{module}.read_input_image", read)
+    monkeypatch.setattr("turbrestore_cli.restoring.run_pipeline", run)
     quick = ["--centroid.iterations=1", "--sigma=1", "--deconvolution.iterations=2", "--quiet"]
     assert main(["restore", "clip.npy", "image.png", "--truth=truth.png", "--json", *quick]) == 0
     assert "psnr" in json.loads(capsys.readouterr().out)["stages"]["deconvolved"]

@@ -25,7 +25,7 @@ from turbrestore.report.batch_page import ClipRow, render_batch
 from turbrestore.runtime.runtime import Runtime
 from turbrestore_cli import batch as command
 from turbrestore_cli import cluster
-from turbrestore_cli import restore as command_restore
+from turbrestore_cli import restoring as command_restore
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.batch_plan import find_clips, journal_line, name_outputs, read_journal
 from turbrestore_cli.inputs import open_input

@@ -67,7 +67,8 @@ def test_one_step_is_that_of_dense_algebra(margin, number):
     def unrelaxed(new: np.ndarray, old: np.ndarray) -> np.ndarray:
         return (old + (new - old) / primal_dual.RELAXATION).ravel()
 
-    share = max(1 / number, primal_dual.LEAST_DATA_STEP)
+    early = primal_dual.EARLY_DATA_STEP if number <= primal_dual.EARLY else primal_dual.LEAST_DATA_STEP
+    share = max(1 / number, early)
     tau, t = primal_dual.PRIMAL_STEP / np.sqrt(TV.norm_squared), 30.0 * share
     metric = np.eye(64) / tau + t * blur.T @ blur
     expected = u.ravel() - np.linalg.solve(metric, differences.T @ p.ravel() + blur.T @ q.ravel())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-from importlib import metadata
 
 from .errors import ConfigurationError
 
@@ -13,6 +12,9 @@ _OURSELVES = "turbrestore"
 
 def install_command(extra: str) -> str:
     """Command that installs the packages of an extra by their own names, wherever turbrestore itself came from."""
+    # It takes a while to load, and is needed where something is missing.
+    from importlib import metadata
+
     try:
         return f"pip install {shlex.join(_packages(extra))}"
     except metadata.PackageNotFoundError:
@@ -25,6 +27,8 @@ def missing_package(user: str, package: str, extra: str) -> ConfigurationError:
 
 
 def _packages(extra: str) -> list[str]:
+    from importlib import metadata
+
     found: list[str] = []
     for line in metadata.requires(_OURSELVES) or ():
         requirement, _, marker = (part.strip() for part in line.partition(";"))

@@ -27,9 +27,10 @@ condition does not depend on t.
 
 If t = λ and M = 1 everywhere, q stays equal to λ(Bu − f) once it has that value, and the step of u is the proximal step
 of the data term.  In a margin, where M = 0, q is zero, but the term tBᵀB of P still limits the change of u.  With
-t = λ the margin, and the part of the image that its light reaches, would therefore converge slowly.  So t decreases: it
-is λ/k in iteration k ≤ 50, and remains λ/50 afterwards.  The first 50 iterations thus only provide a starting point,
-from which the splitting with a constant t converges.
+t = λ the margin, and the part of the image that its light reaches, would therefore converge slowly.  With a small t the
+image oscillates instead.  So t is λ/k in iteration k ≤ 5 and λ/5 up to k = 50, by when most images are at rest, in half
+as many iterations as λ/50 takes from the start.  From then on it is λ/50, for images whose border holds detail.  The
+first iterations thus only provide a starting point, from which the splitting with a constant t converges.
 
 Start
 -----
@@ -51,8 +52,8 @@ from .problem import Problem
 RELAXATION = 1.8
 # τ‖K‖.  Small primal steps suit images in [0, 1] with λ between 300 and 30000.
 PRIMAL_STEP = 0.08
-# Smallest t/λ.
-LEAST_DATA_STEP = 0.02
+# Smallest t/λ up to an iteration, and from then on.
+EARLY_DATA_STEP, EARLY, LEAST_DATA_STEP = 0.2, 50, 0.02
 # Number of iterations over which a change of the image is measured.  Oscillations mostly cancel within that many
 # iterations; a drift does not.
 WINDOW = 10
@@ -115,7 +116,7 @@ class PrimalDual:
         """Do one iteration.  With d = u − u' = P⁻¹(Kᵀp + Bᵀq), the point 2u' − u is u − 2d."""
         (tau, s), forward, otf = self._steps, problem.ops.forward, problem.otf
         u, blurred, q, p, adjoint, k = state
-        share = max(1 / k, LEAST_DATA_STEP)
+        share = max(1 / k, EARLY_DATA_STEP if k <= EARLY else LEAST_DATA_STEP)
         t = share * problem.fidelity
         spectrum = (forward(adjoint) + otf.conj() * forward(q)) / (1 / tau + t * problem.power)
         d, blurred_d = problem.ops.back(spectrum, problem.shape), problem.blur(spectrum)

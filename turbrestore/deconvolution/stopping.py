@@ -1,6 +1,6 @@
 """The loop of the iterative solvers, and when it stops.
 
-A photograph is deblurred after some fifty iterations, the finest bars of a chart after hundreds.  The last change of
+A photograph is deblurred after some thirty iterations, the finest bars of a chart after a hundred.  The last change of
 the whole image tells the two apart badly: an image that changes slowly may have far to go, and a few letters on a large
 page change little of it.  So changes are measured in the tile that changes most, and further changes are predicted.
 
@@ -40,7 +40,7 @@ from .problem import Problem
 TILE = 64
 # q is the mean over this many steps from window to window, of which there must be at least FEWEST; the prediction is at
 # most MOST times the last change.
-SPAN, FEWEST, MOST = 5, 4, 6.0
+SPAN, FEWEST, MOST = 3, 2, 6.0
 # The energy is recorded every so many iterations, a multiple of the windows of all solvers.
 _RECORD_EVERY = 10
 

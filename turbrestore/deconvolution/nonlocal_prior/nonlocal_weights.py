@@ -29,6 +29,8 @@ from .patch_search import NO_KEY, PLACES, Keys, search_tile
 
 # A weight must be positive for its pair to stay in the graph.
 SMALLEST_WEIGHT = 1e-6
+# Powers of the graph for the bound of its norm, which is then two per cent above that after many.
+POWERS = 4
 # Rows and columns of a tile of the search.
 _TILE_ROWS, _TILE_COLUMNS = 64, 192
 # Bits of an infinite distance: that of a pixel outside the image.
@@ -107,7 +109,7 @@ class NonlocalGraph:
     reach: int  # largest number of rows from a tail to its heads
     h: float  # filtering parameter that was used, intensity
 
-    def norm_squared(self, iterations: int = 10) -> float:
+    def norm_squared(self) -> float:
         """Upper bound of ‖∇_w‖² = 2‖D‖², with D the differences of pairs.
 
         ``‖D‖² = ρ(DᵀD) ≤ ρ(|D|ᵀ|D|)``, and for a non-negative matrix A and any positive x, ``ρ(A) ≤ max_i (Ax)_i/x_i``
@@ -117,7 +119,7 @@ class NonlocalGraph:
         weights = scipy.sparse.csr_array((self.roots**2, self.heads, self.starts), shape=(size, size))
         x, bound = np.ones(size, np.float32), np.inf
         degrees = weights @ x + weights.T @ x
-        for _ in range(iterations):
+        for _ in range(POWERS):
             # Pixels without pairs do not take part.
             x = np.maximum(x / x.max(), np.float32(1e-6))
             product = weights @ x + weights.T @ x + degrees * x

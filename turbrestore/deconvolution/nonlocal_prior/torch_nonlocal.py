@@ -20,7 +20,7 @@ import numpy as np
 
 from ...core.arrays import FloatArray
 from ...runtime.image_stacks import torch_ops
-from .nonlocal_weights import SMALLEST_WEIGHT, NonlocalParams, automatic_h
+from .nonlocal_weights import POWERS, SMALLEST_WEIGHT, NonlocalParams, automatic_h
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -90,7 +90,7 @@ class TorchNonlocalPenalty:
     def norm_squared(self) -> float:
         """Upper bound of ‖∇_w‖², as of :class:`.nonlocal_weights.NonlocalGraph`."""
         x, bound = self.root.new_ones(self.shape[0] * self.shape[1]), np.inf
-        for _ in range(10):
+        for _ in range(POWERS):
             x = (x / x.max()).clamp(min=1e-6)
             along = (x.index_select(0, self.tails) + x.index_select(0, self.heads)) * self.root**2
             product = self._sum_of_pairs(along.repeat(2)).reshape(-1)
