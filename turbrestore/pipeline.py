@@ -132,7 +132,7 @@ def restore(
         check_space(plan.runtime.scratch, plan.scratch_bytes)
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
-    prepared = prepare(source, plan.train, params.static_mask)
+    prepared = prepare(source, params.static_mask, plan.runtime.scratch)
     stretched, bars = _stretched_params(params, prepared.levels), prepared.bars
     run = Run(prepared, stretched, plan, tiles, store or NoStore(), progress, on_decision, map_tiles, psf)
     run.seconds["read"] = time.perf_counter() - begun

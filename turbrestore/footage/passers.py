@@ -32,6 +32,7 @@ from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import FrameSource, Window
 from .placement import Placement, measured_shifts, placed, reduced, shifts_of_reduced
+from .survey import Survey
 
 # Frames of which the median is taken, the fewest that tell what passes, and rows that it is taken of at once.
 _SAMPLES, _FEWEST, _ROWS = 25, 9, 64
@@ -108,9 +109,13 @@ class _Usual:
         return dataclasses.replace(self, excess=None)
 
 
-def without_passers(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Replace what passes by the background; a source in which nothing does is returned as it is."""
-    usual = _usual_of(source) if len(source) >= _FEWEST else None
+def without_passers(survey: Survey) -> tuple[FrameSource, tuple[Decision, ...]]:
+    """Replace what passes by the background; a clip in which nothing does is returned as it is.
+
+    Where something does, all frames are read once more, because each shows the background elsewhere.
+    """
+    source = survey.clip
+    usual = _usual_of(survey) if len(source) >= _FEWEST else None
     if usual is None:
         return source, ()
     background, share, touched = _background(source, *usual)
@@ -121,11 +126,10 @@ def without_passers(source: FrameSource) -> tuple[FrameSource, tuple[Decision, .
     return source.adjusted(background.shown), (decision,)
 
 
-def _usual_of(source: FrameSource) -> tuple[_Usual, Placement] | None:
+def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
     """Find what frames usually show, and where they lie; None where nothing passes."""
-    picked = np.unique(np.linspace(0, len(source) - 1, _SAMPLES).round().astype(int))
-    sample = dataclasses.replace(source, numbers=tuple(source.numbers[int(index)] for index in picked))
-    stack = np.empty((len(sample), *sample.shape[1:3]), np.uint8)
+    source, sample = survey.clip, survey.part(_SAMPLES)
+    stack = np.empty((len(sample), *source.shape[1:3]), np.uint8)
     for plane, frame in zip(stack, sample, strict=True):
         np.rint(255 * np.clip(luminance(frame), 0, 1), out=plane, casting="unsafe")
     still = Placement.still(source)
@@ -136,7 +140,8 @@ def _usual_of(source: FrameSource) -> tuple[_Usual, Placement] | None:
     if not _moves(measured_shifts(map(_grey, stack), stack.shape)):
         return None
     # For a camera that moves the scene passes too; what moves as most of the frame does is the scene.
-    moving = placed(source, measured_shifts(map(luminance, source), source.shape))
+    small = luminance(survey.small)
+    moving = placed(source, shifts_of_reduced(reduced(small, small.shape), source.shape))
     if np.prod(moving.shape) > _LARGEST_SCENE * np.prod(moving.size):
         return None
     followed = _usual(stack, sample.numbers, moving)
