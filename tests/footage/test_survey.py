@@ -36,7 +36,7 @@ def test_whole_frames_are_those_of_the_clip(tmp_path, scratch):
         source = replace(FrameSource.from_array(frames), full_scale=white)
         clip = source.select(frames=(3, None)).adjusted(lambda number, values, _: values * np.float32(0.9) + number)
         survey = take_survey(clip, tmp_path if scratch else None)
-        assert len(survey) == 48 and survey.numbers[0] == 3 and survey.numbers[-1] == 59
+        assert len(survey.numbers) == 48 and survey.numbers[0] == 3 and survey.numbers[-1] == 59
         for number, frame in zip(survey.numbers, survey, strict=True):
             np.testing.assert_allclose(frame, clip.read(number - 3, number - 2)[0], rtol=1e-6)
         assert survey.part(5).numbers == tuple(survey.numbers[place] for place in (0, 12, 24, 35, 47))

@@ -74,7 +74,7 @@ def without_stripes(survey: Survey, moments: Moments | None = None) -> tuple[Sur
 
     ``moments`` are those of the survey, if they are known.
     """
-    if len(survey) < _FEWEST:
+    if len(survey.numbers) < _FEWEST:
         return survey, ()
     moments = moments or measure_moments(survey)
     mean, variance, usual = luminance(moments.mean), moments.change, max(moments.noise, 1e-4)

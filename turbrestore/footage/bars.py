@@ -93,7 +93,7 @@ def _extremes(survey: Survey) -> tuple[FloatArray, FloatArray, FloatArray]:
         total += frame
         np.minimum(lowest, grey, out=lowest)
         np.maximum(highest, grey, out=highest)
-    return (total / len(survey)).astype(np.float32), lowest, highest
+    return (total / len(survey.numbers)).astype(np.float32), lowest, highest
 
 
 def _picture_of(shows: NDArray[Any], level: FloatArray) -> slice:

@@ -96,7 +96,7 @@ def _range_of(survey: Survey) -> tuple[float, float]:
         smooth = cv2.medianBlur(frame, 3)
         lows.append(float(smooth.min()))
         highs.append(float(smooth.max()))
-    mean = (total / len(survey)).astype(np.float32)
+    mean = (total / len(survey.numbers)).astype(np.float32)
     smooth = cv2.medianBlur(mean, 3)
     low, high = float(smooth.min()), float(smooth.max())
     coarse = high - low < _LEAST_CONTRAST

@@ -47,7 +47,8 @@ def measure_moments(survey: Survey) -> Moments:
         cv2.accumulate(grey, sums[0])
         cv2.accumulateSquare(grey, sums[1])
         noise.append(estimate_noise(grey))
-    change = (sums[2] / (2 * max(len(survey) - 1, 1))).astype(np.float32)
-    sums /= len(survey)
+    count = len(survey.numbers)
+    change = (sums[2] / (2 * max(count - 1, 1))).astype(np.float32)
+    sums /= count
     variance = np.maximum(sums[1] - np.square(sums[0]), 0).astype(np.float32)
-    return Moments((total / len(survey)).astype(np.float32), variance, change, float(np.median(noise)), len(survey))
+    return Moments((total / count).astype(np.float32), variance, change, float(np.median(noise)), count)

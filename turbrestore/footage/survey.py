@@ -35,15 +35,12 @@ class Survey:
     pixels: tuple[PixelArray, ...]  # (H, W) or (H, W, 3) each: the whole frames before they are adjusted
     small: FloatArray  # (T, h, w) or (T, h, w, 3): all frames, corrected
 
-    def __len__(self) -> int:
-        return len(self.numbers)
-
     def __iter__(self) -> Iterator[FloatArray]:
         return map(self.clip.intensities, self.numbers, iter_frames(self.pixels))
 
     def part(self, count: int) -> Survey:
         """Keep at most that many of the whole frames, spread evenly."""
-        chosen = _spread(len(self), count)
+        chosen = _spread(len(self.numbers), count)
         return dataclasses.replace(
             self,
             numbers=tuple(self.numbers[index] for index in chosen),
