@@ -25,8 +25,8 @@ from ...registration.camera.global_shift import DEAD_ZONE, ShiftReference, measu
 from ..survey import Survey
 from .shadows import measure_shade
 
-# Longest side of the reduced frames, pixels, of up to that many frames, and of more.
-_SIDE, _MANY, _SIDE_OF_MANY = 96, 4000, 48
+# Longest side of the reduced frames, pixels.
+_SIDE = 96
 # Blur of the frames that hides the motion of the air: pixels of the frame, and at least that many of the reduced one.
 _BLUR, _LEAST_BLUR = 4.0, 1.5
 # Cosines along the rows: bands as narrow as an eighth of the frame are followed.
@@ -173,7 +173,7 @@ def _reduced_frames(survey: Survey) -> FloatArray:
 
 
 def _reduction(survey: Survey) -> float:
-    return max(1.0, max(survey.clip.shape[1:3]) / (_SIDE if len(survey.small) <= _MANY else _SIDE_OF_MANY))
+    return max(1.0, max(survey.clip.shape[1:3]) / min(_SIDE, max(survey.small.shape[1:3])))
 
 
 def _blur_of(survey: Survey) -> float:
