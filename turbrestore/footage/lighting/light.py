@@ -83,8 +83,7 @@ def steady_light(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
                 lit[...] = replace(light, rows=rows).steady(number, frame, (rows, columns))
         survey = survey.adjusted(light.steady, small)
     shade, on_shade = measure_shade(frames, numbers, survey.clip.window, _blur_of(survey))
-    # Shadows do not move: where a camera is, which is all that is asked of the reduced frames from here on, they
-    # do not hide.
+    # From here on the reduced frames only serve to measure shifts of the camera, which shadows hardly change.
     return survey if shade is None else survey.adjusted(shade.lit), (*on_light, *on_shade)
 
 
