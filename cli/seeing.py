@@ -73,7 +73,7 @@ def seeing(
     runtime = machine.runtime()
     most = min(len(source), frames_in_memory(source.shape[1:]))
     count = training_share(len(source), source.shape[1:], most if train is None else train)
-    prepared = prepare(source, count)
+    prepared = prepare(source, scratch=runtime.scratch)
     frames = prepared.source.read(0, count)
     with progress_bars(quiet) as progress:
         steps = centroid_steps(frames, centroid, flow, runtime)

@@ -11,6 +11,8 @@ import pytest
 import skimage.data
 from hypothesis import HealthCheck, settings
 
+from turbrestore.footage.survey import Survey, take_survey
+from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
@@ -70,6 +72,10 @@ def natural_scene(size: int) -> np.ndarray:
 
 
 SCENES = {"chart": lambda size: resolution_chart(size, size), "camera": natural_scene}
+
+
+def surveyed(frames) -> Survey:
+    return take_survey(FrameSource.from_array(frames))
 
 
 def make_sequence(

@@ -4,8 +4,7 @@ import numpy as np
 from scipy import fft
 
 from turbrestore.blur.psf import gaussian_otf
-from turbrestore.deconvolution.array_ops import numpy_ops
-from turbrestore.deconvolution.problem import Problem
+from turbrestore.deconvolution.problem import Problem, numpy_ops
 
 OPS = numpy_ops()
 

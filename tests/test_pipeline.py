@@ -67,7 +67,7 @@ def test_until_stops_there(blurred, until):
     assert short.image is expected
 
 
-def test_a_source_is_read_front_to_back_and_once_for_the_filter_and_the_mean(blurred):
+def test_a_source_is_read_front_to_back_and_once_for_all_stages(blurred):
     reads = []
     array = FrameSource.from_array(blurred.frames[:8])
 
@@ -77,9 +77,8 @@ def test_a_source_is_read_front_to_back_and_once_for_the_filter_and_the_mean(blu
             yield from array.pixels(range(number, number + 1))
 
     restore(replace(array, pixels=pixels), replace(QUICK, train=4, until="filter"))
-    # Before them all frames are looked at for bars, overlays, stripes and changes of the light, and the training frames
-    # for their range.
-    assert reads == [*(list(range(8)) * 4), *range(4), *range(8)]
+    # Before the filter all frames are read for the survey.
+    assert reads == [*range(8), *range(8)]
 
 
 def test_the_result_is_the_same_every_time(blurred):

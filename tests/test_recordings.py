@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import make_sequence
+from conftest import make_sequence, surveyed
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.bars import without_bars
 from turbrestore.footage.checks.content import check_content
@@ -76,22 +76,22 @@ class TestLight:
     def test_in_colour_with_drift(self, clip):
         colours = clip.frames[..., None] * np.float32([0.8, 0.6, 0.4])
         drifting = np.stack([np.roll(frame, k // 3, axis=1) for k, frame in enumerate(colours)])
-        source, (found,) = steady_light(FrameSource.from_array(u8(drifting * (1 + 0.2 * np.sin(T / 4))[..., None])))
-        even = source.read()
+        source, (found,) = steady_light(surveyed(u8(drifting * (1 + 0.2 * np.sin(T / 4))[..., None])))
+        even = source.clip.read()
         left = [np.roll(frame, -(k // 3), axis=1)[:, :66].mean() for k, frame in enumerate(even)]
         assert found.subject == "light" and np.ptp(left) < 0.05 * np.mean(left)
 
     def test_rows_of_a_region_are_those_of_the_file(self, clip):
         bands = u8(0.8 * clip.frames * LIGHT["bands of the mains"][0])
-        whole, _ = steady_light(FrameSource.from_array(bands))
-        part = whole.select((3, 9), (5, 40, 20, 30))
-        np.testing.assert_array_equal(part.read(), whole.read(3, 9)[:, 40:70, 5:25])
+        whole, _ = steady_light(surveyed(bands))
+        part = whole.clip.select((3, 9), (5, 40, 20, 30))
+        np.testing.assert_array_equal(part.read(), whole.clip.read(3, 9)[:, 40:70, 5:25])
 
     @pytest.mark.parametrize("scene", ["camera", "chart"])
     @pytest.mark.parametrize("rms", [0.5, 3.0])
     def test_steady_light_is_left_as_it_is(self, scene, rms):
-        source = FrameSource.from_array(make_sequence(5, 20, 96, scene, rms=rms).frames.clip(0, 1))
-        assert steady_light(source) == (source, ())
+        survey = surveyed(make_sequence(5, 20, 96, scene, rms=rms).frames.clip(0, 1))
+        assert steady_light(survey) == (survey, ())
 
 
 @pytest.fixture(scope="module")
@@ -158,13 +158,14 @@ class TestOverlays:
 
     def test_scenes_have_none(self, shaken, clip):
         for frames in (shaken, u8(clip.frames), u8(0.2 + 0 * clip.frames[:1] + 0.3 * clip.frames)):
-            source = FrameSource.from_array(frames)
-            assert without_overlay(source) == (source, None, None, ())
+            survey = surveyed(frames)
+            assert without_overlay(survey) == (survey, None, None, ())
 
     def test_a_window_is_that_of_the_whole_frame(self, shaken):
         covered = shaken.copy()
         covered[:, 40, 20:60] = 255
-        source, _, _, _ = without_overlay(FrameSource.from_array(covered))
+        source, _, _, _ = without_overlay(surveyed(covered))
+        source = source.clip
         part = source.select((2, 5), (15, 30, 30, 25))
         np.testing.assert_array_equal(part.read(), source.read(2, 5)[:, 30:55, 15:45])
 
@@ -191,7 +192,7 @@ class TestTitles:
         assert np.sqrt(np.mean((found.image[rows] - alone.image[rows]) ** 2)) < 0.025
 
     def test_a_window_is_that_of_the_whole_frame_and_letters_are_no_stuck_pixels(self, titled):
-        _, hidden, title, _ = without_overlay(FrameSource.from_array(titled))
+        _, hidden, title, _ = without_overlay(surveyed(titled))
         assert title is not None and np.array_equal(hidden, title.mask)
         np.testing.assert_allclose(title.put_back(np.zeros((20, 30)), 5, 55)[title.mask[55:75, 5:35]].max(), 1)
         assert len(check_content(FrameSource.from_array(titled)).stuck) == 0
@@ -213,14 +214,15 @@ class TestBars:
         np.testing.assert_allclose(255 * found.image[outside], 16, atol=0.01)
 
     def test_windows_are_those_of_the_whole_frame(self, clip):
-        source, _, _ = without_bars(FrameSource.from_array(np.pad(u8(clip.frames), ((0, 0), (9, 9), (0, 0)))))
+        source, _, _ = without_bars(surveyed(np.pad(u8(clip.frames), ((0, 0), (9, 9), (0, 0)))))
+        source = source.clip
         np.testing.assert_array_equal(source.select((1, 3), (5, 0, 30, 25)).read(), source.read(1, 3)[:, :25, 5:35])
 
     def test_black_around_a_disc_is_no_bar(self):
         y, x = np.mgrid[:64, :80]
         disc = 0.8 * (np.hypot(x - 40, y - 32) < 20)
-        source = FrameSource.from_array(u8(np.stack([np.roll(disc, k, axis=1) for k in range(5)])))
-        assert without_bars(source) == (source, None, ())
+        survey = surveyed(u8(np.stack([np.roll(disc, k, axis=1) for k in range(5)])))
+        assert without_bars(survey) == (survey, None, ())
 
 
 class TestRange:
@@ -253,16 +255,16 @@ class TestRange:
         y, x = np.mgrid[:64, :80]
         rng = np.random.default_rng(0)
         discs = [0.8 * (np.hypot(x - 40 - dx, y - 32 - dy) < 8) for dx, dy in rng.uniform(-20, 20, (20, 2))]
-        source = FrameSource.from_array(u8(np.stack(discs)))
-        assert stretch_levels(source, 20)[0] is source
+        survey = surveyed(u8(np.stack(discs)))
+        assert stretch_levels(survey)[0] is survey
 
     def test_wide_clips_are_left_as_they_are(self, clip):
-        source = FrameSource.from_array(u8(clip.frames))
-        same, levels, decisions = stretch_levels(source, 10)
-        assert same is source and not levels.changed and decisions == ()
+        survey = surveyed(u8(clip.frames))
+        same, levels, decisions = stretch_levels(survey)
+        assert same is survey and not levels.changed and decisions == ()
 
     @pytest.mark.parametrize("deviation", [0, 0.0002])
     def test_noise_is_no_scene(self, deviation):
         noise = 0.1 + deviation * np.random.default_rng(0).standard_normal((20, 48, 48))
         with pytest.raises(DataError, match="some contrast"):
-            stretch_levels(FrameSource.from_array(noise.astype(np.float32)), 20)
+            stretch_levels(surveyed(noise.astype(np.float32)))

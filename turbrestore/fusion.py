@@ -53,13 +53,10 @@ from .tiled_stages import (
 )
 from .uncertainty.pixel_deviation import saturation_level
 from .wording import (
-    explain_camera,
-    explain_centroid,
     explain_dynamics,
-    explain_frames,
-    explain_geometry,
+    explain_filter,
     explain_input,
-    explain_motion,
+    explain_registration,
     explain_seeing,
     explain_structure,
     explain_training,
@@ -153,7 +150,7 @@ def fuse(run: Run) -> Fused:
     run.decide(explain_training(train, len(run.source), params.train), *explain_input(training))
 
     centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
-    run.decide(explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows))
+    run.decide(*explain_registration(centroid))
     seeing, saturation = _measure_seeing(run, training, centroid), _find_saturation(run, training)
     if not params.runs("identify"):
         return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation)
@@ -169,9 +166,7 @@ def fuse(run: Run) -> Fused:
     mean = run.stage("filter", "mean", lambda: levels.original(_mean(unread, total, len(run.source))))
     # The sharpness is NaN for frames that do not count.
     chosen = int(np.isfinite(filtered.sharpness).sum())
-    run.decide(
-        explain_frames(filtered, None if params.keep_best == 1 else chosen), explain_geometry(filtered, dynamics)
-    )
+    run.decide(*explain_filter(filtered, dynamics, None if params.keep_best == 1 else chosen))
     structure = _compare_structure(levels.stretched(filtered.image), training, centroid, filtered.mean_flow)
     run.decide(*explain_structure(structure))
     image = filtered.image if structure.passed else mean

@@ -32,6 +32,7 @@ from .core.decision import Decision
 from .core.errors import ConfigurationError, DataError, require
 from .dynamics.dynamic_texture import identify_memory, modes_memory
 from .filtering.filter_records import filter_memory
+from .footage.survey import survey_bytes, survey_memory
 from .registration.flow import MIN_SIDE
 from .registration.opencv_flow import flow_memory
 from .runtime.device import TORCH_BYTES, find_device, needs_torch
@@ -209,6 +210,7 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget
     flow, side = flow_memory(part, threads), _deconvolution_side(shape, params, choice, budget)
     results = _held_by_deconvolution(shape, params, choice)
     prepared = _pixels(shape) * float(_PREPARED + _PREPARED_COLOUR * _channels(shape))
+    prepared += survey_memory(shape, choice.in_scratch)
     deblurred = results + max(remove_blur_memory(shape[1:], params.deconvolution, side), keep_agreed_memory(shape[1:]))
     halves = held + halves_memory(shape[1:], threads)
     stages = {
@@ -264,7 +266,7 @@ def _scratch_bytes(shape: tuple[int, ...], params: RestoreParams, choice: _Choic
         part = shape[0], *largest_tile((shape[1], shape[2]), choice.tile), *shape[3:]
         # A tile has copies of its frames and flows and a model of its own; tiles of the images overlap up to fourfold.
         size += sum(_stack(part, params, choice.train)) + 4.0 * _pixels(shape) * (6 + 14 * _channels(shape))
-    return int(size)
+    return int(max(size, survey_bytes(shape)))
 
 
 def _report(shape: tuple[int, ...]) -> float:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .agreement.last_guard import Halves, keep_agreed
-from .blind.blur_to_remove import SIGMAS_A_SIDE
-from .blind.remove_blur import Deblurred, remove_blur_steps
+from .blind.remove_blur import SIGMAS_A_SIDE, Deblurred, remove_blur_steps
 from .blur.measured_psf import psf_from_image
 from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
@@ -42,14 +41,7 @@ from .settings import RestoreParams
 from .stacking.fine_grid import fine_image, fine_shape
 from .stacking.placement import settings_of_known_flows
 from .tiled_stages import TileMap
-from .uncertainty.pixel_deviation import (
-    informed_pixels,
-    pixel_deviation,
-    position_variance,
-    posterior_gain,
-    quadratic_fidelity,
-    variance_by_blur,
-)
+from .uncertainty.pixel_deviation import informed_pixels, measure_deviation
 from .wording import explain_border
 
 # Every pixel of a cropped image is visible in at least this share of the training frames.
@@ -132,7 +124,7 @@ def restore(
         check_space(plan.runtime.scratch, plan.scratch_bytes)
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
-    prepared = prepare(source, plan.train, params.static_mask)
+    prepared = prepare(source, params.static_mask, plan.runtime.scratch)
     stretched, bars = _stretched_params(params, prepared.levels), prepared.bars
     run = Run(prepared, stretched, plan, tiles, store or NoStore(), progress, on_decision, map_tiles, psf)
     run.seconds["read"] = time.perf_counter() - begun
@@ -246,36 +238,14 @@ def _measure_uncertainty(
         return None
     if fused.is_mean:
         return np.full(image.shape[:2], np.inf, np.float32)
-    begun, position = time.perf_counter(), position_variance(dynamics)
+    begun = time.perf_counter()
     known = informed_pixels(seen, fused.mean, fused.saturation)
     if run.prepared.hidden is not None:
         known &= ~run.prepared.hidden
-    gain, by_blur = _gain(run, filtered.image, deblurred), _variance_by_blur(run, filtered.image, deblurred)
-    deviation = pixel_deviation(image, filtered.variance, gain, position, known, by_blur)
+    stretched, params = run.levels.stretched(filtered.image), run.params.deconvolution
+    deviation = measure_deviation(image, filtered, stretched, dynamics, known, params, deblurred)
     run.seconds["uncertainty"] = time.perf_counter() - begun
     return deviation
-
-
-def _gain(run: Run, fused: FloatArray, deblurred: Deblurred | None) -> float:
-    """Return the factor of the variance that the deconvolution has, computed at the levels of the stages."""
-    if deblurred is None:
-        return 1.0
-    params, done = run.params.deconvolution, deblurred.deconvolution
-    blur = deblurred.posterior or deblurred.blur
-    exponent = blur.exponent if params.exponent is None and blur is not None else params.exponent
-    fidelity = quadratic_fidelity(run.levels.stretched(fused), params.method, done.fidelity)
-    return posterior_gain(fused.shape[:2], fidelity, done.sigma, exponent)
-
-
-def _variance_by_blur(run: Run, fused: FloatArray, deblurred: Deblurred | None) -> FloatArray | float:
-    """Return the variance of pixels, at the levels of the clip, that the posterior of the blur leaves."""
-    posterior = None if deblurred is None else deblurred.posterior
-    if deblurred is None or posterior is None:
-        return 0.0
-    params, done = run.params.deconvolution, deblurred.deconvolution
-    fidelity = quadratic_fidelity(run.levels.stretched(fused), params.method, done.fidelity)
-    low, _, high = posterior.width
-    return variance_by_blur(fused, fidelity, (float(low), float(high)), params.exponent or posterior.exponent)
 
 
 def _crop(image: FloatArray, seen: FloatArray, border: str, deblurred: Deblurred | None) -> tuple[Rectangle, Decision]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,9 @@ from .footage.levels import Levels, stretch_levels
 from .footage.lighting.light import steady_light
 from .footage.lighting.white_balance import steady_white_balance
 from .footage.moments import measure_moments
-from .footage.overlays import FEWEST, Title, read_static_mask, without_overlay
+from .footage.overlays import Title, read_static_mask, without_overlay
 from .footage.passers import without_passers
+from .footage.survey import take_survey
 from .io.source import FrameSource, Window
 from .registration.centroid import Centroid
 from .runtime.scratch import mean_of
@@ -42,34 +44,27 @@ class Prepared:
         return np.s_[:, :] if self.bars is None else self.bars.picture
 
 
-def prepare(source: FrameSource, train: int, static_mask: str = "auto") -> Prepared:
-    """Prepare the frames of a clip."""
+def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None = None) -> Prepared:
+    """Prepare the frames of a clip, which are read once, and once more where something passes through the scene."""
     mask = None if static_mask in ("auto", "off") else read_static_mask(static_mask, source)
+    survey = take_survey(source, scratch)
     # Before the light, because a stop would be taken for bands of it.
-    source, bars, on_bars = without_bars(source)
-    moments = measure_moments(source) if len(source) >= FEWEST else None
+    survey, bars, on_bars = without_bars(survey)
+    moments = measure_moments(survey)
     # Before what stands is looked for, because a dead column stands.
-    source, on_stripes = without_stripes(source, moments)
-    source, hidden, title, on_overlay = (
-        without_overlay(source, mask, None if on_stripes else moments)
-        if static_mask != "off"
-        else (source, None, None, ())
-    )
+    survey, on_stripes = without_stripes(survey, moments)
+    hidden, title, on_overlay = None, None, tuple[Decision, ...]()
+    if static_mask != "off":
+        survey, hidden, title, on_overlay = without_overlay(survey, mask, None if on_stripes else moments)
     if source.unseen is not None:
         unseen = source.unseen[source.window]
         hidden = unseen if hidden is None else hidden | unseen
-    source, on_colours = steady_white_balance(source)
-    source, on_light = steady_light(source)
-    source, levels, on_range = stretch_levels(source, train)
-    source, on_passers = without_passers(source) if static_mask != "off" else (source, ())
-    return Prepared(
-        source,
-        levels,
-        bars,
-        hidden,
-        title,
-        (*on_bars, *on_stripes, *on_overlay, *on_colours, *on_light, *on_range, *on_passers),
-    )
+    survey, on_colours = steady_white_balance(survey)
+    survey, on_light = steady_light(survey)
+    survey, levels, on_range = stretch_levels(survey)
+    clip, on_passers = without_passers(survey) if static_mask != "off" else (survey.clip, ())
+    decisions = (*on_bars, *on_stripes, *on_overlay, *on_colours, *on_light, *on_range, *on_passers)
+    return Prepared(clip, levels, bars, hidden, title, decisions)
 
 
 def seeing_of_picture(

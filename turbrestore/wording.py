@@ -56,6 +56,11 @@ def explain_input(training: FloatArray) -> tuple[Decision, ...]:
     return (Decision("saturation", "left as it is", reason),)
 
 
+def explain_registration(centroid: Centroid) -> tuple[Decision, ...]:
+    """Say how the centroid was found, and how camera and air move."""
+    return (explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows))
+
+
 def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
     """Report motion that is too large for optical flow.
 
@@ -94,14 +99,19 @@ def explain_centroid(centroid: Centroid) -> Decision:
 
 def explain_dynamics(dynamics: FlowDynamics, modelled: bool = False) -> tuple[Decision, ...]:
     """Say which rank the flow model has, how it was adjusted, and whether it changes the image."""
-    largest = float(abs(dynamics.eigenvalues).max(initial=0.0))
+    largest = float(abs(np.linalg.eigvals(dynamics.A)).max(initial=0.0))
     modes = Decision(
         "flow model",
-        f"{dynamics.rank} modes",
+        f"{len(dynamics.A)} modes",
         f"they hold {100 * dynamics.energy_share:.1f} % of the energy of the motion; the largest eigenvalue is "
         f"{largest:.3f}; frames are registered by {'the flow of the model' if modelled else 'the measured flow'}",
     )
     return modes, *(Decision("flow model", "adjusted", note) for note in dynamics.notes)
+
+
+def explain_filter(filtered: Filtered, dynamics: FlowDynamics, chosen: int | None) -> tuple[Decision, ...]:
+    """Say what the image is made of, and where it was moved."""
+    return explain_frames(filtered, chosen), explain_geometry(filtered, dynamics)
 
 
 def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:

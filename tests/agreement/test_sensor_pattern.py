@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from conftest import make_sequence
+from conftest import make_sequence, surveyed
 from turbrestore.agreement.sensor_pattern import _dead, without_stripes
-from turbrestore.io.source import FrameSource
 
 SIDE = 160
 
@@ -17,8 +16,8 @@ def test_offsets_of_columns_and_rows_are_subtracted():
     frames, rng = 0.1 + 0.8 * clip(), np.random.default_rng(1)
     columns, rows = 0.02 * rng.standard_normal(SIDE), 0.02 * rng.standard_normal((SIDE, 1))
     for pattern in (columns, rows, columns + rows):
-        cleaned, (decision,) = without_stripes(FrameSource.from_array(np.float32(frames + pattern)))
-        left = (cleaned.read() - frames).mean(axis=0)
+        cleaned, (decision,) = without_stripes(surveyed(np.float32(frames + pattern)))
+        left = (cleaned.clip.read() - frames).mean(axis=0)
         assert np.diff(left, axis=0).std() + np.diff(left, axis=1).std() < 0.35 * (
             np.diff(pattern + np.zeros((SIDE, SIDE)), axis=0).std()
             + np.diff(pattern + np.zeros((SIDE, SIDE)), axis=1).std()
@@ -30,7 +29,8 @@ def test_dead_columns_and_rows_are_filled_in_windows_as_in_whole_frames():
     frames = clip()
     broken = frames.copy()
     broken[:, :, 40], broken[:, 61] = 0.03, 1.0
-    source, (decision,) = without_stripes(FrameSource.from_array(broken))
+    source, (decision,) = without_stripes(surveyed(broken))
+    source = source.clip
     whole = source.read()
     assert np.abs(whole - frames)[:, 61].mean() < 0.06 and np.abs(whole - frames)[:, :, 40].mean() < 0.06
     assert "2 dead" in decision.choice
@@ -45,9 +45,9 @@ def test_warm_pixels_are_evened_out_and_points_of_the_scene_stay():
     warm = warm.clip(0, 1)
     for colours in (1, 3):
         seen, still = (np.squeeze(np.repeat(some[..., None], colours, axis=3)) for some in (warm, frames))
-        source, (decision,) = without_stripes(FrameSource.from_array(seen))
+        source, (decision,) = without_stripes(surveyed(seen))
         assert "warm pixels" in decision.choice
-        left = (source.read() - still).reshape(len(warm), SIDE * SIDE, -1)
+        left = (source.clip.read() - still).reshape(len(warm), SIDE * SIDE, -1)
         assert np.abs(left[:, places]).mean() < 0.2 * np.abs((warm - frames).reshape(len(warm), -1)[:, places]).mean()
         assert np.count_nonzero(np.abs(left).max(axis=(0, 2)) > 1e-6) <= 60
     # A star moves with the air.
@@ -57,19 +57,19 @@ def test_warm_pixels_are_evened_out_and_points_of_the_scene_stay():
     for number, (dx, dy) in enumerate(flows):
         for place in ((20, 20), (40, 31), (11, 50)):
             stars[number] += np.exp(-((x - place[0] - dx) ** 2 + (y - place[1] - dy) ** 2) / 0.5)
-    source = FrameSource.from_array(np.float32(0.1 + 0.6 * stars + rng.normal(0, 0.005, stars.shape)))
-    assert without_stripes(source) == (source, ())
+    survey = surveyed(np.float32(0.1 + 0.6 * stars + rng.normal(0, 0.005, stars.shape)))
+    assert without_stripes(survey) == (survey, ())
 
 
 def test_stripes_of_the_scene_are_left():
     for scene in ("camera", "chart"):
-        source = FrameSource.from_array(clip(scene))
-        assert without_stripes(source) == (source, ())
+        survey = surveyed(clip(scene))
+        assert without_stripes(survey) == (survey, ())
     x = np.arange(96)
     flows = np.cumsum(np.random.default_rng(0).normal(0, 1, 24))
     waves = np.stack([np.tile(0.5 + 0.2 * np.sin((x - shift - shift.mean()) / 2), (96, 1)) for shift in flows])
-    source = FrameSource.from_array(np.float32(waves + np.random.default_rng(1).normal(0, 0.01, waves.shape)))
-    assert without_stripes(source) == (source, ())
+    survey = surveyed(np.float32(waves + np.random.default_rng(1).normal(0, 0.01, waves.shape)))
+    assert without_stripes(survey) == (survey, ())
 
 
 def test_columns_at_the_border_are_not_dead():

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blind.guards import GuardParams, GuardReading, evaluate_guards
-from turbrestore.blind.ringing import ringing
+from turbrestore.blind.guards import GuardParams, GuardReading, evaluate_guards, ringing
 from turbrestore.blur.psf import blur_otf
 from turbrestore.core.arrays import luminance
 from turbrestore.core.errors import ConfigurationError, DataError
@@ -130,7 +129,7 @@ def test_different_shapes_and_bad_bounds_are_refused():
 
 def test_edges_in_one_row_of_tiles_are_not_all_left_out(monkeypatch):
     # More edges than are followed, all of them in the second row of tiles.
-    monkeypatch.setattr("turbrestore.blind.ringing._SAMPLES", 40 * 13)
+    monkeypatch.setattr("turbrestore.blind.guards._SAMPLES", 40 * 13)
     edge = np.repeat([0.2] * 24 + [0.8] * 24, 48).reshape(48, 48).astype(np.float32)
     blurred = cv2.GaussianBlur(edge, (0, 0), 1.5)
     assert ringing(edge + 2 * (edge - blurred), blurred, 1.5) == 1.0

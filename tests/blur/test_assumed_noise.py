@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blur.assumed_noise import assumed_noise, noise_multiple
-from turbrestore.blur.estimation import estimate_blur
+from turbrestore.blur.estimation import assumed_noise, estimate_blur, noise_multiple
 from turbrestore.synthesis.scenes import SCENES
 
 WIDTH, LEVEL = 1.2, 0.012

@@ -8,11 +8,10 @@ import pytest
 
 from turbrestore.blind.decisions import explain_posterior
 from turbrestore.blind.remove_blur import remove_blur_steps
-from turbrestore.blur.posterior import BlurWitnesses, blur_posterior, measure_witnesses
+from turbrestore.blur.posterior import EXCLUDED, BlurWitnesses, blur_posterior, measure_witnesses
 from turbrestore.blur.psf import half_frequency, radial_otf
 from turbrestore.blur.witnesses.hypotheses import hypotheses, shapes
 from turbrestore.blur.witnesses.image_evidence import image_evidence
-from turbrestore.blur.witnesses.likelihoods import EXCLUDED
 from turbrestore.blur.witnesses.short_exposure import displacement_variance, short_exposures
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SpectralVariation
 from turbrestore.runtime.steps import finish

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from conftest import make_sequence
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
-from turbrestore.filtering.image_state import PixelStacks, update_pixels
-from turbrestore.filtering.kalman import Gaussian, predict, update_information
+from turbrestore.filtering.kalman import Gaussian, PixelStacks, predict, update_information, update_pixels
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 

@@ -9,9 +9,8 @@ from flow_systems import (
     uneven_flows,
 )
 
-from turbrestore.dynamics import flow_subspace
-from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
-from turbrestore.dynamics.flow_subspace import FlowStrips
+from turbrestore.dynamics import dynamic_texture
+from turbrestore.dynamics.dynamic_texture import DynamicsParams, FlowStrips, identify
 
 
 @pytest.fixture
@@ -56,7 +55,7 @@ def test_signs_do_not_depend_on_the_decomposition(noise_flows):
 @pytest.mark.parametrize("size", [1, 5000, 2**25])
 def test_strips_equal_the_whole(noise_flows, monkeypatch, size):
     whole = identify(noise_flows, DynamicsParams(rank=6))
-    monkeypatch.setattr(flow_subspace, "_STRIP_BYTES", size)
+    monkeypatch.setattr(dynamic_texture, "_STRIP_BYTES", size)
     assert len(list(FlowStrips.of(noise_flows).rows())) == {1: 9, 5000: 9, 2**25: 1}[size]
     assert_same_dynamics(whole, identify(noise_flows, DynamicsParams(rank=6)))
 

@@ -10,8 +10,7 @@ from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.filtering.alternating import filter_frames, filter_steps
 from turbrestore.filtering.filter_records import FilterParams, filter_memory
-from turbrestore.filtering.image_state import PixelStacks, update_pixels
-from turbrestore.filtering.kalman import Gaussian, predict, update
+from turbrestore.filtering.kalman import Gaussian, PixelStacks, predict, update, update_pixels
 from turbrestore.metrics import psnr
 from turbrestore.registration.centroid import find_centroid
 from turbrestore.registration.warp import warp

@@ -8,8 +8,7 @@ from flow_systems import uneven_flows
 
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import flow_of
-from turbrestore.filtering.flow_state import predict_state, project_measured, update_state
-from turbrestore.filtering.kalman import Gaussian, predict, update
+from turbrestore.filtering.kalman import Gaussian, predict, predict_state, project_measured, update, update_state
 
 
 @pytest.fixture

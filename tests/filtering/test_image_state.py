@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import DataError
-from turbrestore.filtering.image_state import PixelGaussian, PixelStacks, update_pixels
-from turbrestore.filtering.kalman import Gaussian, predict, update
+from turbrestore.filtering.kalman import Gaussian, PixelGaussian, PixelStacks, predict, update, update_pixels
 
 
 @pytest.fixture

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from conftest import surveyed
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.footage.passers import without_passers
-from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
 from turbrestore.settings import RestoreParams
@@ -41,7 +41,7 @@ def clip(scene, objects=0, channels=1, d_over_r0=2.5):
 @pytest.mark.parametrize("channels", [1, 3])
 def test_frames_show_the_background_where_objects_pass(channels):
     frames, empty = clip("brick", 3, channels)
-    cleaned, (decision,) = without_passers(FrameSource.from_array(frames))
+    cleaned, (decision,) = without_passers(surveyed(frames))
     cleaned = cleaned.read()
     covered = np.abs(frames - empty).reshape(*empty.shape[:3], -1).max(axis=3) > 0.1
     assert covered.mean() > 0.03
@@ -61,43 +61,43 @@ def test_the_image_is_that_of_the_clip_without_objects():
 
 
 def test_a_window_of_a_frame_is_cleaned_as_the_whole_frame_is():
-    cleaned, _ = without_passers(FrameSource.from_array(clip("brick", 3)[0]))
+    cleaned, _ = without_passers(surveyed(clip("brick", 3)[0]))
     whole, part = cleaned.read(), cleaned.select(roi=(20, 10, 90, 100)).read()
     assert np.array_equal(whole[:, 10:110, 20:110], part)
 
 
 @pytest.mark.parametrize("scene", ["camera", "chart", "brick"])
 def test_turbulence_passes_for_nothing(scene):
-    source = FrameSource.from_array(clip(scene, d_over_r0=5.0)[1])
-    assert without_passers(source) == (source, ())
+    survey = surveyed(clip(scene, d_over_r0=5.0)[1])
+    assert without_passers(survey) == (survey.clip, ())
 
 
 def test_a_planet_that_drifts_is_the_scene():
     y, x = np.mgrid[:96, :160]
     frames = np.float32([0.8 * (np.hypot(x - 30 - 4 * k, y - 48) < 20) for k in range(25)])
     frames += 0.05 * (np.random.default_rng(0).random((96, 160)) > 0.998)  # Stars, which the planet covers.
-    source = FrameSource.from_array(cv2.GaussianBlur(frames.transpose(1, 2, 0), (0, 0), 1.5).transpose(2, 0, 1))
-    assert without_passers(source) == (source, ())
+    survey = surveyed(cv2.GaussianBlur(frames.transpose(1, 2, 0), (0, 0), 1.5).transpose(2, 0, 1))
+    assert without_passers(survey) == (survey.clip, ())
 
 
 def test_nothing_passes_while_the_camera_moves():
     scene = SCENES["camera"](160, 240)
-    source = FrameSource.from_array(np.stack([scene[:, 4 * k : 4 * k + 140] for k in range(25)]))
-    assert without_passers(source) == (source, ())
+    survey = surveyed(np.stack([scene[:, 4 * k : 4 * k + 140] for k in range(25)]))
+    assert without_passers(survey) == (survey.clip, ())
 
 
 def test_a_black_frame_is_left_as_it_is():
     frames, empty = (some.copy() for some in clip("brick", 3))
     frames[[5, 20]] = 0
-    cleaned, _ = without_passers(FrameSource.from_array(frames))
+    cleaned, _ = without_passers(surveyed(frames))
     assert not cleaned.read()[[5, 20]].any()
     empty[5] = 0
-    assert without_passers(FrameSource.from_array(empty))[1] == ()
+    assert without_passers(surveyed(empty))[1] == ()
 
 
 def test_few_frames_tell_nothing():
-    source = FrameSource.from_array(clip("brick", 3)[0][:8])
-    assert without_passers(source) == (source, ())
+    survey = surveyed(clip("brick", 3)[0][:8])
+    assert without_passers(survey) == (survey.clip, ())
 
 
 def snowy(frames, share, seed=3):
@@ -114,7 +114,7 @@ def snowy(frames, share, seed=3):
 def test_snow_is_replaced_by_the_background():
     empty = 0.8 * clip("camera")[1]
     frames, covers = snowy(empty, 0.06)
-    cleaned, (decision,) = without_passers(FrameSource.from_array(frames))
+    cleaned, (decision,) = without_passers(surveyed(frames))
     before, after = (np.abs(some - empty)[covers > 0.3].mean() for some in (frames, cleaned.read()))
     assert after < 0.25 * before
     assert "snow" in decision.reason
@@ -134,7 +134,7 @@ def test_a_car_is_replaced_while_the_camera_moves():
     frames = empty.copy()
     for k, frame in enumerate(frames):
         frame[90:120, 6 * k - 50 : 6 * k] = 0.95 if 50 <= 6 * k <= 160 else frame[90:120, 6 * k - 50 : 6 * k]
-    cleaned, (decision,) = without_passers(FrameSource.from_array(frames))
+    cleaned, (decision,) = without_passers(surveyed(frames))
     covered = np.abs(frames - empty) > 0.1
     assert covered.any() and decision.subject == "passers"
     before, after = (np.sqrt(np.mean((some - empty)[covered] ** 2)) for some in (frames, cleaned.read()))

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..footage.moments import Moments, measure_moments
-from ..io.source import FrameSource, Window
+from ..footage.survey import Survey
+from ..io.source import Window
 
 # Fewest frames from which stripes are found.
 _FEWEST = 8
@@ -68,18 +69,18 @@ class _Stripes:
         return _filled(flat.swapaxes(0, 1), self.dead[1][rows]).swapaxes(0, 1)
 
 
-def without_stripes(source: FrameSource, moments: Moments | None = None) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Take stripes of the sensor out of the frames; a source without them is returned as it is.
+def without_stripes(survey: Survey, moments: Moments | None = None) -> tuple[Survey, tuple[Decision, ...]]:
+    """Take stripes of the sensor out of the frames; frames without them are returned as they are.
 
-    ``moments`` are those of the source, if they are known.
+    ``moments`` are those of the survey, if they are known.
     """
-    if len(source) < _FEWEST:
-        return source, ()
-    moments = moments or measure_moments(source)
+    if len(survey.numbers) < _FEWEST:
+        return survey, ()
+    moments = moments or measure_moments(survey)
     mean, variance, usual = luminance(moments.mean), moments.change, max(moments.noise, 1e-4)
     motion = _motion(mean, variance, usual)
     if motion < _LEAST_MOTION:
-        return source, ()
+        return survey, ()
     dead = (_dead(variance, usual), _dead(variance.T, usual))
     offsets = tuple(
         _offsets(_filled(image, gone), spread, usual / np.sqrt(moments.count), motion)
@@ -89,16 +90,16 @@ def without_stripes(source: FrameSource, moments: Moments | None = None) -> tupl
     size = float(np.sqrt(sum(np.mean(offset**2) for offset in offsets)))
     warm = _warm(mean, variance, usual, motion)
     if not count and size == 0 and not warm.any():
-        return source, ()
+        return survey, ()
     excess = _above_around(moments.mean) * (warm if moments.mean.ndim == 2 else warm[..., None]) if warm.any() else None
-    stripes = _Stripes(excess, (offsets[0], offsets[1]), dead, source.window)
+    stripes = _Stripes(excess, (offsets[0], offsets[1]), dead, survey.clip.window)
     kinds = [
         *([f"offsets of {100 * size:.2g} % of full scale subtracted"] if size else ()),
         *([f"{count} dead columns or rows filled from beside them"] if count else ()),
         *([f"{warm.sum()} warm pixels evened out"] if warm.any() else ()),
     ]
     decision = Decision("sensor", "; ".join(kinds), "they stand while the air moves the scene")
-    return source.adjusted(stripes.without), (decision,)
+    return survey.adjusted(stripes.without), (decision,)
 
 
 def _motion(mean: FloatArray, variance: FloatArray, noise: float) -> float:

@@ -18,9 +18,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..blur.estimation import BlurEstimate
-from ..blur.posterior import BlurPosterior, BlurWitnesses
-from ..core.arrays import FloatArray
+from ..blur.estimation import BlurEstimate, estimate_blur, limit_to_edges
+from ..blur.posterior import BlurPosterior, BlurWitnesses, blur_posterior
+from ..blur.witnesses.image_evidence import image_evidence
+from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.noise import NoiseCurve
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, DeconvolutionState
@@ -31,7 +32,6 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.tiling import halo_tiles, largest_tile
 from .blur_map import BlurMap, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
-from .blur_to_remove import WIDEST, find_blur
 from .decisions import explain_blur, explain_blur_map, explain_guards, explain_posterior
 from .guards import GuardParams, GuardReading, evaluate_guards
 from .tiled_deconvolution import MOST_THREADS, tiled_deconvolution_steps
@@ -44,6 +44,9 @@ Float64Array = NDArray[np.float64]
 _BYTES, _CHANNEL_BYTES = 22, 2
 # Bytes per pixel of the maps of widths, and per pixel and channel of the results of two attempts.
 _WIDTHS_BYTES, _RESULTS_BYTES = 8, 8
+# The widest blur that is found, pixels, and the least shorter side of an image in widths of its blur: a wider one
+# leaves nothing to restore.
+WIDEST, SIGMAS_A_SIDE = 21.0, 8
 
 
 @dataclass(frozen=True)
@@ -232,3 +235,31 @@ def _image_bytes(shape: tuple[int, ...]) -> float:
     """Bytes of the maps of widths and of the results of two attempts."""
     channels = shape[2] if len(shape) == 3 else 1
     return float(shape[0] * shape[1] * (_WIDTHS_BYTES + channels * _RESULTS_BYTES))
+
+
+def find_blur(
+    image: FloatArray, params: DeconvolutionParams, runtime: Runtime, witnesses: BlurWitnesses | None
+) -> tuple[BlurEstimate | None, BlurPosterior | None]:
+    """Estimate the blur by the image, and by the frames where there are witnesses."""
+    if params.sigma is not None:
+        return None, None
+    if witnesses is None:
+        return estimate_blur(image, exponent=params.exponent, runtime=runtime), None
+    grey = luminance(image)
+    if witnesses.picture is not None:
+        grey = np.ascontiguousarray(grey[witnesses.picture])
+    evidence = image_evidence(grey, runtime)
+    ratio = None if witnesses.variation is None else witnesses.variation.with_power(grey)
+    posterior = blur_posterior(evidence, witnesses, ratio)
+    widest = min(WIDEST, min(grey.shape) / SIGMAS_A_SIDE)
+    posterior = replace(posterior, removed=min(posterior.removed, widest))
+    if evidence is None:
+        return estimate_blur(image, exponent=params.exponent, runtime=runtime), replace(posterior, removed=0.0)
+    if posterior.removed == 0:
+        return evidence.estimate, posterior
+    # No scene is steeper behind a blur than a step.
+    limited = limit_to_edges(replace(evidence.estimate, sigma=posterior.removed, exponent=posterior.exponent), grey)
+    if not limited.edge_limited:
+        return evidence.estimate, posterior
+    removed = limited.sigma if limited.blurred else 0.0
+    return evidence.estimate, replace(posterior, removed=removed, exponent=limited.exponent, edge_limited=True)

@@ -16,8 +16,14 @@ a side, the one whose width depends least on the assumed noise decides.  The ima
 is small, because a soft scene such as the Moon looks blurred at every reduction; but it is not preferred if its
 evidence is weak, because the block edges of a codec look like scene edges with almost no blur.
 
-Noise.  The estimated width depends on the noise that is assumed, n of :mod:`turbrestore.blur.assumed_noise`;
-``uncertainty`` measures by how much.
+Noise.  The estimated width depends on the noise that is assumed, n; ``uncertainty`` measures by how much.  s_1 and s_2
+are the noise measured between neighbouring pixels, and between means of 2×2 pixels times 2; equal if it is white.
+n is larger than the noise of the image: no real blur follows the assumed shape exactly, and high contrast makes the
+mismatch larger.  So n² is the sum of the squares of a multiple of s_1 and of a share of the contrast.
+
+Registration interpolates, which smooths the noise of a fused image: s_1 misses a part of it, and the width would come
+out too small.  So the multiple grows with s_2 / s_1.  In a clip with little noise this ratio is that of fine detail, so
+the multiple grows only where s_1 is a clear share of the contrast.
 
 A fused image is never sharper than its pixels and the interpolation of the registration allow: the smallest width is
 0.35 px, which is also the result if a wider blur is hardly more likely.
@@ -36,11 +42,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import require
+from ..core.noise import estimate_noise
 from ..display.plots import plot_blur
 from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import ThreadTeam, one_thread_each
-from .assumed_noise import LEAST_NOISE, assumed_noise, noise_multiple
 from .edges import edge_limit
 from .marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
 from .psf import GAUSSIAN, check_exponent, fused_exponent
@@ -53,6 +59,11 @@ Float64Array = NDArray[np.float64]
 # Factors by which the image is reduced; smallest side of a reduced image and of an image that is analysed at all.
 _REDUCTIONS = (1, 2, 3, 4, 6, 8)
 _SMALLEST_SIDE, _SMALLEST_IMAGE = 60, 16
+# Smallest n; share of the contrast; multiple of s_1.
+LEAST_NOISE = 1e-4
+_MISFIT, _MULTIPLES = 0.025, (1.5, 2.0)
+# Ratios of s_2 to s_1, and shares of the contrast, between which the multiple grows.
+_SMOOTH, _NOISY = (1.5, 2.0), (0.03, 0.05)
 # Smallest width that a reduced image resolves, in its own pixels.
 _RESOLVED = 0.6
 # Evidence, in units of L, that a blur needs; and the evidence it needs if the image itself is to be preferred over its
@@ -333,3 +344,24 @@ def _fast_size(size: int) -> int:
     """Largest size up to ``size`` whose transform is fast."""
     fast = (n for n in range(size // 2, size + 1) if scipy.fft.next_fast_len(n, real=True) == n)
     return max(n for n in fast if n != _SLOW_SIZE)
+
+
+def noise_multiple(image: FloatArray) -> float:
+    """Multiple of the noise that is measured in an image and in its reductions.
+
+    ``image`` (H, W).
+    """
+    fine = max(estimate_noise(image), LEAST_NOISE)
+    halved = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    smooth = np.interp(2 * estimate_noise(halved) / fine, _SMOOTH, (0, 1))
+    noisy = np.interp(fine / max(float(image.std()), LEAST_NOISE), _NOISY, (0, 1))
+    return float(np.interp(min(smooth, noisy), (0, 1), _MULTIPLES))
+
+
+def assumed_noise(image: FloatArray, noise: float | None = None, multiple: float = _MULTIPLES[0]) -> float:
+    """Return n.
+
+    ``image`` (H, W).
+    """
+    level = estimate_noise(image) if noise is None else noise
+    return max(float(np.hypot(multiple * level, _MISFIT * image.std())), LEAST_NOISE)

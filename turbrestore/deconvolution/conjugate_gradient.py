@@ -22,8 +22,7 @@ import numpy as np
 
 from ..blur.psf import laplacian_symbol, wiener_fidelity
 from ..core.noise import estimate_noise
-from .array_ops import Array
-from .problem import Problem
+from .problem import Array, Problem
 
 # A residual below this share of the energy of the data consists of rounding errors.
 ROUNDING = 1e-14

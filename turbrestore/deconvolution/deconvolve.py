@@ -33,13 +33,24 @@ from ..runtime.device import CPU, find_device, memory_of
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.threads import ThreadTeam, one_thread_each
-from .array_ops import Array, numpy_ops, torch_ops
 from .conjugate_gradient import quadratic_solver, wiener_image
 from .nonlocal_prior.nonlocal_tv import NonlocalPenalty
 from .nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
 from .nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from .primal_dual import Penalty, PrimalDual
-from .problem import Margin, Problem, automatic_fidelity, join_planes, margin_around, read_blur, split_planes
+from .problem import (
+    Array,
+    Margin,
+    Problem,
+    automatic_fidelity,
+    join_planes,
+    margin_around,
+    numpy_ops,
+    problem_of,
+    read_blur,
+    split_planes,
+    torch_ops,
+)
 from .stopping import DeconvolutionState, Solution, iterate
 from .tv import LocalPenalty
 
@@ -262,10 +273,7 @@ def deconvolve_steps(
     ops = numpy_ops(runtime.workers) if device == CPU else torch_ops(device)
     with memory_of(device), one_thread_each(), ThreadTeam(runtime.workers) as team:
         transfer = ops.load(otf)
-        problems = [
-            Problem(ops.load(margin.pad(plane)), ops.load(margin.weights(plane, photons)), transfer, fidelity, ops)
-            for plane in planes
-        ]
+        problems = [problem_of(plane, margin, photons, transfer, fidelity, ops) for plane in planes]
         measured = ops.load(margin.mask(rim))
         around = _padded_guide(guide, margin)
         solution = yield from _solve(problems, around, measured, params, _Resources(team, runtime.workers, device))
@@ -325,7 +333,7 @@ def _sharpened(
     ops, blurred = problems[0].ops, list(problems)
     if guide is not None and params.sharpen_guide and params.method == "nltv":
         blurred.append(dataclasses.replace(problems[0], observed=ops.load(guide)))
-    side_by_side = resources.device == CPU and np.prod(problems[0].shape) >= _PARALLEL_PIXELS
+    side_by_side = resources.device == CPU and np.prod(problems[0].observed.shape) >= _PARALLEL_PIXELS
     sharp = list(resources.team.map(wiener_image, blurred) if side_by_side else map(wiener_image, blurred))
     starts, further = sharp[: len(problems)], sharp[len(problems) :]
     if further:

@@ -45,8 +45,7 @@ from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from .array_ops import Array
-from .problem import Problem
+from .problem import Array, Problem
 
 # Over-relaxation ρ.
 RELAXATION = 1.8

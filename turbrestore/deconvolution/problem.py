@@ -16,10 +16,17 @@ Boundary
 Pixels near the border of f received light from outside the image.  The unknown u therefore has a margin of at least 4σ
 on each side, in which M is 0.  The convolution is periodic on that padded domain; opposite sides meet within the
 margin, where nothing was observed.
+
+Libraries
+---------
+Solvers are written once for NumPy and torch. Arithmetic, ``sum``, ``clip``, ``abs``, ``roll``, ``stack`` and ``sqrt``
+are spelled alike in both; loading arrays and Fourier transforms are not, and are in :class:`ArrayOps`.
+
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -33,12 +40,61 @@ from ..blur.psf import check_psf, wiener_fidelity
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import require
 from ..core.noise import NoiseCurve
-from .array_ops import Array, ArrayOps
+from ..runtime.image_stacks import from_device
 
 # Smallest margin, in widths of the blur.
 MARGIN_SIGMAS = 4.0
 # Largest weight of a pixel, and the inverse of the least.
 _MOST_WEIGHT = 4.0
+# ndarray or torch tensor.
+Array = Any
+# Transforms of smaller images are faster on one thread than on several.
+_PARALLEL_PIXELS = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayOps:
+    """Operations of one library."""
+
+    arrays: Any  # ``numpy`` or ``torch``
+    # Convert from a NumPy array of real or complex numbers, and back to one.
+    load: Callable[[NDArray[Any]], Array]
+    store: Callable[[Array], NDArray[Any]]
+    forward: Callable[[Array], Array]  # half-spectrum of a real image, as :func:`scipy.fft.rfft2`
+    back: Callable[[Array, tuple[int, int]], Array]  # ``back(spectrum, shape)`` is the image of a half-spectrum
+
+    def total(self, values: Array) -> float:
+        """Sum all values in double precision."""
+        return float(values.sum(dtype=self.arrays.float64))
+
+
+def numpy_ops(threads: int = 1) -> ArrayOps:
+    """Operations of NumPy and SciPy."""
+
+    def workers(shape: tuple[int, ...]) -> int:
+        return threads if shape[0] * shape[1] >= _PARALLEL_PIXELS else 1
+
+    return ArrayOps(
+        arrays=np,
+        load=np.asarray,
+        store=np.asarray,
+        forward=lambda image: scipy.fft.rfft2(image, workers=workers(image.shape)),
+        back=lambda spectrum, shape: scipy.fft.irfft2(spectrum, s=shape, workers=workers(shape)),
+    )
+
+
+def torch_ops(device: str) -> ArrayOps:
+    """Operations of torch on a device."""
+    import torch
+
+    return ArrayOps(
+        arrays=torch,
+        # torch shares no memory that is read-only.
+        load=lambda array: torch.from_numpy(np.require(array, requirements=["C", "W"])).to(device),
+        store=from_device,
+        forward=torch.fft.rfft2,
+        back=lambda spectrum, shape: torch.fft.irfft2(spectrum, s=shape),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +176,13 @@ def margin_around(size: tuple[int, int], least: int | None) -> Margin:
     extra = [scipy.fft.next_fast_len(length + 2 * least, real=True) - length for length in size]
     top, left = (total // 2 for total in extra)
     return Margin(size, ((top, extra[0] - top), (left, extra[1] - left)))
+
+
+def problem_of(
+    plane: FloatArray, margin: Margin, photons: NoiseCurve | None, otf: Array, fidelity: float, ops: ArrayOps
+) -> Problem:
+    """Problem of a plane (H, W); ``photons`` is its noise at every level, relative to the mean."""
+    return Problem(ops.load(margin.pad(plane)), ops.load(margin.weights(plane, photons)), otf, fidelity, ops)
 
 
 def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:

@@ -33,8 +33,7 @@ from typing import ClassVar, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .array_ops import Array, ArrayOps
-from .problem import Problem
+from .problem import Array, ArrayOps, Problem
 
 # Pixels a side of the tiles that changes are measured in.
 TILE = 64

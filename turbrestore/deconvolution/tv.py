@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .array_ops import Array, ArrayOps
+from .problem import Array, ArrayOps
 
 
 def local_gradient(u: Array, ops: ArrayOps) -> Array:

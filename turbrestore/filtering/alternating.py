@@ -15,8 +15,8 @@ Given Ŵ the image is a linear state, given ρ the flow is, so each frame update
 3. warp the frame by Ŵ and update ρ̂ (eqs. 15, 16);
 4. return to 2 with the new image, ``inner_iterations`` times in all.
 
-Eqs. 14b, 14d, 17 and 19 are in :mod:`turbrestore.filtering.flow_state`, eqs. 14a, 14c, 15 and 16 in
-:mod:`turbrestore.filtering.image_state`, and Z is in :mod:`turbrestore.filtering.frame_noise`.
+Eqs. 14, 16, 17 and 19 are in :mod:`turbrestore.filtering.kalman`, and Z (eq. 15) is in
+:mod:`turbrestore.filtering.frame_noise`.
 :mod:`turbrestore.filtering.frame_pass` measures, follows and registers the frames of one iteration.
 
 Departures from the paper, each with its reason:
@@ -71,8 +71,7 @@ from .filter_records import (
 )
 from .frame_pass import Frame, PassSettings, TrackedFrame, pass_over
 from .frame_statistics import measure_frame_statistics
-from .image_state import PixelGaussian, PixelStacks, update_pixels
-from .kalman import Gaussian
+from .kalman import Gaussian, PixelGaussian, PixelStacks, update_pixels
 
 # Variance of an image of which nothing is known: full scale, squared.
 _DIFFUSE = 1.0
@@ -314,10 +313,11 @@ def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params
 
 
 def _check_flows(image: FloatArray, dynamics: FlowDynamics, known_flows: ArrayLike | None) -> FloatArray | None:
-    if image.shape[:2] != dynamics.shape:
-        raise DataError(f"dynamics: expected flows of {image.shape[:2]} pixels, found {dynamics.shape}")
+    shape = dynamics.mean_flow.shape[:2]
+    if image.shape[:2] != shape:
+        raise DataError(f"dynamics: expected flows of {image.shape[:2]} pixels, found {shape}")
     flows = None if known_flows is None else check_flow(known_flows, "known_flows")
-    if flows is not None and (flows.ndim != 4 or flows.shape[1:3] != dynamics.shape):
+    if flows is not None and (flows.ndim != 4 or flows.shape[1:3] != shape):
         raise DataError(f"known_flows: expected shape (K, {image.shape[0]}, {image.shape[1]}, 2), found {flows.shape}")
     return flows
 

@@ -18,7 +18,7 @@ from ..registration.warp import inside, warp
 from ..runtime.device import CPU, find_device, memory_of
 from ..runtime.image_stacks import Stack, StackOps, numpy_ops, torch_ops, warp_stack
 from .frame_noise import FrameStatistics
-from .image_state import PixelGaussian, PixelStacks
+from .kalman import PixelGaussian, PixelStacks
 
 # Registered channels (C, H, W), their luminance (H, W), and where the warp samples the frame (H, W), 1 to 0.
 Warped = tuple[Stack, Stack, Stack]

@@ -18,9 +18,7 @@ from ..display.preview import preview
 from ..dynamics.flow_model import FlowDynamics
 from ..registration.recentring import recentring_flow
 from ..registration.warp import warp
-from .flow_state import flow_noise
-from .image_state import PixelGaussian
-from .kalman import Gaussian
+from .kalman import Gaussian, PixelGaussian, flow_noise
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

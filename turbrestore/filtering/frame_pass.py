@@ -1,6 +1,6 @@
 """One pass over consecutive frames: measure flows, update the flow state, register frames (paper 3, section 4).
 
-Symbols as in :mod:`turbrestore.filtering.flow_state` and :mod:`turbrestore.filtering.frame_noise`.
+Symbols as in :mod:`turbrestore.filtering.kalman` and :mod:`turbrestore.filtering.frame_noise`.
 
 Threads measure and project the flows of several frames in parallel.  The flow state is then updated by one frame after
 another, and the frames are registered in parallel again.  On a torch device a frame is registered only when the image
@@ -24,9 +24,8 @@ from ..runtime.runtime import Runtime
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import in_batches, map_in_turns
 from .array_backend import ArrayBackend
-from .flow_state import ProjectedFlow, predict_state, project_measured, update_state
 from .frame_noise import FrameStatistics, frame_noise_variance
-from .kalman import Gaussian
+from .kalman import Gaussian, ProjectedFlow, predict_state, project_measured, update_state
 
 # A frame as it was read, or prepared for flow; None for a frame that does not count.
 Frame = FloatArray | FlowFrame | None

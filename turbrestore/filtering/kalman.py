@@ -1,4 +1,4 @@
-"""Kalman filter: prediction, and measurement update in covariance form and in information form.
+"""Kalman filter: prediction, measurement update in covariance and in information form, and the updates of paper 3.
 
 Symbols (paper 3, section 4)
 ----------------------------
@@ -9,20 +9,49 @@ M : gain (eq. 18; information form, eq. 19)
 
 Matrix operations act on the last two axes, so leading axes are batches and broadcast. A component of a measurement that
 is NaN is missing.
+
+Flow of the alternating filter
+------------------------------
+ξ̂, P : state of the flow and its covariance, :class:`Gaussian`
+A, C, Q, R, W̄ : flow model of :mod:`turbrestore.dynamics.flow_model` (eqs. 10, 13b)
+W^meas : measured flow (eq. 17)
+M : gain (eq. 19)
+z : Cᵀ(W^meas − W̄)
+
+As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R``: a measured flow enters the update only through
+z, which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the expensive part and
+needs no state, and predictions and updates have the size n.
+
+The paper measures the flow by C ξ alone (eq. 17); here ``W^meas = W̄ + C ξ + r``, as the states are identified around
+the mean flow.
+
+Image of the alternating filter
+-------------------------------
+ρ̂, Σ : image and its variance per pixel, :class:`PixelGaussian`
+S : variance by which the image drifts from frame to frame (eq. 13a)
+I ∘ ŵ, Z : registered frame and its variance about the image (eq. 15)
+L : gain (eq. 16)
+
+The paper takes Σ, Z and L to be one number each; here they vary from pixel to pixel.  Pixels are independent of each
+other, and channels share the variance.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.arrays import FloatArray
 from ..core.errors import DataError
-
-Float64Array = NDArray[np.float64]
+from ..dynamics.flow_model import Float64Array, FlowDynamics, project_deviation
+from ..runtime.image_stacks import Stack
 
 _LOG_2PI = float(np.log(2 * np.pi))
+# Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
+_FLOW_NOISE_FLOOR = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,3 +274,82 @@ def _cholesky(matrix: Float64Array, name: str, kind: str) -> Float64Array:
         return np.asarray(np.linalg.cholesky(matrix), np.float64)
     except np.linalg.LinAlgError:
         raise DataError(f"{name}: expected a {kind} matrix, found one that is not; check the covariances") from None
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedFlow:
+    """A measured flow, as far as the update of the state needs it."""
+
+    state: Float64Array  # (n,): z
+    squared: float  # sum of squares of W^meas − W̄, squared pixels
+    size: int  # components of the flow, 2 H W
+
+
+def project_measured(measured: FloatArray, dynamics: FlowDynamics) -> ProjectedFlow:
+    """Project a measured flow on the subspace of the model.
+
+    ``measured`` (H, W, 2).
+    """
+    deviation = measured - dynamics.mean_flow
+    state = project_deviation(dynamics, deviation)
+    return ProjectedFlow(state, float(np.square(deviation, out=deviation).sum(dtype=np.float64)), deviation.size)
+
+
+def flow_noise(dynamics: FlowDynamics) -> float:
+    """R, squared pixels, with a floor for flows that lie in the subspace of the model as a whole."""
+    return max(dynamics.R, _FLOW_NOISE_FLOOR)
+
+
+def predict_state(state: Gaussian, dynamics: FlowDynamics) -> Gaussian:
+    """Predict the state of the flow one frame ahead (paper 3, eqs. 14b and 14d)."""
+    return predict(state, dynamics.A, dynamics.Q)
+
+
+def update_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
+    """Update the state of the flow by a measured flow (paper 3, eqs. 17 and 19)."""
+    # Cᵀ(W^meas − W̄) = ξ + noise of covariance R I, by CᵀC = I.
+    state, _ = update_information(predicted, measured.state, np.eye(len(measured.state)), flow_noise(dynamics))
+    # |W − W̄ − C ξ̂|² without the product C ξ̂.
+    squared = measured.squared - float(predicted.mean @ (2 * measured.state - predicted.mean))
+    return state, (max(squared, 0.0) / measured.size) ** 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class PixelGaussian:
+    """Mean and variance of every pixel."""
+
+    mean: NDArray[np.floating]  # (H, W) or (H, W, 3): ρ̂, intensities
+    variance: NDArray[np.floating]  # (H, W): Σ, squared intensities, not negative
+
+    def __post_init__(self) -> None:
+        mean = np.asarray(self.mean)
+        mean = mean if mean.dtype in (np.float32, np.float64) else mean.astype(np.float64)
+        variance = np.asarray(self.variance, mean.dtype)
+        pixels = variance.shape
+        if mean.shape not in (pixels, (*pixels, 3)):
+            raise DataError(f"mean: expected the shape of variance {pixels} or {(*pixels, 3)}, found {mean.shape}")
+        if not np.isfinite(np.sum(mean, dtype=np.float64)):
+            raise DataError("mean: expected finite values, found NaN or infinite ones")
+        if not np.isfinite(np.sum(variance, dtype=np.float64)) or (variance < 0).any():
+            raise DataError("variance: expected finite values of at least 0, found others")
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "variance", variance)
+
+
+class PixelStacks(NamedTuple):
+    """ρ̂ and Σ as arrays or tensors with the channels first: shapes (C, H, W) and (H, W)."""
+
+    mean: Stack
+    variance: Stack
+
+
+def update_pixels(state: PixelStacks, registered: Stack, noise: Stack, drift: float) -> tuple[PixelStacks, Stack]:
+    """Predict the image and update it by a registered frame (paper 3, eqs. 14a, 14c, 15 and 16).
+
+    ``registered`` (C, H, W); ``noise`` (H, W); returns ``gain`` (H, W).
+    """
+    prior = state.variance + drift  # (14c); by (14a) the mean stays
+    gain = prior / (prior + noise)  # L of (16)
+    mean = state.mean + gain * (registered - state.mean)  # (16)
+    # L Z equals (1 − L) Σ of (16) without its cancellation where Z is small.
+    return PixelStacks(mean, gain * noise), gain

@@ -7,6 +7,7 @@ for an edge of the scene, and are put back into the result.
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +16,9 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
-from ..io.source import FrameSource, Window
+from ..io.source import Window
+from .survey import Survey
 
-# Frames that are looked at.
-_SAMPLES = 16
 # A bar is darker than that, even to that in place and time, and the picture beside it differs by that in that share.
 _DARK, _EVEN, _STEP, _SHARE = 0.12, 3.5 / 255, 0.02, 0.5
 # Narrowest bar, pixels, and least part of the frame that the picture takes.
@@ -42,9 +42,9 @@ class Bars:
         return with_bars
 
 
-def without_bars(source: FrameSource) -> tuple[FrameSource, Bars | None, tuple[Decision, ...]]:
-    """Fill bars with the mirrored picture; a source without bars is returned as it is."""
-    mean, lowest, highest = _extremes(source)
+def without_bars(survey: Survey) -> tuple[Survey, Bars | None, tuple[Decision, ...]]:
+    """Fill bars with the mirrored picture; frames without bars are returned as they are."""
+    mean, lowest, highest = _extremes(survey)
     height, width = lowest.shape
     uneven = (highest - lowest > _EVEN) | (highest > _DARK)
     level = luminance(mean)
@@ -53,11 +53,9 @@ def without_bars(source: FrameSource) -> tuple[FrameSource, Bars | None, tuple[D
     sizes = {"top": rows.start, "bottom": height - rows.stop, "left": columns.start, "right": width - columns.stop}
     found = {side: size for side, size in sizes.items() if size}
     if not found or (rows.stop - rows.start) * (columns.stop - columns.start) < _LEAST_PICTURE * height * width:
-        return source, None, ()
-    before, own = source.adjust, source.window
-    around = ((sizes["top"], sizes["bottom"]), (sizes["left"], sizes["right"]))
-    pairs = zip(picture, around, strict=True)
-    places = [np.pad(np.arange(side.start, side.stop), size, mode="symmetric") for side, size in pairs]
+        return survey, None, ()
+    before, own = survey.clip.adjust, survey.clip.window
+    places = [_mirrored(part, length) for part, length in zip(picture, (height, width), strict=True)]
 
     def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
         if window != own:
@@ -68,24 +66,34 @@ def without_bars(source: FrameSource) -> tuple[FrameSource, Bars | None, tuple[D
         values = values if before is None else before(number, values, window)
         return values[places[0]][:, places[1]]
 
-    filled = dataclasses.replace(source, adjust=adjust)
+    filled = dataclasses.replace(survey.clip, adjust=adjust)
+    small = survey.small
+    for axis, (part, length) in enumerate(zip(picture, (height, width), strict=True), 1):
+        share = small.shape[axis] / length
+        inside = slice(math.ceil(part.start * share), max(math.floor(part.stop * share), 1))
+        small = small.take(_mirrored(inside, small.shape[axis]), axis)
     text = ", ".join(f"{side} {size}" for side, size in found.items())
     choice = f"left out of the computation and put back: {text} pixels"
     decision = Decision("bars", choice, "they are even and dark in every frame")
-    return filled, Bars(picture, mean), (decision,)
+    return dataclasses.replace(survey, clip=filled, small=small), Bars(picture, mean), (decision,)
 
 
-def _extremes(source: FrameSource) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _mirrored(inside: slice, length: int) -> NDArray[np.int_]:
+    """Places whose values continue what is inside to the whole length."""
+    return np.pad(np.arange(inside.start, inside.stop), (inside.start, length - inside.stop), mode="symmetric")
+
+
+def _extremes(survey: Survey) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mean of some frames, and the least and greatest luminance."""
-    part = source.select((0, len(source), max(1, len(source) // _SAMPLES)))
-    total = np.zeros(source.shape[1:])
-    lowest, highest = np.full(source.shape[1:3], np.inf, np.float32), np.full(source.shape[1:3], -np.inf, np.float32)
-    for frame in part:
+    shape = survey.clip.shape[1:]
+    total = np.zeros(shape)
+    lowest, highest = np.full(shape[:2], np.inf, np.float32), np.full(shape[:2], -np.inf, np.float32)
+    for frame in survey:
         grey = luminance(frame)
         total += frame
         np.minimum(lowest, grey, out=lowest)
         np.maximum(highest, grey, out=highest)
-    return (total / len(part)).astype(np.float32), lowest, highest
+    return (total / len(survey.numbers)).astype(np.float32), lowest, highest
 
 
 def _picture_of(shows: NDArray[Any], level: FloatArray) -> slice:

@@ -18,12 +18,10 @@ from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.errors import DataError
 from ..core.noise import estimate_noise
-from ..io.source import FrameSource
+from .survey import Survey
 
 # Clips that span less than this share of full scale are stretched to it, so that their scale does not matter.
 _SPAN = 0.7
-# Frames from which the range is taken.
-_SAMPLES = 16
 # Percentage of the frames at either end whose extremes do not count.
 _FEW = 10
 # A contrast below one grey level of an 8-bit camera is a scene only if it is that many deviations of the noise.
@@ -72,38 +70,38 @@ class Levels:
         return dataclasses.replace(result, **changed)
 
 
-def stretch_levels(source: FrameSource, train: int) -> tuple[FrameSource, Levels, tuple[Decision, ...]]:
+def stretch_levels(survey: Survey) -> tuple[Survey, Levels, tuple[Decision, ...]]:
     """Stretch the frames of a clip that uses a part of the scale."""
-    low, high = _range_of(source, train)
+    low, high = _range_of(survey)
     span = high - low
     if span >= _SPAN:
-        return source, Levels(), ()
+        return survey, Levels(), ()
     gain = _SPAN / span
     levels = Levels(low - (1 - _SPAN) / 2 / gain, gain)
     reason = f"the scene spans {low:.4g} to {high:.4g} of full scale, and results come back to these levels"
     decision = Decision("range", f"stretched {gain:.3g} times", reason)
-    return source.adjusted(lambda _, values, window: levels.stretched(values)), levels, (decision,)
+    small = levels.stretched(survey.small)
+    return survey.adjusted(lambda _, values, window: levels.stretched(values), small), levels, (decision,)
 
 
-def _range_of(source: FrameSource, train: int) -> tuple[float, float]:
+def _range_of(survey: Survey) -> tuple[float, float]:
     """Darkest and brightest intensity of most of some frames, without lone pixels.
 
     The mean of the frames would not do: that of a planet that the wind shakes is dark.
     """
-    part = source.select((0, train, max(1, train // _SAMPLES)))
-    total = np.zeros(source.shape[1:])
+    total = np.zeros(survey.clip.shape[1:])
     lows, highs = [], []
-    for frame in part:
+    for frame in survey:
         total += frame
         smooth = cv2.medianBlur(frame, 3)
         lows.append(float(smooth.min()))
         highs.append(float(smooth.max()))
-    mean = (total / len(part)).astype(np.float32)
+    mean = (total / len(survey.numbers)).astype(np.float32)
     smooth = cv2.medianBlur(mean, 3)
     low, high = float(smooth.min()), float(smooth.max())
     coarse = high - low < _LEAST_CONTRAST
     if high <= low or (
-        coarse and (source.bit_depth <= 8 or high - low < _DEVIATIONS * estimate_noise(luminance(mean)))
+        coarse and (survey.clip.bit_depth <= 8 or high - low < _DEVIATIONS * estimate_noise(luminance(mean)))
     ):
         raise DataError(
             f"frames: expected a scene with some contrast, found one intensity within {high - low:.1g} of full scale"

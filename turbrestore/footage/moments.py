@@ -9,10 +9,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import estimate_noise
-from ..io.source import FrameSource
-
-# Frames that are looked at.
-_SAMPLES = 60
+from .survey import Survey
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +33,12 @@ class Moments:
     count: int
 
 
-def measure_moments(source: FrameSource) -> Moments:
-    """Read some frames of a clip, and take their moments."""
-    part = source.select((0, len(source), max(1, len(source) // _SAMPLES)))
-    total, sums, noise = np.zeros(source.shape[1:]), np.zeros((3, *source.shape[1:3])), []
+def measure_moments(survey: Survey) -> Moments:
+    """Take the moments of the whole frames of a survey."""
+    shape = survey.clip.shape[1:]
+    total, sums, noise = np.zeros(shape), np.zeros((3, *shape[:2])), []
     before: FloatArray | None = None
-    for frame in part:
+    for frame in survey:
         grey = luminance(frame)
         if before is not None:
             cv2.accumulateSquare(grey - before, sums[2])
@@ -50,7 +47,8 @@ def measure_moments(source: FrameSource) -> Moments:
         cv2.accumulate(grey, sums[0])
         cv2.accumulateSquare(grey, sums[1])
         noise.append(estimate_noise(grey))
-    change = (sums[2] / (2 * max(len(part) - 1, 1))).astype(np.float32)
-    sums /= len(part)
+    count = len(survey.numbers)
+    change = (sums[2] / (2 * max(count - 1, 1))).astype(np.float32)
+    sums /= count
     variance = np.maximum(sums[1] - np.square(sums[0]), 0).astype(np.float32)
-    return Moments((total / len(part)).astype(np.float32), variance, change, float(np.median(noise)), len(part))
+    return Moments((total / count).astype(np.float32), variance, change, float(np.median(noise)), count)

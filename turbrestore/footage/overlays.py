@@ -31,11 +31,10 @@ from ..io.images import read_image
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import global_shifts
 from .moments import Moments, measure_moments
+from .survey import Survey
 
 # Fewest and most frames of a clip in which an overlay is looked for.
 FEWEST, _MOST = 3, 1500
-# Longest side of the reduced frames whose shifts are measured.
-_SIDE = 192
 # Root mean square of the shifts from which a scene moves, pixels.
 _LEAST_MOTION = 3.0
 # An edge stands if it varies by less than its gradient times this share of the motion of the edges, or one pixel, and
@@ -49,8 +48,9 @@ _CONSTANT, _DARK = 0.5, 0.25
 _LEAST_EDGES, _LARGEST = 0.0005, 0.7
 # Share of the frame that no frame shows from which it is reported, and factor between the reaches of its fill.
 _REPORTED, _WIDER = 0.002, 3.0
-# Pixels around an overlay that are replaced too, and reach of the fill under which shifts are measured.
-_AROUND, _REACH = 2, 12.0
+# Pixels around an overlay that are replaced too, reach of the fill under which shifts are measured, and the share of a
+# reduced pixel beside an overlay that has to show the scene.
+_AROUND, _REACH, _FREE = 2, 12.0, 0.9
 # With a camera that stands: radius around standing edges in which what has no noise belongs to them, and of the gaps
 # between letters; pixels around them over which the overlay fades.
 _NEAR, _GAP, _FADE = 4, 2, 0.7
@@ -125,27 +125,28 @@ def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArr
 
 
 def without_overlay(
-    source: FrameSource, mask: NDArray[np.bool_] | None = None, moments: Moments | None = None
-) -> tuple[FrameSource, NDArray[np.bool_] | None, Title | None, tuple[Decision, ...]]:
-    """Replace what stands in the frames while the scene moves; a source without it is returned as it is.
+    survey: Survey, mask: NDArray[np.bool_] | None = None, moments: Moments | None = None
+) -> tuple[Survey, NDArray[np.bool_] | None, Title | None, tuple[Decision, ...]]:
+    """Replace what stands in the frames while the scene moves; frames without it are returned as they are.
 
-    Return the source, the pixels (H, W) of the scene that no frame shows, the title that has to be put back into
+    Return the frames, the pixels (H, W) of the scene that no frame shows, the title that has to be put back into
     results because the camera stands as well, and the decisions. ``mask`` (H, W) names the pixels that are replaced;
-    ``moments`` are those of the source, if they are known.
+    ``moments`` are those of the survey, if they are known.
     """
     given, title = mask is not None, None
-    if mask is None and FEWEST <= len(source) <= _MOST:
-        mask, title = _standing(source, moments or measure_moments(source))
+    if mask is None and FEWEST <= len(survey.small) <= _MOST:
+        mask, title = _standing(survey.clip, moments or measure_moments(survey))
     if mask is None:
-        return source, None, None, ()
-    shifts = _shifts_of(source, mask)
+        return survey, None, None, ()
+    small = _continued_small(survey.small, mask)
+    shifts = global_shifts(luminance(small)) * (mask.shape[1] / small.shape[2], mask.shape[0] / small.shape[1])
     if not given and float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _LEAST_MOTION:
         if title is None:
-            return source, None, None, ()
+            return survey, None, None, ()
         choice = f"{100 * float(title.mask.mean()):.1f} % of the frame kept as in the mean of the frames"
         reason = "it stands while the air bends the scene around it; it is neither moved nor deblurred"
-        return source.adjusted(title.without), title.mask, title, (Decision("overlay", choice, reason),)
-    overlay = _overlay(source, mask, np.rint(shifts).astype(int))
+        return survey.adjusted(title.without, small), title.mask, title, (Decision("overlay", choice, reason),)
+    overlay = _overlay(survey, mask, np.rint(shifts).astype(int))
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
     reason = "asked for" if given else "it stands while the scene moves"
     hidden = float(overlay.hidden.mean())
@@ -153,7 +154,7 @@ def without_overlay(
         choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced"
         reason += f"; {100 * hidden:.1f} % is shown by no frame and filled from around, the rest by others"
     decision = Decision("overlay", choice, reason)
-    return source.adjusted(overlay.without), overlay.hidden, None, (decision,)
+    return survey.adjusted(overlay.without, small), overlay.hidden, None, (decision,)
 
 
 def _standing(source: FrameSource, moments: Moments) -> tuple[NDArray[np.bool_] | None, Title | None]:
@@ -201,40 +202,37 @@ def _connected(grown: NDArray[np.bool_], edges: NDArray[np.bool_]) -> NDArray[np
     return np.asarray((counts > 0)[labels])
 
 
-def _shifts_of(source: FrameSource, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Shift of the scene in every frame, pixels, measured under a smooth fill of the overlay."""
-    height, width = mask.shape
-    factor = max(1.0, max(height, width) / _SIDE)
-    size = max(16, round(width / factor)), max(16, round(height / factor))
-    known = (~mask).astype(np.float32)
-    reach = _REACH / factor
-    stack = np.empty((len(source), size[1], size[0]), np.float32)
-    weight = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
-    around = cv2.GaussianBlur(weight, (0, 0), reach) + 1e-3
-    for small, frame in zip(stack, source, strict=True):
-        seen = cv2.resize(luminance(frame) * known, size, interpolation=cv2.INTER_AREA)
-        middle = float(seen.sum() / max(float(weight.sum()), 1e-6))
-        fill = (cv2.GaussianBlur(seen, (0, 0), reach) + 1e-3 * middle) / around
-        small[...] = seen + (1 - weight) * fill
-    shifts = global_shifts(stack)
-    return shifts * (width / size[0], height / size[1])
+def _continued_small(small: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:
+    """Fill reduced frames smoothly where they show pixels of an overlay; (T, h, w) or (T, h, w, 3)."""
+    size, reach = small.shape[2:0:-1], _REACH * small.shape[2] / mask.shape[1]
+    free = cv2.resize((~mask).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    known = np.float32(free >= _FREE)
+    around = cv2.GaussianBlur(known, (0, 0), reach) + 1e-3
+    filled = np.empty_like(small)
+    for after, frame in zip(filled, small, strict=True):
+        seen = (frame.T * known.T).T
+        middle = seen.sum(axis=(0, 1)) / max(float(known.sum()), 1.0)
+        fill = (cv2.GaussianBlur(seen, (0, 0), reach) + 1e-3 * middle).T / around.T
+        after[...] = seen + (fill * (1 - known.T)).T
+    return filled
 
 
-def _overlay(source: FrameSource, mask: NDArray[np.bool_], shifts: NDArray[np.int_]) -> Overlay:
-    """Average what all frames show of the scene, without the overlay."""
+def _overlay(survey: Survey, mask: NDArray[np.bool_], shifts: NDArray[np.int_]) -> Overlay:
+    """Average what the whole frames show of the scene, without the overlay."""
     low, high = shifts.min(axis=0), shifts.max(axis=0)
     height, width = mask.shape
     shape = height + high[1] - low[1], width + high[0] - low[0]
-    total, count = np.zeros((*shape, *source.shape[3:])), np.zeros(shape)
+    total, count = np.zeros((*shape, *survey.clip.shape[3:])), np.zeros(shape)
     origin = int(high[1]), int(high[0])
-    for (dx, dy), frame in zip(shifts, source, strict=True):
+    places = {number: (int(dx), int(dy)) for number, (dx, dy) in zip(survey.clip.numbers, shifts, strict=True)}
+    for number, frame in zip(survey.numbers, survey, strict=True):
+        dx, dy = places[number]
         place = np.s_[origin[0] - dy : origin[0] - dy + height, origin[1] - dx : origin[1] - dx + width]
         total[place][~mask] += frame[~mask]
         count[place][~mask] += 1
     scene = _continued((total.T / np.maximum(count, 1).T).T.astype(np.float32), count > 0)
     hidden = count[origin[0] : origin[0] + height, origin[1] : origin[1] + width] == 0
-    places = {number: (int(dx), int(dy)) for number, (dx, dy) in zip(source.numbers, shifts, strict=True)}
-    return Overlay(mask, scene, hidden, origin, places, source.window)
+    return Overlay(mask, scene, hidden, origin, places, survey.clip.window)
 
 
 def _continued(scene: FloatArray, known: NDArray[np.bool_]) -> FloatArray:

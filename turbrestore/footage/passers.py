@@ -21,7 +21,7 @@ compared at the place of the scene that they show, to whole pixels.  What no fra
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import FrameSource, Window
-from .placement import Placement, measured_shifts, placed, reduced, shifts_of_reduced
+from ..registration.camera.global_shift import global_shifts
+from .survey import Survey
 
 # Frames of which the median is taken, the fewest that tell what passes, and rows that it is taken of at once.
 _SAMPLES, _FEWEST, _ROWS = 25, 9, 64
@@ -57,6 +58,8 @@ _LEAST, _LARGEST, _LARGEST_PART, _SEEN = 0.0025, 0.35, 0.5, 3
 _CAMERA, _OWN_EDGES = 3.0, 0.5
 # Most pixels of what a moving camera shows, in frames, and the share of the variance that following it may leave.
 _LARGEST_SCENE, _FOLLOWED = 4.0, 0.5
+# Longest side of the reduced frames whose shifts are measured.
+_REDUCED_SIDE = 192
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +111,13 @@ class _Usual:
         return dataclasses.replace(self, excess=None)
 
 
-def without_passers(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Replace what passes by the background; a source in which nothing does is returned as it is."""
-    usual = _usual_of(source) if len(source) >= _FEWEST else None
+def without_passers(survey: Survey) -> tuple[FrameSource, tuple[Decision, ...]]:
+    """Replace what passes by the background; a clip in which nothing does is returned as it is.
+
+    Where something does, all frames are read once more, because each shows the background elsewhere.
+    """
+    source = survey.clip
+    usual = _usual_of(survey) if len(source) >= _FEWEST else None
     if usual is None:
         return source, ()
     background, share, touched = _background(source, *usual)
@@ -121,11 +128,10 @@ def without_passers(source: FrameSource) -> tuple[FrameSource, tuple[Decision, .
     return source.adjusted(background.shown), (decision,)
 
 
-def _usual_of(source: FrameSource) -> tuple[_Usual, Placement] | None:
+def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
     """Find what frames usually show, and where they lie; None where nothing passes."""
-    picked = np.unique(np.linspace(0, len(source) - 1, _SAMPLES).round().astype(int))
-    sample = dataclasses.replace(source, numbers=tuple(source.numbers[int(index)] for index in picked))
-    stack = np.empty((len(sample), *sample.shape[1:3]), np.uint8)
+    source, sample = survey.clip, survey.part(_SAMPLES)
+    stack = np.empty((len(sample.numbers), *source.shape[1:3]), np.uint8)
     for plane, frame in zip(stack, sample, strict=True):
         np.rint(255 * np.clip(luminance(frame), 0, 1), out=plane, casting="unsafe")
     still = Placement.still(source)
@@ -136,7 +142,8 @@ def _usual_of(source: FrameSource) -> tuple[_Usual, Placement] | None:
     if not _moves(measured_shifts(map(_grey, stack), stack.shape)):
         return None
     # For a camera that moves the scene passes too; what moves as most of the frame does is the scene.
-    moving = placed(source, measured_shifts(map(luminance, source), source.shape))
+    small = luminance(survey.small)
+    moving = placed(source, shifts_of_reduced(reduced(small, small.shape), source.shape))
     if np.prod(moving.shape) > _LARGEST_SCENE * np.prod(moving.size):
         return None
     followed = _usual(stack, sample.numbers, moving)
@@ -304,3 +311,59 @@ def _background(source: FrameSource, usual: _Usual, placement: Placement) -> tup
 
 def _disc(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2), np.uint8)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Shifts of frames, and the part of the scene that they show together."""
+
+    shifts: dict[int, tuple[int, int]]  # (dx, dy) of each frame by its number in the file, pixels
+    size: tuple[int, int]  # (H, W) of a frame
+
+    @classmethod
+    def still(cls, source: FrameSource) -> Placement:
+        """Place all frames alike."""
+        return cls(dict.fromkeys(source.numbers, (0, 0)), (source.shape[1], source.shape[2]))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H', W') of the part of the scene that the frames show together."""
+        (left, right), (top, bottom) = (self._range(axis) for axis in (0, 1))
+        return self.size[0] + bottom - top, self.size[1] + right - left
+
+    def place(self, number: int) -> Window:
+        """Return the rows and columns of the scene that a frame shows."""
+        dx, dy = self.shifts[number]
+        top, left = self._range(1)[1] - dy, self._range(0)[1] - dx
+        return slice(top, top + self.size[0]), slice(left, left + self.size[1])
+
+    def _range(self, axis: int) -> tuple[int, int]:
+        values = [shift[axis] for shift in self.shifts.values()]
+        return min(values), max(values)
+
+
+def reduced(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> FloatArray:
+    """Reduce and smooth T frames of (H, W) pixels, ``shape`` beginning with (T, H, W), to measure their shifts."""
+    count, height, width = shape[:3]
+    factor = max(1.0, max(height, width) / _REDUCED_SIDE)
+    size = max(16, round(width / factor)), max(16, round(height / factor))
+    small = np.empty((count, size[1], size[0]), np.float32)
+    for plane, frame in zip(small, frames, strict=True):
+        plane[...] = cv2.GaussianBlur(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
+    return small
+
+
+def shifts_of_reduced(small: FloatArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Shifts (dx, dy) of frames that :func:`reduced` has reduced, in pixels of the frames, shape (T, 2)."""
+    return global_shifts(small) * (shape[2] / small.shape[2], shape[1] / small.shape[1])
+
+
+def measured_shifts(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Shifts (dx, dy) of T frames of (H, W) pixels, ``shape`` beginning with (T, H, W), in pixels, shape (T, 2)."""
+    return shifts_of_reduced(reduced(frames, shape), shape)
+
+
+def placed(source: FrameSource, shifts: NDArray[np.float64]) -> Placement:
+    """Place the frames of a source by shifts of shape (T, 2)."""
+    whole = ((int(dx), int(dy)) for dx, dy in np.rint(shifts))
+    return Placement(dict(zip(source.numbers, whole, strict=True)), (source.shape[1], source.shape[2]))

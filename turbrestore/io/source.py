@@ -161,6 +161,18 @@ class FrameSource:
         for _, pixels in self._native(self.numbers):
             yield pixels
 
+    def intensities(self, number: int, pixels: PixelArray) -> FloatArray:
+        """Scale and adjust what :meth:`native` yields for the frame with this number in the file.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> float(FrameSource.from_array(np.zeros((1, 1, 1), np.uint8)).intensities(0, np.uint8([[255]]))[0, 0])
+        1.0
+        """
+        values = to_unit(pixels, self.full_scale, f"{self.name}: frame {number}")
+        return values if self.adjust is None else self.adjust(number, values, self.window)
+
     def mosaics(self) -> Iterator[PixelArray | None]:
         """Iterate over whole frames as the sensor saw them, before they are repaired and developed; None for others.
 
@@ -307,8 +319,7 @@ class FrameSource:
 
     def _frames(self, chosen: range | tuple[int, ...]) -> Iterator[FloatArray]:
         for number, pixels in self._native(chosen):
-            values = to_unit(pixels, self.full_scale, f"{self.name}: frame {number}")
-            yield values if self.adjust is None else self.adjust(number, values, self.window)
+            yield self.intensities(number, pixels)
 
     def _native(self, chosen: range | tuple[int, ...]) -> Iterator[tuple[int, PixelArray]]:
         done = 0

@@ -9,8 +9,7 @@ import numpy as np
 
 from ..core.errors import DataError, InputNotFoundError
 from ..filtering.filter_records import FilterCheckpoint, FilterState, FrameRecord
-from ..filtering.image_state import PixelGaussian
-from ..filtering.kalman import Gaussian
+from ..filtering.kalman import Gaussian, PixelGaussian
 from ..io.npy import read_npz
 from ..io.output import atomic_output
 

@@ -77,8 +77,8 @@ def numpy_ops() -> StackOps:
 
     return StackOps(
         arrays=np,
-        load=lambda array: array,
-        store=lambda stack: stack,
+        load=np.asarray,
+        store=np.asarray,
         zeros=lambda shape: np.zeros(shape, np.float32),
         filter=filtered,
         resize=lambda stack, size: each(lambda plane, out: cv2.resize(plane, size[::-1], dst=out), stack, size),

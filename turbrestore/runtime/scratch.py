@@ -30,11 +30,11 @@ _SPARE = 1 << 26
 _PART = 1 << 22
 
 
-def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.float32]:
+def new_stack(shape: tuple[int, ...], folder: Path | None = None, dtype: Any = np.float32) -> NDArray[Any]:
     """Return an array to be filled, in memory or in a file; an array in a file is full of zeros."""
-    size = 4 * int(np.prod(shape, dtype=np.int64))
+    size = np.dtype(dtype).itemsize * int(np.prod(shape, dtype=np.int64))
     if folder is None or size == 0:
-        return np.empty(shape, np.float32)
+        return np.empty(shape, dtype)
     try:
         # A page that is mapped beyond the end of a full disk kills the process, so the space is checked now.
         free = shutil.disk_usage(folder).free
@@ -45,7 +45,7 @@ def new_stack(shape: tuple[int, ...], folder: Path | None = None) -> NDArray[np.
             )
         with tempfile.TemporaryFile(dir=folder, prefix="turbrestore-") as file:
             _reserve(file, size)
-            return np.memmap(file, np.float32, "r+", shape=shape)
+            return np.memmap(file, dtype, "r+", shape=shape)
     except OSError as error:
         raise StorageError(f"{folder}: cannot hold a file of {size / 1e9:.1f} GB ({error.strerror})") from error
 

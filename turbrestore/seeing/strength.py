@@ -35,15 +35,7 @@ from ..blur_moments.tile_spectra import CueParams
 from ..core.arrays import FloatArray
 from ..core.noise import estimate_noise
 from ..synthesis.atmosphere import fried_parameter
-from .displacement import (
-    Displacement,
-    Float64Array,
-    MotionStatistics,
-    block_displacement,
-    motion_statistics,
-    rotation_share,
-    separation_correlation,
-)
+from .displacement import Displacement, Float64Array, MotionStatistics, measure_motion, motion_statistics
 from .tilt_theory import MEAN_CONE, Optics, displacement_differences, strength_of_tilt
 
 # Relative error of a variance besides that of finitely many frames: on synthetic clips of D/r0 1 to 6 the variance of
@@ -224,16 +216,15 @@ def measure_seeing(
     True
     """
     noise = estimate_noise(frames[0])
-    found = block_displacement(frames, flows, image, noise, threads)
-    by_blur = _by_blur(mean, image, noise / np.sqrt(len(found.blocks)))
-    if not found.usable:
+    motion = measure_motion(frames, flows, image, noise, threads)
+    by_blur = _by_blur(mean, image, noise / np.sqrt(len(flows)))
+    if motion is None:
         remark = "too little structure or motion to measure the displacement: no strength of the turbulence is reported"
         return _unmeasured(by_blur, remark)
+    found, whole, rotation = motion.displacement, motion.statistics, motion.rotation
     w = found.blocks[:, found.counts]
-    whole = motion_statistics(w, found.noise_variance)
     variance = max(float(np.mean(w**2)) - found.noise_variance, 0.0)
     by_flow = _with_deviation(variance, _MODEL_ERROR * variance)
-    rotation = rotation_share(found)
     anisotropy, direction = _wind(w, whole, found.noise_variance)
     remarks: tuple[str, ...] = ()
     if whole.slow:
@@ -258,7 +249,7 @@ def measure_seeing(
         displacement_variance_y=y,
         displacement_by_flow=by_flow,
         displacement_by_blur=by_blur,
-        isoplanatic_patch=_crossing(separation_correlation(found), _HALF, whole.freedom, float(found.spacing)),
+        isoplanatic_patch=_crossing(motion.correlation, _HALF, whole.freedom, float(found.spacing)),
         coherence_time=_crossing(whole.autocorrelation, _E_FOLD, whole.freedom, 1.0),
         wind_anisotropy=anisotropy,
         wind_direction=direction,

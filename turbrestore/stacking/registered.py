@@ -104,7 +104,7 @@ def registered_frames(
     (4, (32, 32))
     """
     params = params or RestoreParams()
-    prepared = prepare(source, restoration.train, params.static_mask)
+    prepared = prepare(source, params.static_mask, runtime.scratch)
     filtered, count = restoration.filtered, len(source)
     unknown = np.full(count, np.nan)
     shares, sharpness = (unknown, unknown) if filtered is None else (filtered.shares, filtered.sharpness)

@@ -39,12 +39,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ..blind.remove_blur import Deblurred
 from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol, wiener_fidelity
 from ..core.arrays import FloatArray, luminance
 from ..core.gradient import sobel_gradient
 from ..core.noise import estimate_noise
+from ..deconvolution.deconvolve import DeconvolutionParams
 from ..deconvolution.problem import MARGIN_SIGMAS, automatic_fidelity, margin_around
 from ..dynamics.flow_model import FlowDynamics
+from ..filtering.alternating import Filtered
 
 # Full scale, less half a grey level of 8 bits.
 _SATURATED = 1 - 0.5 / 255
@@ -54,6 +57,33 @@ _WINDOW = 1.5
 _ERROR_SHARE, _SMOOTH = 0.7, 4.0
 # Longest side of the grid of frequencies; g hardly depends on it.
 _GRID = 256
+
+
+def measure_deviation(
+    image: FloatArray,
+    filtered: Filtered,
+    stretched: FloatArray,
+    dynamics: FlowDynamics,
+    known: NDArray[np.bool_],
+    params: DeconvolutionParams,
+    deblurred: Deblurred | None,
+) -> FloatArray:
+    """Measure the standard deviation of every pixel of a restored image.
+
+    ``image`` (H, W) or (H, W, 3); ``stretched`` is the filtered image at the levels of the deconvolution; returns
+    (H, W).
+    """
+    gain, by_blur = 1.0, np.zeros(1, np.float32)
+    if deblurred is not None:
+        done, posterior = deblurred.deconvolution, deblurred.posterior
+        blur, exponent = posterior or deblurred.blur, params.exponent
+        fidelity = quadratic_fidelity(stretched, params.method, done.fidelity)
+        exponent = blur.exponent if exponent is None and blur is not None else exponent
+        gain = posterior_gain((stretched.shape[0], stretched.shape[1]), fidelity, done.sigma, exponent)
+        if posterior is not None:
+            low, _, high = posterior.width
+            by_blur = variance_by_blur(filtered.image, fidelity, (float(low), float(high)), exponent or GAUSSIAN)
+    return pixel_deviation(image, filtered.variance, gain, position_variance(dynamics), known, by_blur)
 
 
 def pixel_deviation(

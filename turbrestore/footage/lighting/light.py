@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
 from ...core.decision import Decision
-from ...io.source import FrameSource, Window
+from ...io.source import Window
 from ...registration.camera.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
+from ..survey import Survey
 from .shadows import measure_shade
 
-# Longest side of the reduced frames, pixels, of up to that many frames, and of more.
-_SIDE, _MANY, _SIDE_OF_MANY = 96, 4000, 48
+# Longest side of the reduced frames, pixels.
+_SIDE = 96
 # Blur of the frames that hides the motion of the air: pixels of the frame, and at least that many of the reduced one.
 _BLUR, _LEAST_BLUR = 4.0, 1.5
 # Cosines along the rows: bands as narrow as an eighth of the frame are followed.
@@ -68,21 +69,25 @@ class Light:
         return steady
 
 
-def steady_light(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Take changes of the light out of the frames; a source whose light is steady is returned as it is."""
-    if len(source) < 2:
-        return source, ()
-    frames = _reduced_frames(source)
-    light, on_light = _measure_light(source, frames)
+def steady_light(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
+    """Take changes of the light out of the frames; frames whose light is steady are returned as they are."""
+    if len(survey.small) < 2:
+        return survey, ()
+    frames, numbers = _reduced_frames(survey), survey.clip.numbers
+    light, on_light = _measure_light(survey, frames)
     if light is not None:
-        source, rows = source.adjusted(light.steady), slice(0, frames.shape[1])
-        for number, frame in zip(source.numbers, frames, strict=True):
-            frame[...] = replace(light, rows=rows).steady(number, frame, (rows, slice(0, frames.shape[2])))
-    shade, on_shade = measure_shade(frames, source.numbers, source.window, _blur_of(source))
-    return source if shade is None else source.adjusted(shade.lit), (*on_light, *on_shade)
+        small = np.empty_like(survey.small)
+        for before, after in ((frames, frames), (survey.small, small)):
+            rows, columns = (slice(0, length) for length in before.shape[1:3])
+            for number, frame, lit in zip(numbers, before, after, strict=True):
+                lit[...] = replace(light, rows=rows).steady(number, frame, (rows, columns))
+        survey = survey.adjusted(light.steady, small)
+    shade, on_shade = measure_shade(frames, numbers, survey.clip.window, _blur_of(survey))
+    # From here on the reduced frames only serve to measure shifts of the camera, which shadows hardly change.
+    return survey if shade is None else survey.adjusted(shade.lit), (*on_light, *on_shade)
 
 
-def _measure_light(source: FrameSource, frames: FloatArray) -> tuple[Light | None, tuple[Decision, ...]]:
+def _measure_light(survey: Survey, frames: FloatArray) -> tuple[Light | None, tuple[Decision, ...]]:
     as_a_whole, along_rows = _hardly_change(frames)
     reference = None if as_a_whole and along_rows else _reference_of(frames)
     if reference is None:
@@ -96,8 +101,8 @@ def _measure_light(source: FrameSource, frames: FloatArray) -> tuple[Light | Non
     if light is None:
         return None, ()
     gains, offsets, with_rows = light
-    numbers = list(source.numbers)
-    record = Light(dict(zip(numbers, gains, strict=True)), dict(zip(numbers, offsets, strict=True)), source.window[0])
+    numbers, rows = survey.clip.numbers, survey.clip.window[0]
+    record = Light(dict(zip(numbers, gains, strict=True)), dict(zip(numbers, offsets, strict=True)), rows)
     extent = np.array([coefficients[0] for coefficients in gains])
     what = "exposure of each frame, and bands along its rows," if with_rows else "exposure of each frame"
     reason = f"the gain varies from {extent.min():.2f} to {extent.max():.2f}"
@@ -155,24 +160,24 @@ def _evened_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.linalg.lstsq(basis, np.maximum(gains, _LEAST_GAIN).T, rcond=None)[0].T, np.float64)
 
 
-def _reduced_frames(source: FrameSource) -> FloatArray:
+def _reduced_frames(survey: Survey) -> FloatArray:
     """Reduced, blurred luminance of all frames, (T, h, w)."""
-    (height, width), factor = source.shape[1:3], _reduction(source)
+    (height, width), factor = survey.clip.shape[1:3], _reduction(survey)
     size = max(1, round(width / factor)), max(1, round(height / factor))
-    stack = np.empty((len(source), size[1], size[0]), np.float32)
-    for small, frame in zip(stack, source, strict=True):
+    stack = np.empty((len(survey.small), size[1], size[0]), np.float32)
+    for plane, frame in zip(stack, survey.small, strict=True):
         reduced = luminance(cv2.resize(frame, size, interpolation=cv2.INTER_AREA))
-        small[...] = cv2.GaussianBlur(reduced, (0, 0), _blur_of(source))
+        plane[...] = cv2.GaussianBlur(reduced, (0, 0), _blur_of(survey))
     return stack
 
 
-def _reduction(source: FrameSource) -> float:
-    return max(1.0, max(source.shape[1:3]) / (_SIDE if len(source) <= _MANY else _SIDE_OF_MANY))
+def _reduction(survey: Survey) -> float:
+    return max(1.0, max(survey.clip.shape[1:3]) / min(_SIDE, max(survey.small.shape[1:3])))
 
 
-def _blur_of(source: FrameSource) -> float:
+def _blur_of(survey: Survey) -> float:
     """Blur of the reduced frames, in their pixels."""
-    return max(_LEAST_BLUR, _BLUR / _reduction(source))
+    return max(_LEAST_BLUR, _BLUR / _reduction(survey))
 
 
 def _hardly_change(frames: FloatArray) -> tuple[bool, bool]:

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
 from ...core.decision import Decision
-from ...io.source import FrameSource, Window
+from ...io.source import Window
 from ...registration.camera.global_shift import global_shifts
+from ..survey import Survey
 
 # Longest side of the reduced frames, pixels, and their blur.
 _SIDE, _BLUR = 64, 1.5
@@ -43,28 +44,30 @@ class WhiteBalance:
         return values / self.ratios[number]
 
 
-def steady_white_balance(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
+def steady_white_balance(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
     """Take a white balance that changes out of the frames; others, and grey frames, are returned as they are."""
-    if len(source.shape) != 4 or len(source) < 3:
-        return source, ()
-    ratios = _ratios(_reduced(source))
+    if survey.small.ndim != 4 or len(survey.small) < 3:
+        return survey, ()
+    ratios = _ratios(_reduced(survey.small))
     changes = ratios.std(axis=0)
     if changes.max() < _LEAST_CHANGE:
-        return source, ()
-    found = WhiteBalance(dict(zip(source.numbers, np.exp(ratios).astype(np.float32), strict=True)))
+        return survey, ()
+    factors = np.exp(ratios).astype(np.float32)
+    found = WhiteBalance(dict(zip(survey.clip.numbers, factors, strict=True)))
     name = ("red", "green", "blue")[int(changes.argmax())]
     low, high = np.exp(ratios[:, changes.argmax()].min()), np.exp(ratios[:, changes.argmax()].max())
     reason = f"{name} varies from {low:.2f} to {high:.2f} of its mean against the other colours"
-    return source.adjusted(found.steady), (Decision("white balance", "colours of each frame evened out", reason),)
+    decision = Decision("white balance", "colours of each frame evened out", reason)
+    return survey.adjusted(found.steady, survey.small / factors[:, None, None]), (decision,)
 
 
-def _reduced(source: FrameSource) -> FloatArray:
-    """Reduced, blurred frames, (T, h, w, 3)."""
-    height, width = source.shape[1:3]
+def _reduced(frames: FloatArray) -> FloatArray:
+    """Reduce and blur frames, (T, H, W, 3) to (T, h, w, 3)."""
+    height, width = frames.shape[1:3]
     factor = max(1.0, max(height, width) / _SIDE)
     size = max(1, round(width / factor)), max(1, round(height / factor))
-    stack = np.empty((len(source), size[1], size[0], 3), np.float32)
-    for small, frame in zip(stack, source, strict=True):
+    stack = np.empty((len(frames), size[1], size[0], 3), np.float32)
+    for small, frame in zip(stack, frames, strict=True):
         small[...] = cv2.GaussianBlur(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), (0, 0), _BLUR)
     return stack
 

@@ -1,0 +1,102 @@
+"""The survey of a clip: one pass over its frames, from which all questions about the clip are answered.
+
+A survey keeps every frame in a reduced size, and some frames, spread over the clip, as they are in the file.  What is
+looked for, such as bars beside the picture or a lamp that flickers, is a function from a survey to one in which the
+frames are corrected.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..core.arrays import FloatArray
+from ..io.pixels import PixelArray
+from ..io.source import FrameSource, Window
+from ..runtime.scratch import drop_pages, iter_frames, new_stack
+
+# Most and fewest frames that are kept whole; those beyond the fewest take at most so many bytes.
+_MOST, _FEWEST, _WHOLE_BYTES = 48, 9, 4e8
+# Longest and shortest side of reduced frames, pixels, and about how many numbers all of them are.
+_SIDE, _SHORTEST, _NUMBERS = 192, 16, 8e6
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """All frames of a clip in small, and some of them whole; iterating yields the whole ones, corrected."""
+
+    clip: FrameSource  # corrected by what has been found
+    numbers: tuple[int, ...]  # of the whole frames, in the file
+    pixels: tuple[PixelArray, ...]  # (H, W) or (H, W, 3) each: the whole frames before they are adjusted
+    small: FloatArray  # (T, h, w) or (T, h, w, 3): all frames, corrected
+
+    def __iter__(self) -> Iterator[FloatArray]:
+        return map(self.clip.intensities, self.numbers, iter_frames(self.pixels))
+
+    def part(self, count: int) -> Survey:
+        """Keep at most that many of the whole frames, spread evenly."""
+        chosen = _spread(len(self.numbers), count)
+        return dataclasses.replace(
+            self,
+            numbers=tuple(self.numbers[index] for index in chosen),
+            pixels=tuple(self.pixels[index] for index in chosen),
+        )
+
+    def adjusted(
+        self, adjust: Callable[[int, FloatArray, Window], FloatArray], small: FloatArray | None = None
+    ) -> Survey:
+        """Correct the frames; ``small`` are the corrected reduced ones, if what is corrected shows in them."""
+        return dataclasses.replace(self, clip=self.clip.adjusted(adjust), small=self.small if small is None else small)
+
+
+def take_survey(clip: FrameSource, scratch: Path | None = None) -> Survey:
+    """Read the frames of a clip once; whole ones are kept in memory or, if there is a folder, in a scratch file."""
+    small = np.empty(_small_shape(clip.shape), np.float32)
+    size, places, stack = (small.shape[2], small.shape[1]), list[int](), np.empty(0)
+    for index, (number, pixels) in enumerate(zip(clip.numbers, clip.native(), strict=True)):
+        values = clip.intensities(number, pixels)
+        small[index] = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+        if not places:
+            dtype = pixels.dtype if pixels.dtype.kind == "u" else np.dtype(np.float32)
+            places = _spread(len(clip), _whole_frames(clip.shape, dtype.itemsize))
+            stack = new_stack((len(places), *clip.shape[1:]), scratch, dtype.newbyteorder("="))
+        if index in places:
+            # Floating point is in [0, 1] in the file as well.
+            stack[places.index(index)] = pixels
+            drop_pages(stack)
+    return Survey(clip, tuple(clip.numbers[place] for place in places), tuple(stack), small)
+
+
+def survey_memory(shape: tuple[int, ...], in_scratch: bool) -> float:
+    """Bytes that a survey takes of frames of shape (T, H, W) or (T, H, W, 3): what is whole, and what is small."""
+    whole = float(np.prod(shape[1:])) * 4 * (2 if in_scratch else _whole_frames(shape, 4))
+    # One more while they are corrected, and what the light is measured from.
+    return whole + 4.0 * 3 * float(np.prod(_small_shape(shape)))
+
+
+def survey_bytes(shape: tuple[int, ...]) -> float:
+    """Bytes of the scratch file of a survey."""
+    return float(np.prod(shape[1:])) * 4 * _whole_frames(shape, 4)
+
+
+def _whole_frames(shape: tuple[int, ...], itemsize: int) -> int:
+    most = int(_WHOLE_BYTES / (itemsize * np.prod(shape[1:], dtype=float)))
+    return min(shape[0], max(_FEWEST, min(_MOST, most)))
+
+
+def _small_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """(T, h, w) or (T, h, w, 3) of the reduced frames: smaller ones where there are many."""
+    longest = max(shape[1:3])
+    side = min(float(_SIDE), (_NUMBERS * longest**2 / np.prod(shape, dtype=float)) ** 0.5)
+    factor = max(1.0, longest / side)
+    return (shape[0], *(max(_SHORTEST, round(length / factor)) for length in shape[1:3]), *shape[3:])
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """Places of at most ``most`` of ``count`` things, spread evenly."""
+    return [int(place) for place in np.linspace(0, count - 1, min(most, count)).round()]
