@@ -172,7 +172,9 @@ def _described(F: FloatArray, likeness: float) -> Alignment:
 
 def _equally_sharp(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Bring both images to a range of 1, and blur them until both have the same share of fine detail."""
-    a, b = (cv2.GaussianBlur(image / np.float32(max(float(np.ptp(image)), 1e-6)), (0, 0), _LEAST_BLUR) for image in (a, b))
+    a, b = (
+        cv2.GaussianBlur(image / np.float32(max(float(np.ptp(image)), 1e-6)), (0, 0), _LEAST_BLUR) for image in (a, b)
+    )
     sharper, other = (a, b) if _fineness(a) > _fineness(b) else (b, a)
     wanted = _fineness(other)
     tried = [sharper, *(cv2.GaussianBlur(sharper, (0, 0), blur) for blur in _BLURS[1:])]
