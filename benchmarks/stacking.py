@@ -198,7 +198,7 @@ def derotation(radius: float = 170.0, count: int = 40) -> Iterator[str]:
     within = np.hypot(x, y) < 0.8 * radius
     flows = air(count, side, side, 5)
     flows -= flows.mean(axis=0)
-    for minutes in (2.5, 10.0):
+    for minutes in (2.5, 10.0, 20.0):
         rng, times = np.random.default_rng(6), np.linspace(-30 * minutes, 30 * minutes, count)
         discs = np.clip([jupiter_disc(radius, side, time, surface) for time in times], 0, 1)
         hazy = np.concatenate(
