@@ -36,7 +36,6 @@ from ..core.errors import DataError
 from ..registration.camera.global_shift import correlation, measure_shift, prepare_shift_reference
 from ..registration.flow_algebra import compose_flows
 from ..registration.warp import inside, warp
-from ..runtime.runtime import DEFAULT, Runtime
 from ..steady.camera import camera_flow, fit_camera
 
 Matrix = NDArray[np.float64]
@@ -93,7 +92,7 @@ class Alignment:
     likeness: float
 
 
-def align_to(image: FloatArray, reference: FloatArray, runtime: Runtime = DEFAULT) -> Alignment:
+def align_to(image: FloatArray, reference: FloatArray) -> Alignment:
     """Find where an image of the same scene lies against a reference.
 
     ``image``, ``reference`` (H, W) or (H, W, 3) of one size; DataError where they are not alike.
@@ -123,13 +122,14 @@ def _sharpened(image: FloatArray) -> FloatArray:
 
 
 def _lacking(r: FloatArray, q: FloatArray, F: FloatArray, local: float) -> FloatArray:
-    """Displacement d that an alignment lacks; ``r`` and ``q`` have a range of 1."""
+    """Return the displacement d that an alignment lacks; ``r`` and ``q`` have a range of 1."""
     moved, least = warp(q, F), np.float32(_FLAT**2)
 
     def mean(image: FloatArray) -> FloatArray:
         return cv2.GaussianBlur(image, (0, 0), local)
 
-    level, spread = mean(r), mean(r * r) - np.square(mean(r)) + least
+    level = mean(r)
+    spread = mean(r * r) - np.square(level) + least
 
     def unexplained(image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what brightness and contrast leave of an image, and its contrast."""
