@@ -61,11 +61,11 @@ class Clip:
             return self.source.read(number, number + 1)[0]
 
     def quality(self) -> np.ndarray:
-        """Sharpness of every frame."""
-        from turbrestore.footage.frame_selection import frame_quality
+        """Quality, noise and brightness of every frame, (T, 3)."""
+        from turbrestore.stacking.quality import measure_quality
 
         with self._reading:
-            return frame_quality(self.source)
+            return measure_quality(self.source)
 
 
 def open_clip(path: Path, name: Path) -> Clip:

@@ -114,7 +114,8 @@ def restore_order(order: Order, job: Job[object], earlier: Restored | None = Non
 def preview_order(order: Order, shape: tuple[int, ...]) -> Order:
     """Reduce an order to a small part of the region and to few frames, so that it takes seconds.
 
-    Where an object is followed, which may be anywhere in the region, the region stays as it is.
+    Where an object is followed or turned, which may be anywhere in the region, the region stays as it is.  The geometry
+    is the clip's own, because a reference has the size of the whole.
 
     Parameters
     ----------
@@ -135,7 +136,8 @@ def preview_order(order: Order, shape: tuple[int, ...]) -> Order:
     first, every = start or 0, step or 1
     last = min(shape[0] if stop is None else stop, first + PREVIEW_FRAMES * every)
     frames = f"{first}:{last}" if step is None else f"{first}:{last}:{step}"
-    if order.selection.crop_to_object:
+    order = dataclasses.replace(order, params=dataclasses.replace(order.params, reference=None))
+    if order.selection.crop_to_object or order.selection.derotate is not None:
         return dataclasses.replace(order, selection=dataclasses.replace(order.selection, frames=frames))
     x, y, width, height = order.selection.region() or (0, 0, shape[2], shape[1])
     w, h = min(width, PREVIEW_SIDE), min(height, PREVIEW_SIDE)

@@ -22,6 +22,7 @@ _TITLES = {
     "centroid": "Centroid",
     "filtered": "Filtered",
     "deblurred": "Deblurred",
+    "finer": "Finer",
     "result": "Result",
 }
 
@@ -75,7 +76,11 @@ class CompareView:
         whole = restored is self._tab.restored
         what = f"{width}×{height} pixels from {found.frame_count} frames in {sum(found.seconds.values()):.1f} s"
         note = what if whole else f"Preview of a part: {what}"
-        await self.show(stages(found, restored.frame), note)
+        images = stages(found, restored.frame)
+        if found.finer is not None:
+            images["finer"] = found.finer
+            note += f"; the finer image, of {found.finer.shape[1]}×{found.finer.shape[0]}, is what is saved"
+        await self.show(images, note)
         self._shown = restored
 
     async def show_part(self, restored: Restored, part: tuple[slice, slice], image: FloatArray, note: str) -> None:

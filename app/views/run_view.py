@@ -16,6 +16,7 @@ from ..tab import Tab
 from .astronomy_view import AstronomyView
 from .elements import Notices
 from .progress_view import ProgressView
+from .stacking_view import StackingView
 
 if TYPE_CHECKING:
     from turbrestore.deconvolution.deconvolve import DeconvolutionParams
@@ -39,7 +40,7 @@ class RunView:
 
     def __init__(self, tab: Tab, notices: Notices, on_region: Callable[[Roi | None], None]) -> None:
         self._tab, self._notices, self._on_region = tab, notices, on_region
-        self._astronomy = AstronomyView(tab)
+        self._astronomy, self._stacking = AstronomyView(tab), StackingView(tab)
         self._progress = ProgressView(tab, "restore")
         self.follow = self._progress.follow
 
@@ -70,6 +71,7 @@ class RunView:
                     'unelevated no-caps padding="4px 12px" aria-label="Preset"'
                 )
             self._astronomy.build()
+            self._stacking.build()
             with ui.element("div").classes("fields apart"):
                 preview = ui.button("Preview", on_click=lambda: self._start(self._tab.preview)).props("outline")
                 run = ui.button("Run", on_click=lambda: self._start(self._tab.run)).classes("grow").props("unelevated")
@@ -85,7 +87,8 @@ class RunView:
         self._first.value, self._last.value = 0, len(clip.source) - 1
         self.set_region(None)
         self._typed()
-        await self._astronomy.opened()
+        self._astronomy.opened()
+        await self._stacking.opened()
 
     def show_method(self, params: DeconvolutionParams | None) -> None:
         """Say that the next run removes the blur that was chosen, where one was."""
@@ -105,6 +108,7 @@ class RunView:
         self.set_region(order.selection.region())
         self._preset.value = order.preset
         self._astronomy.take_over(order)
+        self._stacking.take_over(order.params)
 
     def order(self) -> Order:
         """Return what the fields say; the deconvolution is that of the last step.
@@ -112,7 +116,7 @@ class RunView:
         Raises
         ------
         ConfigurationError
-            The region is not all given, or a file of dark or flat frames lies outside the folders of the app.
+            The region is not all given, a file lies outside the folders of the app, or a planet is not known.
         """
         clip = self._tab.clip
         assert clip is not None
@@ -125,7 +129,7 @@ class RunView:
             roi=None if roi is None or roi == (0, 0, *clip.size) else ",".join(map(str, roi)),
         )
         preset = self._preset.value
-        params = self._tab.chosen(self._astronomy.share(PRESETS[preset]))
+        params = self._tab.chosen(self._stacking.choose(PRESETS[preset]))
         return Order(clip.path, self._astronomy.select(selection), params, preset)
 
     def _region(self) -> Roi | None:
@@ -150,7 +154,7 @@ class RunView:
     def _ranged(self) -> None:
         first, last = self._range()
         self._count.text = f"{max(last - first, 0)} frames"
-        self._astronomy.show_range(first, last)
+        self._stacking.show_range(first, last)
 
     def _start(self, begin: Callable[[Order], Job[object]]) -> None:
         with self._notices.catching():

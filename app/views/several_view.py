@@ -39,7 +39,7 @@ class SeveralView:
         """Make the elements."""
         with ui.element("section") as self.place:
             ui.html("Several clips", tag="h2", sanitize=False)
-            ui.label("Whole clips, restored with the preset, share of frames and blur chosen above.").classes("note")
+            ui.label("Whole clips, restored with the preset, the stacking and the blur chosen above.").classes("note")
             self._list = ui.element("div").classes("files choice")
             self._list.props('role=group aria-label="Clips to restore"')
             with ui.element("div").classes("fields"):

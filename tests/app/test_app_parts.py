@@ -185,6 +185,9 @@ class TestOrders:
         assert (selection.frames, selection.roi) == ("0:9", "0,0,64,100")
         order = Order(Path("a.ser"), Selection(crop_to_object=True))
         assert preview_order(order, (99, 100, 640)).selection == Selection(frames="0:24", crop_to_object=True)
+        order = Order(Path("a.ser"), Selection(derotate="mars"), RestoreParams(reference="b.png", scale=2))
+        part = preview_order(order, (99, 100, 640))
+        assert (part.selection.roi, part.params) == (None, RestoreParams(scale=2))
 
 
 class TestTuning:
@@ -388,7 +391,7 @@ def test_a_clip_has_the_numbers_of_its_file(tmp_path):
     clip = open_clip(tmp_path / "clip.mkv", Path("clip.mkv"))
     assert (clip.size, len(clip.source), clip.facts["usable_frames"]) == ((64, 64), 6, 5)
     assert clip.remarks == ("1 duplicated: frame 3 left out",)
-    assert clip.quality().shape == (6,)
+    assert clip.quality().shape == (6, 3)
     assert np.abs(clip.frame(5) - frames[5]).max() < 1 / 255
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.io.images import write_image
+from turbrestore.io.images import read_image, write_image
 from turbrestore_cli.__main__ import main
 
 from .conftest import EVIL, LONG, SAMPLE, draw, drop, press, push
@@ -78,7 +78,7 @@ def test_frames_are_chosen_by_the_strip_and_the_line(open_tab):
     page = open_tab()
     page.locator(".strip button").nth(1).click()
     page.locator(".view .value").get_by_text("9", exact=True).wait_for()
-    page.get_by_text("Astronomy").click()
+    page.get_by_text("Stacking", exact=True).click()
     page.get_by_label("last", exact=True).fill("39")
     page.get_by_text("40 of 40 frames are kept; drag the line").wait_for()
     graph = page.locator("svg.quality")
@@ -94,6 +94,43 @@ def test_frames_are_chosen_by_the_strip_and_the_line(open_tab):
     assert len(heights) == 40 and heights == sorted(heights, reverse=True)
     level = graph.locator(".level").bounding_box()
     assert level["x"] - box["x"] == pytest.approx(0.3 * box["width"], abs=2)
+    # What a share costs and gains stands beside it, and a press keeps it.
+    shares = page.get_by_label("Shares to keep")
+    assert shares.inner_text().split()[4:9] == ["10", "%", "4", "3.16×", shares.inner_text().split()[8]]
+    shares.get_by_role("button", name="25 %", exact=True).click()
+    page.get_by_text("10 of 40 frames are kept").wait_for()
+    suggested = shares.get_by_role("button", name=re.compile("suggested"))
+    suggested.click()
+    page.locator(".value").get_by_text(suggested.inner_text(), exact=True).wait_for()
+
+
+def test_a_clip_is_placed_on_another_result_and_made_finer(open_tab, app):
+    page = open_tab()
+    page.get_by_label("last", exact=True).fill("11")
+    page.get_by_text("Stacking", exact=True).click()
+    page.get_by_label("Reference for the geometry").fill("../other.tif")
+    press(page, "Preview")
+    page.get_by_role("alert").get_by_text("lies outside the folder").wait_for()
+    reference = app.folder / "placed.png"
+    write_image(reference, read_image(SAMPLE.with_name("chart_truth.png")).image, 8)
+    try:
+        page.get_by_label("Reference for the geometry").fill("placed.png")
+        page.get_by_label("Grid of the result").click()
+        page.get_by_role("option", name="1.5 times as fine").click()
+        page.get_by_text("Astronomy").click()
+        page.get_by_label("Turn a planet back").fill("pluto")
+        press(page, "Run")
+        page.get_by_role("alert").get_by_text("expected jupiter, saturn, mars or a period").wait_for()
+        page.get_by_label("Turn a planet back").fill("")
+        press(page, "Run")
+        page.get_by_text("the finer image, of 384×288, is what is saved").wait_for(timeout=LONG)
+        assert "Finer" in page.locator("#right option").all_inner_texts()
+        page.get_by_text("decisions").click()
+        assert page.locator("dt").get_by_text("reference: ").is_visible()
+        command = page.get_by_label("Command", exact=True).inner_text()
+        assert shlex.split(command)[4:] == ["--frames=0:12", "--reference=placed.png", "--scale=1.5"]
+    finally:
+        reference.unlink()
 
 
 def test_what_astronomers_choose_is_in_the_command(open_tab, app):

@@ -19,8 +19,8 @@ from distributed import CancelledError, KilledWorker, LocalCluster
 
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, TurbrestoreError
-from turbrestore.io.images import write_image
-from turbrestore.io.video import write_video
+from turbrestore.io.images import read_image, write_image
+from turbrestore.io.video import open_frames, write_video
 from turbrestore.report.batch_page import ClipRow, render_batch
 from turbrestore.runtime.runtime import Runtime
 from turbrestore_cli import batch as command
@@ -209,6 +209,7 @@ class TestBatch:
         (tmp_path / "0.mkv").write_bytes((clips / "0.mkv").read_bytes())
         for name, level in (("dark", 0.02), ("flat", 0.5), ("mask", np.arange(64) < 6)):
             write_image(tmp_path / f"{name}.png", np.full((64, 64), level, np.float32), 8)
+        write_image(tmp_path / "still.png", open_frames(clips / "0.mkv").read().mean(axis=0), 8)
         real = command.work
 
         def elsewhere(order):
@@ -217,12 +218,15 @@ class TestBatch:
 
         monkeypatch.setattr(command, "work", elsewhere)
         words = ["--dark", "dark.png", "--flat", "flat.png", "--static-mask", "mask.png"]
+        words += ["--reference", "still.png", "--scale", "1.5"]
         for more, count in (([], "1 of 1: "), (["--resume"], "")):
             monkeypatch.chdir(tmp_path)
             code, _, err = run("0.mkv", "--out", tmp_path / "out", *words, *more)
             assert code == 0 and count in err, err
         assert "1 of 1: " not in err
-        assert tomllib.loads((tmp_path / "out" / "0.png.toml").read_text())["dark"] == str(tmp_path / "dark.png")
+        settings = tomllib.loads((tmp_path / "out" / "0.png.toml").read_text())
+        assert (settings["dark"], settings["reference"]) == (str(tmp_path / "dark.png"), str(tmp_path / "still.png"))
+        assert read_image(tmp_path / "out" / "0.png").image.shape == (96, 96)
 
     def test_reasons(self, monkeypatch, clips):
         monkeypatch.setattr(command, "restore_clip", lambda order: (_ for _ in ()).throw(MemoryError))

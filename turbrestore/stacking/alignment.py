@@ -2,20 +2,23 @@
 
 Symbols
 -------
-r, q : reference and image; W : smooth flow, pixels
+r, q : reference and image
 A : similarity from the reference to the image, ``A x = c (cos φ, −sin φ; sin φ, cos φ) x + s``
-F : the whole alignment, ``id + F = A ∘ (id + W)``, so that ``q ∘ (id + F) ≈ r``
+F : the whole alignment, ``q ∘ (id + F) ≈ r``; d : what it still lacks, pixels
+α, β : contrast and brightness of q relative to r, in a Gaussian window about every pixel
 
 Results of other clips have another brightness and contrast, perhaps another sign of it: bands of Jupiter in methane,
-leaves in the infrared.  So neither image is compared by its intensities.  Both are reduced to the same sharpness, and
-to their deviation from a local mean in units of the local spread; where that does not correlate, to its negative, and
-to the length of its gradient, which has no sign.
+leaves in the infrared.  So neither image is compared by its intensities.
 
 A maximises the enhanced correlation coefficient (Evangelidis and Psarakis 2008) on three levels of a pyramid, from the
-shift that phase correlation finds.  W is the dense flow after that, averaged in Gaussian windows with the energy of the
-gradient as weight, because what remains between two results is the mean displacement by air, which is smooth; where a
-window has little gradient, the average of a wider one stands in.  W is measured twice, the second time from the image
-that the first has moved.
+shift that phase correlation finds.  There both images are reduced to their deviation from a local mean in units of the
+local spread; where that does not correlate, to its negative, and to the length of its gradient, which has no sign.
+
+F starts from A.  With ``q' = q ∘ (id + F)``, d minimises ``Σ ρ (q' + ∇q' · d − α r − β)²``, where every pixel has the α
+and β that fit its own window best (as in Lucas and Kanade 1981, whose windows share one), and ρ is the squared
+correlation there over the spread of q'.  The windows of α and β are hardly wider than an edge, so that edges side by
+side may change their contrast by different factors.  Those of d are wide, because what remains between two results is
+the mean displacement by air, which is smooth; where one has little gradient, a wider one stands in.
 """
 
 from __future__ import annotations
@@ -31,9 +34,8 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError
 from ..registration.camera.global_shift import correlation, measure_shift, prepare_shift_reference
-from ..registration.flow import FlowParams, estimate_flow
+from ..registration.flow_algebra import compose_flows
 from ..registration.warp import inside, warp
-from ..runtime.runtime import DEFAULT, Runtime
 from ..steady.camera import camera_flow, fit_camera
 
 Matrix = NDArray[np.float64]
@@ -43,20 +45,23 @@ _Features = tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], Flo
 # Longest sides of the levels on which the similarity is found, pixels.
 _LEVELS = (64, 160, 640)
 # Least sharpness that images are compared at, and the window of their local mean and spread, pixels.
-_LEAST_BLUR, _WINDOW, _FLOOR = 1.0, 8.0, 0.02
+_LEAST_BLUR, _WINDOW, _FLOOR = 0.5, 8.0, 0.02
 # Blurs that are tried on the sharper image, pixels.
 _BLURS = np.arange(0.0, 3.01, 0.25)
 # Correlation below which features say nothing, and above which no other features are tried.
 _ALIKE, _CLEARLY = 0.2, 0.6
 # Iterations of the correlation and the change that ends them.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)
-# Standard deviations of the windows in which the flow is averaged, pixels, and the share of the usual weight below
-# which a window holds little.
-_WINDOWS, _LITTLE = (32.0, 16.0, 8.0, 4.0), 0.1
-# Distance from its neighbourhood beyond which a displacement counts little, pixels.
-_FAR = 1.0
-# Largest displacement that remains after the similarity, pixels, and how often the flow is measured.
-_LARGEST, _PASSES = 4.0, 3
+# Deviation of the windows of contrast and brightness, pixels: at first wide, because A is only nearly right; and the
+# largest displacement of a step.
+_LOCAL, _LARGEST = (4.0, 4.0, 2.0, 2.0, 1.5, 1.5, 1.5, 1.5), 1.0
+# Reduction of the image for the windows of d, their deviations, pixels, and the share of the usual weight below which
+# one holds little.
+_REDUCED, _WIDE, _LITTLE = 4, (32.0, 12.0), 0.03
+# How much detail is raised, and below which size, pixels.
+_RAISED, _FINE = np.float32(4), 1.2
+# Spread, as a share of the range of an image, below which a window is flat.
+_FLAT = 0.003
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +92,7 @@ class Alignment:
     likeness: float
 
 
-def align_to(image: FloatArray, reference: FloatArray, runtime: Runtime = DEFAULT) -> Alignment:
+def align_to(image: FloatArray, reference: FloatArray) -> Alignment:
     """Find where an image of the same scene lies against a reference.
 
     ``image``, ``reference`` (H, W) or (H, W, 3) of one size; DataError where they are not alike.
@@ -104,35 +109,49 @@ def align_to(image: FloatArray, reference: FloatArray, runtime: Runtime = DEFAUL
             break
     if best < _ALIKE:
         raise DataError(f"image: expected the scene of the reference, found a likeness of {max(best, 0):.2f} with it")
+    F, r, q = _joined(A, a.shape), _sharpened(a), _sharpened(b)
+    for local in _LOCAL:
+        F = compose_flows(F, np.clip(_lacking(r, q, F, local), -_LARGEST, _LARGEST))
     first, second = (feature(image) for feature, image in zip(features, (a, b), strict=True))
-    W, weight = np.zeros((*a.shape, 2), np.float32), _energy(a)
-    for _ in range(_PASSES):
-        F = _joined(A, W)
-        there = warp(second, F)
-        rest = estimate_flow(_unit(first), _unit(there)[None], FlowParams(global_shift=False), runtime)[0]
-        # Where the contrast differs in kind, edges of the two do not lie in one place.
-        trusted = weight * np.square(_local_correlation(first, there)) * inside(F)
-        W += _smoothed(np.clip(rest, -_LARGEST, _LARGEST), trusted)
-    F = _joined(A, W)
     return _described(F, correlation(first, warp(second, F)))
 
 
-def _local_correlation(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Correlation in a window about every pixel; negative ones count as none."""
-    product, *squares = (cv2.GaussianBlur(one, (0, 0), _WINDOW) for one in (a * b, a * a, b * b))
-    return np.clip(product / np.sqrt(squares[0] * squares[1] + np.float32(1e-12)), 0, 1)
+def _sharpened(image: FloatArray) -> FloatArray:
+    """Raise fine detail, so that edges side by side blend less."""
+    return image + _RAISED * (image - cv2.GaussianBlur(image, (0, 0), _FINE))
 
 
-def _smoothed(flow: FloatArray, weight: FloatArray) -> FloatArray:
-    """Average a flow in windows of one size after the other; where a window holds little, that of the one before."""
-    smooth, usual = np.zeros_like(flow), np.float32(_LITTLE * weight.mean() + 1e-30)
-    for width in _WINDOWS:
-        # What lies far from its neighbourhood has followed another period of a pattern.
-        trusted = weight / (1 + np.square(flow - smooth).sum(axis=-1) / np.float32(_FAR**2))
-        held = cv2.GaussianBlur(trusted, (0, 0), width)[..., None]
-        total = cv2.GaussianBlur(flow * trusted[..., None], (0, 0), width)
-        smooth = (total + usual * smooth) / (held + usual)
-    return smooth
+def _lacking(r: FloatArray, q: FloatArray, F: FloatArray, local: float) -> FloatArray:
+    """Return the displacement d that an alignment lacks; ``r`` and ``q`` have a range of 1."""
+    moved, least = warp(q, F), np.float32(_FLAT**2)
+
+    def mean(image: FloatArray) -> FloatArray:
+        return cv2.GaussianBlur(image, (0, 0), local)
+
+    level = mean(r)
+    spread = mean(r * r) - np.square(level) + least
+
+    def unexplained(image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what brightness and contrast leave of an image, and its contrast."""
+        about = mean(image)
+        contrast = (mean(r * image) - level * about) / spread
+        return image - about - contrast * (r - level), contrast
+
+    rest, contrast = unexplained(moved)
+    own = mean(moved * moved) - np.square(mean(moved)) + least
+    along, across = (unexplained(cv2.Sobel(moved, cv2.CV_32F, *axis, scale=1 / 8))[0] for axis in ((1, 0), (0, 1)))
+    # The squared correlation, over the spread of q'.
+    weight = np.square(contrast) * spread / np.square(own) * inside(F)
+    products = along * along, along * across, across * across, along * rest, across * rest
+    size = tuple(max(length // _REDUCED, 1) for length in r.shape[::-1])
+    small = [cv2.resize(weight * product, size, interpolation=cv2.INTER_AREA) for product in products]
+    d = np.zeros((*size[::-1], 2), np.float32)
+    usual = np.float32(_LITTLE * (small[0] + small[2]).mean() / 2 + 1e-30)
+    for width in _WIDE:
+        xx, xy, yy, x, y = (cv2.GaussianBlur(one, (0, 0), width / _REDUCED) for one in small)
+        xx, yy, x, y = xx + usual, yy + usual, x - usual * d[..., 0], y - usual * d[..., 1]
+        d = np.stack([xy * y - yy * x, xy * x - xx * y], -1) / (xx * yy - xy * xy)[..., None]
+    return cv2.resize(d, r.shape[::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def _described(F: FloatArray, likeness: float) -> Alignment:
@@ -152,8 +171,10 @@ def _described(F: FloatArray, likeness: float) -> Alignment:
 
 
 def _equally_sharp(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Blur both images a little, and the sharper one until both have the same share of fine detail."""
-    a, b = (cv2.GaussianBlur(image, (0, 0), _LEAST_BLUR) for image in (a, b))
+    """Bring both images to a range of 1, and blur them until both have the same share of fine detail."""
+    a, b = (
+        cv2.GaussianBlur(image / np.float32(max(float(np.ptp(image)), 1e-6)), (0, 0), _LEAST_BLUR) for image in (a, b)
+    )
     sharper, other = (a, b) if _fineness(a) > _fineness(b) else (b, a)
     wanted = _fineness(other)
     tried = [sharper, *(cv2.GaussianBlur(sharper, (0, 0), blur) for blur in _BLURS[1:])]
@@ -179,10 +200,6 @@ def _edges(image: FloatArray) -> FloatArray:
     levels = _levels(image)
     length = cv2.magnitude(*(cv2.Sobel(levels, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1))))
     return _levels(cv2.GaussianBlur(length, (0, 0), 1.0))
-
-
-def _energy(feature: FloatArray) -> FloatArray:
-    return sum(np.square(cv2.Sobel(feature, cv2.CV_32F, *axis)) for axis in ((1, 0), (0, 1)))
 
 
 def _unit(feature: FloatArray) -> FloatArray:
@@ -211,7 +228,7 @@ def _similarity(a: FloatArray, b: FloatArray, features: _Features) -> tuple[floa
             continue
         whole = enlarged @ np.vstack([affine.astype(np.float64), (0, 0, 1)]) @ np.linalg.inv(enlarged)
         warped = _closest_similarity(whole, a.shape)
-    alike = correlation(first(a), warp(second(b), _joined(warped, np.zeros((*a.shape, 2), np.float32))))
+    alike = correlation(first(a), warp(second(b), _joined(warped, a.shape)))
     return alike, warped
 
 
@@ -238,10 +255,9 @@ def _closest_similarity(affine: Matrix, shape: tuple[int, ...]) -> Matrix:
     return np.column_stack([linear, affine[:2, :2] @ centre + affine[:2, 2] - linear @ centre])
 
 
-def _joined(A: Matrix, W: FloatArray) -> FloatArray:
-    """Flow F of ``A ∘ (id + W)``."""
-    y, x = np.mgrid[: W.shape[0], : W.shape[1]].astype(np.float64)
-    u, v = x + W[..., 0], y + W[..., 1]
-    return np.stack([A[0, 0] * u + A[0, 1] * v + A[0, 2] - x, A[1, 0] * u + A[1, 1] * v + A[1, 2] - y], -1).astype(
+def _joined(A: Matrix, shape: tuple[int, ...]) -> FloatArray:
+    """Flow of a similarity."""
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+    return np.stack([A[0, 0] * x + A[0, 1] * y + A[0, 2] - x, A[1, 0] * x + A[1, 1] * y + A[1, 2] - y], -1).astype(
         np.float32
     )

@@ -55,7 +55,7 @@ def onto_reference(
             f"reference: expected an image of {width}×{height} pixels as the frames have, found "
             f"{image.shape[1]}×{image.shape[0]}; turbrestore align takes results of any size"
         )
-    found = align_to(centroid.image, image, runtime)
+    found = align_to(centroid.image, image)
     flows = new_stack(centroid.flows.shape, runtime.scratch)
     for _ in fill_frames(flows, (compose_flows(flow, found.flow) for flow in iter_frames(centroid.flows))):
         pass

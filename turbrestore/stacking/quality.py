@@ -78,7 +78,17 @@ class QualityList:
 
 def quality_list(frames: Iterable[FloatArray]) -> QualityList:
     """Sort the frames of a clip, which are taken one at a time, by quality."""
-    raw, noise, level = np.array([_facts(luminance(frame)) for frame in frames]).T
+    return sort_by_quality(measure_quality(frames))
+
+
+def measure_quality(frames: Iterable[FloatArray]) -> NDArray[np.float64]:
+    """Quality, noise and mean brightness of every frame, (T, 3)."""
+    return np.array([_facts(luminance(frame)) for frame in frames])
+
+
+def sort_by_quality(measured: NDArray[np.float64]) -> QualityList:
+    """Sort frames that were measured."""
+    raw, noise, level = measured.T
     quality = np.maximum(raw - _noise_energy() * (noise / level) ** 2, 0.0)
     z, f = float(np.median(noise / level)), _ERROR / float(np.median(level))
     sizes = np.arange(1, len(quality) + 1)
