@@ -2,11 +2,15 @@
 
 import blur_clips
 import clips
+import cv2
 import numpy as np
+import oracles
+import pytest
 import quality
 from provenance import LINE, revision, with_origin
 
 import turbrestore
+from turbrestore.registration.warp import warp
 
 
 class TestDrawnClips:
@@ -42,3 +46,14 @@ def test_a_table_says_what_it_is_of_once():
     found = LINE.search(once)
     assert found["version"] == turbrestore.__version__ and found["revision"] == revision()
     assert LINE.sub("", once) == "# Title\n\nText.\n"
+
+
+def test_oracles_know_the_motion_and_the_blur():
+    case = oracles.Case(count=6, displacement=1.5, blur=1.2, noise=0.0)
+    frames, flows, truth, _ = oracles.clip("coins", case)
+    inside = np.s_[12:-12, 12:-12]
+    blurred = cv2.GaussianBlur(truth, (0, 0), case.blur)
+    registered = np.mean([warp(frame, flow) for frame, flow in zip(frames, flows, strict=True)], axis=0)
+    assert np.abs(registered - blurred)[inside].mean() < 0.2 * np.abs(frames[0] - blurred)[inside].mean()
+    assert np.abs(flows.mean(axis=0))[inside].max() < 0.1
+    assert oracles.blur_of(blurred, truth).sigma == pytest.approx(case.blur, rel=0.15)
