@@ -22,13 +22,13 @@ READ = {"tesseract": "words", "rapidocr": "words_rapidocr"}
 LEADS = {f"psnr{SAME}": 0.05} | {f"{figure}{SAME}": 0.02 for figure in READ.values()}
 COLUMNS = (
     ("PSNR, dB", "psnr", 2),
-    ("deblurred", f"psnr{SAME}", 2),
+    ("PSNR, dB, deblurred", f"psnr{SAME}", 2),
     ("SSIM", "ssim", 3),
-    ("deblurred", f"ssim{SAME}", 3),
+    ("SSIM, deblurred", f"ssim{SAME}", 3),
     ("PSNR at the mean geometry, dB, deblurred", f"centroid{SAME}", 2),
     ("words by Tesseract", "words", 2),
-    ("deblurred", f"words{SAME}", 2),
-    ("by RapidOCR, deblurred", f"words_rapidocr{SAME}", 2),
+    ("words by Tesseract, deblurred", f"words{SAME}", 2),
+    ("words by RapidOCR, deblurred", f"words_rapidocr{SAME}", 2),
     ("processor time a clip, s", "seconds", 1),
     ("of deblurring", "deblurring", 1),
     ("peak memory, MB", "peak", 0),

@@ -9,7 +9,7 @@ own.  ``--clips`` takes names or patterns, ``--images`` writes the images side b
 broken or a stage is worse than the one before; without the data it says so and exits with 0.
 
 ``--before`` instead restores the clips with truth or text by an earlier revision too, and exits with 1 where the
-filtered image or the result has lost more than 0.05 dB; its document is ``benchmarks/results/quality_change.md``.
+filtered image or the result has lost more than 0.05 dB.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
 from pathlib import Path
 
@@ -83,7 +84,7 @@ def main() -> int:
             text, lost = compare_with(options.before, options.clips)
         else:
             results = measure_all(options.clips, options.images)
-            text = document(results)
+            text = document(results, options.clips)
     except TurbrestoreError as error:
         print(f"quality: {error}", file=sys.stderr)
         return error.exit_code
@@ -169,12 +170,13 @@ def panel(restored: dict[str, tuple[FloatArray, float]], clip: Clip) -> FloatArr
     return np.vstack(rows).astype(np.float32) / np.float32(255)
 
 
-def document(results: Results) -> str:
-    """Markdown of everything that was measured."""
+def document(results: Results, chosen: Sequence[str] = ()) -> str:
+    """Markdown of everything that was measured; ``chosen`` are the clips that were asked for, all if it is empty."""
     parts = [
         "# Quality\n",
         "What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --write benchmarks/results/quality.md` measures: "
         "clips restored by simple methods, by every stage of the pipeline and by its defaults.\n",
+        *([f"Only some of the clips were measured: `--clips {shlex.join(chosen)}`.\n"] if chosen else []),
         "".join(f"- **{method}**: {meaning}.\n" for method, meaning in METHODS.items()),
         f"Clips called `smooth_…` ({COUNT} frames of {SMOOTH_SIDE}×{SMOOTH_SIDE}: smooth random flow, Gaussian blur of "
         f"1 to 2 px, noise 0.01) and `screens_…` ({COUNT} frames of {SCREEN_SIDE}×{SCREEN_SIDE} through phase screens, "

@@ -1,13 +1,18 @@
-"""Clips that nothing was chosen on, tables that split by them, and the line that says what a table is of."""
+"""Clips that nothing was chosen on, tables that split by them, what a table is of, and texts with their figures."""
 
+import sys
+
+import all as everything
 import blur_clips
 import clips
 import cv2
 import numpy as np
 import oracles
+import provenance
 import pytest
 import quality
-from provenance import LINE, revision, with_origin
+import texts
+from provenance import LINE, outdated, revision, with_origin
 
 import turbrestore
 from turbrestore.registration.warp import warp
@@ -57,3 +62,62 @@ def test_oracles_know_the_motion_and_the_blur():
     assert np.abs(registered - blurred)[inside].mean() < 0.2 * np.abs(frames[0] - blurred)[inside].mean()
     assert np.abs(flows.mean(axis=0))[inside].max() < 0.1
     assert oracles.blur_of(blurred, truth).sigma == pytest.approx(case.blur, rel=0.15)
+
+
+class TestOutdated:
+    def test_a_table_before_the_last_release_is_outdated(self):
+        changelog = "# Changelog\n\n## 1.10.0, unreleased\nA.\n\n## 1.9.0, 2026-01-02\nB.\n\n## 1.8.0, 2025-01-02\n"
+        versions = {"older": "1.8.3", "as old": "1.9.0", "new": "1.10.0"}
+        assert outdated(versions, changelog) == ["older"]
+        assert outdated(versions, "# Changelog\n\n## 1.0.0, unreleased\n") == []
+
+    def test_no_table_is(self):
+        tables = sorted(everything.RESULTS.glob("*.md"))
+        found = {path.stem: LINE.search(path.read_text("utf-8")) for path in tables}
+        versions = {name: line["version"] if line else "0" for name, line in found.items()}
+        assert not outdated(versions, (everything.HERE.parent / "CHANGELOG.md").read_text("utf-8"))
+
+
+class TestAll:
+    def test_it_makes_every_table(self):
+        assert {path.stem for path in everything.RESULTS.glob("*.md")} <= set(everything.TABLES)
+        for table in everything.TABLES.values():
+            assert (everything.HERE / table.words.split()[0]).exists()
+
+    def test_a_table_of_this_revision_is_kept_and_another_is_made(self, tmp_path, monkeypatch, capsys):
+        script = tmp_path / "script.py"
+        script.write_text("import sys; open(sys.argv[-1], 'a').write('# T\\n\\nText.\\n')")
+        monkeypatch.setattr(everything, "RESULTS", tmp_path)
+        monkeypatch.setattr(everything, "revision", lambda: "abc1234")
+        monkeypatch.setattr(provenance, "revision", lambda: "abc1234")
+        table = everything.Table(str(script))
+        assert everything.make("t", table)
+        # The script itself did not say what its table is of.
+        assert LINE.search((tmp_path / "t.md").read_text())["revision"] == "abc1234"
+        assert everything.make("t", table) and (tmp_path / "t.md").read_text().count("Text.") == 1
+        monkeypatch.setattr(everything, "revision", lambda: "abc1234+")
+        assert everything.make("t", table) and (tmp_path / "t.md").read_text().count("Text.") == 2
+        script.write_text("raise SystemExit('no clip')")
+        assert not everything.make("t", table)
+        assert "NOT WRITTEN" in capsys.readouterr().out
+
+
+class TestTexts:
+    def test_figures_are_those_of_the_tables(self):
+        for path in texts.texts():
+            assert texts.filled(path.read_text("utf-8")) == path.read_text("utf-8"), f"{path}: run benchmarks/all.py"
+
+    def test_the_first_table_below_a_heading_is_read(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(texts, "RESULTS", tmp_path)
+        (tmp_path / "t.md").write_text(
+            "# T\n\n## A\n\nText.\n\n| x | y |\n|---|---|\n| 1 | 2 |\n\n| z |\n\n## B\n\nNone.\n"
+        )
+        assert texts.read_table("t", "A") == {"1": {"x": "1", "y": "2"}}
+        assert texts.read_table("t", "B") == {}
+
+
+def test_a_script_that_prints_its_table_stores_it_below_its_heading(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["script.py", "--write", str(tmp_path / "t.md"), "rest"])
+    assert provenance.publish_printed("# T", lambda: 3 * bool(sys.stdout.write("| 1 |\n"))) == 3
+    assert capsys.readouterr().out == "| 1 |\n"
+    assert LINE.sub("", (tmp_path / "t.md").read_text()) == "# T\n\n| 1 |\n"
