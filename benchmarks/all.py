@@ -21,6 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from methods.packages import NETWORKS, PackageError, make_environment
 from provenance import LINE, revision, with_origin
 from texts import fill_texts
 
@@ -82,6 +83,11 @@ def main() -> int:
         for name in chosen:
             print(f"{name}: {origin_of(RESULTS / f'{name}.md')}")
         return 0
+    try:
+        # Tables that read text want the second reader from the start.
+        make_environment(NETWORKS)
+    except PackageError as error:
+        print(f"without the network and the second reader: {error}")
     with ThreadPoolExecutor(2) as pool:
         done = [*pool.map(lambda name: make(name, TABLES[name]), [name for name in chosen if not chosen[name].timed])]
     done += [make(name, table) for name, table in chosen.items() if table.timed]

@@ -96,7 +96,7 @@ def main() -> int:
     try:
         chosen = [name for name in MEANINGS if any(fnmatch(name, pattern) for pattern in options.methods)]
         results, skipped = measure_all(options.clips, chosen, options.images)
-        networks = {NETWORK: PACKAGES[NETWORK].python} if NETWORK in results else {}
+        networks = {NETWORK: PACKAGES[NETWORK].python} if results.get(NETWORK) else {}
         videos = {} if options.without_videos else measure_videos(networks)
     except TurbrestoreError as error:
         print(f"peers: {error}", file=sys.stderr)
