@@ -168,10 +168,12 @@ def _cause(name: str, other: Figures, own: Figures, figure: str) -> str:
         return f"At the mean geometry of the clip {TURBRESTORE} is ahead, so the scene is bent as a whole, not blurred."
     if merged not in own or merged not in other:
         return ""
+    if other[merged] == other[figure]:
+        return f"{name} sharpens as it merges, so that its stages cannot be told apart."
     less = own[merged] - other[merged]
     size = f"{abs(less):.2f} {'dB' if figure.startswith('psnr') else 'of the words'}"
     if less > 0:
-        return f"Before deblurring {name} is {size} behind, so more of its blur is removed, or less too much."
+        return f"Before deblurring {name} is {size} behind, so its blur is removed better."
     return f"Before deblurring {name} is {size} ahead already, so it merges the frames better."
 
 
