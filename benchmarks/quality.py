@@ -184,7 +184,7 @@ def document(results: Results, chosen: Sequence[str] = ()) -> str:
         f"`TURBRESTORE_DATA` names; of real clips the first {MOST_FRAMES} frames and, where there is no text to read, "
         f"the middle {LARGEST_SIDE}×{LARGEST_SIDE} pixels are used.  Results are aligned with the truth once "
         "(`turbrestore.metrics.align`).  Clips called `drawn_…` are those to judge by: their scenes appear in no other "
-        "clip, their crops, motion, blur, noise and codec are drawn anew for every version, and nothing was chosen on "
+        "clip, their crops, motion, blur and noise are drawn anew for every version, and nothing was chosen on "
         "them.  Settings were chosen on some of the others, whose means stand apart.  The truth of `drawn_…` is the "
         "scene at the mean geometry of the clip.\n",
     ]
