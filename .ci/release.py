@@ -1,7 +1,8 @@
 """Build source archive and wheel into dist/, twice, and keep them if both times gave the same bytes.
 
-The wheel is then installed alone into a new environment, where a clip is synthesized and restored, and the source
-archive after it. ``--environment FOLDER`` takes an environment that has what the wheel asks for instead of a new one.
+``twine check`` reads what they say of themselves. The wheel is then installed alone into new environments, with the
+newest and with the oldest versions of what it asks for. In each a clip is synthesized and restored, and the source
+archive replaces the wheel. ``--environment FOLDER`` takes an environment that has the newest versions already.
 ``--tag v0.2.0`` checks that the tag is the version; ``--no-trial`` leaves the installation out.
 """
 
@@ -35,12 +36,15 @@ def main() -> None:
         first, second = (build(Path(folder, name), int(time)) for name in ("first", "second"))
         if {path.name: path.read_bytes() for path in first} != {path.name: path.read_bytes() for path in second}:
             sys.exit("release: two builds of the same source differ")
+        subprocess.run([sys.executable, "-m", "twine", "check", "--strict", *first], check=True)
         (ROOT / "dist").mkdir(exist_ok=True)
         kept = [Path(shutil.copy(path, ROOT / "dist")) for path in first]
         if not options.no_trial:
-            trial = Path(folder, "trial")
-            trial.mkdir()
-            try_out(trial, options.environment, *sorted(kept, key=lambda path: path.suffix != ".whl"))
+            for name, environment in (("newest", options.environment), ("oldest", None)):
+                trial = Path(folder, name)
+                trial.mkdir()
+                constraints = [] if name == "newest" else ["-c", ROOT / "constraints-lowest.txt"]
+                try_out(trial, environment, constraints, *sorted(kept, key=lambda path: path.suffix != ".whl"))
     print("\n".join(str(path.relative_to(ROOT)) for path in kept))
 
 
@@ -75,14 +79,14 @@ def settle(path: Path, time: int) -> None:
     path.write_bytes(gzip.compress(settled.getvalue(), mtime=time))
 
 
-def try_out(folder: Path, environment: Path | None, wheel: Path, archive: Path) -> None:
+def try_out(folder: Path, environment: Path | None, constraints: list, wheel: Path, archive: Path) -> None:
     """Install the wheel alone, with what it asks for, and restore a clip; then the source archive in its place."""
     scripts = (environment or folder / "environment").absolute() / ("Scripts" if sys.platform == "win32" else "bin")
     pip = [scripts / "python", "-m", "pip"]
     replace = [*pip, "install", "--quiet", "--no-deps", "--force-reinstall"]
     if environment is None:
         venv.create(scripts.parent, with_pip=True)
-        subprocess.run([*pip, "install", "--quiet", f"{wheel}[report]"], check=True)
+        subprocess.run([*pip, "install", "--quiet", *constraints, f"{wheel}[report]"], check=True)
     else:
         subprocess.run([*replace, wheel], check=True)
         subprocess.run([*pip, "check"], check=True)

@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 from clips import Clip, find_clips
+from provenance import publish
 
 from turbrestore.blur.estimation import BlurEstimate, estimate_blur
 from turbrestore.blur.psf import GAUSSIAN
@@ -25,7 +26,6 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.filtering.alternating import FilterParams
-from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import Restoration, RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
@@ -71,9 +71,7 @@ def main() -> int:
         print(f"ablation: {error}", file=sys.stderr)
         return error.exit_code
     text = document(rows)
-    print(text, end="")
-    if options.write is not None:
-        atomic_write(options.write, text.encode(), overwrite=True)
+    publish(text, options.write)
     return 0
 
 

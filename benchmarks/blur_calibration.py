@@ -22,6 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from blur_clips import Case, cases, make_clip
+from provenance import publish
 from scipy import fft
 
 from turbrestore.blind.remove_blur import remove_blur, remove_blur_steps
@@ -58,9 +59,7 @@ def main() -> int:
     with get_context("spawn").Pool(2) as pool:
         figures = list(pool.imap(partial(measure_case, given.folder), cases(given.part)))
     text = table_of(figures)
-    print(text)
-    if given.write:
-        given.write.write_text(text, "utf-8")
+    publish(text, given.write)
     return 0
 
 

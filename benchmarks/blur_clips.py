@@ -78,7 +78,7 @@ def make_clip(case: Case, folder: Path) -> Path:
     return path
 
 
-def behind_air(case: Case, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def behind_air(case: Case, rng: np.random.Generator, codec: bool = True) -> tuple[FloatArray, FloatArray]:
     """Frames behind phase screens of random strength, diffraction, noise, lens and codec, and the mean geometry."""
     params = PhaseScreenParams(d_over_r0=1.0)
     while params.tilt_rms() > 3.2 or params.strength == 1.0:
@@ -94,7 +94,7 @@ def behind_air(case: Case, rng: np.random.Generator) -> tuple[FloatArray, FloatA
     made = list(phase_screen_frames(blurred, count, rng, params, camera))
     frames = np.stack([frame.image for frame in made])
     mean = np.mean([frame.flow for frame in made], axis=0, dtype=np.float32)
-    return h264(frames, quality) if quality else frames, warp(scene, invert_flow(mean))
+    return h264(frames, quality) if quality and codec else frames, warp(scene, invert_flow(mean))
 
 
 def behind_lens(case: Case, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

@@ -1,5 +1,9 @@
 """Clips that benchmarks restore: the project's own synthetic ones, and stored ones where there are any.
 
+Settings of the package were chosen on some of them.  Clips called ``drawn_…`` are judged on: they show scenes that no
+other clip shows, and everything about them is drawn from a seed that is the version, so that a release has clips that
+nobody has seen before.
+
 Stored clips lie under the folder that ``TURBRESTORE_DATA`` names: ``simulated/NAME/clip.*`` with ``truth.png``, and
 ``real/NAME/clip.*`` with ``words.txt`` where the text is known and ``peer_*.png`` where other methods' results are.
 """
@@ -7,6 +11,7 @@ Stored clips lie under the folder that ``TURBRESTORE_DATA`` names: ``simulated/N
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
@@ -14,7 +19,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from blur_clips import REPORTED, Case, behind_air, behind_lens
 
+import turbrestore
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import InputNotFoundError
 from turbrestore.io.images import read_image
@@ -35,6 +42,9 @@ TEXT = (
     *("marble", "sunset", "library", "compass", "feather"),
 )
 PIXELS_A_WORD = 10
+# Of the scenes that no constant was set on, those that no other clip here shows.
+DRAWN, DRAWN_SCENES = "drawn_", tuple(name for name in REPORTED if name not in ("cat", "chart"))
+WIDEST_LENS = 2.5
 # What is read of real clips, so that a benchmark of all takes minutes.
 MOST_FRAMES, LARGEST_SIDE = 60, 320
 
@@ -71,7 +81,7 @@ def find_clips(patterns: Sequence[str] = ()) -> dict[str, Callable[[], Clip]]:
     InputNotFoundError
         A pattern matches nothing.
     """
-    known = {**_synthetic(), **_stored()}
+    known = {**drawn_clips(turbrestore.__version__), **_synthetic(), **_stored()}
     for pattern in patterns:
         if not any(fnmatch(name, pattern) for name in known):
             raise InputNotFoundError(f"{pattern}: no such clip; there are {', '.join(known)}")
@@ -82,6 +92,31 @@ def data_folder() -> Path | None:
     """Folder of stored clips, None where there is none."""
     named = os.environ.get("TURBRESTORE_DATA", "")
     return Path(named) if named and Path(named).is_dir() else None
+
+
+def is_reported(name: str) -> bool:
+    """Whether nothing was chosen on the clip of this name."""
+    return name.startswith(DRAWN)
+
+
+def drawn_clips(version: str) -> dict[str, Callable[[], Clip]]:
+    """Clips that are drawn for a version: every scene behind phase screens, and moved behind a lens."""
+    return {
+        f"{DRAWN}{kind}_{scene}": partial(_drawn, scene, kind, zlib.crc32(f"{version} {kind} {scene}".encode()))
+        for kind in ("air", "lens")
+        for scene in DRAWN_SCENES
+    }
+
+
+def _drawn(scene: str, kind: str, seed: int) -> Clip:
+    rng = np.random.default_rng(seed)
+    number = float(rng.integers(2) if kind == "air" else rng.uniform(0, WIDEST_LENS))
+    case = Case("drawn", scene, kind, number)
+    # H.264 does not give the same frames every time, and two runs shall have the same clips.
+    frames, truth = behind_air(case, rng, codec=False) if kind == "air" else behind_lens(case, rng)
+    # As a camera with 8 bits stores them; the truth is the scene at the mean geometry.
+    stored = np.rint(255 * np.clip(frames, 0, 1)).astype(np.float32) / np.float32(255)
+    return Clip(stored, np.clip(truth, 0, 1))
 
 
 def _synthetic() -> dict[str, Callable[[], Clip]]:

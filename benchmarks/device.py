@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from provenance import publish
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps
@@ -27,7 +28,6 @@ from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalPa
 from turbrestore.deconvolution.nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import FilterParams, filter_frames
-from turbrestore.io.output import atomic_write
 from turbrestore.metrics import psnr
 from turbrestore.pipeline import restore
 from turbrestore.registration.flow import FlowParams, estimate_flow
@@ -240,9 +240,7 @@ def main() -> int:
     options = parser.parse_args()
     device = find_device(options.device or "auto")
     text, good = document(options.size, "cpu:0" if device == CPU else device, options.runs, options.frames)
-    print(text, end="")
-    if options.write is not None:
-        atomic_write(options.write, text.encode(), overwrite=True)
+    publish(text, options.write)
     return int(not good)
 
 

@@ -1,6 +1,6 @@
-"""What the flow of a frame is worth to the image: measured, of the flow model, or true; and since a revision.
+"""What the flow of a frame is worth to the image: measured, of the flow model, or true.
 
-    python benchmarks/dynamics.py --before 7b5207f --write benchmarks/results/dynamics.md
+    python benchmarks/dynamics.py --write benchmarks/results/dynamics.md
 
 PSNR after deblurring against the scene at the mean geometry, of clips made here by phase screens: three scenes at
 medium turbulence, with noise, and with 30 % of the frames missing or half of the scene flat.  The true flow is a bound
@@ -16,16 +16,13 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from quality_change import restored_by
-from revisions import revision
+from provenance import publish
 
 from turbrestore.blind.remove_blur import remove_blur
 from turbrestore.core.arrays import FloatArray
-from turbrestore.core.errors import TurbrestoreError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import FilterParams, filter_frames
-from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.flow_algebra import compose_flows, invert_flow
@@ -38,7 +35,7 @@ NAMES, COUNT, SIDE, BORDER = ("camera", "brick", "chart"), 60, 160, 8
 NOISES = (0.01, 0.05, 0.12)
 KINDS = ("as is", "missing", "half flat")
 MISSING = 0.3
-COLUMNS = ("now", "before", "flow of the model", "true flow")
+COLUMNS = ("measured flow", "flow of the model", "true flow")
 
 Row = dict[str, float]
 
@@ -46,29 +43,20 @@ Row = dict[str, float]
 def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--before", metavar="REVISION", default="HEAD", help="revision to compare with")
     parser.add_argument("--strength", nargs="+", choices=STRENGTHS, default=["medium"])
+    parser.add_argument("--scenes", nargs="+", choices=NAMES, default=NAMES)
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
     options = parser.parse_args()
     rows: dict[tuple[str, ...], Row] = {}
-    try:
-        with revision(options.before) as tree:
-            for strength, kind, noise, name in product(options.strength, KINDS, NOISES, NAMES):
-                rows[strength, kind, f"{noise:g}", name] = measure(strength, kind, noise, name, tree)
-                print(
-                    strength, kind, noise, name, rows[strength, kind, f"{noise:g}", name], file=sys.stderr, flush=True
-                )
-    except TurbrestoreError as error:
-        print(f"dynamics: {error}", file=sys.stderr)
-        return error.exit_code
-    text = document(rows, options.before)
-    print(text, end="")
-    if options.write is not None:
-        atomic_write(options.write, text.encode(), overwrite=True)
+    for strength, kind, noise, name in product(options.strength, KINDS, NOISES, options.scenes):
+        key = strength, kind, f"{noise:g}", name
+        rows[key] = measure(strength, kind, noise, name)
+        print(*key, rows[key], file=sys.stderr, flush=True)
+    publish(document(rows), options.write)
     return 0
 
 
-def measure(strength: str, kind: str, noise: float, name: str, tree: Path | None) -> Row:
+def measure(strength: str, kind: str, noise: float, name: str) -> Row:
     """PSNR, dB, of each column."""
     frames, flows, truth = clip(strength, kind, noise, name)
     whole = restore(frames)
@@ -78,8 +66,7 @@ def measure(strength: str, kind: str, noise: float, name: str, tree: Path | None
     drop, once = FilterParams(residual="drop"), FilterParams(inner_iterations=1)
     fused = filter_frames(frames, whole.centroid.image, identify(flows), once, known_flows=flows).image
     images = {
-        "now": whole.image,
-        "before": restored_by(frames, tree)["result"],
+        "measured flow": whole.image,
         "flow of the model": restore(frames, RestoreParams(filter=drop, deconvolution=blur)).image,
         "true flow": remove_blur(fused, whole.centroid.image, blur).deconvolution.image,
     }
@@ -103,22 +90,21 @@ def clip(strength: str, kind: str, noise: float, name: str) -> tuple[FloatArray,
     return frames, flows, warp(scene, back)
 
 
-def document(rows: dict[tuple[str, ...], Row], before: str) -> str:
+def document(rows: dict[tuple[str, ...], Row]) -> str:
     """Markdown of all rows and of their means."""
     lines = [
         "# Dynamics\n",
-        f"What `python benchmarks/dynamics.py --before {before} --write benchmarks/results/dynamics.md` measures: PSNR "
+        "What `python benchmarks/dynamics.py --write benchmarks/results/dynamics.md` measures: PSNR "
         f"after deblurring, dB, against the scene at the mean geometry; phase screens, {COUNT} frames of {SIDE} pixels "
-        f"a side, of which 'missing' lacks {100 * MISSING:.0f} %.  'Now' registers frames by the measured flow.  "
-        "The other columns are differences to it: of the revision, of the flow of the model as the paper prints it, "
-        "and of the true flow, which no model of the motion can surpass.  The last two are deblurred by the width of "
-        "'now'.\n",
-        "| turbulence | frames | noise | scene | now | before | flow of the model | true flow |",
-        "|---|---|---:|---|---:|---:|---:|---:|",
+        f"a side, of which 'missing' lacks {100 * MISSING:.0f} %.  The product registers frames by the measured flow.  "
+        "The other columns are differences to it: of the flow of the model as the paper prints it, and of the true "
+        "flow, which no model of the motion can surpass.  All are deblurred by the width that the product removes.\n",
+        "| turbulence | frames | noise | scene | measured flow | flow of the model | true flow |",
+        "|---|---|---:|---|---:|---:|---:|",
         *(f"| {' | '.join(key)} | {_cells(row)} |" for key, row in rows.items()),
         "\n## Means\n",
-        "| turbulence | frames | noise | now | before | flow of the model | true flow |",
-        "|---|---|---:|---:|---:|---:|---:|",
+        "| turbulence | frames | noise | measured flow | flow of the model | true flow |",
+        "|---|---|---:|---:|---:|---:|",
         *_means(rows),
     ]
     return "\n".join(lines) + "\n"
@@ -132,7 +118,7 @@ def _means(rows: dict[tuple[str, ...], Row]) -> Iterator[str]:
 
 
 def _cells(row: Row) -> str:
-    return " | ".join([f"{row['now']:.2f}", *(f"{row[column] - row['now']:+.2f}" for column in COLUMNS[1:])])
+    return " | ".join([f"{row[COLUMNS[0]]:.2f}", *(f"{row[column] - row[COLUMNS[0]]:+.2f}" for column in COLUMNS[1:])])
 
 
 if __name__ == "__main__":

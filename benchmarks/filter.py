@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from provenance import publish_printed
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.dynamics.dynamic_texture import identify
@@ -60,6 +62,14 @@ def simulated(names: list[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
     }
 
 
+HEAD = """# Choices of the alternating filter
+
+Printed by `TURBRESTORE_DATA=DIR python benchmarks/filter.py`.
+
+PSNR, dB, before deconvolution. The first row is made by the script; the others are clips of three simulators with 120
+frames of 256×256."""
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -80,4 +90,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(publish_printed(HEAD, main))

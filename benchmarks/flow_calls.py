@@ -25,11 +25,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from clips import find_clips
+from provenance import publish
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.filtering.alternating import FilterParams
-from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
@@ -101,9 +101,8 @@ def main() -> int:
         print(f"flow_calls: {error}", file=sys.stderr)
         return error.exit_code
     text, at_knee = document(measured)
-    print(text, end="")
+    publish(text, options.write)
     if options.write is not None:
-        atomic_write(options.write, text.encode(), overwrite=True)
         draw(measured, options.write.with_suffix(".png"))
     return int(not at_knee)
 
@@ -122,9 +121,8 @@ def compare_presets(patterns: Sequence[str], write: Path | None) -> int:
             measured[name][setting] = Cost(compare(image, clip.truth).psnr, time.process_time() - begun)
         print(f"{name}: {measured[name]}", file=sys.stderr, flush=True)
     text, held = presets_document(measured)
-    print(text, end="")
+    publish(text, write)
     if write is not None:
-        atomic_write(write, text.encode(), overwrite=True)
         draw_presets(measured, write.with_suffix(".png"))
     return int(not held)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 
 import numpy as np
+from provenance import publish_printed
 
 from turbrestore.blind.guards import GuardReading, evaluate_guards
 from turbrestore.blur.psf import GAUSSIAN, blur_otf
@@ -38,6 +39,14 @@ def cell(reading: GuardReading) -> str:
     return f"{reading.ringing:.3f} {reading.overshoot:.3f} {reading.noise_gain:.1f}{'' if reading.passed else ' ✗'}"
 
 
+HEAD = """# Guards
+
+Printed by `python benchmarks/guards.py`.
+
+Share of edges that ring, share of pixels near edges that overshoot, gain of noise in flat regions, and ✗ where a guard
+fails. Scenes are blurred by a Gaussian and deconvolved by nonlocal TV."""
+
+
 def main() -> int:
     """Print the table."""
     print("| scene | blur, px | the scene itself | " + " | ".join(f"{factor} × width" for factor in FACTORS) + " |")
@@ -59,4 +68,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(publish_printed(HEAD, main))

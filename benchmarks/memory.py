@@ -26,6 +26,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from provenance import with_origin
 from revisions import take_two_cores
 
 GROWTH_BOUND_MB = 20.0
@@ -333,7 +334,7 @@ def main() -> int:
     take_two_cores()
     text, held = document(arguments)
     if arguments.write is not None:
-        arguments.write.write_text(text, encoding="utf-8")
+        arguments.write.write_text(with_origin(text), encoding="utf-8")
     return int(not held)
 
 

@@ -14,6 +14,7 @@ import sys
 import cv2
 import numpy as np
 from clips import Clip, find_clips
+from provenance import publish_printed
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.metrics import compare
@@ -43,6 +44,14 @@ def figures(restoration: Restoration, clip: Clip) -> list[float]:
     return [compare(image, clip.truth).psnr for image in images]
 
 
+HEAD = """# Outliers
+
+Printed by `TURBRESTORE_DATA=DIR python benchmarks/outliers.py`.
+
+PSNR, dB, before deconvolution, of clips as they are and spoilt: a bird crosses a tenth of the frames, one frame is
+brighter by .35 and one by half, a glint covers a disc in one, and one slips by ten pixels."""
+
+
 def main() -> int:
     """Print the table."""
     print("| clip | mean | centroid | filtered | spoilt: mean | spoilt: centroid | spoilt: filtered |")
@@ -61,4 +70,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(publish_printed(HEAD, main))

@@ -1,11 +1,13 @@
-"""Tables of ``peers.py``: means over the clips, every clip, where another method is ahead, and videos."""
+"""Tables of ``peers.py``: means over the clips, a network, where another method is ahead, every clip, and videos."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from clips import is_reported
+from methods.packages import NETWORK
 
 Figures = dict[str, float]
 # Method, clip, figure.
@@ -14,16 +16,19 @@ Results = dict[str, dict[str, Figures]]
 TURBRESTORE = "turbrestore"
 # Suffix of the figures of deblurred images.
 SAME = "_sharp"
+# Readers, and the figures of what each reads.
+READ = {"tesseract": "words", "rapidocr": "words_rapidocr"}
 # What is less than this is no lead: dB, and shares of words.
-LEADS = {f"psnr{SAME}": 0.05, f"words{SAME}": 0.02}
+LEADS = {f"psnr{SAME}": 0.05} | {f"{figure}{SAME}": 0.02 for figure in READ.values()}
 COLUMNS = (
     ("PSNR, dB", "psnr", 2),
-    ("deblurred", f"psnr{SAME}", 2),
+    ("PSNR, dB, deblurred", f"psnr{SAME}", 2),
     ("SSIM", "ssim", 3),
-    ("deblurred", f"ssim{SAME}", 3),
+    ("SSIM, deblurred", f"ssim{SAME}", 3),
     ("PSNR at the mean geometry, dB, deblurred", f"centroid{SAME}", 2),
-    ("words", "words", 2),
-    ("deblurred", f"words{SAME}", 2),
+    ("words by Tesseract", "words", 2),
+    ("words by Tesseract, deblurred", f"words{SAME}", 2),
+    ("words by RapidOCR, deblurred", f"words_rapidocr{SAME}", 2),
     ("processor time a clip, s", "seconds", 1),
     ("of deblurring", "deblurring", 1),
     ("peak memory, MB", "peak", 0),
@@ -55,18 +60,27 @@ def document(
         parts.append("Not measured:\n\n" + "".join(f"- {name}: {reason}\n" for name, reason in skipped.items()))
     parts += [
         "## Means\n",
-        "PSNR and structural similarity (SSIM, after the best gain and offset) over the clips with known truth, words "
-        "over those with text, each after alignment and over the clips on which every method ended.  Processor time is "
-        "that of all threads, and high on a busy machine; packages start an interpreter for each clip, which counts.  "
-        "Memory is the peak of the process over all clips, libraries included.\n",
-        _means(results),
+        "Over the clips `drawn_…`, on which nothing was chosen: scenes, crops and settings are drawn anew for every "
+        "version.  PSNR and structural similarity (SSIM, after the best gain and offset) after alignment, over the "
+        "clips on which every method ended.  Processor time is that of all threads, and high on a busy machine; "
+        "packages start an interpreter for each clip, which counts.  Memory is the peak of the process over all clips, "
+        "libraries included.\n",
+        _means(results, is_reported),
+        "## Means over the other clips\n",
+        "Settings were chosen on some of these.  PSNR and SSIM are over the clips with known truth, words over those "
+        f"with text.  {NETWORK} ran on some of them only.\n",
+        _means(results, lambda clip: not is_reported(clip)),
+        "## Beside a network\n",
+        _network(results),
         "## Where another method is ahead\n",
+        "Each clip on which another method ends with more, and where its lead arises.\n",
         _leads(results),
     ]
     for heading, figure, digits in (
         ("PSNR of the merged images, dB", "psnr", 2),
         ("PSNR of the deblurred images, dB", f"psnr{SAME}", 2),
-        ("Share of the words that tesseract reads, deblurred images", f"words{SAME}", 2),
+        ("Share of the words that Tesseract reads, deblurred images", f"words{SAME}", 2),
+        ("Share of the words that RapidOCR reads, deblurred images", f"words_rapidocr{SAME}", 2),
     ):
         rows = {
             clip: {method: found[clip][figure] for method, found in results.items() if figure in found.get(clip, {})}
@@ -79,18 +93,50 @@ def document(
     return "\n".join(parts)
 
 
-def _means(results: Results) -> str:
-    """Return a row of means for each method, over the clips that have the figure by every method."""
+def _means(results: Results, chosen: Callable[[str], bool]) -> str:
+    """Return a row of means for each method, over the chosen clips whose figure is known of all but the network."""
     header = "| method | " + " | ".join(title for title, _, _ in COLUMNS) + " |\n|---|" + "---:|" * len(COLUMNS)
     lines = [header]
     for method, clips in results.items():
         cells = []
         for _, figure, digits in COLUMNS:
-            common = [clip for clip in clips if all(figure in found.get(clip, {}) for found in results.values())]
-            values = [clips[clip][figure] for clip in common]
-            mean = max(values) if values and figure == "peak" else float(np.mean(values)) if values else None
+            others = [found for name, found in results.items() if name != NETWORK]
+            names = filter(chosen, dict.fromkeys(clip for found in others for clip in found))
+            common = [clip for clip in names if all(figure in found.get(clip, {}) for found in others)]
+            values = [clips[clip][figure] for clip in common if figure in clips.get(clip, {})]
+            whole = bool(values) and len(values) == len(common)
+            mean = (max(values) if figure == "peak" else float(np.mean(values))) if whole else None
             cells.append(_number(mean, digits))
         lines.append(f"| {method} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+NETWORK_COLUMNS = (
+    ("PSNR, dB", f"psnr{SAME}", 2),
+    ("at the mean geometry", f"centroid{SAME}", 2),
+    ("Tesseract", f"words{SAME}", 2),
+    ("RapidOCR", f"words_rapidocr{SAME}", 2),
+    ("s", "seconds", 0),
+    ("MB", "peak", 0),
+)
+
+
+def _network(results: Results) -> str:
+    """Table of the network and of this project, clip by clip."""
+    own, found = results.get(TURBRESTORE, {}), results.get(NETWORK, {})
+    rows = [clip for clip in found if clip in own]
+    if not rows:
+        return "Not measured.\n"
+    titles = [f"{who}: {title}" for title, _, _ in NETWORK_COLUMNS for who in ("network", "turbrestore")]
+    lines = [
+        "The mean of its de-tilted frames as it is, and, as all else here, after the deconvolution of this project.  "
+        "The network is one half of its method: the other half, which deblurs, is not in that package.\n",
+        f"| clip | network, not deblurred, dB | {' | '.join(titles)} |",
+        f"|---|{'---:|' * (1 + len(titles))}",
+    ]
+    for clip in rows:
+        pairs = [_number(by[clip].get(figure), digits) for _, figure, digits in NETWORK_COLUMNS for by in (found, own)]
+        lines.append(f"| {clip} | {_number(found[clip].get('psnr'), 2)} | {' | '.join(pairs)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -106,10 +152,29 @@ def _leads(results: Results) -> str:
             }
             ahead = {name: value for name, value in others.items() if figure in own and value > own[figure] + least}
             if ahead:
-                unit = " dB" if figure.startswith("psnr") else " of the words"
-                said = ", ".join(f"{name} {ahead[name]:.2f}" for name in sorted(ahead, key=lambda one: -ahead[one]))
-                lines.append(f"- {clip}: {said}; {TURBRESTORE} {own[figure]:.2f}{unit}\n")
+                reader = next((name for name, read in READ.items() if figure == f"{read}{SAME}"), None)
+                unit = f" of the words by {reader}" if reader else " dB"
+                order = sorted(ahead, key=lambda one: -ahead[one])
+                said = ", ".join(f"{name} {ahead[name]:.2f}" for name in order)
+                why = _cause(order[0], results[order[0]][clip], own, figure)
+                lines.append(f"- {clip}: {said}; {TURBRESTORE} {own[figure]:.2f}{unit}. {why}\n")
     return "".join(lines) or "On no clip.\n"
+
+
+def _cause(name: str, other: Figures, own: Figures, figure: str) -> str:
+    """Sentence on the stage in which a lead arises, from the figures before deblurring and at the mean geometry."""
+    merged, centroid = figure.removesuffix(SAME), f"centroid{SAME}"
+    if figure.startswith("psnr") and centroid in own and own[centroid] >= other.get(centroid, np.inf):
+        return f"At the mean geometry of the clip {TURBRESTORE} is ahead, so the scene is bent as a whole, not blurred."
+    if merged not in own or merged not in other:
+        return ""
+    if other[merged] == other[figure]:
+        return f"{name} sharpens as it merges, so that its stages cannot be told apart."
+    less = own[merged] - other[merged]
+    size = f"{abs(less):.2f} {'dB' if figure.startswith('psnr') else 'of the words'}"
+    if less > 0:
+        return f"Before deblurring {name} is {size} behind, so its blur is removed better."
+    return f"Before deblurring {name} is {size} ahead already, so it merges the frames better."
 
 
 def _videos(videos: Mapping[str, Results]) -> str:

@@ -2,17 +2,18 @@
 
 One video is made here: a square that moves before a photograph, through smooth random flows.  Others lie under
 ``TURBRESTORE_DATA``: ``dynamic/NAME/clip.mp4`` with ``truth.mp4`` and the published output of a network as
-``peer_NAME.mp4``.
+``peer_NAME.mp4``.  A network that is there runs on the video that is made here; it takes minutes for larger ones.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 from clips import data_folder
+from methods.packages import run_package
 from methods.sobolev import sobolev_flow
 from methods.usage import processor_seconds
 from peer_tables import Figures
@@ -26,7 +27,7 @@ from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
 
 # Frames, pixels a side of the video that is made here, and which frames are compared: all takes minutes.
-COUNT, SIDE, EVERY = 30, 256, 3
+MADE, COUNT, SIDE, EVERY = "moving square", 30, 256, 3
 SMOOTHED = 5
 
 # Each takes frames and returns as many.
@@ -38,16 +39,19 @@ VIDEO_METHODS: dict[str, Callable[[FloatArray], FloatArray]] = {
 }
 
 
-def measure_videos() -> dict[str, dict[str, Figures]]:
-    """Figures of every video by every method."""
+def measure_videos(networks: Mapping[str, Path]) -> dict[str, dict[str, Figures]]:
+    """Figures of every video by every method; ``networks`` are interpreters of the packages that have one."""
     results: dict[str, dict[str, Figures]] = {}
-    for name, frames, truth, networks in _videos():
+    for name, frames, truth, published in _videos():
         results[name] = {}
         for method, run in VIDEO_METHODS.items():
             begun = processor_seconds()
             video = np.clip(run(frames), 0, 1)
             results[name][method] = score_video(video, truth) | {"seconds": round(processor_seconds() - begun, 2)}
-        results[name] |= {f"{method} (network)": score_video(video, truth) for method, video in networks.items()}
+        for method, python in networks.items() if name == MADE else ():
+            video, used = run_package(method, frames, python)
+            results[name][f"{method} (network)"] = score_video(video, truth) | {"seconds": used["seconds"]}
+        results[name] |= {f"{method} (network)": score_video(video, truth) for method, video in published.items()}
         print(f"{name}: {results[name]}", file=sys.stderr, flush=True)
     return results
 
@@ -88,12 +92,12 @@ def moving_square(count: int = COUNT, side: int = SIDE) -> tuple[FloatArray, Flo
 
 def _videos() -> Iterator[tuple[str, FloatArray, FloatArray, dict[str, FloatArray]]]:
     """Name, frames, truth and outputs of networks."""
-    yield "moving square", *moving_square(), {}
+    yield MADE, *moving_square(), {}
     root = data_folder()
     for path in sorted(root.glob("dynamic/*/truth.mp4")) if root is not None else []:
         frames, truth = _read(path.with_name("clip.mp4")), _read(path)
-        networks = {file.stem.removeprefix("peer_"): _read(file) for file in sorted(path.parent.glob("peer_*.mp4"))}
-        yield path.parent.name, frames, truth, networks
+        published = {file.stem.removeprefix("peer_"): _read(file) for file in sorted(path.parent.glob("peer_*.mp4"))}
+        yield path.parent.name, frames, truth, published
 
 
 def _read(path: Path) -> FloatArray:

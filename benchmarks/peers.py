@@ -2,8 +2,8 @@
 
 Run ``TURBRESTORE_DATA=DIR python benchmarks/peers.py --write benchmarks/results/peers.md``; without the folder only the
 clips and the video that are made here are used.  Each method runs in a process of its own over all clips, one method
-after the other.  Packages of others run in an environment (``--environment``) that is made where there is none; where
-that fails they are left out, with the reason.  ``--clips`` and ``--methods`` take names or patterns, ``--images``
+after the other.  Packages of others, and the network of one, run in environments that are made where there are none;
+where that fails they are left out, with the reason.  ``--clips`` and ``--methods`` take names or patterns, ``--images``
 writes the results of every clip side by side, ``--json`` the figures.
 """
 
@@ -15,6 +15,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,12 @@ import numpy as np
 from clips import Clip, find_clips
 from methods.diffeomorphic import deblurred_template
 from methods.low_rank import low_rank_image
-from methods.packages import PackageError, make_environment, run_package
+from methods.packages import NETWORK, PACKAGES, PackageError, make_environment, run_package
 from methods.sobolev import sobolev_latent_image
 from methods.usage import peak_megabytes, processor_seconds
-from peer_tables import SAME, TURBRESTORE, Figures, Results, document
+from peer_tables import READ, SAME, TURBRESTORE, Figures, Results, document
 from peer_videos import measure_videos
+from provenance import publish
 from quality import panel
 from revisions import child
 from words import can_read, share_read
@@ -40,10 +42,10 @@ from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
 
-ENVIRONMENT = Path(__file__).resolve().parent.parent / ".venv-peers"
 # Share of the frames that a lucky average keeps: as the stacker does here.
 LUCKY = 0.5
-PACKAGES = ("PlanetarySystemStacker", "pystackreg")
+# The network takes minutes for a clip, so it sees those that are drawn, one with a known mean geometry, and text.
+NETWORK_CLIPS = ("drawn_*", "ao_camera_medium", "smooth_words", "screens_strong_words", "turbtext_pg*")
 # What is compiled and loaded once does not count.
 WARM = np.s_[:6, :64, :64]
 
@@ -82,6 +84,8 @@ MEANINGS = {
     "Sobolev flow": "Sobolev gradient flow and lucky regions (Lou, Kang, Soatto, Bertozzi 2013), sharp by itself",
     "low rank": "registration to the mean and three-term decomposition (Oreifej, Li, Shah 2013)",
     "template": "diffeomorphic template (Lao, Wang, Wong, Soatto 2024), deblurred by a Gaussian of estimated width",
+    NETWORK: "mean of frames that the first network of Turbulence Mitigation Transformer (Zhang, Mao, Chimitt, Chan "
+    "2024) has de-tilted, with the weights in the package vs_undistort 2.3.1, whose licence is not stated",
     TURBRESTORE: "this project with its defaults; merged is its image before deconvolution",
 }
 
@@ -91,47 +95,51 @@ def main() -> int:
     options = _options()
     try:
         chosen = [name for name in MEANINGS if any(fnmatch(name, pattern) for pattern in options.methods)]
-        results, skipped = measure_all(options.clips, chosen, options.environment, options.images)
-        videos = {} if options.without_videos else measure_videos()
+        results, skipped = measure_all(options.clips, chosen, options.images)
+        networks = {NETWORK: PACKAGES[NETWORK].python} if results.get(NETWORK) else {}
+        videos = {} if options.without_videos else measure_videos(networks)
     except TurbrestoreError as error:
         print(f"peers: {error}", file=sys.stderr)
         return error.exit_code
     text = document(results, {name: MEANINGS[name] for name in chosen}, skipped, videos, options.clips)
-    print(text, end="")
-    if options.write is not None:
-        atomic_write(options.write, text.encode(), overwrite=True)
+    publish(text, options.write)
     if options.json is not None:
         figures = {"clips": results, "videos": videos, "skipped": skipped}
         atomic_write(options.json, (json.dumps(figures, indent=2) + "\n").encode(), overwrite=True)
     return 0
 
 
-def measure_all(
-    patterns: list[str], methods: list[str], environment: Path, images: Path | None
-) -> tuple[Results, dict[str, str]]:
+def measure_all(patterns: list[str], methods: list[str], images: Path | None) -> tuple[Results, dict[str, str]]:
     """Figures of every method and clip, and why methods are missing."""
     clips = {name: load() for name, load in find_clips(patterns).items()}
     # Without a truth or words there is nothing to compare.
     clips = {name: clip for name, clip in clips.items() if clip.truth is not None or (clip.words and can_read())}
-    results: Results = {}
+    spent: dict[str, dict[str, Figures]] = {}
     skipped: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for clip_name, clip in clips.items():
             np.save(folder / f"{clip_name}.npy", clip.frames)
         for method in methods:
+            some = [one for one in clips if method != NETWORK or any(map(partial(fnmatch, one), NETWORK_CLIPS))]
+            if not some:
+                skipped[method] = "it runs on none of these clips"
+                continue
             try:
-                python = make_environment(environment) if method in PACKAGES else None
-                task = {"method": method, "folder": name, "clips": [*clips], "python": python and str(python)}
-                used = child(__file__, task)
+                python = make_environment(PACKAGES[method]) if method in PACKAGES else None
+                used = child(
+                    __file__, {"method": method, "folder": name, "clips": some, "python": python and str(python)}
+                )
             except PackageError as error:
                 skipped[method] = str(error)
                 continue
             skipped |= {f"{method} on {clip_name}": reason for clip_name, reason in used["failed"].items()}
-            results[method] = {
-                clip_name: _figures(folder / f"{method}-{clip_name}.npz", clips[clip_name]) | spent
-                for clip_name, spent in used["clips"].items()
-            }
+            spent[method] = used["clips"]
+        # After all environments are made, that of the second reader too.
+        results = {
+            method: {one: _figures(folder / f"{method}-{one}.npz", clips[one]) | used for one, used in found.items()}
+            for method, found in spent.items()
+        }
         if images is not None:
             _write_panels(images, folder, clips, [*results])
     return results, skipped
@@ -153,8 +161,8 @@ def run_child(task: dict[str, Any]) -> dict[str, Any]:
                 merged, sharp = METHODS[name](frames)
                 used = {"seconds": processor_seconds() - begun, "peak": peak_megabytes()}
             else:
-                merged, used = run_package(name, frames, Path(task["python"]))
-                sharp = None
+                made, used = run_package(name, frames, Path(task["python"]))
+                merged, sharp = made.mean(axis=0) if made.ndim == frames.ndim else made, None
         except TurbrestoreError as error:
             failed[clip] = str(error)
             continue
@@ -177,8 +185,9 @@ def _figures(path: Path, clip: Clip) -> Figures:
                 measured |= {f"psnr{suffix}": found.psnr, f"ssim{suffix}": found.ssim}
             if clip.centroid is not None:
                 measured[f"centroid{suffix}"] = compare(image, clip.centroid).psnr
-            if clip.words and can_read():
-                measured[f"words{suffix}"] = share_read(image, clip.words)
+            for reader, figure in READ.items():
+                if clip.words and can_read(reader):
+                    measured[f"{figure}{suffix}"] = share_read(image, clip.words, reader)
     return {name: round(float(value), 4) for name, value in measured.items()}
 
 
@@ -195,9 +204,6 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="names or patterns; all by default")
     parser.add_argument("--methods", nargs="+", default=["*"], metavar="NAME", help="names or patterns; all by default")
-    parser.add_argument(
-        "--environment", type=Path, default=ENVIRONMENT, metavar="DIR", help="environment of packages of others"
-    )
     parser.add_argument("--without-videos", action="store_true", help="measure images only")
     parser.add_argument("--images", type=Path, metavar="DIR", help="write one panel of images a clip")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")

@@ -1,14 +1,15 @@
 """Restore a table of clips by simple methods, by every stage of the pipeline and by its defaults, and score them.
 
 Run ``python benchmarks/quality.py``; it prints a Markdown document.  Clips: synthetic ones made here, and those under
-the folder that ``TURBRESTORE_DATA`` names, where there are any.  ``--clips`` takes names or patterns, ``--images``
-writes the images side by side, ``--json`` the figures, ``--write benchmarks/results/quality.md`` the document.
+the folder that ``TURBRESTORE_DATA`` names, where there are any.  Clips on which nothing was chosen have means of their
+own.  ``--clips`` takes names or patterns, ``--images`` writes the images side by side, ``--json`` the figures,
+``--write benchmarks/results/quality.md`` the document.
 
 ``--bounds`` instead restores a few simulated clips with the blur given by hand, and exits with 1 when a bound is
 broken or a stage is worse than the one before; without the data it says so and exits with 0.
 
 ``--before`` instead restores the clips with truth or text by an earlier revision too, and exits with 1 where the
-filtered image or the result has lost more than 0.05 dB; its document is ``benchmarks/results/quality_change.md``.
+filtered image or the result has lost more than 0.05 dB.
 """
 
 from __future__ import annotations
@@ -16,17 +17,19 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
 from pathlib import Path
 
 import cv2
 import numpy as np
-from clips import COUNT, LARGEST_SIDE, MOST_FRAMES, SCREEN_SIDE, SMOOTH_SIDE, Clip, data_folder, find_clips
+from clips import COUNT, LARGEST_SIDE, MOST_FRAMES, SCREEN_SIDE, SMOOTH_SIDE, Clip, data_folder, find_clips, is_reported
+from provenance import publish
 from quality_change import compare_with
-from words import can_read, share_read
+from words import READERS, can_read, missing, share_read
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
@@ -81,13 +84,11 @@ def main() -> int:
             text, lost = compare_with(options.before, options.clips)
         else:
             results = measure_all(options.clips, options.images)
-            text = document(results)
+            text = document(results, options.clips)
     except TurbrestoreError as error:
         print(f"quality: {error}", file=sys.stderr)
         return error.exit_code
-    print(text, end="")
-    if options.write is not None:
-        atomic_write(options.write, text.encode(), overwrite=True)
+    publish(text, options.write)
     if options.json is not None:
         atomic_write(options.json, (json.dumps(results, indent=2) + "\n").encode(), overwrite=True)
     return int(lost)
@@ -101,8 +102,11 @@ def measure_all(patterns: list[str], folder: Path | None) -> Results:
         clip = load()
         restored = restorations(clip)
         results[name] = {method: figures(image, clip, s) for method, (image, s) in restored.items()}
-        if clip.words and clip.peers and can_read():
-            results[name]["peers"] = {"words": max(share_read(peer, clip.words) for peer in clip.peers.values())}
+        if clip.words and clip.peers:
+            results[name]["peers"] = {
+                figure: max(words_read(peer, clip)[figure] for peer in clip.peers.values())
+                for figure in map(words_by, filter(can_read, READERS))
+            }
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
             write_image(folder / f"{name}.png", panel(restored, clip), 8, overwrite=True)
@@ -134,9 +138,18 @@ def figures(image: FloatArray, clip: Clip, seconds: float) -> Figures:
     measured = {name: round(value, 4) for name, value in dataclasses.asdict(seen).items()}
     if clip.centroid is not None:
         measured["centroid_psnr"] = round(compare(image, clip.centroid).psnr, 4)
-    if clip.words and can_read():
-        measured["words"] = round(share_read(image, clip.words), 4)
-    return measured | {"seconds": round(seconds, 2)}
+    return measured | words_read(image, clip) | {"seconds": round(seconds, 2)}
+
+
+def words_read(image: FloatArray, clip: Clip) -> Figures:
+    """Share of the words of a clip that each reader reads; nothing of clips without."""
+    readers = filter(can_read, READERS) if clip.words else ()
+    return {words_by(reader): round(share_read(image, clip.words, reader), 4) for reader in readers}
+
+
+def words_by(reader: str) -> str:
+    """Name of the figure of a reader."""
+    return f"words by {reader}"
 
 
 def panel(restored: dict[str, tuple[FloatArray, float]], clip: Clip) -> FloatArray:
@@ -157,19 +170,23 @@ def panel(restored: dict[str, tuple[FloatArray, float]], clip: Clip) -> FloatArr
     return np.vstack(rows).astype(np.float32) / np.float32(255)
 
 
-def document(results: Results) -> str:
-    """Markdown of everything that was measured."""
+def document(results: Results, chosen: Sequence[str] = ()) -> str:
+    """Markdown of everything that was measured; ``chosen`` are the clips that were asked for, all if it is empty."""
     parts = [
         "# Quality\n",
         "What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --write benchmarks/results/quality.md` measures: "
         "clips restored by simple methods, by every stage of the pipeline and by its defaults.\n",
+        *([f"Only some of the clips were measured: `--clips {shlex.join(chosen)}`.\n"] if chosen else []),
         "".join(f"- **{method}**: {meaning}.\n" for method, meaning in METHODS.items()),
         f"Clips called `smooth_…` ({COUNT} frames of {SMOOTH_SIDE}×{SMOOTH_SIDE}: smooth random flow, Gaussian blur of "
         f"1 to 2 px, noise 0.01) and `screens_…` ({COUNT} frames of {SCREEN_SIDE}×{SCREEN_SIDE} through phase screens, "
         "weak, medium and strong: D/r0 1.2, 2.5 and 5) are made on the spot.  The others come from the folder that "
         f"`TURBRESTORE_DATA` names; of real clips the first {MOST_FRAMES} frames and, where there is no text to read, "
         f"the middle {LARGEST_SIDE}×{LARGEST_SIDE} pixels are used.  Results are aligned with the truth once "
-        "(`turbrestore.metrics.align`).\n",
+        "(`turbrestore.metrics.align`).  Clips called `drawn_…` are those to judge by: their scenes appear in no other "
+        "clip, their crops, motion, blur and noise are drawn anew for every version, and nothing was chosen on "
+        "them.  Settings were chosen on some of the others, whose means stand apart.  The truth of `drawn_…` is the "
+        "scene at the mean geometry of the clip.\n",
     ]
     for heading, figure, digits in (
         ("PSNR, dB", "psnr", 2),
@@ -177,8 +194,8 @@ def document(results: Results) -> str:
         ("Structural similarity, after the best gain and offset", "ssim", 3),
     ):
         rows = _rows(results, figure, figure)
-        parts.append(f"## {heading}\n\n{_table(rows, METHODS, digits, average=True)}")
-    parts.append(_words_section(results))
+        parts.append(f"## {heading}\n\n{_split(rows, digits)}")
+    parts += [_words_section(results, reader) for reader in READERS]
     for heading, figure, digits in (
         ("Sharpness without truth: mean gradient relative to the temporal mean", "sharpness", 2),
         ("Overshoot without truth: share of pixels outside the local range of the temporal mean", "overshoot", 4),
@@ -257,11 +274,17 @@ def _rows(results: Results, needed: str, figure: str) -> dict[str, Figures]:
     }
 
 
-def _words_section(results: Results) -> str:
-    heading = "## Share of the words that tesseract reads\n\n"
-    if not can_read():
-        return heading + "Not measured: tesseract is not installed.\n"
-    rows = _rows(results, "words", "words")
+def _split(rows: dict[str, Figures], digits: int) -> str:
+    """Tables of the clips on which nothing was chosen, and of the others."""
+    parts = [{name: row for name, row in rows.items() if is_reported(name) is part} for part in (True, False)]
+    return "\n".join(_table(part, METHODS, digits, average=True) for part in parts if part) or _table({}, (), digits)
+
+
+def _words_section(results: Results, reader: str) -> str:
+    heading = f"## Share of the words that {reader} reads\n\n"
+    if not can_read(reader):
+        return heading + f"Not measured: {missing(reader)}.\n"
+    rows = _rows(results, words_by(reader), words_by(reader))
     columns = [*METHODS]
     note = ""
     if any("peers" in row for row in rows.values()):

@@ -60,11 +60,11 @@ def compare_with(before: str, patterns: Sequence[str]) -> tuple[str, bool]:
         raise InputNotFoundError("--clips: expected a clip with truth, or with text and tesseract, found none")
     lines = [
         f"# Quality against revision {before}\n",
-        f"What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --before {before} --write "
-        "benchmarks/results/quality_change.md` measures: clips of `benchmarks/quality.py` restored from the same "
-        "frames by that revision and by the present tree; PSNR, dB, where the truth is known, and the share of the "
-        f"words that tesseract reads where there is text.  It ends with 1 where an image loses more than {LOSS_BOUND} "
-        "dB.  Words have no bound: what is read of a line changes with the last bits of an image.\n",
+        f"What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --before {before}` measures: clips of "
+        "`benchmarks/quality.py` restored from the same frames by that revision and by the present tree; PSNR, dB, "
+        "where the truth is known, and the share of the words that tesseract reads where there is text.  It ends "
+        f"with 1 where an image loses more than {LOSS_BOUND} dB.  Words have no bound: what is read of a line changes "
+        "with the last bits of an image.\n",
         "| clip | filtered: before | now | change | result: before | now | change | words: before | now |",
         "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
         *(_row(name, change) for name, change in changes.items()),

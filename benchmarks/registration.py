@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import skimage.data
+from provenance import publish_printed
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.metrics import compare
@@ -111,6 +112,11 @@ def invented_motion(scene: FloatArray, moving: bool) -> list[tuple[Comparison, C
     return rows
 
 
+HEAD = """# Registration
+
+Printed by `python benchmarks/registration.py`: scenes of 256×256 pixels."""
+
+
 def main() -> int:
     """Print the tables; 1 when a bound is broken."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -156,4 +162,4 @@ def _print_table(corner: str, columns: list[str], rows: dict[str, list[Compariso
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(publish_printed(HEAD, main))

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from turbrestore.io.output import atomic_write
+from provenance import publish
 
 HERE = Path(__file__).parent
 TESTS = HERE.parent / "tests"
@@ -51,12 +51,10 @@ def main() -> int:
         print(f"{name} …", file=sys.stderr, flush=True)
         rows += GROUPS[name]()
     text = INTRO + table(rows)
-    print(text, end="")
     for row in rows:
         for failure in row.failures:
             print(f"{row.title}: {failure}", file=sys.stderr)
-    if options.write is not None:
-        atomic_write(options.write, text.encode(), overwrite=True)
+    publish(text, options.write)
     return int(any(row.passed < row.count for row in rows))
 
 

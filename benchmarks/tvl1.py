@@ -30,6 +30,7 @@ from unittest import mock
 
 import cv2
 import numpy as np
+from provenance import publish_printed
 
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.dynamics.dynamic_texture import identify
@@ -137,6 +138,11 @@ def measure(motion: KnownMotion, runs: int) -> dict[str, Score]:
             errors[name] = endpoint_error(flows, motion.truth), endpoint_error(*(a[:, None] for a in where))
     best = {name: np.min(np.array(t), axis=0) / len(motion.frames) for name, t in times.items()}
     return {name: Score(*map(float, best[name]), *errors[name]) for name in times}
+
+
+HEAD = """# TV-L1 flow
+
+Printed by `python benchmarks/tvl1.py`: our flow, and OpenCV's DualTVL1 with its defaults."""
 
 
 def main() -> int:
@@ -276,4 +282,4 @@ def _textured_half(reference: FloatArray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(publish_printed(HEAD, main))

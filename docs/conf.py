@@ -63,7 +63,7 @@ html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
 html_static_path = ["_static"]
 html_css_files = ["turbrestore.css"]
-html_title = "turbrestore"
+html_title = f"turbrestore {release}"
 html_show_sourcelink = False
 # Every page shows the whole table of contents, with its captions.
 html_sidebars = {"**": ["manual.html"]}

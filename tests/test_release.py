@@ -30,11 +30,11 @@ def test_every_data_file_is_in_the_wheel():
             assert any(fnmatch(path.name, pattern) for pattern in patterns), path
 
 
-def test_the_version_stands_in_one_place_and_the_changelog_begins_with_it():
+def test_the_version_is_that_of_the_package_everywhere():
     assert TOOL["dynamic"]["version"] == {"attr": "turbrestore.__version__"}
     heading = re.search(r"(?m)^## (\S+?),? ", (ROOT / "CHANGELOG.md").read_text())[1]
     assert heading == turbrestore.__version__
-    assert not re.search(r"(?m)^version:", (ROOT / "CITATION.cff").read_text())
+    assert re.search(r"(?m)^version: (\S+)$", (ROOT / "CITATION.cff").read_text())[1] == turbrestore.__version__
 
 
 def test_the_workflow_has_no_secrets_and_writes_nothing():

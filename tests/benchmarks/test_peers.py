@@ -1,18 +1,24 @@
 """The table of methods: every method runs, figures land in the right cells, and a lead of others is printed."""
 
+import importlib
 import json
 import subprocess
 import sys
+import zipfile
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import peers
 import pytest
-from methods.packages import PackageError, make_environment, run_package
+from methods.packages import NETWORK, STACKERS, PackageError, make_environment, run_package
 from methods.usage import peak_megabytes
 from peer_tables import document
 from peer_videos import moving_square, score_video
+from provenance import LINE
 
+import turbrestore
 from conftest import make_sequence
 
 BENCHMARKS = Path(peers.__file__).parent
@@ -52,7 +58,43 @@ def test_a_package_that_fails_is_left_out_with_its_reason(folder, tmp_path):
 def test_an_environment_that_cannot_be_made_gives_its_reason(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(PackageError, match="cannot be made"):
-        make_environment(tmp_path / "file" / "environment")
+        make_environment(replace(STACKERS, folder=tmp_path / "file" / "environment"))
+
+
+def test_a_network_sees_every_frame_and_pixel_once(tmp_path, monkeypatch):
+    """Of windows, tiles and padding nothing is left where the network returns what it is given."""
+    seen = []
+
+    class Identity:
+        def __init__(self, weights, options, providers):
+            assert weights == b"weights"
+
+        def run(self, _, given):
+            planes = given["input"]
+            seen.append(planes.shape)
+            assert planes.dtype == np.float16 and planes.shape[1] % 3 == 0
+            # Red, green and blue of a frame lie beside each other.
+            colours = planes.reshape(-1, 3, *planes.shape[2:])
+            assert not np.any(colours[:, 0] - colours[:, 2])
+            return [planes]
+
+    monkeypatch.syspath_prepend(BENCHMARKS / "methods")
+    fake = SimpleNamespace(InferenceSession=Identity, SessionOptions=SimpleNamespace)
+    monkeypatch.setitem(sys.modules, "onnxruntime", fake)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    with zipfile.ZipFile(tmp_path / "vs_undistort-2.3.1-py3-none-any.whl", "w") as packed:
+        packed.writestr("vs_undistort/models/UNet3d_TMT_cub_op19_fp16.onnx", b"weights")
+    child = importlib.import_module("package_child")
+    frames = np.random.default_rng(0).random((13, 70, 300), dtype=np.float32)
+    for given in (frames, np.stack([frames] * 3, axis=-1)):
+        made = []
+        child.tmt_detilting(given, tmp_path, made.append)
+        np.testing.assert_allclose(made[0], given, atol=5e-4)
+    assert set(seen) == {(1, 30, 128, 256)}
+    # Windows and tiles cover what they are parts of.
+    for length, overlap in ((40, 0), (41, 16), (300, 16), (1000, 16)):
+        begins = child.starts(length, 40, overlap)
+        assert begins[0] == 0 and begins[-1] + 40 == length and max(np.diff(begins), default=0) <= 40 - overlap
 
 
 def test_the_memory_of_the_parent_is_not_counted():
@@ -76,12 +118,29 @@ class TestDocument:
 
     def test_means_are_those_of_the_clips(self):
         text = self.document()
-        assert "| turbrestore | 25.00 | 25.00 | 0.500 | 0.600 | – | – | – | 1.0 | 0.5 | 100 |" in text
+        assert "| turbrestore | 25.00 | 25.00 | 0.500 | 0.600 | – | – | – | – | 1.0 | 0.5 | 100 |" in text
         assert "- other: not installed" in text
         assert "On no clip." in text
 
     def test_a_lead_of_another_method_is_printed(self):
         assert "- a: mean 25.40; turbrestore 25.00 dB" in self.document(psnr_sharp=25.4)
+
+    def test_a_lead_is_followed_by_where_it_arises(self):
+        assert "Before deblurring mean is 1.00 dB ahead already" in self.document(psnr=21.0, psnr_sharp=25.4)
+        assert "Before deblurring mean is 1.00 dB behind" in self.document(psnr=19.0, psnr_sharp=25.4)
+
+    def test_a_network_has_a_table_and_spoils_no_mean_where_it_did_not_run(self):
+        drawn, other = "drawn_air_page", "quick_chart"
+        found = {**FIGURES, **SPENT}
+        results = {
+            NETWORK: {drawn: {**found, "psnr_sharp": 24.0}},
+            "turbrestore": {drawn: found, other: found},
+        }
+        text = document(results, {}, {}, {})
+        reported, others = text.split("## Means over the other clips")
+        assert f"| {NETWORK} | 20.00 | 24.00 |" in reported
+        assert f"| {NETWORK} | – | – |" in others and "| turbrestore | 20.00 | 25.00 |" in others
+        assert f"| {drawn} | 20.00 | 24.00 | 25.00 | – | – |" in text
 
     def test_a_lead_on_a_video_is_printed(self):
         methods = {"mean": {"psnr": 22.0}, "turbrestore": {"psnr": 21.0}}
@@ -118,7 +177,8 @@ def test_the_script_prints_and_writes_its_document(tmp_path, monkeypatch, capsys
         sys, "argv", ["peers.py", "--without-videos", "--write", str(target), "--json", str(tmp_path / "f.json")]
     )
     assert peers.main() == 0
-    assert target.read_text() == capsys.readouterr().out
+    assert LINE.sub("", target.read_text()) == capsys.readouterr().out
+    assert LINE.search(target.read_text())["version"] == turbrestore.__version__
     assert "--clips" not in target.read_text()
     monkeypatch.setattr(sys, "argv", ["peers.py", "--without-videos", "--clips", "smooth_*", "tiny"])
     assert peers.main() == 0

@@ -1,0 +1,157 @@
+"""What limits a result: the same clips restored as they are, with the true motion, with the true blur, and without end.
+
+    python benchmarks/oracles.py --write benchmarks/results/oracles.md
+
+Scenes that no constant was set on are moved by smooth random flows behind a lens, with one thing at a time made worse.
+An oracle gives the product something that a recording does not tell.  ``--quick`` takes one scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from blur_calibration import registered, transfer_function
+from blur_clips import part_of
+from clips import DRAWN_SCENES
+from provenance import publish
+
+from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.blur.witnesses.hypotheses import shapes
+from turbrestore.core.arrays import FloatArray
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.metrics import compare
+from turbrestore.pipeline import restore
+from turbrestore.registration.flow_algebra import compose_flows, invert_flow
+from turbrestore.registration.warp import warp
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
+
+SCENES, SIDE, BORDER = DRAWN_SCENES[:3], 176, 12
+FRAMES = (8, 15, 30, 60, 120)
+COLUMNS = ("mean", "product", "true flow", "true blur", "both", "no end of frames", "against the scene")
+
+
+@dataclass(frozen=True)
+class Case:
+    """Number of frames, displacement and blur in pixels, noise as a share of white."""
+
+    count: int = 30
+    displacement: float = 1.5
+    blur: float = 1.2
+    noise: float = 0.01
+
+
+BASE = Case()
+CASES = {
+    "base": BASE,
+    "8 frames": replace(BASE, count=8),
+    "displacement 4 px": replace(BASE, displacement=4.0),
+    "blur 2.5 px": replace(BASE, blur=2.5),
+    "noise 0.05": replace(BASE, noise=0.05),
+}
+
+Row = dict[str, float]
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="one scene, at most 15 frames")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
+    options = parser.parse_args()
+    scenes, most = (SCENES[:1], 15) if options.quick else (SCENES, FRAMES[-1])
+    cases = CASES | {f"{count} frames": replace(BASE, count=count) for count in FRAMES}
+    rows: dict[str, Row] = {}
+    for title, case in cases.items():
+        found = [measure(scene, replace(case, count=min(case.count, most))) for scene in scenes]
+        rows[title] = {column: float(np.mean([row[column] for row in found])) for column in COLUMNS}
+        print(title, rows[title], file=sys.stderr, flush=True)
+    publish(document(rows, scenes), options.write)
+    return 0
+
+
+def measure(scene: str, case: Case) -> Row:
+    """PSNR, dB, of each column."""
+    frames, flows, truth, original = clip(scene, case)
+    whole = restore(frames)
+    filtered = whole.centroid.image if whole.filtered is None else whole.filtered.image
+    sigma = 0.0 if whole.deconvolution is None else whole.deconvolution.sigma
+    same = DeconvolutionParams(sigma=sigma, exponent=None if whole.blur is None else whole.blur.exponent)
+    merged = np.mean([warp(frame, flow) for frame, flow in zip(frames, flows, strict=True)], axis=0, dtype=np.float32)
+    limit = cv2.GaussianBlur(truth, (0, 0), case.blur)
+    images = {
+        "mean": whole.mean,
+        "product": whole.image,
+        "true flow": deblurred(merged, same),
+        "true blur": deblurred(filtered, blur_of(filtered, registered(truth, filtered))),
+        "both": deblurred(merged, blur_of(merged, truth)),
+        "no end of frames": deblurred(limit, blur_of(limit, truth)),
+    }
+    inner = np.s_[BORDER:-BORDER, BORDER:-BORDER]
+    row = {column: compare(image[inner], truth[inner]).psnr for column, image in images.items()}
+    return row | {"against the scene": compare(whole.image[inner], original[inner]).psnr}
+
+
+def clip(scene: str, case: Case) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Frames, the flows to them from the scene at their mean geometry, that scene, and the scene itself."""
+    rng = np.random.default_rng(zlib.crc32(f"oracles {scene}".encode()))
+    original = part_of(scene, (SIDE, SIDE), rng, 2 * SIDE)
+    moved = smooth_flows(case.count, SIDE, SIDE, rng, SmoothFlowParams(rms=case.displacement))
+    frames = distort(original, moved, rng, case.blur, case.noise)
+    back = invert_flow(moved.mean(axis=0))
+    return frames, np.stack([compose_flows(flow, back) for flow in moved]), warp(original, back), original
+
+
+def deblurred(image: FloatArray, params: DeconvolutionParams) -> FloatArray:
+    """Image without this blur."""
+    return remove_blur(image, image, params).deconvolution.image
+
+
+def blur_of(image: FloatArray, truth: FloatArray) -> DeconvolutionParams:
+    """Width and shape that fit the transfer function from the truth to the image."""
+    (width,), (exponent,) = shapes(transfer_function(image, truth)[None])
+    return DeconvolutionParams(sigma=float(width), exponent=float(exponent))
+
+
+def document(rows: dict[str, Row], scenes: tuple[str, ...]) -> str:
+    """Markdown of both tables."""
+    return "\n".join(
+        [
+            "# What limits a result\n",
+            "What `python benchmarks/oracles.py --write benchmarks/results/oracles.md` measures: PSNR, dB, means over "
+            f"the scenes {', '.join(scenes)} ({SIDE}×{SIDE} pixels), which smooth random flows move behind a lens: "
+            f"{BASE.count} frames, displacement {BASE.displacement} px, blur {BASE.blur} px, noise {BASE.noise}, if "
+            "the row does not say otherwise.  All columns but the last compare with the scene at the mean geometry of "
+            "the frames.\n",
+            "- **true flow**: mean of the frames registered by their true flows, deblurred by the width that the "
+            "product removes.\n"
+            "- **true blur**: filtered image of the product, deblurred by the width and shape of its true transfer "
+            "function, which is fitted to the truth.\n"
+            "- **both**: both; all that so many frames can give to this deconvolution.\n"
+            "- **no end of frames**: the blurred scene without noise, deblurred by its true blur.\n"
+            "- **against the scene**: the product, compared with the scene itself: what the mean geometry of so few "
+            "frames leaves bent.\n",
+            "## One thing made worse at a time\n",
+            *_table(rows, CASES),
+            "\n## More frames\n",
+            *_table(rows, [f"{count} frames" for count in FRAMES]),
+            "",
+        ]
+    )
+
+
+def _table(rows: dict[str, Row], titles: list[str] | dict[str, Case]) -> Iterator[str]:
+    yield f"| clip | {' | '.join(COLUMNS)} |"
+    yield f"|---|{'---:|' * len(COLUMNS)}"
+    for title in titles:
+        yield f"| {title} | {' | '.join(f'{rows[title][column]:.2f}' for column in COLUMNS)} |"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,110 @@
+"""Figures in README.md and docs/ that are those of the tables in ``benchmarks/results``.
+
+A text holds them between ``<!-- figures: NAME -->`` and ``<!-- end -->``; ``fill_texts`` writes them anew.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
+MARK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+# As README.md calls the methods of peers.md.
+METHODS = {
+    "mean": "temporal mean",
+    "lucky average": "lucky average",
+    "PlanetarySystemStacker": "PlanetarySystemStacker",
+    "pystackreg": "pystackreg",
+    "Sobolev flow": "Sobolev flow (Lou et al. 2013)",
+    "low rank": "low rank (Oreifej et al. 2013)",
+    "template": "diffeomorphic template (Lao et al. 2024)",
+    "TMT de-tilting": "de-tilting network of TMT (Zhang et al. 2024), mean of its frames",
+    "turbrestore": "turbrestore",
+}
+STAGES = {
+    "middle frame": "middle frame",
+    "mean": "temporal mean",
+    "centroid": "centroid",
+    "filtered": "filtered",
+    "paper": "settings of the paper",
+    "default": "default",
+}
+
+HEAD = "| PSNR, dB | structural similarity | words by Tesseract | words by RapidOCR |\n|---|---:|---:|---:|---:|"
+SCORES = "PSNR of the deblurred images, dB"
+
+# Rows of a table by their first cell, each a cell by column.
+Table = dict[str, dict[str, str]]
+
+
+def fill_texts() -> list[str]:
+    """Write the figures of all texts, and return the names of those that have changed."""
+    changed = []
+    for path in texts():
+        old = path.read_text("utf-8")
+        if (new := filled(old)) != old:
+            path.write_text(new, "utf-8")
+            changed.append(path.relative_to(ROOT).as_posix())
+    return changed
+
+
+def texts() -> list[Path]:
+    """Texts that hold figures."""
+    found = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    return [path for path in found if MARK.search(path.read_text("utf-8"))]
+
+
+def filled(text: str) -> str:
+    """Text with the figures of the tables."""
+    return MARK.sub(lambda found: found[1] + PARTS[found[2]]() + found[3], text)
+
+
+def read_table(name: str, heading: str) -> Table:
+    """First table below a heading of ``benchmarks/results/NAME.md``."""
+    below = (RESULTS / f"{name}.md").read_text("utf-8").partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+    lines = re.search(r"(?m)(?:^\|.*\|\n)+", below)
+    if lines is None:
+        return {}
+    head, _, *rows = ([cell.strip() for cell in line.strip("|").split(" | ")] for line in lines[0].splitlines())
+    return {row[0]: dict(zip(head, row, strict=True)) for row in rows}
+
+
+def methods() -> str:
+    """Means of the methods over the clips that nothing was chosen on, and where others are ahead."""
+    drawn = read_table("peers", "Means")
+    text = read_table("peers", "Means over the other clips")
+    lines = [f"| method {HEAD}"]
+    for name, title in METHODS.items():
+        if name in drawn:
+            figures = [drawn[name]["PSNR, dB, deblurred"], drawn[name]["SSIM, deblurred"]]
+            figures += [text[name][f"words by {reader}, deblurred"] for reader in ("Tesseract", "RapidOCR")]
+            lines.append(f"| {title} | {' | '.join(figures)} |")
+    leads = []
+    reported = [row for name, row in read_table("peers", SCORES).items() if name.startswith("drawn_")]
+    for row in reported:
+        others = [float(cell) for name, cell in row.items() if name not in ("clip", "turbrestore") and cell != "–"]
+        leads.append(max(others) - float(row["turbrestore"]))
+    lost = [lead for lead in leads if lead > 0.05]
+    said = f"Another method is ahead in PSNR on {len(lost)} of these {len(reported)} clips"
+    said += f", by up to {max(lost):.1f} dB." if lost else "."
+    return "\n".join([*lines, "", said, ""])
+
+
+def stages() -> str:
+    """Means of every stage over the clips that nothing was chosen on, and the words of the others."""
+    psnr, ssim = (
+        read_table("quality", heading)["**mean**"]
+        for heading in ("PSNR, dB", "Structural similarity, after the best gain and offset")
+    )
+    words = [read_table("quality", f"Share of the words that {one} reads") for one in ("tesseract", "rapidocr")]
+    lines = [f"| {HEAD}"]
+    for name, title in STAGES.items():
+        cells = [psnr[name], ssim[name], *(one.get("**mean**", {}).get(name, "–") for one in words)]
+        lines.append(f"| {title} | {' | '.join(cells)} |")
+    return "\n".join([*lines, ""])
+
+
+PARTS: dict[str, Callable[[], str]] = {"methods": methods, "stages": stages}

@@ -1,0 +1,123 @@
+"""Clips that nothing was chosen on, tables that split by them, what a table is of, and texts with their figures."""
+
+import sys
+
+import all as everything
+import blur_clips
+import clips
+import cv2
+import numpy as np
+import oracles
+import provenance
+import pytest
+import quality
+import texts
+from provenance import LINE, outdated, revision, with_origin
+
+import turbrestore
+from turbrestore.registration.warp import warp
+
+
+class TestDrawnClips:
+    def test_they_are_those_of_the_version(self):
+        one, same, other = (clips.drawn_clips(version)["drawn_lens_coins"]() for version in ("1.0", "1.0", "1.1"))
+        np.testing.assert_array_equal(one.frames, same.frames)
+        assert not np.array_equal(one.truth, other.truth)
+        assert one.frames.dtype == np.float32
+        # The truth is the scene in the geometry of the frames: their mean lies about it.
+        errors = [np.abs(one.frames.mean(axis=0) - truth).mean() for truth in (one.truth, other.truth)]
+        assert errors[0] < 0.5 * errors[1]
+
+    def test_no_other_clip_shows_their_scenes(self):
+        shown = {name.split("_")[-1] for name in clips.find_clips() if name.startswith(("smooth_", "screens_"))}
+        assert not shown & set(clips.DRAWN_SCENES)
+        assert not set(clips.DRAWN_SCENES) & set(blur_clips.CHOSEN)
+
+    def test_they_are_found_and_told_apart(self):
+        assert {*filter(clips.is_reported, clips.find_clips())} == {*clips.drawn_clips(turbrestore.__version__)}
+
+
+def test_reported_and_other_clips_have_means_of_their_own():
+    rows = {"drawn_air_page": 30.0, "drawn_lens_page": 20.0, "smooth_cat": 40.0}
+    figures = {clip: {"default": {"psnr": value, "ssim": 0.5}} for clip, value in rows.items()}
+    text = quality.document(figures)
+    reported, others = text.split("## PSNR, dB\n")[1].split("## ")[0].split("| **mean** |")[1:]
+    assert "25.00" in reported and "smooth_cat" in reported and "40.00" in others
+
+
+def test_a_table_says_what_it_is_of_once():
+    once = with_origin("# Title\n\nText.\n")
+    assert with_origin(once).count("turbrestore") == 1
+    found = LINE.search(once)
+    assert found["version"] == turbrestore.__version__ and found["revision"] == revision()
+    assert LINE.sub("", once) == "# Title\n\nText.\n"
+
+
+def test_oracles_know_the_motion_and_the_blur():
+    case = oracles.Case(count=6, displacement=1.5, blur=1.2, noise=0.0)
+    frames, flows, truth, _ = oracles.clip("coins", case)
+    inside = np.s_[12:-12, 12:-12]
+    blurred = cv2.GaussianBlur(truth, (0, 0), case.blur)
+    registered = np.mean([warp(frame, flow) for frame, flow in zip(frames, flows, strict=True)], axis=0)
+    assert np.abs(registered - blurred)[inside].mean() < 0.2 * np.abs(frames[0] - blurred)[inside].mean()
+    assert np.abs(flows.mean(axis=0))[inside].max() < 0.1
+    assert oracles.blur_of(blurred, truth).sigma == pytest.approx(case.blur, rel=0.15)
+
+
+class TestOutdated:
+    def test_a_table_before_the_last_release_is_outdated(self):
+        changelog = "# Changelog\n\n## 1.10.0, unreleased\nA.\n\n## 1.9.0, 2026-01-02\nB.\n\n## 1.8.0, 2025-01-02\n"
+        versions = {"older": "1.8.3", "as old": "1.9.0", "new": "1.10.0"}
+        assert outdated(versions, changelog) == ["older"]
+        assert outdated(versions, "# Changelog\n\n## 1.0.0, unreleased\n") == []
+
+    def test_no_table_is(self):
+        tables = sorted(everything.RESULTS.glob("*.md"))
+        found = {path.stem: LINE.search(path.read_text("utf-8")) for path in tables}
+        versions = {name: line["version"] if line else "0" for name, line in found.items()}
+        assert not outdated(versions, (everything.HERE.parent / "CHANGELOG.md").read_text("utf-8"))
+
+
+class TestAll:
+    def test_it_makes_every_table(self):
+        assert {path.stem for path in everything.RESULTS.glob("*.md")} <= set(everything.TABLES)
+        for table in everything.TABLES.values():
+            assert (everything.HERE / table.words.split()[0]).exists()
+
+    def test_a_table_of_this_revision_is_kept_and_another_is_made(self, tmp_path, monkeypatch, capsys):
+        script = tmp_path / "script.py"
+        script.write_text("import sys; open(sys.argv[-1], 'a').write('# T\\n\\nText.\\n')")
+        monkeypatch.setattr(everything, "RESULTS", tmp_path)
+        monkeypatch.setattr(everything, "revision", lambda: "abc1234")
+        monkeypatch.setattr(provenance, "revision", lambda: "abc1234")
+        table = everything.Table(str(script))
+        assert everything.make("t", table)
+        # The script itself did not say what its table is of.
+        assert LINE.search((tmp_path / "t.md").read_text())["revision"] == "abc1234"
+        assert everything.make("t", table) and (tmp_path / "t.md").read_text().count("Text.") == 1
+        monkeypatch.setattr(everything, "revision", lambda: "abc1234+")
+        assert everything.make("t", table) and (tmp_path / "t.md").read_text().count("Text.") == 2
+        script.write_text("raise SystemExit('no clip')")
+        assert not everything.make("t", table)
+        assert "NOT WRITTEN" in capsys.readouterr().out
+
+
+class TestTexts:
+    def test_figures_are_those_of_the_tables(self):
+        for path in texts.texts():
+            assert texts.filled(path.read_text("utf-8")) == path.read_text("utf-8"), f"{path}: run benchmarks/all.py"
+
+    def test_the_first_table_below_a_heading_is_read(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(texts, "RESULTS", tmp_path)
+        (tmp_path / "t.md").write_text(
+            "# T\n\n## A\n\nText.\n\n| x | y |\n|---|---|\n| 1 | 2 |\n\n| z |\n\n## B\n\nNone.\n"
+        )
+        assert texts.read_table("t", "A") == {"1": {"x": "1", "y": "2"}}
+        assert texts.read_table("t", "B") == {}
+
+
+def test_a_script_that_prints_its_table_stores_it_below_its_heading(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["script.py", "--write", str(tmp_path / "t.md"), "rest"])
+    assert provenance.publish_printed("# T", lambda: 3 * bool(sys.stdout.write("| 1 |\n"))) == 3
+    assert capsys.readouterr().out == "| 1 |\n"
+    assert LINE.sub("", (tmp_path / "t.md").read_text()) == "# T\n\n| 1 |\n"
