@@ -4,7 +4,7 @@
 
 prints the peak signal-to-noise ratio of the result, of the filtered image, of the temporal mean and of the median of
 every clip, after the best gain and offset.  ``robustness.py --groups recordings`` asks that no result is worse than the
-mean, and that in snow and rain it is better than the median.
+mean, text as little as the rest, and that in snow and rain it is better than the median.
 """
 
 from __future__ import annotations
@@ -21,10 +21,13 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
+from turbrestore.settings import RestoreParams
 
 COUNT, SIDE = 32, 144
 # Kinds in which what hides the scene covers a pixel in less than half of the frames.
 COVERED = ("snow", "rain")
+# Ratio from which text is as it was drawn, dB.
+AS_DRAWN = 35.0
 RNG = np.random.default_rng
 
 
@@ -37,10 +40,15 @@ class Figures:
     filtered: float
     mean: float
     median: float
+    text: tuple[float, float] | None = None  # of result and mean, in dB, where digits are drawn over the scene
 
     def bound(self, slack: float) -> float:
         """Return the least ratio that the result may have."""
         return self.median if self.name.split()[-1] in COVERED else self.mean - slack
+
+    def text_is_worse(self, slack: float) -> bool:
+        """Whether text is worse than in the mean, and not as good as what is drawn."""
+        return self.text is not None and self.text[0] < min(self.text[1] - slack, AS_DRAWN)
 
 
 def as_8_bits(frames: FloatArray) -> np.ndarray:
@@ -90,6 +98,18 @@ def written(frames: FloatArray) -> np.ndarray:
         for shade, width in ((0, 3), (255, 1)):
             place, text = (8, 136), f"09:48:{number // 10:02d}.{number % 10}"
             cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, shade, width)
+    return result
+
+
+def stamped(frames: FloatArray) -> np.ndarray:
+    """Draw a time code over the frames, and a counter in a black box, whose digits change in every frame."""
+    result = as_8_bits(frames)
+    for number, frame in enumerate(result):
+        for shade, width in ((0, 3), (255, 1)):
+            text = f"14:06:{51 + number // 25:02d}:{number % 25:02d}"
+            cv2.putText(frame, text, (30, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, shade, width)
+        cv2.rectangle(frame, (50, 120), (132, 138), 0, -1)
+        cv2.putText(frame, f"No {2871 + number:06d}", (54, 133), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 255, 1, cv2.LINE_AA)
     return result
 
 
@@ -161,37 +181,54 @@ KINDS: dict[str, Callable[[FloatArray], np.ndarray]] = {
 # What is drawn into the picture is part of what is right.
 DRAWN: dict[str, Callable[[FloatArray], np.ndarray]] = {
     "clock": written,
+    "time code": stamped,
     "logo": with_logo,
     "side by side": side_by_side,
     "picture in picture": in_picture,
 }
 
 
-def clips() -> Iterator[tuple[str, np.ndarray, FloatArray]]:
-    """Name, frames and truth of every clip."""
+TEXTS = {"title": titled, "clock": written, "time code": stamped}
+
+
+def of_text(
+    frames: FloatArray, scene: FloatArray, record: Callable[[FloatArray], np.ndarray]
+) -> Callable[[FloatArray], float]:
+    """Return the ratio of an image to the mean of what was drawn, in most of the frames, over the scene at rest."""
+    text = np.mean(np.abs(record(frames) - 255 * frames) > 20, axis=0) >= 0.5
+    truth = record(np.repeat(scene[None], COUNT, axis=0)).mean(axis=0) / np.float32(255)
+    return lambda image: float(-10 * np.log10(np.mean((image[text] - truth[text]) ** 2)))
+
+
+def clips() -> Iterator[tuple[str, np.ndarray, FloatArray, Callable[[FloatArray], float] | None]]:
+    """Name, frames and truth of every clip, and the ratio of an image in its text."""
     from conftest import make_sequence
 
     for scene in ("camera", "chart"):
         still = make_sequence(19, COUNT, SIDE, scene, blur=0.8, noise=0.008, rms=1.2)
         for kind, record in KINDS.items():
-            yield f"{scene}, {kind}", record(still.frames), still.scene
+            ratio = of_text(still.frames, still.scene, TEXTS[kind]) if kind in TEXTS else None
+            yield f"{scene}, {kind}", record(still.frames), still.scene, ratio
         for kind, record in DRAWN.items():
-            yield f"{scene}, {kind}", record(still.frames), record(still.scene[None])[0] / np.float32(255)
+            ratio = of_text(still.frames, still.scene, TEXTS[kind]) if kind in TEXTS else None
+            yield f"{scene}, {kind}", record(still.frames), record(still.scene[None])[0] / np.float32(255), ratio
     wide = make_sequence(20, COUNT, SIDE + 48, "camera", blur=0.8, noise=0.008, rms=0.8)
     places = np.arange(COUNT) * 3 // 2
     frames = np.stack([frame[24 : 24 + SIDE, x : x + SIDE] for frame, x in zip(wide.frames, places, strict=True)])
     for k, frame in enumerate(frames):
         frame[100:124, max(9 * k - 60, 0) : max(9 * k, 0)] = 0.9
-    yield "camera, car before a moving camera", as_8_bits(frames), wide.scene[24 : 24 + SIDE, 23 : 23 + SIDE]
+    yield "camera, car before a moving camera", as_8_bits(frames), wide.scene[24 : 24 + SIDE, 23 : 23 + SIDE], None
 
 
 def figures() -> Iterator[Figures]:
     """Ratios of every clip."""
-    for name, frames, truth in clips():
-        found, raw = restore(FrameSource.from_array(frames)), frames / np.float32(np.iinfo(frames.dtype).max)
+    for name, frames, truth, ratio in clips():
+        found = restore(FrameSource.from_array(frames), RestoreParams(border="keep"))
+        raw = frames / np.float32(np.iinfo(frames.dtype).max)
         fused = found.mean if found.filtered is None else found.filtered.image
         images = found.image, fused, raw.mean(axis=0), np.median(raw, axis=0)
-        yield Figures(name, *(compare(image, truth).psnr_fit for image in images))
+        text = None if ratio is None else (ratio(images[0]), ratio(images[2]))
+        yield Figures(name, *(compare(image, truth).psnr_fit for image in images), text)
 
 
 if __name__ == "__main__":
@@ -200,5 +237,6 @@ if __name__ == "__main__":
         print(
             "{name}: result {result:.2f}, filtered {filtered:.2f}, mean {mean:.2f}, median {median:.2f}".format(
                 **vars(row)
-            )
+            ),
+            "" if row.text is None else "text {:.2f}, mean {:.2f}".format(*row.text),
         )

@@ -159,7 +159,15 @@ def recordings_kinds(slack: float) -> Row:
         for row in rows
         if row.result < row.bound(slack)
     )
-    rule = f"the result is no more than {slack} dB worse than the temporal mean; in snow and rain above the median"
+    worse += tuple(
+        f"{row.name}: text {row.text[0]:.2f} dB, mean {row.text[1]:.2f}"
+        for row in rows
+        if row.text is not None and row.text_is_worse(slack)
+    )
+    rule = (
+        f"the result, and the text in it, is no more than {slack} dB worse than the temporal mean; in snow and rain "
+        "the result is above the median"
+    )
     title = "clips with more than the scene: weather, photons, titles, pictures in pictures, sensors, shadows, a car"
     return Row(title, len(rows), rule, len(rows) - len(worse), worse)
 

@@ -198,6 +198,24 @@ class TestTitles:
         assert len(check_content(FrameSource.from_array(titled)).stuck) == 0
 
 
+class TestClocks:
+    """Digits that change keep their pixels, although they do not stand all the time."""
+
+    def test_they_stay_as_in_the_mean(self, clip):
+        frames = u8(0.8 * clip.frames)
+        plain = frames.copy()
+        for number, frame in enumerate(frames):
+            for shade, width in ((0, 3), (255, 1)):
+                cv2.putText(frame, f"1:{number // 2:02d}", (8, 70), cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, width)
+        source = FrameSource.from_array(frames)
+        title = without_overlay(source)[2]
+        changing = (frames.std(axis=0) > 40) & ((frames != plain).mean(axis=0) >= 0.5)
+        assert title is not None and title.mask[changing].mean() > 0.9
+        assert title.mask[:46].sum() == 0
+        found = restore(source)
+        np.testing.assert_allclose(found.image[title.mask], frames.mean(axis=0)[title.mask] / 255, atol=0.01)
+
+
 class TestBars:
     @pytest.mark.parametrize("sides", [(12, 12, 0, 0), (0, 0, 20, 30), (8, 0, 4, 0)])
     def test_the_picture_is_as_without_them(self, clip, sides):

@@ -13,12 +13,15 @@ of the scene.  Flow, fusion and deconvolution then see the scene alone.
 With a camera that stands no frame shows what is behind a title.  The scene moves all the same, by the pixel or two that
 the air bends it: every frame is continued over the overlay, whose pixels are put back into the result as they are in
 the mean of the frames.
+
+The digits of a clock change, but from one frame to the next most of their strokes stand, as no edge does that the air
+moves.  Where an overlay has been found, the places of such strokes belong to it.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -56,6 +59,17 @@ _AROUND, _REACH, _FREE = 2, 12.0, 0.9
 _NEAR, _GAP, _FADE = 4, 2, 0.7
 # Deviation of a title, in units of the noise.
 _NOISELESS = 0.7
+# Strokes of a clock: least change of a pixel, in units of the noise and in intensity, that is one; least share of the
+# frames that have an edge there, and of these in which it stands; fewest pixels that belong together.
+_SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5 / 255, 0.2, 0.25, 12
+# Fewest frames in which it stands, and the share that 10 % of the edges exceed in a scene that moves by a pixel.
+_TIMES, _USUAL, _ALMOST_USUAL = 2, 0.15, 1.5
+# Largest part of the frame that digits take.
+_MOST_DIGITS = 0.1
+# Pixels beside others in which fewer frames need to have it.
+_BESIDE, _REMAINS_BESIDE = 8, 0.18
+# Most frames in which they are looked for.
+_LOOKED_AT = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +149,11 @@ def without_overlay(
     """
     given, title = mask is not None, None
     if mask is None and FEWEST <= len(survey.small) <= _MOST:
-        mask, title = _standing(survey.clip, moments or measure_moments(survey))
+        moments = moments or measure_moments(survey)
+        mask, title = _standing(survey.clip, moments)
+        if mask is not None:
+            shown = mask if title is None else title.mask
+            mask, title = _with_digits(mask, title, _digits(survey.clip, moments, shown))
     if mask is None:
         return survey, None, None, ()
     small = _continued_small(survey.small, mask)
@@ -185,6 +203,55 @@ def _standing(source: FrameSource, moments: Moments) -> tuple[NDArray[np.bool_] 
     letters = cv2.morphologyEx(letters, cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
     letters = cv2.dilate(letters, np.ones((3, 3), np.uint8)) > 0
     return mask, Title(letters, moments.mean, source.window)
+
+
+def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mark strokes that stand from one frame to the next, and change at times; with the gaps between them."""
+    same, clear = max(_SAME * moments.noise, _LEAST_SAME), _DEVIATIONS * max(moments.noise, _LEAST_STILL / _STILL)
+    edges, standing = np.zeros((2, *source.shape[1:3]), np.int32)
+    part, before = source.select((0, len(source), max(1, len(source) // _LOOKED_AT))), None
+    for frame in part:
+        grey = luminance(frame)
+        if before is not None:
+            edge = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8 > clear
+            edges += edge
+            standing += edge & (np.abs(grey - before) < same)
+        before = grey
+    # What stands all the time is found by its deviation.
+    moving = (edges >= _OFTEN * (len(part) - 1)) & (moments.variance > (_STILL * same) ** 2)
+    if not moving.any():
+        return moving
+    share = np.where(moving, standing / np.maximum(edges, 1), 0)
+    # Where the scene hardly moves, its edges stand at times as well.
+    usual = max(float(np.quantile(share[moving], 0.9)) / _USUAL, 1.0)
+    share[standing < _TIMES] = 0
+    digits = _large(share > _REMAINS * usual)
+    if usual <= _ALMOST_USUAL:
+        near = cv2.dilate((digits | mask).astype(np.uint8), np.ones((2 * _BESIDE + 1,) * 2, np.uint8)) > 0
+        digits |= _large(near & (share > _REMAINS_BESIDE * usual))
+    return digits if digits.mean() <= _MOST_DIGITS else np.zeros_like(digits)
+
+
+def _large(strokes: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Regions of many strokes, with the gaps between them."""
+    closed = cv2.morphologyEx(strokes.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
+    _, labels = cv2.connectedComponents(closed, connectivity=8)
+    counts = np.bincount(labels[strokes], minlength=int(labels.max()) + 1)
+    counts[0] = 0
+    return np.asarray((counts >= _FEWEST_STROKES)[labels])
+
+
+def _with_digits(
+    mask: NDArray[np.bool_], title: Title | None, digits: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], Title | None]:
+    """Add digits, and a pixel around them, to what stands; a digit that a box surrounds is a hole in it."""
+    wide = cv2.dilate(digits.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    if title is None:
+        return mask | wide, None
+    letters = title.mask | wide
+    _, labels, sizes, _ = cv2.connectedComponentsWithStats((~letters).astype(np.uint8), connectivity=4)
+    letters |= (sizes[:, cv2.CC_STAT_AREA] <= (2 * _BESIDE + 1) ** 2)[labels]
+    return mask | wide, replace(title, mask=letters)
 
 
 def _motion(deviation: NDArray[np.float64], gradient: FloatArray, noise: float) -> float:
