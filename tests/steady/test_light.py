@@ -62,6 +62,9 @@ def test_gain_is_that_of_most_squares():
     frame[:4] = 0.5
     assert light_between(frame, other) == pytest.approx(gain, abs=1e-3)
     assert not light_between(other * 1.002, other).any()
+    moved = np.roll(other, 3, axis=0)
+    assert np.abs(light_between(1.05 * moved, moved) - np.log(1.05)).max() < 1e-3
+    assert np.abs(light_between(moved, other)).max() < 0.01
     assert not light_between(np.ones_like(other), other).any()
 
 

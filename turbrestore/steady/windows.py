@@ -30,6 +30,8 @@ _CUT = 0.5
 _CONTRAST_WINDOW, _CONTRAST_FLOOR = 10.0, 0.01
 # Side of the squares in which light is compared, pixels; range of intensities that are compared, and fewest squares.
 _SQUARE, _EXPOSED, _FEWEST = 8, (0.02, 0.95), 16
+# A gain that is as many times the scatter of the squares counts half.
+_SCATTER = 2.0
 # Smallest and largest logarithm of a gain, and the power of the intensity by which it fades towards white.
 _LEAST_LIGHT, _MOST_LIGHT, _WHITE = 0.005, 0.7, 8
 # Standard deviation of the shading that is taken off thumbnails, pixels of the thumbnail.
@@ -109,8 +111,14 @@ def light_between(frame: FloatArray, other: FloatArray) -> FloatArray:
     exposed = ((pair > _EXPOSED[0]) & (pair < _EXPOSED[1])).all(axis=(0, 2))
     if exposed.sum() < _FEWEST:
         return np.zeros(pair.shape[2], np.float32)
-    gains = np.median(np.log(pair[0, exposed] / pair[1, exposed]), axis=0)
-    return np.where(np.abs(gains).max() < _LEAST_LIGHT, 0, gains.clip(-_MOST_LIGHT, _MOST_LIGHT)).astype(np.float32)
+    ratios = np.log(pair[0, exposed] / pair[1, exposed])
+    gains = np.median(ratios, axis=0)
+    size, scatter = np.abs(gains).max(), np.median(np.abs(ratios - gains), axis=0).max()
+    if size < _LEAST_LIGHT:
+        return np.zeros(pair.shape[2], np.float32)
+    # Content that has moved changes some squares up and others down; light changes all alike.
+    gains /= 1 + (_SCATTER * scatter / size) ** 4
+    return gains.clip(-_MOST_LIGHT, _MOST_LIGHT).astype(np.float32)
 
 
 def relit(image: FloatArray, gain: FloatArray) -> FloatArray:
