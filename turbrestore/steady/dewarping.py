@@ -12,6 +12,10 @@ V : its inverse map, ``(id + D) ∘ (id + V) = id``, about d_k
 2. ``J = I_k ∘ (id + V)`` is the frame without its turbulent displacement.
 3. ``J_i = I_{k+i} ∘ (id + F_i) ∘ (id + V)`` are its neighbours, registered to it; those that agree are averaged with it
    (:mod:`turbrestore.steady.fusion`).
+
+Exposure and white balance may hunt.  Neighbours get the light of the frame before they are averaged with it, and the
+result gets the mean light of the pairs of neighbours, as far as light changes by the few per cent by which cameras
+hunt; what is switched on passes at once.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError
 from ..core.noise import estimate_noise
 from ..registration.camera.global_shift import LEAST_CORRELATION, correlation, measure_shift
@@ -44,12 +48,14 @@ from .grid import enlarged, follow, grid_of, inverted, pixel_of
 from .motion import moving_mask, path_length, witnesses
 from .path import smooth_motion, without_shake
 from .settings import SteadyParams
-from .windows import Window, WindowFrame, contrast_levels
+from .windows import Window, WindowFrame, contrast_levels, light_between, relit
 
 # Patches this sparse lose nothing on phase screens; closer ones take a fifth longer.
 _FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
 # Level of the pyramid, above the finest, at which a search with a start begins.
 _START_LEVEL = 1
+# Largest change of the light in a window, logarithm, of which half passes: cameras hunt by less, and lamps change more.
+_HUNTING = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +78,7 @@ class DewarpedFrame:
     removed_camera: Matrix  # (2, 3): its part in the displacement that was removed
     seen: WindowFrame  # the frame as it was
     mean: FloatArray  # (h, w): luminance of its neighbours on the grid, which the camera alone has brought to it
+    light: FloatArray  # (1,) or (3,): logarithm of the gain that takes the hunting of the camera off the result
 
 
 def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
@@ -95,8 +102,12 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
         displacement = mean_displacement(own, largest, path, pixel_of(shape))
         displacement += camera_flow(removed_camera, shape, grid)
     inverse = inverted(displacement, shape)
+    lights = _lights(window, cameras)
     registered = (
-        sample_splines(frame.planes, enlarged(inverse + follow(flows[offset], inverse, shape), shape))
+        relit(
+            sample_splines(frame.planes, enlarged(inverse + follow(flows[offset], inverse, shape), shape)),
+            lights[offset],
+        )
         for offset, frame in window.neighbours.items()
     )
     noise = estimate_noise(image)
@@ -119,6 +130,7 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
         removed_camera=removed_camera,
         seen=window.frame,
         mean=np.asarray(np.mean([*placed.values()] or [window.frame.grey], 0), np.float32),
+        light=_hunted(lights, window.frame),
     )
 
 
@@ -172,7 +184,28 @@ def _first_guess(frame: WindowFrame, neighbour: WindowFrame) -> Matrix:
 def _placed(window: Window, cameras: dict[int, Matrix]) -> dict[int, FloatArray]:
     """Luminance of the neighbours on the grid, without the motion of the camera."""
     shape, grid = window.frame.image.shape, window.frame.grey.shape
+    seen, placed = luminance(window.frame.coarse), {}
+    for offset, frame in window.neighbours.items():
+        light = light_between(seen, _coarsely(luminance(frame.coarse), cameras[offset], shape))
+        placed[offset] = relit(follow(frame.grey, camera_flow(cameras[offset], shape, grid), shape), light)
+    return placed
+
+
+def _lights(window: Window, cameras: dict[int, Matrix]) -> dict[int, FloatArray]:
+    """Light of the frame over that of each neighbour, logarithm."""
+    shape = window.frame.image.shape
     return {
-        offset: follow(frame.grey, camera_flow(cameras[offset], shape, grid), shape)
+        offset: light_between(window.frame.coarse, _coarsely(frame.coarse, cameras[offset], shape))
         for offset, frame in window.neighbours.items()
     }
+
+
+def _coarsely(image: FloatArray, camera: Matrix, shape: tuple[int, ...]) -> FloatArray:
+    return follow(image, camera_flow(camera, shape, image.shape), shape)
+
+
+def _hunted(lights: Mapping[int, FloatArray], frame: WindowFrame) -> FloatArray:
+    """Mean light of the pairs of neighbours over that of the frame, logarithm."""
+    paired = [-light for offset, light in lights.items() if -offset in lights]
+    known = np.stack([*paired, np.zeros(1 if frame.image.ndim == 2 else 3, np.float32)])
+    return np.asarray(known.mean(0) / (1 + (np.abs(known).max() / _HUNTING) ** 8), np.float32)

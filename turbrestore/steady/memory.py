@@ -52,6 +52,7 @@ from .camera import Matrix, camera_flow, fit_camera
 from .fusion import agreement_weight, explained_difference, for_channels
 from .grid import enlarged, grid_of, inverted, pixel_of, reduced
 from .path import motion
+from .windows import coarse_image, light_between, relit
 
 # Longest memory, frames: a change of the light is followed as fast.
 _LONGEST = 64
@@ -117,6 +118,7 @@ def remember(
     flow = flow_between(memory.image, image, camera_flow(expected, shape, grid))
     camera = fit_camera(flow, shape)
     own = flow - camera_flow(camera, shape, grid)
+    memory = _in_light(memory, coarse_image(warp(image, camera_flow(expected, shape))))
     placed = sample_linear((luminance(image),), camera_flow(expected, shape))
     found = [_distance(one, memory.mean) for one in (luminance(memory.image), placed)]
     distances = memory.distances + _CHECKED * (np.stack(found, -1) - memory.distances)
@@ -140,6 +142,13 @@ def remember(
     let_go = float(1 - agrees.mean())
     estimate = warp(memory.image + innovation, inverse)
     return Memory(estimate, sample_linear((held,), inverse), frames, memory.pose, mean, distances, let_go)
+
+
+def _in_light(memory: Memory, seen: FloatArray) -> Memory:
+    """Memory in the light of a frame, whose coarse image is given."""
+    known = coarse_image(memory.image)
+    gain, grey_gain = light_between(seen, known), light_between(luminance(seen), luminance(known))
+    return replace(memory, image=relit(memory.image, gain), mean=relit(memory.mean, grey_gain))
 
 
 def shown(memory: Memory) -> Memory:

@@ -7,7 +7,8 @@ G_j : affine map from the first frame of the scene to frame j, homogeneous, pixe
 P_j : motion of the camera from frame k to frame j, ``G_j G_k⁻¹ − 1``, of shape (2, 3)
 T : map from frame k to the steadied frame, ``1 +`` the value at k of a polynomial fitted to the P_j
 e : by what turbulence moves whole frames, pixels
-ε_i, σ_i : what fit i leaves, root mean square; standard deviation of its value at k, from ε_i
+ε_i, σ_i : what fit i leaves, root mean square; standard deviation of its value at k, from ε_i and ρ_i
+ρ_i : correlation of what fit i leaves in successive frames: a mean varies √((1 + ρ) / (1 − ρ)) times as much by it
 
 Turbulence moves whole frames as well, but at random about where the camera is, and a camera stands, pans and zooms at
 constant velocity for a while.  A parabola through a few frames follows whatever the camera does and averages little; a
@@ -37,10 +38,11 @@ LONGEST = 48
 # Fits: frames on either side of k, and order of the polynomial; fewest frames of a fit.
 _FITS = (6, 2), (6, 1), (12, 1), (24, 1), (LONGEST, 1), (LONGEST, 0)
 _FEWEST = 4
-# κ, greater than 1 because turbulence of successive frames is alike, and less for a camera that stands, since that is
-# the assumption that a slow pan breaks.
+# κ, less for a camera that stands, since that is the assumption that a slow pan breaks.
 _DOUBT, _STANDING = 2.0, 1.5
 _AT_ENDS = 0.5
+# Frames from one to the next whose residuals are compared, and the greatest correlation ρ that they count for.
+_SUCCESSIVE, _MOST_ALIKE = 2, 0.95
 # Least e and κ σ, pixels, so that an exact fit has a share.
 _LEAST = 1e-3
 
@@ -89,7 +91,7 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
             differs = camera_size((value - before).reshape(2, 3), shape)
             share *= 1 / (1 + (differs / max((_DOUBT if order else _STANDING) * doubt, _LEAST)) ** 4)
         smooth = smooth + share * (value - smooth)
-        doubt = size * spread
+        doubt = size * spread * _alikeness(times[near], left)
     return smooth.reshape(2, 3)
 
 
@@ -124,6 +126,16 @@ def _samples(path: Mapping[int, Matrix]) -> tuple[Matrix, Matrix, Matrix]:
     times = np.array(sorted([*path, 0]), np.float64)
     seen = np.stack([path[int(time)] if time else np.zeros((2, 3)) for time in times]).reshape(-1, 6)
     return times, seen, np.gradient(times) if len(times) > 1 else np.ones(1)
+
+
+def _alikeness(times: Matrix, left: Matrix) -> float:
+    """By how much more the mean of residuals varies than that of independent ones: √((1 + ρ) / (1 − ρ))."""
+    gaps = np.diff(times)
+    near, shifts = gaps <= _SUCCESSIVE, left.reshape(-1, 2, 3)[..., 2]
+    earlier, later = shifts[:-1][near], shifts[1:][near]
+    alike = 2 * (earlier * later).sum() / max((earlier**2 + later**2).sum(), _LEAST**2)
+    correlation = float(np.clip(alike, 0, _MOST_ALIKE)) ** (1 / gaps[near].mean())
+    return float(np.sqrt((1 + correlation) / (1 - correlation)))
 
 
 def _fit(times: Matrix, seen: Matrix, weights: Matrix, order: int) -> tuple[Matrix, Matrix, float]:

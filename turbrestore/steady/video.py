@@ -36,7 +36,7 @@ from .grid import enlarged, follow, grid_of, pixel_of, reduced
 from .memory import Memory, remember, shown
 from .path import LONGEST, camera_position, homogeneous, longer_path, motion, smooth_motion
 from .settings import SteadyParams
-from .windows import Window, iter_windows
+from .windows import Window, iter_windows, relit
 
 # Share of the width that is removed: too wide a blur costs more than too narrow a one, and compression, which makes
 # frames vary, makes the width too large.  Simulated clips without compression lose 0.1 dB by it.
@@ -267,9 +267,10 @@ def _sharpened(
     memory, moving, width = estimate
     noise = frame.noise * frame.share
     remembered = noise / float(np.sqrt(memory.held.mean()))
+    image = deblur(memory.image, (sigma, round(width, 2)), exponent, (noise, remembered), memory.held)
     return SteadyFrame(
         number=frame.number,
-        image=deblur(memory.image, (sigma, round(width, 2)), exponent, (noise, remembered), memory.held),
+        image=relit(image, frame.light),
         moving=moving,
         displacement=frame.displacement,
         sigma=sigma,

@@ -28,6 +28,12 @@ from .grid import pixel_of, reduced
 _CUT = 0.5
 # Contrast normalisation of the images that flow is measured from, as in registration.flow.
 _CONTRAST_WINDOW, _CONTRAST_FLOOR = 10.0, 0.01
+# Side of the squares in which light is compared, pixels; range of intensities that are compared, and fewest squares.
+_SQUARE, _EXPOSED, _FEWEST = 8, (0.02, 0.95), 16
+# A gain that is as many times the scatter of the squares counts half.
+_SCATTER = 2.0
+# Smallest and largest logarithm of a gain, and the power of the intensity by which it fades towards white.
+_LEAST_LIGHT, _MOST_LIGHT, _WHITE = 0.005, 0.7, 8
 # Standard deviation of the shading that is taken off thumbnails, pixels of the thumbnail.
 _SHADING = 5.0
 
@@ -40,6 +46,7 @@ class WindowFrame:
     planes: FloatArray  # (C, H + 3, W + 3): splines through its channels, which are sampled for each of its neighbours
     grey: FloatArray  # (h, w): luminance on the grid of the image
     levels: GreyImage  # (h, w): contrast-normalised image, which flow is measured from
+    coarse: FloatArray  # (h', w') or (h', w', 3): means of squares, which light is measured from
     scene: int  # number of the scene, from 0
     shift_reference: ShiftReference  # what shifts of the whole image are measured against
 
@@ -86,6 +93,45 @@ def contrast_levels(image: FloatArray) -> GreyImage:
     return _levels(luminance(reduced(image)), image.shape)
 
 
+def coarse_image(image: FloatArray) -> FloatArray:
+    """Means of the squares in which light is compared: they hardly notice turbulence.
+
+    ``image`` (H, W) or (H, W, 3); returns (h', w') or (h', w', 3).
+    """
+    height, width = (max(length // _SQUARE, 1) for length in image.shape[:2])
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def light_between(frame: FloatArray, other: FloatArray) -> FloatArray:
+    """Logarithm of the gain that gives a coarse image the light of another, 0 where it is not worth the while.
+
+    ``frame, other`` (h', w') or (h', w', 3); returns (1,) or (3,).
+    """
+    pair = np.stack([frame, other]).reshape(2, frame.shape[0] * frame.shape[1], -1)
+    exposed = ((pair > _EXPOSED[0]) & (pair < _EXPOSED[1])).all(axis=(0, 2))
+    if exposed.sum() < _FEWEST:
+        return np.zeros(pair.shape[2], np.float32)
+    ratios = np.log(pair[0, exposed] / pair[1, exposed])
+    gains = np.median(ratios, axis=0)
+    size, scatter = np.abs(gains).max(), np.median(np.abs(ratios - gains), axis=0).max()
+    if size < _LEAST_LIGHT:
+        return np.zeros(pair.shape[2], np.float32)
+    # Content that has moved changes some squares up and others down; light changes all alike.
+    gains /= 1 + (_SCATTER * scatter / size) ** 4
+    return gains.clip(-_MOST_LIGHT, _MOST_LIGHT).astype(np.float32)
+
+
+def relit(image: FloatArray, gain: FloatArray) -> FloatArray:
+    """Multiply an image by a gain, of which its logarithm is given, and leave white as it is: it may be clipped.
+
+    ``image`` (H, W) or (H, W, 3); ``gain`` (1,) or (3,).
+    """
+    if not np.any(gain):
+        return image
+    factor = np.exp(gain)
+    return image * factor / (1 + (factor - 1) * np.clip(image, 0, 1) ** _WHITE)
+
+
 def _levels(grey: FloatArray, shape: tuple[int, ...]) -> GreyImage:
     return grey_levels(grey, _CONTRAST_WINDOW / pixel_of(shape), _CONTRAST_FLOOR)
 
@@ -115,4 +161,5 @@ def _prepared(frames: Iterable[ArrayLike]) -> Iterator[WindowFrame]:
         before = detail
         grey = luminance(reduced(image))
         levels = _levels(grey, image.shape)
-        yield WindowFrame(image, spline_planes(image), grey, levels, scene, prepare_shift_reference(image))
+        shift_reference = prepare_shift_reference(image)
+        yield WindowFrame(image, spline_planes(image), grey, levels, coarse_image(image), scene, shift_reference)
