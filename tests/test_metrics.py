@@ -142,3 +142,10 @@ def test_bad_input_is_refused(scene):
     for flows, truth in (((2, 3, 3, 2), (3, 3, 3, 2)), ((3, 3, 2), (3, 3, 2))):
         with pytest.raises(DataError, match="^flows: expected shape"):
             compare_flows(np.zeros(flows), np.zeros(truth))
+
+
+def test_small_images_whose_best_match_lies_outside_are_compared():
+    truth, result = np.random.default_rng(0).random((2, 72, 72)).astype(np.float32)
+    # The truth is continued by its mirror image, which the middle of the result is here.
+    result[24:48, 24:48] = np.pad(truth, 24, mode="reflect")[40:64, 96:]
+    assert np.isfinite(compare(result, truth).ssim)

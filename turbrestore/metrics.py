@@ -20,8 +20,9 @@ BORDER = 30
 # Margin that may contain values from outside after the sub-pixel shift; it is cut off.
 _GUARD = 6
 _LARGEST_SHIFT = 3.0
-# The interior must contain the 7×7 window of the structural similarity.
-_SMALLEST = 2 * BORDER + 8
+# The interior must contain the window of the structural similarity, 7×7 pixels.
+_WINDOW = 7
+_SMALLEST = 2 * BORDER + _WINDOW + 1
 
 
 @dataclass(frozen=True)
@@ -163,10 +164,12 @@ def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
         raise DataError("truth: expected an image with some contrast, found one colour")
     margin = BORDER - _GUARD
     core = image[margin:-margin, margin:-margin]
-    if core.shape[0] > scene.shape[0] + 2 * margin or core.shape[1] > scene.shape[1] + 2 * margin:
+    # As much must overlap as the structural similarity needs.
+    reach = min(margin, min(core.shape) - 2 * _GUARD - _WINDOW)
+    if core.shape[0] > scene.shape[0] + 2 * reach or core.shape[1] > scene.shape[1] + 2 * reach:
         raise DataError(f"result: expected at most the size of the truth {scene.shape}, found {image.shape}")
-    match = cv2.matchTemplate(np.pad(scene, margin, mode="reflect"), core, cv2.TM_CCOEFF_NORMED)
-    y, x = (int(v) - margin for v in np.unravel_index(int(match.argmax()), match.shape))
+    match = cv2.matchTemplate(np.pad(scene, reach, mode="reflect"), core, cv2.TM_CCOEFF_NORMED)
+    y, x = (int(v) - reach for v in np.unravel_index(int(match.argmax()), match.shape))
     top, left = max(y, 0), max(x, 0)
     bottom, right = min(y + core.shape[0], scene.shape[0]), min(x + core.shape[1], scene.shape[1])
     a, t = core[top - y : bottom - y, left - x : right - x], scene[top:bottom, left:right]

@@ -21,9 +21,7 @@ _FEWEST_FRAMES = 10
 _DENSE_FRAMES = 8
 # A lone pixel exceeds its highest neighbour by this share of its distance from the median of all neighbours.
 _ALONE = 0.8
-_STILL, _MOVING = 1.5 / 255, 8 / 255
-# Distance at which a stroke that is alike is that of the same letter, pixels.
-_FAR, _ALIKE = 3, 0.15
+_STILL, _MOVING, _OF_LETTER = 1.5 / 255, 8 / 255, 1
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _AROUND = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
 
@@ -57,10 +55,8 @@ class StuckPixelDetector:
         moves = self._highest - self._lowest
         moved = moves.mean(axis=1) >= _MOVING
         still = (self._most - self._least <= _STILL) & moved
-        # A neighbour that stands too, while others move, is part of a letter of a title, and so is one a stroke away.
-        letter = moved & (moves <= _STILL).any(axis=1)
-        stands = self._far_high - self._far_low <= _STILL
-        letter |= (stands & (np.abs(self._far_low - self._least[:, None]) <= _ALIKE)).any(axis=1)
+        # A neighbour that stands too, while others move, is part of a letter of a title.
+        letter = moved & ((moves <= _STILL).sum(axis=1) >= _OF_LETTER)
         stuck = self._places[(still | (self._alone >= _ALONE)) & ~letter]
         return none if len(stuck) > _MOST_STUCK * self._size else stuck
 
@@ -85,7 +81,6 @@ class StuckPixelDetector:
         self._searching, self._high, self._low = False, None, None
         own, around = _with_neighbours(values, self._places)
         self._least, self._most, self._lowest, self._highest = own, own, around, around
-        self._far_low = self._far_high = _with_neighbours(values, self._places, _FAR)[1]
         self._alone = np.full(len(own), np.inf, np.float32)
 
     def _follow(self, values: FloatArray) -> None:
@@ -99,14 +94,11 @@ class StuckPixelDetector:
         self._least, self._most = np.minimum(self._least, own)[keep], np.maximum(self._most, own)[keep]
         self._lowest = np.minimum(self._lowest, around)[keep]
         self._highest = np.maximum(self._highest, around)[keep]
-        far = _with_neighbours(values, self._places, _FAR)[1]
-        self._far_low, self._far_high = np.minimum(self._far_low[keep], far), np.maximum(self._far_high[keep], far)
 
 
-def _with_neighbours(values: PixelArray, places: NDArray[np.int64], distance: int = 1) -> tuple[PixelArray, PixelArray]:
-    """Values at places off the border, shape (N,), and at their eight neighbours at a distance, shape (N, 8)."""
-    around = places[:, :2, None] + distance * _AROUND.T
-    rows, columns = np.clip(around, 0, np.array(values.shape[:2])[:, None] - 1).swapaxes(0, 1)
+def _with_neighbours(values: PixelArray, places: NDArray[np.int64]) -> tuple[PixelArray, PixelArray]:
+    """Values at places off the border, shape (N,), and at their eight neighbours, shape (N, 8)."""
+    rows, columns = places[:, :1] + _AROUND[:, 0], places[:, 1:2] + _AROUND[:, 1]
     channels = [places[:, 2:3]] if places.shape[1] == 3 else []
     return values[tuple(places.T)], values[(rows, columns, *channels)]
 
