@@ -38,6 +38,8 @@ _ENCODERS = {"h264": "libx264", "hevc": "libx265", "ffv1": "ffv1"}
 _QUALITY = {"h264": 14, "hevc": 18}
 # x265 refuses smaller frames, and damages its memory when it does.
 _SMALLEST_HEVC = 16
+# x265 needs some frames to compute decoding times of reordered ones; without them it takes what its memory holds.
+_REORDERED_HEVC = 4
 # Ticks a second of frames at irregular times, and what counts as irregular, in usual intervals.
 _TICKS, _IRREGULAR = 90000, 0.1
 
@@ -141,6 +143,11 @@ def _encode(
         expected, found = f"{_SMALLEST_HEVC}×{_SMALLEST_HEVC}", f"{first.shape[1]}×{first.shape[0]}"
         raise DataError(f"HEVC: expected frames of at least {expected} pixels, found {found}; choose another codec")
     depth, pixel_format, options = _layout(first.shape, bit_depth, codec, crf)
+    ahead = [first]
+    if codec == "hevc":
+        ahead += itertools.islice(frames, _REORDERED_HEVC)
+        if len(ahead) <= _REORDERED_HEVC:
+            options["x265-params"] += ":bframes=0"
     stream = cast("av.VideoStream", output.add_stream(_ENCODERS[codec], rate=rate, options=options))
     stream.height, stream.width = first.shape[:2]
     stream.pix_fmt = pixel_format
@@ -152,7 +159,7 @@ def _encode(
     if tick != 1 / rate:
         stream.codec_context.time_base = tick
     with _copier(output, sound) as copy_until:
-        for number, frame in enumerate(itertools.chain([first], frames)):
+        for number, frame in enumerate(itertools.chain(ahead, frames)):
             picture = convert(_picture(frame, depth), pixel_format, *tags)
             picture.pts, picture.time_base = number if ticks is None else ticks[number], tick
             output.mux(stream.encode(picture))
