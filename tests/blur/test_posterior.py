@@ -8,19 +8,20 @@ import pytest
 
 from turbrestore.blind.decisions import explain_posterior
 from turbrestore.blind.remove_blur import remove_blur_steps
+from turbrestore.blur.estimation import find_candidates
 from turbrestore.blur.posterior import EXCLUDED, BlurWitnesses, blur_posterior, measure_witnesses
 from turbrestore.blur.psf import half_frequency, radial_otf
 from turbrestore.blur.witnesses.hypotheses import hypotheses, shapes
-from turbrestore.blur.witnesses.image_evidence import image_evidence
+from turbrestore.blur.witnesses.image_evidence import image_evidence, judged_candidate
 from turbrestore.blur.witnesses.short_exposure import displacement_variance, short_exposures
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SpectralVariation
 from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.scenes import SCENES
 
 # Share of the variation that windows over several isoplanatic patches leave.
+SHARE = 0.33
 # Frames that move are interpolated.
 INTERPOLATION = radial_otf(RINGS, 0.35, 2.0)
-SHARE = 0.33
 
 
 def expected_variation(strength, diffraction):
@@ -62,6 +63,27 @@ def test_known_optics_narrow_the_blur():
     before, after = (blur_posterior(None, one) for one in (unknown, replace(unknown, diffraction=diffraction)))
     assert before.width[0] < 0.9 * true < after.width[0] < true < after.width[1] < 1.15 * true
     assert before.removed < after.removed < true and after.removed > 0.85 * true
+
+
+@pytest.mark.parametrize(
+    ("widths", "preferred", "judged"),
+    [
+        # A soft scene, and letters behind a wide blur without and with noise in the original image.
+        ({1: 1.33, 2: 2.32, 3: 2.55, 4: 3.64, 6: 4.38}, 6, 2),
+        ({1: 1.37, 2: 2.46, 3: 3.24, 4: 4.06, 6: 4.83}, 6, 4),
+        ({1: 0.81, 2: 2.42, 3: 3.47, 4: 4.38, 6: 5.97}, 1, 6),
+        # Narrow blurs, which reduced images do not resolve.
+        ({1: 1.2, 2: 1.4}, 1, 1),
+        ({1: 0.9, 2: 1.25}, 2, 2),
+    ],
+)
+def test_an_image_is_reduced_as_far_as_its_blur_is_resolved(widths, preferred, judged):
+    (one, *_) = find_candidates(SCENES["camera"](96, 96))
+    found = tuple(
+        replace(one, estimate=replace(one.estimate, sigma=sigma, reduction=reduction))
+        for reduction, sigma in widths.items()
+    )
+    assert judged_candidate(found, preferred).estimate.reduction == judged
 
 
 def test_only_frames_that_stand_still_can_be_without_any_blur():

@@ -4,9 +4,11 @@ The width depends on the shape that is assumed, and the shape on whether the air
 likelihood of :mod:`turbrestore.blur.marginal_likelihood` is computed for three exponents; the posterior of the blur
 interpolates between them.
 
-A wide blur is measured in a reduced image, because noise and codec hide it in the original one.  But a soft scene, such
-as the Moon, looks blurred by about the same share of a pixel at every reduction.  So the image is reduced as far as its
-blur is wider than a pixel of the reduced image.
+They are computed at the reduction of the image that :func:`turbrestore.blur.estimation.choose_blur` prefers, with two
+exceptions.  A soft scene, such as the Moon, looks blurred by about the same share of a pixel at every reduction: images
+that are reduced by more than two count as far as their blur is as wide as a reduced pixel.  And noise and codec make
+the original image look sharp: where a blur has more pixels in the image reduced by two than in the original one, the
+smallest image counts.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from numpy.typing import NDArray
 from ...core.arrays import FloatArray
 from ...runtime.runtime import DEFAULT, Runtime
 from ...runtime.threads import ThreadTeam, one_thread_each
-from ..estimation import BlurEstimate, choose_blur, find_candidates, unreduced_width
+from ..estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidates, unreduced_width
 from ..marginal_likelihood import WIDTHS, image_gradients, width_costs
 
 Float64Array = NDArray[np.float64]
@@ -28,6 +30,8 @@ Float64Array = NDArray[np.float64]
 EXPONENTS = (1.2, 1.55, 2.0)
 # Rises of the cost after which wider blurs are not tried, and the cost of those above the smallest.
 _RISES, _BEYOND = 4, 3.0
+# Largest reduction at which a blur may be narrower than this, in reduced pixels.
+_TRUSTED, _RESOLVED = 2, 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +50,7 @@ def image_evidence(image: FloatArray, runtime: Runtime = DEFAULT) -> ImageEviden
         if not found:
             return None
         estimate = choose_blur(found, runtime)
-        resolved = [one for one in found if one.estimate.sigma >= one.estimate.reduction]
-        chosen = max(resolved or found[:1], key=lambda one: one.estimate.reduction)
+        chosen = judged_candidate(found, estimate.reduction)
         gradients, noise = image_gradients(chosen.part), chosen.estimate.noise
         with ThreadTeam(min(runtime.workers, 2)) as team:
             curves = list(team.map(lambda shape: width_costs(gradients, shape, noise, rises=_RISES), EXPONENTS))
@@ -56,3 +59,18 @@ def image_evidence(image: FloatArray, runtime: Runtime = DEFAULT) -> ImageEviden
         row[: len(curve)] = curve
     widths = np.array([unreduced_width(width, chosen.estimate.reduction) for width in WIDTHS])
     return ImageEvidence(widths, np.minimum(costs, costs.min() + _BEYOND), estimate)
+
+
+def judged_candidate(found: tuple[BlurCandidate, ...], preferred: int) -> BlurCandidate:
+    """Return the candidate, of those in order of their reduction, by which the image is judged."""
+    original, *reduced = (one.estimate.sigma / one.estimate.reduction for one in found)
+    if reduced and reduced[0] > max(original, 1):
+        return found[-1]
+    if preferred > _TRUSTED:
+        pixels = zip(found, (original, *reduced), strict=True)
+        return max(
+            (one for one, blur in pixels if blur >= _RESOLVED and one.estimate.reduction <= preferred),
+            key=lambda one: one.estimate.reduction,
+            default=found[0],
+        )
+    return next(one for one in found if one.estimate.reduction == preferred)
