@@ -7,8 +7,8 @@ interpolates between them.
 They are computed at the reduction of the image that :func:`turbrestore.blur.estimation.choose_blur` prefers, with two
 exceptions.  A soft scene, such as the Moon, looks blurred by about the same share of a pixel at every reduction: images
 that are reduced by more than two count as far as their blur is as wide as a reduced pixel.  And noise and codec make
-the original image look sharp: where a blur has more pixels in the image reduced by two than in the original one, the
-smallest image counts.
+the original image look sharp: where a blur has more pixels in the image reduced by two than in the original one, or
+is too wide for all but the smallest image, that one counts.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ EXPONENTS = (1.2, 1.55, 2.0)
 _RISES, _BEYOND = 4, 3.0
 # Largest reduction at which a blur may be narrower than this, in reduced pixels.
 _TRUSTED, _RESOLVED = 2, 0.95
+# Share of the widest blur of an image from which its width may be beyond it.
+_SATURATED = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,8 @@ def image_evidence(image: FloatArray, runtime: Runtime = DEFAULT) -> ImageEviden
 def judged_candidate(found: tuple[BlurCandidate, ...], preferred: int) -> BlurCandidate:
     """Return the candidate, of those in order of their reduction, by which the image is judged."""
     original, *reduced = (one.estimate.sigma / one.estimate.reduction for one in found)
-    if reduced and reduced[0] > max(original, 1):
+    beyond = preferred == found[0].estimate.reduction and original > _SATURATED * WIDTHS[-1]
+    if beyond or (reduced and reduced[0] > max(original, 1)):
         return found[-1]
     if preferred > _TRUSTED:
         pixels = zip(found, (original, *reduced), strict=True)
