@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from turbrestore.core.arrays import FloatArray, luminance
-from turbrestore.io.encoding import Encoding
+from turbrestore.io.containers.encoding import Encoding
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.pipeline import restore
 from turbrestore.runtime.runtime import Runtime

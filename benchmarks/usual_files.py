@@ -21,7 +21,7 @@ import numpy as np
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.footage.checks.content import check_content, clean_source
-from turbrestore.io.encoding import Encoding, write_container
+from turbrestore.io.containers.encoding import Encoding, write_container
 from turbrestore.io.pixels import at_levels
 from turbrestore.io.video import open_frames
 from turbrestore.metrics import compare

@@ -17,7 +17,7 @@ from cyclopts import Parameter
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import ConfigurationError, require
 from turbrestore.footage.checks.content import clean_source, keep_all
-from turbrestore.io.encoding import BY_SUFFIX, Encoding, write_pipe
+from turbrestore.io.containers.encoding import BY_SUFFIX, Encoding, write_pipe
 from turbrestore.io.live.stream import open_camera, open_pipe, read_raw, write_raw
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth

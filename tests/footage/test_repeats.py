@@ -6,7 +6,7 @@ import pytest
 from conftest import make_sequence
 from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.footage.checks.repeats import RepeatDetector
-from turbrestore.io.encoding import Encoding
+from turbrestore.io.containers.encoding import Encoding
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.io.encoding import Encoding, write_container, write_pipe
+from turbrestore.io.containers.encoding import Encoding, write_container, write_pipe
 from turbrestore.io.live.stream import live_frames, open_pipe, read_raw, write_raw
 from turbrestore.io.video import open_frames, write_video
 

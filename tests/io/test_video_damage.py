@@ -17,8 +17,8 @@ from turbrestore.core.errors import (
     InputNotFoundError,
     StorageError,
 )
+from turbrestore.io.containers.integrity import ffv1_slices_intact, is_cut_short
 from turbrestore.io.images import write_image
-from turbrestore.io.integrity import ffv1_slices_intact, is_cut_short
 from turbrestore.io.limits import Limits
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video

@@ -14,7 +14,7 @@ from turbrestore.core.errors import (
     ConfigurationError,
     DataError,
 )
-from turbrestore.io.container import _Scan
+from turbrestore.io.containers.decoding import _Scan
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 from videos import encode, grey_ffv1, refused, scene

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from turbrestore.registration.flow_algebra import compose_flows
-from turbrestore.steady.camera import camera_flow, fit_camera
+from turbrestore.steady.camera_path.camera import camera_flow, fit_camera
 from turbrestore.steady.grid import enlarged, follow, grid_of, inverted, reduced
 
 TURN = np.array([[0.01, 0.02, 1.5], [-0.02, 0.005, -0.7]])

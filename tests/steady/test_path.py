@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from turbrestore.steady.path import LONGEST, _alikeness, smooth_motion
+from turbrestore.steady.camera_path.path import LONGEST, _alikeness, smooth_motion
 
 SHAPE = (120, 160)
 

@@ -1,16 +1,16 @@
 """Videos in and out: one function opens every supported input, one writes every supported output.
 
-=====================================  =================================  =====================================
-input                                  module                             output
-=====================================  =================================  =====================================
-.mkv .mp4 .mov .avi .gif and others    :mod:`turbrestore.io.container`       .mkv (FFV1, lossless), .mp4 (H.264)
-.ser                                   :mod:`turbrestore.io.astronomy.ser`   .ser
-.tif .tiff (a stack)                   :mod:`turbrestore.io.tiff`            .tif .tiff
-.npy, shape (T, H, W) or (T, H, W, 3)  :mod:`turbrestore.io.npy`             .npy
-.png .apng .webp (an animation)        :mod:`turbrestore.io.images`          .gif .webp (for viewing)
-.fits .fit .fts (a cube), also .gz     :mod:`turbrestore.io.astronomy.fits`
-a folder of images, raw or FITS files  here, :mod:`turbrestore.io.images`
-=====================================  =================================  =====================================
+=====================================  ===========================  ===================================
+input                                  module                       output
+=====================================  ===========================  ===================================
+.mkv .mp4 .mov .avi .gif and others    :mod:`.containers.decoding`  .mkv (FFV1, lossless), .mp4 (H.264)
+.ser                                   :mod:`.astronomy.ser`        .ser
+.tif .tiff (a stack)                   :mod:`.tiff`                 .tif .tiff
+.npy, shape (T, H, W) or (T, H, W, 3)  :mod:`.npy`                  .npy
+.png .apng .webp (an animation)        :mod:`.images`               .gif .webp (for viewing)
+.fits .fit .fts (a cube), also .gz     :mod:`.astronomy.fits`
+a folder of images, raw or FITS files  here, :mod:`.images`
+=====================================  ===========================  ===================================
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from .animations import ANIMATION_OUTPUT_SUFFIXES, ANIMATION_SUFFIXES, open_anim
 from .astronomy.fits import open_fits, open_fits_folder
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .astronomy.ser import open_ser, write_ser
-from .container import CONTAINER_SUFFIXES, is_container, open_container
-from .encoding import BY_SUFFIX, Encoding, Soundtrack, write_container
+from .containers.decoding import CONTAINER_SUFFIXES, is_container, open_container
+from .containers.encoding import BY_SUFFIX, Encoding, Soundtrack, write_container
 from .images import IMAGE_SUFFIXES, read_pixels
 from .limits import DEFAULT_LIMITS, Limits, check_input, input_errors
 from .npy import open_npy, write_npy

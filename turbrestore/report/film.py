@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, from_unit
 from ..display.preview import shrink
-from ..io.encoding import Encoding, write_container
+from ..io.containers.encoding import Encoding, write_container
 from .pictures import Stretch, stretch_of
 
 # Longest side of a panel, pixels: players decode films of twice that.  Most pixels of one panel in all frames, which

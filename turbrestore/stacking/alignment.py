@@ -36,7 +36,7 @@ from ..core.errors import DataError
 from ..registration.camera.global_shift import correlation, measure_shift, prepare_shift_reference
 from ..registration.flow_algebra import compose_flows
 from ..registration.warp import inside, warp
-from ..steady.camera import camera_flow, fit_camera
+from ..steady.camera_path.camera import camera_flow, fit_camera
 
 Matrix = NDArray[np.float64]
 # What reference and image are reduced to before they are compared.

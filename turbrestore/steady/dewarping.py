@@ -8,7 +8,7 @@ D : mean displacement of frame k to its neighbours (:mod:`turbrestore.steady.dis
 V : its inverse map, ``(id + D) ∘ (id + V) = id``, about d_k
 
 1. F_i is measured by dense inverse search, and its affine part, the camera, is taken off
-   (:mod:`turbrestore.steady.camera`).
+   (:mod:`turbrestore.steady.camera_path.camera`).
 2. ``J = I_k ∘ (id + V)`` is the frame without its turbulent displacement.
 3. ``J_i = I_{k+i} ∘ (id + F_i) ∘ (id + V)`` are its neighbours, registered to it; those that agree are averaged with it
    (:mod:`turbrestore.steady.fusion`).
@@ -33,7 +33,8 @@ from ..registration.camera.global_shift import LEAST_CORRELATION, correlation, m
 from ..registration.flow import MIN_SIDE
 from ..registration.opencv_flow import DisParams, GreyImage, dis_solver
 from ..registration.warp import sample_splines
-from .camera import Matrix, camera_flow, fit_camera
+from .camera_path.camera import Matrix, camera_flow, fit_camera
+from .camera_path.path import smooth_motion, without_shake
 from .displacement import (
     camera_steadiness,
     displacement_size,
@@ -46,7 +47,6 @@ from .displacement import (
 from .fusion import fuse
 from .grid import enlarged, follow, grid_of, inverted, pixel_of
 from .motion import moving_mask, path_length, witnesses
-from .path import smooth_motion, without_shake
 from .settings import SteadyParams
 from .windows import Window, WindowFrame, contrast_levels, light_between, relit
 

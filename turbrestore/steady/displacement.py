@@ -32,7 +32,7 @@ import cv2
 import numpy as np
 
 from ..core.arrays import FloatArray
-from .camera import Matrix, camera_flow, camera_size
+from .camera_path.camera import Matrix, camera_flow, camera_size
 
 # Window in which |S|² is averaged, pixels; share of the frame itself.
 _WINDOW, _OWN_SHARE = 4.0, 0.5

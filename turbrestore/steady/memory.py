@@ -5,7 +5,7 @@ Symbols
 F : frame k, dewarped and fused within its window
 Z : memory; n : number of frames that it holds, for every pixel, so that its variance is that of a frame over n
 C : affine map from the steadied frame k to the one before; N : from the steadied frame to F; both from the path of the
-    camera (:mod:`turbrestore.steady.path`)
+    camera (:mod:`turbrestore.steady.camera_path.path`)
 E : pose, affine map from the steadied frame to the grid of Z
 R : flow from Z to F; A its affine part; r = R − A
 w : agreement of ``F ∘ (id + R)`` with Z (:mod:`turbrestore.steady.fusion`), less where r is more than turbulence, 0 in
@@ -48,10 +48,10 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..registration.warp import inside, sample_linear, warp
-from .camera import Matrix, camera_flow, fit_camera
+from .camera_path.camera import Matrix, camera_flow, fit_camera
+from .camera_path.path import motion
 from .fusion import agreement_weight, explained_difference, for_channels
 from .grid import enlarged, grid_of, inverted, pixel_of, reduced
-from .path import motion
 from .windows import coarse_image, light_between, relit
 
 # Longest memory, frames: a change of the light is followed as fast.

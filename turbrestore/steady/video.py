@@ -27,14 +27,14 @@ from ..core.arrays import FloatArray, luminance
 from ..registration.warp import sample_linear, warp
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_in_turns, one_thread_each
-from .camera import Matrix, camera_flow
+from .camera_path.camera import Matrix, camera_flow
+from .camera_path.path import LONGEST, camera_position, homogeneous, longer_path, motion, smooth_motion
 from .deblurring import deblur
 from .dewarping import DewarpedFrame, dewarp_frame, measure_flow
 from .displacement import whole_displacement
 from .fusion import for_channels, share_of_estimate
 from .grid import enlarged, follow, grid_of, pixel_of, reduced
 from .memory import Memory, remember, shown
-from .path import LONGEST, camera_position, homogeneous, longer_path, motion, smooth_motion
 from .settings import SteadyParams
 from .windows import Window, iter_windows, relit
 

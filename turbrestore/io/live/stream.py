@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arrays import FloatArray, from_unit
 from ...core.errors import DataError, StorageError
-from ..container import OPEN_OPTIONS
+from ..containers.decoding import OPEN_OPTIONS
 from ..limits import DEFAULT_LIMITS, Limits
 from ..output import frames_of_one_size, size_text
 from ..pixels import PixelArray, full_scale_of, to_unit

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ...core.arrays import FloatArray
 
 Matrix = NDArray[np.float64]
 

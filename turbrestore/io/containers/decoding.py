@@ -2,8 +2,8 @@
 
 Grey formats stay grey at their depth, 8-bit colour becomes RGB, and deeper colour 16-bit RGB. Opening a file reads all
 packets once without decoding them, which gives the number of frames, their times, and damage that decoders do not
-report (:mod:`turbrestore.io.integrity`).  Frames that are marked as interlaced pass FFmpeg's filter bwdif.  Frames are
-turned upright as the display matrix of the file demands.
+report (:mod:`turbrestore.io.containers.integrity`).  Frames that are marked as interlaced pass FFmpeg's filter bwdif.
+Frames are turned upright as the display matrix of the file demands.
 
 Losses within a packet of a lossy codec that its decoder conceals are not found. FFmpeg converts YUV colour of more than
 8 bits to values up to 0.4 % darker than exact. Grey video is taken as full range, as its decoder returns it.
@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import DataError
+from ...core.errors import DataError
+from ..limits import DEFAULT_LIMITS, Limits, input_errors
+from ..pixels import BAYER_REMARK, PixelArray, looks_like_bayer, upright
+from ..source import FrameRange, FrameSource, check_cut_short, check_frame_range
+from ..values.pixel_formats import PixelFormat, frame_pixels, has_grey_palette, layout_of
+from ..values.transfer_curves import BT709, remark_on_curve
 from .integrity import ends_early, ffv1_slices_intact, is_cut_short, varies_in_time
-from .limits import DEFAULT_LIMITS, Limits, input_errors
-from .pixels import BAYER_REMARK, PixelArray, looks_like_bayer, upright
-from .source import FrameRange, FrameSource, check_cut_short, check_frame_range
-from .values.pixel_formats import PixelFormat, frame_pixels, has_grey_palette, layout_of
-from .values.transfer_curves import BT709, remark_on_curve
 
 if TYPE_CHECKING:
     import av
