@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import shutil
 import subprocess
 import sys
 
@@ -44,14 +43,6 @@ def whole(tmp_path_factory, frames):
     with contextlib.chdir(folder):
         assert main([*WORDS, "--quiet"]) == 0
     return folder
-
-
-@pytest.fixture
-def ended(whole, tmp_path, monkeypatch):
-    """Folder in which a run has ended, to work in."""
-    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 # The process dies at once in the first stage: before anything is written, and between two files.
