@@ -100,7 +100,7 @@ def bad_arguments() -> list[Row]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         cases.write_inputs(folder)
-        found = [(str(case), cases.complaint(case, folder)) for case in cases.CASES]
+        found = [(str(case), cases.complaint(case, folder)) for kind in cases.KINDS for case in kind()]
     failures = tuple(f"{case}: {complaint}" for case, complaint in found if complaint)
     rule = (
         "exit 2, or 66 for a missing file; one line, no traceback, no output; names the option or key, and the nearest "

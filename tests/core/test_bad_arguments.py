@@ -282,9 +282,10 @@ def complaint(case, folder):
     return f"{', '.join(lacking)} not in {line!r}" if lacking else ""
 
 
-@pytest.mark.parametrize(
-    "kind", [misspelt, of_another_type, out_of_range, contradicting, missing, settings_files], ids=lambda f: f.__name__
-)
+KINDS = (misspelt, of_another_type, out_of_range, contradicting, missing, settings_files)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda f: f.__name__)
 def test_is_refused_in_one_line_that_names_it(kind, tmp_path):
     write_inputs(tmp_path)
     wrong = {str(case): found for case in kind() if (found := complaint(case, tmp_path))}
