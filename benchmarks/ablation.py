@@ -20,7 +20,7 @@ import numpy as np
 from clips import Clip, find_clips
 from provenance import publish
 
-from turbrestore.blur.estimation import BlurEstimate, estimate_blur
+from turbrestore.blur.estimation import estimate_blur
 from turbrestore.blur.psf import GAUSSIAN
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
@@ -84,20 +84,20 @@ def measure(clip: Clip, truth: FloatArray) -> Row:
     whole = restore(clip.frames)
     row = {"default": score(whole.image)}
     row |= {name: score(restore(clip.frames, params).image) for name, params in VARIANTS.items()}
-    filtered, found = _stages(whole)
+    filtered, removed, shape = _stages(whole)
 
-    def deblurred(sigma: float, method: Method = "nltv", exponent: float = found.exponent) -> float:
+    def deblurred(sigma: float, method: Method = "nltv", exponent: float = shape) -> float:
         params = DeconvolutionParams(method=method, exponent=exponent)
         return score(deconvolve(filtered, sigma, params, guide=whole.centroid.image).image)
 
-    row |= {name: deblurred(found.removable, method) for name, method in DEBLURRED.items()}
+    row |= {name: deblurred(removed, method) for name, method in DEBLURRED.items()}
     row["Gaussian blur"] = deblurred(estimate_blur(filtered, exponent=GAUSSIAN).removable, exponent=GAUSSIAN)
     row["not deblurred"] = score(filtered)
-    best, by_hand = best_sigma(deblurred, found.sigma)
+    best, by_hand = best_sigma(deblurred, removed)
     # The default may happen to lie between two values of the grid, and above both.
     if by_hand < row["default"]:
-        best, by_hand = found.removable, row["default"]
-    return row | {"best σ": by_hand, "σ removed": found.removable, "σ by hand": best}
+        best, by_hand = removed, row["default"]
+    return row | {"best σ": by_hand, "σ removed": removed, "σ by hand": best}
 
 
 def best_sigma(score: Callable[[float], float], start: float) -> tuple[float, float]:
@@ -146,11 +146,11 @@ def document(rows: dict[str, Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _stages(restoration: Restoration) -> tuple[FloatArray, BlurEstimate]:
-    """Return the filtered image, and the blur that was found in it."""
-    if restoration.filtered is None or restoration.blur is None:
+def _stages(restoration: Restoration) -> tuple[FloatArray, float, float]:
+    """Return the filtered image, and the width and the exponent of the blur that was removed from it."""
+    if restoration.filtered is None or restoration.deconvolution is None or restoration.posterior is None:
         raise RuntimeError("the whole chain did not run")
-    return restoration.filtered.image, restoration.blur
+    return restoration.filtered.image, restoration.deconvolution.sigma, restoration.posterior.exponent
 
 
 def _with_mean(rows: dict[str, Row]) -> dict[str, Row]:
