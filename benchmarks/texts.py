@@ -35,6 +35,7 @@ STAGES = {
 
 HEAD = "| PSNR, dB | structural similarity | words by Tesseract | words by RapidOCR |\n|---|---:|---:|---:|---:|"
 SCORES = "PSNR of the deblurred images, dB"
+_MEAN = "PSNR, dB, deblurred"
 
 # Rows of a table by their first cell, each a cell by column.
 Table = dict[str, dict[str, str]]
@@ -79,7 +80,7 @@ def methods() -> str:
     lines = [f"| method {HEAD}"]
     for name, title in METHODS.items():
         if name in drawn:
-            figures = [drawn[name]["PSNR, dB, deblurred"], drawn[name]["SSIM, deblurred"]]
+            figures = [drawn[name][_MEAN], drawn[name]["SSIM, deblurred"]]
             figures += [text[name][f"words by {reader}, deblurred"] for reader in ("Tesseract", "RapidOCR")]
             lines.append(f"| {title} | {' | '.join(figures)} |")
     leads = []
@@ -88,7 +89,11 @@ def methods() -> str:
         others = [float(cell) for name, cell in row.items() if name not in ("clip", "turbrestore") and cell != "–"]
         leads.append(max(others) - float(row["turbrestore"]))
     lost = [lead for lead in leads if lead > 0.05]
-    said = f"Another method is ahead in PSNR on {len(lost)} of these {len(reported)} clips"
+    ended = sum(
+        "–" not in [row.get(name) for name in METHODS if drawn.get(name, {}).get(_MEAN) != "–"] for row in reported
+    )
+    said = f"Means are over the {ended} clips on which every method ended. " if ended < len(reported) else ""
+    said += f"Another method is ahead in PSNR on {len(lost)} of {len(reported)} clips"
     said += f", by up to {max(lost):.1f} dB." if lost else "."
     return "\n".join([*lines, "", said, ""])
 

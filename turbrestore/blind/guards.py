@@ -63,7 +63,7 @@ _LEAST_DEVIATION = 1e-4
 # Slight excess over a bound, as a factor, and the least bound that it is a factor of.
 _SLIGHT, _LEAST_BOUND = 1.5, 1e-6
 # Widest blur whose ringing is judged, pixels: behind a wider one, profiles of four widths cross the next letter.
-_WIDEST_RINGS = 3.0
+WIDEST_RINGS = 3.0
 # Distance up to which edges are followed: widths of the blur, and pixels.
 _REACH_SIGMAS, _SMALLEST_REACH = 4.0, 6
 # Distance within which the step of an edge ends, in widths of the blur and in pixels.
@@ -146,7 +146,7 @@ def evaluate_guards(
         raise DataError(f"result: expected the shape {before.shape} of the blurred image, found {after.shape}")
     # One pair of planes at a time, because those of a large image take a good part of the memory.
     pairs = zip(_planes(after), _planes(before), strict=True)
-    profiles_stay = sigma <= _WIDEST_RINGS
+    profiles_stay = sigma <= WIDEST_RINGS
     figures = [
         (ringing(*pair, sigma) if profiles_stay else 0.0, _overshoot(*pair, sigma), _noise_gain(*pair))
         for pair in pairs
