@@ -24,7 +24,7 @@ may have preferred a frame that is tinted.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -134,7 +134,7 @@ def _agreed(result: FloatArray, first_half: FloatArray, second_half: FloatArray)
         )
         window = partial(_smooth, scale=_WINDOWS * scale + _WINDOW)
         moments = [window(one * other) for one, other in ((a, a), (b, b), (a, b), (usual, usual), (detail, detail))]
-        given = _given(*moments)
+        given = _given(moments)
         image += detail + (usual - detail) * (given if result.ndim == 2 else given[..., None])
         np.maximum(share, given, out=share)
     if result.ndim == 3:
@@ -156,14 +156,13 @@ def _flat_parts(first: FloatArray, second: FloatArray, mean: FloatArray, result:
 
     pairs = (first, first), (second, second), (first, second), (mean, mean), (result, result)
     # The standard error of the correlation of noise in a window: faint texture may seem to be none in some.
-    given = _given(*(covariance(*pair) for pair in pairs), doubt=1 / _FLAT)
+    given = _given([covariance(*pair) for pair in pairs], doubt=1 / _FLAT)
     return np.asarray(cv2.blur(cv2.dilate(given, np.ones(side, np.uint8)), (3, 3)), np.float32)
 
 
-def _given(
-    aa: FloatArray, bb: FloatArray, ab: FloatArray, usual: FloatArray, detail: FloatArray, doubt: float = 0.0
-) -> FloatArray:
-    """Return g from moments of the halves, energies of the mean and of the result, and the error of a correlation."""
+def _given(moments: Sequence[FloatArray], doubt: float = 0.0) -> FloatArray:
+    """Return g from ⟨AA⟩, ⟨BB⟩, ⟨AB⟩, the energies of the mean and of the result, and the error of a correlation."""
+    aa, bb, ab, usual, detail = moments
     alike = doubt + np.clip(ab / np.sqrt(np.maximum(aa * bb, 0) + np.float32(_NOTHING**2)), 0, 1 - doubt)
     unlike = 1 - np.clip((2 * alike / (1 + alike) - _NONE) / (_ALL - _NONE), 0, 1)
     more = detail / (np.maximum(usual, 0) + np.float32(_NOTHING)) - 1
