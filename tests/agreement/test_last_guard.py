@@ -1,5 +1,6 @@
 """Detail that the halves of a clip do not agree on is that of the registered mean; what they agree on stays."""
 
+import cv2
 import numpy as np
 
 from turbrestore.agreement import last_guard
@@ -53,6 +54,46 @@ def test_colours_are_those_of_the_mean_and_detail_stays():
     assert guarded.share.min() == 1
     slightly = scene + np.float32([0.003, 0, -0.003])
     assert np.abs(keep_agreed(slightly, Halves(scene, scene.copy())).image - slightly).max() < 1e-5
+
+
+def plate(noise=NOISE):
+    """Scene, halves behind a blur, and flat parts from three pixels beside an edge on."""
+    scene = np.full((96, 96), 0.3, np.float32)
+    scene[:, 40:60] = 0.7
+    columns = np.arange(96)
+    flat = (np.abs(columns - 39.5) >= 4) & (np.abs(columns - 59.5) >= 4)
+    return scene, halves_of(cv2.GaussianBlur(scene, (0, 0), 0.8), noise=noise), flat
+
+
+def test_rings_behind_an_edge_in_a_flat_part_give_way_and_the_edge_stays():
+    scene, halves, flat = plate(noise=0.002)
+    distance = np.abs(np.arange(96) - 39.5)
+    rings = 0.03 * np.cos(np.pi * distance / 2.5) * np.exp(-distance / 8) * (distance > 2)
+    ringing = np.float32(scene + rings)
+    guarded = keep_agreed(ringing, halves)
+    before, after = (np.abs(image - scene)[:, flat].max() for image in (ringing, guarded.image))
+    assert before > 0.012 and after < 0.006
+    assert guarded.share[:, flat & (distance < 8)].mean() > 0.9
+    # The map shows it; frames that agree on the scene are no reason for a remark.
+    assert guarded.decisions == ()
+    np.testing.assert_array_equal(guarded.image[:, 39:41], ringing[:, 39:41])
+
+
+def test_a_sharp_result_without_rings_stays():
+    scene, halves, _ = plate(noise=0.002)
+    assert np.abs(keep_agreed(scene, halves).image - scene).max() < 2e-3
+    colours = Halves(*(np.repeat(half[..., None], 3, axis=2) for half in (halves.first, halves.second)))
+    image = np.repeat(scene[..., None], 3, axis=2)
+    assert np.abs(keep_agreed(image, colours).image - image).max() < 2e-3
+
+
+def test_noise_beside_an_edge_is_that_of_the_mean():
+    scene, halves, flat = plate()
+    mean = (halves.first + halves.second) / 2
+    noisy = scene + np.float32(np.random.default_rng(4).normal(0, 2 * NOISE, scene.shape))
+    near = flat & (np.abs(np.arange(96) - 39.5) < 8)
+    left, usual = ((image - scene)[:, near].std() for image in (keep_agreed(noisy, halves).image, mean))
+    assert left < 1.25 * usual
 
 
 def test_rows_are_worked_on_in_parts_as_if_in_one(monkeypatch):

@@ -1,5 +1,6 @@
 """Stripes of the sensor are subtracted and dead columns filled; stripes of the scene stay."""
 
+import cv2
 import numpy as np
 
 from conftest import make_sequence, surveyed
@@ -58,6 +59,16 @@ def test_warm_pixels_are_evened_out_and_points_of_the_scene_stay():
         for place in ((20, 20), (40, 31), (11, 50)):
             stars[number] += np.exp(-((x - place[0] - dx) ** 2 + (y - place[1] - dy) ** 2) / 0.5)
     survey = surveyed(np.float32(0.1 + 0.6 * stars + rng.normal(0, 0.005, stars.shape)))
+    assert without_stripes(survey) == (survey, ())
+
+
+def test_gaps_between_strokes_of_a_clock_that_ticks_are_no_warm_pixels():
+    frames = np.rint(255 * clip()).astype(np.uint8)
+    for number, frame in enumerate(frames):
+        for shade, width in ((0, 3), (255, 1)):
+            text = f"05:12:4{5 + number // 12}"
+            cv2.putText(frame, text, (8, 60), cv2.FONT_HERSHEY_SIMPLEX, 0.42, shade, width)
+    survey = surveyed(frames / np.float32(255))
     assert without_stripes(survey) == (survey, ())
 
 

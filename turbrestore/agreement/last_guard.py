@@ -13,14 +13,20 @@ deconvolution sharpens them all the same, and so do weights that follow sharpnes
 more energy in a band than the mean of the registered frames, ``g = (1 − ρ')(E / E₀ − 1)``, with ρ' and g between 0 and
 1, goes from the one to the other.  Where the halves agree, and where the result is smoother than the mean, it stays.
 
+Near an edge the windows of the bands hold the edge, on which the halves agree, and a ring behind it passes with it.
+Flat parts are therefore looked at once more in small windows with sharp borders, each against its own mean: where the
+halves share nothing in a window that ends before the edge, the scene is flat to within the noise, and what the result
+varies by beyond the mean is rings or noise.  There all of the image is the mean's.
+
 What is left of the colours below the bands is that of the mean where it differs by more than two grey levels: weights
 may have preferred a frame that is tinted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -36,6 +42,8 @@ _PARTS = 4
 # Gaussians that separate the bands; the window of a band, in these and in pixels.
 _SCALES = (1.0, 2.0, 4.0, 8.0)
 _WINDOWS, _WINDOW = 2.0, 1.0
+# Side of the small windows that tell flat parts, pixels.
+_FLAT = 7
 # ρ below which nothing of a band is taken for the scene, and above which all of it is.
 _NONE, _ALL = 0.3, 0.8
 # Energy that is nothing, squared intensity; fewest frames that have two halves.
@@ -64,7 +72,7 @@ class Guarded:
     """The image that is left, and what gave way."""
 
     image: FloatArray  # (H, W) or (H, W, 3)
-    share: FloatArray  # (H, W): largest g of the bands and of the tint, 0 to 1
+    share: FloatArray  # (H, W): largest g of bands, tint and flat parts, 0 to 1
     decisions: tuple[Decision, ...]
 
 
@@ -89,13 +97,15 @@ def keep_agreed(result: FloatArray, halves: Halves) -> Guarded:
 
     ``result`` (H, W) or (H, W, 3).
     """
-    image, share = np.empty_like(result), np.empty(result.shape[:2], np.float32)
+    image, (share, flat) = np.empty_like(result), np.empty((2, *result.shape[:2]), np.float32)
     for top in range(0, len(result), _ROWS):
         first, above = max(top - _AROUND, 0), min(top, _AROUND)
         rows, own = slice(first, top + _ROWS + _AROUND), slice(above, above + _ROWS)
         parts = _agreed(result[rows], halves.first[rows], halves.second[rows])
-        image[top : top + _ROWS], share[top : top + _ROWS] = (part[own] for part in parts)
-    return Guarded(image, share, explain_agreement(share))
+        for whole, part in zip((image, share, flat), parts, strict=True):
+            whole[top : top + _ROWS] = part[own]
+    # Flat parts that are smoothed are no reason to doubt the registration.
+    return Guarded(image, np.maximum(share, flat), explain_agreement(share))
 
 
 def halves_memory(shape: tuple[int, ...], threads: int) -> float:
@@ -109,25 +119,22 @@ def keep_agreed_memory(shape: tuple[int, ...]) -> float:
     """Bytes that :func:`keep_agreed` takes for an image of (H, W) or (H, W, 3) pixels, its result among them."""
     channels = shape[2] if len(shape) == 3 else 1
     rows = min(shape[0], _ROWS + 2 * _AROUND)
-    return shape[1] * float(shape[0] * 4 * (1 + channels) + rows * (_BYTES + _CHANNEL_BYTES * channels))
+    return shape[1] * float(shape[0] * 4 * (3 + channels) + rows * (_BYTES + _CHANNEL_BYTES * channels))
 
 
-def _agreed(result: FloatArray, first_half: FloatArray, second_half: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return some rows of the guarded image, and the largest g of each pixel."""
+def _agreed(result: FloatArray, first_half: FloatArray, second_half: FloatArray) -> tuple[FloatArray, ...]:
+    """Return some rows of the guarded image, the largest g of bands and tint, and g of flat parts."""
     first, second = luminance(first_half), luminance(second_half)
     mean, left = (first_half + second_half) / np.float32(2), result
+    flat, all_of_mean = _flat_parts(first, second, mean, result), mean
     image, share = np.zeros_like(result), np.zeros(result.shape[:2], np.float32)
     for scale in _SCALES:
         (first, a), (second, b), (mean, usual), (left, detail) = (
             _split(some, scale) for some in (first, second, mean, left)
         )
-        window = _WINDOWS * scale + _WINDOW
-        product, squares = _smooth(a * b, window), _smooth(a * a, window) * _smooth(b * b, window)
-        alike = np.clip(product / np.sqrt(squares + np.float32(_NOTHING**2)), 0, 1)
-        unlike = 1 - np.clip((2 * alike / (1 + alike) - _NONE) / (_ALL - _NONE), 0, 1)
-        more = _energy(detail, window) / (_energy(usual, window) + np.float32(_NOTHING)) - 1
-        more = more if more.ndim == 2 else more.max(axis=2)
-        given = (unlike * np.clip(more, 0, 1)).astype(np.float32)
+        window = partial(_smooth, scale=_WINDOWS * scale + _WINDOW)
+        moments = [window(one * other) for one, other in ((a, a), (b, b), (a, b), (usual, usual), (detail, detail))]
+        given = _given(moments)
         image += detail + (usual - detail) * (given if result.ndim == 2 else given[..., None])
         np.maximum(share, given, out=share)
     if result.ndim == 3:
@@ -135,7 +142,32 @@ def _agreed(result: FloatArray, first_half: FloatArray, second_half: FloatArray)
         given = np.clip((np.abs(tint).max(axis=2) - _LEAST_TINT) / (_TINT - _LEAST_TINT), 0, 1).astype(np.float32)
         left = left - tint * given[..., None]
         np.maximum(share, given, out=share)
-    return np.clip(image + left, 0, 1), share
+    image = image + left
+    image += (all_of_mean - image) * (flat if result.ndim == 2 else flat[..., None])
+    return np.clip(image, 0, 1), share, flat
+
+
+def _flat_parts(first: FloatArray, second: FloatArray, mean: FloatArray, result: FloatArray) -> FloatArray:
+    """Return the share of the mean in every pixel of a flat part, for one that any flat window of noise holds."""
+    side = (_FLAT, _FLAT)
+
+    def covariance(one: FloatArray, other: FloatArray) -> FloatArray:
+        return np.asarray(cv2.blur(one * other, side) - cv2.blur(one, side) * cv2.blur(other, side), np.float32)
+
+    pairs = (first, first), (second, second), (first, second), (mean, mean), (result, result)
+    # The standard error of the correlation of noise in a window: faint texture may seem to be none in some.
+    given = _given([covariance(*pair) for pair in pairs], doubt=1 / _FLAT)
+    return np.asarray(cv2.blur(cv2.dilate(given, np.ones(side, np.uint8)), (3, 3)), np.float32)
+
+
+def _given(moments: Sequence[FloatArray], doubt: float = 0.0) -> FloatArray:
+    """Return g from ⟨AA⟩, ⟨BB⟩, ⟨AB⟩, the energies of the mean and of the result, and the error of a correlation."""
+    aa, bb, ab, usual, detail = moments
+    alike = doubt + np.clip(ab / np.sqrt(np.maximum(aa * bb, 0) + np.float32(_NOTHING**2)), 0, 1 - doubt)
+    unlike = 1 - np.clip((2 * alike / (1 + alike) - _NONE) / (_ALL - _NONE), 0, 1)
+    more = detail / (np.maximum(usual, 0) + np.float32(_NOTHING)) - 1
+    more = more if more.ndim == 2 else more.max(axis=2)
+    return np.asarray(unlike * np.clip(more, 0, 1), np.float32)
 
 
 def explain_agreement(share: FloatArray) -> tuple[Decision, ...]:
@@ -156,7 +188,3 @@ def _split(image: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:
 
 def _smooth(image: FloatArray, scale: float) -> FloatArray:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), scale), np.float32)
-
-
-def _energy(detail: FloatArray, window: float) -> FloatArray:
-    return _smooth(detail * detail, window)

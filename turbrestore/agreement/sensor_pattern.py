@@ -41,8 +41,9 @@ _EDGE, _LEAST_MOTION = 8.0, 0.3
 _PARTS, _ALIKE, _LARGEST = 3, 0.5, 0.04
 # Share of the height of a warm pixel over the median around by which it exceeds each neighbour; most that are warm.
 _ALONE, _MOST_WARM = 0.7, 0.005
-# Deviation of what is drawn over the noise, in units of it, and reach of its strokes, pixels.
-_DRAWN, _STROKE = 0.25, 4
+# Deviation of what is drawn over the noise, in units of it, and reach of its strokes, pixels: beside a digit that
+# stands there may be one that changes.
+_DRAWN, _STROKE = 0.25, 12
 # A dead column varies less than this share of the noise and of the columns around; dead ones are few, and told
 # from others where there is noise of some size.
 _DEAD, _AROUND, _MOST_DEAD, _LEAST_NOISE = 0.3, 9, 0.05, 1 / 1020
