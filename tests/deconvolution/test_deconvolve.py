@@ -17,12 +17,12 @@ from turbrestore.deconvolution.deconvolve import (
     BOUNDARIES,
     METHODS,
     DeconvolutionParams,
+    automatic_fidelity,
     deconvolve,
     deconvolve_steps,
     whole_image_fidelity,
 )
 from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalParams, automatic_h
-from turbrestore.deconvolution.problem import automatic_fidelity
 from turbrestore.deconvolution.tv import LocalPenalty
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.steps import finish

@@ -305,9 +305,10 @@ def _settings(
 def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params: FilterParams) -> FilterState:
     """State before the first frame."""
     variance = image_noise / params.prior_frames if params.prior_frames else _DIFFUSE
+    covariance = dynamics.state_covariance
     return FilterState(
         PixelGaussian(image, np.full(image.shape[:2], variance, np.float32)),
-        Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance),
+        Gaussian(np.zeros(len(covariance)), covariance),
         *np.zeros((2, *image.shape[:2], 2), np.float32),
     )
 

@@ -25,7 +25,7 @@ from ..runtime.scratch import iter_frames
 from ..runtime.threads import in_batches, map_in_turns
 from .array_backend import ArrayBackend
 from .frame_noise import FrameStatistics, frame_noise_variance
-from .kalman import Gaussian, ProjectedFlow, predict_state, project_measured, update_state
+from .kalman import Gaussian, ProjectedFlow, advance_state, project_measured
 
 # A frame as it was read, or prepared for flow; None for a frame that does not count.
 Frame = FloatArray | FlowFrame | None
@@ -100,9 +100,7 @@ def pass_over(
         nonlocal state
         updated = []
         for item in items:
-            state, innovation = predict_state(state, settings.dynamics), np.nan  # (14b, 14d)
-            if item.projected is not None:
-                state, innovation = update_state(state, item.projected, settings.dynamics)  # (17, 19)
+            state, innovation = advance_state(state, item.projected, settings.dynamics)  # (14b, 14d, 17, 19)
             updated.append((item, state, innovation))
         return updated
 

@@ -300,9 +300,10 @@ def flow_noise(dynamics: FlowDynamics) -> float:
     return max(dynamics.R, _FLOW_NOISE_FLOOR)
 
 
-def predict_state(state: Gaussian, dynamics: FlowDynamics) -> Gaussian:
-    """Predict the state of the flow one frame ahead (paper 3, eqs. 14b and 14d)."""
-    return predict(state, dynamics.A, dynamics.Q)
+def advance_state(state: Gaussian, measured: ProjectedFlow | None, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
+    """Predict the state of the flow one frame ahead (paper 3, eqs. 14b and 14d), and update it by a measured flow."""
+    predicted = predict(state, dynamics.A, dynamics.Q)
+    return (predicted, np.nan) if measured is None else update_state(predicted, measured, dynamics)
 
 
 def update_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
