@@ -7,8 +7,8 @@ import pytest
 from flow_systems import uneven_flows
 
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
-from turbrestore.dynamics.flow_model import flow_of
-from turbrestore.filtering.kalman import Gaussian, advance_state, predict, project_measured, update, update_state
+from turbrestore.dynamics.flow_model import flow_of, project_measured
+from turbrestore.filtering.kalman import Gaussian, advance_state, predict, update, update_state
 
 
 @pytest.fixture

@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
@@ -295,7 +296,7 @@ def _with_uncertainty(candidate: BlurCandidate, team: ThreadTeam) -> BlurEstimat
     found, gradients = candidate.estimate, image_gradients(candidate.part)
     levels = found.noise / 2, 2 * found.noise
     shapes = _exponents(candidate.asked, found.reduction)
-    both = team.map(lambda level: width_costs(gradients, shapes, level, rises=1), levels)
+    both = team.map(partial(width_costs, gradients, shapes, rises=1), levels)
     less, more = (unreduced_width(likeliest_width(costs), found.reduction) for costs in both)
     return replace(found, uncertainty=abs(more - less) / 2)
 

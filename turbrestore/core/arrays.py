@@ -96,6 +96,17 @@ def from_unit(image: FloatArray, bit_depth: int) -> NDArray[np.unsignedinteger]:
     return levels
 
 
+def from_unit_to_type(image: FloatArray, bit_depth: int) -> NDArray[Any]:
+    """Convert intensities to the type of a file: uint8 up to 8 bits, uint16 up to 16, clipped float32 for 32."""
+    if bit_depth != 32:
+        return from_unit(image, 8 if bit_depth <= 8 else 16)
+    pixels, done = np.empty(image.shape, np.float32), 0
+    for part in _parts(image):
+        np.clip(part, 0, 1, out=pixels[done : done + len(part)])
+        done += len(part)
+    return pixels
+
+
 def _parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
     """Consecutive views along the first axis, each of a few million numbers at most."""
     step = max(1, len(array) * _PART // max(array.size, 1))

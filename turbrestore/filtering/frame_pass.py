@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
-from ..dynamics.flow_model import FlowDynamics, flow_of
+from ..dynamics.flow_model import FlowDynamics, ProjectedFlow, flow_of, project_measured
 from ..registration.flow import FlowFrame, FlowParams, FlowReference, prepare_reference
 from ..runtime.image_stacks import Stack
 from ..runtime.runtime import Runtime
@@ -25,7 +25,7 @@ from ..runtime.scratch import iter_frames
 from ..runtime.threads import in_batches, map_in_turns
 from .array_backend import ArrayBackend
 from .frame_noise import FrameStatistics, frame_noise_variance
-from .kalman import Gaussian, ProjectedFlow, advance_state, project_measured
+from .kalman import Gaussian, advance_state
 
 # A frame as it was read, or prepared for flow; None for a frame that does not count.
 Frame = FloatArray | FlowFrame | None

@@ -44,9 +44,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray
 from ..core.errors import DataError
-from ..dynamics.flow_model import Float64Array, FlowDynamics, project_deviation
+from ..dynamics.flow_model import Float64Array, FlowDynamics, ProjectedFlow
 from ..runtime.image_stacks import Stack
 
 _LOG_2PI = float(np.log(2 * np.pi))
@@ -274,25 +273,6 @@ def _cholesky(matrix: Float64Array, name: str, kind: str) -> Float64Array:
         return np.asarray(np.linalg.cholesky(matrix), np.float64)
     except np.linalg.LinAlgError:
         raise DataError(f"{name}: expected a {kind} matrix, found one that is not; check the covariances") from None
-
-
-@dataclass(frozen=True, eq=False)
-class ProjectedFlow:
-    """A measured flow, as far as the update of the state needs it."""
-
-    state: Float64Array  # (n,): z
-    squared: float  # sum of squares of W^meas − W̄, squared pixels
-    size: int  # components of the flow, 2 H W
-
-
-def project_measured(measured: FloatArray, dynamics: FlowDynamics) -> ProjectedFlow:
-    """Project a measured flow on the subspace of the model.
-
-    ``measured`` (H, W, 2).
-    """
-    deviation = measured - dynamics.mean_flow
-    state = project_deviation(dynamics, deviation)
-    return ProjectedFlow(state, float(np.square(deviation, out=deviation).sum(dtype=np.float64)), deviation.size)
 
 
 def flow_noise(dynamics: FlowDynamics) -> float:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import FrameSource, Window
-from ..registration.camera.global_shift import global_shifts
+from ..registration.camera.global_shift import known_shifts
 from .survey import Survey
 
 # Frames of which the median is taken, the fewest that tell what passes, and rows that it is taken of at once.
@@ -355,7 +355,7 @@ def reduced(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> FloatArray:
 
 def shifts_of_reduced(small: FloatArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Shifts (dx, dy) of frames that :func:`reduced` has reduced, in pixels of the frames, shape (T, 2)."""
-    return global_shifts(small) * (shape[2] / small.shape[2], shape[1] / small.shape[1])
+    return known_shifts(small)[0] * (shape[2] / small.shape[2], shape[1] / small.shape[1])
 
 
 def measured_shifts(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> NDArray[np.float64]:

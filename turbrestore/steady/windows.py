@@ -21,7 +21,7 @@ from ..footage.checks.scene_cuts import similarity_at, thumbnail
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
 from ..registration.contrast import grey_levels
 from ..registration.opencv_flow import GreyImage
-from ..registration.warp import spline_planes
+from ..runtime.image_stacks import spline_planes
 from .grid import pixel_of, reduced
 
 # Likeness of two successive frames below which the second starts a new scene.
