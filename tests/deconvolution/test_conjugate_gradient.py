@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from scipy import fft
+from skimage import data
 from small_problems import OPS, dense, dense_blur, small_problem
 
 from turbrestore.blur.psf import gaussian_otf, laplacian_symbol, psf_to_otf
-from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients, quadratic_solver
+from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients, quadratic_solver, wiener_fidelity
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.deconvolution.tv import local_gradient
 
@@ -93,3 +94,9 @@ def test_conjugate_gradients_stay_where_they_are_when_solved():
     for _ in range(20):
         state = solver.step(problem, state)
     assert state.image == pytest.approx(0.5, abs=1e-5)
+
+
+def test_wiener_fidelity_falls_with_noise_and_rises_with_contrast():
+    image = data.camera()[60:124, 120:184].astype(np.float32) / 255
+    assert wiener_fidelity(image, 0.01) < wiener_fidelity(image, 0.001)
+    assert wiener_fidelity(image / 2, 0.001) < wiener_fidelity(image, 0.001)

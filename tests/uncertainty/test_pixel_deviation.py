@@ -5,8 +5,9 @@ import pytest
 from scipy.stats import spearmanr
 
 import turbrestore
-from turbrestore.blur.psf import blur_otf, laplacian_symbol, wiener_fidelity
+from turbrestore.blur.psf import blur_otf, laplacian_symbol
 from turbrestore.core.noise import estimate_noise
+from turbrestore.deconvolution.conjugate_gradient import wiener_fidelity
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, automatic_fidelity
 from turbrestore.io.images import write_image
 from turbrestore.io.source import FrameSource

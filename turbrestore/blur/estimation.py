@@ -41,7 +41,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_image, luminance
+from ..core.arrays import FloatArray, check_grey
 from ..core.errors import require
 from ..core.noise import estimate_noise
 from ..display.plots import plot_blur
@@ -216,7 +216,7 @@ def estimate_blur(
             nothing, shape = np.zeros(0), exponent or fused_exponent(0.0)
             return BlurEstimate(0.0, float("inf"), shape, noise or 0.0, 1, 0.0, nothing, nothing)
         found = choose_blur(candidates, runtime)
-        return limit_to_edges(found, luminance(check_image(image))) if found.blurred else found
+        return limit_to_edges(found, check_grey(image)) if found.blurred else found
 
 
 def limit_to_edges(estimate: BlurEstimate, image: FloatArray) -> BlurEstimate:
@@ -242,7 +242,7 @@ def find_candidates(
     image: ArrayLike, noise: float | None = None, exponent: float | None = None
 ) -> tuple[BlurCandidate, ...]:
     """Find the likeliest blur at each reduction of an image, without its uncertainty."""
-    grey = luminance(check_image(image))
+    grey = check_grey(image)
     usable = noise is None or (np.isfinite(noise) and noise >= 0)
     require(usable, f"noise: expected a finite number of 0 or more, found {noise}")
     if exponent is not None:

@@ -42,6 +42,11 @@ def check_image(image: ArrayLike, name: str = "image") -> FloatArray:
     return _finite(array, name)
 
 
+def check_grey(image: ArrayLike, name: str = "image") -> FloatArray:
+    """Return the luminance of ``image``, (H, W) or (H, W, 3), as a finite float32 array of shape (H, W)."""
+    return luminance(check_image(image, name))
+
+
 def check_frames(frames: ArrayLike, name: str = "frames", at_least: int = 1) -> FloatArray:
     """Return ``frames`` as a finite float32 array of shape (T, H, W) or (T, H, W, 3).
 

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..blur.estimation import BlurEstimate
-from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, psf_to_otf, wiener_fidelity
-from ..core.arrays import FloatArray, check_image, luminance
+from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, psf_to_otf
+from ..core.arrays import FloatArray, check_grey, check_image, luminance
 from ..core.errors import ConfigurationError, DataError, require, require_between
 from ..core.noise import NoiseCurve, estimate_noise
 from ..display.plots import plot_objective
@@ -33,7 +33,7 @@ from ..runtime.device import CPU, find_device, memory_of
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.threads import ThreadTeam, one_thread_each
-from .conjugate_gradient import quadratic_solver, wiener_image
+from .conjugate_gradient import quadratic_solver, wiener_fidelity, wiener_image
 from .nonlocal_prior.nonlocal_tv import NonlocalPenalty
 from .nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
 from .nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
@@ -366,7 +366,7 @@ def _sharpened(
 def _padded_guide(guide: ArrayLike | None, margin: Margin) -> FloatArray | None:
     if guide is None:
         return None
-    grey = luminance(check_image(guide, "guide"))
+    grey = check_grey(guide, "guide")
     if grey.shape != margin.size:
         raise DataError(f"guide: expected the size of the image {margin.size}, found {grey.shape}")
     return margin.pad(grey)

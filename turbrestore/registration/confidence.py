@@ -34,7 +34,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_image, luminance
+from ..core.arrays import FloatArray, check_grey
 from ..core.noise import estimate_noise
 from ..runtime.jit import jit
 
@@ -73,7 +73,7 @@ def flow_confidence(reference: ArrayLike) -> FlowConfidence:
 
     ``reference`` (H, W) or (H, W, 3).
     """
-    image = luminance(check_image(reference, "reference"))
+    image = check_grey(reference, "reference")
     dx, dy = _gradient(image)
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW).ravel() for product in (dx * dx, dx * dy, dy * dy))
     noise = np.float32(_NOISE_MARGIN * _GRADIENT_NOISE * estimate_noise(image) ** 2)
@@ -90,7 +90,7 @@ def noise_share(image: ArrayLike, noise: float) -> float:
 
     ``image`` (H, W) or (H, W, 3).
     """
-    squares = sum(float(np.square(part).mean(dtype=np.float64)) for part in _gradient(luminance(check_image(image))))
+    squares = sum(float(np.square(part).mean(dtype=np.float64)) for part in _gradient(check_grey(image)))
     return 2 * _SCHARR_NOISE * noise**2 / max(squares, 1e-18)
 
 

@@ -40,10 +40,11 @@ import scipy
 from numpy.typing import NDArray
 
 from ..blind.remove_blur import Deblurred
-from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol, wiener_fidelity
+from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol
 from ..core.arrays import FloatArray, luminance
 from ..core.gradient import sobel_gradient
 from ..core.noise import estimate_noise
+from ..deconvolution.conjugate_gradient import wiener_fidelity
 from ..deconvolution.deconvolve import DeconvolutionParams, automatic_fidelity
 from ..deconvolution.problem import MARGIN_SIGMAS, margin_around
 from ..dynamics.flow_model import FlowDynamics
