@@ -44,6 +44,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.arrays import FloatArray
 from ..core.errors import DataError
 from ..dynamics.flow_model import Float64Array, FlowDynamics, ProjectedFlow
 from ..runtime.image_stacks import Stack
@@ -315,6 +316,12 @@ class PixelGaussian:
             raise DataError("variance: expected finite values of at least 0, found others")
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "variance", variance)
+
+
+def first_states(image: FloatArray, variance: float, dynamics: FlowDynamics) -> tuple[PixelGaussian, Gaussian]:
+    """ρ̂, Σ and ξ̂, P before the first frame: an image (H, W) or (H, W, 3), and the states of the training flows."""
+    pixels, covariance = np.full(image.shape[:2], variance, np.float32), dynamics.state_covariance
+    return PixelGaussian(image, pixels), Gaussian(np.zeros(len(covariance)), covariance)
 
 
 class PixelStacks(NamedTuple):
