@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 import pytest
 from blurred_images import camera, psnr
-from small_problems import OPS
+from small_problems import OPS, gaussian_psf
 
 from turbrestore.blur.estimation import BlurEstimate
-from turbrestore.blur.psf import gaussian_psf
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.deconvolution.deconvolve import (
     BOUNDARIES,

@@ -32,34 +32,10 @@ GAUSSIAN, KOLMOGOROV = 2.0, 5 / 3
 _WIDE, _HALFWAY = 1.2, 1.3
 
 
-def gaussian_psf(sigma: float) -> FloatArray:
-    """Sample a Gaussian point spread function at pixel centres, out to 4σ.
-
-    Returns (n, n).
-    """
-    _check_sigma(sigma)
-    radius = int(np.ceil(4 * sigma))
-    if radius == 0:
-        return np.ones((1, 1), np.float32)
-    profile = np.exp(-(np.arange(-radius, radius + 1) ** 2) / (2 * sigma**2))
-    profile /= profile.sum()
-    return np.outer(profile, profile).astype(np.float32)
-
-
-def gaussian_otf(shape: tuple[int, int], sigma: float) -> FloatArray:
-    """Return the transfer function of a Gaussian on a periodic grid: ``exp(−2π²σ²ν²)``.
-
-    Returns (H, W // 2 + 1).
-    """
-    _check_sigma(sigma)
-    rows, columns = (np.exp(-2 * (np.pi * sigma * nu) ** 2) for nu in _frequencies(shape))
-    return (rows * columns).astype(np.float32)
-
-
 def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -> FloatArray:
     """Return the transfer function ``exp(−ln 2 (ν/ν_h)^p)`` on a periodic grid, ``ν_h = √(ln 2 / 2) / (π σ)``.
 
-    p = 2 is the Gaussian of :func:`gaussian_otf`. p = 5/3 is a long exposure through Kolmogorov turbulence (Fried
+    p = 2 is the Gaussian, ``exp(−2π²σ²ν²)``. p = 5/3 is a long exposure through Kolmogorov turbulence (Fried
     1966), whose point spread function has a narrower core and wider wings. Fused frames have wider wings still, see
     :func:`fused_exponent`.
     Returns (H, W // 2 + 1).
