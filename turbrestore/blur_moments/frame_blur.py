@@ -100,7 +100,8 @@ def frame_blur(frames: ArrayLike, noise: float, params: CueParams | None = None)
     parts = [_blur_of_tiles(power[:, some], spectrum[some], misfit[some], design, fit) for some in _batches(power)]
     shape = (len(stack), len(spectra.grid.rows), len(spectra.grid.columns))
     joined = (np.concatenate(of_tiles, axis=1) for of_tiles in zip(*parts, strict=True))
-    return FrameBlur(*(part.reshape(shape).astype(np.float32) for part in joined), spectra.grid)
+    relative, deviation, extra = (part.reshape(shape).astype(np.float32) for part in joined)
+    return FrameBlur(relative, deviation, extra, spectra.grid)
 
 
 @dataclass(frozen=True, eq=False)
