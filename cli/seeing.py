@@ -9,11 +9,11 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from turbrestore.memory_plan import frames_in_memory, training_share
-from turbrestore.preparation import prepare, seeing_of_picture
+from turbrestore.preparation import prepare
 from turbrestore.registration.centroid import CentroidParams, centroid_steps
 from turbrestore.registration.flow import FlowParams
 from turbrestore.runtime.steps import finish, step_counter
-from turbrestore.seeing.strength import Seeing
+from turbrestore.seeing.strength import Seeing, seeing_of_picture
 from turbrestore.seeing.tilt_theory import Optics, known_optics
 from turbrestore.wording import interval_words
 
@@ -78,7 +78,7 @@ def seeing(
     with progress_bars(quiet) as progress:
         steps = centroid_steps(frames, centroid, flow, runtime)
         found = finish(steps, step_counter(progress, "centroid", count * centroid.iterations))
-    measured = seeing_of_picture(prepared, frames, found, optics, runtime.threads)
+    measured = seeing_of_picture(prepared.picture, frames, found, optics, runtime.threads)
     if json:
         print_json({"input": str(input), "frames": count, **asdict(measured)})
     else:

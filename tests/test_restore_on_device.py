@@ -87,7 +87,7 @@ def test_frames_that_do_not_count(device):
     [
         ("registration.tvl1.tvl1_flows", "lower flow.tvl1.batch", RestoreParams(flow=TVL1)),
         ("registration.warp.warp_stack", "process a smaller part .*", RestoreParams()),
-        ("filtering.array_backend.warp_stack", "process a smaller part .*", RestoreParams(filter=FilterParams())),
+        ("filtering.frame_noise.warp_stack", "process a smaller part .*", RestoreParams(filter=FilterParams())),
     ],
 )
 def test_what_to_do_is_said_where_the_memory_of_the_device_is_too_small(device, place, advice, params, monkeypatch):

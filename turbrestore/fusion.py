@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -27,17 +28,17 @@ from .footage.frame_selection import best_frames, frame_quality
 from .footage.levels import Levels
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan
-from .preparation import Prepared, seeing_of_picture
+from .preparation import Prepared
 from .registration.centroid import Centroid, centroid_steps
 from .registration.flow_algebra import invert_flow
 from .registration.recentring import recentre, recentring_flow
 from .registration.warp import warp
 from .results import Store
-from .runtime.scratch import fill_stack, iter_frames, mean_of
+from .runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
 from .runtime.steps import Progress, finish, step_counter
 from .runtime.tiling import HaloTile, cut_tile
 from .seeing.displacement import LEAST_FRAMES
-from .seeing.strength import Seeing
+from .seeing.strength import Seeing, seeing_of_picture
 from .settings import RestoreParams
 from .stacking.placement import centroid_of_known_flows, onto_reference
 from .tiled_stages import (
@@ -64,6 +65,8 @@ from .wording import (
 
 # Files of floating point are taken for those of 16 bits.
 _MOST_BITS = 16
+# Intensity from which a pixel is saturated: half a grey level of 8 bits below full scale.
+_SATURATED = 1 - 0.5 / 255
 # Least standard deviation of ln V by a measured D/r0: theory and simulated clips agree no better.
 _LEAST_SPREAD = 0.2
 
@@ -109,7 +112,7 @@ class Run:
         Results have the levels of the clip.
         """
         begun = time.perf_counter()
-        result = self.store.get(name, lambda: self.levels.original_result(compute()))
+        result = self.store.get(name, lambda: self.levels.original(compute()))
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begun
         return result
 
@@ -145,13 +148,14 @@ def fuse(run: Run) -> Fused:
     # Tiles read their parts of the frames themselves.
     stream = iter(run.source) if run.tiles else _added_up(run.source, total)
     begun, levels = time.perf_counter(), run.levels
-    training = fill_stack((train, *run.source.shape[1:]), stream, run.plan.runtime.scratch)
+    training, saturated, brightest = _read_training(stream, (train, *run.source.shape[1:]), run.plan.runtime.scratch)
     run.seconds["read"] += time.perf_counter() - begun
-    run.decide(explain_training(train, len(run.source), params.train), *explain_input(training))
+    run.decide(explain_training(train, len(run.source), params.train), *explain_input(saturated))
 
     centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
     run.decide(*explain_registration(centroid))
-    seeing, saturation = _measure_seeing(run, training, centroid), _find_saturation(run, training)
+    start = levels.stretched(centroid)
+    seeing, saturation = _measure_seeing(run, training, start), _find_saturation(run, training[0], brightest)
     if not params.runs("identify"):
         return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation)
 
@@ -160,10 +164,9 @@ def fuse(run: Run) -> Fused:
     if not params.runs("filter"):
         return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation, dynamics)
 
-    start = levels.stretched_result(centroid)
     filtered = run.stage("filter", "filtered", lambda: _placed(run, _filter(run, start, dynamics, training, stream)))
     unread = _added_up(run.source, total) if run.tiles else stream
-    mean = run.stage("filter", "mean", lambda: levels.original(_mean(unread, total, len(run.source))))
+    mean = run.stage("filter", "mean", lambda: _mean(unread, total, len(run.source)))
     # The sharpness is NaN for frames that do not count.
     chosen = int(np.isfinite(filtered.sharpness).sum())
     run.decide(*explain_filter(filtered, dynamics, None if params.keep_best == 1 else chosen))
@@ -174,6 +177,20 @@ def fuse(run: Run) -> Fused:
     halves = _halves(run, training, centroid, filtered.mean_flow)
     found = mean, centroid, seeing, saturation, dynamics, filtered
     return Fused(image, *found, not structure.passed, witnesses, halves)
+
+
+def _read_training(
+    stream: Iterator[FloatArray], shape: tuple[int, ...], scratch: Path | None
+) -> tuple[FloatArray, float, float]:
+    """Read the training frames; also the share of their pixels that are saturated, and the greatest intensity."""
+    training, saturated, brightest = new_stack(shape, scratch), 0.0, 0.0
+    for place in training:
+        # In a loop over the stream, one frame would stay in memory while the next is made.
+        place[...] = next(stream)
+        saturated += float(np.mean(place >= _SATURATED)) / len(training)
+        brightest = max(brightest, float(place.max()))
+        drop_pages(training)
+    return training, saturated, brightest
 
 
 def _find_centroid(run: Run, training: FloatArray) -> Centroid:
@@ -239,8 +256,8 @@ def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seein
     """Measure the strength of the turbulence, unless there are too few frames."""
     if len(training) < LEAST_FRAMES:
         return None
-    begun, stretched = time.perf_counter(), run.levels.stretched_result(centroid)
-    seeing = seeing_of_picture(run.prepared, training, stretched, run.params.optics, run.plan.runtime.threads)
+    begun, picture = time.perf_counter(), run.prepared.picture
+    seeing = seeing_of_picture(picture, training, centroid, run.params.optics, run.plan.runtime.threads)
     run.seconds["seeing"] = time.perf_counter() - begun
     run.decide(*explain_seeing(seeing))
     return seeing
@@ -278,11 +295,11 @@ def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWit
     return replace(known, displacement=made, diffraction=diffraction, spread=float(spread))
 
 
-def _find_saturation(run: Run, training: FloatArray) -> float:
+def _find_saturation(run: Run, frame: FloatArray, brightest: float) -> float:
     """Return the intensity, at the levels of the clip, from which the mean is saturated."""
-    brightest = run.levels.original(np.array([max(frame.max() for frame in iter_frames(training))], np.float32))
-    noise, bits = estimate_noise(training[0]) / run.levels.gain, min(run.source.bit_depth, _MOST_BITS)
-    return saturation_level(float(brightest[0]), noise, 1 / (2**bits - 1))
+    largest = float(run.levels.original(np.array([brightest], np.float32))[0])
+    noise, bits = estimate_noise(frame) / run.levels.gain, min(run.source.bit_depth, _MOST_BITS)
+    return saturation_level(largest, noise, 1 / (2**bits - 1))
 
 
 def _placed(run: Run, filtered: Filtered) -> Filtered:

@@ -26,8 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from .agreement.last_guard import halves_memory, keep_agreed_memory
-from .blind.remove_blur import remove_blur_memory
-from .blind.tiled_deconvolution import SMALLEST_SIDE
+from .blind.remove_blur import SMALLEST_SIDE, remove_blur_memory
 from .core.decision import Decision
 from .core.errors import ConfigurationError, DataError, require
 from .dynamics.dynamic_texture import identify_memory, modes_memory

@@ -41,7 +41,7 @@ from .settings import RestoreParams
 from .stacking.fine_grid import fine_image, fine_shape
 from .stacking.placement import settings_of_known_flows
 from .tiled_stages import TileMap
-from .uncertainty.pixel_deviation import informed_pixels, measure_deviation
+from .uncertainty.pixel_deviation import measure_deviation
 from .wording import explain_border
 
 # Every pixel of a cropped image is visible in at least this share of the training frames.
@@ -215,7 +215,7 @@ def _deblur(run: Run, fused: Fused, photons: NoiseCurve | None) -> Deblurred:
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
     steps = remove_blur_steps(image, guide, *settings, fused.witnesses, run.psf, photons)
     deblurred = finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
-    deconvolution, blur = levels.original_result(deblurred.deconvolution), levels.original_result(deblurred.blur)
+    deconvolution, blur = levels.original(deblurred.deconvolution), levels.original(deblurred.blur)
     return replace(deblurred, deconvolution=deconvolution, blur=blur)
 
 
@@ -239,7 +239,8 @@ def _measure_uncertainty(
     if fused.is_mean:
         return np.full(image.shape[:2], np.inf, np.float32)
     begun = time.perf_counter()
-    known = informed_pixels(seen, fused.mean, fused.saturation)
+    # A pixel is known if a frame has shown it and no channel is saturated in all of them.
+    known = (seen > 0) & (np.atleast_3d(fused.mean).max(axis=-1) < fused.saturation)
     if run.prepared.hidden is not None:
         known &= ~run.prepared.hidden
     stretched, params = run.levels.stretched(filtered.image), run.params.deconvolution

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .agreement.sensor_pattern import without_stripes
-from .core.arrays import FloatArray
 from .core.decision import Decision
 from .footage.bars import Bars, without_bars
 from .footage.levels import Levels, stretch_levels
@@ -20,10 +19,6 @@ from .footage.overlays import Title, read_static_mask, without_overlay
 from .footage.passers import without_passers
 from .footage.survey import take_survey
 from .io.source import FrameSource, Window
-from .registration.centroid import Centroid
-from .runtime.scratch import mean_of
-from .seeing.strength import Seeing, measure_seeing
-from .seeing.tilt_theory import Optics
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +60,3 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
     clip, on_passers = without_passers(survey) if static_mask != "off" else (survey.clip, ())
     decisions = (*on_bars, *on_stripes, *on_overlay, *on_colours, *on_light, *on_range, *on_passers)
     return Prepared(clip, levels, bars, hidden, title, decisions)
-
-
-def seeing_of_picture(
-    prepared: Prepared, frames: FloatArray, centroid: Centroid, optics: Optics | None = None, threads: int = 0
-) -> Seeing:
-    """Measure the strength of the turbulence between the bars, since what fills them is not the scene.
-
-    ``frames`` (T, H, W) or (T, H, W, 3).
-    """
-    rows, columns = prepared.picture
-    seen, flows = frames[:, rows, columns], centroid.flows[:, rows, columns]
-    return measure_seeing(seen, flows, centroid.image[rows, columns], mean_of(seen), optics, threads)

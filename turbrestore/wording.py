@@ -20,8 +20,6 @@ from .seeing.strength import LARGEST_BLUR, Estimate, Seeing
 
 # A frame counts if its weight is at least this share of the average weight.
 _COUNTS = 0.2
-# Intensity from which a pixel is saturated: half a grey level of 8 bits below full scale.
-_SATURATED = 1 - 0.5 / 255
 # Share of saturated pixels above which they are reported.
 _REPORTED_SHARE = 0.01
 # Motion beyond this share of the shorter side is too large for optical flow in some places.
@@ -44,12 +42,8 @@ def explain_training(train: int, frame_count: int, wanted: int | None) -> Decisi
     return Decision("training", f"first {train} of {frame_count} frames", reason)
 
 
-def explain_input(training: FloatArray) -> tuple[Decision, ...]:
-    """Report saturated pixels.
-
-    ``training`` (T, H, W) or (T, H, W, 3).
-    """
-    saturated = float(np.mean([np.mean(frame >= _SATURATED) for frame in iter_frames(training)]))
+def explain_input(saturated: float) -> tuple[Decision, ...]:
+    """Report a share of saturated pixels."""
     if saturated <= _REPORTED_SHARE:
         return ()
     reason = f"{saturated:.0%} of the pixels are at full scale: detail is lost there, and edges may ring"

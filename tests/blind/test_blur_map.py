@@ -163,7 +163,7 @@ def counted(monkeypatch):
         widths.append(width)
         return (yield from deconvolve_steps(image, width, *rest))
 
-    monkeypatch.setattr("turbrestore.blind.tiled_deconvolution.deconvolve_steps", steps)
+    monkeypatch.setattr("turbrestore.blind.remove_blur.deconvolve_steps", steps)
     return widths
 
 
@@ -193,7 +193,7 @@ def test_widths_and_deconvolution_do_not_wait_for_each_other(monkeypatch):
 
         return wait
 
-    monkeypatch.setattr("turbrestore.blind.tiled_deconvolution.deconvolve_steps", waiting(deconvolve_steps))
+    monkeypatch.setattr("turbrestore.blind.remove_blur.deconvolve_steps", waiting(deconvolve_steps))
     monkeypatch.setattr("turbrestore.blind.remove_blur.blur_map_steps", waiting(blur_map_steps))
     assert remove_blur(image, image, WIENER, FIRST).tiles is not None
 
@@ -216,7 +216,7 @@ def test_after_an_interrupt_the_remaining_tiles_are_left_out(monkeypatch):
 
     interrupted = threading.Event()
     monkeypatch.setattr("turbrestore.blind.blur_map.find_candidates", estimated)
-    monkeypatch.setattr("turbrestore.blind.tiled_deconvolution.deconvolve_steps", interrupt)
+    monkeypatch.setattr("turbrestore.blind.remove_blur.deconvolve_steps", interrupt)
     with pytest.raises(KeyboardInterrupt):
         remove_blur(image, image, WIENER)
     assert len(tiles) == 1

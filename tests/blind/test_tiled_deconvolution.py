@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from turbrestore.blind.tiled_deconvolution import (
-    tiled_deconvolution_steps,
-)
+from turbrestore.blind.remove_blur import tiled_deconvolution_steps
 from turbrestore.blur.psf import GAUSSIAN, blur_otf
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.metrics import psnr

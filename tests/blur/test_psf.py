@@ -5,16 +5,14 @@ import numpy as np
 import pytest
 from scipy import fft
 from skimage import data
+from small_problems import gaussian_psf
 
 from turbrestore.blur.psf import (
     blur_otf,
     check_psf,
-    gaussian_otf,
-    gaussian_psf,
     half_frequency,
     laplacian_symbol,
     psf_to_otf,
-    wiener_fidelity,
 )
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.core.noise import estimate_noise
@@ -24,18 +22,10 @@ def camera(size: int = 256) -> np.ndarray:
     return data.camera()[60 : 60 + size, 120 : 120 + size].astype(np.float32) / 255
 
 
-def test_gaussian_psf_has_its_standard_deviation():
-    psf = gaussian_psf(1.7)
-    x = np.arange(psf.shape[1]) - psf.shape[1] // 2
-    assert psf.sum() == pytest.approx(1, abs=1e-6)
-    assert np.sqrt(psf.sum(axis=0) @ x**2) == pytest.approx(1.7, rel=2e-3)
-    assert np.array_equal(gaussian_psf(0), [[1]])
-
-
 @pytest.mark.parametrize("shape", [(24, 31), (25, 30)])
 def test_gaussian_otf_is_the_transform_of_the_sampled_gaussian(shape):
     sampled = psf_to_otf(gaussian_psf(1.4), shape)
-    assert np.abs(sampled - gaussian_otf(shape, 1.4)).max() < 2e-4
+    assert np.abs(sampled - blur_otf(shape, 1.4)).max() < 2e-4
 
 
 def test_psf_to_otf_convolves_around_the_middle_pixel():
@@ -57,9 +47,7 @@ def test_laplacian_symbol_is_that_of_the_five_point_stencil():
 @pytest.mark.parametrize("sigma", [-1.0, np.nan, np.inf])
 def test_negative_and_undefined_sigmas_are_refused(sigma):
     with pytest.raises(ConfigurationError, match="sigma"):
-        gaussian_psf(sigma)
-    with pytest.raises(ConfigurationError, match="sigma"):
-        gaussian_otf((4, 4), sigma)
+        blur_otf((4, 4), sigma)
 
 
 @pytest.mark.parametrize("psf", [np.ones((2, 3)), np.ones(3), -np.ones((3, 3)), np.zeros((3, 3)), [[np.nan]]])
@@ -85,12 +73,6 @@ def test_images_too_small_to_judge_have_no_noise():
     assert estimate_noise(np.random.default_rng(3).random((2, 9))) == 0
 
 
-def test_wiener_fidelity_falls_with_noise_and_rises_with_contrast():
-    image = camera(64)
-    assert wiener_fidelity(image, 0.01) < wiener_fidelity(image, 0.001)
-    assert wiener_fidelity(image / 2, 0.001) < wiener_fidelity(image, 0.001)
-
-
 @pytest.mark.parametrize("exponent", [1.0, 5 / 3, 2.0])
 def test_blur_of_any_exponent_passes_one_half_where_the_gaussian_does(exponent):
     otf = blur_otf((400, 400), 2.0, exponent)
@@ -102,7 +84,8 @@ def test_blur_of_any_exponent_passes_one_half_where_the_gaussian_does(exponent):
 
 
 def test_an_exponent_of_two_is_the_gaussian():
-    assert np.abs(blur_otf((31, 40), 1.3) - gaussian_otf((31, 40), 1.3)).max() < 1e-6
+    nu = np.hypot(fft.fftfreq(31)[:, None], fft.rfftfreq(40))
+    assert np.abs(blur_otf((31, 40), 1.3) - np.exp(-2 * (np.pi * 1.3 * nu) ** 2)).max() < 1e-6
 
 
 @pytest.mark.parametrize("exponent", [0.9, 2.1, float("nan")])

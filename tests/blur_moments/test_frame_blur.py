@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from conftest import SCENES, blurred, moving_blur
-from turbrestore.blur_moments.frame_blur import frame_blur, prepare_blur_reference, relative_frame_blur
+from turbrestore.blur_moments.frame_blur import frame_blur
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.registration.warp import warp
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
@@ -63,15 +63,12 @@ def test_noise_alone_makes_no_frame_sharper():
 
 def test_batches_of_tiles_give_the_result_of_all_together(varied, monkeypatch):
     _, frames, _ = varied
-    whole = prepare_blur_reference(frames, 0.01)
-    against = relative_frame_blur(frames, whole[0], 0.02)
+    whole = frame_blur(frames, 0.01)
     # Three tiles of forty frames.
     monkeypatch.setattr("turbrestore.blur_moments.frame_blur._FITTED", 120)
-    parts = prepare_blur_reference(frames, 0.01)
-    for one, other in zip((*whole, against), (*parts, relative_frame_blur(frames, parts[0], 0.02)), strict=True):
-        for name, value in vars(one).items():
-            if isinstance(value, np.ndarray):
-                assert getattr(other, name) == pytest.approx(value, rel=1e-6, abs=1e-9), name
+    parts = frame_blur(frames, 0.01)
+    for name in ("relative", "deviation", "extra"):
+        assert getattr(parts, name) == pytest.approx(getattr(whole, name), rel=1e-6, abs=1e-9), name
 
 
 @pytest.mark.parametrize("shape", [(16, 16), (20, 100), (50, 49)])
@@ -82,34 +79,9 @@ def test_frames_without_content_say_nothing_and_break_nothing(shape, noise):
     assert blur.deviation == pytest.approx(np.full_like(blur.deviation, 2), abs=1e-3)
 
 
-def test_frames_one_by_one_give_the_result_of_all_together(varied):
-    _, frames, _ = varied
-    reference, together = prepare_blur_reference(frames, 0.01)
-    assert (together.extra == frame_blur(frames, 0.01).extra).all()
-    for index in (0, 7, 39):
-        alone = relative_frame_blur(frames[index : index + 1], reference)
-        for name in ("relative", "deviation", "extra"):
-            assert getattr(alone, name)[0] == pytest.approx(getattr(together, name)[index], abs=1e-5)
-
-
-@pytest.mark.parametrize("scene", SCENES)
-def test_blur_of_frames_that_the_reference_does_not_contain(scene):
-    image, rng = SCENES[scene](144), np.random.default_rng(0)
-    reference, _ = prepare_blur_reference(np.stack([blurred(image, sigma, rng) for sigma in 4 * [0.8, 1.2, 1.6]]), 0.01)
-    for sigma, noise in ((1.0, 0.01), (1.4, 0.01), (1.8, 0.01), (1.4, 0.002), (1.4, 0.04)):
-        found = relative_frame_blur(blurred(image, sigma, rng, noise)[None], reference, noise)
-        seen = found.deviation < 0.3
-        assert seen.sum() > 5
-        # The error of a tile, and nothing that all tiles share beyond the sharpest frame being a little off.
-        assert np.median(found.extra[seen]) == pytest.approx(sigma**2 - 0.8**2, rel=0.1, abs=0.1)
-    assert relative_frame_blur(blurred(image, 0.6, rng)[None], reference).extra.min() == 0
-
-
 def test_bad_input_is_named():
     image = np.zeros((32, 32), np.float32)
     with pytest.raises(DataError, match="at least 2 frames"):
         frame_blur(image[None], 0.01)
     with pytest.raises(ConfigurationError, match="noise"):
         frame_blur(np.stack([image, image]), np.nan)
-    with pytest.raises(DataError, match=r"frames: expected the size \(32, 32\) of the reference"):
-        relative_frame_blur(image[None, :, :31], prepare_blur_reference(np.stack([image, image]), 0.01)[0])

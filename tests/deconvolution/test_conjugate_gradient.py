@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from scipy import fft
+from skimage import data
 from small_problems import OPS, dense, dense_blur, small_problem
 
-from turbrestore.blur.psf import gaussian_otf, laplacian_symbol, psf_to_otf
-from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients, quadratic_solver
+from turbrestore.blur.psf import blur_otf, laplacian_symbol, psf_to_otf
+from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients, quadratic_solver, wiener_fidelity
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.deconvolution.tv import local_gradient
 
@@ -40,7 +41,7 @@ def test_periodic_solution_is_the_closed_form(method):
     image = (0.3 + 0.4 * cv2.GaussianBlur(rng.random((20, 24)), (0, 0), 1.0)).astype(np.float32)
     params = DeconvolutionParams(method=method, boundary="periodic", fidelity=80.0)
     result = deconvolve(image, 0.9, params)
-    otf = gaussian_otf(image.shape, 0.9).astype(np.float64)
+    otf = blur_otf(image.shape, 0.9).astype(np.float64)
     symbol = laplacian_symbol(*image.shape) if method == "wiener" else 1.0
     mean = image.mean()
     expected = mean + fft.irfft2(80.0 * otf * fft.rfft2(image - mean) / (80.0 * otf**2 + symbol), s=image.shape)
@@ -61,7 +62,7 @@ def test_masked_solution_is_that_of_dense_least_squares(method):
     top, left = ((p - n) // 2 for p, n in zip(shape, image.shape, strict=True))
     seen = np.zeros(shape, bool)
     seen[top : top + 9, left : left + 7] = True
-    otf = gaussian_otf(shape, sigma)
+    otf = blur_otf(shape, sigma)
     blur = dense(lambda u: fft.irfft2(otf * fft.rfft2(u), s=shape), shape)[seen.ravel()]
     penalty = dense(lambda u: local_gradient(u, OPS), shape) if method == "wiener" else np.eye(seen.size)
     system = np.concatenate([np.sqrt(fidelity) * blur, penalty])
@@ -93,3 +94,9 @@ def test_conjugate_gradients_stay_where_they_are_when_solved():
     for _ in range(20):
         state = solver.step(problem, state)
     assert state.image == pytest.approx(0.5, abs=1e-5)
+
+
+def test_wiener_fidelity_falls_with_noise_and_rises_with_contrast():
+    image = data.camera()[60:124, 120:184].astype(np.float32) / 255
+    assert wiener_fidelity(image, 0.01) < wiener_fidelity(image, 0.001)
+    assert wiener_fidelity(image / 2, 0.001) < wiener_fidelity(image, 0.001)

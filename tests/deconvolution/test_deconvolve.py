@@ -8,21 +8,20 @@ import cv2
 import numpy as np
 import pytest
 from blurred_images import camera, psnr
-from small_problems import OPS
+from small_problems import OPS, gaussian_psf
 
 from turbrestore.blur.estimation import BlurEstimate
-from turbrestore.blur.psf import gaussian_psf
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.deconvolution.deconvolve import (
     BOUNDARIES,
     METHODS,
     DeconvolutionParams,
+    automatic_fidelity,
     deconvolve,
     deconvolve_steps,
     whole_image_fidelity,
 )
 from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalParams, automatic_h
-from turbrestore.deconvolution.problem import automatic_fidelity
 from turbrestore.deconvolution.tv import LocalPenalty
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.steps import finish

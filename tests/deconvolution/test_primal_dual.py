@@ -9,7 +9,7 @@ import pytest
 from scipy import fft, optimize
 from small_problems import OPS, dense, dense_blur, small_problem
 
-from turbrestore.blur.psf import gaussian_otf
+from turbrestore.blur.psf import blur_otf
 from turbrestore.deconvolution import primal_dual
 from turbrestore.deconvolution.nonlocal_prior.nonlocal_tv import NonlocalPenalty
 from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
@@ -45,7 +45,7 @@ def solve(solver: PrimalDual, problem: Problem, iterations: int) -> np.ndarray:
 
 def test_blur_matches_opencv_inside():
     image = np.random.default_rng(3).random((40, 44)).astype(np.float32)
-    blurred = fft.irfft2(gaussian_otf(image.shape, 1.2) * fft.rfft2(image), s=image.shape)
+    blurred = fft.irfft2(blur_otf(image.shape, 1.2) * fft.rfft2(image), s=image.shape)
     expected = cv2.GaussianBlur(image, (13, 13), 1.2)
     assert np.abs(blurred - expected)[8:-8, 8:-8].max() < 2e-3
 

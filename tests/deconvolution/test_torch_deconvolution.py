@@ -62,7 +62,7 @@ class TestWeights:
         there = torch_nonlocal_penalty(guide, params, device)
         rng = np.random.default_rng(10)
         u = rng.random(guide.shape).astype(np.float32)
-        p, q = here.zero_dual(u), there.zero_dual(torch.from_numpy(u).to(device))
+        p = q = None
         for _ in range(3):
             u = rng.normal(size=guide.shape).astype(np.float32)
             p, adjoint = here.ascend(p, u, 0.7, 1.8)

@@ -12,6 +12,7 @@ from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import filter_frames
 from turbrestore.filtering.array_backend import array_backend
 from turbrestore.filtering.filter_records import FilterParams
+from turbrestore.filtering.frame_noise import warp_frame
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
@@ -114,7 +115,7 @@ def test_lack_of_memory_is_one_line(device, monkeypatch):
     def fail(*_):
         raise RuntimeError("CUDA out of memory.")
 
-    monkeypatch.setattr("turbrestore.filtering.array_backend.warp_stack", fail)
+    monkeypatch.setattr("turbrestore.filtering.frame_noise.warp_stack", fail)
     frames, flows = frames_of(SCENES["camera"](48), 3)
     with pytest.raises(ConfigurationError, match="^device: the memory of .* is not enough; process a smaller part"):
         filter_both(frames, flows, flows, device)
@@ -124,7 +125,7 @@ def test_lack_of_memory_is_one_line(device, monkeypatch):
 def test_a_warped_frame_has_its_luminance_and_pixels_come_back(device):
     backend, image = array_backend(device), coloured(SCENES["camera"](20))
     flow = np.full((20, 20, 2), 0.75, np.float32)
-    channels, grey, seen = (backend.ops.store(one) for one in backend.warp(image, backend.ops.load(flow)))
+    channels, grey, seen = map(backend.ops.store, warp_frame(image, backend.ops.load(flow), backend.ops))
     assert channels.shape == (3, 20, 20)
     assert grey == pytest.approx(luminance(np.ascontiguousarray(np.moveaxis(channels, 0, -1))), abs=1e-6)
     assert seen[:19, :19].min() == 1

@@ -7,8 +7,8 @@ import pytest
 from flow_systems import uneven_flows
 
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
-from turbrestore.dynamics.flow_model import flow_of
-from turbrestore.filtering.kalman import Gaussian, predict, predict_state, project_measured, update, update_state
+from turbrestore.dynamics.flow_model import flow_of, project_measured
+from turbrestore.filtering.kalman import Gaussian, advance_state, predict, update, update_state
 
 
 @pytest.fixture
@@ -26,9 +26,9 @@ def test_the_projected_update_is_that_of_the_whole_flow(rng, dynamics):
     state = whole = Gaussian(rng.standard_normal(5), dynamics.state_covariance)
     C, R = dynamics.C.astype(np.float64), dynamics.R * np.eye(len(dynamics.C))
     for flow in uneven_flows()[:4]:
-        state, whole = predict_state(state, dynamics), predict(whole, dynamics.A, dynamics.Q)
+        whole = predict(whole, dynamics.A, dynamics.Q)
         expected = (flow - flow_of(dynamics, whole.mean)).ravel()
-        state, innovation = update_state(state, project_measured(flow, dynamics), dynamics)
+        state, innovation = advance_state(state, project_measured(flow, dynamics), dynamics)
         whole, _ = update(whole, (flow - dynamics.mean_flow).ravel(), C, R)
         np.testing.assert_allclose(state.mean, whole.mean, rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(state.cov, whole.cov, rtol=1e-5, atol=1e-6 * whole.cov.max())

@@ -7,13 +7,14 @@ import pytest
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.metrics import endpoint_error
-from turbrestore.registration.contrast import grey_levels, normalise_contrast
 from turbrestore.registration.flow import (
     FLOW_METHODS,
     FlowParams,
     estimate_flow,
+    grey_levels,
     iterate_flows,
     measure_flows,
+    normalise_contrast,
     prepare_reference,
 )
 from turbrestore.registration.opencv_flow import DisParams, FarnebackParams, dis_solver, flow_memory

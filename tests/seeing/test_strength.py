@@ -12,10 +12,10 @@ from turbrestore.footage.bars import Bars
 from turbrestore.footage.levels import Levels
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
-from turbrestore.preparation import Prepared, seeing_of_picture
+from turbrestore.preparation import Prepared
 from turbrestore.registration.centroid import Centroid, find_centroid
 from turbrestore.seeing.displacement import Displacement
-from turbrestore.seeing.strength import Seeing, measure_seeing
+from turbrestore.seeing.strength import Seeing, measure_seeing, seeing_of_picture
 from turbrestore.seeing.tilt_theory import Optics
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
@@ -155,7 +155,7 @@ def test_bars_do_not_count(clip):
     prepared = Prepared(FrameSource.from_array(frames), Levels(), Bars(np.s_[24:-24, :], barred[0]), None, None, ())
     flows = np.pad(clip[1].flows, ((0, 0), (24, 24), (0, 0), (0, 0)), constant_values=3.0)
     image = np.pad(clip[1].image, ((24, 24), (0, 0)), mode="symmetric")
-    within = seeing_of_picture(prepared, frames, replace(clip[1], image=image, flows=flows))
+    within = seeing_of_picture(prepared.picture, frames, replace(clip[1], image=image, flows=flows))
     assert within == measure(clip)
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..blur.estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidates, removable_width
-from ..core.arrays import FloatArray, check_image, luminance
+from ..core.arrays import FloatArray, check_grey
 from ..core.noise import estimate_noise
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionState
 from ..runtime.runtime import DEFAULT, Runtime
@@ -72,7 +72,7 @@ def blur_map_steps(
     image: ArrayLike, whole: BlurEstimate, runtime: Runtime = DEFAULT
 ) -> Generator[int, None, BlurMap | None]:
     """Estimate the blur of overlapping tiles, one tile per step; see :func:`estimate_blur_map`."""
-    grey = luminance(check_image(image))
+    grey = check_grey(image)
     rows, columns = _spans(grey.shape[0]), _spans(grey.shape[1])
     if len(rows) == 1 or len(columns) == 1:
         return None

@@ -16,25 +16,31 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..blur.estimation import BlurEstimate, estimate_blur, limit_to_edges
 from ..blur.posterior import BlurPosterior, BlurWitnesses, blur_posterior
 from ..blur.witnesses.image_evidence import image_evidence
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import FloatArray, check_image, luminance
 from ..core.decision import Decision
 from ..core.noise import NoiseCurve
-from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, DeconvolutionState
+from ..deconvolution.deconvolve import (
+    Deconvolution,
+    DeconvolutionParams,
+    DeconvolutionState,
+    deconvolve_steps,
+    whole_image_fidelity,
+)
 from ..deconvolution.memory import deconvolution_memory
 from ..deconvolution.problem import read_blur
 from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
+from ..runtime.scratch import to_scratch
 from ..runtime.steps import finish
-from ..runtime.tiling import halo_tiles, largest_tile
+from ..runtime.tiling import HALO, HaloTile, add_tile, halo_tiles, largest_tile, new_mosaic
 from .blur_map import BlurMap, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
 from .decisions import explain_blur, explain_blur_map, explain_guards, explain_posterior
 from .guards import GuardParams, GuardReading, evaluate_guards
-from .tiled_deconvolution import MOST_THREADS, tiled_deconvolution_steps
 
 Result = TypeVar("Result")
 Float64Array = NDArray[np.float64]
@@ -47,6 +53,10 @@ _WIDTHS_BYTES, _RESULTS_BYTES = 8, 8
 # The widest blur that is found, pixels, and the least shorter side of an image in widths of its blur: a wider one
 # leaves nothing to restore.
 WIDEST, SIGMAS_A_SIDE = 21.0, 8
+# Shortest side that tiles may have, pixels.
+SMALLEST_SIDE = 4 * HALO
+# More threads than these take no more memory.
+MOST_THREADS = 4
 
 
 @dataclass(frozen=True)
@@ -148,6 +158,44 @@ def remove_blur_steps(
         on_blur = explain_blur(blur, sigma, tiles, "asked for" if psf is None else "the point spread function is given")
     decisions = (on_blur, *explain_blur_map(tiles), *on_guards)
     return Deblurred(result, blur, tiles, readings, decisions, posterior)
+
+
+def tiled_deconvolution_steps(
+    image: ArrayLike,
+    sigma: float | ArrayLike,
+    params: DeconvolutionParams | None = None,
+    guide: ArrayLike | None = None,
+    runtime: Runtime = DEFAULT,
+    tiles: tuple[HaloTile, ...] = (),
+    photons: NoiseCurve | None = None,
+) -> Generator[DeconvolutionState, None, Deconvolution]:
+    """Deconvolve an image in overlapping tiles, where the whole would take too much memory.
+
+    Width and shape of the blur and the fidelity λ are those of the whole image.  Each tile is deconvolved as an image
+    of its own and faded into its neighbours (:mod:`turbrestore.runtime.tiling`).  The halo of 96 pixels is much wider
+    than a blur, so the result is close to that of the whole image, but not the same: nonlocal weights and the end of
+    the iterations are decided tile by tile, and with a periodic boundary each tile is periodic.
+    ``image`` (H, W) or (H, W, 3); ``sigma`` may be a PSF (h, w); ``guide`` (H, W) or (H, W, 3).
+    """
+    pixels = check_image(image)
+    around = None if guide is None else check_image(guide, "guide")
+    if not np.any(sigma) or len(tiles) < 2:
+        whole = yield from deconvolve_steps(pixels, sigma, params, around, runtime, photons)
+        return replace(whole, image=to_scratch(whole.image, runtime.scratch))
+    params = params or DeconvolutionParams()
+    # Each tile chooses its own h for the nonlocal weights, from its guide after sharpening; that of the whole guide
+    # before sharpening would be too small (0.3 dB worse on brick).
+    params = replace(params, fidelity=whole_image_fidelity(pixels, params))
+    restored, parts = new_mosaic(pixels.shape, runtime.scratch), list[Deconvolution]()
+    for tile in tiles:
+        guide_part = None if around is None else around[tile.rows, tile.columns]
+        cut = pixels[tile.rows, tile.columns]
+        part = yield from deconvolve_steps(cut, sigma, params, guide_part, runtime, photons)
+        add_tile(restored, tile, part.image)
+        parts.append(replace(part, image=restored))
+    noise = float(np.sqrt(np.mean([part.noise**2 for part in parts])))
+    slowest = max(parts, key=lambda part: part.iterations)
+    return replace(slowest, noise=noise, converged=all(part.converged for part in parts))
 
 
 def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side: int | None = None) -> float:

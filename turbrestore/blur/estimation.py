@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
@@ -40,7 +41,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_image, luminance
+from ..core.arrays import FloatArray, check_grey
 from ..core.errors import require
 from ..core.noise import estimate_noise
 from ..display.plots import plot_blur
@@ -215,7 +216,7 @@ def estimate_blur(
             nothing, shape = np.zeros(0), exponent or fused_exponent(0.0)
             return BlurEstimate(0.0, float("inf"), shape, noise or 0.0, 1, 0.0, nothing, nothing)
         found = choose_blur(candidates, runtime)
-        return limit_to_edges(found, luminance(check_image(image))) if found.blurred else found
+        return limit_to_edges(found, check_grey(image)) if found.blurred else found
 
 
 def limit_to_edges(estimate: BlurEstimate, image: FloatArray) -> BlurEstimate:
@@ -241,7 +242,7 @@ def find_candidates(
     image: ArrayLike, noise: float | None = None, exponent: float | None = None
 ) -> tuple[BlurCandidate, ...]:
     """Find the likeliest blur at each reduction of an image, without its uncertainty."""
-    grey = luminance(check_image(image))
+    grey = check_grey(image)
     usable = noise is None or (np.isfinite(noise) and noise >= 0)
     require(usable, f"noise: expected a finite number of 0 or more, found {noise}")
     if exponent is not None:
@@ -295,7 +296,7 @@ def _with_uncertainty(candidate: BlurCandidate, team: ThreadTeam) -> BlurEstimat
     found, gradients = candidate.estimate, image_gradients(candidate.part)
     levels = found.noise / 2, 2 * found.noise
     shapes = _exponents(candidate.asked, found.reduction)
-    both = team.map(lambda level: width_costs(gradients, shapes, level, rises=1), levels)
+    both = team.map(partial(width_costs, gradients, shapes, rises=1), levels)
     less, more = (unreduced_width(likeliest_width(costs), found.reduction) for costs in both)
     return replace(found, uncertainty=abs(more - less) / 2)
 

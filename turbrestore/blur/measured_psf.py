@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import check_image, luminance
+from ..core.arrays import check_grey
 from ..core.errors import DataError
 
 Float64Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ _LEAST_SIDE = 5
 
 def psf_from_image(image: ArrayLike, name: str = "psf") -> Float64Array:
     """Return the point spread function (h, w) with odd sides that an image (H, W) or (H, W, 3) of a point shows."""
-    grey = luminance(check_image(image, name)).astype(np.float64)
+    grey = check_grey(image, name).astype(np.float64)
     if min(grey.shape) < _LEAST_SIDE:
         raise DataError(f"{name}: expected at least {_LEAST_SIDE}×{_LEAST_SIDE} pixels, found {_size(grey)}")
     frame = max(1, round(_BORDER * min(grey.shape)))

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
@@ -33,34 +32,10 @@ GAUSSIAN, KOLMOGOROV = 2.0, 5 / 3
 _WIDE, _HALFWAY = 1.2, 1.3
 
 
-def gaussian_psf(sigma: float) -> FloatArray:
-    """Sample a Gaussian point spread function at pixel centres, out to 4σ.
-
-    Returns (n, n).
-    """
-    _check_sigma(sigma)
-    radius = int(np.ceil(4 * sigma))
-    if radius == 0:
-        return np.ones((1, 1), np.float32)
-    profile = np.exp(-(np.arange(-radius, radius + 1) ** 2) / (2 * sigma**2))
-    profile /= profile.sum()
-    return np.outer(profile, profile).astype(np.float32)
-
-
-def gaussian_otf(shape: tuple[int, int], sigma: float) -> FloatArray:
-    """Return the transfer function of a Gaussian on a periodic grid: ``exp(−2π²σ²ν²)``.
-
-    Returns (H, W // 2 + 1).
-    """
-    _check_sigma(sigma)
-    rows, columns = (np.exp(-2 * (np.pi * sigma * nu) ** 2) for nu in _frequencies(shape))
-    return (rows * columns).astype(np.float32)
-
-
 def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -> FloatArray:
     """Return the transfer function ``exp(−ln 2 (ν/ν_h)^p)`` on a periodic grid, ``ν_h = √(ln 2 / 2) / (π σ)``.
 
-    p = 2 is the Gaussian of :func:`gaussian_otf`. p = 5/3 is a long exposure through Kolmogorov turbulence (Fried
+    p = 2 is the Gaussian, ``exp(−2π²σ²ν²)``. p = 5/3 is a long exposure through Kolmogorov turbulence (Fried
     1966), whose point spread function has a narrower core and wider wings. Fused frames have wider wings still, see
     :func:`fused_exponent`.
     Returns (H, W // 2 + 1).
@@ -135,18 +110,6 @@ def laplacian_symbol(height: int, width: int) -> FloatArray:
     """
     rows, columns = (2 - 2 * np.cos(2 * np.pi * nu) for nu in _frequencies((height, width)))
     return (rows + columns).astype(np.float32)
-
-
-def wiener_fidelity(image: FloatArray, noise: float) -> float:
-    """Compute the weight λ of the data for Wiener deconvolution: ``6 s / √(n² + 0.002²)``.
-
-    s is the standard deviation of the image. On photographs, brick and text blurred by σ = 1 to 3 px the result is
-    within 0.5 dB of that of the best λ for n = 0.01 to 0.02. For less noise, a perfectly known blur would allow 3 to 10
-    times more (0.2 to 1.5 dB better, 3 dB on thin text); the floor of 0.002 accounts for errors of the blur model.
-    """
-    # Unlike NumPy's, OpenCV's keeps no copy of the image in double precision.
-    _, deviation = cv2.meanStdDev(image.reshape(-1, 1))
-    return max(6.0 * float(deviation.item()) / float(np.hypot(noise, 0.002)), 1.0)
 
 
 def _frequencies(shape: tuple[int, ...]) -> tuple[Float64Array, Float64Array]:

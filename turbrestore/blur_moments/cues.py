@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_frames, check_image, luminance
+from ..core.arrays import FloatArray, check_frames, check_grey, luminance
 from ..core.errors import DataError
 from ..runtime.scratch import iter_frames
 from .tile_spectra import (
@@ -107,7 +107,7 @@ def relative_blur(
     (1.0, [[1.0, 0.0], [0.0, 1.0]])
     """
     params = params or CueParams()
-    one, two = (luminance(check_image(image, name)) for image, name in ((first, "first"), (second, "second")))
+    one, two = (check_grey(image, name) for image, name in ((first, "first"), (second, "second")))
     if one.shape != two.shape:
         raise DataError(f"second: expected the shape of first {one.shape}, found {two.shape}")
     noises = noise if isinstance(noise, tuple) else (noise, noise)

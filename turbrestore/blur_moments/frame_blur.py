@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_frames, luminance
-from ..core.errors import DataError
 from ..runtime.scratch import iter_frames
 from .tile_spectra import (
     CORRELATED,
@@ -30,8 +29,6 @@ from .tile_spectra import (
     noise_floor,
 )
 
-# Relative blur variance of frames in some tiles, its deviation, and its best estimate above the sharpest; (T, tiles).
-_Estimate = tuple[Float64Array, Float64Array, Float64Array]
 # Prior standard deviation of the relative blur variance of a frame, squared pixels.
 _PRIOR = 2.0
 # Rounds that fit the frames to the reference and the reference to the frames.
@@ -55,22 +52,6 @@ class FrameBlur:
     # as noise explains it, minus its minimum over the frames.
     extra: FloatArray
     grid: TileGrid  # positions of the tiles
-
-
-@dataclass(frozen=True, eq=False)
-class BlurReference:
-    """Common spectrum and statistics of the frames of a sequence, with which other frames can be compared."""
-
-    spectrum: Float64Array  # (tiles, rings): P̄ above the noise, squared intensity
-    # (tiles, rings): factor on the expected squared error of each ring; the fit divides its weight by this.
-    misfit: Float64Array
-    residual: Float64Array  # (tiles, rings): mean squared residual of each ring, in units of the expected one
-    offset: Float64Array  # (tiles,): mean of s over the frames before centring, squared pixels
-    spread: Float64Array  # (tiles,): variance of s over the frames beyond that of its error, pixels to the fourth
-    sharpest: Float64Array  # (tiles,): best estimate of s of the sharpest frame, squared pixels
-    noise: float  # standard deviation of the white noise of a frame, intensity
-    shape: tuple[int, int]  # height and width of a frame, pixels
-    params: CueParams
 
 
 def frame_blur(frames: ArrayLike, noise: float, params: CueParams | None = None) -> FrameBlur:
@@ -108,13 +89,6 @@ def frame_blur(frames: ArrayLike, noise: float, params: CueParams | None = None)
     >>> frame_blur(frames, noise=1e-4).extra.ravel().astype(float).round(1).tolist()
     [0.0, 1.0, 0.0]
     """
-    return prepare_blur_reference(frames, noise, params)[1]
-
-
-def prepare_blur_reference(
-    frames: ArrayLike, noise: float, params: CueParams | None = None
-) -> tuple[BlurReference, FrameBlur]:
-    """Measure the blur of every frame as :func:`frame_blur` does, and prepare a reference for other frames."""
     params = params or CueParams()
     stack = check_frames(frames, at_least=2)
     spectra = TileSpectra.of(stack.shape[1:3], params)
@@ -123,38 +97,11 @@ def prepare_blur_reference(
     power = _ring_power(stack, spectra, averaging)
     spectrum, misfit = _common_spectrum(power, fit)
     design = fit.design(spectrum)
-    found = [
-        _reference_statistics(power[:, some], spectrum[some], misfit[some], design, fit) for some in _batches(power)
-    ]
-    residual, offset, spread, sharpest = (
-        np.concatenate(parts) for parts in zip(*(statistics for statistics, _ in found), strict=True)
-    )
-    reference = BlurReference(spectrum, misfit, residual, offset, spread, sharpest, noise, spectra.grid.shape, params)
-    return reference, _frame_blur([estimate for _, estimate in found], spectra.grid)
-
-
-def relative_frame_blur(frames: ArrayLike, reference: BlurReference, noise: float | None = None) -> FrameBlur:
-    """Blur of frames, or of an image fused from them, relative to the frames of a reference.
-
-    The result for a frame does not depend on the other frames given.
-    ``frames`` (T, H, W) or (T, H, W, 3).
-    """
-    stack = check_frames(frames)
-    if stack.shape[1:3] != reference.shape:
-        raise DataError(f"frames: expected the size {reference.shape} of the reference, found {stack.shape[1:3]}")
-    spectra = TileSpectra.of(reference.shape, reference.params)
-    averaging, k2, counts = spectra.cells()
-    floor = noise_floor(reference.noise if noise is None else noise)
-    fit = _Fit(spectra, k2, counts, floor, reference.params)
-    power, design = _ring_power(stack, spectra, averaging), fit.design(reference.spectrum)
-    estimates: list[_Estimate] = []
-    for some in _batches(power):
-        s, gathered, _ = _fit_frames(power[:, some], reference.spectrum[some], reference.misfit[some], design, fit)
-        s = s - reference.offset[some]
-        deviation = _deviation(s, gathered, reference.residual[some])
-        estimate = _posterior(s, deviation, reference.spread[some])
-        estimates.append((s, deviation, np.maximum(estimate - reference.sharpest[some], 0.0)))
-    return _frame_blur(estimates, spectra.grid)
+    parts = [_blur_of_tiles(power[:, some], spectrum[some], misfit[some], design, fit) for some in _batches(power)]
+    shape = (len(stack), len(spectra.grid.rows), len(spectra.grid.columns))
+    joined = (np.concatenate(of_tiles, axis=1) for of_tiles in zip(*parts, strict=True))
+    relative, deviation, extra = (part.reshape(shape).astype(np.float32) for part in joined)
+    return FrameBlur(relative, deviation, extra, spectra.grid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,18 +160,21 @@ def _refit(
     return s, refitted, np.clip(misfit * residual.mean(axis=0), _SMALLEST_MISFIT, _LARGEST_MISFIT)
 
 
-def _reference_statistics(
+def _blur_of_tiles(
     power: FloatArray, spectrum: Float64Array, misfit: Float64Array, design: Float64Array, fit: _Fit
-) -> tuple[tuple[Float64Array, Float64Array, Float64Array, Float64Array], _Estimate]:
-    """Residual, offset, spread and sharpest of the frames of the reference in some tiles, and their blur."""
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """S of the frames in some tiles, its deviation, and its best estimate above the sharpest frame; (T, tiles)."""
     s, gathered, squared = _fit_frames(power, spectrum, misfit, design, fit)
-    residual, offset = squared.mean(axis=0), s.mean(axis=0)
-    s = s - offset
-    deviation = _deviation(s, gathered, residual)
+    s = s - s.mean(axis=0)
+    # The deviation of s from the information in the rings and the mean squared residual of each.
+    total = gathered.sum(axis=-1) + 1 / _PRIOR**2
+    excess = np.maximum(squared.mean(axis=0), 1.0)
+    variance = (CORRELATED * (gathered * excess).sum(axis=-1) + 1 / _PRIOR**2) / total**2
+    deviation = np.hypot(np.sqrt(variance), _WINDOW_ERROR * s)
+    # The posterior mean, with the variance of s over the frames beyond that of its error as that of the prior.
     spread = np.maximum((s**2 - deviation**2).mean(axis=0), 0.0)
-    estimate = _posterior(s, deviation, spread)
-    sharpest = estimate.min(axis=0)
-    return (residual, offset, spread, sharpest), (s, deviation, estimate - sharpest)
+    estimate = s * spread / np.maximum(spread + deviation**2, 1e-30)
+    return s, deviation, estimate - estimate.min(axis=0)
 
 
 def _fit_frames(
@@ -261,23 +211,3 @@ def _fit_relative(
         step = ((weight * difference) @ design - s / _PRIOR**2) / (information @ design**2 + 1 / _PRIOR**2)
         s = s + np.clip(step, -LARGEST_STEP, LARGEST_STEP)
     return s, information, difference**2 * weight / signal
-
-
-def _deviation(s: Float64Array, gathered: Float64Array, residual: Float64Array) -> Float64Array:
-    """Compute the deviation of s from the information in the rings and the mean squared residual of each."""
-    total = gathered.sum(axis=-1) + 1 / _PRIOR**2
-    variance = (CORRELATED * (gathered * np.maximum(residual, 1.0)).sum(axis=-1) + 1 / _PRIOR**2) / total**2
-    return np.hypot(np.sqrt(variance), _WINDOW_ERROR * s)
-
-
-def _posterior(s: Float64Array, deviation: Float64Array, spread: Float64Array) -> Float64Array:
-    """Posterior mean of s, with the variance ``spread`` over the frames as that of the prior."""
-    return s * spread / np.maximum(spread + deviation**2, 1e-30)
-
-
-def _frame_blur(estimates: list[_Estimate], grid: TileGrid) -> FrameBlur:
-    """Join the estimates of batches of tiles."""
-    shape = (-1, len(grid.rows), len(grid.columns))
-    joined = (np.concatenate(parts, axis=1) for parts in zip(*estimates, strict=True))
-    relative, deviation, extra = (part.reshape(shape).astype(np.float32) for part in joined)
-    return FrameBlur(relative, deviation, extra, grid)

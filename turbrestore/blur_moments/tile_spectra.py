@@ -17,10 +17,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..core.errors import DataError, require, require_between
@@ -144,20 +143,6 @@ class TileSpectra:
         """
         slopes = sum(_log_slope(power, k2) for power in powers)
         return np.clip(1 + self.smear * (2 + slopes) / k2, 0.5, 1.5)
-
-
-def tile_map(values: ArrayLike, grid: TileGrid) -> FloatArray:
-    """Interpolate values of the tiles to every pixel: bilinear between the centres of the tiles, constant beyond.
-
-    ``values`` (m, n); returns (H, W).
-    """
-    tiles = np.asarray(values, np.float32)
-    positions = []
-    for first, size, length in zip((grid.rows, grid.columns), grid.size, grid.shape, strict=True):
-        centres = first + (size - 1) / 2
-        positions.append(np.interp(np.arange(length), centres, np.arange(len(first))).astype(np.float32))
-    map_y, map_x = np.meshgrid(*positions, indexing="ij")
-    return cv2.remap(tiles, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def noise_floor(noise: float) -> float:

@@ -42,6 +42,11 @@ def check_image(image: ArrayLike, name: str = "image") -> FloatArray:
     return _finite(array, name)
 
 
+def check_grey(image: ArrayLike, name: str = "image") -> FloatArray:
+    """Return the luminance of ``image``, (H, W) or (H, W, 3), as a finite float32 array of shape (H, W)."""
+    return luminance(check_image(image, name))
+
+
 def check_frames(frames: ArrayLike, name: str = "frames", at_least: int = 1) -> FloatArray:
     """Return ``frames`` as a finite float32 array of shape (T, H, W) or (T, H, W, 3).
 
@@ -94,6 +99,17 @@ def from_unit(image: FloatArray, bit_depth: int) -> NDArray[np.unsignedinteger]:
         levels[done : done + len(part)] = np.rint(np.clip(part, 0.0, 1.0) * np.float64(top))
         done += len(part)
     return levels
+
+
+def from_unit_to_type(image: FloatArray, bit_depth: int) -> NDArray[Any]:
+    """Convert intensities to the type of a file: uint8 up to 8 bits, uint16 up to 16, clipped float32 for 32."""
+    if bit_depth != 32:
+        return from_unit(image, 8 if bit_depth <= 8 else 16)
+    pixels, done = np.empty(image.shape, np.float32), 0
+    for part in _parts(image):
+        np.clip(part, 0, 1, out=pixels[done : done + len(part)])
+        done += len(part)
+    return pixels
 
 
 def _parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from .arrays import FloatArray, check_image, luminance
+from .arrays import FloatArray, check_grey
 
 # Rows that are filtered at once, and pixels that tell the noise to a quarter of a percent.
 _NOISE_ROWS, _NOISE_PIXELS = 16, 1 << 18
@@ -105,7 +105,7 @@ def estimate_noise(image: ArrayLike) -> float:
     rows all over it are used.
     ``image`` (H, W) or (H, W, 3).
     """
-    grey = luminance(check_image(image))
+    grey = check_grey(image)
     if min(grey.shape) < 3:
         return 0.0
     mask, (height, width) = np.array([1, -2, 1], np.float32), grey.shape

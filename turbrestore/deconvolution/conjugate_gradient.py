@@ -18,9 +18,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
+import cv2
 import numpy as np
 
-from ..blur.psf import laplacian_symbol, wiener_fidelity
+from ..blur.psf import laplacian_symbol
+from ..core.arrays import FloatArray
 from ..core.noise import estimate_noise
 from .problem import Array, Problem
 
@@ -104,6 +106,18 @@ def quadratic_solver(problem: Problem, method: str) -> ConjugateGradients:
     """Solver of a quadratic method."""
     symbol = laplacian_symbol(*problem.shape) if method == "wiener" else np.ones((1, 1), np.float32)
     return ConjugateGradients(problem.ops.load(symbol))
+
+
+def wiener_fidelity(image: FloatArray, noise: float) -> float:
+    """Compute the weight λ of the data for Wiener deconvolution: ``6 s / √(n² + 0.002²)``.
+
+    s is the standard deviation of the image. On photographs, brick and text blurred by σ = 1 to 3 px the result is
+    within 0.5 dB of that of the best λ for n = 0.01 to 0.02. For less noise, a perfectly known blur would allow 3 to 10
+    times more (0.2 to 1.5 dB better, 3 dB on thin text); the floor of 0.002 accounts for errors of the blur model.
+    """
+    # Unlike NumPy's, OpenCV's keeps no copy of the image in double precision.
+    _, deviation = cv2.meanStdDev(image.reshape(-1, 1))
+    return max(6.0 * float(deviation.item()) / float(np.hypot(noise, 0.002)), 1.0)
 
 
 def wiener_image(problem: Problem) -> Array:

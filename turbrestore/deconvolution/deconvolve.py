@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..blur.estimation import BlurEstimate
 from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, psf_to_otf
-from ..core.arrays import FloatArray, check_image, luminance
+from ..core.arrays import FloatArray, check_grey, check_image, luminance
 from ..core.errors import ConfigurationError, DataError, require, require_between
 from ..core.noise import NoiseCurve, estimate_noise
 from ..display.plots import plot_objective
@@ -33,7 +33,7 @@ from ..runtime.device import CPU, find_device, memory_of
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.threads import ThreadTeam, one_thread_each
-from .conjugate_gradient import quadratic_solver, wiener_image
+from .conjugate_gradient import quadratic_solver, wiener_fidelity, wiener_image
 from .nonlocal_prior.nonlocal_tv import NonlocalPenalty
 from .nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
 from .nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
@@ -42,13 +42,10 @@ from .problem import (
     Array,
     Margin,
     Problem,
-    automatic_fidelity,
-    join_planes,
     margin_around,
     numpy_ops,
     problem_of,
     read_blur,
-    split_planes,
     torch_ops,
 )
 from .stopping import DeconvolutionState, Solution, iterate
@@ -293,6 +290,28 @@ def whole_image_fidelity(image: ArrayLike, params: DeconvolutionParams | None = 
     return _noise_and_fidelity(split_planes(check_image(image), params.channels), params)[1]
 
 
+def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:
+    """Split an image into the planes that are deblurred.
+
+    ``image`` (H, W) or (H, W, 3); returns (H, W) each.
+    """
+    if image.ndim == 3 and channels == "each":
+        return [np.ascontiguousarray(image[..., index]) for index in range(image.shape[2])]
+    return [luminance(image)]
+
+
+def join_planes(image: FloatArray, planes: list[FloatArray], channels: str) -> FloatArray:
+    """Join deblurred planes into an image; the reverse of :func:`split_planes`.
+
+    ``image`` (H, W) or (H, W, 3); ``planes`` (H, W) each.
+    """
+    if image.ndim == 2:
+        return planes[0]
+    if channels == "each":
+        return np.stack(planes, axis=-1)
+    return image + (planes[0] - luminance(image))[..., None]
+
+
 class _Resources(NamedTuple):
     team: ThreadTeam
     threads: int
@@ -347,7 +366,7 @@ def _sharpened(
 def _padded_guide(guide: ArrayLike | None, margin: Margin) -> FloatArray | None:
     if guide is None:
         return None
-    grey = luminance(check_image(guide, "guide"))
+    grey = check_grey(guide, "guide")
     if grey.shape != margin.size:
         raise DataError(f"guide: expected the size of the image {margin.size}, found {grey.shape}")
     return margin.pad(grey)
@@ -356,3 +375,16 @@ def _padded_guide(guide: ArrayLike | None, margin: Margin) -> FloatArray | None:
 def _noise_and_fidelity(planes: list[FloatArray], params: DeconvolutionParams) -> tuple[float, float]:
     noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))
     return noise, params.fidelity or automatic_fidelity(params.method, planes[0], noise)
+
+
+def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
+    """Choose the weight λ of the data term from the noise of the blurred image.
+
+    ``image`` (H, W).
+    """
+    if method == "nltv":
+        return 20.0 / float(np.hypot(noise, 0.004))
+    if method == "tv":
+        return 12.0 / float(np.hypot(noise, 0.003))
+    fidelity = wiener_fidelity(image, noise)
+    return fidelity if method == "wiener" else fidelity / 2

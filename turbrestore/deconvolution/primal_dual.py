@@ -68,14 +68,10 @@ class Penalty(Protocol):
         """Upper bound of ‖K‖²."""
         ...
 
-    def zero_dual(self, u: Array) -> Array:
-        """Dual variable p = 0 for an image of the size of u."""
-        ...
-
-    def ascend(self, p: Array, u: Array, step: float, relaxation: float) -> tuple[Array, Array]:
+    def ascend(self, p: Array | None, u: Array, step: float, relaxation: float) -> tuple[Array, Array]:
         """Return the new p, ``p + ρ(p' − p)`` with p' the projection of ``p + sKu`` on |p|(x) ≤ 1, and Kᵀp for it.
 
-        The given p is overwritten.
+        The given p is overwritten; None is p = 0.
         """
         ...
 
@@ -108,7 +104,7 @@ class PrimalDual:
         """Start from the image u, with q = λM(Bu − f) and p after one dual step from 0."""
         blurred = problem.blur(problem.ops.forward(u))
         q = problem.fidelity * problem.seen * (blurred - problem.observed)
-        p, adjoint = self.regulariser.ascend(self.regulariser.zero_dual(u), u, self._steps[1], 1.0)
+        p, adjoint = self.regulariser.ascend(None, u, self._steps[1], 1.0)
         return PrimalDualState(u, blurred, q, p, adjoint, 1)
 
     def step(self, problem: Problem, state: PrimalDualState) -> PrimalDualState:

@@ -27,8 +27,7 @@ are spelled alike in both; loading arrays and Fourier transforms are not, and ar
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -36,8 +35,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from ..blur.psf import check_psf, wiener_fidelity
-from ..core.arrays import FloatArray, luminance
+from ..blur.psf import check_psf
+from ..core.arrays import FloatArray
 from ..core.errors import require
 from ..core.noise import NoiseCurve
 from ..runtime.image_stacks import from_device
@@ -106,21 +105,16 @@ class Problem:
     otf: Array  # (P, Q // 2 + 1): H
     fidelity: float  # λ
     ops: ArrayOps  # library that the arrays belong to
+    # What follows from these.
+    shape: tuple[int, int] = field(init=False)  # P and Q
+    power: Array = field(init=False)  # |H|², the transfer function of BᵀB
+    mean: float = field(init=False)  # of the observed pixels
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns, P and Q."""
-        return self.observed.shape[0], self.observed.shape[1]
-
-    @cached_property
-    def power(self) -> Array:
-        """|H|², the transfer function of BᵀB."""
-        return self.ops.arrays.abs(self.otf) ** 2
-
-    @cached_property
-    def mean(self) -> float:
-        """Mean of the observed pixels."""
-        return self.ops.total(self.seen * self.observed) / self.ops.total(self.seen)
+    def __post_init__(self) -> None:
+        mean = self.ops.total(self.seen * self.observed) / self.ops.total(self.seen)
+        object.__setattr__(self, "shape", (self.observed.shape[0], self.observed.shape[1]))
+        object.__setattr__(self, "power", self.ops.arrays.abs(self.otf) ** 2)
+        object.__setattr__(self, "mean", mean)
 
     def blur(self, spectrum: Array) -> Array:
         """Image Bu from the transform of u."""
@@ -183,41 +177,6 @@ def problem_of(
 ) -> Problem:
     """Problem of a plane (H, W); ``photons`` is its noise at every level, relative to the mean."""
     return Problem(ops.load(margin.pad(plane)), ops.load(margin.weights(plane, photons)), otf, fidelity, ops)
-
-
-def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:
-    """Split an image into the planes that are deblurred.
-
-    ``image`` (H, W) or (H, W, 3); returns (H, W) each.
-    """
-    if image.ndim == 3 and channels == "each":
-        return [np.ascontiguousarray(image[..., index]) for index in range(image.shape[2])]
-    return [luminance(image)]
-
-
-def join_planes(image: FloatArray, planes: list[FloatArray], channels: str) -> FloatArray:
-    """Join deblurred planes into an image; the reverse of :func:`split_planes`.
-
-    ``image`` (H, W) or (H, W, 3); ``planes`` (H, W) each.
-    """
-    if image.ndim == 2:
-        return planes[0]
-    if channels == "each":
-        return np.stack(planes, axis=-1)
-    return image + (planes[0] - luminance(image))[..., None]
-
-
-def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
-    """Choose the weight λ of the data term from the noise of the blurred image.
-
-    ``image`` (H, W).
-    """
-    if method == "nltv":
-        return 20.0 / float(np.hypot(noise, 0.004))
-    if method == "tv":
-        return 12.0 / float(np.hypot(noise, 0.003))
-    fidelity = wiener_fidelity(image, noise)
-    return fidelity if method == "wiener" else fidelity / 2
 
 
 def read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:

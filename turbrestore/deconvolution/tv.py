@@ -38,13 +38,11 @@ class LocalPenalty:
         """Upper bound of ‖∇‖²."""
         return 8.0
 
-    def zero_dual(self, u: Array) -> Array:
-        """Dual variable p = 0 for an image of the size of u."""
-        return self.ops.arrays.stack([0 * u, 0 * u])
-
-    def ascend(self, p: Array, u: Array, step: float, relaxation: float) -> tuple[Array, Array]:
+    def ascend(self, p: Array | None, u: Array, step: float, relaxation: float) -> tuple[Array, Array]:
         """``p + ρ(p' − p)`` with p' the projection of ``p + s∇u`` on |p|(x) ≤ 1, and −div of it."""
-        ascent = p + step * local_gradient(u, self.ops)
+        gradient = local_gradient(u, self.ops)
+        p = 0 * gradient if p is None else p
+        ascent = p + step * gradient
         p = p + relaxation * (ascent / self._length(ascent).clip(1) - p)
         return p, -local_divergence(p, self.ops)
 

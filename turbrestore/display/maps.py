@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_flow, check_image, luminance
+from ..core.arrays import FloatArray, check_flow, check_grey, check_image
 from ..core.errors import DataError
 from ..runtime.scratch import iter_frames, variance_of
 from .figure import FONT, INK, REST, WIDTH, new_figure, set_labels
@@ -111,7 +111,7 @@ def _draw_map(values: FloatArray, image: ArrayLike | None, title: str) -> tuple[
     top = max(float(np.quantile(values, _SCALE_QUANTILE)), 1e-6)
     drawn = axes.imshow(reduced, cmap=_colour_map(), vmin=0, vmax=top, extent=extent, interpolation="none")
     if image is not None:
-        grey = luminance(check_image(image))
+        grey = check_grey(image)
         if grey.shape != values.shape:
             raise DataError(
                 f"image: expected {width}×{height} pixels as the flow, found {grey.shape[1]}×{grey.shape[0]}"

@@ -164,6 +164,25 @@ def mean_flow_error(dynamics: FlowDynamics, count: int) -> float:
     return float(np.sqrt(modelled + 2 * dynamics.R / count))
 
 
+@dataclass(frozen=True, eq=False)
+class ProjectedFlow:
+    """A measured flow, as far as the update of the state needs it."""
+
+    state: Float64Array  # (n,): z
+    squared: float  # sum of squares of W^meas − W̄, squared pixels
+    size: int  # components of the flow, 2 H W
+
+
+def project_measured(measured: FloatArray, dynamics: FlowDynamics) -> ProjectedFlow:
+    """Project a measured flow on the subspace of the model.
+
+    ``measured`` (H, W, 2).
+    """
+    deviation = measured - dynamics.mean_flow
+    state = project_deviation(dynamics, deviation)
+    return ProjectedFlow(state, float(np.square(deviation, out=deviation).sum(dtype=np.float64)), deviation.size)
+
+
 def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64Array:
     """State of a flow: Cᵀ (W − W̄), the least-squares solution of eq. 10 since Cᵀ C = I (paper 3, eq. 9).
 

@@ -69,9 +69,9 @@ from .filter_records import (
     join_records,
     mean_flow_over,
 )
-from .frame_pass import Frame, PassSettings, TrackedFrame, pass_over
+from .frame_pass import Frame, PassSettings, TrackedFrame, pass_over, register
 from .frame_statistics import measure_frame_statistics
-from .kalman import Gaussian, PixelGaussian, PixelStacks, update_pixels
+from .kalman import PixelStacks, first_states, update_pixels
 
 # Variance of an image of which nothing is known: full scale, squared.
 _DIFFUSE = 1.0
@@ -255,10 +255,10 @@ def _iterate(
 
 def _update_image(image: PixelStacks, tracked: TrackedFrame, settings: PassSettings) -> tuple[PixelStacks, FrameRecord]:
     """Update the image by a frame (eqs. 14a, 14c, 15 and 16)."""
-    if tracked.registered is None:
+    if tracked.image is None or tracked.measured is None:
         return image, FrameRecord(tracked.state.mean, 0.0, tracked.innovation, np.nan, 0.0)
     with settings.backend.memory():
-        frame = tracked.registered()
+        frame = tracked.registered or register(tracked.image, tracked.measured, tracked.state, settings)
         image, gains = update_pixels(image, frame.channels, frame.noise, settings.drift)
         gain, information = float(gains.mean()), float((1 / frame.noise).mean())
     return image, FrameRecord(tracked.state.mean, gain, tracked.innovation, frame.sharpness, information)
@@ -305,11 +305,7 @@ def _settings(
 def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params: FilterParams) -> FilterState:
     """State before the first frame."""
     variance = image_noise / params.prior_frames if params.prior_frames else _DIFFUSE
-    return FilterState(
-        PixelGaussian(image, np.full(image.shape[:2], variance, np.float32)),
-        Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance),
-        *np.zeros((2, *image.shape[:2], 2), np.float32),
-    )
+    return FilterState(*first_states(image, variance, dynamics), *np.zeros((2, *image.shape[:2], 2), np.float32))
 
 
 def _check_flows(image: FloatArray, dynamics: FlowDynamics, known_flows: ArrayLike | None) -> FloatArray | None:

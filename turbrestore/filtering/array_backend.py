@@ -1,27 +1,22 @@
 """Where frames are registered and fused: with NumPy and OpenCV on the CPU, or with torch on a device.
 
-The formulas of the filter are written once for both.  What differs is here: how arrays come to the device and back, and
-how a frame is warped by the estimated flow, ``I ∘ ŵ`` (paper 3, eq. 15).
+The formulas of the filter are written once for both.  How arrays come to the device and back is here; how a frame is
+warped there is in :mod:`.frame_noise`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
-from ..registration.warp import inside, warp
+from ..core.arrays import FloatArray
 from ..runtime.device import CPU, find_device, memory_of
-from ..runtime.image_stacks import Stack, StackOps, numpy_ops, torch_ops, warp_stack
-from .frame_noise import FrameStatistics
+from ..runtime.image_stacks import Stack, StackOps, numpy_ops, torch_ops
+from .frame_noise import FrameStatistics, channels_first
 from .kalman import PixelGaussian, PixelStacks
-
-# Registered channels (C, H, W), their luminance (H, W), and where the warp samples the frame (H, W), 1 to 0.
-Warped = tuple[Stack, Stack, Stack]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +25,6 @@ class ArrayBackend:
 
     device: str  # ``"cpu"`` is NumPy and OpenCV; any other is the name of a device of torch
     ops: StackOps  # operations on its arrays
-    warp: Callable[[FloatArray, Stack], Warped]  # from a frame (a NumPy array) and a flow to the registered frame
 
     @property
     def is_cpu(self) -> bool:
@@ -48,7 +42,7 @@ class ArrayBackend:
 
     def load_pixels(self, pixels: PixelGaussian) -> PixelStacks:
         """Bring ρ̂ and Σ to the device."""
-        return PixelStacks(self.load(_channels_first(pixels.mean)), self.load(pixels.variance))
+        return PixelStacks(self.load(channels_first(pixels.mean)), self.load(pixels.variance))
 
     def store_pixels(self, pixels: PixelStacks) -> PixelGaussian:
         """Bring ρ̂ and Σ back to NumPy arrays."""
@@ -70,32 +64,4 @@ class ArrayBackend:
 def array_backend(device: str) -> ArrayBackend:
     """Return the backend of a device."""
     found = find_device(device)
-    if found == CPU:
-        return ArrayBackend(found, numpy_ops(), _warp_on_cpu)
-    ops = torch_ops(found)
-    return ArrayBackend(found, ops, lambda frame, flow: _warp_in_torch(frame, flow, ops))
-
-
-def _warp_on_cpu(frame: FloatArray, flow: FloatArray) -> Warped:
-    registered = warp(frame, flow)
-    return _channels_first(registered), luminance(registered), inside(flow)
-
-
-def _warp_in_torch(frame: FloatArray, flow: Stack, ops: StackOps) -> Warped:
-    registered = warp_stack(ops.load(_channels_first(frame)), flow, ops)
-    # The luminance of the three unit colours is the weight of each channel.
-    weights = luminance(np.eye(3, dtype=np.float32)[None])[0].tolist() if len(registered) == 3 else [1.0]
-    grey = sum(weight * channel for weight, channel in zip(weights, registered, strict=True))
-    height, width = flow.shape[:2]
-    x, y = (ops.arrays.arange(length, dtype=flow.dtype, device=flow.device) for length in (width, height))
-    seen = _within(x + flow[..., 0], width) * _within(y[:, None] + flow[..., 1], height)
-    return registered, grey, seen
-
-
-def _within(position: Stack, length: int) -> Stack:
-    """1 where a position lies between the first and the last pixel, falling to 0 one pixel beyond."""
-    return (1 - (-position).maximum(position - (length - 1))).clamp(0, 1)
-
-
-def _channels_first(image: NDArray[np.floating]) -> NDArray[np.floating]:
-    return image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)
+    return ArrayBackend(found, numpy_ops() if found == CPU else torch_ops(found))

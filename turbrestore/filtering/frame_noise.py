@@ -1,8 +1,8 @@
-"""Measurement noise of a registered frame at every pixel: Z of the image update (paper 3, eq. 15).
+"""A frame that is registered to the image, and its measurement noise at every pixel (paper 3, eq. 15).
 
 Symbols
 -------
-Z : variance of a registered frame about the image
+I ∘ ŵ : frame I warped by the estimated flow; Z : variance of a registered frame about the image
 z : local sharpness of a frame, standardised over the frames; β its weight
 v : variance of z over the frames
 κ : share of the middle of the window that z leaves out, see :func:`local_sharpness`
@@ -28,8 +28,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from ..runtime.image_stacks import Stack, StackOps
+from ..core.arrays import FloatArray, luminance
+from ..registration.warp import inside, warp
+from ..runtime.image_stacks import Stack, StackOps, warp_stack
+
+# Registered channels (C, H, W), their luminance (H, W), and where the warp samples the frame (H, W), 1 to 0.
+Warped = tuple[Stack, Stack, Stack]
 
 # A larger standardised sharpness is an outlier, not a better frame.
 _LARGEST_SCORE = 3.0
@@ -71,6 +77,55 @@ class FrameStatistics:
     # variance and averaged in a small window.
     median: Stack
     spread: Stack
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredFrame:
+    """A frame registered to the image (eq. 15)."""
+
+    channels: Stack  # (C, H, W): I ∘ ŵ
+    noise: Stack  # (H, W): Z, squared intensity
+    sharpness: float
+
+
+def register_frame(
+    image: FloatArray, flow: FloatArray, statistics: FrameStatistics, sharpness: float, ops: StackOps
+) -> RegisteredFrame:
+    """Warp a frame onto the image by Ŵ and estimate its noise Z (eq. 15).
+
+    ``image`` (H, W) or (H, W, 3); ``flow`` (H, W, 2).
+    """
+    loaded = ops.load(flow)
+    channels, grey, seen = warp_frame(image, loaded, ops)
+    return RegisteredFrame(channels, *frame_noise_variance(grey, loaded, seen, statistics, sharpness, ops))
+
+
+def warp_frame(image: FloatArray, flow: Stack, ops: StackOps) -> Warped:
+    """Warp a frame, a NumPy array, by a flow on the device, in NumPy and OpenCV or in torch.
+
+    ``image`` (H, W) or (H, W, 3); ``flow`` (H, W, 2).
+    """
+    if ops.arrays is np:
+        registered = warp(image, flow)
+        return channels_first(registered), luminance(registered), inside(flow)
+    channels = warp_stack(ops.load(channels_first(image)), flow, ops)
+    # The luminance of the three unit colours is the weight of each channel.
+    weights = luminance(np.eye(3, dtype=np.float32)[None])[0].tolist() if len(channels) == 3 else [1.0]
+    grey = sum(weight * channel for weight, channel in zip(weights, channels, strict=True))
+    height, width = flow.shape[:2]
+    x, y = (ops.arrays.arange(length, dtype=flow.dtype, device=flow.device) for length in (width, height))
+    seen = _within(x + flow[..., 0], width) * _within(y[:, None] + flow[..., 1], height)
+    return channels, grey, seen
+
+
+def _within(position: Stack, length: int) -> Stack:
+    """1 where a position lies between the first and the last pixel, falling to 0 one pixel beyond."""
+    return (1 - (-position).maximum(position - (length - 1))).clamp(0, 1)
+
+
+def channels_first(image: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(H, W) or (H, W, C) to (C, H, W)."""
+    return image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)
 
 
 def frame_noise_variance(

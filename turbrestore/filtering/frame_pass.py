@@ -9,7 +9,7 @@ is updated by it, so that at most one registered frame takes memory there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,15 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
-from ..dynamics.flow_model import FlowDynamics, flow_of
+from ..dynamics.flow_model import FlowDynamics, ProjectedFlow, flow_of, project_measured
 from ..registration.flow import FlowFrame, FlowParams, FlowReference, prepare_reference
-from ..runtime.image_stacks import Stack
 from ..runtime.runtime import Runtime
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import in_batches, map_in_turns
 from .array_backend import ArrayBackend
-from .frame_noise import FrameStatistics, frame_noise_variance
-from .kalman import Gaussian, ProjectedFlow, predict_state, project_measured, update_state
+from .frame_noise import FrameStatistics, RegisteredFrame, register_frame
+from .kalman import Gaussian, advance_state
 
 # A frame as it was read, or prepared for flow; None for a frame that does not count.
 Frame = FloatArray | FlowFrame | None
@@ -47,23 +46,16 @@ class PassSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class RegisteredFrame:
-    """A frame registered to the image (eq. 15)."""
-
-    channels: Stack  # (C, H, W): I ∘ ŵ
-    noise: Stack  # (H, W): Z, squared intensity
-    sharpness: float
-
-
-@dataclass(frozen=True, eq=False)
 class TrackedFrame:
     """A frame after the update of the flow state."""
 
     frame: Frame  # the frame for the next pass, with a flow to start from; None if no other pass follows
     state: Gaussian  # ξ̂ and P after the frame
     innovation: float  # root mean square of W^meas − W̄ − C A ξ̂, pixels; NaN if the frame does not count
-    measured: FloatArray | None  # (H, W, 2), or None: w^meas, pixels; None if the frame does not count
-    registered: Callable[[], RegisteredFrame] | None  # returns the RegisteredFrame; None if the frame does not count
+    # None if the frame does not count: the frame, (H, W) or (H, W, 3), and w^meas, (H, W, 2), pixels.
+    image: FloatArray | None
+    measured: FloatArray | None
+    registered: RegisteredFrame | None = None  # None on a device too, where the update of the image registers it
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +92,7 @@ def pass_over(
         nonlocal state
         updated = []
         for item in items:
-            state, innovation = predict_state(state, settings.dynamics), np.nan  # (14b, 14d)
-            if item.projected is not None:
-                state, innovation = update_state(state, item.projected, settings.dynamics)  # (17, 19)
+            state, innovation = advance_state(state, item.projected, settings.dynamics)  # (14b, 14d, 17, 19)
             updated.append((item, state, innovation))
         return updated
 
@@ -115,16 +105,13 @@ def pass_over(
         yield from tracked
 
 
-def _register(image: FloatArray, measured: FloatArray, state: Gaussian, settings: PassSettings) -> RegisteredFrame:
-    """Warp a frame onto the image by Ŵ and estimate its noise Z (eq. 15).
+def register(image: FloatArray, measured: FloatArray, state: Gaussian, settings: PassSettings) -> RegisteredFrame:
+    """Register a frame by the measured flow, or by that of the model.
 
     ``image`` (H, W) or (H, W, 3); ``measured`` (H, W, 2).
     """
-    backend = settings.backend
-    flow = backend.ops.load(flow_of(settings.dynamics, state.mean) if settings.modelled else measured)
-    channels, grey, seen = backend.warp(image, flow)
-    noise, sharpness = frame_noise_variance(grey, flow, seen, settings.statistics, settings.sharpness, backend.ops)
-    return RegisteredFrame(channels, noise, sharpness)
+    flow = flow_of(settings.dynamics, state.mean) if settings.modelled else measured
+    return register_frame(image, flow, settings.statistics, settings.sharpness, settings.backend.ops)
 
 
 def _measure_flows(items: list[_Item], reference: FlowReference) -> list[_Item]:
@@ -176,8 +163,5 @@ def _track(item: _Item, state: Gaussian, innovation: float, settings: PassSettin
     image = item.frame.image if isinstance(item.frame, FlowFrame) else item.frame
     if image is None or item.measured is None:
         return TrackedFrame(frame, state, innovation, None, None)
-    if settings.backend.is_cpu:
-        registered = _register(image, item.measured, state, settings)
-        return TrackedFrame(frame, state, innovation, item.measured, lambda: registered)
-    measured = item.measured
-    return TrackedFrame(frame, state, innovation, measured, lambda: _register(image, measured, state, settings))
+    registered = register(image, item.measured, state, settings) if settings.backend.is_cpu else None
+    return TrackedFrame(frame, state, innovation, image, item.measured, registered)

@@ -46,7 +46,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import FloatArray
 from ..core.errors import DataError
-from ..dynamics.flow_model import Float64Array, FlowDynamics, project_deviation
+from ..dynamics.flow_model import Float64Array, FlowDynamics, ProjectedFlow
 from ..runtime.image_stacks import Stack
 
 _LOG_2PI = float(np.log(2 * np.pi))
@@ -276,33 +276,15 @@ def _cholesky(matrix: Float64Array, name: str, kind: str) -> Float64Array:
         raise DataError(f"{name}: expected a {kind} matrix, found one that is not; check the covariances") from None
 
 
-@dataclass(frozen=True, eq=False)
-class ProjectedFlow:
-    """A measured flow, as far as the update of the state needs it."""
-
-    state: Float64Array  # (n,): z
-    squared: float  # sum of squares of W^meas − W̄, squared pixels
-    size: int  # components of the flow, 2 H W
-
-
-def project_measured(measured: FloatArray, dynamics: FlowDynamics) -> ProjectedFlow:
-    """Project a measured flow on the subspace of the model.
-
-    ``measured`` (H, W, 2).
-    """
-    deviation = measured - dynamics.mean_flow
-    state = project_deviation(dynamics, deviation)
-    return ProjectedFlow(state, float(np.square(deviation, out=deviation).sum(dtype=np.float64)), deviation.size)
-
-
 def flow_noise(dynamics: FlowDynamics) -> float:
     """R, squared pixels, with a floor for flows that lie in the subspace of the model as a whole."""
     return max(dynamics.R, _FLOW_NOISE_FLOOR)
 
 
-def predict_state(state: Gaussian, dynamics: FlowDynamics) -> Gaussian:
-    """Predict the state of the flow one frame ahead (paper 3, eqs. 14b and 14d)."""
-    return predict(state, dynamics.A, dynamics.Q)
+def advance_state(state: Gaussian, measured: ProjectedFlow | None, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
+    """Predict the state of the flow one frame ahead (paper 3, eqs. 14b and 14d), and update it by a measured flow."""
+    predicted = predict(state, dynamics.A, dynamics.Q)
+    return (predicted, np.nan) if measured is None else update_state(predicted, measured, dynamics)
 
 
 def update_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
@@ -334,6 +316,12 @@ class PixelGaussian:
             raise DataError("variance: expected finite values of at least 0, found others")
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "variance", variance)
+
+
+def first_states(image: FloatArray, variance: float, dynamics: FlowDynamics) -> tuple[PixelGaussian, Gaussian]:
+    """ρ̂, Σ and ξ̂, P before the first frame: an image (H, W) or (H, W, 3), and the states of the training flows."""
+    pixels, covariance = np.full(image.shape[:2], variance, np.float32), dynamics.state_covariance
+    return PixelGaussian(image, pixels), Gaussian(np.zeros(len(covariance)), covariance)
 
 
 class PixelStacks(NamedTuple):

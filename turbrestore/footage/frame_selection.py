@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import check_image, luminance
+from ..core.arrays import check_grey
 from ..core.errors import ConfigurationError, DataError, require
 
 # Small enough for the detail that turbulence blurs, large enough to suppress pixel noise.
@@ -37,7 +37,7 @@ def frame_quality(frames: Iterable[ArrayLike]) -> np.ndarray:
     """Sharpness of the frames of one clip, which are taken one at a time: float64 of shape (T,)."""
     quality = []
     for index, frame in enumerate(frames):
-        grey = luminance(check_image(frame, f"frame {index}"))
+        grey = check_grey(frame, f"frame {index}")
         detail = cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), _SIGMA), cv2.CV_32F)
         quality.append(float(np.mean(np.square(detail))) / max(float(grey.mean()), _DARK) ** 2)
     if not quality:

@@ -44,23 +44,19 @@ class Levels:
         """Whether anything is stretched."""
         return (self.low, self.gain) != (0.0, 1.0)
 
-    def stretched(self, image: FloatArray) -> FloatArray:
-        """Bring an image from the levels of the clip to those of the stages."""
-        return (image - np.float32(self.low)) * np.float32(self.gain) if self.changed else image
+    def stretched(self, result: Result) -> Result:
+        """Bring an image, or the images and the noise of a result, to the levels of the stages."""
+        low, gain = np.float32(self.low), np.float32(self.gain)
+        return self._converted(result, lambda image: (image - low) * gain, self.gain)
 
-    def original(self, image: FloatArray) -> FloatArray:
-        """Bring an image back to the levels of the clip."""
-        return np.clip(image / np.float32(self.gain) + np.float32(self.low), 0, 1) if self.changed else image
-
-    def stretched_result(self, result: Result) -> Result:
-        """Bring the images and the noise of a stage's result to the levels of the stages."""
-        return self._converted(result, self.stretched, self.gain)
-
-    def original_result(self, result: Result) -> Result:
-        """Bring the images and the noise of a stage's result back to the levels of the clip."""
-        return self._converted(result, self.original, 1 / self.gain)
+    def original(self, result: Result) -> Result:
+        """Bring an image, or the images and the noise of a result, back to the levels of the clip."""
+        low, gain = np.float32(self.low), np.float32(self.gain)
+        return self._converted(result, lambda image: np.clip(image / gain + low, 0, 1), 1 / self.gain)
 
     def _converted(self, result: Any, convert: Callable[[FloatArray], FloatArray], factor: float) -> Any:
+        if self.changed and isinstance(result, np.ndarray):
+            return convert(result)
         if not self.changed or not dataclasses.is_dataclass(result) or isinstance(result, type):
             return result
         values = {item.name: getattr(result, item.name) for item in dataclasses.fields(result)}

@@ -32,7 +32,7 @@ from ..core.decision import Decision
 from ..core.errors import DataError
 from ..io.images import read_image
 from ..io.source import FrameSource, Window
-from ..registration.camera.global_shift import global_shifts
+from ..registration.camera.global_shift import known_shifts
 from .moments import Moments, measure_moments
 from .survey import Survey
 
@@ -157,7 +157,7 @@ def without_overlay(
     if mask is None:
         return survey, None, None, ()
     small = _continued_small(survey.small, mask)
-    shifts = global_shifts(luminance(small)) * (mask.shape[1] / small.shape[2], mask.shape[0] / small.shape[1])
+    shifts = known_shifts(luminance(small))[0] * (mask.shape[1] / small.shape[2], mask.shape[0] / small.shape[1])
     if not given and float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _LEAST_MOTION:
         if title is None:
             return survey, None, None, ()

@@ -31,8 +31,9 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import FrameSource, Window
-from ..registration.camera.global_shift import global_shifts
-from .survey import Survey
+from ..registration.camera.global_shift import known_shifts
+from ..runtime.scratch import iter_frames
+from .survey import Survey, spread
 
 # Frames of which the median is taken, the fewest that tell what passes, and rows that it is taken of at once.
 _SAMPLES, _FEWEST, _ROWS = 25, 9, 64
@@ -130,13 +131,15 @@ def without_passers(survey: Survey) -> tuple[FrameSource, tuple[Decision, ...]]:
 
 def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
     """Find what frames usually show, and where they lie; None where nothing passes."""
-    source, sample = survey.clip, survey.part(_SAMPLES)
-    stack = np.empty((len(sample.numbers), *source.shape[1:3]), np.uint8)
+    source, places = survey.clip, spread(len(survey.numbers), _SAMPLES)
+    numbers = tuple(survey.numbers[place] for place in places)
+    stack = np.empty((len(places), *source.shape[1:3]), np.uint8)
+    sample = map(source.intensities, numbers, iter_frames(map(survey.pixels.__getitem__, places)))
     for plane, frame in zip(stack, sample, strict=True):
         np.rint(255 * np.clip(luminance(frame), 0, 1), out=plane, casting="unsafe")
     still = Placement.still(source)
-    usual = _usual(stack, sample.numbers, still)
-    found = _passed_by(stack, sample.numbers, usual, still)
+    usual = _usual(stack, numbers, still)
+    found = _passed_by(stack, numbers, usual, still)
     if found is not None:
         return found, still
     if not _moves(measured_shifts(map(_grey, stack), stack.shape)):
@@ -146,8 +149,8 @@ def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
     moving = placed(source, shifts_of_reduced(reduced(small, small.shape), source.shape))
     if np.prod(moving.shape) > _LARGEST_SCENE * np.prod(moving.size):
         return None
-    followed = _usual(stack, sample.numbers, moving)
-    found = _passed_by(stack, sample.numbers, followed, moving) if followed.spread < _FOLLOWED * usual.spread else None
+    followed = _usual(stack, numbers, moving)
+    found = _passed_by(stack, numbers, followed, moving) if followed.spread < _FOLLOWED * usual.spread else None
     return None if found is None else (found, moving)
 
 
@@ -355,7 +358,7 @@ def reduced(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> FloatArray:
 
 def shifts_of_reduced(small: FloatArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Shifts (dx, dy) of frames that :func:`reduced` has reduced, in pixels of the frames, shape (T, 2)."""
-    return global_shifts(small) * (shape[2] / small.shape[2], shape[1] / small.shape[1])
+    return known_shifts(small)[0] * (shape[2] / small.shape[2], shape[1] / small.shape[1])
 
 
 def measured_shifts(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> NDArray[np.float64]:

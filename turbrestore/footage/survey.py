@@ -38,15 +38,6 @@ class Survey:
     def __iter__(self) -> Iterator[FloatArray]:
         return map(self.clip.intensities, self.numbers, iter_frames(self.pixels))
 
-    def part(self, count: int) -> Survey:
-        """Keep at most that many of the whole frames, spread evenly."""
-        chosen = _spread(len(self.numbers), count)
-        return dataclasses.replace(
-            self,
-            numbers=tuple(self.numbers[index] for index in chosen),
-            pixels=tuple(self.pixels[index] for index in chosen),
-        )
-
     def adjusted(
         self, adjust: Callable[[int, FloatArray, Window], FloatArray], small: FloatArray | None = None
     ) -> Survey:
@@ -63,7 +54,7 @@ def take_survey(clip: FrameSource, scratch: Path | None = None) -> Survey:
         small[index] = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
         if not places:
             dtype = pixels.dtype if pixels.dtype.kind == "u" else np.dtype(np.float32)
-            places = _spread(len(clip), _whole_frames(clip.shape, dtype.itemsize))
+            places = spread(len(clip), _whole_frames(clip.shape, dtype.itemsize))
             stack = new_stack((len(places), *clip.shape[1:]), scratch, dtype.newbyteorder("="))
         if index in places:
             # Floating point is in [0, 1] in the file as well.
@@ -97,6 +88,6 @@ def _small_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
     return (shape[0], *(max(_SHORTEST, round(length / factor)) for length in shape[1:3]), *shape[3:])
 
 
-def _spread(count: int, most: int) -> list[int]:
+def spread(count: int, most: int) -> list[int]:
     """Places of at most ``most`` of ``count`` things, spread evenly."""
     return [int(place) for place in np.linspace(0, count - 1, min(most, count)).round()]

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_image
+from ..core.arrays import FloatArray, check_image, from_unit_to_type
 from ..core.errors import DataError, StorageError, TurbrestoreError
 from .astronomy.fits import read_fits
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
@@ -32,7 +32,6 @@ from .pixels import (
     at_levels,
     check_depth,
     depth_of,
-    from_unit_to_type,
     full_scale_of,
     to_unit,
     upright,

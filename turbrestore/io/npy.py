@@ -18,12 +18,12 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import CHANNELS, FloatArray
+from ..core.arrays import CHANNELS, FloatArray, from_unit_to_type
 from ..core.errors import DataError
 from ..runtime.scratch import iter_parts, new_stack
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
 from .output import atomic_output, frames_of_one_size
-from .pixels import depth_of, from_unit_to_type
+from .pixels import depth_of
 from .source import FrameSource
 from .values.counts import from_counts, holds_counts, scale_of_numbers
 

@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, from_unit
+from ..core.arrays import FloatArray
 from ..core.errors import DataError, require
-from ..runtime.scratch import iter_parts
 
 PixelArray = NDArray[Any]
 
@@ -85,17 +84,6 @@ def check_depth(bit_depth: int) -> int:
     known = not isinstance(bit_depth, bool) and bit_depth in {*range(1, 17), 32}
     require(known, f"bit_depth: expected 1 to 16, or 32 for floating point, found {bit_depth}")
     return bit_depth
-
-
-def from_unit_to_type(image: FloatArray, bit_depth: int) -> PixelArray:
-    """Convert intensities to the type of a file: uint8 up to 8 bits, uint16 up to 16, clipped float32 for 32."""
-    if bit_depth != 32:
-        return from_unit(image, 8 if bit_depth <= 8 else 16)
-    pixels, done = np.empty(image.shape, np.float32), 0
-    for part in iter_parts(image):
-        np.clip(part, 0, 1, out=pixels[done : done + len(part)])
-        done += len(part)
-    return pixels
 
 
 def at_levels(pixels: PixelArray, levels: tuple[float, float] | None) -> PixelArray:

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, from_unit_to_type
 from ..core.errors import DataError
 from ..runtime.jit import jit
 from .limits import DEFAULT_LIMITS, Limits, first_line, format_errors, input_errors
 from .npy import MappedFrames
 from .output import atomic_output, frames_of_one_size
-from .pixels import PixelArray, check_depth, depth_of, from_unit_to_type, upright
+from .pixels import PixelArray, check_depth, depth_of, upright
 from .source import FrameSource
 from .values.counts import from_counts, holds_counts, scale_of_numbers
 

@@ -15,7 +15,7 @@ its noise.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from itertools import repeat
 from typing import TYPE_CHECKING, Literal
@@ -29,7 +29,7 @@ from ..core.errors import require, require_between
 from ..display.plots import plot_displacements
 from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
-from ..runtime.scratch import fill_frames, iter_frames, mean_of, new_stack
+from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
 from ..runtime.steps import finish
 from ..runtime.threads import map_ahead, sum_in_threads
 from .camera.stabilisation import mean_stabilised
@@ -199,8 +199,12 @@ def centroid_steps(
         solved = measure_flows(reference, prepared or iter_frames(stack), starts, draft)
         # Prepared frames are kept for the next iteration, unless memory is so short that stacks are in files.
         keep = runtime.scratch is None and not prepared
-        for measured in fill_frames(flows, _flows_of(solved, prepared if keep else None)):
-            yield CentroidState(len(sizes) + 1, measured)
+        for number, (frame, flow) in enumerate(solved):
+            flows[number] = flow
+            drop_pages(flows)
+            if keep:
+                prepared.append(frame)
+            yield CentroidState(len(sizes) + 1, number + 1)
         mean_flow = mean_of(flows)  # W̄, eq. 12
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
         change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
@@ -223,19 +227,11 @@ def _first_image(stack: FloatArray, params: CentroidParams, flow_params: FlowPar
     return mean_stabilised(stack, runtime.threads) if flow_params.global_shift else mean_of(stack)
 
 
-def _flows_of(solved: Iterable[tuple[FlowFrame, FloatArray]], prepared: list[FlowFrame] | None) -> Iterator[FloatArray]:
-    """Flows alone; their frames are appended to ``prepared``."""
-    for frame, flow in solved:
-        if prepared is not None:
-            prepared.append(frame)
-        yield flow
-
-
 def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:
     """Compose flows with ``recentre``, in place, so that they start from the recentred image."""
-    moved = map_ahead(lambda flow: compose_flows(flow, recentre), iter_frames(flows), threads)
-    for _ in fill_frames(flows, (flow for _, flow in moved)):
-        pass
+    for flow, moved in map_ahead(lambda flow: compose_flows(flow, recentre), iter_frames(flows), threads):
+        flow[...] = moved
+        drop_pages(flows)
 
 
 def mean_registered(frames: FloatArray, flows: FloatArray, runtime: Runtime = DEFAULT) -> FloatArray:

@@ -34,8 +34,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_flow, check_image, luminance
-from ..core.errors import DataError, require
+from ..core.arrays import FloatArray, check_grey
 from ..core.noise import estimate_noise
 from ..runtime.jit import jit
 
@@ -74,7 +73,7 @@ def flow_confidence(reference: ArrayLike) -> FlowConfidence:
 
     ``reference`` (H, W) or (H, W, 3).
     """
-    image = luminance(check_image(reference, "reference"))
+    image = check_grey(reference, "reference")
     dx, dy = _gradient(image)
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW).ravel() for product in (dx * dx, dx * dy, dy * dy))
     noise = np.float32(_NOISE_MARGIN * _GRADIENT_NOISE * estimate_noise(image) ** 2)
@@ -91,21 +90,16 @@ def noise_share(image: ArrayLike, noise: float) -> float:
 
     ``image`` (H, W) or (H, W, 3).
     """
-    squares = sum(float(np.square(part).mean(dtype=np.float64)) for part in _gradient(luminance(check_image(image))))
+    squares = sum(float(np.square(part).mean(dtype=np.float64)) for part in _gradient(check_grey(image)))
     return 2 * _SCHARR_NOISE * noise**2 / max(squares, 1e-18)
 
 
-def regularise_flow(flow: ArrayLike, confidence: FlowConfidence, noise: float) -> FloatArray:
+def regularise_flow(flow: FloatArray, confidence: FlowConfidence, noise: float) -> FloatArray:
     """Draw a flow towards its neighbourhood where the texture does not determine it.
 
     ``flow`` (H, W, 2); returns (H, W, 2).
     """
-    measured = check_flow(flow)
-    require(0 <= noise < np.inf, f"noise: expected a finite number of 0 or more, found {noise}")
-    tensors = confidence.tensors
-    if measured.ndim != 3 or measured.shape[:2] != tensors[0].shape[1:]:
-        raise DataError(f"flow: expected shape {(*tensors[0].shape[1:], 2)}, found {measured.shape}")
-    planes = cv2.split(measured)
+    tensors, planes = confidence.tensors, cv2.split(flow)
     weighted = [_apply(tensors[0], *planes)]
     for _ in tensors[1:]:
         weighted.append((cv2.pyrDown(weighted[-1][0]), cv2.pyrDown(weighted[-1][1])))

@@ -32,7 +32,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_frames, check_image
+from ..core.arrays import FloatArray, check_frames, check_grey, check_image, luminance
 from ..core.errors import DataError, require, require_between
 from ..core.noise import estimate_noise
 from ..runtime.device import CPU, find_device
@@ -41,11 +41,12 @@ from ..runtime.scratch import fill_frames, iter_frames, new_stack
 from ..runtime.threads import in_batches, map_ahead
 from .camera.global_shift import ShiftReference, frame_shift, prepare_shift_reference, shift_frame
 from .confidence import flow_confidence, noise_share, regularise_flow
-from .contrast import grey_levels
 from .opencv_flow import DisParams, FarnebackParams, FlowSolver, GreyImage, dis_solver, farneback_solver
 from .tvl1 import TvL1Params, tvl1_solver
 
 MIN_SIDE = 16
+# Grey levels for each local standard deviation: ±4 deviations fit into 8 bits.
+_LEVELS_PER_DEVIATION = 32.0
 # Most batches that are prepared for a device side by side.
 _BATCHES = 8
 # Share of the gradients of a frame above which noise makes it one that is smoothed, by so many pixels.
@@ -260,6 +261,36 @@ def prepare_reference(
     # A device solves a batch at once while others are prepared; on the CPU every frame has a thread.
     batch, threads = (1, runtime.threads) if device == CPU else (params.tvl1.batch, min(runtime.workers, _BATCHES))
     return FlowReference(prepare, solve, shape, batch, threads)
+
+
+def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> FloatArray:
+    """Normalise to zero mean and unit deviation in a Gaussian window.
+
+    ``image`` (H, W) or (H, W, 3); returns (H, W).
+    """
+    grey = check_grey(image)
+    # Centred first, because E[x²] − E[x]² loses all digits of a faint texture on a bright ground.
+    centred = grey - cv2.GaussianBlur(grey, (0, 0), window)
+    deviation = cv2.GaussianBlur(centred * centred, (0, 0), window)
+    deviation += np.float32(floor) ** 2
+    centred /= np.sqrt(deviation, out=deviation)
+    return centred
+
+
+def grey_levels(image: FloatArray, window: float, floor: float, smoothing: float = 0.0) -> NDArray[np.uint8]:
+    """Contrast-normalised image in 8 bits, with 32 levels for each local standard deviation.
+
+    ``image`` (H, W) or (H, W, 3); returns (H, W).
+    """
+    if smoothing > 0:
+        image = cv2.GaussianBlur(luminance(image), (0, 0), smoothing)
+    if window > 0:
+        levels = normalise_contrast(image, window, floor)
+        levels *= _LEVELS_PER_DEVIATION
+        levels += 128.0
+    else:
+        levels = luminance(image) * 255.0
+    return np.clip(np.rint(levels, out=levels), 0, 255, out=levels).astype(np.uint8)
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_flow, check_frames, check_image, luminance
+from ..core.arrays import FloatArray, check_flow, check_frames, check_grey, luminance
 from ..core.errors import DataError, require, require_between
 from ..runtime.device import CPU, find_device, memory_of
 from ..runtime.image_stacks import Shape, Stack, StackOps, numpy_ops, spline_coefficients, torch_ops
@@ -151,7 +151,7 @@ def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device:
     ``reference`` (H, W) or (H, W, 3).
     """
     params = params or TvL1Params()
-    image = luminance(check_image(reference, "reference"))
+    image = check_grey(reference, "reference")
     if min(image.shape) < _LEAST_SIDE // 2:
         raise DataError(f"reference: expected at least 16×16 pixels, found {image.shape[1]}×{image.shape[0]}")
     found = find_device(device)

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import ConfigurationError, DataError
 from ..runtime.device import CPU, find_device, memory_of
-from ..runtime.image_stacks import bordered, numpy_ops, sample_spline, spline_coefficients, torch_ops, warp_stack
+from ..runtime.image_stacks import sample_spline, spline_planes, torch_ops, warp_stack
 
 INTERPOLATIONS = ("linear", "cubic")
 # Pixels of a strip.  A dozen arrays of a smaller one would stay in the cache of a core, but with two threads, taking
@@ -51,15 +51,6 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device
     with memory_of(found):
         warped = ops.store(warp_stack(ops.load(planes), ops.load(flow), ops))
     return warped[0] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(warped, 0, -1))
-
-
-def spline_planes(image: FloatArray) -> FloatArray:
-    """Splines through the channels of an image that is sampled several times.
-
-    ``image`` (H, W) or (H, W, 3); returns their coefficients (1, H + 3, W + 3) or (3, H + 3, W + 3).
-    """
-    planes = (image,) if image.ndim == 2 else cv2.split(image)
-    return np.stack([bordered(spline_coefficients(plane, numpy_ops())) for plane in planes])
 
 
 def sample_splines(planes: FloatArray, flow: FloatArray) -> FloatArray:

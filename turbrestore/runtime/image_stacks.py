@@ -153,6 +153,15 @@ def bordered(coefficients: FloatArray) -> FloatArray:
     return cv2.copyMakeBorder(coefficients, _BEFORE, _BEYOND, _BEFORE, _BEYOND, cv2.BORDER_REFLECT_101)
 
 
+def spline_planes(image: FloatArray) -> FloatArray:
+    """Splines through the channels of an image that is sampled several times.
+
+    ``image`` (H, W) or (H, W, 3); returns their coefficients (1, H + 3, W + 3) or (3, H + 3, W + 3).
+    """
+    planes = (image,) if image.ndim == 2 else cv2.split(image)
+    return np.stack([bordered(spline_coefficients(plane, numpy_ops())) for plane in planes])
+
+
 def warp_stack(stack: Stack, flow: Stack, ops: StackOps) -> Stack:
     """Backward warp by cubic B-splines: the equation behind :func:`turbrestore.registration.warp.warp`.
 

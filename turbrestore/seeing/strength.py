@@ -34,6 +34,9 @@ from ..blur_moments.cues import relative_blur
 from ..blur_moments.tile_spectra import CueParams
 from ..core.arrays import FloatArray
 from ..core.noise import estimate_noise
+from ..io.source import Window
+from ..registration.centroid import Centroid
+from ..runtime.scratch import mean_of
 from ..synthesis.atmosphere import fried_parameter
 from .displacement import Displacement, Float64Array, MotionStatistics, measure_motion, motion_statistics
 from .tilt_theory import MEAN_CONE, Optics, displacement_differences, strength_of_tilt
@@ -164,6 +167,18 @@ class Seeing:
             "wind_anisotropy": "",
         }
         return {name: (getattr(self, name), unit) for name, unit in units.items()}
+
+
+def seeing_of_picture(
+    picture: Window, frames: FloatArray, centroid: Centroid, optics: Optics | None = None, threads: int = 0
+) -> Seeing:
+    """Measure the strength of the turbulence between the bars, since what fills them is not the scene.
+
+    ``frames`` (T, H, W) or (T, H, W, 3).
+    """
+    rows, columns = picture
+    seen, flows = frames[:, rows, columns], centroid.flows[:, rows, columns]
+    return measure_seeing(seen, flows, centroid.image[rows, columns], mean_of(seen), optics, threads)
 
 
 def measure_seeing(

@@ -25,7 +25,7 @@ import scipy
 from ..blur.psf import blur_otf, laplacian_symbol
 from ..core.arrays import FloatArray
 
-# Weight of contrast over noise as in psf.wiener_fidelity.
+# Weight of contrast over noise as in conjugate_gradient.wiener_fidelity.
 _FIDELITY = 6.0
 # Floors of the noise, of a frame and of what is remembered.
 _LEAST_NOISE = 0.015, 0.005

@@ -19,9 +19,9 @@ from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import DataError
 from ..footage.checks.scene_cuts import similarity_at, thumbnail
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
-from ..registration.contrast import grey_levels
+from ..registration.flow import grey_levels
 from ..registration.opencv_flow import GreyImage
-from ..registration.warp import spline_planes
+from ..runtime.image_stacks import spline_planes
 from .grid import pixel_of, reduced
 
 # Likeness of two successive frames below which the second starts a new scene.

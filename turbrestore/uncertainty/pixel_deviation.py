@@ -40,12 +40,13 @@ import scipy
 from numpy.typing import NDArray
 
 from ..blind.remove_blur import Deblurred
-from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol, wiener_fidelity
+from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol
 from ..core.arrays import FloatArray, luminance
 from ..core.gradient import sobel_gradient
 from ..core.noise import estimate_noise
-from ..deconvolution.deconvolve import DeconvolutionParams
-from ..deconvolution.problem import MARGIN_SIGMAS, automatic_fidelity, margin_around
+from ..deconvolution.conjugate_gradient import wiener_fidelity
+from ..deconvolution.deconvolve import DeconvolutionParams, automatic_fidelity
+from ..deconvolution.problem import MARGIN_SIGMAS, margin_around
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
 
@@ -157,12 +158,3 @@ def saturation_level(brightest: float, noise: float, step: float) -> float:
     the clip in every frame is saturated if the frames are noisy, and else may be a white part of the scene.
     """
     return min(_SATURATED, brightest - step / 2) if noise >= step else _SATURATED
-
-
-def informed_pixels(seen: FloatArray, mean: FloatArray, saturation: float) -> NDArray[np.bool_]:
-    """Return the pixels that a frame has shown, and that are not saturated in all of them.
-
-    ``seen`` (H, W); ``mean`` (H, W) or (H, W, 3); returns (H, W).
-    """
-    saturated = mean >= saturation
-    return (seen > 0) & ~(saturated if saturated.ndim == 2 else saturated.any(axis=-1))

@@ -14,6 +14,7 @@ is too wide for all but the smallest image, that one counts.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +56,7 @@ def image_evidence(image: FloatArray, runtime: Runtime = DEFAULT) -> ImageEviden
         chosen = judged_candidate(found, estimate.reduction)
         gradients, noise = image_gradients(chosen.part), chosen.estimate.noise
         with ThreadTeam(min(runtime.workers, 2)) as team:
-            curves = list(team.map(lambda shape: width_costs(gradients, shape, noise, rises=_RISES), EXPONENTS))
+            curves = list(team.map(partial(width_costs, gradients, noise=noise, rises=_RISES), EXPONENTS))
     costs = np.full((len(EXPONENTS), len(WIDTHS)), np.inf)
     for row, curve in zip(costs, curves, strict=True):
         row[: len(curve)] = curve

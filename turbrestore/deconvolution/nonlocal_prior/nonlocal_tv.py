@@ -60,21 +60,17 @@ class NonlocalPenalty:
         """Upper bound of ‖∇_w‖²."""
         return self.graph.norm_squared()
 
-    def zero_dual(self, u: FloatArray) -> PairDual:
-        """Dual variable p = 0."""
-        values, (factor, lag) = np.zeros((2, len(self.graph.heads)), np.float32), np.zeros((2, u.size), np.float32)
-        return PairDual(values, factor, lag)
-
-    def ascend(self, p: PairDual, u: FloatArray, step: float, relaxation: float) -> tuple[PairDual, FloatArray]:
+    def ascend(self, p: PairDual | None, u: FloatArray, step: float, relaxation: float) -> tuple[PairDual, FloatArray]:
         """``p + ρ(p' − p)`` with p' the projection of ``p + s∇_w u`` on |p|(x) ≤ 1, and −div_w of it."""
         graph, scaled = self.graph, step * u.ravel()
+        given = p or PairDual(np.zeros((2, len(graph.heads)), np.float32), *np.zeros((2, u.size), np.float32))
         pairs, (squares, adjoint) = (graph.starts, graph.heads, graph.roots), np.zeros((2, u.size), np.float32)
-        change = p.lag + scaled
-        self._over_bands(lambda band: add_gradient(p.factor, change, *pairs, band, p.values, squares))
+        change = given.lag + scaled
+        self._over_bands(lambda band: add_gradient(given.factor, change, *pairs, band, given.values, squares))
         factor = np.asarray(1 - relaxation + relaxation / np.sqrt(squares).clip(1), np.float32)
-        p = PairDual(p.values, factor, (relaxation - 1) * scaled)
-        self._over_bands(lambda band: add_adjoint(p.factor, p.lag, *pairs, band, p.values, adjoint))
-        return p, adjoint.reshape(u.shape)
+        new = PairDual(given.values, factor, (relaxation - 1) * scaled)
+        self._over_bands(lambda band: add_adjoint(new.factor, new.lag, *pairs, band, new.values, adjoint))
+        return new, adjoint.reshape(u.shape)
 
     def value(self, u: FloatArray) -> float:
         """J(u)."""

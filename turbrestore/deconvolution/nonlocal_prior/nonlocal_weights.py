@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.arrays import FloatArray, check_image, luminance
+from ...core.arrays import FloatArray, check_grey
 from ...core.errors import DataError, require
 from ...core.noise import estimate_noise
 from ...runtime.jit import jit
@@ -136,7 +136,7 @@ def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None, thr
     ``guide`` (H, W) or (H, W, 3).
     """
     params = params or NonlocalParams()
-    grey = luminance(check_image(guide, "guide"))
+    grey = check_grey(guide, "guide")
     if grey.size < 2:
         raise DataError(f"guide: expected two pixels or more, found shape {grey.shape}")
     h = params.h if params.h is not None else automatic_h(grey)

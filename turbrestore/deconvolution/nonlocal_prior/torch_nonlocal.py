@@ -71,12 +71,9 @@ class TorchNonlocalPenalty:
         factor = 1 / self.magnitude(p).clamp(min=1).reshape(-1)
         return p * torch.stack([factor.index_select(0, self.tails), factor.index_select(0, self.heads)])
 
-    def zero_dual(self, u: Tensor) -> Tensor:
-        """Dual variable p = 0."""
-        return u.new_zeros((2, len(self.root)))
-
-    def ascend(self, p: Tensor, u: Tensor, step: float, relaxation: float) -> tuple[Tensor, Tensor]:
+    def ascend(self, p: Tensor | None, u: Tensor, step: float, relaxation: float) -> tuple[Tensor, Tensor]:
         """``p + ρ(p' − p)`` with p' the projection of ``p + s∇_w u`` on |p|(x) ≤ 1, and −div_w of it."""
+        p = u.new_zeros((2, len(self.root))) if p is None else p
         p = p + relaxation * (self.project(self.gradient(u).mul_(step).add_(p)) - p)
         return p, self.adjoint(p)
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ...core.arrays import FloatArray
 from ...core.decision import Decision
 from ...io.source import Window
-from ...registration.camera.global_shift import global_shifts
+from ...registration.camera.global_shift import known_shifts
 
 # Deviation of the Gaussian average: as a share of the longer side of a frame, and in those of the blur of the frames.
 _REACH, _REACH_BLURS = 0.045, 2.0
@@ -90,7 +90,7 @@ def measure_shade(
     change = float(np.percentile(logarithms.std(axis=0), _MOST_OF))
     if change < _LEAST_CHANGE or explained[1] > (1 - _EXPLAINED) * explained[0]:
         return None, ()
-    shifts = global_shifts(frames / max(float(frames.std()), 1e-6))
+    shifts = known_shifts(frames / max(float(frames.std()), 1e-6))[0]
     if float(np.square(shifts - shifts.mean(axis=0)).sum(axis=1).mean()) > _STANDS**2:
         return None, ()
     gains = np.exp(logarithms).astype(np.float16)

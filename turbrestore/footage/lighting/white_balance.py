@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ...core.arrays import FloatArray, luminance
 from ...core.decision import Decision
 from ...io.source import Window
-from ...registration.camera.global_shift import global_shifts
+from ...registration.camera.global_shift import known_shifts
 from ..survey import Survey
 
 # Longest side of the reduced frames, pixels, and their blur.
@@ -75,7 +75,7 @@ def _reduced(frames: FloatArray) -> FloatArray:
 def _ratios(frames: FloatArray) -> NDArray[np.float64]:
     """Logarithms of the gains of channels over that of luminance, (T, 3), of mean 0 over time."""
     grey = np.stack([luminance(frame) for frame in frames])
-    shifts = global_shifts(grey / np.maximum(grey.mean(axis=(1, 2), keepdims=True), 1e-6) / 4)
+    shifts = known_shifts(grey / np.maximum(grey.mean(axis=(1, 2), keepdims=True), 1e-6) / 4)[0]
     planes = np.concatenate([frames, grey[..., None]], axis=-1)
     size = planes.shape[2], planes.shape[1]
     # Every frame at the place of the first; NaN beyond its border.

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arrays import FloatArray, check_image
+from ...core.arrays import FloatArray, check_image, from_unit_to_type
 from ..output import atomic_output, check_output, check_space, frames_of_one_size
-from ..pixels import PixelArray, at_levels, check_depth, from_unit_to_type
+from ..pixels import PixelArray, at_levels, check_depth
 from .fits_header import astropy_fits
 
 if TYPE_CHECKING:

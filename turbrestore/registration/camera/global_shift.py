@@ -16,7 +16,7 @@ A camera that turns or zooms is followed by :mod:`turbrestore.registration.camer
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -206,13 +206,11 @@ def _follow(
     """Fill in the shifts of frames on one side of the anchor, from near to far."""
     at_anchor = prepare_shift_reference(stack[anchor])
 
-    def frames() -> Iterator[FloatArray]:
-        return iter_frames(stack[number] for number in order)
-
     # Most frames resemble the anchor: all are compared with it side by side, and the others one after the other.
-    against_anchor = [shift for _, shift in map_ahead(lambda f: measure_shift(f, at_anchor), frames(), threads)]
+    frames = iter_frames(map(stack.__getitem__, order))
+    against_anchor = [shift for _, shift in map_ahead(lambda f: measure_shift(f, at_anchor), frames, threads)]
     key, key_shift, last = at_anchor, shifts[anchor], anchor
-    for number, frame, against in zip(order, frames(), against_anchor, strict=True):
+    for number, frame, against in zip(order, iter_frames(map(stack.__getitem__, order)), against_anchor, strict=True):
         found = against if key is at_anchor else measure_shift(frame, key)
         if found is None:
             nearer = prepare_shift_reference(stack[last])

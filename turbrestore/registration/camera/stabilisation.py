@@ -50,7 +50,7 @@ def mean_stabilised(frames: ArrayLike, threads: int = 0) -> FloatArray:
     total = np.zeros(mean.shape)
     count = np.zeros(mean.shape[:2])
     numbers = list(poses) if poses else found.tolist()
-    for number, frame in zip(numbers, iter_frames(stack[number] for number in numbers), strict=True):
+    for number, frame in zip(numbers, iter_frames(map(stack.__getitem__, numbers)), strict=True):
         if poses:
             placed = _placed(frame, poses[number])
             seen = np.isfinite(placed if placed.ndim == 2 else placed[..., 0])
@@ -102,7 +102,7 @@ def _measure(
         whole = np.vstack([np.asarray(affine, np.float64), (0.0, 0.0, 1.0)])
         return _similarity(enlarged @ whole @ np.linalg.inv(enlarged), (height, width))
 
-    pairs = zip(iter_frames(stack[number] for number in numbers), shifts[np.asarray(numbers)], strict=True)
+    pairs = zip(iter_frames(map(stack.__getitem__, numbers)), shifts[np.asarray(numbers)], strict=True)
     measured = zip(numbers, map_ahead(pose, pairs, threads), strict=True)
     return {number: found for number, (_, found) in measured if found is not None}
 
