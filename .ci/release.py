@@ -86,8 +86,8 @@ def try_out(folder: Path, environment: Path | None, constraints: list, wheel: Pa
     replace = [*pip, "install", "--quiet", "--no-deps", "--force-reinstall"]
     if environment is None:
         venv.create(scripts.parent, with_pip=True)
-        install = [sys.executable, "-m", "uv", "pip", "install", "--quiet", "--python", scripts / "python"]
-        subprocess.run([*install, *constraints, f"{wheel}[report]"], check=True)
+        install = [sys.executable, "-m", "uv", "pip", "install", "--quiet", "--only-binary", ":all:"]
+        subprocess.run([*install, "--python", scripts / "python", *constraints, f"{wheel}[report]"], check=True)
     else:
         subprocess.run([*replace, wheel], check=True)
         subprocess.run([*pip, "check"], check=True)
