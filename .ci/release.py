@@ -57,7 +57,7 @@ def build(folder: Path, time: int) -> list[Path]:
     with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
         tar.extractall(source, filter="data")
     environment = {**os.environ, "SOURCE_DATE_EPOCH": str(time)}
-    words = [sys.executable, "-m", "build", "--outdir", str(made)]
+    words = [sys.executable, "-m", "build", "--installer", "uv", "--outdir", str(made)]
     subprocess.run([*words, "--sdist", str(source)], check=True, env=environment, stdout=subprocess.DEVNULL)
     (sdist,) = made.glob("*.tar.gz")
     settle(sdist, time)
@@ -86,7 +86,8 @@ def try_out(folder: Path, environment: Path | None, constraints: list, wheel: Pa
     replace = [*pip, "install", "--quiet", "--no-deps", "--force-reinstall"]
     if environment is None:
         venv.create(scripts.parent, with_pip=True)
-        subprocess.run([*pip, "install", "--quiet", *constraints, f"{wheel}[report]"], check=True)
+        install = [sys.executable, "-m", "uv", "pip", "install", "--quiet", "--only-binary", ":all:"]
+        subprocess.run([*install, "--python", scripts / "python", *constraints, f"{wheel}[report]"], check=True)
     else:
         subprocess.run([*replace, wheel], check=True)
         subprocess.run([*pip, "check"], check=True)

@@ -42,9 +42,10 @@ def test_the_newest_version_is_pinned_and_allowed():
 
 
 def test_both_are_installed_from_wheels_and_tested():
-    script = (ROOT / ".ci" / "run").read_text()
-    assert "export PIP_ONLY_BINARY=:all:" in script
+    run, test = ((ROOT / ".ci" / name).read_text() for name in ("run", "test"))
+    assert "export PIP_ONLY_BINARY=:all:" in run
+    assert "--only-binary :all: --no-binary turbrestore" in test
     for environment, constraints in ((".venv-ci", "constraints.txt"), (".venv-lowest", "constraints-lowest.txt")):
-        assert f".ci/test {environment} {constraints} --version" in script
+        assert f".ci/test {environment} {constraints} --version" in run
         tests = rf"(?m)^ *(\.ci/test {environment} {constraints}$|{environment}/bin/python -m pytest )"
-        assert re.search(tests, script)
+        assert re.search(tests, run)

@@ -330,10 +330,10 @@ def children(process):
     return [child for child in family if "spawn_main" in " ".join(child.cmdline())]
 
 
-def start(words):
-    """Start a batch with two processes; it has restored one clip when this returns."""
+def start(words, workers):
+    """Start a batch with so many processes; it has restored one clip when this returns."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "turbrestore_cli", *words, "--workers", "2"],
+        [sys.executable, "-m", "turbrestore_cli", *words, "--workers", str(workers)],
         stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     timer = threading.Timer(120, process.kill)
@@ -347,7 +347,7 @@ def start(words):
 def test_an_interrupted_batch_whose_processes_are_killed_loses_no_clip(clips, tmp_path):
     chosen = [str(clips / f"{number}.mkv") for number in range(3)]
     words = ["batch", *chosen, "--out", str(tmp_path / "out"), *QUICK]
-    process, timer = start(words)
+    process, timer = start(words, 2)
     family = children(process)
     assert len(family) == 2
     process.send_signal(signal.SIGINT)
@@ -357,7 +357,8 @@ def test_an_interrupted_batch_whose_processes_are_killed_loses_no_clip(clips, tm
     assert not any(child.is_running() for child in family)
     assert {row["state"] for row in rows(tmp_path / "out")} == {"done", "planned"}
 
-    process, timer = start([*words, "--resume"])
+    # Nobody else can do what the only process has begun.
+    process, timer = start([*words, "--resume"], 1)
     children(process)[0].kill()
     _, err = process.communicate()
     timer.cancel()
