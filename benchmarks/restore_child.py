@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
-import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -28,7 +26,7 @@ FLOW_FRAMES = 12
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:
-    """Restore a clip, or steady it; seconds of the clock and of the processor, MB, and seconds of every stage.
+    """Restore a clip, or steady it; seconds of the clock and of the processor, and those of every stage.
 
     The task names a file of 8-bit or float ``frames`` (.npy), and may ask for the ``count`` of frames, which are
     repeated in order, a ``preset``, ``threads``, frames to ``train`` and ``passes`` of the centroid, for a file of
@@ -54,10 +52,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
         if "images" in task:
             np.savez(Path(task["images"]), filtered=restoration.filtered.image, result=restoration.image)
     seconds, cpu = time.perf_counter() - begun, time.process_time() - worked
-    # Linux counts kilobytes, macOS bytes.
-    unit = 1024 if sys.platform != "darwin" else 1024 * 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-    figures: dict[str, Any] = {"seconds": seconds, "cpu": cpu, "peak": peak, "stages": stages}
+    figures: dict[str, Any] = {"seconds": seconds, "cpu": cpu, "stages": stages}
     if task.get("flow"):
         figures["flow"] = flow_alone(stored, runtime) * len(source)
     return figures
