@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
-import sys
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,40 +19,53 @@ import numpy as np
 
 import turbrestore as tr
 
+# Frames and side of what is restored first, so that all that is loaded, compiled and started once has been.
+WARM_FRAMES, WARM_SIDE = 24, 64
+# Frames by which flow alone is measured.
+FLOW_FRAMES = 12
+
 
 def run(task: dict[str, Any]) -> dict[str, Any]:
-    """Restore a clip.
+    """Restore a clip, or steady it; seconds of the clock and of the processor, and those of every stage.
 
     The task names a file of 8-bit or float ``frames`` (.npy), and may ask for the ``count`` of frames, which are
-    repeated in order, for ``train`` and ``passes`` of the centroid, for a file of ``images`` (.npz) to write, and for
-    the ``deconvolution`` by itself.
+    repeated in order, a ``preset``, ``threads``, frames to ``train`` and ``passes`` of the centroid, for a file of
+    ``images`` (.npz) to write, for the processor time of ``flow`` alone, or for a ``steady`` video.
     """
     stored = np.load(task["frames"])
     source = repeated(stored, task.get("count", len(stored)))
-    params = tr.RestoreParams(train=task.get("train"))
+    params, runtime = tr.preset(task.get("preset", "standard")), tr.Runtime(threads=task.get("threads", 0))
     if "passes" in task:
-        params = tr.RestoreParams(train=task.get("train"), centroid=tr.CentroidParams(iterations=task["passes"]))
-    # What is loaded, compiled and started once.
-    tr.restore(repeated(stored[:4, :32, :32], 4))
-    begun, worked = time.perf_counter(), time.process_time()
-    restoration = tr.restore(source, params)
-    # Linux counts kilobytes, macOS bytes.
-    unit = 1024 if sys.platform != "darwin" else 1024 * 1024
-    figures: dict[str, Any] = {
-        "seconds": time.perf_counter() - begun,
-        "cpu": time.process_time() - worked,
-        "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit,
-        "stages": restoration.seconds,
-        "calls": (len(restoration.centroid.mean_flow_sizes) - 1) * restoration.train
-        + params.filter.inner_iterations * len(source),
-    }
-    if task.get("deconvolution"):
-        begun = time.perf_counter()
-        tr.deconvolve(restoration.filtered.image, restoration.deconvolution.sigma, guide=restoration.centroid.image)
-        figures["deconvolution"] = time.perf_counter() - begun
-    if "images" in task:
-        np.savez(Path(task["images"]), filtered=restoration.filtered.image, result=restoration.image)
+        params = replace(params, centroid=tr.CentroidParams(iterations=task["passes"]))
+    small = stored[:WARM_FRAMES, :WARM_SIDE, :WARM_SIDE]
+    stages: dict[str, float] = {}
+    if task.get("steady"):
+        deque(tr.steady_frames(small / np.float32(255), runtime=runtime), 0)
+        begun, worked = time.perf_counter(), time.process_time()
+        deque(tr.steady_frames(source, runtime=runtime), 0)
+    else:
+        tr.restore(repeated(small, len(small)), params, runtime)
+        params = replace(params, train=task.get("train"))
+        begun, worked = time.perf_counter(), time.process_time()
+        restoration = tr.restore(source, params, runtime)
+        stages = dict(restoration.seconds)
+        if "images" in task:
+            np.savez(Path(task["images"]), filtered=restoration.filtered.image, result=restoration.image)
+    seconds, cpu = time.perf_counter() - begun, time.process_time() - worked
+    figures: dict[str, Any] = {"seconds": seconds, "cpu": cpu, "stages": stages}
+    if task.get("flow"):
+        figures["flow"] = flow_alone(stored, runtime) * len(source)
     return figures
+
+
+def flow_alone(stored: np.ndarray, runtime: tr.Runtime) -> float:
+    """Processor time of one bare call of dense inverse search for each frame, at full resolution, s a frame."""
+    frames = stored[:FLOW_FRAMES].astype(np.float32) / 255
+    bare = tr.FlowParams(contrast_window=0, global_shift=False, confidence=False)
+    tr.estimate_flow(frames[0], frames[:2], bare, runtime)
+    worked = time.process_time()
+    tr.estimate_flow(frames.mean(axis=0), frames, bare, runtime)
+    return (time.process_time() - worked) / len(frames)
 
 
 def repeated(stored: np.ndarray, count: int) -> Any:

@@ -1,68 +1,66 @@
-"""Time of whole restorations beside an earlier revision and beside optical flow alone, how it grows, and memory.
+"""Time of whole restorations beside an earlier revision and beside optical flow alone, and how it grows.
 
-    python benchmarks/speed.py --before 7b5207f --full --write benchmarks/results/speed.md
+    python benchmarks/speed.py --before 546a653 --full --write benchmarks/results/speed.md
 
-prints a Markdown document, writes it, and exits with 1 when a bound is broken.  Each figure comes from a process of its
-own, the revisions in turn, and the smallest of a few runs counts.  ``--before`` names a revision of this repository;
-without it only the present tree is measured.  ``--full`` adds 1,000 frames and frames of 1920×1080.
+prints a Markdown document, writes it, and exits with 1 when a bound is broken.  Time is processor time, which other
+programs on the machine change little.  Each figure comes from a process of its own, the revisions in turn, and ratios
+are medians of those of neighbouring runs.  ``--before`` names a revision of this repository; without it only the
+present tree is measured.  ``--full`` adds larger clips, frames of 1920×1080 and 3840×2160, and more runs.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import batch
 import numpy as np
+from provenance import publish
 from revisions import Figures, child, revision, take_two_cores
 
 from turbrestore.core.errors import TurbrestoreError
-from turbrestore.io.output import atomic_write
-from turbrestore.registration.flow import iterate_flows
-from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 CHILD = str(Path(__file__).with_name("restore_child.py"))
-# Against the earlier revision: a whole restoration, and the deconvolution by itself.
-WHOLE_BOUND, DECONVOLUTION_BOUND = 1.15, 1.4
-FRAMES_BOUND, PIXELS_BOUND, MEMORY_BOUND_MB, HELP_BOUND = 1.05, 1.1, 20.0, 6.0
-# What the exponents are fitted to: two passes of the centroid, and so many frames to train, whatever the clip.
-COUNTS, COUNTS_SIDE, SIDES, SIDES_COUNT = (500, 1000, 2000), 128, (128, 256, 384, 768), 60
-FEW, MANY, TRAINED = 260, 2060, 60
+# Against the standard preset of an earlier revision; the exponents; and help against an import of NumPy.
+WHOLE_BOUND, FRAMES_BOUND, PIXELS_BOUND, HELP_BOUND = 1.15, 1.05, 1.1, 6.0
+# What the exponents are fitted to: two passes of the centroid, and at most so many frames to train.
+COUNTS, COUNTS_SIDE, TRAINED = (12, 120, 500, 2000), 128, 60
+SIZES, FULL_SIZES, SIZES_COUNT = ((128, 128), (256, 256), (512, 512)), ((1080, 1920), (2160, 3840)), 12
+# Exponents leave out what is smaller: there most of the time is what is done once.
+FEWEST_FITTED, LEAST_PIXELS = 120, 256**2
+BATCH = (6, 48, 128)
 # Distinct frames of a clip; longer ones repeat them.
 DISTINCT = 60
-STAGES = ("centroid", "identify", "filter", "deconvolve")
+STAGES = ("centroid", "filter", "deconvolve")
+HELP = ("--help", "restore --help")
 
 
 @dataclass(frozen=True)
 class Clip:
     """A clip of a scene under smooth random motion; what is done once takes longer for a photograph than for a chart.
 
-    Attributes
-    ----------
-    count, height, width : int
-    scene : str
-    bound : bool
-        Whether the time has a bound.
-    runs : int
-        Runs of each revision.
+    ``runs`` of each revision and preset have ratios that hold a bound where there are more than one.
     """
 
     count: int
     height: int
     width: int
     scene: str = "chart"
-    bound: bool = False
-    runs: int = 3
+    runs: int = 1
+
+    def __str__(self) -> str:
+        return f"{self.count:,} × {self.width}×{self.height}"
 
     def write(self, folder: Path) -> Path:
         """Write the distinct frames, 8 bits, as a .npy file."""
-        count = min(self.count, DISTINCT, max(25, 2**24 // (self.height * self.width)))
+        count = min(self.count, DISTINCT, max(12, 2**24 // (self.height * self.width)))
         path = folder / f"{self.scene}_{count}_{self.height}_{self.width}.npy"
         if not path.exists():
             rng, image = np.random.default_rng(0), SCENES[self.scene](self.height, self.width)
@@ -71,24 +69,26 @@ class Clip:
             np.save(path, np.stack([np.rint(frame * 255).clip(0, 255).astype(np.uint8) for frame in moved]))
         return path
 
+    def measure(self, folder: Path, tree: Path | None = None, **task: object) -> Figures:
+        """Restore the clip in a process of its own."""
+        return child(CHILD, {"frames": str(self.write(folder)), "count": self.count, **task}, tree)
 
-ROWS = (
-    Clip(50, 128, 128),
-    Clip(120, 256, 256, bound=True, runs=5),
-    Clip(300, 256, 256),
-    Clip(200, 512, 512, runs=1),
-)
+
+ROWS = (Clip(50, 128, 128), Clip(120, 256, 256, runs=3))
 FULL_ROWS = (
-    Clip(1000, 256, 256, runs=1),
-    Clip(25, 1080, 1920, bound=True, runs=2),
-    Clip(25, 1080, 1920, "camera", bound=True, runs=2),
+    Clip(50, 128, 128),
+    Clip(120, 256, 256, runs=5),
+    Clip(120, 256, 256, "camera"),
+    Clip(1000, 256, 256),
+    Clip(25, 1080, 1920, runs=5),
+    Clip(25, 1080, 1920, "camera"),
 )
 
 
 def main() -> int:
     """Print the document; 1 when a bound is broken."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="1,000 frames and 1920×1080 as well")
+    parser.add_argument("--full", action="store_true", help="larger clips, and more runs")
     parser.add_argument("--before", metavar="REVISION", help="measure this revision beside the present tree")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
     options = parser.parse_args()
@@ -99,9 +99,7 @@ def main() -> int:
     except TurbrestoreError as error:
         print(f"speed: {error}", file=sys.stderr)
         return error.exit_code
-    print(text, end="")
-    if options.write is not None:
-        atomic_write(options.write, text.encode(), overwrite=True)
+    publish(text, options.write)
     for line in broken:
         print(f"speed: {line}", file=sys.stderr)
     return int(bool(broken))
@@ -111,19 +109,21 @@ def document(full: bool, before: str | None, tree: Path | None, folder: Path) ->
     """Markdown of the tables, and the bounds that are broken."""
     broken: list[str] = []
     command = f"python benchmarks/speed.py{' --full' if full else ''}{f' --before {before}' if before else ''}"
+    beside = f"; *before* is the preset `standard` of revision {before}" if before else ""
     lines = [
         "# Speed\n",
-        f"What `{command} --write benchmarks/results/speed.md` measures: scenes under smooth random motion, two cores, "
-        f"{_machine()}.  It ends with 1 where a bound is broken.\n",
+        f"What `{command} --write benchmarks/results/speed.md` measures: processor time, s, of clips in memory under "
+        "smooth random motion, on two cores.  It ends with 1 where a bound is broken.\n",
         "## Restorations\n",
-        "Seconds of a whole restoration with the default settings, smallest of a few runs, and of its optical flow "
-        "alone, each call without a start from an earlier flow. Frames are in memory, so nothing is decoded.\n",
-        *_time_table((*ROWS, *FULL_ROWS) if full else ROWS, tree, folder, broken),
+        "Whole restorations, medians of the runs; *flow alone* is one bare call of dense inverse search for each frame "
+        f"at full resolution, without which nothing can be done{beside}.\n",
+        *_restorations(FULL_ROWS if full else ROWS, tree, folder, broken),
         "\n## Growth\n",
-        f"Exponent of the time of a restoration, with two passes of the centroid and {TRAINED} frames to train.\n",
-        *_growth_table(folder, broken),
-        "\n## Memory\n",
-        *_memory_lines(folder, broken),
+        f"Restorations with two passes of the centroid and at most {TRAINED} frames to train. Exponents leave out the "
+        "smallest clips, where most of the time is what is done once.\n",
+        *_growth(full, folder, broken),
+        "\n## Cores, videos and batches\n",
+        *_others(folder, broken),
         *_help_lines(broken),
     ]
     if broken:
@@ -131,114 +131,101 @@ def document(full: bool, before: str | None, tree: Path | None, folder: Path) ->
     return "\n".join(lines) + "\n", broken
 
 
-def _time_table(rows: tuple[Clip, ...], tree: Path | None, folder: Path, broken: list[str]) -> list[str]:
-    names = ["frames", "size", "scene"]
-    names += ["before, s", "now / before", "CPU", "deconvolution alone"] if tree else []
-    names += ["now, s", "flow alone, s", "ratio", *(f"{stage}, s" for stage in STAGES), "peak, MB"]
-    lines = [f"| {' | '.join(names)} |", f"|{'---:|' * len(names)}"]
+def _restorations(rows: tuple[Clip, ...], tree: Path | None, folder: Path, broken: list[str]) -> list[str]:
+    names = ["clip", "scene", "preset", "runs", *(["before, s", "now / before"] if tree else [])]
+    names += ["now, s", "flow alone, s", "times flow alone", *(f"{stage}, % of wall" for stage in STAGES)]
+    lines = [f"| {' | '.join(names)} |", f"|---|---|---|{'---:|' * (len(names) - 3)}"]
     for clip in rows:
-        path = clip.write(folder)
-        task = {"frames": str(path), "count": clip.count, "deconvolution": True}
-        old, new = list[Figures](), list[Figures]()
+        runs: dict[str, list[Figures]] = {"before": [], "standard": [], "fast": []}
         for _ in range(clip.runs):
-            old += [child(CHILD, task, tree)] if tree else []
-            new.append(child(CHILD, task))
-        best = min(new, key=lambda found: found["seconds"])
-        flow = _flow_seconds(np.load(path)) * best["calls"]
-        cells = [f"{clip.count:,}", f"{clip.width}×{clip.height}", clip.scene]
-        if old:
-            cells.append(f"{_least(old, 'seconds'):.2f}")
-            whole, work, alone = (_least(new, name) / _least(old, name) for name in ("seconds", "cpu", "deconvolution"))
-            cells += [f"{whole:.2f}", f"{work:.2f}", f"{alone:.2f}"]
-            name = f"{clip.count} frames of {clip.width}×{clip.height}, {clip.scene}"
-            if clip.bound and whole > WHOLE_BOUND:
-                broken.append(f"{name}: {whole:.3f} times the time before, bound {WHOLE_BOUND}")
-            if clip.bound and alone > DECONVOLUTION_BOUND:
-                broken.append(f"{name}: deconvolution {alone:.2f} times, bound {DECONVOLUTION_BOUND}")
-        cells += [f"{best['seconds']:.2f}", f"{flow:.2f}", f"{best['seconds'] / flow:.2f}"]
-        cells += [*(f"{best['stages'].get(stage, 0.0):.2f}" for stage in STAGES), f"{best['peak']:,.0f}"]
-        lines.append(f"| {' | '.join(cells)} |")
+            if tree:
+                runs["before"].append(clip.measure(folder, tree))
+            for preset in ("standard", "fast"):
+                runs[preset].append(clip.measure(folder, preset=preset, flow=True))
+        for preset in ("standard", "fast"):
+            lines.append(_restoration(clip, preset, runs["before"], runs[preset], broken))
     return lines
 
 
-def _least(runs: list[Figures], name: str) -> float:
-    return float(min(run[name] for run in runs))
+def _restoration(clip: Clip, preset: str, old: list[Figures], new: list[Figures], broken: list[str]) -> str:
+    cells = [str(clip), clip.scene, preset, str(clip.runs)]
+    if old:
+        ratio = float(np.median([now["cpu"] / was["cpu"] for was, now in zip(old, new, strict=True)]))
+        cells += [f"{_median(old, 'cpu'):.2f}", f"{ratio:.2f}"]
+        if clip.runs > 1 and ratio > WHOLE_BOUND:
+            broken.append(f"{clip}, {clip.scene}, {preset}: {ratio:.2f} times the time before, bound {WHOLE_BOUND}")
+    cpu, flow = _median(new, "cpu"), _median(new, "flow")
+    cells += [f"{cpu:.2f}", f"{flow:.2f}", f"{cpu / flow:.2f}"]
+    for stage in STAGES:
+        cells.append(f"{100 * np.median([run['stages'].get(stage, 0.0) / run['seconds'] for run in new]):.0f}")
+    return f"| {' | '.join(cells)} |"
 
 
-def _flow_seconds(stored: np.ndarray) -> float:
-    """Wall time of one flow, two frames at a time."""
-    frames = stored[:25].astype(np.float32) / 255
-    begun = time.perf_counter()
-    for _ in iterate_flows(frames.mean(axis=0), frames, runtime=Runtime(threads=2)):
-        pass
-    return (time.perf_counter() - begun) / len(frames)
+def _median(runs: list[Figures], name: str) -> float:
+    return float(np.median([run[name] for run in runs]))
 
 
-def _growth_table(folder: Path, broken: list[str]) -> list[str]:
-    lines = ["| against | exponent | bound |", "|---|---:|---:|"]
-    for name, clips, bound in (
-        (
-            f"frames: {', '.join(map(str, COUNTS))} of {COUNTS_SIDE}×{COUNTS_SIDE}",
-            [Clip(count, COUNTS_SIDE, COUNTS_SIDE) for count in COUNTS],
-            FRAMES_BOUND,
-        ),
-        (
-            f"pixels: {SIDES_COUNT} frames of side {', '.join(map(str, SIDES))}",
-            [Clip(SIDES_COUNT, side, side) for side in SIDES],
-            PIXELS_BOUND,
-        ),
-    ):
-        seconds = [_growth(clip, folder)["seconds"] for clip in clips]
+def _growth(full: bool, folder: Path, broken: list[str]) -> list[str]:
+    by_frames = [Clip(count, COUNTS_SIDE, COUNTS_SIDE) for count in COUNTS]
+    by_pixels = [Clip(SIZES_COUNT, *size) for size in (*SIZES, *(FULL_SIZES if full else ()))]
+    lines = ["| clip | CPU, s | µs a pixel of a frame |", "|---|---:|---:|"]
+    measured: dict[Clip, float] = {}
+    for clip in dict.fromkeys((*by_frames, *by_pixels)):
+        found = clip.measure(folder, train=min(TRAINED, clip.count), passes=2)
+        measured[clip] = found["cpu"]
+        a_pixel = 1e6 * found["cpu"] / (clip.count * clip.height * clip.width)
+        lines.append(f"| {clip} | {found['cpu']:.2f} | {a_pixel:.2f} |")
+    fitted = [clip for clip in by_frames if clip.count >= FEWEST_FITTED]
+    exponents = []
+    large = [clip for clip in by_pixels if clip.height * clip.width >= LEAST_PIXELS]
+    for name, clips, bound in (("frames", fitted, FRAMES_BOUND), ("pixels", large, PIXELS_BOUND)):
         sizes = [clip.count * clip.height * clip.width for clip in clips]
-        found = float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
-        if found > bound:
-            broken.append(f"exponent against {name}: {found:.2f}, bound {bound}")
-        lines.append(f"| {name} | {found:.2f} | {bound} |")
-    return lines
+        exponent = float(np.polyfit(np.log(sizes), np.log([measured[clip] for clip in clips]), 1)[0])
+        if exponent > bound:
+            broken.append(f"exponent of the time against {name}: {exponent:.2f}, bound {bound}")
+        exponents.append(f"Exponent of the time against {name}: {exponent:.2f}, bound {bound}.")
+    return [*lines, "", *exponents]
 
 
-def _growth(clip: Clip, folder: Path) -> Figures:
-    task = {"frames": str(clip.write(folder)), "count": clip.count, "train": TRAINED, "passes": 2}
-    return child(CHILD, task)
-
-
-def _memory_lines(folder: Path, broken: list[str]) -> list[str]:
-    few, many = (_growth(Clip(count, COUNTS_SIDE, COUNTS_SIDE), folder)["peak"] for count in (FEW, MANY))
-    if many - few > MEMORY_BOUND_MB:
-        broken.append(f"memory grows by {many - few:.1f} MB, bound {MEMORY_BOUND_MB}")
+def _others(folder: Path, broken: list[str]) -> list[str]:
+    """One thread and two, a steadied video, and a batch."""
+    clip = Clip(120, 256, 256)
+    one, two = (clip.measure(folder, threads=threads) for threads in (1, 2))
+    steady = Clip(DISTINCT, 256, 256)
+    video = steady.measure(folder, steady=True)
+    clips, frames, side = BATCH
+    taken = batch.measure(*BATCH)
+    if not taken.same:
+        broken.append("a batch gives other images than single runs")
     return [
-        f"A process that restores {FEW:,} frames of {COUNTS_SIDE}×{COUNTS_SIDE} peaks at {few:.0f} MB, and at "
-        f"{many:.0f} MB for {MANY:,}; bound {MEMORY_BOUND_MB:.0f} MB more."
+        f"- {clip} takes {one['cpu']:.2f} s of processor time on one thread and {two['cpu']:.2f} s on two, "
+        f"{two['cpu'] / one['cpu']:.2f} times as much; by the clock {two['seconds'] / one['seconds']:.2f} times, which "
+        "is 0.5 at best, and more where other programs run.",
+        f"- A steadied video of {steady} takes {1000 * video['cpu'] / steady.count:.0f} ms a frame.",
+        f"- {clips} clips of {frames} × {side}×{side} take {taken.batch_cpu:.1f} s as a batch, the start of its "
+        f"processes included, and {taken.single_cpu:.1f} s one after the other in one process; the images are "
+        f"{'the same' if taken.same else 'NOT the same'}.",
     ]
 
 
 def _help_lines(broken: list[str]) -> list[str]:
-    """Compare ``turbrestore --help`` with starting Python and importing NumPy, by the median of nine pairs."""
+    """Compare ``turbrestore --help`` with starting Python and importing NumPy, by the median of five pairs."""
 
     def seconds(code: str) -> float:
-        begun = time.perf_counter()
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=True)
-        return time.perf_counter() - begun
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
-    pairs = [
-        (seconds("from turbrestore_cli.__main__ import main; main(['--help'])"), seconds("import numpy"))
-        for _ in range(9)
-    ]
-    ratio = float(np.median([a / b for a, b in pairs]))
-    if ratio > HELP_BOUND:
-        broken.append(f"--help takes {ratio:.1f} times as long as importing NumPy, bound {HELP_BOUND}")
-    taken = float(np.median([a for a, _ in pairs]))
-    return [
-        f"\n`turbrestore --help` takes {taken:.2f} s, {ratio:.1f} times as long as Python with NumPy takes to start; "
-        f"bound {HELP_BOUND:.0f}."
-    ]
-
-
-def _machine() -> str:
-    models = Path("/proc/cpuinfo")
-    text = models.read_text() if models.is_file() else ""
-    names = [line.split(":")[1].strip() for line in text.splitlines() if line.startswith("model name")]
-    return names[0] if names else sys.platform
+    calls = {name: f"from turbrestore_cli.__main__ import main; main({name.split()!r})" for name in HELP}
+    runs = [(seconds("import numpy"), *map(seconds, calls.values())) for _ in range(5)]
+    lines = []
+    for number, name in enumerate(calls, 1):
+        taken, ratio = np.median([(run[number], run[number] / run[0]) for run in runs], axis=0)
+        lines.append(f"- `turbrestore {name}` takes {taken:.2f} s, {ratio:.1f} times as long as an import of NumPy.")
+        if name == HELP[0] and ratio > HELP_BOUND:
+            broken.append(f"{name} takes {ratio:.1f} times as long as importing NumPy, bound {HELP_BOUND}")
+    return lines
 
 
 if __name__ == "__main__":

@@ -149,9 +149,13 @@ def _median_and_spread(
 
     def fill(top: int) -> None:
         rows = np.s_[top : top + _ROWS]
-        values = stack[:, rows].astype(np.float32)
-        centre[rows] = np.median(values, axis=0)
-        spread[rows] = (_MEDIAN_DEVIATION * np.median(np.abs(values - centre[rows]), axis=0)) ** 2
+        # With the values of a pixel side by side, sorting them takes a fifth of the time of a median over the frames.
+        values = np.ascontiguousarray(np.moveaxis(stack[:, rows], 0, -1), np.float32)
+        values.sort(axis=-1)
+        centre[rows] = _middle(values)
+        values -= centre[rows, :, None]
+        np.abs(values, out=values).sort(axis=-1)
+        spread[rows] = (_MEDIAN_DEVIATION * _middle(values)) ** 2
 
     for _ in map_ahead(fill, range(0, shape[0], _ROWS), threads):
         pass
@@ -161,6 +165,12 @@ def _median_and_spread(
         # Light that has changed is no noise.
         cv2.accumulateSquare(difference - smooth(difference, LEVEL_WINDOW, _OPS), fine)
     return centre, spread, fine / max(len(stack) - 1, 1)
+
+
+def _middle(ordered: FloatArray) -> FloatArray:
+    """Median of sorted values along the last axis."""
+    count = ordered.shape[-1]
+    return (ordered[..., (count - 1) // 2] + ordered[..., count // 2]) / np.float32(2)
 
 
 def _robust_start(

@@ -256,9 +256,12 @@ def _usual(
 
 def _median(values: FloatArray) -> FloatArray:
     """Median over the first axis of what is not NaN; 0 where all is."""
-    count, ordered = np.isfinite(values).sum(axis=0), np.sort(values, axis=0)
+    # Values side by side are sorted in a fraction of the time.
+    ordered = np.sort(np.ascontiguousarray(np.moveaxis(values, 0, -1)), axis=-1)
+    count = np.isfinite(ordered).sum(axis=-1)
     middle = (np.maximum(count - 1, 0) // 2, np.maximum(count, 1) // 2)
-    low, high = (np.take_along_axis(ordered, np.minimum(index, len(values) - 1)[None], 0)[0] for index in middle)
+    places = (np.minimum(index, len(values) - 1)[..., None] for index in middle)
+    low, high = (np.take_along_axis(ordered, place, -1)[..., 0] for place in places)
     return np.nan_to_num((low + high) / 2)
 
 

@@ -24,7 +24,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
-from ...registration.warp import warp
+from ...registration.warp import sample_splines, spline_planes
 from ...runtime.scratch import drop_pages
 
 Float64Array = NDArray[np.float64]
@@ -96,10 +96,10 @@ def measure_variation(frames: FloatArray, flows: FloatArray, reduction: int = 1)
             if found is None:
                 continue
             plane, flow = found
-            spectra.append(_spectrum(warp(plane, flow)))
+            spectra.append(_spectrum(_warped(plane, flow)))
             if count % every == 0:
                 white = rng.standard_normal(plane.shape).astype(np.float32)
-                noise.append(_spectrum(warp(white, flow)))
+                noise.append(_spectrum(_warped(white, flow)))
                 stretches.append(_mean_square_derivative(flow))
         if len(spectra) >= _FEWEST and noise:
             sums.append(_sums(np.array(spectra)))
@@ -152,7 +152,7 @@ def _around(
     The place of the part takes the whole pixels of the mean flow, which a camera may add.  None beyond the frame.
     """
     moved = _reduced(flow, top, left, SIDE, factor) / np.float32(factor)
-    whole = np.rint(moved.mean(axis=(0, 1)))
+    whole = np.rint(cv2.mean(moved)[:2])
     row, column = top + int(whole[1]), left + int(whole[0])
     ends = ((row, frame.shape[0]), (column, frame.shape[1]))
     if any(start < _BORDER or (start + SIDE + _BORDER) * factor > length for start, length in ends):
@@ -160,13 +160,24 @@ def _around(
     return luminance(_reduced(frame, row, column, SIDE, factor)), moved - whole.astype(np.float32)
 
 
+def _warped(plane: FloatArray, flow: FloatArray) -> FloatArray:
+    """Warp a part of a frame, which has been checked as a whole."""
+    return sample_splines(spline_planes(plane), flow)
+
+
 def _spectrum(plane: FloatArray) -> NDArray[np.complex64]:
     return scipy.fft.fft2(_windowed(plane[_BORDER:-_BORDER, _BORDER:-_BORDER]))
 
 
 def _windowed(part: FloatArray) -> FloatArray:
+    return (part - part.mean()) * _profile()
+
+
+@functools.cache
+def _profile() -> FloatArray:
+    """Weights of a window, which fall to zero beyond it."""
     profile = np.hanning(SIDE + 2)[1:-1].astype(np.float32)
-    return (part - part.mean()) * np.outer(profile, profile)
+    return np.outer(profile, profile)
 
 
 @functools.cache
