@@ -18,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 from clips import Clip, find_clips
-from provenance import publish
+from provenance import arguments, publish
 
 from turbrestore.blur.estimation import estimate_blur
 from turbrestore.blur.psf import GAUSSIAN
@@ -120,8 +120,8 @@ def document(rows: dict[str, Row]) -> str:
     variants = ["default", *VARIANTS, *DEBLURRED, "Gaussian blur", "not deblurred"]
     lines = [
         "# Ablation\n",
-        "What `TURBRESTORE_DATA=DIR python benchmarks/ablation.py --write benchmarks/results/ablation.md` measures, on "
-        "the clips of `benchmarks/quality.py` that have a truth.\n",
+        f"What `TURBRESTORE_DATA=DIR python benchmarks/ablation.py{arguments()}` measures, on clips of "
+        "`benchmarks/quality.py` that have a truth.\n",
         "## What each choice is worth\n",
         "PSNR, dB, of the default, and the change when one choice is changed: negative where the default is "
         "better.  TV and Wiener use the width that the default removes; 'Gaussian blur' estimates and removes a "

@@ -11,6 +11,7 @@ import io
 import os
 import platform
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -43,6 +44,8 @@ def publish_printed(head: str, main: Callable[[], int | None]) -> int:
     with redirect_stdout(printed):
         code = main()
     if options.write is not None:
+        # The command that a head names is the one that was called.
+        head = re.sub(r"(?<=python benchmarks/)(\w+\.py)(?=`)", rf"\1{arguments()}", head)
         atomic_write(options.write, with_origin(f"{head}\n\n{printed.getvalue()}").encode(), overwrite=True)
     return code or 0
 
@@ -78,6 +81,15 @@ def revision() -> str:
     """Last commit of the code, with ``+`` where it has been changed since, or ``unknown`` without git."""
     found = _git("log", "-1", "--format=%h", "--", *CODE)
     return found + "+" * bool(_git("status", "--porcelain", "--", *CODE)) if found else "unknown"
+
+
+def arguments() -> str:
+    """Words of the command line behind a space each, without ``--write FILE``."""
+    words = sys.argv[1:]
+    if "--write" in words:
+        place = words.index("--write")
+        words = words[:place] + words[place + 2 :]
+    return "".join(f" {shlex.quote(word)}" for word in words)
 
 
 def machine() -> str:

@@ -46,7 +46,7 @@ HELP = ("--help", "restore --help")
 class Clip:
     """A clip of a scene under smooth random motion; what is done once takes longer for a photograph than for a chart.
 
-    ``runs`` of each revision and preset have ratios that hold a bound where there are more than one.
+    Each revision and preset is run ``runs`` times; only with more than one run do the ratios have to hold a bound.
     """
 
     count: int

@@ -92,8 +92,12 @@ def methods() -> str:
     ended = sum(
         "–" not in [row.get(name) for name in METHODS if drawn.get(name, {}).get(_MEAN) != "–"] for row in reported
     )
-    said = f"Means are over the {ended} clips on which every method ended. " if ended < len(reported) else ""
-    said += f"Another method is ahead in PSNR on {len(lost)} of {len(reported)} clips"
+    said = (
+        f"PSNR and similarity are over the {ended} of {len(reported)} clips on which every method ended. "
+        if ended < len(reported)
+        else ""
+    )
+    said += f"Another method is ahead in PSNR on {len(lost)} of all {len(reported)} clips"
     said += f", by up to {max(lost):.1f} dB." if lost else "."
     return "\n".join([*lines, "", said, ""])
 

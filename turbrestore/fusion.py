@@ -52,7 +52,7 @@ from .tiled_stages import (
     run_filter_task,
     tile_filter_steps,
 )
-from .uncertainty.pixel_deviation import saturation_level
+from .uncertainty.pixel_deviation import SATURATED, saturation_level
 from .wording import (
     explain_dynamics,
     explain_filter,
@@ -65,8 +65,6 @@ from .wording import (
 
 # Files of floating point are taken for those of 16 bits.
 _MOST_BITS = 16
-# Intensity from which a pixel is saturated: half a grey level of 8 bits below full scale.
-_SATURATED = 1 - 0.5 / 255
 # Least standard deviation of ln V by a measured D/r0: theory and simulated clips agree no better.
 _LEAST_SPREAD = 0.2
 
@@ -187,7 +185,7 @@ def _read_training(
     for place in training:
         # In a loop over the stream, one frame would stay in memory while the next is made.
         place[...] = next(stream)
-        saturated += float(np.mean(place >= _SATURATED)) / len(training)
+        saturated += float(np.mean(place >= SATURATED)) / len(training)
         brightest = max(brightest, float(place.max()))
         drop_pages(training)
     return training, saturated, brightest

@@ -239,7 +239,7 @@ def _measure_uncertainty(
     if fused.is_mean:
         return np.full(image.shape[:2], np.inf, np.float32)
     begun = time.perf_counter()
-    # A pixel is known if a frame has shown it and no channel is saturated in all of them.
+    # A pixel is known if a frame has shown it and no channel is saturated in every frame.
     known = (seen > 0) & (np.atleast_3d(fused.mean).max(axis=-1) < fused.saturation)
     if run.prepared.hidden is not None:
         known &= ~run.prepared.hidden

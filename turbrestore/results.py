@@ -142,8 +142,8 @@ class Restoration:
     finer : ndarray, float32, shape (s·H, s·W) or (s·H, s·W, 3), or None
         The image on a grid that is ``RestoreParams.scale`` times as fine; None where that is 1.
     disagreement : ndarray, float32, shape (H, W), or None
-        Share, 0 to 1, of the mean of the registered frames in the detail of the image, because they do not agree on it;
-        None unless the image was deblurred.
+        Share, 0 to 1, of the mean of the registered frames in the image: where they do not agree on its detail or
+        colour, and in flat parts that ring or are noisy; None unless the image was deblurred.
     """
 
     image: FloatArray

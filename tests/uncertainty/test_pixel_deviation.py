@@ -102,6 +102,16 @@ def test_deviation_of_a_restoration_ranks_and_bounds_its_error(clip, tmp_path):
     assert turbrestore.restore(frames, turbrestore.RestoreParams(until="identify")).uncertainty is None
 
 
+def test_what_no_frame_shows_is_unknown(clip, tmp_path):
+    scene, frames = clip
+    # In this geometry the first six columns are beyond the frames.
+    write_image(tmp_path / "reference.png", np.roll(scene, 6, axis=1), 8)
+    params = turbrestore.RestoreParams(reference=str(tmp_path / "reference.png"))
+    unknown = np.isinf(turbrestore.restore(frames[:8, :], params).uncertainty)
+    assert unknown[8:-8, :4].mean() > 0.9
+    assert unknown[8:30, 12:-8].mean() < 0.05
+
+
 def deviation_of(frames, **deconvolution):
     params = turbrestore.RestoreParams(deconvolution=DeconvolutionParams(method="wiener", **deconvolution))
     found = turbrestore.restore(FrameSource.from_array(np.rint(65535 * frames).astype(np.uint16)), params)

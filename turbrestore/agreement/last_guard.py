@@ -53,7 +53,7 @@ _LEAST_TINT, _TINT = 1 / 255, 2 / 255
 # Rows that are worked on at once, and those around that count: the Gaussians of all bands and of the widest window.
 _ROWS, _AROUND = 256, 128
 # Bytes a pixel, and a pixel and channel, of these rows.
-_BYTES, _CHANNEL_BYTES = 64, 40
+_BYTES, _CHANNEL_BYTES = 70, 50
 # Least g, and the share of the image that has it, that is worth a remark.
 _CLEAR, _REMARKED = 0.5, 0.15
 
@@ -148,7 +148,7 @@ def _agreed(result: FloatArray, first_half: FloatArray, second_half: FloatArray)
 
 
 def _flat_parts(first: FloatArray, second: FloatArray, mean: FloatArray, result: FloatArray) -> FloatArray:
-    """Return the share of the mean in every pixel of a flat part, for one that any flat window of noise holds."""
+    """Return g of flat parts: of each pixel the largest g of the small windows that hold it, with a soft edge."""
     side = (_FLAT, _FLAT)
 
     def covariance(one: FloatArray, other: FloatArray) -> FloatArray:

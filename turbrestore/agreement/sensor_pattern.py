@@ -41,9 +41,9 @@ _EDGE, _LEAST_MOTION = 8.0, 0.3
 _PARTS, _ALIKE, _LARGEST = 3, 0.5, 0.04
 # Share of the height of a warm pixel over the median around by which it exceeds each neighbour; most that are warm.
 _ALONE, _MOST_WARM = 0.7, 0.005
-# Deviation of what is drawn over the noise, in units of it, and reach of its strokes, pixels: beside a digit that
-# stands there may be one that changes.
-_DRAWN, _STROKE = 0.25, 12
+# Deviation of what is drawn over the noise, in units of it, and pixels around it in which no pixel is warm: strokes,
+# and a digit beside that changes.
+_DRAWN, _AROUND_DRAWN = 0.25, 12
 # A dead column varies less than this share of the noise and of the columns around; dead ones are few, and told
 # from others where there is noise of some size.
 _DEAD, _AROUND, _MOST_DEAD, _LEAST_NOISE = 0.3, 9, 0.05, 1 / 1020
@@ -163,7 +163,7 @@ def _warm(mean: FloatArray, variance: FloatArray, noise: float, motion: float) -
     smooth = cv2.medianBlur(mean, 3)
     slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) / 8
     drawn = (variance < (_DRAWN * noise) ** 2) & (slope > _EDGE * noise)
-    warm &= cv2.dilate(drawn.astype(np.uint8), np.ones((2 * _STROKE + 1,) * 2, np.uint8)) == 0
+    warm &= cv2.dilate(drawn.astype(np.uint8), np.ones((2 * _AROUND_DRAWN + 1,) * 2, np.uint8)) == 0
     return warm if warm.mean() <= _MOST_WARM else np.zeros_like(warm)
 
 

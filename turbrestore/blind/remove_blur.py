@@ -169,13 +169,10 @@ def tiled_deconvolution_steps(
     tiles: tuple[HaloTile, ...] = (),
     photons: NoiseCurve | None = None,
 ) -> Generator[DeconvolutionState, None, Deconvolution]:
-    """Deconvolve an image in overlapping tiles, where the whole would take too much memory.
+    """Deconvolve an image (H, W) or (H, W, 3) in overlapping tiles, by the blur and the fidelity λ of the whole.
 
-    Width and shape of the blur and the fidelity λ are those of the whole image.  Each tile is deconvolved as an image
-    of its own and faded into its neighbours (:mod:`turbrestore.runtime.tiling`).  The halo of 96 pixels is much wider
-    than a blur, so the result is close to that of the whole image, but not the same: nonlocal weights and the end of
-    the iterations are decided tile by tile, and with a periodic boundary each tile is periodic.
-    ``image`` (H, W) or (H, W, 3); ``sigma`` may be a PSF (h, w); ``guide`` (H, W) or (H, W, 3).
+    The weights, the end of the iterations and a periodic boundary are those of each tile, so the result differs a bit
+    from that of the whole image.  ``sigma`` may be a PSF (h, w); ``guide`` (H, W) or (H, W, 3).
     """
     pixels = check_image(image)
     around = None if guide is None else check_image(guide, "guide")

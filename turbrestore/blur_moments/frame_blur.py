@@ -163,7 +163,7 @@ def _refit(
 def _blur_of_tiles(
     power: FloatArray, spectrum: Float64Array, misfit: Float64Array, design: Float64Array, fit: _Fit
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """S of the frames in some tiles, its deviation, and its best estimate above the sharpest frame; (T, tiles)."""
+    """Values s of the frames in some tiles, their deviation, and the best estimate above the sharpest; (T, tiles)."""
     s, gathered, squared = _fit_frames(power, spectrum, misfit, design, fit)
     s = s - s.mean(axis=0)
     # The deviation of s from the information in the rings and the mean squared residual of each.

@@ -166,7 +166,7 @@ def mean_flow_error(dynamics: FlowDynamics, count: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ProjectedFlow:
-    """A measured flow, as far as the update of the state needs it."""
+    """A measured flow, reduced to what the update of the state needs."""
 
     state: Float64Array  # (n,): z
     squared: float  # sum of squares of W^meas − W̄, squared pixels

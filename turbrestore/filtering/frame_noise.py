@@ -101,7 +101,7 @@ def register_frame(
 
 
 def warp_frame(image: FloatArray, flow: Stack, ops: StackOps) -> Warped:
-    """Warp a frame, a NumPy array, by a flow on the device, in NumPy and OpenCV or in torch.
+    """Warp a frame, a NumPy array, by a flow that is on the device already: by OpenCV, or by torch.
 
     ``image`` (H, W) or (H, W, 3); ``flow`` (H, W, 2).
     """

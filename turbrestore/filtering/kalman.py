@@ -319,7 +319,10 @@ class PixelGaussian:
 
 
 def first_states(image: FloatArray, variance: float, dynamics: FlowDynamics) -> tuple[PixelGaussian, Gaussian]:
-    """ρ̂, Σ and ξ̂, P before the first frame: an image (H, W) or (H, W, 3), and the states of the training flows."""
+    """ρ̂, Σ and ξ̂, P before the first frame: an image (H, W) or (H, W, 3) of one variance, and the state 0.
+
+    The covariance P is that of the training states.
+    """
     pixels, covariance = np.full(image.shape[:2], variance, np.float32), dynamics.state_covariance
     return PixelGaussian(image, pixels), Gaussian(np.zeros(len(covariance)), covariance)
 

@@ -112,7 +112,8 @@ def open_frames(
     source = source if bayer is None else as_bayer(source, bayer)
     source = source.select(frames, roi)
     source = source.without(source.damaged, f"checksum fails: {numbers_text(source.damaged)} left out")
-    # The reader of a container has decoded a frame, and no frame of a video is beyond full scale.
+    # Only the reader of a container sets a colour.  It has decoded the first frame of the file, and no frame of a video
+    # is beyond full scale.
     if source.colour is None:
         _check_first(source)
     return source

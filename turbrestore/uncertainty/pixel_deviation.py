@@ -51,7 +51,7 @@ from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
 
 # Full scale, less half a grey level of 8 bits.
-_SATURATED = 1 - 0.5 / 255
+SATURATED = 1 - 0.5 / 255
 # Window in which the squared gradient is averaged, pixels.
 _WINDOW = 1.5
 # Share of R that is error, and the window in which R is averaged, pixels.
@@ -157,4 +157,4 @@ def saturation_level(brightest: float, noise: float, step: float) -> float:
     A camera of 12 bits saturates far below the full scale of a file of 16. A pixel that has the largest intensity of
     the clip in every frame is saturated if the frames are noisy, and else may be a white part of the scene.
     """
-    return min(_SATURATED, brightest - step / 2) if noise >= step else _SATURATED
+    return min(SATURATED, brightest - step / 2) if noise >= step else SATURATED

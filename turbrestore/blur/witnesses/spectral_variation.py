@@ -24,7 +24,8 @@ import scipy
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
-from ...registration.warp import sample_splines, spline_planes
+from ...registration.warp import sample_splines
+from ...runtime.image_stacks import spline_planes
 from ...runtime.scratch import drop_pages
 
 Float64Array = NDArray[np.float64]
