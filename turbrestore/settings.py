@@ -176,9 +176,9 @@ class RestoreParams:
         return STAGES.index(stage) <= STAGES.index(self.until)
 
 
-# ``standard`` lies where more time no longer gains quality, and ``fast`` gives up some of it to save half of the time;
-# ``benchmarks/flow_calls.py --presets`` shows both on the curve.  ``paper`` is paper 3 as it is printed, with this
-# project's flow; there the width of the blur is chosen by hand, and here it is estimated where none is given.
+# ``standard`` lies where more time no longer gains quality, and ``fast`` gives up little of it to save a third of the
+# time; ``benchmarks/flow_calls.py --presets`` shows both on the curve.  ``paper`` is paper 3 as it is printed, with
+# this project's flow; there the width of the blur is chosen by hand, and here it is estimated where none is given.
 PRESETS: Mapping[Preset, RestoreParams] = MappingProxyType(
     {
         "fast": RestoreParams(
@@ -203,7 +203,7 @@ def preset(name: Preset) -> RestoreParams:
     Parameters
     ----------
     name : {"fast", "standard", "paper"}
-        ``standard`` is ``RestoreParams()``; ``fast`` takes about half of its time; ``paper`` is paper 3 as it is
+        ``standard`` is ``RestoreParams()``; ``fast`` takes two thirds of its time; ``paper`` is paper 3 as it is
         printed: one warped frame as the centroid, a filter that starts after the training frames from the last of
         their states, drops the flow outside the subspace and weighs all frames alike, and a Gaussian blur.  The paper
         chooses its width by hand, ``deconvolution.sigma``; it is estimated where none is given.
