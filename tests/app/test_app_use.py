@@ -243,9 +243,9 @@ def test_several_clips_and_a_steadied_video(open_tab, app):
 
 def test_a_run_is_stopped_and_another_tab_goes_on(open_tab):
     one, other = open_tab(), open_tab()
-    press(one, "Run")
-    one.get_by_text("s left").first.wait_for(timeout=LONG)
+    # The preview is asked for first, so that the run cannot end before it is stopped.
     press(other, "Preview")
+    press(one, "Run")
     press(one, "Stop")
     one.get_by_text("Stopped.", exact=True).wait_for()
     other.get_by_text("Preview of a part: 160×160 pixels from 24 frames").wait_for(timeout=LONG)
