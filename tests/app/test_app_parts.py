@@ -4,6 +4,7 @@ import asyncio
 import doctest
 import shlex
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +23,7 @@ from turbrestore_app import folders, job, restoring, stage_memory, tuning
 from turbrestore_app.clip import open_clip
 from turbrestore_app.folders import Folders
 from turbrestore_app.guard import Guard
-from turbrestore_app.job import Job, one_line
+from turbrestore_app.job import Bar, Job, one_line
 from turbrestore_app.pictures import Pictures
 from turbrestore_app.restoring import Order, preview_order, restore_order
 from turbrestore_app.saving import Outputs, check_outputs, command_line, save
@@ -393,6 +394,11 @@ def test_a_clip_has_the_numbers_of_its_file(tmp_path):
     assert clip.remarks == ("1 duplicated: frame 3 left out",)
     assert clip.quality().shape == (6, 3)
     assert np.abs(clip.frame(5) - frames[5]).max() < 1 / 255
+
+
+def test_the_seconds_that_are_left_are_told_from_the_second_step_on():
+    assert Bar(1, 10).left is None
+    assert Bar(2, 10, time.monotonic() - 4).left == pytest.approx(16, abs=0.5)
 
 
 @pytest.mark.parametrize("module", [folders, job, restoring, stage_memory, tuning])

@@ -163,7 +163,7 @@ def test_a_page_that_is_loaded_again_goes_on(open_tab, app):
     draw(page, 0.25, 0.25, 0.5625, 0.6875)
     page.wait_for_function("document.querySelector('[aria-label=x]').value !== ''")
     press(page, "Run")
-    page.get_by_text("s left").first.wait_for(timeout=LONG)
+    page.get_by_role("button", name="Stop", exact=True).wait_for()
     page.reload()
     done = page.get_by_text(" pixels from 48 frames in ")
     done.wait_for(timeout=LONG)
@@ -291,7 +291,7 @@ def test_what_is_uploaded_goes_with_its_tab(open_tab, app):
     (place,) = (path for path in set(app.temporary.iterdir()) - before if path.is_dir())
     assert [path.suffix for path in place.iterdir()] == [".mkv"]
     press(page, "Run")
-    page.get_by_text("s left").first.wait_for(timeout=LONG)
+    page.get_by_role("button", name="Stop", exact=True).wait_for()
     page.close()
     until = time.monotonic() + 30
     while place.exists() and time.monotonic() < until:
