@@ -34,7 +34,7 @@ from turbrestore.registration.flow import FlowParams, estimate_flow
 from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.device import CPU, find_device
-from turbrestore.runtime.image_stacks import torch_ops
+from turbrestore.runtime.image_stacks import load, store
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.steps import finish
 from turbrestore.runtime.threads import available_cores
@@ -154,15 +154,15 @@ def copy_bandwidth(device: str) -> float:
 
 def transfers(clip: Clip, device: str) -> list[str]:
     """Bandwidth of bringing a flow to the device and back, and what both take."""
-    ops, flow = torch_ops(device), np.ascontiguousarray(clip.flows[0])
-    there = ops.load(flow)
+    flow = np.ascontiguousarray(clip.flows[0])
+    there = load(flow, device)
 
-    def load() -> None:
+    def to_the_device() -> None:
         # Reading a number waits for the device.
-        ops.load(flow)[0, 0, 0].item()
+        load(flow, device)[0, 0, 0].item()
 
     rows = []
-    for name, run in (("to the device", load), ("back", lambda: ops.store(there))):
+    for name, run in (("to the device", to_the_device), ("back", lambda: store(there))):
         taken = milliseconds(run, 5)
         rows.append(f"| {name} | {flow.nbytes / 1e6:.1f} | {taken:.2f} | {flow.nbytes / 1e6 / taken:.1f} |")
     return ["\n| a flow | MB | ms | GB/s |", "|---|---:|---:|---:|", *rows]

@@ -4,16 +4,14 @@ import numpy as np
 from scipy import fft
 
 from turbrestore.blur.psf import blur_otf
-from turbrestore.deconvolution.problem import Problem, numpy_ops
-
-OPS = numpy_ops()
+from turbrestore.deconvolution.problem import Problem
 
 
 def small_problem(seed: int, fidelity: float, shape: tuple[int, int] = (8, 8), margin: int = 2) -> Problem:
     rng = np.random.default_rng(seed)
     seen = np.zeros(shape, np.float32)
     seen[margin : shape[0] - margin, margin : shape[1] - margin] = 1
-    return Problem(rng.random(shape).astype(np.float32), seen, blur_otf(shape, 0.7), fidelity, OPS)
+    return Problem(rng.random(shape).astype(np.float32), seen, blur_otf(shape, 0.7), fidelity)
 
 
 def dense(operator, shape: tuple[int, int]) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import fft
 from skimage import data
-from small_problems import OPS, dense, dense_blur, small_problem
+from small_problems import dense, dense_blur, small_problem
 
 from turbrestore.blur.psf import blur_otf, laplacian_symbol, psf_to_otf
 from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients, quadratic_solver, wiener_fidelity
@@ -64,7 +64,7 @@ def test_masked_solution_is_that_of_dense_least_squares(method):
     seen[top : top + 9, left : left + 7] = True
     otf = blur_otf(shape, sigma)
     blur = dense(lambda u: fft.irfft2(otf * fft.rfft2(u), s=shape), shape)[seen.ravel()]
-    penalty = dense(lambda u: local_gradient(u, OPS), shape) if method == "wiener" else np.eye(seen.size)
+    penalty = dense(local_gradient, shape) if method == "wiener" else np.eye(seen.size)
     system = np.concatenate([np.sqrt(fidelity) * blur, penalty])
     right = np.concatenate([np.sqrt(fidelity) * (image.ravel() - mean), np.zeros(len(penalty))])
     solution = np.linalg.lstsq(system, right, rcond=None)[0]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from blurred_images import camera, psnr
-from small_problems import OPS, gaussian_psf
+from small_problems import gaussian_psf
 
 from turbrestore.blur.estimation import BlurEstimate
 from turbrestore.core.errors import ConfigurationError, DataError
@@ -27,7 +27,7 @@ from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.scenes import SCENES
 
-TV = LocalPenalty(OPS)
+TV = LocalPenalty()
 
 
 @pytest.mark.parametrize("side", [16, 24])

@@ -7,7 +7,7 @@ import numpy as np
 import pair_operators as pairs
 import pytest
 from scipy import fft, optimize
-from small_problems import OPS, dense, dense_blur, small_problem
+from small_problems import dense, dense_blur, small_problem
 
 from turbrestore.blur.psf import blur_otf
 from turbrestore.deconvolution import primal_dual
@@ -17,15 +17,15 @@ from turbrestore.deconvolution.primal_dual import PrimalDual, PrimalDualState
 from turbrestore.deconvolution.problem import Problem
 from turbrestore.deconvolution.tv import LocalPenalty, local_divergence, local_gradient
 
-TV = LocalPenalty(OPS)
+TV = LocalPenalty()
 
 
 def gradient(u: np.ndarray) -> np.ndarray:
-    return local_gradient(u, OPS)
+    return local_gradient(u)
 
 
 def adjoint(p: np.ndarray) -> np.ndarray:
-    return -local_divergence(p, OPS)
+    return -local_divergence(p)
 
 
 def project(p: np.ndarray) -> np.ndarray:

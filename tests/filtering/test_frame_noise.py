@@ -5,10 +5,8 @@ import pytest
 from turbrestore.filtering.frame_noise import frame_noise_variance, invalid_mask, local_sharpness, project_gradient
 from turbrestore.filtering.frame_statistics import measure_frame_statistics
 from turbrestore.registration.warp import inside
-from turbrestore.runtime.image_stacks import numpy_ops
 
 SHAPE = (200, 210)
-OPS = numpy_ops()
 INSIDE = np.s_[16:-16, 16:-16]
 
 
@@ -36,7 +34,7 @@ def model_and_frames():
 
 
 def noise_of(frame, flow, statistics, sharpness):
-    return frame_noise_variance(frame, flow, inside(flow), statistics, sharpness, OPS)
+    return frame_noise_variance(frame, flow, inside(flow), statistics, sharpness)
 
 
 def test_the_noise_is_that_of_its_definition(model_and_frames):
@@ -89,8 +87,8 @@ def test_the_flow_is_invalid_where_the_jacobian_vanishes_and_around_it():
     assert 0 < folded.sum() < folded.size
     expected = smooth(cv2.dilate(folded, np.ones((7, 7), np.uint8)).astype(np.float32), 2.0)
     seen = inside(flow)
-    assert invalid_mask(flow, seen, OPS) == pytest.approx(np.maximum(expected, 1 - seen), abs=1e-5)
-    assert (invalid_mask(0 * flow, seen, OPS) == 1 - seen).all()
+    assert invalid_mask(flow, seen) == pytest.approx(np.maximum(expected, 1 - seen), abs=1e-5)
+    assert (invalid_mask(0 * flow, seen) == 1 - seen).all()
 
 
 def test_what_holds_for_all_frames_is_their_mean_and_variance(model_and_frames):
@@ -151,7 +149,7 @@ def test_the_score_hardly_knows_the_noise_of_its_own_pixel(model_and_frames):
     laplacian, rng, shifts = cv2.Laplacian(scene, cv2.CV_32F), np.random.default_rng(1), np.zeros(2)
     for _ in range(20):
         noise = rng.normal(0, 1, SHAPE).astype(np.float32)
-        projection = project_gradient(noise, model.template, OPS)
-        scores = [local_sharpness(projection, 3.0, left_out, OPS) for left_out in (0.0, 0.25)]
+        projection = project_gradient(noise, model.template)
+        scores = [local_sharpness(projection, 3.0, left_out) for left_out in (0.0, 0.25)]
         shifts += [-float((noise * score * laplacian)[INSIDE].sum()) for score in scores]
     assert 0 < shifts[1] < 0.4 * shifts[0]

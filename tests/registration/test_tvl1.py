@@ -20,7 +20,6 @@ from turbrestore.registration.tvl1_sweeps import (
     sweep_frame,
 )
 from turbrestore.registration.warp import warp
-from turbrestore.runtime.image_stacks import numpy_ops, torch_ops
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 
@@ -70,11 +69,11 @@ both_ways = pytest.mark.parametrize("way", ["loop", pytest.param("torch", marks=
 def sweep_by(way, problem, flow, dual, params):
     """Sweep by the compiled loop, or by torch."""
     if way == "loop":
-        return sweep(problem, flow, dual, params, numpy_ops())
+        return sweep(problem, flow, dual, params)
     import torch
 
     problem = FlowProblem(*map(torch.from_numpy, (problem.direction, problem.offset, problem.bound)))
-    return sweep(problem, torch.from_numpy(flow), torch.from_numpy(dual), params, torch_ops("cpu")).numpy()
+    return sweep(problem, torch.from_numpy(flow), torch.from_numpy(dual), params).numpy()
 
 
 class TestSweeps:
@@ -161,7 +160,7 @@ class TestSweeps:
 
     def test_dual_variable_on_another_grid_moves_nothing_across_the_border(self):
         dual = np.random.default_rng(5).uniform(-0.7, 0.7, (1, 2, 2, 8, 9)).astype(np.float32)
-        finer = resize_dual(dual, (15, 18), numpy_ops())
+        finer = resize_dual(dual, (15, 18))
         out = np.empty((1, 2, 15, 18), np.float32)
         divergence(finer[:, 0], finer[:, 1], out)
         assert np.abs(out.sum((-1, -2))).max() < 1e-4

@@ -2,11 +2,15 @@ import numpy as np
 import pytest
 
 from turbrestore.runtime.image_stacks import (
+    correlate,
     full_precision,
-    numpy_ops,
+    load,
+    median,
+    resize,
+    sample,
     sample_spline,
     spline_coefficients,
-    torch_ops,
+    store,
     warp_stack,
 )
 
@@ -21,23 +25,22 @@ FLOWS = RNG.uniform(-4, 4, (3, 2, 20, 27)).astype(np.float32)
 @pytest.mark.parametrize(
     "operation",
     [
-        lambda ops, stack: ops.filter(stack, KERNEL, ONE),
-        lambda ops, stack: ops.filter(stack, ONE, KERNEL),
-        lambda ops, stack: ops.filter(stack, KERNEL, KERNEL),
-        lambda ops, stack: ops.filter(stack[:, None, None], KERNEL, ONE),
-        lambda ops, stack: ops.resize(stack, (10, 14)),
-        lambda ops, stack: ops.resize(stack[None], (41, 53)),
-        lambda ops, stack: ops.sample(stack, ops.load(FLOWS)),
-        lambda ops, stack: ops.sample(spline_coefficients(stack, ops), ops.load(FLOWS)),
-        lambda ops, stack: warp_stack(stack, ops.load(FLOW), ops),
-        lambda ops, stack: ops.median(stack, 3),
-        lambda ops, stack: ops.median(stack[None], 5),
+        lambda stack: correlate(stack, KERNEL, ONE),
+        lambda stack: correlate(stack, ONE, KERNEL),
+        lambda stack: correlate(stack, KERNEL, KERNEL),
+        lambda stack: correlate(stack[:, None, None], KERNEL, ONE),
+        lambda stack: resize(stack, (10, 14)),
+        lambda stack: resize(stack[None], (41, 53)),
+        lambda stack: sample(stack, load(FLOWS, stack.device)),
+        lambda stack: sample(spline_coefficients(stack), load(FLOWS, stack.device)),
+        lambda stack: warp_stack(stack, load(FLOW, stack.device)),
+        lambda stack: median(stack, 3),
+        lambda stack: median(stack[None], 5),
     ],
 )
 def test_both_libraries_agree(operation):
     pytest.importorskip("torch", reason="torch is not installed")
-    here, there = numpy_ops(), torch_ops("cpu")
-    a, b = operation(here, STACK), there.store(operation(there, there.load(STACK)))
+    a, b = operation(STACK), store(operation(load(STACK, "cpu:0")))
     assert a.shape == b.shape
     assert a.dtype == b.dtype == np.float32
     assert np.abs(a - b).max() < 2e-5
@@ -46,7 +49,7 @@ def test_both_libraries_agree(operation):
 def test_filter_correlates_and_reflects_the_image():
     padded = np.pad(STACK, ((0, 0), (0, 0), (2, 2)), mode="reflect")
     by_hand = sum(k * padded[..., i : i + 27] for i, k in enumerate(KERNEL))
-    assert np.abs(numpy_ops().filter(STACK, KERNEL, ONE) - by_hand).max() < 1e-6
+    assert np.abs(correlate(STACK, KERNEL, ONE) - by_hand).max() < 1e-6
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (2, 2), (9, 1), (31, 45)])
@@ -62,8 +65,7 @@ def test_the_compiled_spline_does_what_it_says(shape):
 def test_a_spline_is_that_of_scipy():
     from scipy.ndimage import map_coordinates
 
-    ops = numpy_ops()
-    sampled = ops.sample(spline_coefficients(STACK, ops), FLOWS)
+    sampled = sample(spline_coefficients(STACK), FLOWS)
     y, x = np.mgrid[:20, :27]
     for image, (dx, dy), found in zip(STACK, FLOWS, sampled, strict=True):
         place = np.clip(y + dy, 0, 19), np.clip(x + dx, 0, 26)
@@ -73,14 +75,13 @@ def test_a_spline_is_that_of_scipy():
 def test_median_is_that_of_the_window():
     padded = np.pad(STACK, ((0, 0), (2, 2), (2, 2)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(1, 2))
-    assert (numpy_ops().median(STACK, 5) == np.median(windows, axis=(-1, -2))).all()
+    assert (median(STACK, 5) == np.median(windows, axis=(-1, -2))).all()
 
 
 def test_torch_samples_wide_images_as_exactly_as_narrow_ones():
     pytest.importorskip("torch", reason="torch is not installed")
     wide, t = RNG.random((1, 16, 4000)).astype(np.float32), np.float32(0.375)
-    ops = torch_ops("cpu")
-    sampled = ops.store(ops.sample(ops.load(wide), ops.load(np.full((1, 2, 16, 4000), t))))
+    sampled = store(sample(load(wide, "cpu:0"), load(np.full((1, 2, 16, 4000), t), "cpu:0")))
     weights = np.array([(1 - t) ** 3, 4 - 6 * t**2 + 3 * t**3, 1 + 3 * t + 3 * t**2 - 3 * t**3, t**3]) / 6
     windows = np.lib.stride_tricks.sliding_window_view(wide[0], (4, 4))
     assert np.abs(np.einsum("yxij,i,j->yx", windows, weights, weights) - sampled[0, 1:-2, 1:-2]).max() < 1e-6
@@ -89,8 +90,7 @@ def test_torch_samples_wide_images_as_exactly_as_narrow_ones():
 def test_torch_filters_with_kernels_longer_than_the_image():
     pytest.importorskip("torch", reason="torch is not installed")
     kernel = RNG.random(61).astype(np.float32)
-    here, there = numpy_ops(), torch_ops("cpu")
-    a, b = here.filter(STACK, kernel, ONE), there.store(there.filter(there.load(STACK), kernel, ONE))
+    a, b = correlate(STACK, kernel, ONE), store(correlate(load(STACK, "cpu:0"), kernel, ONE))
     assert np.abs(a - b).max() < 1e-5 * np.abs(a).max()
 
 

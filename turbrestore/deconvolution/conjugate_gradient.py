@@ -24,7 +24,8 @@ import numpy as np
 from ..blur.psf import laplacian_symbol
 from ..core.arrays import FloatArray
 from ..core.noise import estimate_noise
-from .problem import Array, Problem
+from ..runtime.image_stacks import Stack, load, namespace, store, total
+from .problem import Problem
 
 # A residual below this share of the energy of the data consists of rounding errors.
 ROUNDING = 1e-14
@@ -37,24 +38,24 @@ class GradientState(NamedTuple):
 
     problem: Problem
     # (P, Q // 2 + 1): half-spectra of u − m, r and d.
-    deviation: Array
-    residual: Array
-    direction: Array
-    inverse: Array  # (P, Q // 2 + 1): preconditioner
+    deviation: Stack
+    residual: Stack
+    direction: Stack
+    inverse: Stack  # (P, Q // 2 + 1): preconditioner
     decrease: float  # inner product of r and the preconditioned r
     enough: float  # value of ``decrease`` at which the problem is solved to rounding
 
     @property
-    def image(self) -> Array:
+    def image(self) -> Stack:
         """Image u, transformed at every access."""
-        return self.problem.ops.back(self.deviation, self.problem.shape) + self.problem.mean
+        return self.problem.back(self.deviation) + self.problem.mean
 
 
 @dataclass(frozen=True, eq=False)
 class ConjugateGradients:
     """Solver for wiener and tikhonov."""
 
-    symbol: Array  # (P, Q // 2 + 1) or (1, 1): R in Fourier
+    symbol: Stack  # (P, Q // 2 + 1) or (1, 1): R in Fourier
 
     # Number of iterations over which a change is measured, as a single step may be short by chance.
     window: ClassVar[int] = 2
@@ -63,13 +64,13 @@ class ConjugateGradients:
 
     def start(self, problem: Problem) -> GradientState:
         """Start from the solution for M = 1."""
-        ops, otf, m = problem.ops, problem.otf, problem.mean
+        otf, m = problem.otf, problem.mean
         inverse = 1 / (problem.fidelity * problem.power + self.symbol)
-        deviation = problem.fidelity * inverse * (otf.conj() * ops.forward(problem.observed - m))
+        deviation = problem.fidelity * inverse * (otf.conj() * problem.forward(problem.observed - m))
         misfit = problem.seen * (problem.observed - m - problem.blur(deviation))
-        residual = problem.fidelity * (otf.conj() * ops.forward(misfit)) - self.symbol * deviation
+        residual = problem.fidelity * (otf.conj() * problem.forward(misfit)) - self.symbol * deviation
         direction = inverse * residual
-        enough = ROUNDING * problem.fidelity * ops.total(problem.observed**2)
+        enough = ROUNDING * problem.fidelity * total(problem.observed**2)
         decrease = _inner(problem, residual, direction)
         return GradientState(problem, deviation, residual, direction, inverse, decrease, enough)
 
@@ -87,7 +88,7 @@ class ConjugateGradients:
             return state
         _, deviation, residual, direction, inverse, decrease, enough = state
         blurred = problem.seen * problem.blur(direction)
-        applied = problem.fidelity * (problem.otf.conj() * problem.ops.forward(blurred)) + self.symbol * direction
+        applied = problem.fidelity * (problem.otf.conj() * problem.forward(blurred)) + self.symbol * direction
         length = decrease / _inner(problem, direction, applied)
         deviation = deviation + length * direction
         residual = residual - length * applied
@@ -96,16 +97,16 @@ class ConjugateGradients:
         direction = preconditioned + (left / decrease) * direction
         return GradientState(problem, deviation, residual, direction, inverse, left, enough)
 
-    def penalty(self, problem: Problem, u: Array) -> float:
+    def penalty(self, problem: Problem, u: Stack) -> float:
         """``½⟨u − m, R(u − m)⟩``."""
-        deviation = problem.ops.forward(u - problem.mean)
+        deviation = problem.forward(u - problem.mean)
         return _inner(problem, deviation, self.symbol * deviation) / 2
 
 
 def quadratic_solver(problem: Problem, method: str) -> ConjugateGradients:
     """Solver of a quadratic method."""
     symbol = laplacian_symbol(*problem.shape) if method == "wiener" else np.ones((1, 1), np.float32)
-    return ConjugateGradients(problem.ops.load(symbol))
+    return ConjugateGradients(load(symbol, problem.otf.device))
 
 
 def wiener_fidelity(image: FloatArray, noise: float) -> float:
@@ -120,12 +121,12 @@ def wiener_fidelity(image: FloatArray, noise: float) -> float:
     return max(6.0 * float(deviation.item()) / float(np.hypot(noise, 0.002)), 1.0)
 
 
-def wiener_image(problem: Problem) -> Array:
+def wiener_image(problem: Problem) -> Stack:
     """Wiener solution that nltv and tv start from, with a fidelity of its own.
 
     Returns (P, Q).
     """
-    observed = problem.ops.store(problem.observed)
+    observed = store(problem.observed)
     problem = replace(problem, fidelity=wiener_fidelity(observed, estimate_noise(observed)))
     solver = quadratic_solver(problem, "wiener")
     state = solver.start(problem)
@@ -134,12 +135,12 @@ def wiener_image(problem: Problem) -> Array:
     return state.image
 
 
-def _inner(problem: Problem, a: Array, b: Array) -> float:
+def _inner(problem: Problem, a: Stack, b: Stack) -> float:
     """Inner product of two images from their half-spectra, in double precision.
 
     The other half mirrors all columns except the first and, if the width is even, the last, so these count only once.
     """
-    (height, width), arrays = problem.shape, problem.ops.arrays
-    columns = (a.conj() * b).real.sum(0, dtype=arrays.float64)
+    height, width = problem.shape
+    columns = (a.conj() * b).real.sum(0, dtype=namespace(a).float64)
     once = columns[0] + columns[-1] * (1 - width % 2)
     return float(2 * columns.sum() - once) / (height * width)

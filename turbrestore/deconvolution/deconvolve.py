@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Generator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,7 +29,8 @@ from ..core.errors import ConfigurationError, DataError, require, require_betwee
 from ..core.noise import NoiseCurve, estimate_noise
 from ..display.plots import plot_objective
 from ..display.preview import preview
-from ..runtime.device import CPU, find_device, memory_of
+from ..runtime.device import find_device, memory_of
+from ..runtime.image_stacks import Stack, load, store
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.threads import ThreadTeam, one_thread_each
@@ -38,16 +39,7 @@ from .nonlocal_prior.nonlocal_tv import NonlocalPenalty
 from .nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
 from .nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from .primal_dual import Penalty, PrimalDual
-from .problem import (
-    Array,
-    Margin,
-    Problem,
-    margin_around,
-    numpy_ops,
-    problem_of,
-    read_blur,
-    torch_ops,
-)
+from .problem import Margin, Problem, margin_around, problem_of, read_blur
 from .stopping import DeconvolutionState, Solution, iterate
 from .tv import LocalPenalty
 
@@ -267,14 +259,13 @@ def deconvolve_steps(
     oscillates = unknown and params.method in ("nltv", "tv")
     rim = min(int(np.ceil(sigma)), min(height, width) // 4) if oscillates else 0
     device = find_device(runtime.device)
-    ops = numpy_ops(runtime.workers) if device == CPU else torch_ops(device)
     with memory_of(device), one_thread_each(), ThreadTeam(runtime.workers) as team:
-        transfer = ops.load(otf)
-        problems = [problem_of(plane, margin, photons, transfer, fidelity, ops) for plane in planes]
-        measured = ops.load(margin.mask(rim))
+        transfer = load(otf, device)
+        problems = [problem_of(plane, margin, photons, transfer, fidelity, runtime.workers) for plane in planes]
+        measured = load(margin.mask(rim), device)
         around = _padded_guide(guide, margin)
-        solution = yield from _solve(problems, around, measured, params, _Resources(team, runtime.workers, device))
-    restored = join_planes(pixels, [ops.store(u)[margin.inside()] for u in solution.images], params.channels)
+        solution = yield from _solve(problems, around, measured, params, team)
+    restored = join_planes(pixels, [store(u)[margin.inside()] for u in solution.images], params.channels)
     records = (np.array(column) for column in zip(*solution.records, strict=True))
     return Deconvolution(
         np.clip(restored, 0, 1), sigma, fidelity, noise, solution.iterations, solution.converged, *records
@@ -312,55 +303,45 @@ def join_planes(image: FloatArray, planes: list[FloatArray], channels: str) -> F
     return image + (planes[0] - luminance(image))[..., None]
 
 
-class _Resources(NamedTuple):
-    team: ThreadTeam
-    threads: int
-    device: str
-
-
 def _solve(
     problems: list[Problem],
     guide: FloatArray | None,
-    measured: Array,
+    measured: Stack,
     params: DeconvolutionParams,
-    resources: _Resources,
+    team: ThreadTeam,
 ) -> Generator[DeconvolutionState, None, Solution]:
     stop = measured, params.iterations, params.tolerance
     if params.method in ("wiener", "tikhonov"):
         quadratic = quadratic_solver(problems[0], params.method)
         return (yield from iterate(quadratic, problems, [quadratic.start(p) for p in problems], *stop))
-    starts, compared = _sharpened(problems, guide, params, resources)
-    penalty: Penalty = LocalPenalty(problems[0].ops)
-    if params.method == "nltv":
-        penalty = _nonlocal_penalty(compared, params.weights, resources)
+    starts, compared = _sharpened(problems, guide, params, team)
+    penalty: Penalty = LocalPenalty()
+    if params.method == "nltv" and isinstance(measured, np.ndarray):
+        penalty = NonlocalPenalty(nonlocal_weights(compared, params.weights, problems[0].threads), team)
+    elif params.method == "nltv":
+        penalty = torch_nonlocal_penalty(compared, params.weights, measured.device)
     solver = PrimalDual(penalty)
     states = [solver.start(problem, u) for problem, u in zip(problems, starts, strict=True)]
     del starts, compared
     return (yield from iterate(solver, problems, states, *stop))
 
 
-def _nonlocal_penalty(guide: FloatArray, weights: NonlocalParams, resources: _Resources) -> Penalty:
-    if resources.device != CPU:
-        return torch_nonlocal_penalty(guide, weights, resources.device)
-    return NonlocalPenalty(nonlocal_weights(guide, weights, resources.threads), resources.team)
-
-
 def _sharpened(
-    problems: list[Problem], guide: FloatArray | None, params: DeconvolutionParams, resources: _Resources
-) -> tuple[list[Array], FloatArray]:
+    problems: list[Problem], guide: FloatArray | None, params: DeconvolutionParams, team: ThreadTeam
+) -> tuple[list[Stack], FloatArray]:
     """Return the Wiener solutions to start from, and the image for patches, by default the mean of the channels."""
-    ops, blurred = problems[0].ops, list(problems)
+    observed, blurred = problems[0].observed, list(problems)
     if guide is not None and params.sharpen_guide and params.method == "nltv":
-        blurred.append(dataclasses.replace(problems[0], observed=ops.load(guide)))
-    side_by_side = resources.device == CPU and np.prod(problems[0].observed.shape) >= _PARALLEL_PIXELS
-    sharp = list(resources.team.map(wiener_image, blurred) if side_by_side else map(wiener_image, blurred))
+        blurred.append(dataclasses.replace(problems[0], observed=load(guide, observed.device)))
+    side_by_side = isinstance(observed, np.ndarray) and observed.size >= _PARALLEL_PIXELS
+    sharp = list(team.map(wiener_image, blurred) if side_by_side else map(wiener_image, blurred))
     starts, further = sharp[: len(problems)], sharp[len(problems) :]
     if further:
-        return starts, ops.store(further[0])
+        return starts, store(further[0])
     if guide is not None:
         return starts, guide
     own = starts if params.sharpen_guide else [problem.observed for problem in problems]
-    return starts, np.mean([ops.store(u) for u in own], axis=0, dtype=np.float32)
+    return starts, np.mean([store(u) for u in own], axis=0, dtype=np.float32)
 
 
 def _padded_guide(guide: ArrayLike | None, margin: Margin) -> FloatArray | None:

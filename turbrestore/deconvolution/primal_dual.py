@@ -45,7 +45,8 @@ from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from .problem import Array, Problem
+from ..runtime.image_stacks import Stack
+from .problem import Problem
 
 # Over-relaxation ρ.
 RELAXATION = 1.8
@@ -68,14 +69,14 @@ class Penalty(Protocol):
         """Upper bound of ‖K‖²."""
         ...
 
-    def ascend(self, p: Array | None, u: Array, step: float, relaxation: float) -> tuple[Array, Array]:
+    def ascend(self, p: Stack | None, u: Stack, step: float, relaxation: float) -> tuple[Stack, Stack]:
         """Return the new p, ``p + ρ(p' − p)`` with p' the projection of ``p + sKu`` on |p|(x) ≤ 1, and Kᵀp for it.
 
         The given p is overwritten; None is p = 0.
         """
         ...
 
-    def value(self, u: Array) -> float:
+    def value(self, u: Stack) -> float:
         """J(u)."""
         ...
 
@@ -83,11 +84,11 @@ class Penalty(Protocol):
 class PrimalDualState(NamedTuple):
     """State before an iteration: u, Bu, q, p, Kᵀp, and its number k.  The iteration overwrites p."""
 
-    image: Array
-    blurred: Array
-    data_dual: Array
-    penalty_dual: Array
-    adjoint: Array
+    image: Stack
+    blurred: Stack
+    data_dual: Stack
+    penalty_dual: Stack
+    adjoint: Stack
     number: int
 
 
@@ -100,27 +101,27 @@ class PrimalDual:
     window: ClassVar[int] = WINDOW
     rest: ClassVar[int] = REST
 
-    def start(self, problem: Problem, u: Array) -> PrimalDualState:
+    def start(self, problem: Problem, u: Stack) -> PrimalDualState:
         """Start from the image u, with q = λM(Bu − f) and p after one dual step from 0."""
-        blurred = problem.blur(problem.ops.forward(u))
+        blurred = problem.blur(problem.forward(u))
         q = problem.fidelity * problem.seen * (blurred - problem.observed)
         p, adjoint = self.regulariser.ascend(None, u, self._steps[1], 1.0)
         return PrimalDualState(u, blurred, q, p, adjoint, 1)
 
     def step(self, problem: Problem, state: PrimalDualState) -> PrimalDualState:
         """Do one iteration.  With d = u − u' = P⁻¹(Kᵀp + Bᵀq), the point 2u' − u is u − 2d."""
-        (tau, s), forward, otf = self._steps, problem.ops.forward, problem.otf
+        (tau, s), forward, otf = self._steps, problem.forward, problem.otf
         u, blurred, q, p, adjoint, k = state
         share = max(1 / k, EARLY_DATA_STEP if k <= EARLY else LEAST_DATA_STEP)
         t = share * problem.fidelity
         spectrum = (forward(adjoint) + otf.conj() * forward(q)) / (1 / tau + t * problem.power)
-        d, blurred_d = problem.ops.back(spectrum, problem.shape), problem.blur(spectrum)
+        d, blurred_d = problem.back(spectrum), problem.blur(spectrum)
         p, adjoint = self.regulariser.ascend(p, u - 2 * d, s, RELAXATION)
         q_new = problem.seen * (q + t * (blurred - 2 * blurred_d - problem.observed)) / (problem.seen + share)
         q = q + RELAXATION * (q_new - q)
         return PrimalDualState(u - RELAXATION * d, blurred - RELAXATION * blurred_d, q, p, adjoint, k + 1)
 
-    def penalty(self, problem: Problem, u: Array) -> float:
+    def penalty(self, problem: Problem, u: Stack) -> float:
         """J(u)."""
         return self.regulariser.value(u)
 

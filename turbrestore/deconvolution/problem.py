@@ -17,16 +17,11 @@ Pixels near the border of f received light from outside the image.  The unknown 
 on each side, in which M is 0.  The convolution is periodic on that padded domain; opposite sides meet within the
 margin, where nothing was observed.
 
-Libraries
----------
-Solvers are written once for NumPy and torch. Arithmetic, ``sum``, ``clip``, ``abs``, ``roll``, ``stack`` and ``sqrt``
-are spelled alike in both; loading arrays and Fourier transforms are not, and are in :class:`ArrayOps`.
-
+Solvers are written once for NumPy and torch, see :mod:`turbrestore.runtime.image_stacks`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -39,91 +34,60 @@ from ..blur.psf import check_psf
 from ..core.arrays import FloatArray
 from ..core.errors import require
 from ..core.noise import NoiseCurve
-from ..runtime.image_stacks import from_device
+from ..runtime.image_stacks import Stack, load, namespace, total
 
 # Smallest margin, in widths of the blur.
 MARGIN_SIGMAS = 4.0
 # Largest weight of a pixel, and the inverse of the least.
 _MOST_WEIGHT = 4.0
-# ndarray or torch tensor.
-Array = Any
 # Transforms of smaller images are faster on one thread than on several.
 _PARALLEL_PIXELS = 1 << 20
-
-
-@dataclass(frozen=True, eq=False)
-class ArrayOps:
-    """Operations of one library."""
-
-    arrays: Any  # ``numpy`` or ``torch``
-    # Convert from a NumPy array of real or complex numbers, and back to one.
-    load: Callable[[NDArray[Any]], Array]
-    store: Callable[[Array], NDArray[Any]]
-    forward: Callable[[Array], Array]  # half-spectrum of a real image, as :func:`scipy.fft.rfft2`
-    back: Callable[[Array, tuple[int, int]], Array]  # ``back(spectrum, shape)`` is the image of a half-spectrum
-
-    def total(self, values: Array) -> float:
-        """Sum all values in double precision."""
-        return float(values.sum(dtype=self.arrays.float64))
-
-
-def numpy_ops(threads: int = 1) -> ArrayOps:
-    """Operations of NumPy and SciPy."""
-
-    def workers(shape: tuple[int, ...]) -> int:
-        return threads if shape[0] * shape[1] >= _PARALLEL_PIXELS else 1
-
-    return ArrayOps(
-        arrays=np,
-        load=np.asarray,
-        store=np.asarray,
-        forward=lambda image: scipy.fft.rfft2(image, workers=workers(image.shape)),
-        back=lambda spectrum, shape: scipy.fft.irfft2(spectrum, s=shape, workers=workers(shape)),
-    )
-
-
-def torch_ops(device: str) -> ArrayOps:
-    """Operations of torch on a device."""
-    import torch
-
-    return ArrayOps(
-        arrays=torch,
-        # torch shares no memory that is read-only.
-        load=lambda array: torch.from_numpy(np.require(array, requirements=["C", "W"])).to(device),
-        store=from_device,
-        forward=torch.fft.rfft2,
-        back=lambda spectrum, shape: torch.fft.irfft2(spectrum, s=shape),
-    )
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Data term ``λ/2 Σ M(Bu − f)²`` on the padded domain."""
 
-    observed: Array  # (P, Q): f, extended by reflection into the margin
-    seen: Array  # (P, Q): M
-    otf: Array  # (P, Q // 2 + 1): H
+    observed: Stack  # (P, Q): f, extended by reflection into the margin
+    seen: Stack  # (P, Q): M
+    otf: Stack  # (P, Q // 2 + 1): H
     fidelity: float  # λ
-    ops: ArrayOps  # library that the arrays belong to
+    threads: int = 1  # of transforms on the CPU
     # What follows from these.
     shape: tuple[int, int] = field(init=False)  # P and Q
-    power: Array = field(init=False)  # |H|², the transfer function of BᵀB
+    power: Stack = field(init=False)  # |H|², the transfer function of BᵀB
     mean: float = field(init=False)  # of the observed pixels
 
     def __post_init__(self) -> None:
-        mean = self.ops.total(self.seen * self.observed) / self.ops.total(self.seen)
+        mean = total(self.seen * self.observed) / total(self.seen)
         object.__setattr__(self, "shape", (self.observed.shape[0], self.observed.shape[1]))
-        object.__setattr__(self, "power", self.ops.arrays.abs(self.otf) ** 2)
+        object.__setattr__(self, "power", abs(self.otf) ** 2)
         object.__setattr__(self, "mean", mean)
 
-    def blur(self, spectrum: Array) -> Array:
-        """Image Bu from the transform of u."""
-        return self.ops.back(self.otf * spectrum, self.shape)
+    def forward(self, image: Stack) -> Stack:
+        """Half-spectrum of an image."""
+        if not isinstance(image, np.ndarray):
+            return namespace(image).fft.rfft2(image)
+        return scipy.fft.rfft2(image, workers=self._workers)
 
-    def misfit(self, u: Array) -> float:
+    def back(self, spectrum: Stack) -> Stack:
+        """Image of a half-spectrum."""
+        if not isinstance(spectrum, np.ndarray):
+            return namespace(spectrum).fft.irfft2(spectrum, s=self.shape)
+        return scipy.fft.irfft2(spectrum, s=self.shape, workers=self._workers)
+
+    @property
+    def _workers(self) -> int:
+        return self.threads if self.shape[0] * self.shape[1] >= _PARALLEL_PIXELS else 1
+
+    def blur(self, spectrum: Stack) -> Stack:
+        """Image Bu from the transform of u."""
+        return self.back(self.otf * spectrum)
+
+    def misfit(self, u: Stack) -> float:
         """``λ/2 Σ M(Bu − f)²``."""
-        residual = self.blur(self.ops.forward(u)) - self.observed
-        return self.fidelity / 2 * self.ops.total(self.seen * residual**2)
+        residual = self.blur(self.forward(u)) - self.observed
+        return self.fidelity / 2 * total(self.seen * residual**2)
 
 
 @dataclass(frozen=True)
@@ -173,10 +137,11 @@ def margin_around(size: tuple[int, int], least: int | None) -> Margin:
 
 
 def problem_of(
-    plane: FloatArray, margin: Margin, photons: NoiseCurve | None, otf: Array, fidelity: float, ops: ArrayOps
+    plane: FloatArray, margin: Margin, photons: NoiseCurve | None, otf: Stack, fidelity: float, threads: int
 ) -> Problem:
     """Problem of a plane (H, W); ``photons`` is its noise at every level, relative to the mean."""
-    return Problem(ops.load(margin.pad(plane)), ops.load(margin.weights(plane, photons)), otf, fidelity, ops)
+    observed, seen = (load(image, otf.device) for image in (margin.pad(plane), margin.weights(plane, photons)))
+    return Problem(observed, seen, otf, fidelity, threads)
 
 
 def read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:

@@ -33,7 +33,8 @@ from typing import ClassVar, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .problem import Array, ArrayOps, Problem
+from ..runtime.image_stacks import Stack, namespace, store
+from .problem import Problem
 
 # Pixels a side of the tiles that changes are measured in.
 TILE = 64
@@ -57,7 +58,7 @@ class DeconvolutionState:
 class Solution(NamedTuple):
     """Images, iterations, whether they converged, and records (iteration, energy, change for each iteration)."""
 
-    images: list[Array]
+    images: list[Stack]
     iterations: int
     converged: bool
     records: list[tuple[int, float, float]]
@@ -65,7 +66,7 @@ class Solution(NamedTuple):
 
 class _SolverState(Protocol):
     @property
-    def image(self) -> Array: ...
+    def image(self) -> Stack: ...
 
 
 State = TypeVar("State", bound=_SolverState)
@@ -81,7 +82,7 @@ class Solver(Protocol[State]):
         """One iteration."""
         ...
 
-    def penalty(self, problem: Problem, u: Array) -> float:
+    def penalty(self, problem: Problem, u: Stack) -> float:
         """Value of the penalty."""
         ...
 
@@ -90,12 +91,12 @@ def iterate(
     solver: Solver[State],
     problems: list[Problem],
     states: list[State],
-    measured: Array,
+    measured: Stack,
     iterations: int,
     tolerance: float,
 ) -> Generator[DeconvolutionState, None, Solution]:
     """Step the problems of all channels until no image changes any more."""
-    ops, images = problems[0].ops, [state.image for state in states]
+    images = [state.image for state in states]
     earlier = deque([images], max(solver.rest, 1))
     changes, records, begun, converged = list[float](), list[tuple[int, float, float]](), 0, False
     for iteration in range(1, iterations + 1):
@@ -103,10 +104,10 @@ def iterate(
         last, full = iteration == iterations, iteration % solver.window == 0
         if last or full:
             images = [state.image for state in states]
-            changes.append(change_of(earlier[-1], images, measured, ops) * solver.window / (iteration - begun))
+            changes.append(change_of(earlier[-1], images, measured) * solver.window / (iteration - begun))
             converged = predicted_change(changes) <= tolerance
             if not converged and full and len(earlier) == solver.rest:
-                converged = all(change_of(old, images, measured, ops) <= tolerance for old in earlier)
+                converged = all(change_of(old, images, measured) <= tolerance for old in earlier)
             begun, last = iteration, last or converged
             earlier.append(images)
         change = changes[-1] / solver.window if changes else np.inf
@@ -128,7 +129,7 @@ def predicted_change(changes: Sequence[float]) -> float:
     return last * ratio / (1 - ratio)
 
 
-def change_of(before: list[Array], after: list[Array], measured: Array, ops: ArrayOps) -> float:
+def change_of(before: list[Stack], after: list[Stack], measured: Stack) -> float:
     """Change of images as they are shown: clipped to [0, 1], and where changes are measured.
 
     ``before, after`` (P, Q) each; ``measured`` (P, Q).
@@ -136,19 +137,20 @@ def change_of(before: list[Array], after: list[Array], measured: Array, ops: Arr
     moved, size = np.zeros((2, 1, 1))
     for old, new in zip(before, after, strict=True):
         shown = measured * new.clip(0, 1)
-        moved = moved + tile_sums((shown - measured * old.clip(0, 1)) ** 2, ops)
-        size = size + tile_sums(shown**2, ops)
+        moved = moved + tile_sums((shown - measured * old.clip(0, 1)) ** 2)
+        size = size + tile_sums(shown**2)
     most, brightest = float(moved.max()), float(size.max())
     return float(most > 0) if brightest == 0 else float(np.sqrt(most / brightest))
 
 
-def tile_sums(image: Array, ops: ArrayOps) -> NDArray[np.float64]:
+def tile_sums(image: Stack) -> NDArray[np.float64]:
     """Sum an image over tiles.
 
     ``image`` (P, Q); returns (ceil(P / TILE), ceil(Q / TILE)).
     """
     rows, columns = (-(-length // TILE) for length in image.shape)
-    padded = ops.load(np.zeros((rows * TILE, columns * TILE), np.float32))
+    xp = namespace(image)
+    padded = xp.zeros((rows * TILE, columns * TILE), dtype=image.dtype, device=image.device)
     padded[: image.shape[0], : image.shape[1]] = image
     tiles = padded.reshape(rows, TILE, columns, TILE)
-    return ops.store(tiles.sum((1, 3), dtype=ops.arrays.float64))
+    return store(tiles.sum((1, 3), dtype=xp.float64))

@@ -6,49 +6,45 @@ as in :mod:`turbrestore.deconvolution.primal_dual`: ``K = ∇``, ``Kᵀ = −div
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from .problem import Array, ArrayOps
+from ..runtime.image_stacks import Stack, namespace, total
 
 
-def local_gradient(u: Array, ops: ArrayOps) -> Array:
+def local_gradient(u: Stack) -> Stack:
     """Periodic forward differences ∇u.
 
     ``u`` (H, W); returns (2, H, W).
     """
-    return ops.arrays.stack([ops.arrays.roll(u, -1, axis) - u for axis in (0, 1)])
+    xp = namespace(u)
+    return xp.stack([xp.roll(u, -1, axis) - u for axis in (0, 1)])
 
 
-def local_divergence(v: Array, ops: ArrayOps) -> Array:
+def local_divergence(v: Stack) -> Stack:
     """Negative adjoint of :func:`local_gradient`.
 
     ``v`` (2, H, W); returns (H, W).
     """
-    return v[0] - ops.arrays.roll(v[0], 1, 0) + v[1] - ops.arrays.roll(v[1], 1, 1)
+    xp = namespace(v)
+    return v[0] - xp.roll(v[0], 1, 0) + v[1] - xp.roll(v[1], 1, 1)
 
 
-@dataclass(frozen=True, eq=False)
+def length(v: Stack) -> Stack:
+    """|v| at every pixel."""
+    return namespace(v).sqrt((v * v).sum(0))
+
+
 class LocalPenalty:
     """J(u) = Σ|∇u|."""
 
-    ops: ArrayOps  # library of its images
+    norm_squared = 8.0  # upper bound of ‖∇‖²
 
-    @property
-    def norm_squared(self) -> float:
-        """Upper bound of ‖∇‖²."""
-        return 8.0
-
-    def ascend(self, p: Array | None, u: Array, step: float, relaxation: float) -> tuple[Array, Array]:
+    def ascend(self, p: Stack | None, u: Stack, step: float, relaxation: float) -> tuple[Stack, Stack]:
         """``p + ρ(p' − p)`` with p' the projection of ``p + s∇u`` on |p|(x) ≤ 1, and −div of it."""
-        gradient = local_gradient(u, self.ops)
+        gradient = local_gradient(u)
         p = 0 * gradient if p is None else p
         ascent = p + step * gradient
-        p = p + relaxation * (ascent / self._length(ascent).clip(1) - p)
-        return p, -local_divergence(p, self.ops)
+        p = p + relaxation * (ascent / length(ascent).clip(1) - p)
+        return p, -local_divergence(p)
 
-    def value(self, u: Array) -> float:
+    def value(self, u: Stack) -> float:
         """J(u)."""
-        return self.ops.total(self._length(local_gradient(u, self.ops)))
-
-    def _length(self, v: Array) -> Array:
-        return self.ops.arrays.sqrt((v * v).sum(0))
+        return total(length(local_gradient(u)))

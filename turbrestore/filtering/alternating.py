@@ -55,9 +55,10 @@ from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import DataError
 from ..dynamics.flow_model import FlowDynamics
 from ..registration.flow import FlowParams, iterate_flows
+from ..runtime.device import find_device, memory_of
+from ..runtime.image_stacks import store_image
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
-from .array_backend import array_backend
 from .filter_records import (
     FilterCheckpoint,
     Filtered,
@@ -180,7 +181,8 @@ def filter_steps(
         flows_measured = len(start.records) * params.inner_iterations - len(known)
         at = _Position(start.state, start.records, start.reference, deque(), flows_measured)
     del block
-    at = yield from _filter_blocks(at, stream, known, params, settings)
+    with memory_of(settings.runtime.device):
+        at = yield from _filter_blocks(at, stream, known, settings)
     filtered = join_records(at.state, at.records, image_noise, settings.sharpness)
     # The paper leaves the image in the geometry of the training frames.
     unmoved = np.zeros_like(filtered.mean_flow)
@@ -188,14 +190,11 @@ def filter_steps(
 
 
 def _filter_blocks(
-    at: _Position,
-    stream: Iterator[FloatArray | None],
-    known: Flows,
-    params: FilterParams,
-    settings: PassSettings,
+    at: _Position, stream: Iterator[FloatArray | None], known: Flows, settings: PassSettings
 ) -> Generator[FilterStep, None, _Position]:
     """Do steps 1 to 4 of the module docstring for one block after the other."""
-    size, once = params.block, params.inner_iterations == 1
+    size, iterations = settings.params.block, settings.params.inner_iterations
+    once = iterations == 1
     alone = once or size == 1
     if at.block:
         # The flows of the first block are known in its first iteration.
@@ -209,7 +208,7 @@ def _filter_blocks(
                 return at
             if not once:
                 at = yield from _iterate(at, settings)
-        for _ in range(params.inner_iterations - 2):
+        for _ in range(iterations - 2):
             at = yield from _iterate(at, settings, known)
         # The last iteration of this block and the first of the next are one pass, as threads idle at the end of each.
         reference = at.image
@@ -228,10 +227,10 @@ def _iterate(
     from_known: bool = False,
 ) -> Generator[FilterStep, None, _Position]:
     """Run one iteration over the block that has begun, its last if ``settle``, and over the frames that follow it."""
-    settled, backend = len(at.block) if settle else 0, settings.backend
+    settled = len(at.block) if settle else 0
     frames, starts = chain(_drain(at.block), following), chain(known, repeat(None))
     reference = None if from_known else at.image
-    image = settled_image = backend.load_pixels(at.state.image)
+    image = settled_image = PixelStacks.of(at.state.image, settings.runtime.device)
     flow_sum = at.state.flow_sum.copy() if settle else at.state.flow_sum
     flow, records, block, flows_measured = at.state.flow, list(at.records), deque[Frame](), at.flows_measured
     for number, tracked in enumerate(pass_over(frames, starts, reference, at.state.flow, settled, settings)):
@@ -249,18 +248,17 @@ def _iterate(
     training_flow = at.state.training_flow
     if settled and not at.records and isinstance(known, np.ndarray):
         training_flow = mean_flow_over(flow_sum, records)
-    state = FilterState(backend.store_pixels(settled_image), flow, flow_sum, training_flow)
-    return _Position(state, tuple(records), backend.store_image(image), block, flows_measured)
+    state = FilterState(settled_image.stored(), flow, flow_sum, training_flow)
+    return _Position(state, tuple(records), store_image(image.mean), block, flows_measured)
 
 
 def _update_image(image: PixelStacks, tracked: TrackedFrame, settings: PassSettings) -> tuple[PixelStacks, FrameRecord]:
     """Update the image by a frame (eqs. 14a, 14c, 15 and 16)."""
-    if tracked.image is None or tracked.measured is None:
+    frame = tracked.registered or register(tracked, settings)
+    if frame is None:
         return image, FrameRecord(tracked.state.mean, 0.0, tracked.innovation, np.nan, 0.0)
-    with settings.backend.memory():
-        frame = tracked.registered or register(tracked.image, tracked.measured, tracked.state, settings)
-        image, gains = update_pixels(image, frame.channels, frame.noise, settings.drift)
-        gain, information = float(gains.mean()), float((1 / frame.noise).mean())
+    image, gains = update_pixels(image, frame.channels, frame.noise, settings.params.image_drift)
+    gain, information = float(gains.mean()), float((1 / frame.noise).mean())
     return image, FrameRecord(tracked.state.mean, gain, tracked.innovation, frame.sharpness, information)
 
 
@@ -289,17 +287,10 @@ def _settings(
         params.image_noise,
         runtime.threads,
     )
-    backend = array_backend(runtime.device)
-    return PassSettings(
-        dynamics=dynamics,
-        statistics=backend.load_statistics(statistics),
-        modelled=params.residual == "drop",
-        sharpness=statistics.sharpness_weight if params.sharpness is None else params.sharpness,
-        drift=params.image_drift,
-        flow=flow_params,
-        runtime=runtime,
-        backend=backend,
-    )
+    device = find_device(runtime.device)
+    beta = statistics.sharpness_weight if params.sharpness is None else params.sharpness
+    runtime = replace(runtime, device=device)
+    return PassSettings(dynamics, statistics.on(device), params, beta, flow_params, runtime)
 
 
 def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params: FilterParams) -> FilterState:

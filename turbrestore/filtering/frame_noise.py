@@ -18,21 +18,21 @@ with z limited to ±3 and the exponent to 40.  Z falls where a frame is locally 
 lucky imaging inside the Kalman gain.  It rises where a frame shows something that the others do not (a bird, a flash),
 and where its flow is invalid.
 
-All functions here take NumPy arrays or torch tensors with the operations of their library (``ops``).
+All functions here take NumPy arrays or torch tensors.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..registration.warp import inside, warp
-from ..runtime.image_stacks import Stack, StackOps, warp_stack
+from ..runtime.device import CPU
+from ..runtime.image_stacks import Stack, correlate, load, load_image, namespace, warp_stack
 
 # Registered channels (C, H, W), their luminance (H, W), and where the warp samples the frame (H, W), 1 to 0.
 Warped = tuple[Stack, Stack, Stack]
@@ -61,8 +61,7 @@ class FrameStatistics:
     """Temporal statistics of the registered frames of the first block, which Z of every frame is measured against."""
 
     image_noise: float  # Z₀, squared intensity
-    # (H, W): gradient of the image that the frames are registered to, along x and y, intensity per pixel.
-    template: tuple[Stack, Stack]
+    template: Stack  # (2, H, W): gradient along x and y of the image that frames are registered to, intensity per pixel
     template_energy: float  # sum of its square
     # (H, W): mean over the frames of the local sharpness where they agree, see :func:`project_gradient`.
     mean_sharpness: Stack
@@ -78,6 +77,11 @@ class FrameStatistics:
     median: Stack
     spread: Stack
 
+    def on(self, device: str) -> FrameStatistics:
+        """Return the statistics with their maps on a device."""
+        maps = {item.name: value for item in fields(self) if isinstance(value := getattr(self, item.name), np.ndarray)}
+        return replace(self, **{name: load(value, device) for name, value in maps.items()})
+
 
 @dataclass(frozen=True, eq=False)
 class RegisteredFrame:
@@ -89,31 +93,31 @@ class RegisteredFrame:
 
 
 def register_frame(
-    image: FloatArray, flow: FloatArray, statistics: FrameStatistics, sharpness: float, ops: StackOps
+    image: FloatArray, flow: FloatArray, statistics: FrameStatistics, sharpness: float
 ) -> RegisteredFrame:
     """Warp a frame onto the image by Ŵ and estimate its noise Z (eq. 15).
 
     ``image`` (H, W) or (H, W, 3); ``flow`` (H, W, 2).
     """
-    loaded = ops.load(flow)
-    channels, grey, seen = warp_frame(image, loaded, ops)
-    return RegisteredFrame(channels, *frame_noise_variance(grey, loaded, seen, statistics, sharpness, ops))
+    loaded = load(flow, statistics.median.device)
+    channels, grey, seen = warp_frame(image, loaded)
+    return RegisteredFrame(channels, *frame_noise_variance(grey, loaded, seen, statistics, sharpness))
 
 
-def warp_frame(image: FloatArray, flow: Stack, ops: StackOps) -> Warped:
-    """Warp a frame, a NumPy array, by a flow that is on the device already: by OpenCV, or by torch.
+def warp_frame(image: FloatArray, flow: Stack) -> Warped:
+    """Warp a frame, a NumPy array, by a flow that is on the device already.
 
     ``image`` (H, W) or (H, W, 3); ``flow`` (H, W, 2).
     """
-    if ops.arrays is np:
+    if isinstance(flow, np.ndarray):
         registered = warp(image, flow)
-        return channels_first(registered), luminance(registered), inside(flow)
-    channels = warp_stack(ops.load(channels_first(image)), flow, ops)
+        return load_image(registered, CPU), luminance(registered), inside(flow)
+    channels = warp_stack(load_image(image, flow.device), flow)
     # The luminance of the three unit colours is the weight of each channel.
     weights = luminance(np.eye(3, dtype=np.float32)[None])[0].tolist() if len(channels) == 3 else [1.0]
     grey = sum(weight * channel for weight, channel in zip(weights, channels, strict=True))
     height, width = flow.shape[:2]
-    x, y = (ops.arrays.arange(length, dtype=flow.dtype, device=flow.device) for length in (width, height))
+    x, y = (namespace(flow).arange(length, dtype=flow.dtype, device=flow.device) for length in (width, height))
     seen = _within(x + flow[..., 0], width) * _within(y[:, None] + flow[..., 1], height)
     return channels, grey, seen
 
@@ -123,76 +127,71 @@ def _within(position: Stack, length: int) -> Stack:
     return (1 - (-position).maximum(position - (length - 1))).clamp(0, 1)
 
 
-def channels_first(image: NDArray[np.floating]) -> NDArray[np.floating]:
-    """(H, W) or (H, W, C) to (C, H, W)."""
-    return image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)
-
-
 def frame_noise_variance(
-    grey: Stack, flow: Stack, seen: Stack, statistics: FrameStatistics, sharpness: float, ops: StackOps
+    grey: Stack, flow: Stack, seen: Stack, statistics: FrameStatistics, sharpness: float
 ) -> tuple[Stack, float]:
     """Z of one frame, and how sharp the frame is.
 
     ``grey`` (H, W); ``flow`` (H, W, 2); ``seen`` (H, W); returns ``noise`` (H, W).
     """
-    arrays, beta = ops.arrays, float(sharpness)
-    projection = project_gradient(grey, statistics.template, ops)
+    xp, beta = namespace(grey), float(sharpness)
+    projection = project_gradient(grey, statistics.template)
     sharp = float(projection.sum()) / max(statistics.template_energy, 1e-12)
     if beta == 0:
-        return arrays.full_like(grey, statistics.image_noise), sharp
-    excess = squared_deviation(grey, statistics.mean_frame, statistics.deviation, ops) / OUTLIER
+        return xp.full_like(grey, statistics.image_noise), sharp
+    excess = squared_deviation(grey, statistics.mean_frame, statistics.deviation) / OUTLIER
     difference = grey - statistics.median
     # Light that has changed is no disagreement.
-    difference = difference - smooth(difference, LEVEL_WINDOW, ops)
-    disagreement = smooth(difference * difference, _FINE_WINDOW, ops) / (statistics.spread * _DISAGREES)
-    excess = arrays.clip(arrays.maximum(excess, disagreement), 1, None)
+    difference = difference - smooth(difference, LEVEL_WINDOW)
+    disagreement = smooth(difference * difference, _FINE_WINDOW) / (statistics.spread * _DISAGREES)
+    excess = xp.clip(xp.maximum(excess, disagreement), 1, None)
     squared = excess * excess
-    local = local_sharpness(projection, statistics.window, statistics.left_out, ops)
+    local = local_sharpness(projection, statistics.window, statistics.left_out)
     score = (local - statistics.mean_sharpness) * statistics.score_scale
-    score = arrays.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)
+    score = xp.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)
     # z / e² where z > 0: something other than the scene may have more contrast than the scene.
-    score = arrays.minimum(score, score / squared)
+    score = xp.minimum(score, score / squared)
     # For a normal score of variance v the mean of exp(β z − β² v / 2) is one: the information per frame stays 1 / Z₀.
     exponent = statistics.score_variance * (beta**2 / 2) - score * beta
-    exponent = arrays.clip(exponent + invalid_mask(flow, seen, ops) * _LOG_INVALID, None, _LARGEST_EXPONENT)
+    exponent = xp.clip(exponent + invalid_mask(flow, seen) * _LOG_INVALID, None, _LARGEST_EXPONENT)
     # The third power: a deviation of twice the tolerance reduces the weight to an eighth.
-    return squared * excess * statistics.image_noise * arrays.exp(exponent), sharp
+    return squared * excess * statistics.image_noise * xp.exp(exponent), sharp
 
 
-def invalid_mask(flow: Stack, seen: Stack, ops: StackOps) -> Stack:
+def invalid_mask(flow: Stack, seen: Stack) -> Stack:
     """Mark where a frame gives no measurement: the map id + Ŵ folds, or leaves the frame.
 
     Beyond the frame its border is repeated, which is no measurement. Paper 3 assumes that the maps are diffeomorphisms:
     where the estimate folds it is wrong, and what it samples may have more contrast than the scene.
     ``flow`` (H, W, 2); ``seen`` (H, W); returns (H, W).
     """
-    (ux, uy), (vx, vy) = (gradient(flow[..., axis], ops) for axis in (0, 1))
+    (ux, uy), (vx, vy) = (gradient(flow[..., axis]) for axis in (0, 1))
     folded = (ux + 1) * (vy + 1) <= uy * vx
     outside = 1 - seen
     if not bool(folded.any()):
         return outside
     # Widened by a box, and faded out: an abrupt change of weights would show as an edge.
-    around = ops.arrays.clip(ops.filter(folded * np.float32(1), _BOX, _BOX), 0, 1)
-    return ops.arrays.maximum(smooth(around, _FOLD_FADE, ops), outside)
+    around = namespace(flow).clip(correlate(folded * np.float32(1), _BOX, _BOX), 0, 1)
+    return namespace(flow).maximum(smooth(around, _FOLD_FADE), outside)
 
 
-def squared_deviation(grey: Stack, mean_frame: Stack, deviation: Stack, ops: StackOps) -> Stack:
+def squared_deviation(grey: Stack, mean_frame: Stack, deviation: Stack) -> Stack:
     """Local squared deviation of a frame from the mean frame in units of the usual one; about 1 for most frames."""
     difference = grey - mean_frame
-    return smooth(difference * difference, OUTLIER_WINDOW, ops) / deviation
+    return smooth(difference * difference, OUTLIER_WINDOW) / deviation
 
 
-def project_gradient(grey: Stack, template: tuple[Stack, Stack], ops: StackOps) -> Stack:
+def project_gradient(grey: Stack, template: Stack) -> Stack:
     """Gradient of a frame projected on that of the template; its average in a Gaussian window is the local sharpness.
 
     A blurred frame has a smaller projection.  So has a frame that is torn, misregistered or covered, although its
     gradient may be large: plain gradient energy would prefer it.  Noise enters linearly and averages out.
     """
-    dx, dy = gradient(grey, ops)
+    dx, dy = gradient(grey)
     return dx * template[0] + dy * template[1]
 
 
-def local_sharpness(projection: Stack, window: float, left_out: float, ops: StackOps) -> Stack:
+def local_sharpness(projection: Stack, window: float, left_out: float) -> Stack:
     """Average of the projected gradient in a Gaussian window, of whose middle a share is left out.
 
     The noise n of a pixel is part of the score of the window around it. By Stein's lemma the weights ``exp(β z)``
@@ -200,18 +199,18 @@ def local_sharpness(projection: Stack, window: float, left_out: float, ops: Stac
     Laplacian of the template: noise is added that looks like sharpness, and a blind estimate of the blur believes it.
     ``projection`` (H, W); returns (H, W).
     """
-    whole = smooth(projection, window, ops)
+    whole = smooth(projection, window)
     if left_out == 0:
         return whole
-    return (whole - smooth(projection, window / 2, ops) * left_out) / (1 - left_out)
+    return (whole - smooth(projection, window / 2) * left_out) / (1 - left_out)
 
 
-def gradient(image: Stack, ops: StackOps) -> tuple[Stack, Stack]:
+def gradient(image: Stack) -> tuple[Stack, Stack]:
     """Sobel's derivatives along x and y, divided by 8."""
-    return ops.filter(image, _DIFFERENCE, _BINOMIAL), ops.filter(image, _BINOMIAL, _DIFFERENCE)
+    return correlate(image, _DIFFERENCE, _BINOMIAL), correlate(image, _BINOMIAL, _DIFFERENCE)
 
 
-def smooth(image: Stack, sigma: float, ops: StackOps) -> Stack:
+def smooth(image: Stack, sigma: float) -> Stack:
     """Average in a Gaussian window that is cut off at 4σ."""
     kernel = cv2.getGaussianKernel(round(8 * sigma + 1) | 1, sigma, cv2.CV_32F).ravel()
-    return ops.filter(image, kernel, kernel)
+    return correlate(image, kernel, kernel)

@@ -20,7 +20,6 @@ import numpy as np
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import fit_noise_curve
 from ..registration.warp import warp
-from ..runtime.image_stacks import numpy_ops
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import map_ahead, sum_in_threads
 from .frame_noise import (
@@ -51,7 +50,6 @@ _SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
 _MIDDLE, _LEAST_SHARE = 0.25, 0.15
 # Largest β, the variance of noise that is worth one unit of squared gradient, and steps of the search for β.
 _LARGEST_WEIGHT, _PRICE, _BISECTIONS = 2.0, 10.0, 12
-_OPS = numpy_ops()
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +75,7 @@ def measure_frame_statistics(
 
     ``frames`` (H, W) or (H, W, 3) each; ``flows`` (H, W, 2) each; ``image`` (H, W) or (H, W, 3).
     """
-    template = gradient(luminance(image), _OPS)
+    template = np.stack(gradient(luminance(image)))
 
     def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, ...]:
         sums = tuple(np.zeros(image.shape[:2]) for _ in range(2))
@@ -94,14 +92,14 @@ def measure_frame_statistics(
     mean, variance, passed = _robust_start(mean, variance, centre, usual)
 
     square = template[0] ** 2 + template[1] ** 2
-    energy = smooth(square, window, _OPS)
+    energy = smooth(square, window)
     sensor_noise = fit_noise_curve(mean, np.where(passed, variance, fine), energy).variance(mean)
     mean_frame, deviation, moments = _without_outliers(frames, flows, mean, variance, template, window, threads)
     sharpness, spread, explained, left_out = _leave_middle_out(moments, template, energy, sensor_noise, window)
     scale = _score_scale(sharpness, spread, explained)
     weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, float(sensor_noise.mean()) / count)
     # Near what passes flow is pulled along, and a frame may be sharp without showing the scene.
-    scale *= 1 - smooth(passed.astype(np.float32), window, _OPS)
+    scale *= 1 - smooth(passed.astype(np.float32), window)
     return FrameStatistics(
         image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
         template=template,
@@ -163,7 +161,7 @@ def _median_and_spread(
     for plane in stack:
         difference = plane.astype(np.float32) - centre
         # Light that has changed is no noise.
-        cv2.accumulateSquare(difference - smooth(difference, LEVEL_WINDOW, _OPS), fine)
+        cv2.accumulateSquare(difference - smooth(difference, LEVEL_WINDOW), fine)
     return centre, spread, fine / max(len(stack) - 1, 1)
 
 
@@ -181,8 +179,8 @@ def _robust_start(
     What covers a pixel in a share p of the frames lies (1 − p) / p variances from the mean, and is no outlier if p
     exceeds a seventh.  The median and the median deviation hardly know of it up to p = 0.3.
     """
-    usual = smooth(spread, OUTLIER_WINDOW, _OPS) + np.float32(_IMAGE_NOISE_FLOOR)
-    passed = smooth(variance.astype(np.float32), OUTLIER_WINDOW, _OPS) > _HEAVY_TAIL * usual
+    usual = smooth(spread, OUTLIER_WINDOW) + np.float32(_IMAGE_NOISE_FLOOR)
+    passed = smooth(variance.astype(np.float32), OUTLIER_WINDOW) > _HEAVY_TAIL * usual
     return np.where(passed, centre, mean), np.where(passed, spread, variance), passed
 
 
@@ -191,7 +189,7 @@ def _without_outliers(
     flows: Iterable[FloatArray],
     mean: np.ndarray,
     variance: np.ndarray,
-    template: tuple[FloatArray, FloatArray],
+    template: FloatArray,
     window: float,
     threads: int,
 ) -> tuple[FloatArray, FloatArray, _SharpnessMoments]:
@@ -205,12 +203,12 @@ def _without_outliers(
         counts, total, squares, *moments = (np.zeros(mean.shape) for _ in range(8))
         for frame, flow in pairs:
             registered = luminance(warp(frame, flow))
-            kept = (squared_deviation(registered, centre, usual, _OPS) <= OUTLIER).view(np.uint8)
+            kept = (squared_deviation(registered, centre, usual) <= OUTLIER).view(np.uint8)
             cv2.accumulate(kept, counts)
             cv2.accumulate(registered, total, kept)
             cv2.accumulateSquare(registered - centre, squares, kept)
-            projection = project_gradient(registered, template, _OPS)
-            whole, middle = (smooth(projection, width, _OPS) * kept for width in (window, window / 2))
+            projection = project_gradient(registered, template)
+            whole, middle = (smooth(projection, width) * kept for width in (window, window / 2))
             _add_moments(whole, *moments[:2])
             _add_moments(middle, *moments[2:4])
             cv2.accumulateProduct(whole, middle, moments[4])
@@ -229,12 +227,12 @@ def _without_outliers(
 
 def _deviation(variance: np.ndarray, window: float = OUTLIER_WINDOW) -> FloatArray:
     floor = max(_LEAST_DEVIATION * float(variance.mean()), _IMAGE_NOISE_FLOOR)
-    return smooth(variance.astype(np.float32), window, _OPS) + np.float32(floor)
+    return smooth(variance.astype(np.float32), window) + np.float32(floor)
 
 
 def _leave_middle_out(
     moments: _SharpnessMoments,
-    template: tuple[FloatArray, FloatArray],
+    template: FloatArray,
     energy: FloatArray,
     noise: FloatArray,
     window: float,
@@ -244,9 +242,7 @@ def _leave_middle_out(
     κ grows with that part: without noise the middle of the window is where the sharpness of a pixel shows best.  Noise
     n of variance ``noise`` adds ``Σ g t · ∇n = −Σ n ∇·(g t)`` to the sharpness, with t the template, g the window.
     """
-    divergence = smooth(
-        (gradient(template[0], _OPS)[0] + gradient(template[1], _OPS)[1]) ** 2, window / np.sqrt(2), _OPS
-    )
+    divergence = smooth((gradient(template[0])[0] + gradient(template[1])[1]) ** 2, window / np.sqrt(2))
     # ∫ g² and, along one axis, ∫ (∇g)² of a Gaussian of deviation s are 1 / (4π s²) and 1 / (8π s⁴).
     inside, border = noise * divergence / (4 * np.pi * window**2), noise * energy / (8 * np.pi * window**4)
     share = min(float((inside + border).sum() / max(moments.whole_spread.sum(), 1e-18)), 1.0)

@@ -47,7 +47,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.arrays import FloatArray
 from ..core.errors import DataError
 from ..dynamics.flow_model import Float64Array, FlowDynamics, ProjectedFlow
-from ..runtime.image_stacks import Stack
+from ..runtime.image_stacks import Stack, load, load_image, store, store_image
 
 _LOG_2PI = float(np.log(2 * np.pi))
 # Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
@@ -332,6 +332,15 @@ class PixelStacks(NamedTuple):
 
     mean: Stack
     variance: Stack
+
+    @classmethod
+    def of(cls, pixels: PixelGaussian, device: str) -> PixelStacks:
+        """Bring ρ̂ and Σ to a device."""
+        return cls(load_image(pixels.mean, device), load(pixels.variance, device))
+
+    def stored(self) -> PixelGaussian:
+        """Bring ρ̂ and Σ back."""
+        return PixelGaussian(store_image(self.mean), store(self.variance))
 
 
 def update_pixels(state: PixelStacks, registered: Stack, noise: Stack, drift: float) -> tuple[PixelStacks, Stack]:

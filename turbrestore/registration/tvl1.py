@@ -48,7 +48,18 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.arrays import FloatArray, check_flow, check_frames, check_grey, luminance
 from ..core.errors import DataError, require, require_between
 from ..runtime.device import CPU, find_device, memory_of
-from ..runtime.image_stacks import Shape, Stack, StackOps, numpy_ops, spline_coefficients, torch_ops
+from ..runtime.image_stacks import (
+    Shape,
+    Stack,
+    correlate,
+    load,
+    median,
+    namespace,
+    resize,
+    sample,
+    spline_coefficients,
+    store,
+)
 from .opencv_flow import FlowSolver, GreyImage
 from .tvl1_sweeps import FlowProblem, SweepParams, resize_dual, sweep
 
@@ -133,7 +144,6 @@ class TvL1Reference:
 
     levels: tuple[ReferenceLevel, ...]  # from the image to the coarsest
     params: TvL1Params
-    ops: StackOps  # operations of the CPU, or of the device
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,10 +164,8 @@ def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device:
     image = check_grey(reference, "reference")
     if min(image.shape) < _LEAST_SIDE // 2:
         raise DataError(f"reference: expected at least 16×16 pixels, found {image.shape[1]}×{image.shape[0]}")
-    found = find_device(device)
-    ops = numpy_ops() if found == CPU else torch_ops(found)
-    levels = (_prepare_level(stack, ops) for stack in _pyramid(ops.load(image[None]), params.levels, ops))
-    return TvL1Reference(tuple(levels), params, ops)
+    levels = tuple(map(_prepare_level, _pyramid(load(image[None], find_device(device)), params.levels)))
+    return TvL1Reference(levels, params)
 
 
 def tvl1_flows(
@@ -182,7 +190,7 @@ def tvl1_flows(
         require_between("levels", levels, 1, 10_000)
         reference = replace(reference, levels=reference.levels[:levels])
     # On the CPU a single frame stays in the cache.
-    size = 1 if reference.ops.arrays is np else len(stack)
+    size = 1 if isinstance(reference.levels[0].image, np.ndarray) else len(stack)
     groups = [slice(first, first + size) for first in range(0, len(stack), size)]
     parts = [_solve(stack[group], reference, None if flows is None else flows[group], draft) for group in groups]
     return TvL1Flows(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("flows", "warps", "settled")))
@@ -213,46 +221,46 @@ def tvl1_solver(params: TvL1Params, reference: GreyImage, device: str) -> FlowSo
     return solve
 
 
-def _prepare_level(image: Stack, ops: StackOps) -> ReferenceLevel:
-    y, x = np.mgrid[: image.shape[-2], : image.shape[-1]].astype(np.float32)
-    return ReferenceLevel(image, _gradient(image, ops), ops.load(x), ops.load(y))
+def _prepare_level(image: Stack) -> ReferenceLevel:
+    y, x = (load(axis, image.device) for axis in np.mgrid[: image.shape[-2], : image.shape[-1]].astype(np.float32))
+    return ReferenceLevel(image, _gradient(image), x, y)
 
 
-def _gradient(images: Stack, ops: StackOps) -> Stack:
-    return ops.arrays.stack([ops.filter(images, _DERIVATIVE, _ONE), ops.filter(images, _ONE, _DERIVATIVE)], 1)
+def _gradient(images: Stack) -> Stack:
+    return namespace(images).stack([correlate(images, _DERIVATIVE, _ONE), correlate(images, _ONE, _DERIVATIVE)], 1)
 
 
-def _pyramid(images: Stack, levels: int, ops: StackOps) -> list[Stack]:
+def _pyramid(images: Stack, levels: int) -> list[Stack]:
     pyramid = [images]
     while len(pyramid) < levels and min(pyramid[-1].shape[-2:]) >= _LEAST_SIDE:
         height, width = pyramid[-1].shape[-2:]
-        smooth = ops.filter(pyramid[-1], _REDUCTION, _REDUCTION)
-        pyramid.append(ops.resize(smooth, ((height + 1) // 2, (width + 1) // 2)))
+        smooth = correlate(pyramid[-1], _REDUCTION, _REDUCTION)
+        pyramid.append(resize(smooth, ((height + 1) // 2, (width + 1) // 2)))
     return pyramid
 
 
 def _solve(frames: FloatArray, reference: TvL1Reference, start: FloatArray | None, draft: bool) -> TvL1Flows:
     """Flows of a batch, from the coarsest level to the finest."""
-    ops = reference.ops
-    pyramid = _pyramid(ops.load(frames), len(reference.levels), ops)
+    device = reference.levels[0].image.device
+    pyramid = _pyramid(load(frames, device), len(reference.levels))
     count, *size = pyramid[-1].shape
-    flow, dual = ops.zeros((count, 2, *size)), ops.zeros((count, 2, 2, *size))
+    flow, dual = (load(np.zeros((count, *axes, *size), np.float32), device) for axes in ((2,), (2, 2)))
     if start is not None:
-        flow = _resized(ops.load(np.moveaxis(start, -1, 1)), tuple(size), ops)
+        flow = _resized(load(np.moveaxis(start, -1, 1), device), tuple(size))
     finest = int(draft and len(pyramid) > 1)
     for level, images in zip(reference.levels[finest:][::-1], pyramid[finest:][::-1], strict=True):
         shape = tuple(images.shape[-2:])
         if tuple(flow.shape[-2:]) != shape:
-            flow, dual = _resized(flow, shape, ops), resize_dual(dual, shape, ops)
-        warps, settled = _settle(level, spline_coefficients(images, ops), flow, dual, reference)
-    flow = _resized(flow, tuple(pyramid[0].shape[-2:]), ops) if finest else flow
-    return TvL1Flows(np.moveaxis(ops.store(flow), 1, -1), warps, settled)
+            flow, dual = _resized(flow, shape), resize_dual(dual, shape)
+        warps, settled = _settle(level, spline_coefficients(images), flow, dual, reference)
+    flow = _resized(flow, tuple(pyramid[0].shape[-2:])) if finest else flow
+    return TvL1Flows(np.moveaxis(store(flow), 1, -1), warps, settled)
 
 
-def _resized(flow: Stack, shape: Shape, ops: StackOps) -> Stack:
+def _resized(flow: Stack, shape: Shape) -> Stack:
     """Flow on another grid; displacements scale with it."""
     height, width = flow.shape[-2:]
-    result = ops.resize(flow, shape)
+    result = resize(flow, shape)
     result[:, 0] *= shape[1] / width
     result[:, 1] *= shape[0] / height
     return result
@@ -265,7 +273,7 @@ def _settle(
 
     ``flow`` and ``dual`` are overwritten.
     """
-    params, ops = reference.params, reference.ops
+    params, xp = reference.params, namespace(flow)
     sweeps = SweepParams(params.sweeps, params.step, params.huber)
     warps, settled = np.zeros(len(frames), np.intp), np.zeros(len(frames), np.bool_)
     for _ in range(params.warps):
@@ -274,12 +282,12 @@ def _settle(
             break
         before, p = flow[running], dual[running]
         problem = _linearise(level, frames[running], before, reference)
-        after = sweep(problem, before, p, sweeps, ops)
+        after = sweep(problem, before, p, sweeps)
         if params.median > 1:
-            after = ops.median(after, params.median)
-        unchanged = ops.arrays.square(after - before).sum(1) < params.tolerance**2
+            after = median(after, params.median)
+        unchanged = xp.square(after - before).sum(1) < params.tolerance**2
         # Counted where the flow is, so that a device gives back one number for each frame.
-        still = ops.store(unchanged.reshape(len(running), -1).sum(1))
+        still = store(unchanged.reshape(len(running), -1).sum(1))
         flow[running], dual[running] = after, p
         warps[running] += 1
         settled[running] = 2 * still > unchanged.shape[-2] * unchanged.shape[-1]
@@ -288,18 +296,18 @@ def _settle(
 
 def _linearise(level: ReferenceLevel, frames: Stack, flow: Stack, reference: TvL1Reference) -> FlowProblem:
     """Linearise the data term about a flow u₀: ``ρ(u) = f_w − r + g·(u − u₀)``, divided by |g|."""
-    ops = reference.ops
+    xp = namespace(flow)
     x, y = level.x + flow[:, 0], level.y + flow[:, 1]
     height, width = x.shape[-2:]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    warped = ops.sample(frames, flow)  # f_w
-    g = _gradient(warped, ops)
+    warped = sample(frames, flow)  # f_w
+    g = _gradient(warped)
     g += level.gradient
     # Outside the frame g vanishes, and with it the largest step that the data term can make.
     g *= 0.5 * inside[:, None]
     offset = warped - level.image
     offset -= (g * flow).sum(1)
-    length = ops.arrays.sqrt(ops.arrays.square(g).sum(1) + _FLAT**2)
+    length = xp.sqrt(xp.square(g).sum(1) + _FLAT**2)
     offset /= length
     g /= length[:, None]
     return FlowProblem(g, offset, length * reference.params.attachment)

@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.arrays import FloatArray
-from ..runtime.image_stacks import Shape, Stack, StackOps
+from ..runtime.image_stacks import Shape, Stack, resize
 from ..runtime.jit import jit
 
 # Bound of the squared norm of the gradient by forward differences.
@@ -68,12 +68,12 @@ class SweepParams:
         return 1 / (1 + self.dual_step * self.huber)
 
 
-def sweep(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams, ops: StackOps) -> Stack:
+def sweep(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams) -> Stack:
     """Sweep the flows of a batch.
 
     ``flow`` (B, 2, H, W); ``dual`` (B, 2, 2, H, W); returns (B, 2, H, W).
     """
-    if ops.arrays is not np:
+    if not isinstance(flow, np.ndarray):
         return _sweep_on_device(problem, flow, dual, params)
     steps = np.array([params.step, params.dual_step, params.shrink, params.count], flow.dtype)
     u, ahead = flow.copy(), flow.copy()
@@ -184,12 +184,12 @@ def divergence(px: Stack, py: Stack, out: Stack) -> None:
     out[..., 1:, :] -= py[..., :-1, :]
 
 
-def resize_dual(dual: Stack, shape: Shape, ops: StackOps) -> Stack:
+def resize_dual(dual: Stack, shape: Shape) -> Stack:
     """Dual variable on another grid.
 
     ``dual`` (B, 2, 2, h, w); returns (B, 2, 2, H, W).
     """
-    result = ops.resize(dual, shape)
+    result = resize(dual, shape)
     # There are no differences across the border.
     result[:, 0, :, :, -1] = 0
     result[:, 1, :, -1, :] = 0

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, check_flow, check_image
 from ..core.errors import ConfigurationError, DataError
 from ..runtime.device import CPU, find_device, memory_of
-from ..runtime.image_stacks import sample_spline, spline_planes, torch_ops, warp_stack
+from ..runtime.image_stacks import load, load_image, sample_spline, spline_planes, store_image, warp_stack
 
 INTERPOLATIONS = ("linear", "cubic")
 # Pixels of a strip.  A dozen arrays of a smaller one would stay in the cache of a core, but with two threads, taking
@@ -47,10 +47,8 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device
     found = find_device(device)
     if found == CPU:
         return sample_splines(spline_planes(image), flow)
-    planes, ops = image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0), torch_ops(found)
     with memory_of(found):
-        warped = ops.store(warp_stack(ops.load(planes), ops.load(flow), ops))
-    return warped[0] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(warped, 0, -1))
+        return store_image(warp_stack(load_image(image, found), load(flow, found)))
 
 
 def sample_splines(planes: FloatArray, flow: FloatArray) -> FloatArray:

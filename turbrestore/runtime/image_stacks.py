@@ -1,9 +1,11 @@
-"""Operations on stacks of images that have another name in torch than on the CPU: filter, resize, sample, median.
+"""Stacks of images: arrays on the CPU, or tensors of torch on a device; equations are written once for both.
 
-A stack has the shape (..., H, W), float32.  Arithmetic is spelled alike in NumPy and torch (``ops.arrays.sqrt(a)``), so
-a solver is written once; the operations here are not.  On the CPU they are OpenCV's and one compiled loop, on a device
-those of torch and kornia.  Both agree to rounding.  Pixel centres lie at whole numbers.  Images are continued by
-reflection about their outermost pixels; the median repeats those.
+A stack has the shape (..., H, W), float32.  Arithmetic is spelled alike in NumPy and torch: ``xp = namespace(stack)``,
+``xp.sqrt(stack)``.  The operations here are not, and look at the stack: on the CPU they are OpenCV's and one compiled
+loop, on a device those of torch and kornia.  Both agree to rounding.  Pixel centres lie at whole numbers.  Images are
+continued by reflection about their outermost pixels; the median repeats those.
+
+On a device a repeated run gives the same bytes, in full single precision: nothing is scattered.
 
 Images are sampled by cubic B-splines: the cubic convolution that the libraries offer does not reproduce a ramp, and
 biases flows by up to 0.04 px.
@@ -12,17 +14,19 @@ biases flows by up to 0.04 px.
 from __future__ import annotations
 
 import functools
-import threading
+import sys
 from collections.abc import Callable
-from contextlib import ContextDecorator, ExitStack
-from dataclasses import dataclass
+from contextlib import AbstractContextManager
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
+from .device import CPU
 from .jit import jit
+from .threads import WhileInside
 
 # Pole of the cubic B-spline prefilter; its impulse response is cut off where it falls below 1e-7.
 _POLE = np.sqrt(3.0) - 2.0
@@ -30,122 +34,108 @@ PREFILTER = (-6 * _POLE / (1 - _POLE**2) * _POLE ** np.abs(np.arange(-12, 13))).
 # Coefficients that a spline needs before the image and beyond it.
 _BEFORE, _BEYOND = 1, 2
 
-# ndarray or torch tensor, float32.
+# ndarray or torch tensor.
 Stack = Any
 Shape = tuple[int, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class StackOps:
-    """The operations of one library."""
-
-    arrays: Any  # ``numpy`` or ``torch``, for arithmetic
-    # From a NumPy array to a stack, and back.
-    load: Callable[[FloatArray], Stack]
-    store: Callable[[Stack], FloatArray]
-    zeros: Callable[[Shape], Stack]  # ``zeros(shape)`` is a stack of zeros
-    # ``filter(stack, kernel_x, kernel_y)`` correlates along both axes with kernels of odd length.
-    filter: Callable[[Stack, FloatArray, FloatArray], Stack]
-    resize: Callable[[Stack, Shape], Stack]  # ``resize(stack, (H, W))`` interpolates linearly
-    # ``sample(coefficients, flow)`` evaluates the cubic B-spline with these coefficients, shape (B, H, W), where each
-    # pixel leads by its flow, shape (B, 2, H, W), pixels; positions outside the image are moved to its border.
-    sample: Callable[[Stack, Stack], Stack]
-    median: Callable[[Stack, int], Stack]  # ``median(stack, side)`` of windows of 3×3 or 5×5 pixels
+def namespace(stack: Stack) -> Any:
+    """Return the library that a stack belongs to, ``numpy`` or ``torch``."""
+    return np if isinstance(stack, np.ndarray) else sys.modules["torch"]
 
 
-@functools.cache
-def numpy_ops() -> StackOps:
-    """Operations of NumPy and OpenCV."""
+def load(array: NDArray[Any], device: Any) -> Stack:
+    """Bring an array to a device, given by its name or as the ``device`` of a stack; ``"cpu"`` is NumPy."""
+    if isinstance(device, str) and device == CPU:
+        return array
+    import torch
 
-    def each(function: Callable[[FloatArray, FloatArray], object], stack: FloatArray, size: Shape) -> FloatArray:
-        result = np.empty((*stack.shape[:-2], *size), np.float32)
-        for plane, out in zip(stack.reshape(-1, *stack.shape[-2:]), result.reshape(-1, *size), strict=True):
-            function(plane, out)
-        return result
+    # torch shares no memory that cannot be written.
+    return torch.from_numpy(np.require(array, requirements=["C", "W"])).to(device)
 
-    def filtered(stack: FloatArray, kernel_x: FloatArray, kernel_y: FloatArray) -> FloatArray:
-        def correlate(plane: FloatArray, out: FloatArray) -> None:
+
+def store(stack: Stack) -> NDArray[Any]:
+    """Return a stack as an array; from a GPU into memory that the system does not move, which is many times faster."""
+    if isinstance(stack, np.ndarray):
+        return stack
+    if stack.device.type != "cuda":
+        return np.asarray(stack.cpu().numpy())
+    import torch
+
+    pinned = torch.empty(stack.shape, dtype=stack.dtype, pin_memory=True)
+    return np.asarray(pinned.copy_(stack).numpy())
+
+
+def load_image(image: NDArray[np.floating], device: Any) -> Stack:
+    """Bring an image (H, W) or (H, W, C) to a device with its channels first, (C, H, W)."""
+    return load(image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0), device)
+
+
+def store_image(channels: Stack) -> FloatArray:
+    """Return channels (C, H, W) as an image (H, W) or (H, W, C); the reverse of :func:`load_image`."""
+    planes = store(channels)
+    return planes[0] if len(planes) == 1 else np.ascontiguousarray(np.moveaxis(planes, 0, -1))
+
+
+def total(values: Stack) -> float:
+    """Sum all values in double precision."""
+    return float(values.sum(dtype=namespace(values).float64))
+
+
+def correlate(stack: Stack, kernel_x: FloatArray, kernel_y: FloatArray) -> Stack:
+    """Correlate along both axes with kernels of odd length."""
+    if isinstance(stack, np.ndarray):
+
+        def filtered(plane: FloatArray, out: FloatArray) -> None:
             cv2.sepFilter2D(plane, -1, kernel_x, kernel_y, dst=out, borderType=cv2.BORDER_REFLECT_101)
 
-        return each(correlate, stack, stack.shape[-2:])
+        return _each(filtered, stack, stack.shape[-2:])
+    from kornia.filters import filter2d_separable
 
-    def sampled(coefficients: FloatArray, flow: FloatArray) -> FloatArray:
-        result = np.empty(coefficients.shape, np.float32)
-        for plane, displacement, out in zip(coefficients, flow, result, strict=True):
-            sample_spline(bordered(plane)[None], np.ascontiguousarray(np.moveaxis(displacement, 0, -1)), out[None])
-        return result
-
-    return StackOps(
-        arrays=np,
-        load=np.asarray,
-        store=np.asarray,
-        zeros=lambda shape: np.zeros(shape, np.float32),
-        filter=filtered,
-        resize=lambda stack, size: each(lambda plane, out: cv2.resize(plane, size[::-1], dst=out), stack, size),
-        sample=sampled,
-        median=lambda stack, side: each(
-            lambda plane, out: cv2.medianBlur(plane, side, dst=out), stack, stack.shape[-2:]
-        ),
-    )
+    half = len(kernel_y) // 2, len(kernel_x) // 2
+    planes = _reflect(_planes_of(stack), half, half)
+    along, across = (_kernel_on(str(stack.device), kernel.tobytes()) for kernel in (kernel_x, kernel_y))
+    with full_precision():
+        return filter2d_separable(planes, along, across, padding="valid").reshape(stack.shape)
 
 
-@functools.cache
-def torch_ops(device: str) -> StackOps:
-    """Operations of torch and kornia.
+def resize(stack: Stack, size: Shape) -> Stack:
+    """Interpolate linearly to a grid (H, W)."""
+    if isinstance(stack, np.ndarray):
+        return _each(lambda plane, out: cv2.resize(plane, size[::-1], dst=out), stack, size)
+    from torch.nn.functional import interpolate
 
-    A repeated run gives the same bytes, in full single precision (see :func:`full_precision`): nothing is scattered.
+    planes = interpolate(_planes_of(stack), size=size, mode="bilinear", align_corners=False)
+    return planes.reshape(*stack.shape[:-2], *size)
+
+
+def median(stack: Stack, side: int) -> Stack:
+    """Median of windows of 3×3 or 5×5 pixels."""
+    if isinstance(stack, np.ndarray):
+        return _each(lambda plane, out: cv2.medianBlur(plane, side, dst=out), stack, stack.shape[-2:])
+    from kornia.filters import median_blur
+
+    with full_precision():
+        return median_blur(_planes_of(stack), side, border_type="replicate").reshape(stack.shape)
+
+
+def sample(coefficients: Stack, flow: Stack) -> Stack:
+    """Evaluate the cubic B-splines with these coefficients (B, H, W) where each pixel leads by its flow (B, 2, H, W).
+
+    Positions outside the image are moved to its border.
     """
-    import torch
-    from kornia.filters import filter2d_separable, median_blur
-    from torch.nn import functional
-
-    def planes_of(stack: Stack) -> Stack:
-        return stack.reshape(-1, 1, *stack.shape[-2:])
-
-    def filtered(stack: Stack, kernel_x: FloatArray, kernel_y: FloatArray) -> Stack:
-        half = len(kernel_y) // 2, len(kernel_x) // 2
-        planes = _reflect(planes_of(stack), half, half)
-        along, across = (_kernel_on(str(stack.device), kernel.tobytes()) for kernel in (kernel_x, kernel_y))
-        with full_precision():
-            return filter2d_separable(planes, along, across, padding="valid").reshape(stack.shape)
-
-    def resized(stack: Stack, size: Shape) -> Stack:
-        planes = functional.interpolate(planes_of(stack), size=size, mode="bilinear", align_corners=False)
-        return planes.reshape(*stack.shape[:-2], *size)
-
-    def median(stack: Stack, side: int) -> Stack:
-        with full_precision():
-            return median_blur(planes_of(stack), side, border_type="replicate").reshape(stack.shape)
-
-    return StackOps(
-        arrays=torch,
-        # torch shares no memory that cannot be written.
-        load=lambda array: torch.from_numpy(np.require(array, requirements=["C", "W"])).to(device),
-        store=from_device,
-        zeros=lambda shape: torch.zeros(shape, device=device),
-        filter=filtered,
-        resize=resized,
-        sample=lambda coefficients, flow: _sample_gathered(coefficients, flow, torch),
-        median=median,
-    )
+    if not isinstance(coefficients, np.ndarray):
+        return _sample_gathered(coefficients, flow)
+    result = np.empty(coefficients.shape, np.float32)
+    for number, displacement in enumerate(np.moveaxis(flow, 1, -1)):
+        planes = bordered(coefficients[number])[None]
+        sample_spline(planes, np.ascontiguousarray(displacement), result[number : number + 1])
+    return result
 
 
-def from_device(tensor: Stack) -> FloatArray:
-    """Copy a tensor into an array; from a GPU into memory that the system does not move, which is many times faster."""
-    import torch
-
-    if tensor.device.type != "cuda":
-        return np.asarray(tensor.cpu().numpy())
-    pinned = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
-    return np.asarray(pinned.copy_(tensor).numpy())
-
-
-def spline_coefficients(stack: Stack, ops: StackOps) -> Stack:
-    """Coefficients of the cubic B-spline through the pixels.
-
-    ``stack`` (..., H, W); returns (..., H, W).
-    """
-    return ops.filter(stack, PREFILTER, PREFILTER)
+def spline_coefficients(stack: Stack) -> Stack:
+    """Coefficients of the cubic B-spline through the pixels."""
+    return correlate(stack, PREFILTER, PREFILTER)
 
 
 def bordered(coefficients: FloatArray) -> FloatArray:
@@ -159,16 +149,17 @@ def spline_planes(image: FloatArray) -> FloatArray:
     ``image`` (H, W) or (H, W, 3); returns their coefficients (1, H + 3, W + 3) or (3, H + 3, W + 3).
     """
     planes = (image,) if image.ndim == 2 else cv2.split(image)
-    return np.stack([bordered(spline_coefficients(plane, numpy_ops())) for plane in planes])
+    return np.stack([bordered(spline_coefficients(plane)) for plane in planes])
 
 
-def warp_stack(stack: Stack, flow: Stack, ops: StackOps) -> Stack:
+def warp_stack(stack: Stack, flow: Stack) -> Stack:
     """Backward warp by cubic B-splines: the equation behind :func:`turbrestore.registration.warp.warp`.
 
     ``stack`` (B, H, W); ``flow`` (H, W, 2); returns (B, H, W).
     """
-    planes = ops.arrays.moveaxis(flow, -1, 0)
-    return ops.sample(spline_coefficients(stack, ops), ops.arrays.broadcast_to(planes, (len(stack), *planes.shape)))
+    xp = namespace(stack)
+    planes = xp.moveaxis(flow, -1, 0)
+    return sample(spline_coefficients(stack), xp.broadcast_to(planes, (len(stack), *planes.shape)))
 
 
 @jit
@@ -201,8 +192,10 @@ def sample_spline(coefficients: FloatArray, flow: FloatArray, result: FloatArray
                 result[plane, row, column] = a * upper + b * middle + c * below + d * lower
 
 
-def _sample_gathered(coefficients: Stack, flow: Stack, torch: Any) -> Stack:
+def _sample_gathered(coefficients: Stack, flow: Stack) -> Stack:
     """Sixteen gathers; torch's grid_sample rounds positions to 1e-7 of the width, which is 2e-4 px of 1920."""
+    import torch
+
     count, height, width = coefficients.shape
     y, x = (torch.arange(length, dtype=torch.float32, device=flow.device) for length in (height, width))
     x, y = (x + flow[:, 0]).clip(0, width - 1), (y[:, None] + flow[:, 1]).clip(0, height - 1)
@@ -230,6 +223,18 @@ def _spline_weights(t: Stack) -> tuple[Stack, Stack, Stack, Stack]:
     return first, second, 1 - first - second - last, last
 
 
+def _each(function: Callable[[FloatArray, FloatArray], object], stack: FloatArray, size: Shape) -> FloatArray:
+    """Fill planes (H, W) of a given size by a function of each plane of a stack."""
+    result = np.empty((*stack.shape[:-2], *size), np.float32)
+    for plane, out in zip(stack.reshape(-1, *stack.shape[-2:]), result.reshape(-1, *size), strict=True):
+        function(plane, out)
+    return result
+
+
+def _planes_of(stack: Stack) -> Stack:
+    return stack.reshape(-1, 1, *stack.shape[-2:])
+
+
 def _reflect(stack: Stack, before: Shape, beyond: Shape) -> Stack:
     """Continue images by so many rows and columns; unlike torch's padding, by more than there are too."""
     for axis, *sides in zip((-2, -1), before, beyond, strict=True):
@@ -253,32 +258,16 @@ def _reflected_order(device: str, length: int, before: int, beyond: int) -> Stac
     return torch.from_numpy(np.pad(np.arange(length), (before, beyond), mode="reflect")).to(device)
 
 
-class _FullPrecision(ContextDecorator):
-    """Settings of cuDNN while anybody is inside; they belong to the process, so the last one out restores them."""
-
-    def __init__(self) -> None:
-        self._lock, self._inside, self._restore = threading.Lock(), 0, ExitStack()
-
-    def __enter__(self) -> None:
-        from torch.backends import cudnn
-
-        with self._lock:
-            if self._inside == 0:
-                settings = cudnn.flags(enabled=cudnn.enabled, deterministic=True, allow_tf32=False)
-                self._restore.enter_context(settings)
-            self._inside += 1
-
-    def __exit__(self, *error: object) -> None:
-        with self._lock:
-            self._inside -= 1
-            if self._inside == 0:
-                self._restore.close()
-
-
 @functools.cache
-def full_precision() -> _FullPrecision:
+def full_precision() -> WhileInside:
     """Keep the convolutions of cuDNN, which kornia's filters and median use, in single precision and reproducible.
 
     A GPU otherwise rounds their factors to ten bits.
     """
-    return _FullPrecision()
+
+    def settings() -> AbstractContextManager[None]:
+        from torch.backends import cudnn
+
+        return cudnn.flags(enabled=cudnn.enabled, deterministic=True, allow_tf32=False)
+
+    return WhileInside(settings)

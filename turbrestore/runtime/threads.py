@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import ContextDecorator, ExitStack
+from contextlib import AbstractContextManager, ContextDecorator, ExitStack, contextmanager
 from itertools import islice
 from types import TracebackType
 from typing import Self, TypeVar
@@ -193,24 +193,20 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class _OneThreadEach(ContextDecorator):
-    """Threads of OpenCV and BLAS, switched off while anybody is inside: the first takes them, the last gives them back.
+class WhileInside(ContextDecorator):
+    """Settings of the process, in force while anybody is inside: the first one in makes them, the last undoes them.
 
     Two streams that are worked on in turns do not end in the order in which they began.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, settings: Callable[[], AbstractContextManager[object]]) -> None:
         # Reentrant: memory that is collected meanwhile may end a stream in this very thread.
-        self._lock = threading.RLock()
-        self._inside = 0
-        self._restore = ExitStack()
+        self._settings, self._lock, self._inside, self._restore = settings, threading.RLock(), 0, ExitStack()
 
     def __enter__(self) -> None:
         with self._lock:
             if self._inside == 0:
-                self._restore.callback(cv2.setNumThreads, cv2.getNumThreads())
-                self._restore.enter_context(_controller().limit(limits=1, user_api="blas"))
-                cv2.setNumThreads(1)
+                self._restore.enter_context(self._settings())
             self._inside += 1
 
     def __exit__(self, *error: object) -> None:
@@ -221,13 +217,24 @@ class _OneThreadEach(ContextDecorator):
 
 
 @functools.cache
-def one_thread_each() -> _OneThreadEach:
+def one_thread_each() -> WhileInside:
     """Keep OpenCV and BLAS from starting threads of their own, and give them back what they had afterwards.
 
     Beside busy threads a BLAS call on two threads is not twice as fast but tens of times slower: each waits for the
     other to be scheduled. Uses may overlap, in one thread or in several: what they had comes back after the last.
     """
-    return _OneThreadEach()
+
+    @contextmanager
+    def settings() -> Iterator[None]:
+        before = cv2.getNumThreads()
+        with _controller().limit(limits=1, user_api="blas"):
+            cv2.setNumThreads(1)
+            try:
+                yield
+            finally:
+                cv2.setNumThreads(before)
+
+    return WhileInside(settings)
 
 
 @functools.cache

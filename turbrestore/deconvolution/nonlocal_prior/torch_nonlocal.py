@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from ...core.arrays import FloatArray
-from ...runtime.image_stacks import torch_ops
+from ...runtime.image_stacks import correlate, load
 from .nonlocal_weights import POWERS, SMALLEST_WEIGHT, NonlocalParams, automatic_h
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def _neighbours(guide: FloatArray, params: NonlocalParams, device: str) -> tuple
     bits = len(offsets).bit_length()
     margin = params.search // 2 + params.patch // 2
     around = cv2.copyMakeBorder(guide, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
-    padded = torch.from_numpy(around).to(device)
+    padded = load(around, device)
     room = _STRIP_BYTES_CPU if padded.device.type == "cpu" else _STRIP_BYTES_GPU
     rows = max(1, int(room / (4 * params.search**2 * width)))
     strips = [_best_keys(padded, top, min(rows, height - top), height, params) for top in range(0, height, rows)]
@@ -208,12 +208,11 @@ def _best_keys(padded: Tensor, top: int, rows: int, height: int, params: Nonloca
 
 def _distances(padded: Tensor, top: int, rows: int, params: NonlocalParams) -> Tensor:
     """Patch distances of a strip to every pixel of the window; shape (search, search, rows, W)."""
-    ops = torch_ops(str(padded.device))
     reach, half = params.search // 2, params.patch // 2
     strip = padded[top : top + rows + 2 * (reach + half)]
     height, width = strip.shape[0] - 2 * reach, strip.shape[1] - 2 * reach
     moved = strip.unfold(0, height, 1).unfold(1, width, 1)
-    window = cv2.getGaussianKernel(params.patch, params.patch_sigma, cv2.CV_32F).ravel()
+    window = params.window
     squares = (moved - strip[reach : reach + height, reach : reach + width]).square_()
-    smooth = ops.filter(squares, window, window)
+    smooth = correlate(squares, window, window)
     return smooth[..., half : height - half, half : width - half].contiguous()

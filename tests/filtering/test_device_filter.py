@@ -10,9 +10,9 @@ from turbrestore.core.arrays import luminance
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import filter_frames
-from turbrestore.filtering.array_backend import array_backend
 from turbrestore.filtering.filter_records import FilterParams
 from turbrestore.filtering.frame_noise import warp_frame
+from turbrestore.runtime.image_stacks import load, store
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
@@ -123,9 +123,9 @@ def test_lack_of_memory_is_one_line(device, monkeypatch):
 
 @pytest.mark.parametrize("device", ["cpu", *devices()])
 def test_a_warped_frame_has_its_luminance_and_pixels_come_back(device):
-    backend, image = array_backend(device), coloured(SCENES["camera"](20))
+    image = coloured(SCENES["camera"](20))
     flow = np.full((20, 20, 2), 0.75, np.float32)
-    channels, grey, seen = map(backend.ops.store, warp_frame(image, backend.ops.load(flow), backend.ops))
+    channels, grey, seen = map(store, warp_frame(image, load(flow, device)))
     assert channels.shape == (3, 20, 20)
     assert grey == pytest.approx(luminance(np.ascontiguousarray(np.moveaxis(channels, 0, -1))), abs=1e-6)
     assert seen[:19, :19].min() == 1
