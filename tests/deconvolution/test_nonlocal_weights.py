@@ -14,8 +14,8 @@ from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import (
     nonlocal_weights,
     place_pairs,
     search_patches,
+    search_tile,
 )
-from turbrestore.deconvolution.nonlocal_prior.patch_search import search_tile
 
 SMALL = NonlocalParams(patch=3, search=5, best=3)
 

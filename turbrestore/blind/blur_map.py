@@ -88,8 +88,13 @@ def blur_map_steps(
     sigmas, uncertainties = np.full(shape, whole.sigma), np.full(shape, whole.uncertainty)
     agree = _agree(found.values())
     for number, (place, candidates) in enumerate(found.items(), 1):
-        with one_thread_each():
-            chosen = _nearest_reduction(candidates, whole) if agree else choose_blur(_like(candidates, whole), runtime)
+        plausible = tuple(one for one in candidates if one.plausible)
+        if agree:
+            chosen = min((one.estimate for one in plausible), key=lambda one: abs(one.reduction - whole.reduction))
+        else:
+            alike = tuple(one for one in plausible if 2 * one.estimate.reduction >= whole.reduction)
+            with one_thread_each():
+                chosen = choose_blur(alike or candidates, runtime)
         sigmas[place], uncertainties[place] = chosen.sigma, chosen.uncertainty
         yield number
     known = tuple(np.array(list(found), int).reshape(-1, 2).T)
@@ -167,20 +172,6 @@ def _agree(tiles: Iterable[tuple[BlurCandidate, ...]]) -> bool:
         return False
     widths = [width for tile in plausible for width in tile]
     return not widths or max(widths) <= _CLEAR_FACTOR * min(widths)
-
-
-def _nearest_reduction(candidates: tuple[BlurCandidate, ...], whole: BlurEstimate) -> BlurEstimate:
-    """Plausible estimate whose reduction is nearest to that of the whole image."""
-    plausible = (one.estimate for one in candidates if one.plausible)
-    return min(plausible, key=lambda estimate: abs(estimate.reduction - whole.reduction))
-
-
-def _like(candidates: tuple[BlurCandidate, ...], whole: BlurEstimate) -> tuple[BlurCandidate, ...]:
-    """Plausible candidates of about the reduction of the whole image; all of them if there is none."""
-    return (
-        tuple(one for one in candidates if one.plausible and 2 * one.estimate.reduction >= whole.reduction)
-        or candidates
-    )
 
 
 def _clearly_differ(sigmas: np.ndarray, uncertainties: np.ndarray) -> bool:

@@ -201,7 +201,9 @@ def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side
     part = shape if side is None else (*largest_tile((shape[0], shape[1]), side), *shape[2:])
     beside = float(pixels * (_BYTES + channels * _CHANNEL_BYTES))
     params = params if params.sigma is not None else replace(params, sigma=WIDEST)
-    return _image_bytes(shape) + max(beside, deconvolution_memory(part, params, MOST_THREADS))
+    # Maps of widths, and results of two attempts.
+    images = float(pixels * (_WIDTHS_BYTES + channels * _RESULTS_BYTES))
+    return images + max(beside, deconvolution_memory(part, params, MOST_THREADS))
 
 
 def blur_to_remove(
@@ -274,12 +276,6 @@ def _map_meanwhile(
         finally:
             # After an error, or if the caller leaves, the remaining tiles are not needed.
             stopped.set()
-
-
-def _image_bytes(shape: tuple[int, ...]) -> float:
-    """Bytes of the maps of widths and of the results of two attempts."""
-    channels = shape[2] if len(shape) == 3 else 1
-    return float(shape[0] * shape[1] * (_WIDTHS_BYTES + channels * _RESULTS_BYTES))
 
 
 def find_blur(

@@ -67,8 +67,10 @@ def compare_structure(image: FloatArray, frames: FloatArray, flows: FloatArray) 
     picked = np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)
     gradient = _gradient(luminance(image))
     steepness = np.hypot(*gradient)
-    least = max(_EDGE * _steepest(steepness), _CLEAR * _GRADIENT_NOISE * estimate_noise(frames[picked[0]]))
-    edges = (steepness > least) & _within(steepness.shape)
+    within = _within(steepness.shape)
+    steepest = float(np.percentile(steepness[within], _STEEPEST))
+    least = max(_EDGE * steepest, _CLEAR * _GRADIENT_NOISE * estimate_noise(frames[picked[0]]))
+    edges = (steepness > least) & within
     totals = np.zeros(4)
     for window in _windows(edges.shape):
         direction = np.stack([derivative[window] for derivative in gradient])
@@ -83,10 +85,6 @@ def compare_structure(image: FloatArray, frames: FloatArray, flows: FloatArray) 
 
 def _gradient(plane: FloatArray) -> tuple[FloatArray, FloatArray]:
     return sobel_gradient(cv2.GaussianBlur(plane, (0, 0), _SCALE))
-
-
-def _steepest(steepness: FloatArray) -> float:
-    return float(np.percentile(steepness[_within(steepness.shape)], _STEEPEST))
 
 
 def _within(shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -28,7 +28,9 @@ def psf_from_image(image: ArrayLike, name: str = "psf") -> Float64Array:
     """Return the point spread function (h, w) with odd sides that an image (H, W) or (H, W, 3) of a point shows."""
     grey = check_grey(image, name).astype(np.float64)
     if min(grey.shape) < _LEAST_SIDE:
-        raise DataError(f"{name}: expected at least {_LEAST_SIDE}×{_LEAST_SIDE} pixels, found {_size(grey)}")
+        raise DataError(
+            f"{name}: expected at least {_LEAST_SIDE}×{_LEAST_SIDE} pixels, found {grey.shape[1]}×{grey.shape[0]}"
+        )
     frame = max(1, round(_BORDER * min(grey.shape)))
     rim = np.ones(grey.shape, bool)
     rim[frame:-frame, frame:-frame] = False
@@ -83,7 +85,3 @@ def _cut(light: Float64Array) -> Float64Array:
         if part.sum() >= 0.999 * light.sum():
             return part
     return light[row - largest : row + largest + 1, column - largest : column + largest + 1]
-
-
-def _size(grey: Float64Array) -> str:
-    return f"{grey.shape[1]}×{grey.shape[0]}"

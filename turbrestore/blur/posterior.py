@@ -175,8 +175,11 @@ def blur_posterior(
     mean = np.exp(weights.ravel() @ np.log(np.maximum(curves, LEAST_TRANSFER)))
     width, exponent = _least_loss(curves, weights.ravel(), mean, scale)
     by_image, whole = quantiles(of_image), _quantiles(kappa * scale * known.width, weights)
-    width = _less_if_contradicted(width * scale, float(by_image[2]), float(whole[0]))
-    low, high = _curve_quantiles(curves, weights.ravel())
+    width *= scale
+    if by_image[2] < whole[0]:
+        # The mean, in logarithm, with the widest blur by the image where the posterior has only wider ones.
+        width = (width * min(width, float(by_image[2]))) ** 0.5
+    low, _, high = np.array([_quantiles(column, weights.ravel()) for column in curves.T]).T
     air = float(1 - weights[-1].sum())
     return BlurPosterior(
         removed=width if width >= _LEAST_REMOVED else min(width, float(whole[0])) * (air > _SURELY),
@@ -224,11 +227,6 @@ def _least_loss(curves: Float64Array, weights: Float64Array, mean: Float64Array,
     return float(chosen * width), float(exponent)
 
 
-def _less_if_contradicted(width: float, widest_by_image: float, narrowest: float) -> float:
-    """Return the mean, in logarithm, with the widest blur by the image where the posterior has only wider ones."""
-    return (width * min(width, widest_by_image)) ** 0.5 if widest_by_image < narrowest else width
-
-
 def _normalised(logs: Float64Array) -> Float64Array:
     weights = np.exp(logs - logs.max())
     return weights / weights.sum()
@@ -237,11 +235,6 @@ def _normalised(logs: Float64Array) -> Float64Array:
 def _quantiles(widths: Float64Array, weights: Float64Array) -> Float64Array:
     order = np.argsort(widths, axis=None)
     return np.interp(_QUANTILES, np.cumsum(weights.ravel()[order]), widths.ravel()[order])
-
-
-def _curve_quantiles(curves: Float64Array, weights: Float64Array) -> tuple[Float64Array, Float64Array]:
-    low, _, high = np.array([_quantiles(column, weights) for column in curves.T]).T
-    return low, high
 
 
 def _measured_and_expected(

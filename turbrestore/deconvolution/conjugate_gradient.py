@@ -24,8 +24,8 @@ import numpy as np
 from ..blur.psf import laplacian_symbol
 from ..core.arrays import FloatArray
 from ..core.noise import estimate_noise
-from ..runtime.image_stacks import Stack, load, namespace, store, total
-from .problem import Problem
+from ..runtime.image_stacks import Stack, load, namespace, store
+from .problem import Problem, total
 
 # A residual below this share of the energy of the data consists of rounding errors.
 ROUNDING = 1e-14

@@ -34,7 +34,7 @@ from ..blur.psf import check_psf
 from ..core.arrays import FloatArray
 from ..core.errors import require
 from ..core.noise import NoiseCurve
-from ..runtime.image_stacks import Stack, load, namespace, total
+from ..runtime.image_stacks import Stack, load, namespace
 
 # Smallest margin, in widths of the blur.
 MARGIN_SIGMAS = 4.0
@@ -134,6 +134,11 @@ def margin_around(size: tuple[int, int], least: int | None) -> Margin:
     extra = [scipy.fft.next_fast_len(length + 2 * least, real=True) - length for length in size]
     top, left = (total // 2 for total in extra)
     return Margin(size, ((top, extra[0] - top), (left, extra[1] - left)))
+
+
+def total(values: Stack) -> float:
+    """Sum all values in double precision."""
+    return float(values.sum(dtype=namespace(values).float64))
 
 
 def problem_of(

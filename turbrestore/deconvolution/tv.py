@@ -1,12 +1,18 @@
 """Total variation by differences of neighbouring pixels, periodic, as a penalty of the primal-dual splitting.
 
-``J(u) = Σ_x |∇u|(x)`` is the penalty of the energy F_λ,μ of paper 3, section 5, whose gradient flow is eq. 22.  Symbols
-as in :mod:`turbrestore.deconvolution.primal_dual`: ``K = ∇``, ``Kᵀ = −div``.
+``J(u) = Σ_x |∇u|(x)`` is the penalty of the energy ``F(u) = λ/2 ∫ (f − k∗u)² + μ ∫ |∇u|`` of paper 3, section 5.  The
+paper descends its gradient,
+
+    ∂u/∂t = λ k*∗(f − k∗u) + μ div(∇u / |∇u|),    (22)
+
+which comes to rest at the minimum that :mod:`turbrestore.deconvolution.primal_dual` finds.  Symbols as there:
+``K = ∇``, ``Kᵀ = −div``; μ is 1.
 """
 
 from __future__ import annotations
 
-from ..runtime.image_stacks import Stack, namespace, total
+from ..runtime.image_stacks import Stack, namespace
+from .problem import total
 
 
 def local_gradient(u: Stack) -> Stack:

@@ -1,12 +1,7 @@
 """Alternating-estimation Kalman filter over the image and the state of its flow (paper 3, section 4).
 
-Symbols
--------
-ρ̂, Σ : image and its variance per pixel; S drift of the image, Z noise of a registered frame (eqs. 13a, 15)
-ξ̂, P : state of the flow and its covariance; A, C, Q, R from :mod:`turbrestore.dynamics.flow_model` (eqs. 10, 13b)
-W^meas : measured flow (eq. 17); Ŵ flow that frames are registered by
-L, M : gains of the image (eq. 16) and of the flow state (eq. 19)
-β : weight of sharpness, given or chosen by :mod:`turbrestore.filtering.frame_statistics`
+Symbols as in :mod:`turbrestore.filtering.kalman`, which has eqs. 14, 16, 17 and 19; Ŵ is the flow that frames are
+registered by, and β the weight of sharpness, given or chosen by :mod:`turbrestore.filtering.frame_statistics`.
 
 Given Ŵ the image is a linear state, given ρ the flow is, so each frame updates one after the other:
 
@@ -15,9 +10,8 @@ Given Ŵ the image is a linear state, given ρ the flow is, so each frame update
 3. warp the frame by Ŵ and update ρ̂ (eqs. 15, 16);
 4. return to 2 with the new image, ``inner_iterations`` times in all.
 
-Eqs. 14, 16, 17 and 19 are in :mod:`turbrestore.filtering.kalman`, and Z (eq. 15) is in
-:mod:`turbrestore.filtering.frame_noise`.
-:mod:`turbrestore.filtering.frame_pass` measures, follows and registers the frames of one iteration.
+Z (eq. 15) is in :mod:`turbrestore.filtering.frame_noise`; :mod:`turbrestore.filtering.frame_pass` measures, follows and
+registers the frames of one iteration.
 
 Departures from the paper, each with its reason:
 
@@ -56,7 +50,7 @@ from ..core.errors import DataError
 from ..dynamics.flow_model import FlowDynamics
 from ..registration.flow import FlowParams, iterate_flows
 from ..runtime.device import find_device, memory_of
-from ..runtime.image_stacks import store_image
+from ..runtime.image_stacks import load, load_image, load_record, store, store_image
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from .filter_records import (
@@ -66,13 +60,10 @@ from .filter_records import (
     FilterState,
     FilterStep,
     FrameRecord,
-    after_training,
-    join_records,
-    mean_flow_over,
 )
 from .frame_pass import Frame, PassSettings, TrackedFrame, pass_over, register
 from .frame_statistics import measure_frame_statistics
-from .kalman import PixelStacks, first_states, update_pixels
+from .kalman import Gaussian, PixelGaussian, PixelStacks, first_states, flow_noise, update_pixels
 
 # Variance of an image of which nothing is known: full scale, squared.
 _DIFFUSE = 1.0
@@ -172,10 +163,11 @@ def filter_steps(
         known = [None if frame is None else next(measured) for frame in block]
     settings = _settings(block, known, image, dynamics, params, flow_params, runtime)
     image_noise = settings.statistics.image_noise
+    prior = _prior(image, image_noise, dynamics, params)
     if start is None and params.training == "skip":
-        start = after_training(_prior(image, image_noise, dynamics, params), image, dynamics, len(known))
+        start = _after_training(prior, image, dynamics, len(known))
     if start is None:
-        at = _Position(_prior(image, image_noise, dynamics, params), (), image, deque(block), 0)
+        at = _Position(prior, (), image, deque(block), 0)
     else:
         _skip(stream, len(start.records) - len(block), start, image.shape, dynamics)
         flows_measured = len(start.records) * params.inner_iterations - len(known)
@@ -183,10 +175,7 @@ def filter_steps(
     del block
     with memory_of(settings.runtime.device):
         at = yield from _filter_blocks(at, stream, known, settings)
-    filtered = join_records(at.state, at.records, image_noise, settings.sharpness)
-    # The paper leaves the image in the geometry of the training frames.
-    unmoved = np.zeros_like(filtered.mean_flow)
-    return filtered if params.training == "filter" else replace(filtered, mean_flow=unmoved)
+    return _joined(at, settings)
 
 
 def _filter_blocks(
@@ -230,7 +219,8 @@ def _iterate(
     settled = len(at.block) if settle else 0
     frames, starts = chain(_drain(at.block), following), chain(known, repeat(None))
     reference = None if from_known else at.image
-    image = settled_image = PixelStacks.of(at.state.image, settings.runtime.device)
+    device = settings.runtime.device
+    image = settled_image = PixelStacks(load_image(at.state.image.mean, device), load(at.state.image.variance, device))
     flow_sum = at.state.flow_sum.copy() if settle else at.state.flow_sum
     flow, records, block, flows_measured = at.state.flow, list(at.records), deque[Frame](), at.flows_measured
     for number, tracked in enumerate(pass_over(frames, starts, reference, at.state.flow, settled, settings)):
@@ -247,8 +237,9 @@ def _iterate(
             yield FilterStep(flows_measured)
     training_flow = at.state.training_flow
     if settled and not at.records and isinstance(known, np.ndarray):
-        training_flow = mean_flow_over(flow_sum, records)
-    state = FilterState(settled_image.stored(), flow, flow_sum, training_flow)
+        training_flow = _mean_flow(flow_sum, records)
+    pixels = PixelGaussian(store_image(settled_image.mean), store(settled_image.variance))
+    state = FilterState(pixels, flow, flow_sum, training_flow)
     return _Position(state, tuple(records), store_image(image.mean), block, flows_measured)
 
 
@@ -290,13 +281,56 @@ def _settings(
     device = find_device(runtime.device)
     beta = statistics.sharpness_weight if params.sharpness is None else params.sharpness
     runtime = replace(runtime, device=device)
-    return PassSettings(dynamics, statistics.on(device), params, beta, flow_params, runtime)
+    return PassSettings(dynamics, load_record(statistics, device), params, beta, flow_params, runtime)
 
 
 def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params: FilterParams) -> FilterState:
     """State before the first frame."""
     variance = image_noise / params.prior_frames if params.prior_frames else _DIFFUSE
     return FilterState(*first_states(image, variance, dynamics), *np.zeros((2, *image.shape[:2], 2), np.float32))
+
+
+def _after_training(
+    prior: FilterState, image: FloatArray, dynamics: FlowDynamics, known_flows: int
+) -> FilterCheckpoint:
+    """Start after the training frames, with the state of the last of them (paper 3, section 6)."""
+    if known_flows != dynamics.frame_count:
+        raise DataError(
+            f"known_flows: expected the {dynamics.frame_count} flows that the dynamics were identified from, found "
+            f"{known_flows}"
+        )
+    last = Gaussian(dynamics.last_state, flow_noise(dynamics) * np.eye(dynamics.rank))
+    records = tuple(FrameRecord(state, 0.0, np.nan, np.nan, 0.0) for state in dynamics.states.T)
+    return FilterCheckpoint(replace(prior, flow=last), records, image)
+
+
+def _mean_flow(flow_sum: FloatArray, records: Sequence[FrameRecord]) -> FloatArray:
+    """Average the flows (H, W, 2) to the frames that count; 0 if none of them does."""
+    return flow_sum / np.float32(max(sum(np.isfinite(record.sharpness) for record in records), 1))
+
+
+def _joined(at: _Position, settings: PassSettings) -> Filtered:
+    """Join the last state and the records of all frames."""
+    state, records = at.state, at.records
+    information = np.array([record.information for record in records])
+    if not information.any():
+        raise DataError("frames: expected at least one after those with known flows, found none; train on fewer")
+    mean_flow = _mean_flow(state.flow_sum, records) - state.training_flow
+    if settings.params.training == "skip":
+        # The paper leaves the image in the geometry of the training frames.
+        mean_flow = np.zeros_like(mean_flow)
+    return Filtered(
+        image=state.image.mean.astype(np.float32),
+        variance=state.image.variance.astype(np.float32),
+        flow_states=np.array([record.flow_state for record in records]),
+        gains=np.array([record.gain for record in records]),
+        innovations=np.array([record.innovation for record in records]),
+        sharpness=np.array([record.sharpness for record in records]),
+        shares=information / information.sum(),
+        image_noise=settings.statistics.image_noise,
+        sharpness_weight=settings.sharpness,
+        mean_flow=mean_flow,
+    )
 
 
 def _check_flows(image: FloatArray, dynamics: FlowDynamics, known_flows: ArrayLike | None) -> FloatArray | None:

@@ -5,20 +5,18 @@ Symbols as in :mod:`turbrestore.filtering.alternating`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from ..core.arrays import FloatArray
-from ..core.errors import DataError, require, require_between
+from ..core.errors import require, require_between
 from ..display.plots import plot_frames
 from ..display.preview import preview
-from ..dynamics.flow_model import FlowDynamics
 from ..registration.recentring import recentring_flow
 from ..registration.warp import warp
-from .kalman import Gaussian, PixelGaussian, flow_noise
+from .kalman import Gaussian, PixelGaussian
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -208,53 +206,6 @@ class Filtered:
             ("noise of a frame", f"{100 * self.image_noise**0.5:.2f} % of full scale"),
         ]
         return preview("Filtered image", facts, self.image)
-
-
-def after_training(prior: FilterState, image: FloatArray, dynamics: FlowDynamics, known_flows: int) -> FilterCheckpoint:
-    """Start after the training frames, with the state of the last of them (paper 3, section 6).
-
-    ``image`` (H, W) or (H, W, 3).
-    """
-    if known_flows != dynamics.frame_count:
-        raise DataError(
-            f"known_flows: expected the {dynamics.frame_count} flows that the dynamics were identified from, found "
-            f"{known_flows}"
-        )
-    last = Gaussian(dynamics.last_state, flow_noise(dynamics) * np.eye(dynamics.rank))
-    records = tuple(FrameRecord(state, 0.0, np.nan, np.nan, 0.0) for state in dynamics.states.T)
-    return FilterCheckpoint(replace(prior, flow=last), records, image)
-
-
-def mean_flow_over(flow_sum: FloatArray, records: Sequence[FrameRecord]) -> FloatArray:
-    """Average the flows to the frames that count; 0 if none of them does.
-
-    ``flow_sum`` (H, W, 2); returns (H, W, 2).
-    """
-    return flow_sum / np.float32(max(sum(np.isfinite(record.sharpness) for record in records), 1))
-
-
-def join_records(
-    state: FilterState,
-    records: Sequence[FrameRecord],
-    image_noise: float,
-    sharpness_weight: float,
-) -> Filtered:
-    """Join the last state and the records of all frames."""
-    information = np.array([record.information for record in records])
-    if not information.any():
-        raise DataError("frames: expected at least one after those with known flows, found none; train on fewer")
-    return Filtered(
-        image=state.image.mean.astype(np.float32),
-        variance=state.image.variance.astype(np.float32),
-        flow_states=np.array([record.flow_state for record in records]),
-        gains=np.array([record.gain for record in records]),
-        innovations=np.array([record.innovation for record in records]),
-        sharpness=np.array([record.sharpness for record in records]),
-        shares=information / information.sum(),
-        image_noise=image_noise,
-        sharpness_weight=sharpness_weight,
-        mean_flow=mean_flow_over(state.flow_sum, records) - state.training_flow,
-    )
 
 
 def filter_memory(shape: tuple[int, ...], train: int, params: FilterParams | None = None, threads: int = 1) -> float:

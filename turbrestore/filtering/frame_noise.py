@@ -1,8 +1,10 @@
 """A frame that is registered to the image, and its measurement noise at every pixel (paper 3, eq. 15).
 
+The measurement of the image by a frame is ``I ∘ ŵ = ρ + ζ`` with ``ζ ~ N(0, Z)`` (eq. 15).
+
 Symbols
 -------
-I ∘ ŵ : frame I warped by the estimated flow; Z : variance of a registered frame about the image
+I ∘ ŵ : frame I warped by the estimated flow; ρ : image; Z : variance of a registered frame about it
 z : local sharpness of a frame, standardised over the frames; β its weight
 v : variance of z over the frames
 κ : share of the middle of the window that z leaves out, see :func:`local_sharpness`
@@ -24,7 +26,7 @@ All functions here take NumPy arrays or torch tensors.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -76,11 +78,6 @@ class FrameStatistics:
     # variance and averaged in a small window.
     median: Stack
     spread: Stack
-
-    def on(self, device: str) -> FrameStatistics:
-        """Return the statistics with their maps on a device."""
-        maps = {item.name: value for item in fields(self) if isinstance(value := getattr(self, item.name), np.ndarray)}
-        return replace(self, **{name: load(value, device) for name, value in maps.items()})
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 
 import cv2
 import numpy as np
@@ -75,11 +76,12 @@ def pass_over(
     """
     dynamics, on_cpu = settings.dynamics, settings.runtime.device == CPU
     reference = None if image is None else prepare_reference(image, settings.flow_params, settings.runtime)
-    batch, threads = (1, settings.runtime.threads) if reference is None else (reference.batch, reference.threads)
+    size, threads = (1, settings.runtime.threads) if reference is None else (reference.batch, reference.threads)
 
-    def measure(items: list[TrackedFrame]) -> list[TrackedFrame]:
+    def measure(batch: list[tuple[int, Frame, FloatArray | None]]) -> list[TrackedFrame]:
+        items = [TrackedFrame(frame, start, number >= settled, state) for number, frame, start in batch]
         if reference is None:
-            items = [replace(item, measured=item.start) for item in items]
+            items = [item if item.frame is None else replace(item, measured=item.start) for item in items]
         else:
             items = _measure_flows(items, reference)
         return [
@@ -100,12 +102,8 @@ def pass_over(
             return items
         return [replace(item, registered=register(item, settings)) for item in items]
 
-    pairs = zip(iter_frames(frames), iter_frames(starts), strict=False)
-    items = (
-        TrackedFrame(frame, None if frame is None else start, number >= settled, state)
-        for number, (frame, start) in enumerate(pairs)
-    )
-    for tracked in map_in_turns(measure, update_states, register_all, in_batches(items, batch), threads):
+    numbered = zip(count(), iter_frames(frames), iter_frames(starts), strict=False)
+    for tracked in map_in_turns(measure, update_states, register_all, in_batches(numbered, size), threads):
         yield from tracked
 
 

@@ -1,39 +1,34 @@
 """Kalman filter: prediction, measurement update in covariance and in information form, and the updates of paper 3.
 
-Symbols (paper 3, section 4)
-----------------------------
-ξ̂, P : mean and covariance of the state, :class:`Gaussian`
-A, Q : state transition and covariance of the process noise (eqs. 13b, 14b, 14d)
-z, H, R : measurement, its matrix and the covariance of its noise; W^meas, C and R for the flow (eq. 17)
-M : gain (eq. 18; information form, eq. 19)
+The equations of paper 3, section 4, of the image and of the state of its flow::
 
-Matrix operations act on the last two axes, so leading axes are batches and broadcast. A component of a measurement that
-is NaN is missing.
+    ρ̂ ← ρ̂,  ξ̂ ← A ξ̂                                           (14a, b)
+    Σ ← Σ + S,  P ← A P Aᵀ + Q                                 (14c, d)
+    I ∘ ŵ = ρ + ζ,  ζ ~ N(0, Z)                                (15)
+    ρ̂ ← ρ̂ + L (I ∘ ŵ − ρ̂),  Σ ← (1 − L) Σ,  L = Σ / (Σ + Z)   (16)
+    W^meas = W̄ + C ξ + r,  r ~ N(0, R)                         (17)
+    ξ̂ ← ξ̂ + M (W^meas − W̄ − C ξ̂),  P ← (I − M C) P
+    M = P Cᵀ (C P Cᵀ + R)⁻¹                                    (18)
+    M = (CᵀR⁻¹C + P⁻¹)⁻¹ CᵀR⁻¹                                 (19)
 
-Flow of the alternating filter
-------------------------------
-ξ̂, P : state of the flow and its covariance, :class:`Gaussian`
-A, C, Q, R, W̄ : flow model of :mod:`turbrestore.dynamics.flow_model` (eqs. 10, 13b)
-W^meas : measured flow (eq. 17)
-M : gain (eq. 19)
-z : Cᵀ(W^meas − W̄)
-
-As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R``: a measured flow enters the update only through
-z, which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the expensive part and
-needs no state, and predictions and updates have the size n.
-
-The paper measures the flow by C ξ alone (eq. 17); here ``W^meas = W̄ + C ξ + r``, as the states are identified around
-the mean flow.
-
-Image of the alternating filter
--------------------------------
-ρ̂, Σ : image and its variance per pixel, :class:`PixelGaussian`
-S : variance by which the image drifts from frame to frame (eq. 13a)
-I ∘ ŵ, Z : registered frame and its variance about the image (eq. 15)
-L : gain (eq. 16)
+Symbols
+-------
+ρ̂, Σ : image and its variance; S, Z : variance of its drift, and of a registered frame I ∘ ŵ about it
+ξ̂, P : mean and covariance of the state
+A, C, Q, R, W̄ : flow model of :mod:`turbrestore.dynamics.flow_model`; W^meas : measured flow
+L, M : gains
+z, H, R : measurement, its matrix and the covariance of its noise, where the state is any other
 
 The paper takes Σ, Z and L to be one number each; here they vary from pixel to pixel.  Pixels are independent of each
 other, and channels share the variance.
+
+The paper measures the flow by C ξ alone (eq. 17); here W̄ is added, as the states are identified around the mean flow.
+As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R``: a measured flow enters the update only through
+``z = Cᵀ(W^meas − W̄)``, which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the
+expensive part and needs no state, and predictions and updates have the size n.
+
+Matrix operations act on the last two axes, so leading axes are batches and broadcast.  A component of a measurement
+that is NaN is missing.
 """
 
 from __future__ import annotations
@@ -47,7 +42,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.arrays import FloatArray
 from ..core.errors import DataError
 from ..dynamics.flow_model import Float64Array, FlowDynamics, ProjectedFlow
-from ..runtime.image_stacks import Stack, load, load_image, store, store_image
+from ..runtime.image_stacks import Stack
 
 _LOG_2PI = float(np.log(2 * np.pi))
 # Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
@@ -105,7 +100,7 @@ def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
     _check_batches(state.mean.shape[:-1], A=A.shape[:-2], Q=Q.shape[:-2])
     # Gaussian raises a DataError where the result overflows, so NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
-        return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ _transposed(A) + Q))  # (14b), (14d)
+        return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ A.mT + Q))  # (14b), (14d)
 
 
 def update(
@@ -130,15 +125,12 @@ def update(
         H = np.where(missing[..., None], 0.0, H)
         R = np.where(missing[..., None] | missing[..., None, :], np.eye(m), R)
     HP = H @ state.cov
-    S = _symmetric(HP @ _transposed(H) + R)
+    S = _symmetric(HP @ H.mT + R)
     lower = _cholesky(S, "innovation covariance H P Hᵀ + R", "positive definite")
-    M = _transposed(_solve(S, HP))  # P Hᵀ (H P Hᵀ + R)⁻¹, (18)
+    M = np.asarray(np.linalg.solve(S, HP), np.float64).mT  # P Hᵀ (H P Hᵀ + R)⁻¹, (18)
     F = np.eye(n) - M @ H
-    after = Gaussian(
-        state.mean + _apply(M, residual),
-        _symmetric(F @ state.cov @ _transposed(F) + M @ R @ _transposed(M)),
-    )
-    squared = (residual * _solve(S, residual[..., None])[..., 0]).sum(-1)
+    after = Gaussian(state.mean + _apply(M, residual), _symmetric(F @ state.cov @ F.mT + M @ R @ M.mT))
+    squared = (residual * np.linalg.solve(S, residual[..., None])[..., 0]).sum(-1)
     log_det = 2 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
     observed = m - missing.sum(-1)
     if missing.any():
@@ -168,39 +160,25 @@ def update_information(
         raise DataError("noise_variance: expected finite values above 0, found others; give the noise a floor")
     missing = np.isnan(z)
     weight, z = np.where(missing, 0.0, 1.0 / variance), np.where(missing, 0.0, z)
-    weighted = _transposed(H * weight[..., None])
+    weighted = (H * weight[..., None]).mT
     G, Hz, zz = _symmetric(weighted @ H), _apply(weighted, z), (weight * z**2).sum(-1)
-    log_det_noise = np.where(missing, 0.0, np.log(variance)).sum(-1)
-    return _information_step(state, G, Hz, zz, log_det_noise, m - missing.sum(-1))
-
-
-def _information_step(
-    state: Gaussian,
-    G: Float64Array,
-    Hz: Float64Array,
-    zz: Float64Array,
-    log_det_noise: Float64Array,
-    observed: NDArray[np.intp],
-) -> tuple[Gaussian, Innovation]:
-    """Update from the normal equations G = Hᵀ R⁻¹ H, Hz = Hᵀ R⁻¹ z, zz = zᵀ R⁻¹ z."""
     T, gained = _posterior_root(state.cov, G)
-    cov = _symmetric(T @ _transposed(T))  # (G + P⁻¹)⁻¹, of M in (19)
-    G_mean = _apply(G, state.mean)
-    score = Hz - G_mean
-    step = _apply(cov, score)  # M (z − H ξ̂), (17)
+    cov = _symmetric(T @ T.mT)  # (G + P⁻¹)⁻¹, of M in (19)
+    score = Hz - _apply(G, state.mean)
+    step = _apply(cov, score)  # M (z − H ξ̂)
     # zᵀR⁻¹z − 2 ξ̂ᵀHᵀR⁻¹z + ξ̂ᵀGξ̂ needs no further pass over H; rounding may leave it a little below zero.
-    weighted = zz - (state.mean * (Hz + score)).sum(-1)
-    squared = np.maximum(weighted - (score * step).sum(-1), 0.0)
-    log_det = log_det_noise + np.log1p(gained).sum(-1)
+    squared = np.maximum(zz - (state.mean * (Hz + score)).sum(-1) - (score * step).sum(-1), 0.0)
+    log_det = np.where(missing, 0.0, np.log(variance)).sum(-1) + np.log1p(gained).sum(-1)
     score_cov = _symmetric(G + G @ state.cov @ G)
-    return Gaussian(state.mean + step, cov), _innovation(score, score_cov, squared, log_det, observed)
+    innovation = _innovation(score, score_cov, squared, log_det, m - missing.sum(-1))
+    return Gaussian(state.mean + step, cov), innovation
 
 
 def _posterior_root(P: Float64Array, G: Float64Array) -> tuple[Float64Array, Float64Array]:
     """T with T Tᵀ = (G + P⁻¹)⁻¹, and the eigenvalues of P G: how much more is known in each direction."""
     values, vectors = np.linalg.eigh(P)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-    gained, directions = np.linalg.eigh(_symmetric(_transposed(root) @ G @ root))
+    gained, directions = np.linalg.eigh(_symmetric(root.mT @ G @ root))
     gained = np.maximum(gained, 0.0)
     return root @ directions / np.sqrt(1.0 + gained)[..., None, :], gained
 
@@ -220,16 +198,8 @@ def _apply(matrix: Float64Array, vector: Float64Array) -> Float64Array:
     return np.matmul(matrix, vector[..., None])[..., 0]
 
 
-def _transposed(matrix: Float64Array) -> Float64Array:
-    return np.swapaxes(matrix, -1, -2)
-
-
-def _solve(matrix: Float64Array, right: Float64Array) -> Float64Array:
-    return np.asarray(np.linalg.solve(matrix, right), np.float64)
-
-
 def _symmetric(matrix: Float64Array) -> Float64Array:
-    return 0.5 * (matrix + _transposed(matrix))
+    return 0.5 * (matrix + matrix.mT)
 
 
 def _check_matrix(matrix: NDArray[np.floating], rows: int, columns: int, name: str) -> None:
@@ -252,7 +222,7 @@ def _check_covariance(cov: Float64Array, n: int, name: str) -> None:
         raise DataError(f"{name}: expected finite values, found NaN or infinite ones; the filter may be unstable")
     diagonal = np.abs(np.diagonal(cov, axis1=-2, axis2=-1))
     scale = diagonal.max(-1, initial=0.0)[..., None]
-    if (np.abs(cov - _transposed(cov)) > 1e-8 * scale[..., None]).any():
+    if (np.abs(cov - cov.mT) > 1e-8 * scale[..., None]).any():
         raise DataError(f"{name}: expected a symmetric matrix, found one that is not")
     # Rounding may leave the eigenvalue of a known direction slightly negative; only more than that is an error.
     slack = 1e-10 * diagonal + 1e-14 * scale + 1e-300
@@ -333,18 +303,9 @@ class PixelStacks(NamedTuple):
     mean: Stack
     variance: Stack
 
-    @classmethod
-    def of(cls, pixels: PixelGaussian, device: str) -> PixelStacks:
-        """Bring ρ̂ and Σ to a device."""
-        return cls(load_image(pixels.mean, device), load(pixels.variance, device))
-
-    def stored(self) -> PixelGaussian:
-        """Bring ρ̂ and Σ back."""
-        return PixelGaussian(store_image(self.mean), store(self.variance))
-
 
 def update_pixels(state: PixelStacks, registered: Stack, noise: Stack, drift: float) -> tuple[PixelStacks, Stack]:
-    """Predict the image and update it by a registered frame (paper 3, eqs. 14a, 14c, 15 and 16).
+    """Predict the image and update it by a registered frame (paper 3, eqs. 14a, 14c and 16).
 
     ``registered`` (C, H, W); ``noise`` (H, W); returns ``gain`` (H, W).
     """

@@ -186,7 +186,10 @@ def centroid_steps(
     params, flow_params = params or CentroidParams(), flow_params or FlowParams()
     stack = check_frames(frames, at_least=2)
     require(params.start < len(stack), f"start: expected a frame below {len(stack)}, found {params.start}")
-    image = _first_image(stack, params, flow_params, runtime)
+    if params.mode == "single":
+        image = stack[params.start]
+    else:
+        image = mean_stabilised(stack, runtime.threads) if flow_params.global_shift else mean_of(stack)
     total = np.zeros((*stack.shape[1:3], 2), np.float32)
     flows = new_stack((*stack.shape[:3], 2), runtime.scratch)
     prepared: list[FlowFrame] = []
@@ -219,12 +222,6 @@ def centroid_steps(
         image = mean_registered(stack, flows, runtime) if params.mode == "fused" else warp(stack[params.start], total)
         if converged or change > _DIVERGED or len(sizes) == params.iterations:
             return Centroid(image, flows, np.array(sizes), converged)
-
-
-def _first_image(stack: FloatArray, params: CentroidParams, flow_params: FlowParams, runtime: Runtime) -> FloatArray:
-    if params.mode == "single":
-        return stack[params.start]
-    return mean_stabilised(stack, runtime.threads) if flow_params.global_shift else mean_of(stack)
 
 
 def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:

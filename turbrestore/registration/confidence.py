@@ -100,7 +100,8 @@ def regularise_flow(flow: FloatArray, confidence: FlowConfidence, noise: float) 
     ``flow`` (H, W, 2); returns (H, W, 2).
     """
     tensors, planes = confidence.tensors, cv2.split(flow)
-    weighted = [_apply(tensors[0], *planes)]
+    (xx, xy, yy), (dx, dy) = tensors[0], planes
+    weighted = [(xx * dx + xy * dy, xy * dx + yy * dy)]
     for _ in tensors[1:]:
         weighted.append((cv2.pyrDown(weighted[-1][0]), cv2.pyrDown(weighted[-1][1])))
     noise = max(noise, _LEAST_NOISE)
@@ -141,17 +142,6 @@ def subtract_noise(noise: np.float32, xx: FloatArray, xy: FloatArray, yy: FloatA
 def _gradient(image: FloatArray) -> Planes:
     smooth = cv2.GaussianBlur(image, (0, 0), _GRADIENT_WINDOW)
     return cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32
-
-
-def _apply(tensor: FloatArray, dx: FloatArray, dy: FloatArray) -> Planes:
-    xx, xy, yy = tensor
-    return _sum_of_products(xx, dx, xy, dy), _sum_of_products(xy, dx, yy, dy)
-
-
-def _sum_of_products(a: FloatArray, x: FloatArray, b: FloatArray, y: FloatArray) -> FloatArray:
-    total = a * x
-    total += b * y
-    return total
 
 
 @jit

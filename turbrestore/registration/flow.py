@@ -252,11 +252,11 @@ def prepare_reference(
         levels, solver = solvers[noisy]
         # Farneback's method takes no start.
         usable = [replace(frame, start=None) for frame in batch] if params.method == "farneback" else batch
-        placed = [_place(frame, levels, position) for frame in usable]
-        flows = list(solver(np.stack([p.levels for p in placed]), [p.start for p in placed], draft))
+        placed, starts, shifts = zip(*(_place(frame, levels, position) for frame in usable), strict=True)
+        flows = list(solver(np.stack(placed), list(starts), draft))
         if confidence is not None:
             flows = [regularise_flow(f, confidence, frame.noise) for f, frame in zip(flows, batch, strict=True)]
-        return [flow + p.shift if p.shift.any() else flow for flow, p in zip(flows, placed, strict=True)]
+        return [flow + shift if shift.any() else flow for flow, shift in zip(flows, shifts, strict=True)]
 
     # A device solves a batch at once while others are prepared; on the CPU every frame has a thread.
     batch, threads = (1, runtime.threads) if device == CPU else (params.tvl1.batch, min(runtime.workers, _BATCHES))
@@ -293,25 +293,21 @@ def grey_levels(image: FloatArray, window: float, floor: float, smoothing: float
     return np.clip(np.rint(levels, out=levels), 0, 255, out=levels).astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class _PlacedFrame:
-    """A frame moved onto the grid of the reference by whole pixels, and its start relative to that."""
+def _place(
+    frame: FlowFrame, outside: GreyImage, position: ShiftReference | None
+) -> tuple[GreyImage, FloatArray | None, FloatArray]:
+    """Move a frame onto the grid of the reference by whole pixels; ``outside`` supplies what the frame does not show.
 
-    levels: GreyImage
-    start: FloatArray | None
-    shift: FloatArray
-
-
-def _place(frame: FlowFrame, outside: GreyImage, position: ShiftReference | None) -> _PlacedFrame:
-    """Remove the shift of the whole frame; ``outside`` supplies the pixels that the frame does not show."""
+    Returns its levels (H, W), its start (H, W, 2) from there, and the shift (2,).
+    """
     start = None
     if frame.start is not None:
         size = frame.levels.shape[::-1]
         start = cv2.resize(frame.start.astype(np.float32, copy=False), size, interpolation=cv2.INTER_LINEAR)
     shift = np.zeros(2, np.float32) if position is None else frame_shift(frame.image, start, position)
     if not shift.any():
-        return _PlacedFrame(frame.levels, start, shift)
-    return _PlacedFrame(shift_frame(frame.levels, shift, outside), None if start is None else start - shift, shift)
+        return frame.levels, start, shift
+    return shift_frame(frame.levels, shift, outside), None if start is None else start - shift, shift
 
 
 FLOW_METHODS: dict[str, Callable[[FlowParams, GreyImage, str], FlowSolver]] = {

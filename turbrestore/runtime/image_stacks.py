@@ -17,7 +17,8 @@ import functools
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import Any
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 import numpy as np
@@ -28,6 +29,9 @@ from .device import CPU
 from .jit import jit
 from .threads import WhileInside
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 # Pole of the cubic B-spline prefilter; its impulse response is cut off where it falls below 1e-7.
 _POLE = np.sqrt(3.0) - 2.0
 PREFILTER = (-6 * _POLE / (1 - _POLE**2) * _POLE ** np.abs(np.arange(-12, 13))).astype(np.float32)
@@ -37,6 +41,7 @@ _BEFORE, _BEYOND = 1, 2
 # ndarray or torch tensor.
 Stack = Any
 Shape = tuple[int, ...]
+Record = TypeVar("Record", bound="DataclassInstance")
 
 
 def namespace(stack: Stack) -> Any:
@@ -52,6 +57,14 @@ def load(array: NDArray[Any], device: Any) -> Stack:
 
     # torch shares no memory that cannot be written.
     return torch.from_numpy(np.require(array, requirements=["C", "W"])).to(device)
+
+
+def load_record(record: Record, device: Any) -> Record:
+    """Return a dataclass with its arrays on a device."""
+    values = {item.name: getattr(record, item.name) for item in fields(record)}
+    return replace(
+        record, **{name: load(value, device) for name, value in values.items() if isinstance(value, np.ndarray)}
+    )
 
 
 def store(stack: Stack) -> NDArray[Any]:
@@ -75,11 +88,6 @@ def store_image(channels: Stack) -> FloatArray:
     """Return channels (C, H, W) as an image (H, W) or (H, W, C); the reverse of :func:`load_image`."""
     planes = store(channels)
     return planes[0] if len(planes) == 1 else np.ascontiguousarray(np.moveaxis(planes, 0, -1))
-
-
-def total(values: Stack) -> float:
-    """Sum all values in double precision."""
-    return float(values.sum(dtype=namespace(values).float64))
 
 
 def correlate(stack: Stack, kernel_x: FloatArray, kernel_y: FloatArray) -> Stack:

@@ -4,7 +4,13 @@ Symbols as in :mod:`turbrestore.deconvolution.primal_dual` and :mod:`.nonlocal_w
 
 ∇_w u : nonlocal gradient, ``(∇_w u)(x, y) = [u(y) − u(x)] √w(x, y)``; it is K.
 div_w v : nonlocal divergence, ``(div_w v)(x) = Σ_y [v(x, y) − v(y, x)] √w(x, y)``; Kᵀ = −div_w.
-J(u) : nonlocal total variation, ``Σ_x |∇_w u|(x)`` with ``|v|(x)² = Σ_y v(x, y)²``; its gradient flow is eq. 24.
+J(u) : nonlocal total variation, ``Σ_x |∇_w u|(x)`` with ``|v|(x)² = Σ_y v(x, y)²``.
+
+The paper descends the gradient of ``λ/2 ∫ (f − k∗u)² + μ J(u)``,
+
+    ∂u/∂t = λ k*∗(f − k∗u) + μ div_w(∇_w u / |∇_w u|),    (24)
+
+which comes to rest at the minimum that the splitting finds; μ is 1.
 
 A function on pairs is an array of shape (2, E): row 0 is its value from the tail to the head of each pair, row 1 from
 the head to the tail.

@@ -8,7 +8,11 @@ h : filtering parameter, intensity.
 w(x, y) : weight of the pair of pixels x, y, ``exp(−d(x, y)/h²)``; 0 for pairs outside the graph (eq. 23).
 tail, head : the pixels x < y of a pair, in the order of the image.
 
-Neighbours are integers (keys) that hold a distance and an offset, see :mod:`.patch_search`.
+key : bits of a distance d, the last of which hold the rank of the offset, nearest first.
+
+Floats of 0 or more sort like the integers of the same bits, so that a key sorts by distance and tells where it was
+found.  A distance loses the last bits of its mantissa that way (relative error 6e-5 for a search of 21×21), and of
+equal distances the nearer offset comes first.
 """
 
 from __future__ import annotations
@@ -25,7 +29,6 @@ from ...core.errors import DataError, require
 from ...core.noise import estimate_noise
 from ...runtime.jit import jit
 from ...runtime.threads import map_ahead
-from .patch_search import NO_KEY, PLACES, Keys, search_tile
 
 # A weight must be positive for its pair to stay in the graph.
 SMALLEST_WEIGHT = 1e-6
@@ -33,8 +36,14 @@ SMALLEST_WEIGHT = 1e-6
 POWERS = 4
 # Rows and columns of a tile of the search.
 _TILE_ROWS, _TILE_COLUMNS = 64, 192
+# Sorts after all keys.
+_NO_KEY = int(np.iinfo(np.int32).max)
+# The search goes through this many of the best at a time, so that they stay in registers.
+_PLACES = 5
 # Bits of an infinite distance: that of a pixel outside the image.
 _OUTSIDE = int(np.float32(np.inf).view(np.int32))
+
+Keys = NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -170,13 +179,13 @@ def search_patches(grey: FloatArray, params: NonlocalParams, threads: int = 0) -
     margin = params.search // 2 + params.patch // 2
     padded = cv2.copyMakeBorder(grey, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
     keys = np.empty((height, width, params.nearest + params.best), np.int32)
-    places = params.nearest + -(-params.best // PLACES) * PLACES
+    places = params.nearest + -(-params.best // _PLACES) * _PLACES
 
     def search(corner: tuple[int, int]) -> None:
         top, left = corner
         rows, columns = min(_TILE_ROWS, height - top), min(_TILE_COLUMNS, width - left)
         block = np.ascontiguousarray(padded[top : top + rows + 2 * margin, left : left + columns + 2 * margin])
-        found = np.full((rows, places, columns), NO_KEY, np.int32)
+        found = np.full((rows, places, columns), _NO_KEY, np.int32)
         edges = np.array([-top, height - top, -left, width - left])
         search_tile(block, window, offsets, edges, params.nearest, params.rank_mask, found)
         keys[top : top + rows, left : left + columns] = found[:, : keys.shape[2]].transpose(0, 2, 1)
@@ -185,6 +194,60 @@ def search_patches(grey: FloatArray, params: NonlocalParams, threads: int = 0) -
     for _ in map_ahead(search, corners, threads):
         pass
     return keys.reshape(-1, keys.shape[2])
+
+
+@jit
+def search_tile(
+    block: FloatArray,
+    window: FloatArray,
+    offsets: NDArray[np.int32],
+    edges: NDArray[np.int64],
+    nearest: int,
+    rank_mask: int,
+    found: Keys,
+) -> None:
+    """Choose neighbours of every pixel of a tile.
+
+    Two distances at a time pass the sorted keys of the best and change places with those that they are less than. There
+    is no branch in that, so that the compiler works on many pixels at once.
+    ``block`` (rows + 2 margin, columns + 2 margin); ``window`` (patch,); ``offsets`` (n, 2); ``edges`` (4,); ``found``
+    (rows, nearest + best or more, columns).
+    """
+    rows, places, columns = found.shape
+    patch, nothing, far = window.size, np.float32(0), np.float32(np.inf)
+    margin = (block.shape[1] - columns) // 2 - patch // 2
+    down, along = np.empty(columns + patch - 1, np.float32), np.empty((2, columns), np.float32)
+    keys = along.view(np.int32)
+    for row in range(rows):
+        best = found[row]
+        for first in range(0, len(offsets), 2):
+            for rank in range(first, first + 2):
+                (dy, dx), distance, key = offsets[rank], along[rank - first], keys[rank - first]
+                # The window is separable: weighted sums of squares along y, then along x.
+                down[:], distance[:] = nothing, nothing
+                for k in range(patch):
+                    here = block[margin + row + k, margin : margin + down.size]
+                    there, share = block[margin + row + k + dy, margin + dx : margin + dx + down.size], window[k]
+                    for x in range(down.size):
+                        down[x] += (here[x] - there[x]) * (here[x] - there[x]) * share
+                for k in range(patch):
+                    ahead, share = down[k : k + columns], window[k]
+                    for x in range(columns):
+                        distance[x] += ahead[x] * share
+                inside = edges[3] - dx if edges[0] <= row + dy < edges[1] else 0
+                distance[: max(edges[2] - dx, 0)], distance[max(inside, 0) :] = far, far
+                for x in range(columns):
+                    key[x] = key[x] & ~rank_mask | rank
+                    if rank < nearest:
+                        best[rank, x] = key[x]
+            for start in range(nearest, places, _PLACES):
+                for x in range(columns):
+                    one, other = keys[0, x], keys[1, x]
+                    for place in range(start, start + _PLACES):
+                        held = best[place, x]
+                        held, one = min(held, one), max(held, one)
+                        best[place, x], other = min(held, other), max(held, other)
+                    keys[0, x], keys[1, x] = one, other
 
 
 def join_pairs(keys: Keys, width: int, params: NonlocalParams) -> tuple[NDArray[np.int32], NDArray[np.int32], Keys]:
