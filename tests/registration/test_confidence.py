@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 
 from turbrestore.registration.confidence import (
-    FlowConfidence,
     _gradient,
     flow_confidence,
     noise_share,
@@ -27,8 +26,8 @@ def test_one_window_is_the_posterior_mean():
     # Without wider windows what is expected is zero.
     image, rng = texture(12), np.random.default_rng(1)
     flow, noise = rng.normal(0, 2, (12, 12, 2)).astype(np.float32), 0.05
-    confidence = FlowConfidence(flow_confidence(image).tensors[:1])
-    xx, xy, yy = confidence.tensors[0].astype(np.float64)
+    confidence = flow_confidence(image)[:1]
+    xx, xy, yy = confidence[0].astype(np.float64)
     tensor = np.moveaxis(np.array([[xx, xy], [xy, yy]]), (0, 1), (2, 3))
     # The covariance of a displacement is ten times σ² / (A J) within A = 16 π pixels, and that of the prior 0.5²; the
     # tensor is known to a hundredth of its mean eigenvalue.
@@ -43,7 +42,7 @@ def test_each_window_draws_towards_the_next_wider_one(noise, left):
     # Equal tensors and flow everywhere: each window moves what the next wider one expects towards the flow.  Noise
     # averages out in wider windows, but not below 0.01.
     tensors = tuple(np.full((side, side, 3), (1e-5, 0, 2e-5), np.float32).transpose(2, 0, 1) for side in (16, 8, 4))
-    found = regularise_flow(np.ones((16, 16, 2), np.float32), FlowConfidence(tensors), noise)
+    found = regularise_flow(np.ones((16, 16, 2), np.float32), tensors, noise)
     expected = np.zeros(2)
     for sigma in reversed(left):
         prior = 10 * sigma**2 / (16 * np.pi * 0.25) + 0.01 * 1.5e-5
@@ -155,9 +154,9 @@ def test_arguments_are_not_changed():
     rng = np.random.default_rng(26)
     image, flow = rng.random((40, 31), np.float32), rng.normal(0, 2, (40, 31, 2)).astype(np.float32)
     confidence, before = flow_confidence(image), (image.copy(), flow.copy())
-    tensors = [tensor.copy() for tensor in confidence.tensors]
+    tensors = [tensor.copy() for tensor in confidence]
     regularise_flow(flow, confidence, 0.02)
-    assert all(map(np.array_equal, (image, flow, *confidence.tensors), (*before, *tensors)))
+    assert all(map(np.array_equal, (image, flow, *confidence), (*before, *tensors)))
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.1])

@@ -38,7 +38,7 @@ _OVERLAP = 0.25
 # Widths differ clearly if the largest exceeds the smallest by this factor and by this many standard deviations.
 _CLEAR_FACTOR, _CLEAR_DEVIATIONS = 1.5, 3.0
 # A tile in which no blur is found counts as sharp only if its fine detail exceeds the noise by this factor.
-_DETAIL = 2.0
+_DETAIL, _SECOND = 2.0, np.array([1, -2, 1], np.float32)
 # Ratio of neighbouring widths between whose images is interpolated, and largest number of widths.
 _STEP, _MOST_WIDTHS = 1.35, 5
 # Rows that are interpolated at a time.
@@ -82,19 +82,20 @@ def blur_map_steps(
         tile = np.ascontiguousarray(grey[rows[place[0]], columns[place[1]]])
         with one_thread_each():
             candidates = find_candidates(tile, exponent=whole.exponent)
-        if any(one.plausible for one in candidates) or (candidates and _fine_detail(tile) > _DETAIL * noise):
+        # Second differences, from which noise is estimated too; in a flat tile they equal the noise.
+        fine = cv2.sepFilter2D(tile, cv2.CV_32F, _SECOND, _SECOND).std() / 6
+        if any(one.plausible for one in candidates) or (candidates and fine > _DETAIL * noise):
             found[place] = candidates
         yield number
     sigmas, uncertainties = np.full(shape, whole.sigma), np.full(shape, whole.uncertainty)
     agree = _agree(found.values())
     for number, (place, candidates) in enumerate(found.items(), 1):
-        plausible = tuple(one for one in candidates if one.plausible)
         if agree:
-            chosen = min((one.estimate for one in plausible), key=lambda one: abs(one.reduction - whole.reduction))
+            plausible = (one.estimate for one in candidates if one.plausible)
+            chosen = min(plausible, key=lambda estimate: abs(estimate.reduction - whole.reduction))
         else:
-            alike = tuple(one for one in plausible if 2 * one.estimate.reduction >= whole.reduction)
             with one_thread_each():
-                chosen = choose_blur(alike or candidates, runtime)
+                chosen = choose_blur(_like(candidates, whole), runtime)
         sigmas[place], uncertainties[place] = chosen.sigma, chosen.uncertainty
         yield number
     known = tuple(np.array(list(found), int).reshape(-1, 2).T)
@@ -158,12 +159,6 @@ def _spans(length: int) -> list[slice]:
     return [slice(int(start), int(start) + size) for start in starts]
 
 
-def _fine_detail(tile: FloatArray) -> float:
-    """Measure the second differences from which noise is estimated; in a flat tile they equal the noise."""
-    second = np.array([1, -2, 1], np.float32)
-    return float(cv2.sepFilter2D(tile, cv2.CV_32F, second, second).std()) / 6
-
-
 def _agree(tiles: Iterable[tuple[BlurCandidate, ...]]) -> bool:
     """Whether all widths that might be chosen are too close to each other to differ clearly."""
     plausible = [[one.estimate.sigma for one in tile if one.plausible] for tile in tiles]
@@ -172,6 +167,14 @@ def _agree(tiles: Iterable[tuple[BlurCandidate, ...]]) -> bool:
         return False
     widths = [width for tile in plausible for width in tile]
     return not widths or max(widths) <= _CLEAR_FACTOR * min(widths)
+
+
+def _like(candidates: tuple[BlurCandidate, ...], whole: BlurEstimate) -> tuple[BlurCandidate, ...]:
+    """Plausible candidates of about the reduction of the whole image; all of them if there is none."""
+    return (
+        tuple(one for one in candidates if one.plausible and 2 * one.estimate.reduction >= whole.reduction)
+        or candidates
+    )
 
 
 def _clearly_differ(sigmas: np.ndarray, uncertainties: np.ndarray) -> bool:

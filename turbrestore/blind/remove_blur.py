@@ -8,12 +8,11 @@ pixel.
 
 from __future__ import annotations
 
-import itertools
 import threading
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,15 +59,6 @@ MOST_THREADS = 4
 
 
 @dataclass(frozen=True)
-class DeblurState:
-    """Progress of :func:`remove_blur_steps`."""
-
-    sigma: float  # width of the blur that is being removed, pixels; the largest one if it differs between pixels
-    attempt: int  # number of the attempt, from 1
-    iteration: int  # iterations done in this attempt, over all its tiles and widths
-
-
-@dataclass(frozen=True)
 class Deblurred:
     """A deblurred image and the decisions on the way to it."""
 
@@ -80,7 +70,7 @@ class Deblurred:
     posterior: BlurPosterior | None = None  # none if the width was given, or nothing is known but the image
 
 
-Steps = Generator[DeblurState, None, Result]
+Steps = Generator[DeconvolutionState, None, Result]
 
 
 def remove_blur(
@@ -120,9 +110,8 @@ def remove_blur_steps(
         sigma, params = posterior.removed, replace(params, exponent=params.exponent or posterior.exponent)
     size = image.shape[0], image.shape[1]
     in_tiles = () if side is None or find_device(runtime.device) != CPU else halo_tiles(size, side)
-    numbers = itertools.count(1)
 
-    def remove(width: float) -> Generator[DeconvolutionState, None, Deconvolution]:
+    def remove(width: float) -> Steps[Deconvolution]:
         kernel = width if psf is None or width == 0 else psf
         return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles, photons)
 
@@ -130,7 +119,7 @@ def remove_blur_steps(
     # The likelihood of a tile is unreliable where that of the image is, and where frames tell the blur they decide.
     if posterior is None and blur is not None and blur.blurred and not blur.edge_limited:
         if runtime.memory_limit is None:
-            tiles, first = yield from _map_meanwhile(image, blur, _label(remove(sigma), sigma, next(numbers)))
+            tiles, first = yield from _map_meanwhile(image, blur, remove(sigma))
         else:
             tiles = estimate_blur_map(image, blur, runtime)
     widths = sigma_map(tiles.removable, image.shape[:2]) if tiles is not None and tiles.varies else None
@@ -139,10 +128,8 @@ def remove_blur_steps(
 
     def attempt(width: float) -> Steps[Deconvolution]:
         if widths is None or width == 0:
-            steps = remove(width)
-        else:
-            steps = varying_deconvolution_steps(remove, widths * (width / sigma), runtime)
-        return _label(steps, width, next(numbers))
+            return remove(width)
+        return varying_deconvolution_steps(remove, widths * (width / sigma), runtime)
 
     if blur is None:
         result = yield from attempt(sigma)
@@ -235,18 +222,6 @@ def guarded_steps(
         sigma *= guards.back_off if len(readings) > 1 else guards.first_back_off(readings[0])
     result = yield from attempt(0.0)
     return result, tuple(readings)
-
-
-def _label(steps: Generator[Any, None, Result], sigma: float, attempt: int) -> Steps[Result]:
-    """Pass on the steps of a deconvolution as those of an attempt."""
-    iteration = 0
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return end.value
-        iteration += 1
-        yield DeblurState(sigma, attempt, iteration)
 
 
 def _map_meanwhile(

@@ -14,8 +14,6 @@ Transfer functions are half-spectra with the layout of :func:`scipy.fft.rfft2`, 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +22,6 @@ from ..core.arrays import FloatArray
 from ..core.errors import DataError, require
 
 Float64Array = NDArray[np.float64]
-Spectrum = NDArray[Any]
 
 # Exponents of the transfer function: a Gaussian, and a long exposure through Kolmogorov turbulence (Fried 1966).
 GAUSSIAN, KOLMOGOROV = 2.0, 5 / 3
@@ -40,7 +37,7 @@ def blur_otf(shape: tuple[int, int], sigma: float, exponent: float = GAUSSIAN) -
     :func:`fused_exponent`.
     Returns (H, W // 2 + 1).
     """
-    _check_sigma(sigma)
+    require(np.isfinite(sigma) and sigma >= 0, f"sigma: expected a finite number of 0 or more pixels, found {sigma}")
     check_exponent(exponent)
     if sigma == 0:
         return np.ones((shape[0], shape[1] // 2 + 1), np.float32)
@@ -114,7 +111,3 @@ def laplacian_symbol(height: int, width: int) -> FloatArray:
 
 def _frequencies(shape: tuple[int, ...]) -> tuple[Float64Array, Float64Array]:
     return scipy.fft.fftfreq(shape[0])[:, None], scipy.fft.rfftfreq(shape[1])
-
-
-def _check_sigma(sigma: float) -> None:
-    require(np.isfinite(sigma) and sigma >= 0, f"sigma: expected a finite number of 0 or more pixels, found {sigma}")

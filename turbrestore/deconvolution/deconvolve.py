@@ -39,7 +39,7 @@ from .nonlocal_prior.nonlocal_tv import NonlocalPenalty
 from .nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
 from .nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from .primal_dual import Penalty, PrimalDual
-from .problem import Margin, Problem, margin_around, problem_of, read_blur
+from .problem import Problem, margin_around, problem_of, read_blur
 from .stopping import DeconvolutionState, Solution, iterate
 from .tv import LocalPenalty
 
@@ -258,12 +258,17 @@ def deconvolve_steps(
     otf = blur_otf(shape, sigma, params.exponent or GAUSSIAN) if psf is None else psf_to_otf(psf, shape)
     oscillates = unknown and params.method in ("nltv", "tv")
     rim = min(int(np.ceil(sigma)), min(height, width) // 4) if oscillates else 0
+    around = None
+    if guide is not None:
+        grey = check_grey(guide, "guide")
+        if grey.shape != margin.size:
+            raise DataError(f"guide: expected the size of the image {margin.size}, found {grey.shape}")
+        around = margin.pad(grey)
     device = find_device(runtime.device)
     with memory_of(device), one_thread_each(), ThreadTeam(runtime.workers) as team:
         transfer = load(otf, device)
         problems = [problem_of(plane, margin, photons, transfer, fidelity, runtime.workers) for plane in planes]
         measured = load(margin.mask(rim), device)
-        around = _padded_guide(guide, margin)
         solution = yield from _solve(problems, around, measured, params, team)
     restored = join_planes(pixels, [store(u)[margin.inside()] for u in solution.images], params.channels)
     records = (np.array(column) for column in zip(*solution.records, strict=True))
@@ -342,15 +347,6 @@ def _sharpened(
         return starts, guide
     own = starts if params.sharpen_guide else [problem.observed for problem in problems]
     return starts, np.mean([store(u) for u in own], axis=0, dtype=np.float32)
-
-
-def _padded_guide(guide: ArrayLike | None, margin: Margin) -> FloatArray | None:
-    if guide is None:
-        return None
-    grey = check_grey(guide, "guide")
-    if grey.shape != margin.size:
-        raise DataError(f"guide: expected the size of the image {margin.size}, found {grey.shape}")
-    return margin.pad(grey)
 
 
 def _noise_and_fidelity(planes: list[FloatArray], params: DeconvolutionParams) -> tuple[float, float]:

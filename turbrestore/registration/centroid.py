@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
+from functools import partial
 from itertools import repeat
 from typing import TYPE_CHECKING, Literal
 
@@ -217,18 +218,14 @@ def centroid_steps(
         if not converged:
             recentre = invert_flow(mean_flow)  # V
             total = compose_flows(total, recentre) if params.mode == "single" else total
-            _recentre(flows, recentre, runtime.threads)
+            onto_new = partial(compose_flows, inner=recentre)
+            for flow, moved in map_ahead(onto_new, iter_frames(flows), runtime.threads):
+                flow[...] = moved
+                drop_pages(flows)
         # q ← q ∘ (id + W̄)⁻¹.
         image = mean_registered(stack, flows, runtime) if params.mode == "fused" else warp(stack[params.start], total)
         if converged or change > _DIVERGED or len(sizes) == params.iterations:
             return Centroid(image, flows, np.array(sizes), converged)
-
-
-def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:
-    """Compose flows with ``recentre``, in place, so that they start from the recentred image."""
-    for flow, moved in map_ahead(lambda flow: compose_flows(flow, recentre), iter_frames(flows), threads):
-        flow[...] = moved
-        drop_pages(flows)
 
 
 def mean_registered(frames: FloatArray, flows: FloatArray, runtime: Runtime = DEFAULT) -> FloatArray:

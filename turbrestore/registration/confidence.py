@@ -28,8 +28,6 @@ J also contains the noise of the reference, which must not pass for texture, so 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,19 +55,12 @@ _LEAST_NOISE = 1 / 4096
 
 # Components of a vector field: separate planes are read several times as fast as every second number of an array.
 Planes = tuple[FloatArray, FloatArray]
+# (3, h, w) each: J as planes xx, xy and yy, squared intensity per squared pixel.
+Tensors = tuple[FloatArray, ...]
 
 
-@dataclass(frozen=True)
-class FlowConfidence:
-    """What the texture of a reference tells about displacements."""
-
-    # (3, h, w): J as planes xx, xy and yy, squared intensity per squared pixel: of the image, then of ever twice as
-    # wide windows and grids.
-    tensors: tuple[FloatArray, ...]
-
-
-def flow_confidence(reference: ArrayLike) -> FlowConfidence:
-    """Structure tensors of the image that flows start from.
+def flow_confidence(reference: ArrayLike) -> Tensors:
+    """Structure tensors of the image that flows start from, then those of ever twice as wide windows and grids.
 
     ``reference`` (H, W) or (H, W, 3).
     """
@@ -82,7 +73,7 @@ def flow_confidence(reference: ArrayLike) -> FlowConfidence:
     tensors = [tensor]
     while min(tensors[-1].shape[1:]) > 1:
         tensors.append(np.stack([cv2.pyrDown(plane) for plane in tensors[-1]]))
-    return FlowConfidence(tuple(tensors))
+    return tuple(tensors)
 
 
 def noise_share(image: ArrayLike, noise: float) -> float:
@@ -94,12 +85,12 @@ def noise_share(image: ArrayLike, noise: float) -> float:
     return 2 * _SCHARR_NOISE * noise**2 / max(squares, 1e-18)
 
 
-def regularise_flow(flow: FloatArray, confidence: FlowConfidence, noise: float) -> FloatArray:
+def regularise_flow(flow: FloatArray, tensors: Tensors, noise: float) -> FloatArray:
     """Draw a flow towards its neighbourhood where the texture does not determine it.
 
     ``flow`` (H, W, 2); returns (H, W, 2).
     """
-    tensors, planes = confidence.tensors, cv2.split(flow)
+    planes = cv2.split(flow)
     (xx, xy, yy), (dx, dy) = tensors[0], planes
     weighted = [(xx * dx + xy * dy, xy * dx + yy * dy)]
     for _ in tensors[1:]:

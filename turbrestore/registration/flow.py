@@ -117,7 +117,6 @@ class FlowReference:
     # From an image of the size of the reference to a FlowFrame; the same for all references with these settings.
     prepare: Callable[[FloatArray], FlowFrame]
     solve: Callable[[list[FlowFrame]], list[FloatArray]]  # from a list of FlowFrame to the list of their flows, pixels
-    shape: tuple[int, int]  # (H, W)
     batch: int  # frames to hand to ``solve`` together
     threads: int  # batches to solve side by side; 0 means one for each available core
 
@@ -260,7 +259,7 @@ def prepare_reference(
 
     # A device solves a batch at once while others are prepared; on the CPU every frame has a thread.
     batch, threads = (1, runtime.threads) if device == CPU else (params.tvl1.batch, min(runtime.workers, _BATCHES))
-    return FlowReference(prepare, solve, shape, batch, threads)
+    return FlowReference(prepare, solve, batch, threads)
 
 
 def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> FloatArray:

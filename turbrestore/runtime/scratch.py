@@ -14,7 +14,7 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,10 +41,14 @@ def new_stack(shape: tuple[int, ...], folder: Path | None = None, dtype: Any = n
         if free < size + _SPARE:
             raise StorageError(
                 f"{folder}: expected {size / 1e9:.1f} GB free for what memory does not hold, found "
-                f"{free / 1e9:.1f} GB; {_another(folder)}, or a higher memory limit"
+                f"{free / 1e9:.1f} GB; name another scratch folder"
+                f"{' by TMPDIR' if folder == Path(tempfile.gettempdir()) else ''}, or a higher memory limit"
             )
         with tempfile.TemporaryFile(dir=folder, prefix="turbrestore-") as file:
-            _reserve(file, size)
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)
+            else:
+                file.truncate(size)
             return np.memmap(file, dtype, "r+", shape=shape)
     except OSError as error:
         raise StorageError(f"{folder}: cannot hold a file of {size / 1e9:.1f} GB ({error.strerror})") from error
@@ -157,15 +161,3 @@ def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
             strip += np.square(part - mean)
         strip /= np.float32(len(stack))
     return variance
-
-
-def _another(folder: Path) -> str:
-    temporary = folder == Path(tempfile.gettempdir())
-    return f"name another scratch folder{' by TMPDIR' if temporary else ''}"
-
-
-def _reserve(file: IO[bytes], size: int) -> None:
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file.fileno(), 0, size)
-    else:
-        file.truncate(size)

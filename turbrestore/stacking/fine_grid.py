@@ -23,7 +23,7 @@ that nothing was folded back, the image reduced to the usual grid is the usual r
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -31,11 +31,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..agreement.last_guard import Halves, keep_agreed
-from ..blind.remove_blur import DeblurState, guarded_steps
+from ..blind.remove_blur import Steps, guarded_steps
 from ..blur.psf import GAUSSIAN, blur_otf
 from ..core.arrays import FloatArray
 from ..core.decision import Decision
-from ..deconvolution.deconvolve import Deconvolution, deconvolve
+from ..deconvolution.deconvolve import Deconvolution, deconvolve_steps
 from ..preparation import Prepared
 from ..results import Restoration
 from ..runtime.runtime import DEFAULT, Runtime
@@ -181,10 +181,9 @@ def _removed(
     exponent = params.deconvolution.exponent or (GAUSSIAN if blur is None else blur.exponent)
     settings = replace(params.deconvolution, sigma=None, exponent=None)
 
-    def attempt(width: float) -> Generator[DeblurState, None, Deconvolution]:
-        yield DeblurState(width, 1, 0)
-        psf = fine_psf(width, exponent, scale)
-        return replace(deconvolve(image, psf, settings, image, runtime), sigma=width)
+    def attempt(width: float) -> Steps[Deconvolution]:
+        found = yield from deconvolve_steps(image, fine_psf(width, exponent, scale), settings, image, runtime)
+        return replace(found, sigma=width)
 
     if params.deconvolution.sigma is not None:
         return finish(attempt(fine))

@@ -101,7 +101,8 @@ def measure_variation(frames: FloatArray, flows: FloatArray, reduction: int = 1)
             if count % every == 0:
                 white = rng.standard_normal(plane.shape).astype(np.float32)
                 noise.append(_spectrum(_warped(white, flow)))
-                stretches.append(_mean_square_derivative(flow))
+                smooth = cv2.GaussianBlur(flow, (0, 0), _SMOOTH)
+                stretches.append(float(np.mean([np.square(np.diff(smooth, axis=axis)).mean() for axis in (0, 1)])))
         if len(spectra) >= _FEWEST and noise:
             sums.append(_sums(np.array(spectra)))
             responses.append(_by_ring(np.square(np.abs(np.array(noise))).mean(axis=0)))
@@ -192,11 +193,6 @@ def _rings() -> tuple[NDArray[np.int_], NDArray[np.int_]]:
 def _by_ring(values: NDArray[np.float32]) -> Float64Array:
     ring, count = _rings()
     return np.bincount(ring, values.ravel(), minlength=len(RINGS))[: len(RINGS)] / count
-
-
-def _mean_square_derivative(flow: FloatArray) -> float:
-    smooth = cv2.GaussianBlur(flow, (0, 0), _SMOOTH)
-    return float(np.mean([np.square(np.diff(smooth, axis=axis)).mean() for axis in (0, 1)]))
 
 
 def _sums(spectra: NDArray[np.complex64]) -> Float64Array:

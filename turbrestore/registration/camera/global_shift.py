@@ -180,9 +180,12 @@ def overlap(shape: tuple[int, ...], shift: ArrayLike) -> tuple[Slices, Slices]:
 
     ``shift`` (2,).
     """
-    dx, dy = (int(step) for step in np.asarray(shift))
-    pairs = [_overlap_of_axis(length, step) for length, step in ((shape[0], dy), (shape[1], dx))]
-    return (pairs[0][0], pairs[1][0]), (pairs[0][1], pairs[1][1])
+    to, origin = [], []
+    for length, moved in zip(shape, np.asarray(shift)[::-1], strict=False):
+        step = min(max(int(moved), -length), length)
+        to.append(slice(max(-step, 0), length - max(step, 0)))
+        origin.append(slice(max(step, 0), length - max(-step, 0)))
+    return (to[0], to[1]), (origin[0], origin[1])
 
 
 def correlation(a: FloatArray, b: FloatArray) -> float:
@@ -193,11 +196,6 @@ def correlation(a: FloatArray, b: FloatArray) -> float:
     a, b = a - a.mean(), b - b.mean()
     energy = float(np.vdot(a, a)) * float(np.vdot(b, b))
     return float(np.vdot(a, b)) / energy**0.5 if energy > 0 else 0.0
-
-
-def _overlap_of_axis(length: int, step: int) -> Slices:
-    step = min(max(step, -length), length)
-    return slice(max(-step, 0), length - max(step, 0)), slice(max(step, 0), length - max(-step, 0))
 
 
 def _follow(
