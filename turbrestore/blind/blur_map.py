@@ -61,10 +61,7 @@ class BlurMap:
 
 
 def estimate_blur_map(image: ArrayLike, whole: BlurEstimate, runtime: Runtime = DEFAULT) -> BlurMap | None:
-    """Estimate the blur of overlapping tiles, two or three along each side.
-
-    ``image`` (H, W) or (H, W, 3).
-    """
+    """Estimate the blur of overlapping tiles of an image (H, W[, 3]), two or three along each side."""
     return finish(blur_map_steps(image, whole, runtime))
 
 
@@ -103,10 +100,7 @@ def blur_map_steps(
 
 
 def sigma_map(tiles: ArrayLike, shape: tuple[int, int]) -> FloatArray:
-    """Interpolate the widths of tiles between their centres, to a width for every pixel.
-
-    ``tiles`` (rows, columns); returns (H, W).
-    """
+    """Interpolate the widths (rows, columns) of tiles between their centres, to a width for every pixel (H, W)."""
     values = np.asarray(tiles, np.float32)
     axes = []
     for length, count in zip(shape, values.shape, strict=True):
@@ -121,10 +115,7 @@ def varying_deconvolution_steps(
     sigmas: FloatArray,
     runtime: Runtime = DEFAULT,
 ) -> Generator[DeconvolutionState, None, Deconvolution]:
-    """Deconvolve by a width for every pixel: by a few widths, between whose images is interpolated.
-
-    ``sigmas`` (H, W).
-    """
+    """Deconvolve by a width for every pixel (H, W): by a few widths, between whose images is interpolated."""
     widths = _widths_between(float(sigmas.min()), float(sigmas.max()))
     for index, width in enumerate(widths):
         result = yield from attempt(float(width))

@@ -136,10 +136,7 @@ class GuardReading:
 def evaluate_guards(
     result: ArrayLike, blurred: ArrayLike, sigma: float, params: GuardParams | None = None
 ) -> GuardReading:
-    """Compare a deconvolved image with the blurred one.
-
-    ``result`` (H, W) or (H, W, 3).
-    """
+    """Compare a deconvolved image (H, W[, 3]) with the blurred one."""
     params = params or GuardParams()
     after, before = check_image(result, "result"), check_image(blurred, "blurred")
     if after.shape != before.shape:
@@ -198,10 +195,7 @@ def _noise_gain(after: FloatArray, before: FloatArray) -> float:
 
 
 def ringing(after: FloatArray, before: FloatArray, sigma: float) -> float:
-    """Return the share of strong edges along which a deconvolved image rings.
-
-    ``after`` (H, W); ``before`` (H, W).
-    """
+    """Return the share of strong edges along which a deconvolved image (H, W) rings."""
     reach = max(_SMALLEST_REACH, int(np.ceil(_REACH_SIGMAS * sigma)))
     noise = estimate_noise(before)
     edges = fewer_edges(find_edges(before, noise), _SAMPLES // (2 * reach + 1))

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..blur.estimation import BlurEstimate, estimate_blur, limit_to_edges
 from ..blur.posterior import BlurPosterior, BlurWitnesses, blur_posterior
+from ..blur.psf import Float64Array
 from ..blur.witnesses.image_evidence import image_evidence
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.decision import Decision
@@ -42,7 +43,6 @@ from .decisions import explain_blur, explain_blur_map, explain_guards, explain_p
 from .guards import GuardParams, GuardReading, evaluate_guards
 
 Result = TypeVar("Result")
-Float64Array = NDArray[np.float64]
 
 # Bytes per pixel, and per pixel and channel, of what is computed before and after the deconvolution; the guards take
 # most.
@@ -81,10 +81,7 @@ def remove_blur(
     runtime: Runtime = DEFAULT,
     side: int | None = None,
 ) -> Deblurred:
-    """Remove a blur of given or of estimated width.
-
-    ``image`` (H, W) or (H, W, 3).
-    """
+    """Remove a blur of given or of estimated width from an image (H, W[, 3])."""
     return finish(remove_blur_steps(image, guide, deconvolution, guards, runtime, side))
 
 
@@ -209,10 +206,7 @@ def guarded_steps(
     guards: GuardParams,
     first: Deconvolution | None = None,
 ) -> Steps[tuple[Deconvolution, tuple[GuardReading, ...]]]:
-    """Deconvolve by smaller and smaller widths until the guards pass.
-
-    ``blurred`` (H, W) or (H, W, 3).
-    """
+    """Deconvolve an image (H, W[, 3]) by smaller and smaller widths until the guards pass."""
     readings: list[GuardReading] = []
     while sigma > 0 and len(readings) < guards.tries:
         result, first = first or (yield from attempt(sigma)), None

@@ -60,10 +60,7 @@ class StructureReading:
 
 
 def compare_structure(image: FloatArray, frames: FloatArray, flows: FloatArray) -> StructureReading:
-    """Compare a fused image with the registered frames.
-
-    ``image`` (H, W) or (H, W, 3); ``frames`` (T, H, W) or (T, H, W, 3); ``flows`` (T, H, W, 2).
-    """
+    """Compare a fused image (H, W[, 3]) with its frames (T, H, W[, 3]), registered by flows (T, H, W, 2)."""
     picked = np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)
     gradient = _gradient(luminance(image))
     steepness = np.hypot(*gradient)

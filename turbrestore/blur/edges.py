@@ -66,10 +66,7 @@ class Edges:
 
 
 def find_edges(image: FloatArray, noise: float) -> Edges:
-    """Find the pixels at which the gradient is largest along its own direction.
-
-    ``image`` (H, W).
-    """
+    """Find the pixels of an image (H, W) at which the gradient is largest along its own direction."""
     places, normals = [np.zeros((0, 2), np.float32)], [np.zeros((0, 2), np.float32)]
     for top in range(0, len(image), _ROWS):
         start = max(top - _AROUND, 0)
@@ -97,10 +94,7 @@ def fewer_edges(edges: Edges, most: int) -> Edges:
 
 
 def edge_profiles(image: FloatArray, edges: Edges, reach: int) -> tuple[FloatArray, FloatArray]:
-    """Follow the image along the normals on either side of edges.
-
-    ``image`` (H, W); returns ``bright, dark`` (n, reach + 1).
-    """
+    """Profiles (n, reach + 1) of an image (H, W) along the normals of n edges, on the bright and on the dark side."""
     # Commands that estimate no blur start faster without it.
     from scipy import ndimage
 
@@ -113,10 +107,7 @@ def edge_profiles(image: FloatArray, edges: Edges, reach: int) -> tuple[FloatArr
 
 
 def largest_fall(profiles: NDArray[Any]) -> NDArray[Any]:
-    """Return the largest fall of each profile from any sample to a later one.
-
-    ``profiles`` (n, k); returns (n,).
-    """
+    """Return the largest fall (n,) of each profile (n, k) from any sample to a later one."""
     return (np.maximum.accumulate(profiles, axis=1) - profiles).max(axis=1)
 
 

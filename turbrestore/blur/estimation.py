@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_grey
 from ..core.errors import require
@@ -50,12 +50,10 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import ThreadTeam, one_thread_each
 from .edges import edge_limit
 from .marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
-from .psf import GAUSSIAN, check_exponent, fused_exponent
+from .psf import GAUSSIAN, Float64Array, check_exponent, fused_exponent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Float64Array = NDArray[np.float64]
 
 # Factors by which the image is reduced; smallest side of a reduced image and of an image that is analysed at all.
 _REDUCTIONS = (1, 2, 3, 4, 6, 8)
@@ -348,10 +346,7 @@ def _fast_size(size: int) -> int:
 
 
 def noise_multiple(image: FloatArray) -> float:
-    """Multiple of the noise that is measured in an image and in its reductions.
-
-    ``image`` (H, W).
-    """
+    """Multiple of the noise that is measured in an image (H, W) and in its reductions."""
     fine = max(estimate_noise(image), LEAST_NOISE)
     halved = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     smooth = np.interp(2 * estimate_noise(halved) / fine, _SMOOTH, (0, 1))
@@ -360,9 +355,6 @@ def noise_multiple(image: FloatArray) -> float:
 
 
 def assumed_noise(image: FloatArray, noise: float | None = None, multiple: float = _MULTIPLES[0]) -> float:
-    """Return n.
-
-    ``image`` (H, W).
-    """
+    """Return n of an image (H, W)."""
     level = estimate_noise(image) if noise is None else noise
     return max(float(np.hypot(multiple * level, _MISFIT * image.std())), LEAST_NOISE)

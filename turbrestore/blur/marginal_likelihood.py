@@ -35,13 +35,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..runtime.jit import jit
-from .psf import half_frequency
-
-Float64Array = NDArray[np.float64]
+from .psf import Float64Array, half_frequency
 
 # Widths whose cost is computed, pixels; the first is the width of a sharp image.
 WIDTHS = np.array([0.35, 0.45, 0.55, 0.65, 0.8, 0.95, 1.1, 1.3, 1.55, 1.85, 2.2, 2.6])
@@ -67,10 +64,7 @@ class ImageGradients:
 
 
 def image_gradients(image: FloatArray) -> ImageGradients:
-    """Compute the tapered gradients of an image and their spectrum.
-
-    ``image`` (h + 1, w + 1).
-    """
+    """Compute the tapered gradients of an image (h + 1, w + 1) and their spectrum."""
     dx, dy = image[:-1, 1:] - image[:-1, :-1], image[1:, :-1] - image[:-1, :-1]
     rows, columns = (_taper(size) for size in dx.shape)
     planes = np.stack([dx, dy], axis=-1) * np.outer(rows, columns)[..., None]
@@ -79,10 +73,7 @@ def image_gradients(image: FloatArray) -> ImageGradients:
 
 
 def width_costs(gradients: ImageGradients, exponent: float | Sequence[float], noise: float, rises: int) -> Float64Array:
-    """Compute L for increasing widths until it has risen several times in a row; L has a single minimum.
-
-    Returns (k,).
-    """
+    """Compute L (k,) for increasing widths until it has risen several times in a row; L has a single minimum."""
     costs: list[float] = []
     scene = gradients.planes
     prior = np.full_like(scene, max(float(np.square(scene).mean()), _LEAST_VARIANCE))
@@ -96,10 +87,7 @@ def width_costs(gradients: ImageGradients, exponent: float | Sequence[float], no
 
 
 def likeliest_width(costs: Float64Array) -> float:
-    """Return the width at which L is smallest, by a parabola in log σ through the three smallest neighbours.
-
-    ``costs`` (k,).
-    """
+    """Return the width of the smallest L (k,), by a parabola in log σ through the three smallest neighbours."""
     index = int(np.argmin(costs))
     if not 0 < index < len(costs) - 1:
         return float(WIDTHS[index])
@@ -111,10 +99,7 @@ def likeliest_width(costs: Float64Array) -> float:
 def fit_scene(
     gradients: ImageGradients, scene: FloatArray, prior: FloatArray, blur: tuple[float, float], noise: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Minimise the bound over x and γ for one blur, from a given start.
-
-    ``scene, prior`` (h, w, 2); returns ``scene, prior`` (h, w, 2).
-    """
+    """Minimise the bound over x and γ, both (h, w, 2), for one blur, from a given start."""
     width, exponent = blur
     otf = np.exp(-np.log(2) * (gradients.frequency / half_frequency(width)) ** exponent).astype(np.float32)
     # ‖k‖² by Parseval.  OpenCV's inverse transform does not divide by the size, so the kernel does.

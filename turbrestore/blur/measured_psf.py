@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import check_grey
 from ..core.errors import DataError
-
-Float64Array = NDArray[np.float64]
+from .psf import Float64Array
 
 # Width of the border whose median is the background, in shares of the side; a standard deviation in median absolute
 # deviations; deviations of the noise above which light is that of the point, and least ratio of peak and noise.

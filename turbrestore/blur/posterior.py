@@ -43,12 +43,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
+from .psf import Float64Array
 from .witnesses.hypotheses import LEAST_TRANSFER, Hypotheses, hypotheses, shapes
 from .witnesses.image_evidence import EXPONENTS, ImageEvidence
 from .witnesses.short_exposure import TILT_SPREAD
 from .witnesses.spectral_variation import RINGS, SpectralVariation, measure_variation
-
-Float64Array = NDArray[np.float64]
 
 # Fidelity of the Wiener filter and exponent of the power of a scene; factors on the width that are tried.
 _FIDELITY, _SCENE = 1500.0, 2.2

@@ -72,10 +72,7 @@ def check_exponent(exponent: float) -> None:
 
 
 def psf_to_otf(psf: ArrayLike, shape: tuple[int, int]) -> NDArray[np.complex64]:
-    """Compute the transfer function of a sampled point spread function on a periodic grid.
-
-    ``psf`` (h, w); returns (H, W // 2 + 1).
-    """
+    """Compute the transfer function (H, W // 2 + 1) of a sampled PSF (h, w) on a periodic grid."""
     kernel = check_psf(psf)
     height, width = kernel.shape
     if height > shape[0] or width > shape[1]:
@@ -87,10 +84,7 @@ def psf_to_otf(psf: ArrayLike, shape: tuple[int, int]) -> NDArray[np.complex64]:
 
 
 def check_psf(psf: ArrayLike) -> Float64Array:
-    """Return ``psf`` as a float64 array that sums to 1.
-
-    ``psf`` (h, w); returns (h, w).
-    """
+    """Return a PSF (h, w) as a float64 array that sums to 1."""
     kernel = np.asarray(psf, dtype=np.float64)
     if kernel.ndim != 2 or any(size % 2 == 0 for size in kernel.shape):
         raise DataError(f"psf: expected shape (h, w) with odd sizes, found {kernel.shape}")
@@ -101,10 +95,7 @@ def check_psf(psf: ArrayLike) -> Float64Array:
 
 
 def laplacian_symbol(height: int, width: int) -> FloatArray:
-    """Return the Fourier symbol of −Δ for periodic forward differences.
-
-    Returns (H, W // 2 + 1).
-    """
+    """Return the Fourier symbol (H, W // 2 + 1) of −Δ for periodic forward differences."""
     rows, columns = (2 - 2 * np.cos(2 * np.pi * nu) for nu in _frequencies((height, width)))
     return (rows + columns).astype(np.float32)
 

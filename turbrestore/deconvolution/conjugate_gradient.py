@@ -122,10 +122,7 @@ def wiener_fidelity(image: FloatArray, noise: float) -> float:
 
 
 def wiener_image(problem: Problem) -> Stack:
-    """Wiener solution that nltv and tv start from, with a fidelity of its own.
-
-    Returns (P, Q).
-    """
+    """Wiener solution (P, Q) that nltv and tv start from, with a fidelity of its own."""
     observed = store(problem.observed)
     problem = replace(problem, fidelity=wiener_fidelity(observed, estimate_noise(observed)))
     solver = quadratic_solver(problem, "wiener")

@@ -278,29 +278,20 @@ def deconvolve_steps(
 
 
 def whole_image_fidelity(image: ArrayLike, params: DeconvolutionParams | None = None) -> float:
-    """Weight λ of the data for the whole image, so that tiles of it can be deconvolved with the same weight.
-
-    ``image`` (H, W) or (H, W, 3).
-    """
+    """Weight λ of the data for an image (H, W[, 3]), so that its tiles can have the same."""
     params = params or DeconvolutionParams()
     return _noise_and_fidelity(split_planes(check_image(image), params.channels), params)[1]
 
 
 def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:
-    """Split an image into the planes that are deblurred.
-
-    ``image`` (H, W) or (H, W, 3); returns (H, W) each.
-    """
+    """Split an image (H, W[, 3]) into the planes (H, W) that are deblurred."""
     if image.ndim == 3 and channels == "each":
         return [np.ascontiguousarray(image[..., index]) for index in range(image.shape[2])]
     return [luminance(image)]
 
 
 def join_planes(image: FloatArray, planes: list[FloatArray], channels: str) -> FloatArray:
-    """Join deblurred planes into an image; the reverse of :func:`split_planes`.
-
-    ``image`` (H, W) or (H, W, 3); ``planes`` (H, W) each.
-    """
+    """Join deblurred planes (H, W) into an image (H, W[, 3]); the reverse of :func:`split_planes`."""
     if image.ndim == 2:
         return planes[0]
     if channels == "each":
@@ -355,10 +346,7 @@ def _noise_and_fidelity(planes: list[FloatArray], params: DeconvolutionParams) -
 
 
 def automatic_fidelity(method: str, image: FloatArray, noise: float) -> float:
-    """Choose the weight λ of the data term from the noise of the blurred image.
-
-    ``image`` (H, W).
-    """
+    """Choose the weight λ of the data term from the noise of the blurred image (H, W)."""
     if method == "nltv":
         return 20.0 / float(np.hypot(noise, 0.004))
     if method == "tv":

@@ -150,10 +150,7 @@ def problem_of(
 
 
 def read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:
-    """Read a blur that is given either by its width or by its PSF.
-
-    ``sigma_or_psf`` (h, w).
-    """
+    """Read a blur that is given either by its width or by its PSF (h, w)."""
     if np.ndim(sigma_or_psf) == 0:
         sigma: Any = sigma_or_psf
         require(

@@ -130,10 +130,7 @@ def predicted_change(changes: Sequence[float]) -> float:
 
 
 def change_of(before: list[Stack], after: list[Stack], measured: Stack) -> float:
-    """Change of images as they are shown: clipped to [0, 1], and where changes are measured.
-
-    ``before, after`` (P, Q) each; ``measured`` (P, Q).
-    """
+    """Change of images (P, Q) as they are shown, clipped to [0, 1], where it is ``measured`` (P, Q)."""
     moved, size = np.zeros((2, 1, 1))
     for old, new in zip(before, after, strict=True):
         shown = measured * new.clip(0, 1)
@@ -144,10 +141,7 @@ def change_of(before: list[Stack], after: list[Stack], measured: Stack) -> float
 
 
 def tile_sums(image: Stack) -> NDArray[np.float64]:
-    """Sum an image over tiles.
-
-    ``image`` (P, Q); returns (ceil(P / TILE), ceil(Q / TILE)).
-    """
+    """Sum an image (P, Q) over tiles, (ceil(P / TILE), ceil(Q / TILE))."""
     rows, columns = (-(-length // TILE) for length in image.shape)
     xp = namespace(image)
     padded = xp.zeros((rows * TILE, columns * TILE), dtype=image.dtype, device=image.device)

@@ -16,19 +16,13 @@ from .problem import total
 
 
 def local_gradient(u: Stack) -> Stack:
-    """Periodic forward differences ∇u.
-
-    ``u`` (H, W); returns (2, H, W).
-    """
+    """Periodic forward differences ∇u, (2, H, W), of an image (H, W)."""
     xp = namespace(u)
     return xp.stack([xp.roll(u, -1, axis) - u for axis in (0, 1)])
 
 
 def local_divergence(v: Stack) -> Stack:
-    """Negative adjoint of :func:`local_gradient`.
-
-    ``v`` (2, H, W); returns (H, W).
-    """
+    """Negative adjoint (H, W) of :func:`local_gradient`, for v (2, H, W)."""
     xp = namespace(v)
     return v[0] - xp.roll(v[0], 1, 0) + v[1] - xp.roll(v[1], 1, 1)
 

@@ -258,10 +258,7 @@ class FlowStrips:
 
     @classmethod
     def of(cls, flows: FloatArray | Iterable[FloatArray], threads: int = 0) -> FlowStrips:
-        """Check the shapes of flows.
-
-        ``flows`` (τ, H, W, 2), or iterable of arrays of shape (H, W, 2).
-        """
+        """Check the shapes of flows, an array (τ, H, W, 2) or an iterable of arrays (H, W, 2)."""
         if isinstance(flows, np.ndarray):
             shapes = [flows.shape[1:]] * len(flows) if flows.ndim else []
         elif not isinstance(flows, Iterable) or iter(flows) is flows:
@@ -286,20 +283,14 @@ class FlowStrips:
         return iter_slices(self.height, step, self.flows, *written)
 
     def read(self, rows: slice) -> Float64Array:
-        """Flows of these rows.
-
-        Returns (τ, numbers).
-        """
+        """Flows of these rows, (τ, numbers)."""
         flows = self.flows
         strip = flows[:, rows] if isinstance(flows, np.ndarray) else np.stack([np.asarray(f)[rows] for f in flows])
         return check_flow(strip, "flows").astype(np.float64).reshape(self.count, -1)
 
 
 def gram_matrix(strips: FlowStrips) -> tuple[FloatArray, Float64Array, float]:
-    """Gram matrix of the flows without their mean, strip by strip.
-
-    Returns ``mean`` (H, W, 2), ``gram`` (τ, τ).
-    """
+    """Mean flow (H, W, 2), Gram matrix (τ, τ) of the flows without it, strip by strip, and norm of the flows."""
     mean = np.empty((strips.height, strips.width, 2), np.float32)
 
     def add(batch: list[slice]) -> tuple[Float64Array, ...]:
@@ -318,10 +309,7 @@ def gram_matrix(strips: FlowStrips) -> tuple[FloatArray, Float64Array, float]:
 
 
 def singular_vectors(gram: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Singular values of X, and V.
-
-    ``gram`` (τ, τ); returns ``values`` (τ,), ``V`` (τ, τ).
-    """
+    """Singular values (τ,) of X, and V (τ, τ), from the Gram matrix."""
     values, V = np.linalg.eigh(gram)
     values, V = np.sqrt(np.maximum(values[::-1], 0.0)), V[:, ::-1]
     largest = V[np.abs(V).argmax(0), np.arange(len(V))]

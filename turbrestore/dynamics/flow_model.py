@@ -174,10 +174,7 @@ class ProjectedFlow:
 
 
 def project_measured(measured: FloatArray, dynamics: FlowDynamics) -> ProjectedFlow:
-    """Project a measured flow on the subspace of the model.
-
-    ``measured`` (H, W, 2).
-    """
+    """Project a measured flow (H, W, 2) on the subspace of the model."""
     deviation = measured - dynamics.mean_flow
     state = project_deviation(dynamics, deviation)
     return ProjectedFlow(state, float(np.square(deviation, out=deviation).sum(dtype=np.float64)), deviation.size)
@@ -200,10 +197,7 @@ def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64A
 
 @jit
 def add_products(modes: FloatArray, deviation: FloatArray, first: int, end: int, state: Float64Array) -> None:
-    """Add the inner products of some flows and one flow over a range of pixels.
-
-    ``modes`` (n, P); ``deviation`` (P,); ``state`` (n,).
-    """
+    """Add the inner products of flows (n, P) and one flow (P,) over a range of pixels to ``state`` (n,)."""
     for start in range(first, end, SUMMED):
         stop = min(start + SUMMED, end)
         for mode in range(modes.shape[0]):
@@ -214,10 +208,7 @@ def add_products(modes: FloatArray, deviation: FloatArray, first: int, end: int,
 
 
 def flow_of(dynamics: FlowDynamics, state: ArrayLike) -> FloatArray:
-    """Flow of a state: W̄ + C ξ (paper 3, eq. 10, without the residual r).
-
-    ``state`` (n,); returns (H, W, 2).
-    """
+    """Flow (H, W, 2) of a state (n,): W̄ + C ξ (paper 3, eq. 10, without the residual r)."""
     state = check_state(dynamics, state).astype(np.float32)
     moved, done = np.empty(len(dynamics.C), np.float32), 0
     for part in iter_parts(dynamics.C):
@@ -260,10 +251,7 @@ def predict_flow(dynamics: FlowDynamics, state: ArrayLike) -> FloatArray:
 
 
 def check_state(dynamics: FlowDynamics, state: ArrayLike) -> Float64Array:
-    """Return ``state`` as a finite float64 array of shape (n,).
-
-    ``state`` (n,); returns (n,).
-    """
+    """Return ``state`` as a finite float64 array of shape (n,)."""
     array = np.asarray(state, np.float64)
     if array.shape != (dynamics.rank,):
         raise DataError(f"state: expected shape ({dynamics.rank},), found {array.shape}")

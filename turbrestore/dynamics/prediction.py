@@ -45,10 +45,7 @@ class PredictionStudy:
 def study_prediction(
     flows: ArrayLike, params: DynamicsParams | None = None, runtime: Runtime = DEFAULT
 ) -> PredictionStudy:
-    """Train models of several τ and n, and predict the last quarter of the flows by each.
-
-    ``flows`` (T, H, W, 2).
-    """
+    """Train models of several τ and n, and predict the last quarter of the flows (T, H, W, 2) by each."""
     params, stack = params or DynamicsParams(), check_flow(flows, "flows")
     if stack.ndim != 4 or len(stack) < 5:
         raise DataError(f"flows: expected at least 5, shape (T, H, W, 2), found {stack.shape}")
@@ -78,10 +75,7 @@ def study_prediction(
 
 
 def prediction_error(dynamics: FlowDynamics, flows: FloatArray) -> float:
-    """Error of predicting each flow but the first from the one before.
-
-    ``flows`` (T, H, W, 2).
-    """
+    """Error of predicting each of the flows (T, H, W, 2) but the first from the one before."""
     squared, predicted = 0.0, None
     for flow in iter_frames(flows):
         deviation = flow - dynamics.mean_flow

@@ -92,20 +92,14 @@ class RegisteredFrame:
 def register_frame(
     image: FloatArray, flow: FloatArray, statistics: FrameStatistics, sharpness: float
 ) -> RegisteredFrame:
-    """Warp a frame onto the image by Ŵ and estimate its noise Z (eq. 15).
-
-    ``image`` (H, W) or (H, W, 3); ``flow`` (H, W, 2).
-    """
+    """Warp a frame (H, W[, 3]) onto the image by Ŵ (H, W, 2) and estimate its noise Z (eq. 15)."""
     loaded = load(flow, statistics.median.device)
     channels, grey, seen = warp_frame(image, loaded)
     return RegisteredFrame(channels, *frame_noise_variance(grey, loaded, seen, statistics, sharpness))
 
 
 def warp_frame(image: FloatArray, flow: Stack) -> Warped:
-    """Warp a frame, a NumPy array, by a flow that is on the device already.
-
-    ``image`` (H, W) or (H, W, 3); ``flow`` (H, W, 2).
-    """
+    """Warp a frame (H, W[, 3]), a NumPy array, by a flow (H, W, 2) that is on the device already."""
     if isinstance(flow, np.ndarray):
         registered = warp(image, flow)
         return load_image(registered, CPU), luminance(registered), inside(flow)

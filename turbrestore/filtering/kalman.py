@@ -89,10 +89,7 @@ class Innovation:
 
 
 def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
-    """Time update: A ξ̂ (paper 3, eq. 14b) and A P Aᵀ + Q (eq. 14d).
-
-    ``A`` (..., n, n); ``Q`` (..., n, n).
-    """
+    """Time update: A ξ̂ (paper 3, eq. 14b) and A P Aᵀ + Q (eq. 14d), with A and Q of shape (..., n, n)."""
     n = state.mean.shape[-1]
     A, Q = np.asarray(A, np.float64), np.asarray(Q, np.float64)
     _check_matrix(A, n, n, "A")

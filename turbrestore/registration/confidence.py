@@ -60,10 +60,7 @@ Tensors = tuple[FloatArray, ...]
 
 
 def flow_confidence(reference: ArrayLike) -> Tensors:
-    """Structure tensors of the image that flows start from, then those of ever twice as wide windows and grids.
-
-    ``reference`` (H, W) or (H, W, 3).
-    """
+    """Structure tensors of the reference (H, W[, 3]), then those of ever twice as wide windows and grids."""
     image = check_grey(reference, "reference")
     dx, dy = _gradient(image)
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW).ravel() for product in (dx * dx, dx * dy, dy * dy))
@@ -77,19 +74,13 @@ def flow_confidence(reference: ArrayLike) -> Tensors:
 
 
 def noise_share(image: ArrayLike, noise: float) -> float:
-    """Share of the squared gradient of an image that is noise.
-
-    ``image`` (H, W) or (H, W, 3).
-    """
+    """Share of the squared gradient of an image (H, W[, 3]) that is noise."""
     squares = sum(float(np.square(part).mean(dtype=np.float64)) for part in _gradient(check_grey(image)))
     return 2 * _SCHARR_NOISE * noise**2 / max(squares, 1e-18)
 
 
 def regularise_flow(flow: FloatArray, tensors: Tensors, noise: float) -> FloatArray:
-    """Draw a flow towards its neighbourhood where the texture does not determine it.
-
-    ``flow`` (H, W, 2); returns (H, W, 2).
-    """
+    """Draw a flow (H, W, 2) towards its neighbourhood where the texture does not determine it."""
     planes = cv2.split(flow)
     (xx, xy, yy), (dx, dy) = tensors[0], planes
     weighted = [(xx * dx + xy * dy, xy * dx + yy * dy)]
@@ -114,10 +105,7 @@ def regularise_flow(flow: FloatArray, tensors: Tensors, noise: float) -> FloatAr
 
 @jit
 def subtract_noise(noise: np.float32, xx: FloatArray, xy: FloatArray, yy: FloatArray, lowered: FloatArray) -> None:
-    """Lower both eigenvalues of the tensor of each pixel by ``noise``, but not below zero.
-
-    ``xx, xy, yy`` (P,); ``lowered`` (3, P).
-    """
+    """Lower both eigenvalues of each pixel's tensor, planes (P,), by ``noise``, not below zero, into (3, P)."""
     zero, two, tiny = np.float32(0), np.float32(2), np.finfo(np.float32).tiny
     for pixel in range(xx.size):
         half, tilt = (xx[pixel] + yy[pixel]) / two, (xx[pixel] - yy[pixel]) / two

@@ -14,10 +14,7 @@ Rectangle = tuple[int, int, int, int]
 
 
 def coverage(flows: ArrayLike) -> FloatArray:
-    """Share of the frames that show each pixel of the reference.
-
-    ``flows`` (T, H, W, 2); returns (H, W).
-    """
+    """Share (H, W) of the frames that show each pixel of the reference of their flows (T, H, W, 2)."""
     stack = check_flow(flows, "flows")
     if stack.ndim != 4 or not len(stack):
         raise DataError(f"flows: expected shape (T, H, W, 2) with at least one flow, found {stack.shape}")

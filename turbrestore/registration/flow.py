@@ -192,10 +192,7 @@ def measure_flows(
     starts: Iterable[FloatArray | None] = repeat(None),
     draft: bool = False,
 ) -> Iterator[tuple[FlowFrame, FloatArray]]:
-    """Measure flows from a prepared reference while threads solve a few frames ahead.
-
-    Yields ``flow`` (H, W, 2).
-    """
+    """Measure flows (H, W, 2) from a prepared reference while threads solve a few frames ahead."""
 
     def solve(batch: list[tuple[FloatArray | FlowFrame, FloatArray | None]]) -> list[tuple[FlowFrame, FloatArray]]:
         prepared = [
@@ -214,10 +211,7 @@ def prepare_reference(
     params: FlowParams | None = None,
     runtime: Runtime = DEFAULT,
 ) -> FlowReference:
-    """Prepare the image that flows start from.
-
-    ``reference`` (H, W) or (H, W, 3).
-    """
+    """Prepare the image (H, W[, 3]) that flows start from."""
     params = params or FlowParams()
     target = check_image(reference, "reference")
     if min(target.shape[:2]) < MIN_SIDE:
@@ -263,10 +257,7 @@ def prepare_reference(
 
 
 def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> FloatArray:
-    """Normalise to zero mean and unit deviation in a Gaussian window.
-
-    ``image`` (H, W) or (H, W, 3); returns (H, W).
-    """
+    """Luminance (H, W) of an image (H, W[, 3]) with zero mean and unit deviation in a Gaussian window."""
     grey = check_grey(image)
     # Centred first, because E[x²] − E[x]² loses all digits of a faint texture on a bright ground.
     centred = grey - cv2.GaussianBlur(grey, (0, 0), window)
@@ -277,10 +268,7 @@ def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> 
 
 
 def grey_levels(image: FloatArray, window: float, floor: float, smoothing: float = 0.0) -> NDArray[np.uint8]:
-    """Contrast-normalised image in 8 bits, with 32 levels for each local standard deviation.
-
-    ``image`` (H, W) or (H, W, 3); returns (H, W).
-    """
+    """Contrast-normalised image (H, W) in 8 bits, with 32 levels for each local standard deviation."""
     if smoothing > 0:
         image = cv2.GaussianBlur(luminance(image), (0, 0), smoothing)
     if window > 0:

@@ -124,10 +124,7 @@ def dis_solver(params: DisParams, reference: GreyImage, start_level: int | None 
 
 
 def farneback_solver(params: FarnebackParams, reference: GreyImage) -> FlowSolver:
-    """Prepare Farneback's method from a reference; it ignores starts.
-
-    ``reference`` (H, W).
-    """
+    """Prepare Farneback's method from a reference (H, W); it ignores starts."""
     deviation = {5: 1.1, 7: 1.5}[params.neighbourhood]
 
     def solve(frame: GreyImage) -> FloatArray:

@@ -44,10 +44,7 @@ def recentring_flow(mean_flow: ArrayLike) -> FloatArray:
 
 
 def recentre(image: ArrayLike, mean_flow: ArrayLike) -> FloatArray:
-    """Move an image onto the mean geometry of its frames: ``q ∘ (id + W̄)^{-1}``.
-
-    ``image`` (H, W) or (H, W, 3); ``mean_flow`` (H, W, 2).
-    """
+    """Move an image (H, W[, 3]) onto the mean geometry of its frames: ``q ∘ (id + W̄)^{-1}``."""
     V = recentring_flow(mean_flow)
     # Interpolation by no shift would change the last bits.
     return warp(image, V) if V.any() else check_image(image)

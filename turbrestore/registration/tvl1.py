@@ -156,10 +156,7 @@ class TvL1Flows:
 
 
 def prepare_tvl1(reference: ArrayLike, params: TvL1Params | None = None, device: str = CPU) -> TvL1Reference:
-    """Prepare the reference of many flows.
-
-    ``reference`` (H, W) or (H, W, 3).
-    """
+    """Prepare the reference (H, W[, 3]) of many flows."""
     params = params or TvL1Params()
     image = check_grey(reference, "reference")
     if min(image.shape) < _LEAST_SIDE // 2:
@@ -197,10 +194,7 @@ def tvl1_flows(
 
 
 def tvl1_solver(params: TvL1Params, reference: GreyImage, device: str) -> FlowSolver:
-    """Prepare TV-L1 from a reference as a method of :mod:`turbrestore.registration.flow`.
-
-    ``reference`` (H, W).
-    """
+    """Prepare TV-L1 from a reference (H, W) as a method of :mod:`turbrestore.registration.flow`."""
     with memory_of(device):
         prepared = prepare_tvl1(reference.astype(np.float32), params, device)
     admitted = threading.Semaphore(_BATCHES_AT_A_TIME) if device != CPU else nullcontext()

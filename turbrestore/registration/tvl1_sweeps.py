@@ -69,10 +69,7 @@ class SweepParams:
 
 
 def sweep(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams) -> Stack:
-    """Sweep the flows of a batch.
-
-    ``flow`` (B, 2, H, W); ``dual`` (B, 2, 2, H, W); returns (B, 2, H, W).
-    """
+    """Sweep the flows (B, 2, H, W) of a batch; its dual variables (B, 2, 2, H, W) are overwritten."""
     if not isinstance(flow, np.ndarray):
         return _sweep_on_device(problem, flow, dual, params)
     steps = np.array([params.step, params.dual_step, params.shrink, params.count], flow.dtype)
@@ -163,10 +160,7 @@ def _sweep_on_device(problem: FlowProblem, flow: Stack, dual: Stack, params: Swe
 
 
 def add_differences(u: Stack, px: Stack, py: Stack) -> None:
-    """Add ∇u to p, for arrays of NumPy or torch.
-
-    ``u, px, py`` (..., H, W).
-    """
+    """Add ∇u to p, arrays (..., H, W) of NumPy or torch."""
     px[..., :-1] += u[..., 1:]
     px[..., :-1] -= u[..., :-1]
     py[..., :-1, :] += u[..., 1:, :]
@@ -174,10 +168,7 @@ def add_differences(u: Stack, px: Stack, py: Stack) -> None:
 
 
 def divergence(px: Stack, py: Stack, out: Stack) -> None:
-    """Negative adjoint of the forward differences, for p that vanishes across the last column and row.
-
-    ``px, py`` (..., H, W); ``out`` (..., H, W).
-    """
+    """Negative adjoint of the forward differences, for p (..., H, W) that vanishes across the last column and row."""
     out[...] = px
     out += py
     out[..., 1:] -= px[..., :-1]
@@ -185,10 +176,7 @@ def divergence(px: Stack, py: Stack, out: Stack) -> None:
 
 
 def resize_dual(dual: Stack, shape: Shape) -> Stack:
-    """Dual variable on another grid.
-
-    ``dual`` (B, 2, 2, h, w); returns (B, 2, 2, H, W).
-    """
+    """Dual variables (B, 2, 2, h, w) on another grid."""
     result = resize(dual, shape)
     # There are no differences across the border.
     result[:, 0, :, :, -1] = 0

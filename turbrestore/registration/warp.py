@@ -52,20 +52,14 @@ def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device
 
 
 def sample_splines(planes: FloatArray, flow: FloatArray) -> FloatArray:
-    """Sample splines where a flow leads, as :func:`warp` does.
-
-    ``planes`` (C, H + 3, W + 3); ``flow`` (H, W, 2); returns (H, W) or (H, W, 3).
-    """
+    """Sample splines (C, H + 3, W + 3) where a flow (H, W, 2) leads, as :func:`warp` does."""
     result = np.empty((*flow.shape[:2], len(planes)), np.float32)
     sample_spline(planes, np.ascontiguousarray(flow), np.moveaxis(result, -1, 0))
     return result[..., 0] if len(planes) == 1 else result
 
 
 def inside(flow: ArrayLike) -> FloatArray:
-    """Mask of the pixels that a warp samples inside the image rather than from its repeated border.
-
-    ``flow`` (H, W, 2); returns (H, W).
-    """
+    """Mask (H, W) of the pixels that a warp by a flow (H, W, 2) does not sample from the repeated border."""
     flow = check_flow(flow)
     if flow.ndim != 3:
         raise DataError(f"flow: expected shape (H, W, 2), found {flow.shape}")
@@ -78,10 +72,7 @@ def inside(flow: ArrayLike) -> FloatArray:
 
 
 def sample_linear(planes: Sequence[FloatArray], flow: FloatArray, rows: slice = slice(None)) -> FloatArray:
-    """Sample planes bilinearly where the flow of some rows leads.
-
-    ``planes`` (H, W) or (H, W, 3) each; ``flow`` (h, W, 2); returns (h, W).
-    """
+    """Sample planes (H, W[, 3]) bilinearly where the flow (h, W, 2) of some rows leads."""
     x, y = (axis[rows] for axis in _pixel_grid(*planes[0].shape[:2]))
     position = x + flow[..., 0], y + flow[..., 1]
     sampled = [cv2.remap(plane, *position, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in planes]

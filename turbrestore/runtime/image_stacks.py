@@ -152,19 +152,13 @@ def bordered(coefficients: FloatArray) -> FloatArray:
 
 
 def spline_planes(image: FloatArray) -> FloatArray:
-    """Splines through the channels of an image that is sampled several times.
-
-    ``image`` (H, W) or (H, W, 3); returns their coefficients (1, H + 3, W + 3) or (3, H + 3, W + 3).
-    """
+    """Coefficients (C, H + 3, W + 3) of splines through an image (H, W[, 3]) that is sampled several times."""
     planes = (image,) if image.ndim == 2 else cv2.split(image)
     return np.stack([bordered(spline_coefficients(plane)) for plane in planes])
 
 
 def warp_stack(stack: Stack, flow: Stack) -> Stack:
-    """Backward warp by cubic B-splines: the equation behind :func:`turbrestore.registration.warp.warp`.
-
-    ``stack`` (B, H, W); ``flow`` (H, W, 2); returns (B, H, W).
-    """
+    """Warp a stack (B, H, W) backward by a flow (H, W, 2): :func:`turbrestore.registration.warp.warp` on any device."""
     xp = namespace(stack)
     planes = xp.moveaxis(flow, -1, 0)
     return sample(spline_coefficients(stack), xp.broadcast_to(planes, (len(stack), *planes.shape)))

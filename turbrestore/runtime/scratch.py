@@ -57,10 +57,7 @@ def new_stack(shape: tuple[int, ...], folder: Path | None = None, dtype: Any = n
 def fill_stack(
     shape: tuple[int, ...], items: Iterator[NDArray[np.float32]], folder: Path | None = None
 ) -> NDArray[np.float32]:
-    """Return an array with the next items of an iterator, in memory or in a file.
-
-    ``items`` (...) each.
-    """
+    """Return an array (T, ...) with the next items (...) of an iterator, in memory or in a file."""
     stack = new_stack(shape, folder)
     for index in range(len(stack)):
         # In a loop over the items, one would stay in memory while the next is made.
@@ -135,10 +132,7 @@ def iter_slices(length: int, step: int, *arrays: object) -> Iterator[slice]:
 
 
 def mean_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Mean over the first axis, as ``stack.mean(axis=0)`` gives it, bit for bit.
-
-    ``stack`` (T, ...); returns (...).
-    """
+    """Mean of a stack (T, ...) over its first axis, as ``stack.mean(axis=0)`` gives it, bit for bit."""
     total = np.zeros(stack.shape[1:], np.float32)
     for part in iter_frames(stack):
         total += part
@@ -146,10 +140,7 @@ def mean_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Variance over the first axis.
-
-    ``stack`` (T, ...); returns (...).
-    """
+    """Variance of a stack (T, ...) over its first axis."""
     variance = np.zeros(stack.shape[1:], np.float32)
     rows = np.atleast_1d(variance)
     step = max(1, len(rows) * _PART // max(rows.size, 1))

@@ -61,10 +61,7 @@ def largest_tile(shape: tuple[int, int], side: int, halo: int = HALO) -> tuple[i
 
 
 def cut_tile(stack: FloatArray, tile: HaloTile, folder: Path | None = None) -> FloatArray:
-    """Copy a tile of every frame or flow.
-
-    ``stack`` (T, H, W, ...); returns (T, h, w, ...).
-    """
+    """Copy a tile (T, h, w, ...) of every frame or flow (T, H, W, ...)."""
     part = new_stack((len(stack), *tile.shape, *stack.shape[3:]), folder)
     for index, frame in enumerate(stack):
         part[index] = frame[tile.rows, tile.columns]
@@ -83,10 +80,7 @@ def new_mosaic(shape: tuple[int, ...], folder: Path | None = None) -> FloatArray
 
 
 def add_tile(mosaic: FloatArray, tile: HaloTile, part: FloatArray) -> None:
-    """Add what was made of a tile to the whole, by the weight of the tile.
-
-    ``mosaic`` (H, W, ...); ``part`` (h, w, ...).
-    """
+    """Add what was made of a tile (h, w, ...) to the whole (H, W, ...), by the weight of the tile."""
     weights = np.outer(tile.row_weights, tile.column_weights)
     mosaic[tile.rows, tile.columns] += part * weights.reshape(*weights.shape, *[1] * (part.ndim - 2))
     drop_pages(mosaic)

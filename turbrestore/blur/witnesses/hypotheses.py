@@ -9,13 +9,10 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..psf import half_frequency
+from ..psf import Float64Array, half_frequency
 from .short_exposure import displacement_variance, short_exposures
 from .spectral_variation import RINGS
-
-Float64Array = NDArray[np.float64]
 
 # Hypotheses: D/r0, λ/D and σ_l.
 _STRENGTHS = np.geomspace(0.5, 7, 11)

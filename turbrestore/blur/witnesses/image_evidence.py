@@ -17,15 +17,13 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray
 from ...runtime.runtime import DEFAULT, Runtime
 from ...runtime.threads import ThreadTeam, one_thread_each
 from ..estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidates, unreduced_width
 from ..marginal_likelihood import WIDTHS, image_gradients, width_costs
-
-Float64Array = NDArray[np.float64]
+from ..psf import Float64Array
 
 # Exponents of the transfer function: strong air, weak air behind an aperture, a lens.
 EXPONENTS = (1.2, 1.55, 2.0)

@@ -20,9 +20,8 @@ import functools
 from importlib.resources import files
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64Array = NDArray[np.float64]
+from ..psf import Float64Array
 
 # c for an outer scale between 20 and 1000 apertures: geometric mean, and standard deviation of its logarithm, in which
 # the outer scale has a share of 0.32, and the error of a measured displacement the rest.

@@ -27,8 +27,7 @@ from ...core.arrays import FloatArray, luminance
 from ...registration.warp import sample_splines
 from ...runtime.image_stacks import spline_planes
 from ...runtime.scratch import drop_pages
-
-Float64Array = NDArray[np.float64]
+from ..psf import Float64Array
 
 # Side of a window, and pixels around it that are left out at the border of the image.
 SIDE, _BORDER = 64, 16

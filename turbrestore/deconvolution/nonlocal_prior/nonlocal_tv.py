@@ -134,10 +134,7 @@ def add_adjoint(
     values: FloatArray,
     adjoint: FloatArray,
 ) -> None:
-    """Add ``Kᵀ(ga + Kl)`` of the pairs of a band to their pixels.
-
-    ``factor, lag, adjoint`` (H · W,).
-    """
+    """Add ``Kᵀ(ga + Kl)`` of the pairs of a band to their pixels; ``factor, lag, adjoint`` (H · W,)."""
     there, back = values[0], values[1]
     for tail in range(np.uintp(band[0]), np.uintp(band[1])):
         own, share, total = lag[tail], factor[tail], np.float32(0)

@@ -171,10 +171,7 @@ def automatic_h(grey: FloatArray) -> float:
 
 
 def search_patches(grey: FloatArray, params: NonlocalParams, threads: int = 0) -> Keys:
-    """Keys of the neighbours that every pixel chooses.
-
-    ``grey`` (H, W); returns (H · W, nearest + best).
-    """
+    """Keys (H · W, nearest + best) of the neighbours that every pixel of an image (H, W) chooses."""
     (height, width), offsets, window = grey.shape, params.offsets, params.window
     margin = params.search // 2 + params.patch // 2
     padded = cv2.copyMakeBorder(grey, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
@@ -251,10 +248,7 @@ def search_tile(
 
 
 def join_pairs(keys: Keys, width: int, params: NonlocalParams) -> tuple[NDArray[np.int32], NDArray[np.int32], Keys]:
-    """Pairs of pixels from the neighbours that they choose; a pair that both choose counts once.
-
-    ``keys`` (H · W, nearest + best); returns ``keys`` (E,).
-    """
+    """Pairs from the keys (H · W, nearest + best) of every pixel; a pair that both choose counts once."""
     offsets, radius = params.offsets, params.search // 2
     steps = offsets @ np.array([width, 1])
     rank_of = np.zeros((params.search, params.search), np.int64)

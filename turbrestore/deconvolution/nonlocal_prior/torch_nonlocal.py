@@ -105,10 +105,7 @@ class TorchNonlocalPenalty:
 
 
 def torch_nonlocal_penalty(guide: FloatArray, params: NonlocalParams, device: str) -> TorchNonlocalPenalty:
-    """Nonlocal TV with weights between the similar patches of a guide.
-
-    ``guide`` (H, W).
-    """
+    """Nonlocal TV with weights between the similar patches of a guide (H, W)."""
     import torch
 
     h = params.h if params.h is not None else automatic_h(guide)

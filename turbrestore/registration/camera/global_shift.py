@@ -62,20 +62,14 @@ class ShiftReference:
 
 
 def prepare_shift_reference(image: ArrayLike) -> ShiftReference:
-    """Prepare an image that the shifts of many frames are measured against.
-
-    ``image`` (H, W) or (H, W, 3).
-    """
+    """Prepare an image (H, W[, 3]) that the shifts of many frames are measured against."""
     checked = check_image(image)
     reduced = reduce_image(checked)
     return ShiftReference(reduced, np.conj(_spectrum(reduced)), checked.shape[:2])
 
 
 def measure_shift(image: ArrayLike, reference: ShiftReference) -> Shift | None:
-    """Shift of a frame against a reference.
-
-    ``image`` (H, W) or (H, W, 3); returns (2,).
-    """
+    """Shift (2,) of a frame (H, W[, 3]) against a reference; None if they are not alike."""
     checked = check_image(image)
     if checked.shape[:2] != reference.shape:
         raise DataError(f"image: expected {reference.shape} pixels as the reference has, found {checked.shape[:2]}")
@@ -123,10 +117,7 @@ def global_shifts(frames: ArrayLike) -> Shift:
 
 
 def known_shifts(stack: FloatArray, threads: int = 0) -> tuple[Shift, NDArray[np.bool_]]:
-    """Shifts of all frames against their mean position, and which of them were found.
-
-    ``stack`` (T, H, W) or (T, H, W, 3); returns ``shifts`` (T, 2), ``known`` (T,).
-    """
+    """Shifts (T, 2) of frames (T, H, W[, 3]) against their mean position, and which of them (T,) were found."""
     numbers = np.arange(len(stack))
     # The middle frame may itself show something else.
     for anchor in (len(stack) // 2, len(stack) // 4, 3 * len(stack) // 4):
@@ -140,10 +131,7 @@ def known_shifts(stack: FloatArray, threads: int = 0) -> tuple[Shift, NDArray[np
 
 
 def reduce_image(image: FloatArray) -> FloatArray:
-    """Reduce an image to its luminance with zero mean and unit deviation in a Gaussian window.
-
-    ``image`` (H, W) or (H, W, 3); returns (h, w).
-    """
+    """Reduce an image (H, W[, 3]) to a small luminance of zero mean and unit deviation in a Gaussian window."""
     height, width = image.shape[:2]
     factor = -(-max(height, width) // _LONGEST_SIDE)
     size = max(width // factor, 1), max(height // factor, 1)
@@ -153,10 +141,7 @@ def reduce_image(image: FloatArray) -> FloatArray:
 
 
 def frame_shift(image: FloatArray, start: FloatArray | None, reference: ShiftReference) -> FloatArray:
-    """Shift of a frame in whole pixels, zero if it is so small that dense flow finds it.
-
-    ``image`` (H, W) or (H, W, 3); ``start`` (H, W, 2); returns (2,).
-    """
+    """Shift (2,) of a frame (H, W[, 3]) in whole pixels, zero if it is so small that dense flow finds it."""
     known = None if start is None else _common_shift(start)
     shift = measure_shift(image, reference) if known is None else known
     if shift is None or np.abs(shift).max() <= DEAD_ZONE:
@@ -165,10 +150,7 @@ def frame_shift(image: FloatArray, start: FloatArray | None, reference: ShiftRef
 
 
 def shift_frame(frame: Pixels, shift: ArrayLike, outside: Pixels) -> Pixels:
-    """Frame moved onto the grid of the reference by whole pixels.
-
-    ``frame`` (H, W); ``shift`` (2,); ``outside`` (H, W); returns (H, W).
-    """
+    """Move a frame (H, W) onto the grid of the reference by whole pixels; ``outside`` (H, W) fills the rest."""
     to, origin = overlap(frame.shape, shift)
     result = outside.copy()
     result[to] = frame[origin]
@@ -176,10 +158,7 @@ def shift_frame(frame: Pixels, shift: ArrayLike, outside: Pixels) -> Pixels:
 
 
 def overlap(shape: tuple[int, ...], shift: ArrayLike) -> tuple[Slices, Slices]:
-    """Where a reference and a frame that is shifted by whole pixels overlap.
-
-    ``shift`` (2,).
-    """
+    """Where a reference and a frame that is shifted by whole pixels (2,) overlap."""
     to, origin = [], []
     for length, moved in zip(shape, np.asarray(shift)[::-1], strict=False):
         step = min(max(int(moved), -length), length)
@@ -189,10 +168,7 @@ def overlap(shape: tuple[int, ...], shift: ArrayLike) -> tuple[Slices, Slices]:
 
 
 def correlation(a: FloatArray, b: FloatArray) -> float:
-    """Correlate two images.
-
-    ``a, b`` (H, W).
-    """
+    """Correlate two images (H, W)."""
     a, b = a - a.mean(), b - b.mean()
     energy = float(np.vdot(a, a)) * float(np.vdot(b, b))
     return float(np.vdot(a, b)) / energy**0.5 if energy > 0 else 0.0
