@@ -28,12 +28,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.image_stacks import Stack, namespace, store
+from .conjugate_gradient import ConjugateGradients
+from .primal_dual import PrimalDual
 from .problem import Problem
 
 # Pixels a side of the tiles that changes are measured in.
@@ -64,33 +66,10 @@ class Solution(NamedTuple):
     records: list[tuple[int, float, float]]
 
 
-class _SolverState(Protocol):
-    @property
-    def image(self) -> Stack: ...
-
-
-State = TypeVar("State", bound=_SolverState)
-
-
-class Solver(Protocol[State]):
-    """An iterative solver; see :mod:`turbrestore.deconvolution.primal_dual` for the constants."""
-
-    window: ClassVar[int]
-    rest: ClassVar[int]
-
-    def step(self, problem: Problem, state: State) -> State:
-        """One iteration."""
-        ...
-
-    def penalty(self, problem: Problem, u: Stack) -> float:
-        """Value of the penalty."""
-        ...
-
-
 def iterate(
-    solver: Solver[State],
+    solver: PrimalDual | ConjugateGradients,
     problems: list[Problem],
-    states: list[State],
+    states: list[Any],
     measured: Stack,
     iterations: int,
     tolerance: float,

@@ -68,14 +68,8 @@ class FilterParams:
     prior_frames: float = 0.0
 
     def __post_init__(self) -> None:
-        require(
-            self.residual in RESIDUALS,
-            f"residual: expected one of {', '.join(RESIDUALS)}, found {self.residual!r}",
-        )
-        require(
-            self.training in TRAININGS,
-            f"training: expected one of {', '.join(TRAININGS)}, found {self.training!r}",
-        )
+        for name, value, known in (("residual", self.residual, RESIDUALS), ("training", self.training, TRAININGS)):
+            require(value in known, f"{name}: expected one of {', '.join(known)}, found {value!r}")
         require_between("inner_iterations", self.inner_iterations, 1, 100)
         require_between("block", self.block, 1, 10_000, "frames")
         if self.sharpness is not None:

@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.arrays import FloatArray
-from ..runtime.image_stacks import Shape, Stack, resize
+from ..runtime.image_stacks import Shape, Stack, namespace, resize
 from ..runtime.jit import jit
 
 # Bound of the squared norm of the gradient by forward differences.
@@ -132,35 +132,33 @@ def sweep_frame(
 
 def _sweep_on_device(problem: FlowProblem, flow: Stack, dual: Stack, params: SweepParams) -> Stack:
     """Sweep a batch by operations of torch, in place as far as possible."""
-    import torch
-
-    px, py = dual[:, 0], dual[:, 1]
+    xp, px, py = namespace(flow), dual[:, 0], dual[:, 1]
     upper = problem.bound * params.step  # τλ|g|
     lower = -upper
     # σ ū / (1 + σα), so that the dual step only adds.
     scale = params.dual_step * params.shrink
     ahead = flow * scale
-    u, v, work = flow.clone(), torch.empty_like(flow), torch.empty_like(flow)
+    u, v, work = flow.clone(), xp.empty_like(flow), xp.empty_like(flow)
     for _ in range(params.count):
         dual *= params.shrink
         add_differences(ahead, px, py)
-        torch.hypot(px, py, out=v).clamp_(min=1)
+        xp.hypot(px, py, out=v).clamp_(min=1)
         px /= v
         py /= v
         divergence(px, py, v)
         v *= params.step
         v += u
-        torch.mul(v, problem.direction, out=work)
+        xp.mul(v, problem.direction, out=work)
         push = (work.sum(1) + problem.offset).clamp_(lower, upper)
-        v -= torch.mul(problem.direction, push[:, None], out=work)
-        torch.mul(v, 2 * scale, out=ahead)
+        v -= xp.mul(problem.direction, push[:, None], out=work)
+        xp.mul(v, 2 * scale, out=ahead)
         ahead -= u.mul_(scale)
         u, v = v, u
     return u
 
 
 def add_differences(u: Stack, px: Stack, py: Stack) -> None:
-    """Add ∇u to p, arrays (..., H, W) of NumPy or torch."""
+    """Add ∇u to p, arrays (..., H, W) of NumPy or xp."""
     px[..., :-1] += u[..., 1:]
     px[..., :-1] -= u[..., :-1]
     py[..., :-1, :] += u[..., 1:, :]

@@ -196,20 +196,18 @@ def sample_spline(coefficients: FloatArray, flow: FloatArray, result: FloatArray
 
 def _sample_gathered(coefficients: Stack, flow: Stack) -> Stack:
     """Sixteen gathers; torch's grid_sample rounds positions to 1e-7 of the width, which is 2e-4 px of 1920."""
-    import torch
-
-    count, height, width = coefficients.shape
-    y, x = (torch.arange(length, dtype=torch.float32, device=flow.device) for length in (height, width))
+    xp, (count, height, width) = namespace(flow), coefficients.shape
+    y, x = (xp.arange(length, dtype=xp.float32, device=flow.device) for length in (height, width))
     x, y = (x + flow[:, 0]).clip(0, width - 1), (y[:, None] + flow[:, 1]).clip(0, height - 1)
     left, top = x.floor(), y.floor()
     columns, rows = _spline_weights(x - left), _spline_weights(y - top)
     around = _reflect(coefficients, (_BEFORE, _BEFORE), (_BEYOND, _BEYOND)).reshape(-1)
     longer = width + _BEFORE + _BEYOND
-    first = torch.arange(count, device=x.device, dtype=torch.int32) * ((height + _BEFORE + _BEYOND) * longer)
+    first = xp.arange(count, device=x.device, dtype=xp.int32) * ((height + _BEFORE + _BEYOND) * longer)
     index = (first[:, None, None] + top.int() * longer + left.int()).reshape(-1)
-    result = torch.zeros_like(x)
+    result = xp.zeros_like(x)
     for row, row_weight in enumerate(rows):
-        line = torch.zeros_like(x)
+        line = xp.zeros_like(x)
         for column, column_weight in enumerate(columns):
             step = row * longer + column
             taken = around.narrow(0, step, around.numel() - step).index_select(0, index)

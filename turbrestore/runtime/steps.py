@@ -1,12 +1,6 @@
 """Stages that run step by step: a generator yields a state after each step and returns the result of the stage.
 
-The loop belongs to the caller, who may show progress, keep a checkpoint or stop between any two steps::
-
-    def find_root(...) -> Generator[State, None, Result]:
-        while not converged:
-            state = step(state)
-            yield state
-        return Result(...)
+The loop belongs to the caller, who may show progress, keep a checkpoint or stop between any two steps.
 """
 
 from __future__ import annotations
