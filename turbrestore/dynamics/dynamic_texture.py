@@ -7,14 +7,9 @@ The model is ``ξ_{k+1} = A ξ_k + q_k``, ``W_k = W̄ + C ξ_k + r_k`` (eq. 10, 
 2. A minimises ``|Ξ_{2:τ} − A Ξ_{1:τ−1}|``: ``A = Ξ_{2:τ} Ξ_{1:τ−1}⁺``;
 3. Q is the covariance of e, and R the variance of X − C Ξ.
 
-Symbols
--------
-τ, n : number of flows, number of states
-W, W̄ : flow and its mean over time
-X : matrix of W − W̄, 2HW × τ, one flow in each column
-U Σ Vᵀ : singular value decomposition of X, from :mod:`turbrestore.dynamics.dynamic_texture`
-C : modes, rows in the order of ``flow.reshape(-1)``; Ξ : states
-A : transition; Q, R : covariances of q and r
+Symbols as there, and
+
+X : matrix of W − W̄, 2HW × τ, one flow in each column; U Σ Vᵀ its singular value decomposition
 e : residuals of the one-step prediction, ξ_{k+1} − A ξ_k
 
 Departures from the paper

@@ -98,9 +98,9 @@ def pass_over(
         return updated
 
     def register_all(items: list[TrackedFrame]) -> list[TrackedFrame]:
-        if not on_cpu:
-            return items
-        return [replace(item, registered=register(item, settings)) for item in items]
+        # What flow has prepared of a frame takes memory, and is of use in another pass only.
+        plain = [item if item.kept else replace(item, frame=item.image) for item in items]
+        return [replace(item, registered=register(item, settings)) for item in plain] if on_cpu else plain
 
     numbered = zip(count(), iter_frames(frames), iter_frames(starts), strict=False)
     for tracked in map_in_turns(measure, update_states, register_all, in_batches(numbered, size), threads):

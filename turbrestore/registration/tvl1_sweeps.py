@@ -1,11 +1,9 @@
 """The inner loop of TV-L1 flow: primal-dual sweeps.
 
-Symbols
--------
-u : flow, pixels; u⁺ after a sweep; ū : extrapolated flow ``2u⁺ − u``
+Symbols as in :mod:`turbrestore.registration.tvl1`, and
+
+u⁺ : flow after a sweep; ū : extrapolated flow ``2u⁺ − u``; ``ρ(u) = ρ₀ + g·u``, ``ĝ = g/|g|``
 p : dual variable, one vector (x, y) for each component of the flow, ``|p| ≤ 1``
-ρ(u) = ρ₀ + g·u : linearised difference of frame and reference; g its gradient, ``ĝ = g/|g|``
-λ : weight of the data term; α : Huber threshold
 τ, σ : step sizes of u and p, ``8 τ σ = 1``; 8 bounds the squared norm of the discrete gradient
 
 The problem is ``min_u Σ λ|ρ(u)| + h_α(∇u₁) + h_α(∇u₂)`` with Huber's ``h_α(v) = |v|²/2α`` up to ``|v| = α`` and
