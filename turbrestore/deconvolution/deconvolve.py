@@ -258,17 +258,17 @@ def deconvolve_steps(
     otf = blur_otf(shape, sigma, params.exponent or GAUSSIAN) if psf is None else psf_to_otf(psf, shape)
     oscillates = unknown and params.method in ("nltv", "tv")
     rim = min(int(np.ceil(sigma)), min(height, width) // 4) if oscillates else 0
-    around = None
-    if guide is not None:
-        grey = check_grey(guide, "guide")
-        if grey.shape != margin.size:
-            raise DataError(f"guide: expected the size of the image {margin.size}, found {grey.shape}")
-        around = margin.pad(grey)
     device = find_device(runtime.device)
     with memory_of(device), one_thread_each(), ThreadTeam(runtime.workers) as team:
         transfer = load(otf, device)
         problems = [problem_of(plane, margin, photons, transfer, fidelity, runtime.workers) for plane in planes]
         measured = load(margin.mask(rim), device)
+        around = None
+        if guide is not None:
+            grey = check_grey(guide, "guide")
+            if grey.shape != margin.size:
+                raise DataError(f"guide: expected the size of the image {margin.size}, found {grey.shape}")
+            around = margin.pad(grey)
         solution = yield from _solve(problems, around, measured, params, team)
     restored = join_planes(pixels, [store(u)[margin.inside()] for u in solution.images], params.channels)
     records = (np.array(column) for column in zip(*solution.records, strict=True))
