@@ -5,12 +5,15 @@ from turbrestore.runtime.image_stacks import (
     correlate,
     full_precision,
     load,
+    load_image,
     median,
+    namespace,
     resize,
     sample,
     sample_spline,
     spline_coefficients,
     store,
+    store_image,
     warp_stack,
 )
 
@@ -44,6 +47,18 @@ def test_both_libraries_agree(operation):
     assert a.shape == b.shape
     assert a.dtype == b.dtype == np.float32
     assert np.abs(a - b).max() < 2e-5
+
+
+def test_an_array_tells_its_library_and_an_image_comes_back():
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    assert load(STACK, "cpu") is STACK
+    for device, library in (("cpu", np), ("cpu:0", torch)):
+        for image in (STACK[0], np.moveaxis(STACK, 0, -1)):
+            channels = load_image(image, device)
+            assert namespace(channels) is library
+            assert tuple(channels.shape[-2:]) == image.shape[:2]
+            assert np.array_equal(store_image(channels), image)
+            assert namespace(load(STACK, channels.device)) is library
 
 
 def test_filter_correlates_and_reflects_the_image():

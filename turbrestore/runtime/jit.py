@@ -21,13 +21,7 @@ COMPILER_BYTES = 1.4e8
 
 
 class Jit(Generic[Arguments]):
-    """A loop over arrays that Numba compiles when it is first called.
-
-    Attributes
-    ----------
-    py_func : callable
-        The function as written: the oracle of its tests.
-    """
+    """A loop over arrays that Numba compiles when it is first called; ``py_func`` is what it does, for tests."""
 
     def __init__(self, py_func: Callable[Arguments, None]) -> None:
         self.py_func = py_func

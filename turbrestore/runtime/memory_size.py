@@ -14,18 +14,7 @@ _CLOSE = 0.65
 
 
 class MemorySize(float):
-    """Number of bytes; text such as ``"2GB"`` or ``"1.5 GiB"`` is understood.
-
-    Parameters
-    ----------
-    value : float or str
-        A number of bytes, or text of a number with a unit: B, kB, MB, GB, TB, KiB, MiB, GiB.
-
-    Raises
-    ------
-    ConfigurationError
-        Neither.
-    """
+    """Number of bytes; text such as ``"2GB"`` or ``"1.5 GiB"`` is understood, with a unit of kB to TB or KiB to GiB."""
 
     def __new__(cls, value: float | str) -> Self:
         """Read number and unit."""

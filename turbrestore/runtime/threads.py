@@ -121,12 +121,7 @@ class ThreadTeam:
     """Threads that share out some work, the calling thread among them.
 
     Handing an item to a sleeping thread takes as long as a pass over a small image, so the caller does not sleep
-    meanwhile.  Of one thread there are none but the caller.
-
-    Parameters
-    ----------
-    threads : int
-        At least 1, with the caller.
+    meanwhile.  ``threads``, at least 1, count the caller, who works alone where there is one.
     """
 
     def __init__(self, threads: int) -> None:
