@@ -40,12 +40,11 @@ class SimulatedFlows:
 
 
 def stable_system(dynamics: FlowDynamics, largest_modulus: float = 0.99) -> tuple[Float64Array, Float64Array]:
-    """Return A and Q of a stationary process: A inside the unit circle, P = A P Aᵀ + Q for the training P.
+    """Return A and Q (n, n) of a stationary process: A inside the unit circle, P = A P Aᵀ + Q for the training P.
 
     Eigenvalues of larger modulus are scaled to ``largest_modulus`` and keep their angle; the others do not change. For
     that the blocks on the diagonal of A's real Schur form are scaled, which is well conditioned even if A has no basis
     of eigenvectors. Q is ``P − A P Aᵀ`` with its negative eigenvalues set to zero.
-    Returns ``A, Q`` (n, n).
     """
     if not 0 < largest_modulus < 1:
         raise ConfigurationError(f"largest_modulus: expected above 0 and below 1, found {largest_modulus}")

@@ -150,11 +150,10 @@ def frame_noise_variance(
 
 
 def invalid_mask(flow: Stack, seen: Stack) -> Stack:
-    """Mark where a frame gives no measurement: the map id + Ŵ folds, or leaves the frame.
+    """Mark (H, W) where a frame gives no measurement: the map id + Ŵ (H, W, 2) folds, or leaves the frame.
 
     Beyond the frame its border is repeated, which is no measurement. Paper 3 assumes that the maps are diffeomorphisms:
     where the estimate folds it is wrong, and what it samples may have more contrast than the scene.
-    ``flow`` (H, W, 2); ``seen`` (H, W); returns (H, W).
     """
     (ux, uy), (vx, vy) = (gradient(flow[..., axis]) for axis in (0, 1))
     folded = (ux + 1) * (vy + 1) <= uy * vx
@@ -183,12 +182,11 @@ def project_gradient(grey: Stack, template: Stack) -> Stack:
 
 
 def local_sharpness(projection: Stack, window: float, left_out: float) -> Stack:
-    """Average of the projected gradient in a Gaussian window, of whose middle a share is left out.
+    """Average of the projected gradient (H, W) in a Gaussian window, of whose middle a share is left out.
 
     The noise n of a pixel is part of the score of the window around it. By Stein's lemma the weights ``exp(β z)``
     therefore shift the fused pixel by ``β cov(n, z)``, whatever the number of frames. The shift is proportional to the
     Laplacian of the template: noise is added that looks like sharpness, and a blind estimate of the blur believes it.
-    ``projection`` (H, W); returns (H, W).
     """
     whole = smooth(projection, window)
     if left_out == 0:

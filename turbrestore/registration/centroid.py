@@ -229,10 +229,9 @@ def centroid_steps(
 
 
 def mean_registered(frames: FloatArray, flows: FloatArray, runtime: Runtime = DEFAULT) -> FloatArray:
-    """Average of frames warped onto the reference that their flows start from.
+    """Average of frames (T, H, W[, 3]) warped onto the reference that their flows (T, H, W, 2) start from.
 
     Each pixel is averaged over the frames that show it; if none does, over all of them, with their borders repeated.
-    ``frames`` (T, H, W) or (T, H, W, 3); ``flows`` (T, H, W, 2); returns (H, W) or (H, W, 3).
     """
 
     def add(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[np.ndarray, np.ndarray]:

@@ -25,11 +25,10 @@ def coverage(flows: ArrayLike) -> FloatArray:
 
 
 def well_seen(seen: ArrayLike, least: float = 0.9, margin: int = 0, smallest: int = 16) -> Rectangle:
-    """Rectangle whose border enough frames show.
+    """Rectangle whose border enough frames show, by their share ``seen`` (H, W).
 
     The side with the worst pixel is trimmed until no pixel of the border is below ``least``; pixels inside are not
     examined. If less than the smallest size would be left, nothing is trimmed.
-    ``seen`` (H, W).
     """
     require_between("least", least, 0, 1)
     require_between("margin", margin, 0, 10_000, "pixels")

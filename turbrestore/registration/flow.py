@@ -175,11 +175,9 @@ def iterate_flows(
     params: FlowParams | None = None,
     runtime: Runtime = DEFAULT,
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield ``(frame, flow)`` in order while threads solve a few frames ahead.
+    """Yield frames (H, W[, 3]) and flows (H, W, 2) in order while threads solve a few frames ahead.
 
     A handful of frames are in memory at a time, however long ``frames`` is.
-    ``reference`` (H, W) or (H, W, 3); ``frames`` (H, W) or (H, W, 3) each; yields ``frame`` (H, W) or (H, W, 3),
-    ``flow`` (H, W, 2).
     """
     target = prepare_reference(reference, params, runtime)
     checked = (check_image(frame, f"frame {number}") for number, frame in enumerate(frames))

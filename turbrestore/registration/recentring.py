@@ -30,11 +30,10 @@ from .warp import warp
 
 
 def recentring_flow(mean_flow: ArrayLike) -> FloatArray:
-    """Flow V that moves an image onto the mean geometry: the inverse of W̄.
+    """Flow V (H, W, 2) that moves an image onto the mean geometry: the inverse of W̄.
 
     A shift of the whole image by more than two pixels is the camera's; it is left, because it bends nothing, and
     following it would move a part of the image out of the frame.
-    ``mean_flow`` (H, W, 2); returns (H, W, 2).
     """
     flow = check_flow(mean_flow, "mean_flow")
     if flow.ndim != 3:

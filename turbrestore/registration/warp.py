@@ -31,10 +31,9 @@ _STRIP = 1 << 16
 
 
 def warp(image: ArrayLike, flow: ArrayLike, interpolation: str = "cubic", device: str = CPU) -> FloatArray:
-    """Backward warp: ``result(x, y) = image(x + dx, y + dy)``.
+    """Backward warp of an image (H, W[, 3]) by a flow (H, W, 2): ``result(x, y) = image(x + dx, y + dy)``.
 
     With ``flow = estimate_flow(reference, frame)`` the result lies on the reference (``I ∘ w``; paper 3, eq. 15).
-    ``image`` (H, W) or (H, W, 3); ``flow`` (H, W, 2).
     """
     image, flow = check_image(image), check_flow(flow)
     if interpolation not in INTERPOLATIONS:

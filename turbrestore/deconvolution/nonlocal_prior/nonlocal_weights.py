@@ -142,7 +142,6 @@ def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None, thr
 
     The printed equation has the absolute difference instead of its square, which does not fit the unit of h²; the
     square is that of the nonlocal means that the paper cites. Beyond the border the guide is reflected.
-    ``guide`` (H, W) or (H, W, 3).
     """
     params = params or NonlocalParams()
     grey = check_grey(guide, "guide")
@@ -158,12 +157,11 @@ def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None, thr
 
 
 def automatic_h(grey: FloatArray) -> float:
-    """Choose the filtering parameter h: an eighth of the contrast of the guide, or 4 times its noise if that is more.
+    """Choose the filtering parameter h: an eighth of the contrast of the guide (H, W), or 4 times its noise if more.
 
     Contrast is the range from the 1st to the 99th percentile. The paper takes h equal to the noise: a fused image has
     so little that almost every weight would vanish, and with them the regularisation. At 4 times the noise n, patches
     that differ by noise alone (d = 2 n²) keep the weight .88, so that flat regions hold together.
-    ``grey`` (H, W).
     """
     low, high = np.percentile(grey, (1, 99))
     # The last term only keeps h positive for an image of one colour, where all distances are 0.

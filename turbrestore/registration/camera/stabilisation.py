@@ -34,11 +34,10 @@ _ITERATIONS, _CHANGE = 50, 1e-4
 
 
 def mean_stabilised(frames: ArrayLike, threads: int = 0) -> FloatArray:
-    """Temporal mean of the frames, each moved to the mean position of the camera.
+    """Temporal mean of frames (T, H, W[, 3]), each moved to the mean position of the camera.
 
     If all frames lie within two pixels of it they are averaged as they are; otherwise frames whose position is unknown
     are left out.
-    ``frames`` (T, H, W) or (T, H, W, 3); returns (H, W) or (H, W, 3).
     """
     stack = check_frames(frames)
     mean = mean_of(stack)
