@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -25,7 +24,6 @@ from .dynamics.dynamic_texture import identify
 from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import Filtered, FilterStep, filter_steps
 from .footage.frame_selection import best_frames, frame_quality
-from .footage.levels import Levels
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan
 from .preparation import Prepared
@@ -92,11 +90,6 @@ class Run:
         """Frames as the stages take them."""
         return self.prepared.source
 
-    @property
-    def levels(self) -> Levels:
-        """From the levels of the clip to those of the stages."""
-        return self.prepared.levels
-
     def decide(self, *decisions: Decision) -> None:
         """Record decisions, and tell whoever listens."""
         self.decisions.extend(decisions)
@@ -105,12 +98,9 @@ class Run:
                 self.on_decision(decision)
 
     def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:
-        """Return a result from the store, or compute it, and add the time that this takes to that of the stage.
-
-        Results have the levels of the clip.
-        """
+        """Return a result from the store, or compute it, and add the time that this takes to that of the stage."""
         begun = time.perf_counter()
-        result = self.store.get(name, lambda: self.levels.original(compute()))
+        result = self.store.get(name, compute)
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begun
         return result
 
@@ -124,7 +114,7 @@ class Fused:
     """Results of the stages before the deconvolution.
 
     ``is_mean`` says that the image is the mean of the frames, because the filtered one has structure that they lack;
-    ``halves`` are at the levels of the clip, None for few frames.
+    ``halves`` is None for few frames.
     """
 
     image: FloatArray
@@ -145,30 +135,29 @@ def fuse(run: Run) -> Fused:
     total = np.zeros(run.source.shape[1:])
     # Tiles read their parts of the frames themselves.
     stream = iter(run.source) if run.tiles else _added_up(run.source, total)
-    begun, levels = time.perf_counter(), run.levels
-    training, saturated, brightest = _read_training(stream, (train, *run.source.shape[1:]), run.plan.runtime.scratch)
+    begun = time.perf_counter()
+    training, saturated, brightest = _read_training(run, stream)
     run.seconds["read"] += time.perf_counter() - begun
     run.decide(explain_training(train, len(run.source), params.train), *explain_input(saturated))
 
     centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
     run.decide(*explain_registration(centroid))
-    start = levels.stretched(centroid)
-    seeing, saturation = _measure_seeing(run, training, start), _find_saturation(run, training[0], brightest)
+    seeing, saturation = _measure_seeing(run, training, centroid), _find_saturation(run, training[0], brightest)
     if not params.runs("identify"):
-        return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation)
+        return Fused(centroid.image, mean_of(training), centroid, seeing, saturation)
 
     dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
     run.decide(*explain_dynamics(dynamics, params.filter.residual == "drop"))
     if not params.runs("filter"):
-        return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation, dynamics)
+        return Fused(centroid.image, mean_of(training), centroid, seeing, saturation, dynamics)
 
-    filtered = run.stage("filter", "filtered", lambda: _placed(run, _filter(run, start, dynamics, training, stream)))
+    filtered = run.stage("filter", "filtered", lambda: _placed(run, _filter(run, centroid, dynamics, training, stream)))
     unread = _added_up(run.source, total) if run.tiles else stream
     mean = run.stage("filter", "mean", lambda: _mean(unread, total, len(run.source)))
     # The sharpness is NaN for frames that do not count.
     chosen = int(np.isfinite(filtered.sharpness).sum())
     run.decide(*explain_filter(filtered, dynamics, None if params.keep_best == 1 else chosen))
-    structure = _compare_structure(levels.stretched(filtered.image), training, centroid, filtered.mean_flow)
+    structure = _compare_structure(filtered.image, training, centroid, filtered.mean_flow)
     run.decide(*explain_structure(structure))
     image = filtered.image if structure.passed else mean
     witnesses = _find_witnesses(run, training, centroid, seeing) if structure.passed else None
@@ -177,15 +166,14 @@ def fuse(run: Run) -> Fused:
     return Fused(image, *found, not structure.passed, witnesses, halves)
 
 
-def _read_training(
-    stream: Iterator[FloatArray], shape: tuple[int, ...], scratch: Path | None
-) -> tuple[FloatArray, float, float]:
+def _read_training(run: Run, stream: Iterator[FloatArray]) -> tuple[FloatArray, float, float]:
     """Read the training frames; also the share of their pixels that are saturated, and the greatest intensity."""
-    training, saturated, brightest = new_stack(shape, scratch), 0.0, 0.0
+    training = new_stack((run.plan.train, *run.source.shape[1:]), run.plan.runtime.scratch)
+    saturated, brightest = 0.0, 0.0
     for place in training:
         # In a loop over the stream, one frame would stay in memory while the next is made.
         place[...] = next(stream)
-        saturated += float(np.mean(place >= SATURATED)) / len(training)
+        saturated += float(np.mean(place >= _saturated(run))) / len(training)
         brightest = max(brightest, float(place.max()))
         drop_pages(training)
     return training, saturated, brightest
@@ -246,8 +234,7 @@ def _halves(run: Run, training: FloatArray, centroid: Centroid, mean_flow: Float
     if len(training) < FEWEST or not run.params.finds_blur:
         return None
     found = registered_halves(training, centroid.flows, training.shape[1:], len(training), run.plan.runtime.threads)
-    halves = (run.levels.original(recentre(half, mean_flow)) for half in (found.first, found.second))
-    return Halves(*halves)
+    return Halves(recentre(found.first, mean_flow), recentre(found.second, mean_flow))
 
 
 def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:
@@ -294,10 +281,15 @@ def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWit
 
 
 def _find_saturation(run: Run, frame: FloatArray, brightest: float) -> float:
-    """Return the intensity, at the levels of the clip, from which the mean is saturated."""
-    largest = float(run.levels.original(np.array([brightest], np.float32))[0])
-    noise, bits = estimate_noise(frame) / run.levels.gain, min(run.source.bit_depth, _MOST_BITS)
-    return saturation_level(largest, noise, 1 / (2**bits - 1))
+    """Return the intensity from which the mean is saturated."""
+    step = run.prepared.levels.gain / (2 ** min(run.source.bit_depth, _MOST_BITS) - 1)
+    return saturation_level(brightest, estimate_noise(frame), step, _saturated(run))
+
+
+def _saturated(run: Run) -> float:
+    """Return the intensity from which a frame is saturated."""
+    levels = run.prepared.levels
+    return levels.full_scale[1] - levels.gain * (1 - SATURATED)
 
 
 def _placed(run: Run, filtered: Filtered) -> Filtered:

@@ -31,7 +31,7 @@ from .preparation import prepare
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
 from .registration.recentring import recentre
-from .results import NoStore, Restoration, Store
+from .results import NoStore, Restoration, Store, restoration_at_levels_of_clip
 from .runtime.allocator import returning_freed_memory
 from .runtime.device import explain_device
 from .runtime.runtime import DEFAULT, Runtime
@@ -125,8 +125,10 @@ def restore(
     size = source.shape[1], source.shape[2]
     tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
     prepared = prepare(source, params.static_mask, plan.runtime.scratch)
-    stretched, bars = _stretched_params(params, prepared.levels), prepared.bars
-    run = Run(prepared, stretched, plan, tiles, store or NoStore(), progress, on_decision, map_tiles, psf)
+    store = store or NoStore()
+    store.begin(prepared.levels)
+    stretched = _stretched_params(params, prepared.levels)
+    run = Run(prepared, stretched, plan, tiles, store, progress, on_decision, map_tiles, psf)
     run.seconds["read"] = time.perf_counter() - begun
     run.decide(*on_blank, *plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
     run.decide(*prepared.decisions)
@@ -134,7 +136,8 @@ def restore(
         restoration = _restored(run)
     if params.scale > 1:
         restoration = _refined(run, restoration)
-    for kept in (prepared.title, bars):
+    restoration = restoration_at_levels_of_clip(restoration, prepared.levels)
+    for kept in (prepared.title, prepared.bars):
         restoration = restoration if kept is None else _put_back(restoration, kept)
     return restoration
 
@@ -177,7 +180,11 @@ def _restored(run: Run) -> Restoration:
         deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused, photons))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
-    agreed = None if deblurred is None or fused.halves is None else keep_agreed(image, fused.halves)
+    agreed = (
+        None
+        if deblurred is None or fused.halves is None
+        else keep_agreed(image, fused.halves, run.prepared.levels.full_scale)
+    )
     if agreed is not None:
         run.decide(*agreed.decisions)
         image = agreed.image
@@ -208,20 +215,18 @@ def _restored(run: Run) -> Restoration:
 
 
 def _deblur(run: Run, fused: Fused, photons: NoiseCurve | None) -> Deblurred:
-    params, plan, levels = run.params, run.plan, run.levels
-    image, guide = levels.stretched(fused.image), levels.stretched(fused.centroid.image)
+    params, plan = run.params, run.plan
+    guide = fused.centroid.image
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
-    steps = remove_blur_steps(image, guide, *settings, fused.witnesses, run.psf, photons)
-    deblurred = finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
-    deconvolution, blur = levels.original(deblurred.deconvolution), levels.original(deblurred.blur)
-    return replace(deblurred, deconvolution=deconvolution, blur=blur)
+    steps = remove_blur_steps(fused.image, guide, *settings, fused.witnesses, run.psf, photons)
+    return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 
 
 def _photon_noise(run: Run, halves: Halves) -> NoiseCurve | None:
-    """Measure how the noise of the image depends on its level, at the levels of the stages."""
-    curve = photon_noise(*(run.levels.stretched(luminance(half)) for half in (halves.first, halves.second)))
+    """Measure how the noise of the image depends on its level."""
+    curve = photon_noise(luminance(halves.first), luminance(halves.second))
     if curve is not None:
         times = float(curve.variances[-1] / max(curve.variances[0], _LEAST_SHARE * curve.variances[-1]))
         reason = f"its variance is {times:.0f} times as large where the scene is bright, as that of photons"
@@ -243,8 +248,7 @@ def _measure_uncertainty(
     known = (seen > 0) & (np.atleast_3d(fused.mean).max(axis=-1) < fused.saturation)
     if run.prepared.hidden is not None:
         known &= ~run.prepared.hidden
-    stretched, params = run.levels.stretched(filtered.image), run.params.deconvolution
-    deviation = measure_deviation(image, filtered, stretched, dynamics, known, params, deblurred)
+    deviation = measure_deviation(image, filtered, dynamics, known, run.params.deconvolution, deblurred)
     run.seconds["uncertainty"] = time.perf_counter() - begun
     return deviation
 

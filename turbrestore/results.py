@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
@@ -19,6 +19,7 @@ from .display.plots import plot_images
 from .display.preview import preview
 from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import FilterCheckpoint, Filtered
+from .footage.levels import Levels
 from .metrics import sharpness
 from .registration.centroid import Centroid
 from .registration.coverage import Rectangle
@@ -53,6 +54,9 @@ class Store(Protocol):
     def stored(self) -> frozenset[str]:
         """Names of the files on disk that hold the results of stages."""
 
+    def begin(self, levels: Levels) -> None:
+        """Take the levels at which the stages are about to work, so that what is kept can be brought back."""
+
     def filter_start(self) -> FilterCheckpoint | None:
         """Return the state from which an interrupted filter continues."""
 
@@ -68,6 +72,9 @@ class NoStore:
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
         """Compute the result."""
         return compute()
+
+    def begin(self, levels: Levels) -> None:
+        """Forget the levels."""
 
     def filter_start(self) -> None:
         """Return None: there is no earlier run."""
@@ -219,6 +226,39 @@ class Restoration:
             ("blur removed", f"{sigma:.2f} pixels" if sigma > 0 else "none"),
             ("time", f"{sum(self.seconds.values()):.1f} s"),
         ]
+
+
+def at_levels_of_clip(result: Result, levels: Levels) -> Result:
+    """Bring the result of a stage from the levels of the stages back to those of the clip."""
+    gain = levels.gain
+    if not levels.changed:
+        return result
+    if isinstance(result, Centroid):
+        return replace(result, image=levels.original(result.image))
+    if isinstance(result, Filtered):
+        image, noise = levels.original(result.image), result.image_noise / gain**2
+        return replace(result, image=image, variance=result.variance / np.float32(gain**2), image_noise=noise)
+    if isinstance(result, Deconvolution):
+        return replace(result, image=levels.original(result.image), noise=result.noise / gain)
+    return replace(result, noise=result.noise / gain) if isinstance(result, BlurEstimate) else result
+
+
+def restoration_at_levels_of_clip(restoration: Restoration, levels: Levels) -> Restoration:
+    """Bring all images and variances of a restoration back to the levels of the clip, and its image into full scale."""
+    if not levels.changed:
+        return restoration
+    finer, uncertainty = restoration.finer, restoration.uncertainty
+    return replace(
+        restoration,
+        image=np.clip(levels.original(restoration.image), 0, 1),
+        mean=levels.original(restoration.mean),
+        centroid=at_levels_of_clip(restoration.centroid, levels),
+        filtered=at_levels_of_clip(restoration.filtered, levels),
+        deconvolution=at_levels_of_clip(restoration.deconvolution, levels),
+        blur=at_levels_of_clip(restoration.blur, levels),
+        uncertainty=None if uncertainty is None else uncertainty / np.float32(levels.gain),
+        finer=None if finer is None else np.clip(levels.original(finer), 0, 1),
+    )
 
 
 def _gained(restoration: Restoration, motion: float, gain: float) -> str:
