@@ -44,7 +44,7 @@ _DOUBTS = ("motion", "saturation")
 class Store(Protocol):
     """Where a restoration keeps the results of its stages, and finds those of an earlier run.
 
-    :class:`turbrestore.runs.run_folder.RunFolder` keeps them on disk; :class:`NoStore` keeps nothing.
+    :class:`turbrestore.runs.run_folder.RunFolder` keeps them on disk.
     """
 
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
@@ -62,25 +62,6 @@ class Store(Protocol):
 
     def checkpoint(self, state: FilterCheckpoint) -> None:
         """Take the newest state of the filter."""
-
-
-class NoStore:
-    """A store that computes every result and keeps none."""
-
-    stored = frozenset[str]()
-
-    def get(self, name: str, compute: Callable[[], Result]) -> Result:
-        """Compute the result."""
-        return compute()
-
-    def begin(self, levels: Levels) -> None:
-        """Forget the levels."""
-
-    def filter_start(self) -> None:
-        """Return None: there is no earlier run."""
-
-    def checkpoint(self, state: FilterCheckpoint) -> None:
-        """Let the state go."""
 
 
 @dataclass(frozen=True)
@@ -157,15 +138,15 @@ class Restoration:
     crop: Rectangle
     mean: FloatArray
     centroid: Centroid
-    dynamics: FlowDynamics | None
-    filtered: Filtered | None
-    blur: BlurEstimate | None
-    deconvolution: Deconvolution | None
-    guard_readings: tuple[GuardReading, ...]
-    decisions: tuple[Decision, ...]
     train: int
     frame_count: int
     seconds: dict[str, float]
+    dynamics: FlowDynamics | None = None
+    filtered: Filtered | None = None
+    blur: BlurEstimate | None = None
+    deconvolution: Deconvolution | None = None
+    guard_readings: tuple[GuardReading, ...] = ()
+    decisions: tuple[Decision, ...] = ()
     seeing: Seeing | None = None
     uncertainty: FloatArray | None = None
     posterior: BlurPosterior | None = None
@@ -241,24 +222,6 @@ def at_levels_of_clip(result: Result, levels: Levels) -> Result:
     if isinstance(result, Deconvolution):
         return replace(result, image=levels.original(result.image), noise=result.noise / gain)
     return replace(result, noise=result.noise / gain) if isinstance(result, BlurEstimate) else result
-
-
-def restoration_at_levels_of_clip(restoration: Restoration, levels: Levels) -> Restoration:
-    """Bring all images and variances of a restoration back to the levels of the clip, and its image into full scale."""
-    if not levels.changed:
-        return restoration
-    finer, uncertainty = restoration.finer, restoration.uncertainty
-    return replace(
-        restoration,
-        image=np.clip(levels.original(restoration.image), 0, 1),
-        mean=levels.original(restoration.mean),
-        centroid=at_levels_of_clip(restoration.centroid, levels),
-        filtered=at_levels_of_clip(restoration.filtered, levels),
-        deconvolution=at_levels_of_clip(restoration.deconvolution, levels),
-        blur=at_levels_of_clip(restoration.blur, levels),
-        uncertainty=None if uncertainty is None else uncertainty / np.float32(levels.gain),
-        finer=None if finer is None else np.clip(levels.original(finer), 0, 1),
-    )
 
 
 def _gained(restoration: Restoration, motion: float, gain: float) -> str:
