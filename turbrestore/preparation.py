@@ -15,10 +15,9 @@ from .footage.bars import Bars, without_bars
 from .footage.levels import Levels, stretch_levels
 from .footage.lighting.light import steady_light
 from .footage.lighting.white_balance import steady_white_balance
-from .footage.moments import measure_moments
 from .footage.overlays import Title, read_static_mask, without_overlay
 from .footage.passers import without_passers
-from .footage.survey import take_survey
+from .footage.survey import measure_moments, take_survey
 from .io.source import FrameSource, Window
 from .results import Restoration, at_levels_of_clip
 

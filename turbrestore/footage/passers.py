@@ -33,7 +33,7 @@ from ..core.decision import Decision
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
 from ..runtime.scratch import iter_frames
-from .survey import Survey, spread
+from .survey import Survey, reduced, spread, within
 
 # Frames of which the median is taken, the fewest that tell what passes, and rows that it is taken of at once.
 _SAMPLES, _FEWEST, _ROWS = 25, 9, 64
@@ -82,15 +82,11 @@ class Background:
         """
         if number not in self.weights:
             return values
-        down, across = (
-            slice(wanted.start - own.start, wanted.stop - own.start)
-            for wanted, own in zip(window, self.window, strict=True)
-        )
-        place = self.placement.place(number)
-        stored = np.asarray(cv2.imdecode(self.weights[number], cv2.IMREAD_GRAYSCALE))[down, across]
-        weight = stored.astype(np.float32) / np.float32(255) * self.known[place][down, across]
+        place, part = self.placement.place(number), within(self.window, window)
+        stored = np.asarray(cv2.imdecode(self.weights[number], cv2.IMREAD_GRAYSCALE))[part]
+        weight = stored.astype(np.float32) / np.float32(255) * self.known[place][part]
         weight = weight if values.ndim == 2 else weight[..., None]
-        return values + weight * (self.image[place][down, across] - values)
+        return values + weight * (self.image[place][part] - values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +138,12 @@ def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
     found = _passed_by(stack, numbers, usual, still)
     if found is not None:
         return found, still
-    if not _moves(measured_shifts(map(_grey, stack), stack.shape)):
+    if not _moves(_shifts(_reduced(map(_grey, stack), stack.shape), stack.shape)):
         return None
     # For a camera that moves the scene passes too; what moves as most of the frame does is the scene.
     small = luminance(survey.small)
-    moving = placed(source, shifts_of_reduced(reduced(small, small.shape), source.shape))
+    shifts = ((int(dx), int(dy)) for dx, dy in np.rint(_shifts(_reduced(small, small.shape), source.shape)))
+    moving = Placement(dict(zip(source.numbers, shifts, strict=True)), still.size)
     if np.prod(moving.shape) > _LARGEST_SCENE * np.prod(moving.size):
         return None
     followed = _usual(stack, numbers, moving)
@@ -156,6 +153,16 @@ def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
 
 def _moves(shifts: NDArray[np.float64]) -> bool:
     return float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) >= _CAMERA
+
+
+def _reduced(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> FloatArray:
+    """Reduce and smooth T frames of (H, W) pixels, ``shape`` beginning with (T, H, W), to measure their shifts."""
+    return reduced(frames, shape[:3], _REDUCED_SIDE, 16, 1.0)
+
+
+def _shifts(small: FloatArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Shifts (dx, dy) of reduced frames, in pixels of the frames, (T, 2)."""
+    return known_shifts(small)[0] * (shape[2] / small.shape[2], shape[1] / small.shape[1])
 
 
 def _grey(plane: NDArray[np.uint8]) -> FloatArray:
@@ -202,11 +209,10 @@ def _stands(
     A planet that drifts over a black sky passes through nothing.
     """
     seen = zip(stack, masks, parts, strict=True)
-    left = reduced((np.where(mask > 0, part.median, _grey(plane)) for plane, mask, part in seen), stack.shape)
-    edges = [
-        np.hypot(*np.gradient(some, axis=(1, 2))).sum() for some in (reduced(map(_grey, stack), stack.shape), left)
-    ]
-    away = shifts_of_reduced(left, stack.shape) - shifts
+    left = _reduced((np.where(mask > 0, part.median, _grey(plane)) for plane, mask, part in seen), stack.shape)
+    both = _reduced(map(_grey, stack), stack.shape), left
+    edges = [np.hypot(*np.gradient(some, axis=(1, 2))).sum() for some in both]
+    away = _shifts(left, stack.shape) - shifts
     # Snow has more edges than the scene.
     own = parts[0].excess is not None or bool(edges[1] > _OWN_EDGES * edges[0])
     return own and not _moves(away - away.mean(axis=0))
@@ -346,30 +352,3 @@ class Placement:
     def _range(self, axis: int) -> tuple[int, int]:
         values = [shift[axis] for shift in self.shifts.values()]
         return min(values), max(values)
-
-
-def reduced(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> FloatArray:
-    """Reduce and smooth T frames of (H, W) pixels, ``shape`` beginning with (T, H, W), to measure their shifts."""
-    count, height, width = shape[:3]
-    factor = max(1.0, max(height, width) / _REDUCED_SIDE)
-    size = max(16, round(width / factor)), max(16, round(height / factor))
-    small = np.empty((count, size[1], size[0]), np.float32)
-    for plane, frame in zip(small, frames, strict=True):
-        plane[...] = cv2.GaussianBlur(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
-    return small
-
-
-def shifts_of_reduced(small: FloatArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Shifts (dx, dy) of frames that :func:`reduced` has reduced, in pixels of the frames, shape (T, 2)."""
-    return known_shifts(small)[0] * (shape[2] / small.shape[2], shape[1] / small.shape[1])
-
-
-def measured_shifts(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Shifts (dx, dy) of T frames of (H, W) pixels, ``shape`` beginning with (T, H, W), in pixels, shape (T, 2)."""
-    return shifts_of_reduced(reduced(frames, shape), shape)
-
-
-def placed(source: FrameSource, shifts: NDArray[np.float64]) -> Placement:
-    """Place the frames of a source by shifts of shape (T, 2)."""
-    whole = ((int(dx), int(dy)) for dx, dy in np.rint(shifts))
-    return Placement(dict(zip(source.numbers, whole, strict=True)), (source.shape[1], source.shape[2]))

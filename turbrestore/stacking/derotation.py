@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import ConfigurationError, DataError
-from ..footage.object_crop import find_object
-from ..io.pixels import PixelArray
+from ..footage.object_crop import find_object, unrepaired
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import correlation
 from ..registration.warp import warp
@@ -125,7 +124,7 @@ def derotated(source: FrameSource, rotation: Rotation) -> FrameSource:
         f"{2 * disc.radius:.0f} pixels at {np.degrees(disc.angle):.1f}°"
     )
     found = source.adjusted(turn_back)
-    return dataclasses.replace(found, repair=source.repair or _unchanged, warnings=(*source.warnings, remark))
+    return dataclasses.replace(found, repair=source.repair or unrepaired, warnings=(*source.warnings, remark))
 
 
 def find_disc(image: FloatArray, rotation: Rotation) -> Disc:
@@ -225,8 +224,3 @@ def _likeness(a: FloatArray, b: FloatArray, disc: Disc) -> float:
     within = np.hypot(x - disc.x, y - disc.y) < _WITHIN * disc.radius
     details = [cv2.GaussianBlur(one, (0, 0), 1.0) - cv2.GaussianBlur(one, (0, 0), _DETAIL) for one in (a, b)]
     return correlation(*(detail[within] for detail in details))
-
-
-def _unchanged(pixels: PixelArray) -> PixelArray:
-    """Repair nothing: where there is a repair, a kept run depends on the remarks, and with them on the rotation."""
-    return pixels

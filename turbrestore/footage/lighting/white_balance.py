@@ -22,7 +22,7 @@ from ...core.arrays import FloatArray, luminance
 from ...core.decision import Decision
 from ...io.source import Window
 from ...registration.camera.global_shift import known_shifts
-from ..survey import Survey
+from ..survey import Survey, reduced
 
 # Longest side of the reduced frames, pixels, and their blur.
 _SIDE, _BLUR = 64, 1.5
@@ -48,7 +48,7 @@ def steady_white_balance(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
     """Take a white balance that changes out of the frames; others, and grey frames, are returned as they are."""
     if survey.small.ndim != 4 or len(survey.small) < 3:
         return survey, ()
-    ratios = _ratios(_reduced(survey.small))
+    ratios = _ratios(reduced(survey.small, survey.small.shape, _SIDE, 1, _BLUR))
     changes = ratios.std(axis=0)
     if changes.max() < _LEAST_CHANGE:
         return survey, ()
@@ -59,17 +59,6 @@ def steady_white_balance(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
     reason = f"{name} varies from {low:.2f} to {high:.2f} of its mean against the other colours"
     decision = Decision("white balance", "colours of each frame evened out", reason)
     return survey.adjusted(found.steady, survey.small / factors[:, None, None]), (decision,)
-
-
-def _reduced(frames: FloatArray) -> FloatArray:
-    """Reduce and blur frames, (T, H, W, 3) to (T, h, w, 3)."""
-    height, width = frames.shape[1:3]
-    factor = max(1.0, max(height, width) / _SIDE)
-    size = max(1, round(width / factor)), max(1, round(height / factor))
-    stack = np.empty((len(frames), size[1], size[0], 3), np.float32)
-    for small, frame in zip(stack, frames, strict=True):
-        small[...] = cv2.GaussianBlur(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), (0, 0), _BLUR)
-    return stack
 
 
 def _ratios(frames: FloatArray) -> NDArray[np.float64]:
