@@ -270,12 +270,12 @@ def _deblurred(run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[n
 def _refined(run: Run, restoration: Restoration) -> Restoration:
     """Add the image on the finer grid."""
     with run.timed("scale"):
-        found = fine_image(run.prepared, restoration, run.params, run.plan.runtime)
-        run.decide(*found.decisions)
+        finer, on_scale = fine_image(run.prepared, restoration, run.params, run.plan.runtime)
+        run.decide(on_scale)
         x, y, width, height = restoration.crop
         upper, left = fine_shape((y, x), run.params.scale)
         lower, right = fine_shape((y + height, x + width), run.params.scale)
-    return replace(restoration, finer=found.image[upper:lower, left:right], decisions=tuple(run.decisions))
+    return replace(restoration, finer=finer[upper:lower, left:right], decisions=tuple(run.decisions))
 
 
 def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:

@@ -106,7 +106,12 @@ def keep_agreed(result: FloatArray, halves: Halves, full_scale: tuple[float, flo
             whole[top : top + _ROWS] = part[own]
     np.clip(image, *full_scale, out=image)
     # Flat parts that are smoothed are no reason to doubt the registration.
-    return Guarded(image, np.maximum(share, flat), explain_agreement(share))
+    clear, share = float((share >= _CLEAR).mean()), np.maximum(share, flat)
+    if clear < _REMARKED:
+        return Guarded(image, share, ())
+    choice = f"detail in {100 * clear:.0f} % of the image is that of the mean of the registered frames"
+    reason = "there the halves of the clip do not agree on it: noise, water, clouds, rain or registration that failed"
+    return Guarded(image, share, (Decision("agreement", choice, reason),))
 
 
 def halves_memory(shape: tuple[int, ...], threads: int) -> float:
@@ -169,16 +174,6 @@ def _given(moments: Sequence[FloatArray], doubt: float = 0.0) -> FloatArray:
     more = detail / (np.maximum(usual, 0) + np.float32(_NOTHING)) - 1
     more = more if more.ndim == 2 else more.max(axis=2)
     return np.asarray(unlike * np.clip(more, 0, 1), np.float32)
-
-
-def explain_agreement(share: FloatArray) -> tuple[Decision, ...]:
-    """Say what gave way, if it is worth a remark."""
-    clear = float((share >= _CLEAR).mean())
-    if clear < _REMARKED:
-        return ()
-    choice = f"detail in {100 * clear:.0f} % of the image is that of the mean of the registered frames"
-    reason = "there the halves of the clip do not agree on it: noise, water, clouds, rain or registration that failed"
-    return (Decision("agreement", choice, reason),)
 
 
 def _split(image: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:

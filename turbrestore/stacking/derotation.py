@@ -43,22 +43,13 @@ _COMPARED, _WITHIN, _DETAIL = 40, 0.8, 4.0
 
 @dataclass(frozen=True)
 class Rotation:
-    """How a planet turns.
+    """How a planet turns."""
 
-    Attributes
-    ----------
-    period : float
-        Hours.
-    flattening : float
-    angle : float or None
-        Of the equator in the image, degrees from the x axis towards the y axis; None where the outline tells it.
-    latitude : float
-        Of the centre of the disc, degrees, positive where the pole that is up in the image is turned to the observer.
-    """
-
-    period: float
+    period: float  # hours
     flattening: float
+    # Of the equator in the image, degrees from the x axis towards the y axis; None where the outline tells it.
     angle: float | None = None
+    # Of the centre of the disc, degrees, positive where the pole that is up in the image is turned to the observer.
     latitude: float = 0.0
 
 

@@ -149,7 +149,7 @@ def position_variance(dynamics: FlowDynamics) -> FloatArray:
     return cv2.GaussianBlur(dynamics.residual_variance, (0, 0), _SMOOTH) * np.float32(_ERROR_SHARE)
 
 
-def saturation_level(brightest: float, noise: float, step: float, saturated: float = SATURATED) -> float:
+def saturation_level(brightest: float, noise: float, step: float, saturated: float) -> float:
     """Return the intensity from which the temporal mean is saturated, where a frame is from ``saturated`` on.
 
     A camera of 12 bits saturates far below the full scale of a file of 16. A pixel that has the largest intensity of
