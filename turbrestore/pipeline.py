@@ -235,7 +235,7 @@ def _deblurred(run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[n
     deblurred, agreed = None, None
     if params.runs("deconvolve") and not evidence.is_mean:
         photons = None if halves is None else _photon_noise(run, halves)
-        deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused, evidence.witnesses, psf, photons))
+        deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused, evidence, psf, photons))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
         if halves is not None:
@@ -301,8 +301,7 @@ def _find_witnesses(run: Run, training: FloatArray, fused: Restoration) -> BlurW
             # Without a displacement that can be measured, that of the flow stands for it, less what the camera adds.
             about = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
             displacement, frames = float(np.mean(about)), float(len(training))
-        known_optics = _of_optics(BlurWitnesses(displacement, frames, picture), run, seeing)
-        return measure_witnesses(seen, flows, known_optics)
+        return measure_witnesses(seen, flows, _of_optics(BlurWitnesses(displacement, frames, picture), run, seeing))
 
 
 def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWitnesses:
@@ -320,17 +319,13 @@ def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWit
 
 
 def _deblur(
-    run: Run,
-    fused: Restoration,
-    witnesses: BlurWitnesses | None,
-    psf: NDArray[np.float64] | None,
-    photons: NoiseCurve | None,
+    run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[np.float64] | None, photons: NoiseCurve | None
 ) -> Deblurred:
     params, plan, guide = run.params, run.plan, fused.centroid.image
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
-    steps = remove_blur_steps(fused.image, guide, *settings, witnesses, psf, photons)
+    steps = remove_blur_steps(fused.image, guide, *settings, evidence.witnesses, psf, photons)
     return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 
 
