@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -355,7 +354,9 @@ def _areas(tiles: Sequence[HaloTile]) -> NDArray[np.float64]:
 def temporal_mean(source: FrameSource) -> FloatArray:
     """Mean of the frames, read one after the other."""
     total = np.zeros(source.shape[1:])
-    return mean_of_sum(added_up(source, total), total, len(source))
+    for frame in source:
+        total += frame
+    return (total / len(source)).astype(np.float32)
 
 
 def added_up(frames: Iterable[FloatArray], total: NDArray[np.float64]) -> Iterator[FloatArray]:
@@ -363,9 +364,3 @@ def added_up(frames: Iterable[FloatArray], total: NDArray[np.float64]) -> Iterat
     for frame in frames:
         total += frame
         yield frame
-
-
-def mean_of_sum(unread: Iterator[FloatArray], total: NDArray[np.float64], count: int) -> FloatArray:
-    """Mean of frames that have been added up but for those that nobody has read yet."""
-    deque(unread, 0)
-    return (total / count).astype(np.float32)

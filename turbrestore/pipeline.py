@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -24,7 +25,7 @@ from .deconvolution.problem import read_blur
 from .dynamics.dynamic_texture import identify
 from .footage.checks.content import without_blank
 from .footage.levels import Levels
-from .fusion import Run, TileMap, added_up, filter_all, find_centroid, mean_of_sum, read_training
+from .fusion import Run, TileMap, added_up, filter_all, find_centroid, read_training
 from .io.images import read_image
 from .io.output import check_space
 from .io.source import FrameSource
@@ -183,7 +184,7 @@ def _fused(run: Run) -> tuple[Restoration, _Evidence]:
         filtering = partial(filter_all, run, centroid, dynamics, training, stream)
         filtered = run.stage("filter", "filtered", filtering)
         unread = added_up(source, total) if run.tiles else stream
-        mean = run.stage("filter", "mean", lambda: mean_of_sum(unread, total, len(source)))
+        mean = run.stage("filter", "mean", lambda: _mean(unread, total, len(source)))
         # The sharpness is NaN for frames that do not count.
         chosen = int(np.isfinite(filtered.sharpness).sum())
         run.decide(*explain_filter(filtered, dynamics, None if params.keep_best == 1 else chosen))
@@ -276,6 +277,12 @@ def _refined(run: Run, restoration: Restoration) -> Restoration:
         upper, left = fine_shape((y, x), run.params.scale)
         lower, right = fine_shape((y + height, x + width), run.params.scale)
     return replace(restoration, finer=finer[upper:lower, left:right], decisions=tuple(run.decisions))
+
+
+def _mean(unread: Iterator[FloatArray], total: NDArray[np.float64], count: int) -> FloatArray:
+    """Mean of frames that have been added up but for those that nobody has read yet."""
+    deque(unread, 0)
+    return (total / count).astype(np.float32)
 
 
 def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:
