@@ -133,7 +133,8 @@ def find_disc(image: FloatArray, rotation: Rotation) -> Disc:
     largest = 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA]))
     rows, columns = np.nonzero(labels == largest)
     variances, axes = np.linalg.eigh(np.cov(np.stack([columns, rows])))
-    polar = _polar_radius(rotation)
+    latitude = np.radians(rotation.latitude)
+    polar = float(np.hypot((1 - rotation.flattening) * np.cos(latitude), np.sin(latitude)))
     angle = 0.0 if rotation.angle is None else float(np.radians(rotation.angle))
     if rotation.angle is None and 1 - np.sqrt(variances[0] / variances[1]) > _FLAT:
         angle = float(np.arctan2(axes[1, 1], axes[0, 1]))
@@ -167,12 +168,6 @@ def rotation_flow(shape: tuple[int, ...], disc: Disc, rotation: Rotation, second
     seen = (root > 0) & (qx * cos_b + pz / q2 * sin_b > 0)
     du, dv = np.where(seen, du, 0), np.where(seen, dv, 0)
     return (disc.radius * np.stack([cosine * du + sine * dv, sine * du - cosine * dv], -1)).astype(np.float32)
-
-
-def _polar_radius(rotation: Rotation) -> float:
-    """Polar over equatorial radius of the outline."""
-    latitude = np.radians(rotation.latitude)
-    return float(np.hypot((1 - rotation.flattening) * np.cos(latitude), np.sin(latitude)))
 
 
 def _times(source: FrameSource) -> NDArray[np.float64]:

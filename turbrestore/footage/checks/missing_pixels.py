@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -55,25 +56,19 @@ class Backdrop:
         return np.where(missing, self.values, pixels).astype(np.float32)
 
 
-class BackdropSum:
-    """Sum of what frames show, from which a :class:`Backdrop` is made."""
+def mean_backdrop(frames: Iterable[PixelArray], shape: tuple[int, ...]) -> Backdrop:
+    """Average what frames show, and continue it smoothly to where none shows anything.
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self._total = np.zeros(shape)
-        self._count = np.zeros(shape, np.int64)
-
-    def add(self, pixels: PixelArray) -> None:
-        """Add a frame; missing pixels are NaN or infinite."""
+    ``frames`` (H, W) or (H, W, 3) each, as ``shape`` says; missing pixels are NaN or infinite.
+    """
+    total, count = np.zeros(shape), np.zeros(shape, np.int64)
+    for pixels in frames:
         known = np.isfinite(pixels)
-        self._total[known] += pixels[known]
-        self._count += known
-
-    def backdrop(self) -> Backdrop:
-        """Divide the sum, and continue it smoothly to where no frame shows anything."""
-        mean = (self._total / np.maximum(self._count, 1)).astype(np.float32)
-        known = self._count > 0
-        unseen = np.asarray(~known if known.ndim == 2 else ~known.all(axis=2))
-        return Backdrop(continued(mean, known), unseen)
+        total[known] += pixels[known]
+        count += known
+    known = count > 0
+    mean = (total / np.maximum(count, 1)).astype(np.float32)
+    return Backdrop(continued(mean, known), np.asarray(~known if known.ndim == 2 else ~known.all(axis=2)))
 
 
 def continued(values: FloatArray, known: NDArray[np.bool_]) -> FloatArray:

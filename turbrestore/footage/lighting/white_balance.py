@@ -12,15 +12,12 @@ the colours of the mean stay.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
 from ...core.decision import Decision
-from ...io.source import Window
 from ...registration.camera.global_shift import known_shifts
 from ..survey import Survey, reduced
 
@@ -33,17 +30,6 @@ _DARK, _SATURATED = 0.02, 0.98
 _ROUNDS = 4
 
 
-@dataclass(frozen=True, eq=False)
-class WhiteBalance:
-    """Ratios of channels, ndarray of float32 and shape (3,), by the number of the frame in the file."""
-
-    ratios: dict[int, NDArray[np.float32]]
-
-    def steady(self, number: int, values: FloatArray, window: Window) -> FloatArray:
-        """Correct the colours of a frame, or of a window of it."""
-        return values / self.ratios[number]
-
-
 def steady_white_balance(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
     """Take a white balance that changes out of the frames; others, and grey frames, are returned as they are."""
     if survey.small.ndim != 4 or len(survey.small) < 3:
@@ -53,12 +39,13 @@ def steady_white_balance(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
     if changes.max() < _LEAST_CHANGE:
         return survey, ()
     factors = np.exp(ratios).astype(np.float32)
-    found = WhiteBalance(dict(zip(survey.clip.numbers, factors, strict=True)))
+    balance = dict(zip(survey.clip.numbers, factors, strict=True))
     name = ("red", "green", "blue")[int(changes.argmax())]
     low, high = np.exp(ratios[:, changes.argmax()].min()), np.exp(ratios[:, changes.argmax()].max())
     reason = f"{name} varies from {low:.2f} to {high:.2f} of its mean against the other colours"
     decision = Decision("white balance", "colours of each frame evened out", reason)
-    return survey.adjusted(found.steady, survey.small / factors[:, None, None]), (decision,)
+    small = survey.small / factors[:, None, None]
+    return survey.adjusted(lambda number, values, _: values / balance[number], small), (decision,)
 
 
 def _ratios(frames: FloatArray) -> NDArray[np.float64]:
