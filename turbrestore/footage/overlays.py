@@ -36,7 +36,7 @@ from ..io.images import read_image
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
 from .checks.missing_pixels import continued
-from .survey import Moments, Survey, measure_moments, within
+from .survey import Moments, Placement, Survey, measure_moments, within
 
 # Fewest and most frames of a clip in which an overlay is looked for.
 FEWEST, _MOST = 3, 1500
@@ -81,18 +81,14 @@ class Overlay:
     mask: NDArray[np.bool_]  # (H, W)
     scene: FloatArray  # (H', W') or (H', W', 3): mean of the frames at one place, without the overlay
     hidden: NDArray[np.bool_]  # (H, W): pixels of the scene, at its mean position, that no frame shows
-    origin: tuple[int, int]  # row and column of the scene at which a frame without shift begins
-    shifts: dict[int, tuple[int, int]]  # (dx, dy) of each frame by its number in the file, pixels
+    placement: Placement  # where frames lie in the scene
     window: Window  # rows and columns of the file that the mask spans
 
     def without(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Replace the pixels that stand in a frame, or in a window of it, by the scene behind them."""
-        dx, dy = self.shifts[number]
-        rows, columns = part = within(self.window, window)
-        top, left = self.origin[0] - dy + rows.start, self.origin[1] - dx + columns.start
-        behind = self.scene[top : top + len(values), left : left + values.shape[1]]
+        part = within(self.window, window)
         replaced, chosen = values.copy(), self.mask[part]
-        replaced[chosen] = behind[chosen]
+        replaced[chosen] = self.scene[self.placement.place(number)][part][chosen]
         return replaced
 
 
@@ -162,7 +158,7 @@ def without_overlay(
         choice = f"{100 * float(title.mask.mean()):.1f} % of the frame kept as in the mean of the frames"
         reason = "it stands while the air bends the scene around it; it is neither moved nor deblurred"
         return survey.adjusted(title.without, small), title.mask, title, (Decision("overlay", choice, reason),)
-    overlay = _overlay(survey, mask, np.rint(shifts).astype(int))
+    overlay = _overlay(survey, mask, shifts)
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
     reason = "asked for" if given else "it stands while the scene moves"
     hidden = float(overlay.hidden.mean())
@@ -282,19 +278,13 @@ def _continued_small(small: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:
     return filled
 
 
-def _overlay(survey: Survey, mask: NDArray[np.bool_], shifts: NDArray[np.int_]) -> Overlay:
+def _overlay(survey: Survey, mask: NDArray[np.bool_], shifts: NDArray[np.float64]) -> Overlay:
     """Average what the whole frames show of the scene, without the overlay."""
-    low, high = shifts.min(axis=0), shifts.max(axis=0)
-    height, width = mask.shape
-    shape = height + high[1] - low[1], width + high[0] - low[0]
-    total, count = np.zeros((*shape, *survey.clip.shape[3:])), np.zeros(shape)
-    origin = int(high[1]), int(high[0])
-    places = {number: (int(dx), int(dy)) for number, (dx, dy) in zip(survey.clip.numbers, shifts, strict=True)}
+    placement = Placement.by(shifts, survey.clip.numbers, (mask.shape[0], mask.shape[1]))
+    total, count = np.zeros((*placement.shape, *survey.clip.shape[3:])), np.zeros(placement.shape)
     for number, frame in zip(survey.numbers, survey, strict=True):
-        dx, dy = places[number]
-        place = np.s_[origin[0] - dy : origin[0] - dy + height, origin[1] - dx : origin[1] - dx + width]
+        place = placement.place(number)
         total[place][~mask] += frame[~mask]
         count[place][~mask] += 1
     scene = continued((total.T / np.maximum(count, 1).T).T.astype(np.float32), count > 0)
-    hidden = count[origin[0] : origin[0] + height, origin[1] : origin[1] + width] == 0
-    return Overlay(mask, scene, hidden, origin, places, survey.clip.window)
+    return Overlay(mask, scene, count[placement.of_shift(0, 0)] == 0, placement, survey.clip.window)

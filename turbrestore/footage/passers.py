@@ -33,7 +33,7 @@ from ..core.decision import Decision
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
 from ..runtime.scratch import iter_frames
-from .survey import Survey, reduced, spread, within
+from .survey import Placement, Survey, reduced, spread, within
 
 # Frames of which the median is taken, the fewest that tell what passes, and rows that it is taken of at once.
 _SAMPLES, _FEWEST, _ROWS = 25, 9, 64
@@ -133,7 +133,7 @@ def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
     sample = map(source.intensities, numbers, iter_frames(map(survey.pixels.__getitem__, places)))
     for plane, frame in zip(stack, sample, strict=True):
         np.rint(255 * np.clip(luminance(frame), 0, 1), out=plane, casting="unsafe")
-    still = Placement.still(source)
+    still = Placement(dict.fromkeys(source.numbers, (0, 0)), (source.shape[1], source.shape[2]))
     usual = _usual(stack, numbers, still)
     found = _passed_by(stack, numbers, usual, still)
     if found is not None:
@@ -142,8 +142,7 @@ def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
         return None
     # For a camera that moves the scene passes too; what moves as most of the frame does is the scene.
     small = luminance(survey.small)
-    shifts = ((int(dx), int(dy)) for dx, dy in np.rint(_shifts(_reduced(small, small.shape), source.shape)))
-    moving = Placement(dict(zip(source.numbers, shifts, strict=True)), still.size)
+    moving = Placement.by(_shifts(_reduced(small, small.shape), source.shape), source.numbers, still.size)
     if np.prod(moving.shape) > _LARGEST_SCENE * np.prod(moving.size):
         return None
     followed = _usual(stack, numbers, moving)
@@ -323,32 +322,3 @@ def _background(source: FrameSource, usual: _Usual, placement: Placement) -> tup
 
 def _disc(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2), np.uint8)
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Shifts of frames, and the part of the scene that they show together."""
-
-    shifts: dict[int, tuple[int, int]]  # (dx, dy) of each frame by its number in the file, pixels
-    size: tuple[int, int]  # (H, W) of a frame
-
-    @classmethod
-    def still(cls, source: FrameSource) -> Placement:
-        """Place all frames alike."""
-        return cls(dict.fromkeys(source.numbers, (0, 0)), (source.shape[1], source.shape[2]))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(H', W') of the part of the scene that the frames show together."""
-        (left, right), (top, bottom) = (self._range(axis) for axis in (0, 1))
-        return self.size[0] + bottom - top, self.size[1] + right - left
-
-    def place(self, number: int) -> Window:
-        """Return the rows and columns of the scene that a frame shows."""
-        dx, dy = self.shifts[number]
-        top, left = self._range(1)[1] - dy, self._range(0)[1] - dx
-        return slice(top, top + self.size[0]), slice(left, left + self.size[1])
-
-    def _range(self, axis: int) -> tuple[int, int]:
-        values = [shift[axis] for shift in self.shifts.values()]
-        return min(values), max(values)

@@ -8,12 +8,14 @@ frames are corrected.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import estimate_noise
@@ -137,6 +139,42 @@ def reduced(frames: Iterable[FloatArray], shape: tuple[int, ...], side: int, sho
     for plane, frame in zip(small, frames, strict=True):
         plane[...] = cv2.GaussianBlur(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), (0, 0), blur)
     return small
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Shifts of frames, and the part of the scene that they show together."""
+
+    shifts: dict[int, tuple[int, int]]  # (dx, dy) of each frame by its number in the file, pixels
+    size: tuple[int, int]  # (H, W) of a frame
+
+    @classmethod
+    def by(cls, shifts: NDArray[np.float64], numbers: Sequence[int], size: tuple[int, int]) -> Placement:
+        """Place frames by shifts (T, 2), rounded to whole pixels."""
+        whole = ((int(dx), int(dy)) for dx, dy in np.rint(shifts))
+        return cls(dict(zip(numbers, whole, strict=True)), size)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H', W') of the part of the scene that the frames show together."""
+        (left, top), (right, bottom) = self._range
+        return self.size[0] + bottom - top, self.size[1] + right - left
+
+    def place(self, number: int) -> Window:
+        """Return the rows and columns of the scene that a frame shows."""
+        return self.of_shift(*self.shifts[number])
+
+    def of_shift(self, dx: int, dy: int) -> Window:
+        """Return the rows and columns of the scene that a frame of this shift shows."""
+        right, bottom = self._range[1]
+        top, left = bottom - dy, right - dx
+        return slice(top, top + self.size[0]), slice(left, left + self.size[1])
+
+    @cached_property
+    def _range(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Least and greatest (dx, dy)."""
+        across, down = zip(*self.shifts.values(), strict=True)
+        return (min(across), min(down)), (max(across), max(down))
 
 
 def within(whole: Window, window: Window) -> Window:
