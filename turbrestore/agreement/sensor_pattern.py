@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
@@ -133,12 +134,7 @@ def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float
 def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
     """Mark the columns that have no noise while those around do."""
     level = np.sqrt(np.median(variance, axis=0)).astype(np.float32)
-    around = np.array(
-        [
-            np.median(part)
-            for part in np.lib.stride_tricks.sliding_window_view(np.pad(level, _AROUND, "reflect"), 2 * _AROUND + 1)
-        ]
-    )
+    around = median_filter(level, 2 * _AROUND + 1, mode="mirror")
     dead = level < _DEAD * np.minimum(around, noise if noise > _LEAST_NOISE else 0)
     if dead.mean() > _MOST_DEAD:
         return np.zeros_like(dead)
