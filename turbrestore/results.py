@@ -221,7 +221,9 @@ def at_levels_of_clip(result: Result, levels: Levels) -> Result:
         return replace(result, image=image, variance=result.variance / np.float32(gain**2), image_noise=noise)
     if isinstance(result, Deconvolution):
         return replace(result, image=levels.original(result.image), noise=result.noise / gain)
-    return replace(result, noise=result.noise / gain) if isinstance(result, BlurEstimate) else result
+    if isinstance(result, BlurEstimate):
+        return replace(result, noise=result.noise / gain)
+    return result
 
 
 def _gained(restoration: Restoration, motion: float, gain: float) -> str:

@@ -13,6 +13,7 @@ filtered    the dynamics, settings of the filter, the share of best frames
 deblurred   the filtered image, settings of deconvolution and guards
 ==========  =========================================================================================================
 
+Results, ``mean.npy`` among them, are kept as the stages made them: stretched, where frames use a part of the scale.
 Threads and a memory limit change no result, so nothing depends on them; but where a limit leaves fewer training frames,
 or whole frames do not fit, the centroid depends on those frames and on the size of the tiles.
 """

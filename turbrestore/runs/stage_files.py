@@ -47,8 +47,8 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "posterior": BlurPosterior,
 }
 _HEADER = "header"
-# No scene with contrast is stretched as much.
-_MOST_GAIN = 1e9
+# Frames are never stretched as much.
+_MOST_GAIN = 1e30
 
 Result = TypeVar("Result", bound="DataclassInstance")
 
