@@ -152,7 +152,7 @@ def read_training(run: Run, stream: Iterator[FloatArray]) -> tuple[FloatArray, f
     return training, saturation_level(brightest, estimate_noise(training[0]), levels.gain / (2**bits - 1), least)
 
 
-def find_centroid(run: Run, training: FloatArray) -> Centroid:
+def centroid_stage(run: Run, training: FloatArray) -> Centroid:
     """Find the centroid of the training frames, in the geometry that was asked for.
 
     ``training`` (K, H, W) or (K, H, W, 3).
@@ -198,7 +198,7 @@ def _run_centroid_task(task: CentroidTask) -> Centroid:
     return replace(found, image=np.array(found.image), flows=np.array(found.flows))
 
 
-def filter_all(
+def filter_stage(
     run: Run, centroid: Centroid, dynamics: FlowDynamics, training: FloatArray, rest: Iterator[FloatArray]
 ) -> Filtered:
     """Filter the training frames and those after them, and move the image to its place.

@@ -25,7 +25,7 @@ from .deconvolution.problem import read_blur
 from .dynamics.dynamic_texture import identify
 from .footage.checks.content import without_blank
 from .footage.levels import Levels
-from .fusion import Run, TileMap, added_up, filter_all, find_centroid, read_training
+from .fusion import Run, TileMap, added_up, centroid_stage, filter_stage, read_training
 from .io.images import read_image
 from .io.output import check_space
 from .io.source import FrameSource
@@ -171,7 +171,7 @@ def _fused(run: Run) -> tuple[Restoration, _Evidence]:
     stream = iter(source) if run.tiles else added_up(source, total)
     training, saturation = read_training(run, stream)
 
-    centroid = run.stage("centroid", "centroid", partial(find_centroid, run, training))
+    centroid = run.stage("centroid", "centroid", partial(centroid_stage, run, training))
     run.decide(*explain_registration(centroid))
     seeing = _measure_seeing(run, training, centroid)
 
@@ -181,7 +181,7 @@ def _fused(run: Run) -> tuple[Restoration, _Evidence]:
         run.decide(*explain_dynamics(dynamics, params.filter.residual == "drop"))
 
     if dynamics is not None and params.runs("filter"):
-        filtering = partial(filter_all, run, centroid, dynamics, training, stream)
+        filtering = partial(filter_stage, run, centroid, dynamics, training, stream)
         filtered = run.stage("filter", "filtered", filtering)
         unread = added_up(source, total) if run.tiles else stream
         mean = run.stage("filter", "mean", lambda: _mean(unread, total, len(source)))
