@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from turbrestore.core.arrays import FloatArray
+from turbrestore.footage.levels import Levels
 
 Result = TypeVar("Result")
 
@@ -40,6 +41,11 @@ class StageMemory:
     def __init__(self, show: Callable[[str, FloatArray], None] | None = None) -> None:
         self.show = show
         self._results: dict[str, Any] = {}
+        self._levels = Levels()
+
+    def begin(self, levels: Levels) -> None:
+        """Take the levels of the stages: what is shown has those of the clip."""
+        self._levels = levels
 
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
         """Return what was computed under this name, or compute it."""
@@ -47,7 +53,7 @@ class StageMemory:
         if name != _ALWAYS_ANEW:
             self._results[name] = result
         if self.show is not None and name in _IMAGES:
-            self.show(name, _IMAGES[name](result))
+            self.show(name, self._levels.original(_IMAGES[name](result)))
         return result
 
     def filter_start(self) -> None:

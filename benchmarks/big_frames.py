@@ -28,13 +28,13 @@ import cv2
 import numpy as np
 
 from turbrestore.core.arrays import FloatArray
+from turbrestore.fusion import TileMap
 from turbrestore.io.video import open_frames
 from turbrestore.metrics import psnr
 from turbrestore.pipeline import restore
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.settings import RestoreParams
 from turbrestore.synthesis.scenes import SCENES
-from turbrestore.tiled_stages import TileMap
 from turbrestore_cli.cluster import connected, over_workers
 
 BOUND_DB = 0.05

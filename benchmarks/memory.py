@@ -225,6 +225,9 @@ class StageWatch(Watch):
         self.taken[name] = self.lap()
         return result
 
+    def begin(self, levels: object) -> None:
+        """Forget the levels."""
+
     def filter_start(self) -> None:
         """Return None: nothing was kept."""
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import require
+from turbrestore.fusion import TileMap
 from turbrestore.io.images import write_map
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
@@ -23,7 +24,6 @@ from turbrestore.runs.run_record import describe_run
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.settings import Preset, RestoreParams
 from turbrestore.stacking.placement import settings_of_known_flows
-from turbrestore.tiled_stages import TileMap
 
 from .cluster import connected, over_workers
 from .inputs import files_read, open_input, read_input_image

@@ -13,6 +13,7 @@ from turbrestore.core.errors import ConfigurationError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.filtering.alternating import Filtered
+from turbrestore.fusion import join_centroids, join_filtered
 from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import plan_memory
 from turbrestore.metrics import psnr
@@ -22,7 +23,6 @@ from turbrestore.runs.run_folder import RunFolder
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.tiling import cut_tile, halo_tiles
 from turbrestore.settings import RestoreParams
-from turbrestore.tiled_stages import join_centroids, join_filtered
 
 HALO = 24
 TILES = halo_tiles((128, 128), 112, HALO)
@@ -102,7 +102,7 @@ def divide(patch, scratch):
 
     for module in (pipeline, run_folder_module):
         patch.setattr(module, "plan_memory", plan)
-    patch.setattr(pipeline, "halo_tiles", lambda shape, side, halo=HALO: halo_tiles(shape, side, halo))
+    patch.setattr(fusion, "halo_tiles", lambda shape, side, halo=HALO: halo_tiles(shape, side, halo))
 
 
 @pytest.fixture

@@ -1,72 +1,61 @@
-"""Fusion of the frames into one image: the stages from the frames to the alternating filter, whole or in tiles."""
+"""Centroid and filter of the frames: of whole frames, or in tiles that overlap, here or in other processes.
+
+Each tile is a clip of its own that passes through the same functions as a whole frame; images and flows of the tiles
+are blended by :mod:`turbrestore.runtime.tiling`.  The result is close to that of whole frames but not the same, because
+what is estimated from all pixels at once (the flow model, the noise of the frames) is estimated from those of the tile.
+Frames that are shifted by more than the halo of 96 pixels leave a part of a tile unseen.
+
+What is done with a tile is described by a task, which another process can be handed: it has the frames of the tile as
+a source that reads them there.  Where a tile is worked on changes nothing in the result, bit for bit.
+"""
 
 from __future__ import annotations
 
+import tempfile
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .agreement.last_guard import FEWEST, Halves, registered_halves
-from .blind.structure import StructureReading, compare_structure
-from .blur.posterior import BlurWitnesses, measure_witnesses
-from .blur.witnesses.short_exposure import displacement_variance
-from .core.arrays import FloatArray, luminance
+from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.noise import estimate_noise
 from .dynamics.dynamic_texture import identify
 from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import Filtered, FilterStep, filter_steps
 from .footage.frame_selection import best_frames, frame_quality
-from .footage.levels import Levels
 from .io.source import FrameSource
 from .memory_plan import MemoryPlan
 from .preparation import Prepared
 from .registration.centroid import Centroid, centroid_steps
-from .registration.flow_algebra import invert_flow
-from .registration.recentring import recentre, recentring_flow
-from .registration.warp import warp
 from .results import Store
-from .runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
+from .runtime.runtime import Runtime
+from .runtime.scratch import drop_pages, fill_stack, iter_frames, new_stack
 from .runtime.steps import Progress, finish, step_counter
-from .runtime.tiling import HaloTile, cut_tile
-from .seeing.displacement import LEAST_FRAMES
-from .seeing.strength import Seeing, seeing_of_picture
+from .runtime.tiling import HaloTile, add_tile, cut_tile, halo_tiles, new_mosaic
 from .settings import RestoreParams
 from .stacking.placement import centroid_of_known_flows, onto_reference
-from .tiled_stages import (
-    TileMap,
-    centroid_tasks,
-    filter_tasks,
-    join_centroids,
-    join_filtered,
-    only_counted,
-    run_centroid_task,
-    run_filter_task,
-    tile_filter_steps,
-)
 from .uncertainty.pixel_deviation import SATURATED, saturation_level
-from .wording import (
-    explain_dynamics,
-    explain_filter,
-    explain_input,
-    explain_registration,
-    explain_seeing,
-    explain_structure,
-    explain_training,
-)
+from .wording import explain_input, explain_training
 
+# As ``map`` does, applies a function to every task and yields the results in order; it may do so in other processes,
+# to which it has to pickle closures too.  The tasks should be taken as they are needed, because those of the filter
+# hold arrays.
+TileMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
 # Files of floating point are taken for those of 16 bits.
 _MOST_BITS = 16
-# Least standard deviation of ln V by a measured D/r0: theory and simulated clips agree no better.
-_LEAST_SPREAD = 0.2
+# Figures of a filtered tile that are joined or averaged.
+_RECORDED = (
+    *("flow_states", "gains", "innovations", "sharpness", "shares"),
+    *("image_noise", "sharpness_weight"),
+)
 
 Result = TypeVar("Result")
 
@@ -76,14 +65,12 @@ class Run:
     """Arguments that every stage shares, what was decided, and the wall time of the stages that have run."""
 
     prepared: Prepared
-    params: RestoreParams
+    params: RestoreParams  # at the levels of the prepared frames
     plan: MemoryPlan
-    tiles: tuple[HaloTile, ...]
-    store: Store
+    store: Store | None
     progress: Progress | None
     on_decision: Callable[[Decision], None] | None
     map_tiles: TileMap | None = None
-    psf: NDArray[np.float64] | None = None
     decisions: list[Decision] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -93,9 +80,10 @@ class Run:
         return self.prepared.source
 
     @property
-    def levels(self) -> Levels:
-        """From the levels of the clip to those of the stages."""
-        return self.prepared.levels
+    def tiles(self) -> tuple[HaloTile, ...]:
+        """Tiles in which frames are processed; none for whole frames."""
+        _, height, width = self.source.shape[:3]
+        return () if self.plan.tile is None else halo_tiles((height, width), self.plan.tile)
 
     def decide(self, *decisions: Decision) -> None:
         """Record decisions, and tell whoever listens."""
@@ -104,98 +92,81 @@ class Run:
             for decision in decisions:
                 self.on_decision(decision)
 
-    def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:
-        """Return a result from the store, or compute it, and add the time that this takes to that of the stage.
-
-        Results have the levels of the clip.
-        """
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the time that something takes to that of a stage."""
         begun = time.perf_counter()
-        result = self.store.get(name, lambda: self.levels.original(compute()))
+        yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begun
-        return result
+
+    def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:
+        """Return a result from the store, or compute it."""
+        with self.timed(stage):
+            return self.kept(name, compute)
+
+    def kept(self, name: str, compute: Callable[[], Result]) -> Result:
+        """Return a result from the store, or compute it, within a stage."""
+        return compute() if self.store is None else self.store.get(name, compute)
 
     def counter(self, stage: str, total: int) -> Callable[[object], None]:
         """Return the observer of the steps of one stage, which reports progress."""
         return step_counter(self.progress, stage, total)
 
 
-@dataclass(frozen=True)
-class Fused:
-    """Results of the stages before the deconvolution.
+@dataclass(frozen=True, eq=False)
+class CentroidTask:
+    """The centroid of a tile, to be found in another process."""
 
-    ``is_mean`` says that the image is the mean of the frames, because the filtered one has structure that they lack;
-    ``halves`` are at the levels of the clip, None for few frames.
-    """
+    source: FrameSource  # all frames of the tile
+    train: int  # number of training frames
+    params: RestoreParams
+    runtime: Runtime  # where it has a scratch folder, that of temporary files is used
 
+
+@dataclass(frozen=True, eq=False)
+class FilterTask:
+    """The filter of a tile, to be run here or in another process."""
+
+    source: FrameSource  # all frames of the tile
+    # Centroid of the tile, and flows to the training frames.
     image: FloatArray
-    mean: FloatArray
-    centroid: Centroid
-    seeing: Seeing | None
-    saturation: float
-    dynamics: FlowDynamics | None = None
-    filtered: Filtered | None = None
-    is_mean: bool = False
-    witnesses: BlurWitnesses | None = None
-    halves: Halves | None = None
+    flows: FloatArray
+    counted: NDArray[np.bool_]  # (T,): frames that count
+    params: RestoreParams
+    runtime: Runtime  # in another process, where it has a scratch folder, that of temporary files is used
 
 
-def fuse(run: Run) -> Fused:
-    """Run the stages up to the filter; the training frames are freed when this function returns."""
-    params, train = run.params, run.plan.train
-    total = np.zeros(run.source.shape[1:])
-    # Tiles read their parts of the frames themselves.
-    stream = iter(run.source) if run.tiles else _added_up(run.source, total)
-    begun, levels = time.perf_counter(), run.levels
-    training, saturated, brightest = _read_training(stream, (train, *run.source.shape[1:]), run.plan.runtime.scratch)
-    run.seconds["read"] += time.perf_counter() - begun
-    run.decide(explain_training(train, len(run.source), params.train), *explain_input(saturated))
-
-    centroid = run.stage("centroid", "centroid", lambda: _find_centroid(run, training))
-    run.decide(*explain_registration(centroid))
-    start = levels.stretched(centroid)
-    seeing, saturation = _measure_seeing(run, training, start), _find_saturation(run, training[0], brightest)
-    if not params.runs("identify"):
-        return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation)
-
-    dynamics = run.stage("identify", "dynamics", lambda: identify(centroid.flows, params.dynamics, run.plan.runtime))
-    run.decide(*explain_dynamics(dynamics, params.filter.residual == "drop"))
-    if not params.runs("filter"):
-        return Fused(centroid.image, levels.original(mean_of(training)), centroid, seeing, saturation, dynamics)
-
-    filtered = run.stage("filter", "filtered", lambda: _placed(run, _filter(run, start, dynamics, training, stream)))
-    unread = _added_up(run.source, total) if run.tiles else stream
-    mean = run.stage("filter", "mean", lambda: _mean(unread, total, len(run.source)))
-    # The sharpness is NaN for frames that do not count.
-    chosen = int(np.isfinite(filtered.sharpness).sum())
-    run.decide(*explain_filter(filtered, dynamics, None if params.keep_best == 1 else chosen))
-    structure = _compare_structure(levels.stretched(filtered.image), training, centroid, filtered.mean_flow)
-    run.decide(*explain_structure(structure))
-    image = filtered.image if structure.passed else mean
-    witnesses = _find_witnesses(run, training, centroid, seeing) if structure.passed else None
-    halves = _halves(run, training, centroid, filtered.mean_flow)
-    found = mean, centroid, seeing, saturation, dynamics, filtered
-    return Fused(image, *found, not structure.passed, witnesses, halves)
+def read_training(run: Run, stream: Iterator[FloatArray]) -> tuple[FloatArray, float]:
+    """Read the training frames; also the intensity from which their mean is saturated."""
+    levels, count, bits = run.prepared.levels, run.plan.train, min(run.source.bit_depth, _MOST_BITS)
+    least, share, brightest = levels.full_scale[1] - levels.gain * (1 - SATURATED), 0.0, 0.0
+    with run.timed("read"):
+        training = new_stack((count, *run.source.shape[1:]), run.plan.runtime.scratch)
+        for place in training:
+            # In a loop over the stream, one frame would stay in memory while the next is made.
+            place[...] = next(stream)
+            share += float(np.mean(place >= least)) / count
+            brightest = max(brightest, float(place.max()))
+            drop_pages(training)
+    run.decide(explain_training(count, len(run.source), run.params.train), *explain_input(share))
+    return training, saturation_level(brightest, estimate_noise(training[0]), levels.gain / (2**bits - 1), least)
 
 
-def _read_training(
-    stream: Iterator[FloatArray], shape: tuple[int, ...], scratch: Path | None
-) -> tuple[FloatArray, float, float]:
-    """Read the training frames; also the share of their pixels that are saturated, and the greatest intensity."""
-    training, saturated, brightest = new_stack(shape, scratch), 0.0, 0.0
-    for place in training:
-        # In a loop over the stream, one frame would stay in memory while the next is made.
-        place[...] = next(stream)
-        saturated += float(np.mean(place >= SATURATED)) / len(training)
-        brightest = max(brightest, float(place.max()))
-        drop_pages(training)
-    return training, saturated, brightest
+def centroid_stage(run: Run, training: FloatArray) -> Centroid:
+    """Find the centroid of the training frames, in the geometry that was asked for.
 
-
-def _find_centroid(run: Run, training: FloatArray) -> Centroid:
+    ``training`` (K, H, W) or (K, H, W, 3).
+    """
     params, runtime = run.params, run.plan.runtime
     if params.like is not None:
         return centroid_of_known_flows(training, run.source, params.like, runtime)
-    found = _own_centroid(run, training)
+    steps = len(training) * params.centroid.iterations
+    if not run.tiles:
+        stage = centroid_steps(training, params.centroid, params.flow, runtime)
+        found = finish(stage, run.counter("centroid", steps))
+    else:
+        parts = _centroids_here(run, training, steps) if run.map_tiles is None else _centroids_elsewhere(run)
+        found = join_centroids(parts, run.tiles, training.shape, runtime.scratch)
     if params.reference is None:
         return found
     placed, on_reference = onto_reference(found, training, params.reference, runtime)
@@ -203,159 +174,105 @@ def _find_centroid(run: Run, training: FloatArray) -> Centroid:
     return placed
 
 
-def _own_centroid(run: Run, training: FloatArray) -> Centroid:
-    params, runtime, train = run.params, run.plan.runtime, len(training)
-    if run.tiles:
-        parts = _centroids_here(run, training) if run.map_tiles is None else _centroids_elsewhere(run, train)
-        return join_centroids(parts, run.tiles, training.shape, runtime.scratch)
-    steps = centroid_steps(training, params.centroid, params.flow, runtime)
-    return finish(steps, run.counter("centroid", train * params.centroid.iterations))
-
-
-def _centroids_here(run: Run, training: FloatArray) -> Iterator[Centroid]:
-    params, runtime = run.params, run.plan.runtime
-    count = run.counter("centroid", len(run.tiles) * len(training) * params.centroid.iterations)
+def _centroids_here(run: Run, training: FloatArray, steps: int) -> Iterator[Centroid]:
+    params, runtime, count = run.params, run.plan.runtime, run.counter("centroid", len(run.tiles) * steps)
     for tile in run.tiles:
-        yield finish(
-            centroid_steps(cut_tile(training, tile, runtime.scratch), params.centroid, params.flow, runtime), count
-        )
+        frames = cut_tile(training, tile, runtime.scratch)
+        yield finish(centroid_steps(frames, params.centroid, params.flow, runtime), count)
 
 
-def _centroids_elsewhere(run: Run, train: int) -> Iterator[Centroid]:
-    params, count = run.params, run.counter("centroid", len(run.tiles))
+def _centroids_elsewhere(run: Run) -> Iterator[Centroid]:
     assert run.map_tiles is not None
-    tasks = centroid_tasks(run.source, run.tiles, train, params.centroid, params.flow, run.plan.runtime)
-    for part in run.map_tiles(run_centroid_task, tasks):
+    count, settings = run.counter("centroid", len(run.tiles)), (run.plan.train, run.params, run.plan.runtime)
+    tasks = (CentroidTask(run.source.select(roi=tile.roi), *settings) for tile in run.tiles)
+    for part in run.map_tiles(_run_centroid_task, tasks):
         count(part)
         yield part
 
 
-def _compare_structure(
-    image: FloatArray, training: FloatArray, centroid: Centroid, mean_flow: FloatArray
-) -> StructureReading:
-    """Compare a recentred image with the training frames, in the geometry of the centroid."""
-    image = luminance(image)
-    if mean_flow.any():
-        image = warp(image, invert_flow(recentring_flow(mean_flow)))
-    return compare_structure(image, training, centroid.flows)
+def _run_centroid_task(task: CentroidTask) -> Centroid:
+    """Find the centroid of a tile whose frames are read here."""
+    runtime = _here(task.runtime)
+    frames = fill_stack((task.train, *task.source.shape[1:]), iter(task.source), runtime.scratch)
+    found = finish(centroid_steps(frames, task.params.centroid, task.params.flow, runtime))
+    return replace(found, image=np.array(found.image), flows=np.array(found.flows))
 
 
-def _halves(run: Run, training: FloatArray, centroid: Centroid, mean_flow: FloatArray) -> Halves | None:
-    """Average two halves of the training frames, in the geometry of the filtered image."""
-    # No guard overrides a width that was asked for.
-    if len(training) < FEWEST or not run.params.finds_blur:
-        return None
-    found = registered_halves(training, centroid.flows, training.shape[1:], len(training), run.plan.runtime.threads)
-    halves = (run.levels.original(recentre(half, mean_flow)) for half in (found.first, found.second))
-    return Halves(*halves)
-
-
-def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:
-    """Measure the strength of the turbulence, unless there are too few frames."""
-    if len(training) < LEAST_FRAMES:
-        return None
-    begun, picture = time.perf_counter(), run.prepared.picture
-    seeing = seeing_of_picture(picture, training, centroid, run.params.optics, run.plan.runtime.threads)
-    run.seconds["seeing"] = time.perf_counter() - begun
-    run.decide(*explain_seeing(seeing))
-    return seeing
-
-
-def _find_witnesses(run: Run, training: FloatArray, centroid: Centroid, seeing: Seeing | None) -> BlurWitnesses | None:
-    """Measure what the frames say about their blur, if it is to be estimated."""
-    if not run.params.finds_blur:
-        return None
-    begun, known = time.perf_counter(), None if seeing is None else seeing.displacement_variance
-    rows, columns = picture = run.prepared.picture
-    seen, flows = training[:, rows, columns], centroid.flows[:, rows, columns]
-    if seeing is not None and known is not None:
-        displacement, frames = known.value, seeing.independent_frames
-    else:
-        # Without a displacement that can be measured, that of the flow stands for it, less what the camera adds.
-        about = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
-        displacement, frames = float(np.mean(about)), float(len(training))
-    witnesses = measure_witnesses(seen, flows, _of_optics(BlurWitnesses(displacement, frames, picture), run, seeing))
-    run.seconds["witnesses"] = time.perf_counter() - begun
-    return witnesses
-
-
-def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWitnesses:
-    """Add what is known of the optics, and of D/r0 by them."""
-    optics = run.params.optics
-    if optics is None:
-        return known
-    strength, diffraction = None if seeing is None else seeing.d_over_r0, optics.diffraction
-    if optics.distance is None or strength is None or not np.isfinite(strength.high):
-        return replace(known, diffraction=diffraction)
-    made = float(displacement_variance(np.array(strength.value), np.array(diffraction)))
-    # V grows as the power 5/3 of D/r0, and a 95 % interval has four standard deviations.
-    spread = max(5 / 3 * np.log(strength.high / strength.low) / 4, _LEAST_SPREAD)
-    return replace(known, displacement=made, diffraction=diffraction, spread=float(spread))
-
-
-def _find_saturation(run: Run, frame: FloatArray, brightest: float) -> float:
-    """Return the intensity, at the levels of the clip, from which the mean is saturated."""
-    largest = float(run.levels.original(np.array([brightest], np.float32))[0])
-    noise, bits = estimate_noise(frame) / run.levels.gain, min(run.source.bit_depth, _MOST_BITS)
-    return saturation_level(largest, noise, 1 / (2**bits - 1))
-
-
-def _placed(run: Run, filtered: Filtered) -> Filtered:
-    """Move a filtered image onto the mean geometry of its frames, unless its geometry is that of another clip."""
-    if run.params.reference is None and run.params.like is None:
-        return filtered.recentred()
-    return replace(filtered, mean_flow=np.zeros_like(filtered.mean_flow))
-
-
-def _filter(
+def filter_stage(
     run: Run, centroid: Centroid, dynamics: FlowDynamics, training: FloatArray, rest: Iterator[FloatArray]
 ) -> Filtered:
+    """Filter the training frames and those after them, and move the image to its place.
+
+    It is that of the mean geometry of the frames, unless the geometry is that of another clip.
+    ``training`` (K, H, W) or (K, H, W, 3).
+    """
     params, source = run.params, run.source
     counted = np.ones(len(source), bool)
     if params.keep_best < 1:
         counted = best_frames(frame_quality(source), params.keep_best)
     if run.tiles:
-        parts = (_tiles_here if run.map_tiles is None else _tiles_elsewhere)(run, centroid, training, counted)
-        return join_filtered(parts, run.tiles, source.shape[1:], run.plan.runtime.scratch)
-    frames, start = only_counted(chain(iter_frames(training), rest), counted), run.store.filter_start()
-    runtime, flows = run.plan.runtime, centroid.flows
-    steps = filter_steps(frames, centroid.image, dynamics, params.filter, params.flow, flows, runtime, start)
-    return finish(steps, partial(_observe_filter, run, 0))
+        parts = _filtered_tiles(run, centroid, training, counted)
+        filtered = join_filtered(parts, run.tiles, source.shape[1:], run.plan.runtime.scratch)
+    else:
+        frames = _only_counted(chain(iter_frames(training), rest), counted)
+        start = None if run.store is None else run.store.filter_start()
+        settings = params.filter, params.flow, centroid.flows, run.plan.runtime
+        steps = filter_steps(frames, centroid.image, dynamics, *settings, start)
+        filtered = finish(steps, partial(_observe_filter, run, 0))
+    if params.reference is None and params.like is None:
+        return filtered.recentred()
+    return replace(filtered, mean_flow=np.zeros_like(filtered.mean_flow))
 
 
-def _tiles_here(run: Run, centroid: Centroid, training: FloatArray, counted: np.ndarray) -> Iterator[Filtered]:
-    for number in range(len(run.tiles)):
-        yield run.store.get(_tile_name(number), partial(_filter_tile, run, centroid, training, counted, number))
-
-
-def _tiles_elsewhere(run: Run, centroid: Centroid, training: FloatArray, counted: np.ndarray) -> Iterator[Filtered]:
-    """Filter those tiles in other processes that the store does not have."""
-    params, total = run.params, len(run.tiles)
-    assert run.map_tiles is not None
-    missing = [tile for number, tile in enumerate(run.tiles) if f"{_tile_name(number)}.npz" not in run.store.stored]
-    settings = params.dynamics, params.filter, params.flow, run.plan.runtime
-    tasks = filter_tasks(run.source, missing, centroid, counted, *settings)
-    results = iter(run.map_tiles(run_filter_task, tasks))
-    for number in range(total):
-        part = run.store.get(_tile_name(number), lambda: next(results))
+def _filtered_tiles(run: Run, centroid: Centroid, training: FloatArray, counted: np.ndarray) -> Iterator[Filtered]:
+    """Filter those tiles that the store does not have."""
+    names = [f"filtered_tile_{number}" for number in range(len(run.tiles))]
+    if run.map_tiles is None:
+        for number, name in enumerate(names):
+            yield run.kept(name, partial(_filter_tile, run, centroid, training, counted, number))
+        return
+    stored = () if run.store is None else run.store.stored
+    missing = [tile for name, tile in zip(names, run.tiles, strict=True) if f"{name}.npz" not in stored]
+    tasks = (_filter_task(run, tile, centroid, counted) for tile in missing)
+    results = iter(run.map_tiles(_run_filter_task, tasks))
+    for number, name in enumerate(names):
+        part = run.kept(name, lambda: next(results))
         if run.progress is not None:
-            run.progress("filter", number + 1, total)
+            run.progress("filter", number + 1, len(names))
         yield part
 
 
-def _tile_name(number: int) -> str:
-    return f"filtered_tile_{number}"
+def _filter_task(
+    run: Run, tile: HaloTile, centroid: Centroid, counted: np.ndarray, folder: Path | None = None
+) -> FilterTask:
+    image, flows = centroid.image[tile.rows, tile.columns].copy(), cut_tile(centroid.flows, tile, folder)
+    return FilterTask(run.source.select(roi=tile.roi), image, flows, counted, run.params, run.plan.runtime)
 
 
 def _filter_tile(run: Run, centroid: Centroid, training: FloatArray, counted: np.ndarray, number: int) -> Filtered:
-    """Filter a tile in this process."""
-    tile, params, runtime = run.tiles[number], run.params, run.plan.runtime
-    frames, flows = (cut_tile(stack, tile, runtime.scratch) for stack in (training, centroid.flows))
-    image, source = centroid.image[tile.rows, tile.columns].copy(), run.source.select(roi=tile.roi)
-    settings = params.dynamics, params.filter, params.flow, runtime
-    return finish(
-        tile_filter_steps(source, frames, image, flows, counted, *settings), partial(_observe_filter, run, number)
+    """Filter a tile in this process, whose training frames need not be read again."""
+    tile, folder = run.tiles[number], run.plan.runtime.scratch
+    frames = cut_tile(training, tile, folder)
+    return _filter_part(
+        _filter_task(run, tile, centroid, counted, folder), frames, partial(_observe_filter, run, number)
     )
+
+
+def _run_filter_task(task: FilterTask) -> Filtered:
+    """Filter a tile whose frames are read here."""
+    runtime = _here(task.runtime)
+    frames = fill_stack((len(task.flows), *task.source.shape[1:]), iter(task.source), runtime.scratch)
+    return _filter_part(replace(task, runtime=runtime), frames)
+
+
+def _filter_part(task: FilterTask, frames: FloatArray, observe: Callable[[FilterStep], None] | None = None) -> Filtered:
+    """Identify the motion of a tile and filter it; ``frames`` (K, h, w) or (K, h, w, 3) are its training frames."""
+    dynamics = identify(task.flows, task.params.dynamics, task.runtime)
+    source, trained = task.source, len(frames)
+    rest = iter(source.select(frames=(trained, None))) if trained < len(source) else ()
+    every = _only_counted(chain(iter_frames(frames), rest), task.counted)
+    settings = task.params.filter, task.params.flow, task.flows, task.runtime
+    return finish(filter_steps(every, task.image, dynamics, *settings), observe)
 
 
 def _observe_filter(run: Run, tile: int, step: FilterStep) -> None:
@@ -363,24 +280,87 @@ def _observe_filter(run: Run, tile: int, step: FilterStep) -> None:
     flows = len(run.source) * run.params.filter.inner_iterations - run.plan.train
     if run.progress is not None:
         run.progress("filter", tile * flows + step.flows_measured, max(len(run.tiles), 1) * flows)
-    if step.checkpoint is not None and not run.tiles:
+    if run.store is not None and step.checkpoint is not None and not run.tiles:
         run.store.checkpoint(step.checkpoint)
+
+
+def _only_counted(frames: Iterable[FloatArray], counted: NDArray[np.bool_]) -> Iterator[FloatArray | None]:
+    """Replace frames that do not count by None."""
+    return (frame if counts else None for frame, counts in zip(frames, counted, strict=True))
+
+
+def join_centroids(
+    parts: Iterable[Centroid], tiles: Sequence[HaloTile], shape: tuple[int, ...], scratch: Path | None = None
+) -> Centroid:
+    """Blend the centroids of all tiles and the flows from them."""
+    image, flows = new_mosaic(shape[1:], scratch), new_mosaic((*shape[:3], 2), scratch)
+    sizes, converged, remaining = list[NDArray[np.float64]](), True, iter(parts)
+    for tile in tiles:
+        part = next(remaining)
+        add_tile(image, tile, part.image)
+        for whole, flow in zip(flows, iter_frames(part.flows), strict=True):
+            add_tile(whole, tile, flow)
+        sizes.append(part.mean_flow_sizes)
+        converged &= part.converged
+        # The flows of a tile must be gone before those of the next are measured.
+        del part, flow
+    longest = max(map(len, sizes))
+    lasting = [np.pad(found, (0, longest - len(found)), mode="edge") for found in sizes]
+    return Centroid(image, flows, np.average(lasting, axis=0, weights=_areas(tiles)), converged)
+
+
+def join_filtered(
+    parts: Iterable[Filtered], tiles: Sequence[HaloTile], shape: tuple[int, ...], scratch: Path | None = None
+) -> Filtered:
+    """Blend the filtered images of all tiles, and join their records."""
+    image, variance = new_mosaic(shape, scratch), new_mosaic(shape[:2], scratch)
+    mean_flow = new_mosaic((*shape[:2], 2), scratch)
+    records: dict[str, list[np.ndarray]] = {}
+    for tile, part in zip(tiles, parts, strict=True):
+        add_tile(image, tile, part.image)
+        add_tile(variance, tile, part.variance)
+        add_tile(mean_flow, tile, part.mean_flow)
+        for name in _RECORDED:
+            records.setdefault(name, []).append(np.asarray(getattr(part, name)))
+    areas = _areas(tiles)
+
+    def average(name: str) -> np.ndarray:
+        return np.average(records[name], axis=0, weights=areas)
+
+    return Filtered(
+        image=image,
+        variance=variance,
+        flow_states=np.concatenate(records["flow_states"], axis=1),
+        gains=average("gains"),
+        innovations=np.sqrt(np.average(np.square(records["innovations"]), axis=0, weights=areas)),
+        sharpness=average("sharpness"),
+        shares=average("shares"),
+        image_noise=float(average("image_noise")),
+        sharpness_weight=float(average("sharpness_weight")),
+        mean_flow=mean_flow,
+    )
+
+
+def _here(runtime: Runtime) -> Runtime:
+    """Use the folder of temporary files of this process."""
+    return runtime if runtime.scratch is None else replace(runtime, scratch=Path(tempfile.gettempdir()))
+
+
+def _areas(tiles: Sequence[HaloTile]) -> NDArray[np.float64]:
+    """Weight of each tile, in pixels."""
+    return np.array([tile.row_weights.sum(dtype=np.float64) * tile.column_weights.sum() for tile in tiles])
 
 
 def temporal_mean(source: FrameSource) -> FloatArray:
     """Mean of the frames, read one after the other."""
     total = np.zeros(source.shape[1:])
-    return _mean(_added_up(source, total), total, len(source))
+    for frame in source:
+        total += frame
+    return (total / len(source)).astype(np.float32)
 
 
-def _added_up(frames: Iterable[FloatArray], total: NDArray[np.float64]) -> Iterator[FloatArray]:
+def added_up(frames: Iterable[FloatArray], total: NDArray[np.float64]) -> Iterator[FloatArray]:
     """Pass frames on, and add them to ``total``, (H, W) or (H, W, 3)."""
     for frame in frames:
         total += frame
         yield frame
-
-
-def _mean(unread: Iterator[FloatArray], total: NDArray[np.float64], count: int) -> FloatArray:
-    """Mean of frames that have been added up but for those that nobody has read yet."""
-    deque(unread, 0)
-    return (total / count).astype(np.float32)

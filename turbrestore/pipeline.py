@@ -3,51 +3,67 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 
-import cv2
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from .agreement.last_guard import Halves, keep_agreed
+from .agreement.last_guard import FEWEST, Halves, keep_agreed, registered_halves
 from .blind.remove_blur import SIGMAS_A_SIDE, Deblurred, remove_blur_steps
+from .blind.structure import compare_structure
 from .blur.measured_psf import psf_from_image
+from .blur.posterior import BlurWitnesses, measure_witnesses
+from .blur.witnesses.short_exposure import displacement_variance
 from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
 from .core.errors import require
 from .core.noise import NoiseCurve, photon_noise
 from .deconvolution.problem import read_blur
-from .footage.bars import Bars
+from .dynamics.dynamic_texture import identify
 from .footage.checks.content import without_blank
 from .footage.levels import Levels
-from .footage.overlays import Title
-from .fusion import Fused, Run, fuse
+from .fusion import Run, TileMap, added_up, centroid_stage, filter_stage, read_training
 from .io.images import read_image
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import plan_memory
-from .preparation import prepare
+from .preparation import as_recorded, prepare
+from .registration.centroid import Centroid
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
-from .registration.recentring import recentre
-from .results import NoStore, Restoration, Store
+from .registration.flow_algebra import invert_flow
+from .registration.recentring import recentre, recentring_flow
+from .registration.warp import warp
+from .results import Restoration, Store
 from .runtime.allocator import returning_freed_memory
 from .runtime.device import explain_device
 from .runtime.runtime import DEFAULT, Runtime
+from .runtime.scratch import iter_frames, mean_of
 from .runtime.steps import Progress, finish
-from .runtime.tiling import halo_tiles
+from .seeing.displacement import LEAST_FRAMES
+from .seeing.strength import Seeing, seeing_of_picture
 from .settings import RestoreParams
 from .stacking.fine_grid import fine_image, fine_shape
 from .stacking.placement import settings_of_known_flows
-from .tiled_stages import TileMap
 from .uncertainty.pixel_deviation import measure_deviation
-from .wording import explain_border
+from .wording import (
+    explain_border,
+    explain_dynamics,
+    explain_filter,
+    explain_registration,
+    explain_seeing,
+    explain_structure,
+)
 
 # Every pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
 # Least noise of dark parts relative to bright ones that is told in words.
 _LEAST_SHARE = 0.01
+# Least standard deviation of ln V by a measured D/r0: theory and simulated clips agree no better.
+_LEAST_SPREAD = 0.2
 
 
 def restore(
@@ -81,7 +97,7 @@ def restore(
         Called with every :class:`turbrestore.Decision` when it is made.
     map_tiles : callable, optional
         Works on tiles elsewhere, where ``runtime.tile`` or a memory limit asks for tiles; see
-        :data:`turbrestore.tiled_stages.TileMap`.  By default they are worked on here, with the same result.
+        :data:`turbrestore.fusion.TileMap`.  By default they are worked on here, with the same result.
 
     Returns
     -------
@@ -122,106 +138,207 @@ def restore(
     _check_training(params, plan.train, len(source))
     if plan.runtime.scratch is not None:
         check_space(plan.runtime.scratch, plan.scratch_bytes)
-    size = source.shape[1], source.shape[2]
-    tiles = () if plan.tile is None else halo_tiles(size, plan.tile)
     prepared = prepare(source, params.static_mask, plan.runtime.scratch)
-    stretched, bars = _stretched_params(params, prepared.levels), prepared.bars
-    run = Run(prepared, stretched, plan, tiles, store or NoStore(), progress, on_decision, map_tiles, psf)
+    if store is not None:
+        store.begin(prepared.levels)
+    stretched = _stretched_params(params, prepared.levels)
+    run = Run(prepared, stretched, plan, store, progress, on_decision, map_tiles)
     run.seconds["read"] = time.perf_counter() - begun
     run.decide(*on_blank, *plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
     run.decide(*prepared.decisions)
     with returning_freed_memory(runtime.memory_limit is not None):
-        restoration = _restored(run)
+        restoration = _deblurred(run, *_fused(run), psf)
     if params.scale > 1:
         restoration = _refined(run, restoration)
-    for kept in (prepared.title, bars):
-        restoration = restoration if kept is None else _put_back(restoration, kept)
-    return restoration
+    return as_recorded(restoration, prepared)
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What the frames say about the image that is fused from them."""
+
+    saturation: float  # intensity from which the mean is saturated
+    is_mean: bool = False  # whether the mean is the image, because the filtered one has structure that they lack
+    witnesses: BlurWitnesses | None = None  # none if no blur is to be estimated
+    halves: Halves | None = None  # none for few frames too
+
+
+def _fused(run: Run) -> tuple[Restoration, _Evidence]:
+    """Fuse the frames into one image; the training frames are freed when this function returns."""
+    params, source, runtime = run.params, run.source, run.plan.runtime
+    total = np.zeros(source.shape[1:])
+    # Tiles read their parts of the frames themselves.
+    stream = iter(source) if run.tiles else added_up(source, total)
+    training, saturation = read_training(run, stream)
+
+    centroid = run.stage("centroid", "centroid", partial(centroid_stage, run, training))
+    run.decide(*explain_registration(centroid))
+    seeing = _measure_seeing(run, training, centroid)
+
+    dynamics, filtered = None, None
+    if params.runs("identify"):
+        dynamics = run.stage("identify", "dynamics", partial(identify, centroid.flows, params.dynamics, runtime))
+        run.decide(*explain_dynamics(dynamics, params.filter.residual == "drop"))
+
+    if dynamics is not None and params.runs("filter"):
+        filtering = partial(filter_stage, run, centroid, dynamics, training, stream)
+        filtered = run.stage("filter", "filtered", filtering)
+        unread = added_up(source, total) if run.tiles else stream
+        mean = run.stage("filter", "mean", lambda: _mean(unread, total, len(source)))
+        # The sharpness is NaN for frames that do not count.
+        chosen = int(np.isfinite(filtered.sharpness).sum())
+        run.decide(*explain_filter(filtered, dynamics, None if params.keep_best == 1 else chosen))
+    else:
+        mean = mean_of(training)
+
+    fused = Restoration(
+        image=centroid.image if filtered is None else filtered.image,
+        crop=(0, 0, source.shape[2], source.shape[1]),
+        mean=mean,
+        centroid=centroid,
+        dynamics=dynamics,
+        filtered=filtered,
+        train=len(training),
+        frame_count=len(training) if filtered is None else len(source),
+        seconds=run.seconds,
+        seeing=seeing,
+    )
+    if filtered is None:
+        return fused, _Evidence(saturation)
+    return _compared(run, fused, training, filtered.mean_flow, saturation)
+
+
+def _compared(
+    run: Run, fused: Restoration, training: FloatArray, mean_flow: FloatArray, saturation: float
+) -> tuple[Restoration, _Evidence]:
+    """Let the frames say whether they have the structure of the filtered image, and how blurred it is."""
+    image, flows = luminance(fused.image), fused.centroid.flows
+    if mean_flow.any():
+        # Into the geometry of the centroid.
+        image = warp(image, invert_flow(recentring_flow(mean_flow)))
+    structure = compare_structure(image, training, flows)
+    run.decide(*explain_structure(structure))
+    if not structure.passed:
+        return replace(fused, image=fused.mean), _Evidence(saturation, is_mean=True)
+    # No guard overrides a width that was asked for.
+    if not run.params.finds_blur:
+        return fused, _Evidence(saturation)
+    witnesses, halves = _find_witnesses(run, training, fused), None
+    if len(training) >= FEWEST:
+        found = registered_halves(training, flows, training.shape[1:], len(training), run.plan.runtime.threads)
+        halves = Halves(recentre(found.first, mean_flow), recentre(found.second, mean_flow))
+    return fused, _Evidence(saturation, False, witnesses, halves)
+
+
+def _deblurred(run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[np.float64] | None) -> Restoration:
+    """Deblur the fused image, let the frames guard what they agree on, and crop it."""
+    params, image, halves = run.params, fused.image, evidence.halves
+    deblurred, agreed = None, None
+    if params.runs("deconvolve") and not evidence.is_mean:
+        photons = None if halves is None else _photon_noise(run, halves)
+        deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused, evidence, psf, photons))
+        run.decide(*deblurred.decisions)
+        image = deblurred.deconvolution.image
+        if halves is not None:
+            agreed = keep_agreed(image, halves, run.prepared.levels.full_scale)
+            run.decide(*agreed.decisions)
+            image = agreed.image
+    seen = coverage(fused.centroid.flows)
+    crop, on_border = _crop(image, seen, params.border, deblurred)
+    run.decide(on_border)
+    deviation = _measure_uncertainty(run, image, fused, evidence, seen, deblurred)
+    x, y, width, height = crop
+    part = np.s_[y : y + height, x : x + width]
+    restoration = replace(
+        fused,
+        image=image if params.border == "keep" else image[part],
+        crop=crop,
+        decisions=tuple(run.decisions),
+        uncertainty=None if deviation is None else deviation[part],
+        disagreement=None if agreed is None else agreed.share[part],
+    )
+    if deblurred is None:
+        return restoration
+    return replace(
+        restoration,
+        blur=deblurred.blur,
+        posterior=deblurred.posterior,
+        deconvolution=deblurred.deconvolution,
+        guard_readings=deblurred.readings,
+    )
 
 
 def _refined(run: Run, restoration: Restoration) -> Restoration:
     """Add the image on the finer grid."""
-    begun = time.perf_counter()
-    found = fine_image(run.prepared, restoration, run.params, run.plan.runtime)
-    run.decide(*found.decisions)
-    x, y, width, height = restoration.crop
-    upper, left = fine_shape((y, x), run.params.scale)
-    lower, right = fine_shape((y + height, x + width), run.params.scale)
-    run.seconds["scale"] = time.perf_counter() - begun
-    return replace(restoration, finer=found.image[upper:lower, left:right], decisions=tuple(run.decisions))
+    with run.timed("scale"):
+        finer, on_scale = fine_image(run.prepared, restoration, run.params, run.plan.runtime)
+        run.decide(on_scale)
+        x, y, width, height = restoration.crop
+        upper, left = fine_shape((y, x), run.params.scale)
+        lower, right = fine_shape((y + height, x + width), run.params.scale)
+    return replace(restoration, finer=finer[upper:lower, left:right], decisions=tuple(run.decisions))
 
 
-def _put_back(restoration: Restoration, kept: Bars | Title) -> Restoration:
-    """Give the images of a restoration what is no scene."""
-    image, uncertainty = kept.put_back(restoration.image, *restoration.crop[:2]), restoration.uncertainty
-    finer = restoration.finer
-    if finer is not None:
-        changed, usual = (image != restoration.image).astype(np.float32), image
-        size = finer.shape[1::-1]
-        hidden, usual = (cv2.resize(one, size, interpolation=cv2.INTER_LINEAR) for one in (changed, usual))
-        finer = np.where(hidden > 0.5, usual, finer)
-    if uncertainty is not None:
-        # What lies under it was not seen.
-        hidden = kept.put_back(np.full_like(restoration.image, -1), *restoration.crop[:2]) >= 0
-        uncertainty = np.where(hidden if hidden.ndim == 2 else hidden[..., 0], np.float32(np.inf), uncertainty)
-    return replace(restoration, image=image, mean=kept.put_back(restoration.mean), uncertainty=uncertainty, finer=finer)
+def _mean(unread: Iterator[FloatArray], total: NDArray[np.float64], count: int) -> FloatArray:
+    """Mean of frames that have been added up but for those that nobody has read yet."""
+    deque(unread, 0)
+    return (total / count).astype(np.float32)
 
 
-def _restored(run: Run) -> Restoration:
-    """Fuse the frames, deblur the image and crop it."""
-    params = run.params
-    fused = fuse(run)
-    image, centroid, deblurred = fused.image, fused.centroid, None
-    if params.runs("deconvolve") and not fused.is_mean:
-        photons = None if fused.halves is None else _photon_noise(run, fused.halves)
-        deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused, photons))
-        run.decide(*deblurred.decisions)
-        image = deblurred.deconvolution.image
-    agreed = None if deblurred is None or fused.halves is None else keep_agreed(image, fused.halves)
-    if agreed is not None:
-        run.decide(*agreed.decisions)
-        image = agreed.image
-    seen = coverage(centroid.flows)
-    crop, on_border = _crop(image, seen, params.border, deblurred)
-    run.decide(on_border)
-    x, y, width, height = crop
-    uncertainty = _measure_uncertainty(run, image, fused, seen, deblurred)
-    return Restoration(
-        image=image if params.border == "keep" else image[y : y + height, x : x + width],
-        crop=crop,
-        mean=fused.mean,
-        centroid=centroid,
-        dynamics=fused.dynamics,
-        filtered=fused.filtered,
-        blur=None if deblurred is None else deblurred.blur,
-        posterior=None if deblurred is None else deblurred.posterior,
-        deconvolution=None if deblurred is None else deblurred.deconvolution,
-        guard_readings=() if deblurred is None else deblurred.readings,
-        decisions=tuple(run.decisions),
-        train=run.plan.train,
-        frame_count=len(run.source) if params.runs("filter") else run.plan.train,
-        seconds=run.seconds,
-        seeing=fused.seeing,
-        uncertainty=None if uncertainty is None else uncertainty[y : y + height, x : x + width],
-        disagreement=None if agreed is None else agreed.share[y : y + height, x : x + width],
-    )
+def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:
+    """Measure the strength of the turbulence, unless there are too few frames."""
+    if len(training) < LEAST_FRAMES:
+        return None
+    with run.timed("seeing"):
+        picture, threads = run.prepared.picture, run.plan.runtime.threads
+        seeing = seeing_of_picture(picture, training, centroid, run.params.optics, threads)
+    run.decide(*explain_seeing(seeing))
+    return seeing
 
 
-def _deblur(run: Run, fused: Fused, photons: NoiseCurve | None) -> Deblurred:
-    params, plan, levels = run.params, run.plan, run.levels
-    image, guide = levels.stretched(fused.image), levels.stretched(fused.centroid.image)
+def _find_witnesses(run: Run, training: FloatArray, fused: Restoration) -> BlurWitnesses:
+    """Measure what the frames say about their blur."""
+    seeing, known = fused.seeing, None if fused.seeing is None else fused.seeing.displacement_variance
+    rows, columns = picture = run.prepared.picture
+    with run.timed("witnesses"):
+        seen, flows = training[:, rows, columns], fused.centroid.flows[:, rows, columns]
+        if seeing is not None and known is not None:
+            displacement, frames = known.value, seeing.independent_frames
+        else:
+            # Without a displacement that can be measured, that of the flow stands for it, less what the camera adds.
+            about = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
+            displacement, frames = float(np.mean(about)), float(len(training))
+        return measure_witnesses(seen, flows, _of_optics(BlurWitnesses(displacement, frames, picture), run, seeing))
+
+
+def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWitnesses:
+    """Add what is known of the optics, and of D/r0 by them."""
+    optics = run.params.optics
+    if optics is None:
+        return known
+    strength, diffraction = None if seeing is None else seeing.d_over_r0, optics.diffraction
+    if optics.distance is None or strength is None or not np.isfinite(strength.high):
+        return replace(known, diffraction=diffraction)
+    made = float(displacement_variance(np.array(strength.value), np.array(diffraction)))
+    # V grows as the power 5/3 of D/r0, and a 95 % interval has four standard deviations.
+    spread = max(5 / 3 * np.log(strength.high / strength.low) / 4, _LEAST_SPREAD)
+    return replace(known, displacement=made, diffraction=diffraction, spread=float(spread))
+
+
+def _deblur(
+    run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[np.float64] | None, photons: NoiseCurve | None
+) -> Deblurred:
+    params, plan, guide = run.params, run.plan, fused.centroid.image
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
-    steps = remove_blur_steps(image, guide, *settings, fused.witnesses, run.psf, photons)
-    deblurred = finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
-    deconvolution, blur = levels.original(deblurred.deconvolution), levels.original(deblurred.blur)
-    return replace(deblurred, deconvolution=deconvolution, blur=blur)
+    steps = remove_blur_steps(fused.image, guide, *settings, evidence.witnesses, psf, photons)
+    return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 
 
 def _photon_noise(run: Run, halves: Halves) -> NoiseCurve | None:
-    """Measure how the noise of the image depends on its level, at the levels of the stages."""
-    curve = photon_noise(*(run.levels.stretched(luminance(half)) for half in (halves.first, halves.second)))
+    """Measure how the noise of the image depends on its level."""
+    curve = photon_noise(luminance(halves.first), luminance(halves.second))
     if curve is not None:
         times = float(curve.variances[-1] / max(curve.variances[0], _LEAST_SHARE * curve.variances[-1]))
         reason = f"its variance is {times:.0f} times as large where the scene is bright, as that of photons"
@@ -230,23 +347,20 @@ def _photon_noise(run: Run, halves: Halves) -> NoiseCurve | None:
 
 
 def _measure_uncertainty(
-    run: Run, image: FloatArray, fused: Fused, seen: FloatArray, deblurred: Deblurred | None
+    run: Run, image: FloatArray, fused: Restoration, evidence: _Evidence, seen: FloatArray, deblurred: Deblurred | None
 ) -> FloatArray | None:
     """Measure the standard deviation of every pixel of a filtered image."""
     filtered, dynamics = fused.filtered, fused.dynamics
     if filtered is None or dynamics is None:
         return None
-    if fused.is_mean:
+    if evidence.is_mean:
         return np.full(image.shape[:2], np.inf, np.float32)
-    begun = time.perf_counter()
-    # A pixel is known if a frame has shown it and no channel is saturated in every frame.
-    known = (seen > 0) & (np.atleast_3d(fused.mean).max(axis=-1) < fused.saturation)
-    if run.prepared.hidden is not None:
-        known &= ~run.prepared.hidden
-    stretched, params = run.levels.stretched(filtered.image), run.params.deconvolution
-    deviation = measure_deviation(image, filtered, stretched, dynamics, known, params, deblurred)
-    run.seconds["uncertainty"] = time.perf_counter() - begun
-    return deviation
+    with run.timed("uncertainty"):
+        # A pixel is known if a frame has shown it and no channel is saturated in every frame.
+        known = (seen > 0) & (np.atleast_3d(fused.mean).max(axis=-1) < evidence.saturation)
+        if run.prepared.hidden is not None:
+            known &= ~run.prepared.hidden
+        return measure_deviation(image, filtered, dynamics, known, run.params.deconvolution, deblurred)
 
 
 def _crop(image: FloatArray, seen: FloatArray, border: str, deblurred: Deblurred | None) -> tuple[Rectangle, Decision]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
@@ -19,6 +19,7 @@ from .display.plots import plot_images
 from .display.preview import preview
 from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import FilterCheckpoint, Filtered
+from .footage.levels import Levels
 from .metrics import sharpness
 from .registration.centroid import Centroid
 from .registration.coverage import Rectangle
@@ -43,7 +44,7 @@ _DOUBTS = ("motion", "saturation")
 class Store(Protocol):
     """Where a restoration keeps the results of its stages, and finds those of an earlier run.
 
-    :class:`turbrestore.runs.run_folder.RunFolder` keeps them on disk; :class:`NoStore` keeps nothing.
+    :class:`turbrestore.runs.run_folder.RunFolder` keeps them on disk.
     """
 
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
@@ -53,27 +54,14 @@ class Store(Protocol):
     def stored(self) -> frozenset[str]:
         """Names of the files on disk that hold the results of stages."""
 
+    def begin(self, levels: Levels) -> None:
+        """Take the levels at which the stages are about to work, so that what is kept can be brought back."""
+
     def filter_start(self) -> FilterCheckpoint | None:
         """Return the state from which an interrupted filter continues."""
 
     def checkpoint(self, state: FilterCheckpoint) -> None:
         """Take the newest state of the filter."""
-
-
-class NoStore:
-    """A store that computes every result and keeps none."""
-
-    stored = frozenset[str]()
-
-    def get(self, name: str, compute: Callable[[], Result]) -> Result:
-        """Compute the result."""
-        return compute()
-
-    def filter_start(self) -> None:
-        """Return None: there is no earlier run."""
-
-    def checkpoint(self, state: FilterCheckpoint) -> None:
-        """Let the state go."""
 
 
 @dataclass(frozen=True)
@@ -150,15 +138,15 @@ class Restoration:
     crop: Rectangle
     mean: FloatArray
     centroid: Centroid
-    dynamics: FlowDynamics | None
-    filtered: Filtered | None
-    blur: BlurEstimate | None
-    deconvolution: Deconvolution | None
-    guard_readings: tuple[GuardReading, ...]
-    decisions: tuple[Decision, ...]
     train: int
     frame_count: int
     seconds: dict[str, float]
+    dynamics: FlowDynamics | None = None
+    filtered: Filtered | None = None
+    blur: BlurEstimate | None = None
+    deconvolution: Deconvolution | None = None
+    guard_readings: tuple[GuardReading, ...] = ()
+    decisions: tuple[Decision, ...] = ()
     seeing: Seeing | None = None
     uncertainty: FloatArray | None = None
     posterior: BlurPosterior | None = None
@@ -219,6 +207,23 @@ class Restoration:
             ("blur removed", f"{sigma:.2f} pixels" if sigma > 0 else "none"),
             ("time", f"{sum(self.seconds.values()):.1f} s"),
         ]
+
+
+def at_levels_of_clip(result: Result, levels: Levels) -> Result:
+    """Bring the result of a stage from the levels of the stages back to those of the clip."""
+    gain = levels.gain
+    if not levels.changed:
+        return result
+    if isinstance(result, Centroid):
+        return replace(result, image=levels.original(result.image))
+    if isinstance(result, Filtered):
+        image, noise = levels.original(result.image), result.image_noise / gain**2
+        return replace(result, image=image, variance=result.variance / np.float32(gain**2), image_noise=noise)
+    if isinstance(result, Deconvolution):
+        return replace(result, image=levels.original(result.image), noise=result.noise / gain)
+    if isinstance(result, BlurEstimate):
+        return replace(result, noise=result.noise / gain)
+    return result
 
 
 def _gained(restoration: Restoration, motion: float, gain: float) -> str:

@@ -23,6 +23,14 @@ def test_what_the_halves_agree_on_stays():
     assert guarded.decisions == ()
 
 
+def test_only_what_is_beyond_full_scale_is_clipped():
+    scene = SCENES["brick"](96, 96)
+    scene[40, 40] = 3
+    halves = Halves(scene, scene.copy())
+    assert keep_agreed(scene, halves).image.max() == 1
+    assert np.abs(keep_agreed(scene, halves, (-4.0, 5.0)).image - scene).max() < 1e-5
+
+
 def test_amplified_noise_in_flat_parts_gives_way_and_edges_stay():
     scene = np.full((96, 96), 0.4, np.float32)
     scene[:, 48:] = 0.8

@@ -15,6 +15,7 @@ import pytest
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError, OutputError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.footage.levels import Levels
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.settings import RestoreParams
@@ -36,6 +37,17 @@ from turbrestore_cli.options import Selection
 from turbrestore_cli.steady import Output
 
 QUICK = RestoreParams(centroid=CentroidParams(iterations=1), deconvolution=DeconvolutionParams(sigma=1.0, iterations=5))
+
+
+def test_stages_are_shown_at_the_levels_of_the_clip():
+    shown = []
+    memory = stage_memory.StageMemory(lambda name, image: shown.append((name, image)))
+    memory.begin(Levels(0.25, 2.0))
+    kept = memory.get("mean", lambda: np.full((2, 2), 0.5, np.float32))
+    assert shown[0][0] == "mean" and (shown[0][1] == 0.5).all() and (kept == 0.5).all()
+    memory.begin(Levels(0.3, 10.0))
+    memory.get("mean", lambda: None)
+    np.testing.assert_allclose(shown[1][1], 0.35)
 
 
 @pytest.fixture(scope="module")

@@ -70,7 +70,7 @@ def spy(monkeypatch):
     """Names of the stages that are computed from now on."""
     called = []
     for name in STAGES:
-        module = "turbrestore.pipeline" if name == "remove_blur_steps" else "turbrestore.fusion"
+        module = f"turbrestore.{'fusion' if name in ('centroid_steps', 'filter_steps') else 'pipeline'}"
         real = getattr(sys.modules[module], name)
 
         def counted(*arguments, real=real, name=name, **named):

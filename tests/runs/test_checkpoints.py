@@ -63,6 +63,9 @@ class Recorder:
             self.results[name] = compute()
         return self.results[name]
 
+    def begin(self, levels):
+        pass
+
     def filter_start(self):
         return self.start
 

@@ -52,7 +52,7 @@ from turbrestore.runs import run_files, run_folder
 from turbrestore.io import images
 from turbrestore_cli.__main__ import main
 where = sys.argv.pop(1)
-real = run_folder.save_artifact
+real = run_folder.save_stage
 def dying(path, *words, **named):
     if where == "after":
         real(path, *words, **named)
@@ -60,7 +60,7 @@ def dying(path, *words, **named):
 def half(path, *words, **named):
     path.with_name(".0123456789abcdef.part").write_bytes(b"half")
     os._exit(9)
-run_folder.save_artifact = half if where == "within" else dying
+run_folder.save_stage = half if where == "within" else dying
 if where == "record":
     run_files.atomic_write = half
 sys.exit(main(sys.argv[1:]))
@@ -87,14 +87,14 @@ def test_a_run_that_fails_before_it_has_anything_leaves_nothing(place, monkeypat
 
 
 def test_an_interruption_right_after_a_file_is_written(place, monkeypatch, capsys):
-    real = sys.modules["turbrestore.runs.run_folder"].save_artifact
+    real = sys.modules["turbrestore.runs.run_folder"].save_stage
 
     def interrupted(*words, **named):
         real(*words, **named)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("turbrestore.runs.run_folder.save_artifact", interrupted)
+        patch.setattr("turbrestore.runs.run_folder.save_stage", interrupted)
         assert main(WORDS) == 130
     assert "--resume continues from the start" in capsys.readouterr().err
     assert main([*WORDS, "--resume"]) == 0

@@ -18,7 +18,7 @@ from .conftest import WORDS, contents, interrupt, params_of, spy
 
 PLACES = {
     "centroid": ("turbrestore.fusion.centroid_steps", 1),
-    "flow model": ("turbrestore.fusion.identify", 1),
+    "flow model": ("turbrestore.pipeline.identify", 1),
     "first block": ("turbrestore.filtering.alternating.pass_over", 1),
     "third block": ("turbrestore.filtering.alternating.pass_over", 4),
     "deconvolution": ("turbrestore.pipeline.remove_blur_steps", 1),

@@ -214,6 +214,9 @@ def test_figures_that_no_stage_makes_are_refused_by_name(restoration, tmp_path, 
         '{"kind": "blur", "schema": 1.0, "fields": {"sigma": 1}}',
         '{"kind": ["blur"], "schema": 1, "fields": {"sigma": 1}}',
         '{"kind": "blur", "schema": 1, "fields": [1]}',
+        '{"kind": "blur", "schema": 1, "fields": {}, "levels": [0, 0]}',
+        '{"kind": "blur", "schema": 1, "fields": {}, "levels": [NaN, 2]}',
+        '{"kind": "blur", "schema": 1, "fields": {}, "levels": 2}',
     ],
 )
 def test_odd_headers_are_refused(tmp_path, header):

@@ -92,10 +92,10 @@ def registered_halves(
     return Halves(*(total / np.float32(some) for total, some in zip(sums, counts, strict=True)))
 
 
-def keep_agreed(result: FloatArray, halves: Halves) -> Guarded:
+def keep_agreed(result: FloatArray, halves: Halves, full_scale: tuple[float, float] = (0.0, 1.0)) -> Guarded:
     """Let the mean of the registered frames take the place of detail that they do not agree on.
 
-    ``result`` (H, W) or (H, W, 3).
+    ``result`` (H, W) or (H, W, 3); ``full_scale`` are black and white.
     """
     image, (share, flat) = np.empty_like(result), np.empty((2, *result.shape[:2]), np.float32)
     for top in range(0, len(result), _ROWS):
@@ -104,8 +104,14 @@ def keep_agreed(result: FloatArray, halves: Halves) -> Guarded:
         parts = _agreed(result[rows], halves.first[rows], halves.second[rows])
         for whole, part in zip((image, share, flat), parts, strict=True):
             whole[top : top + _ROWS] = part[own]
+    np.clip(image, *full_scale, out=image)
     # Flat parts that are smoothed are no reason to doubt the registration.
-    return Guarded(image, np.maximum(share, flat), explain_agreement(share))
+    clear, share = float((share >= _CLEAR).mean()), np.maximum(share, flat)
+    if clear < _REMARKED:
+        return Guarded(image, share, ())
+    choice = f"detail in {100 * clear:.0f} % of the image is that of the mean of the registered frames"
+    reason = "there the halves of the clip do not agree on it: noise, water, clouds, rain or registration that failed"
+    return Guarded(image, share, (Decision("agreement", choice, reason),))
 
 
 def halves_memory(shape: tuple[int, ...], threads: int) -> float:
@@ -144,7 +150,7 @@ def _agreed(result: FloatArray, first_half: FloatArray, second_half: FloatArray)
         np.maximum(share, given, out=share)
     image = image + left
     image += (all_of_mean - image) * (flat if result.ndim == 2 else flat[..., None])
-    return np.clip(image, 0, 1), share, flat
+    return image, share, flat
 
 
 def _flat_parts(first: FloatArray, second: FloatArray, mean: FloatArray, result: FloatArray) -> FloatArray:
@@ -168,16 +174,6 @@ def _given(moments: Sequence[FloatArray], doubt: float = 0.0) -> FloatArray:
     more = detail / (np.maximum(usual, 0) + np.float32(_NOTHING)) - 1
     more = more if more.ndim == 2 else more.max(axis=2)
     return np.asarray(unlike * np.clip(more, 0, 1), np.float32)
-
-
-def explain_agreement(share: FloatArray) -> tuple[Decision, ...]:
-    """Say what gave way, if it is worth a remark."""
-    clear = float((share >= _CLEAR).mean())
-    if clear < _REMARKED:
-        return ()
-    choice = f"detail in {100 * clear:.0f} % of the image is that of the mean of the registered frames"
-    reason = "there the halves of the clip do not agree on it: noise, water, clouds, rain or registration that failed"
-    return (Decision("agreement", choice, reason),)
 
 
 def _split(image: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:

@@ -19,11 +19,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
-from ..footage.moments import Moments, measure_moments
-from ..footage.survey import Survey
+from ..core.gradient import sobel_gradient
+from ..footage.survey import Moments, Survey, measure_moments, within
 from ..io.source import Window
 
 # Fewest frames from which stripes are found.
@@ -60,10 +61,7 @@ class _Stripes:
 
     def without(self, _: int, values: FloatArray, window: Window) -> FloatArray:
         """Take the stripes out of a frame, or of a window of it."""
-        rows, columns = (
-            slice(wanted.start - own.start, wanted.stop - own.start)
-            for wanted, own in zip(window, self.window, strict=True)
-        )
+        rows, columns = within(self.window, window)
         pattern = self.offsets[0][None, columns] + self.offsets[1][rows, None]
         flat = values - (pattern if values.ndim == 2 else pattern[..., None])
         if self.warm is not None:
@@ -136,12 +134,7 @@ def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float
 def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
     """Mark the columns that have no noise while those around do."""
     level = np.sqrt(np.median(variance, axis=0)).astype(np.float32)
-    around = np.array(
-        [
-            np.median(part)
-            for part in np.lib.stride_tricks.sliding_window_view(np.pad(level, _AROUND, "reflect"), 2 * _AROUND + 1)
-        ]
-    )
+    around = median_filter(level, 2 * _AROUND + 1, mode="mirror")
     dead = level < _DEAD * np.minimum(around, noise if noise > _LEAST_NOISE else 0)
     if dead.mean() > _MOST_DEAD:
         return np.zeros_like(dead)
@@ -161,7 +154,7 @@ def _warm(mean: FloatArray, variance: FloatArray, noise: float, motion: float) -
     warm = alone & (variance - noise**2 < _STANDS * (motion * height) ** 2)
     # Letters are drawn over the noise; a lone pixel among their strokes is one of them.
     smooth = cv2.medianBlur(mean, 3)
-    slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) / 8
+    slope = np.hypot(*sobel_gradient(smooth))
     drawn = (variance < (_DRAWN * noise) ** 2) & (slope > _EDGE * noise)
     warm &= cv2.dilate(drawn.astype(np.uint8), np.ones((2 * _AROUND_DRAWN + 1,) * 2, np.uint8)) == 0
     return warm if warm.mean() <= _MOST_WARM else np.zeros_like(warm)

@@ -1,15 +1,13 @@
 """The range of a clip: frames that use a part of the scale are worked on in units of that part.
 
 Twelve bits in a file of 16, or counts of a thermal camera from 7000 to 7400, leave most of the scale unused.  The
-thresholds of the stages are shares of full scale, so such frames are stretched first, and results are brought back.
+thresholds of the stages are shares of full scale, so such frames are stretched first.  All stages work at these levels;
+:func:`turbrestore.results.at_levels_of_clip` brings their results back.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -26,10 +24,6 @@ _SPAN = 0.7
 _FEW = 10
 # A contrast below one grey level of an 8-bit camera is a scene only if it is that many deviations of the noise.
 _LEAST_CONTRAST, _DEVIATIONS = 1 / 255, 12.0
-# Fields of results by the power of the gain that they scale with; images also have the offset.
-_SHIFTED, _SCALED, _SQUARED = ("image",), ("noise",), ("variance", "image_noise")
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -44,26 +38,19 @@ class Levels:
         """Whether anything is stretched."""
         return (self.low, self.gain) != (0.0, 1.0)
 
-    def stretched(self, result: Result) -> Result:
-        """Bring an image, or the images and the noise of a result, to the levels of the stages."""
-        low, gain = np.float32(self.low), np.float32(self.gain)
-        return self._converted(result, lambda image: (image - low) * gain, self.gain)
+    @property
+    def full_scale(self) -> tuple[float, float]:
+        """Black and white of the clip, at the levels of the stages."""
+        black = 0.0 - self.gain * self.low
+        return black, black + self.gain
 
-    def original(self, result: Result) -> Result:
-        """Bring an image, or the images and the noise of a result, back to the levels of the clip."""
-        low, gain = np.float32(self.low), np.float32(self.gain)
-        return self._converted(result, lambda image: np.clip(image / gain + low, 0, 1), 1 / self.gain)
+    def stretched(self, image: FloatArray) -> FloatArray:
+        """Bring an image to the levels of the stages."""
+        return (image - np.float32(self.low)) * np.float32(self.gain) if self.changed else image
 
-    def _converted(self, result: Any, convert: Callable[[FloatArray], FloatArray], factor: float) -> Any:
-        if self.changed and isinstance(result, np.ndarray):
-            return convert(result)
-        if not self.changed or not dataclasses.is_dataclass(result) or isinstance(result, type):
-            return result
-        values = {item.name: getattr(result, item.name) for item in dataclasses.fields(result)}
-        changed = {name: convert(values[name]) for name in _SHIFTED if name in values}
-        for names, power in ((_SCALED, factor), (_SQUARED, factor**2)):
-            changed |= {name: values[name] * power for name in names if name in values}
-        return dataclasses.replace(result, **changed)
+    def original(self, image: FloatArray) -> FloatArray:
+        """Bring an image back to the levels of the clip."""
+        return image / np.float32(self.gain) + np.float32(self.low) if self.changed else image
 
 
 def stretch_levels(survey: Survey) -> tuple[Survey, Levels, tuple[Decision, ...]]:

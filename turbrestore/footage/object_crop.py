@@ -117,7 +117,7 @@ def crop_to_object(source: FrameSource) -> FrameSource:
         file_shape=(source.file_shape[0], *window, *source.file_shape[3:]),
         window=(slice(0, window[0]), slice(0, window[1])),
         pixels=pixels,
-        repair=_unchanged,
+        repair=unrepaired,
         header=without_sky(source.header),
         warnings=(*source.warnings, remark),
     )
@@ -142,6 +142,6 @@ def _shown(source: FrameSource) -> Iterator[FloatArray]:
         yield to_unit(whole, source.full_scale, f"{source.name}: frame {number}")
 
 
-def _unchanged(pixels: PixelArray) -> PixelArray:
-    """Repair nothing: where there is a repair, a kept run depends on the remarks, and with them on the crop."""
+def unrepaired(pixels: PixelArray) -> PixelArray:
+    """Repair nothing: where there is a repair, a kept run depends on the remarks of a source."""
     return pixels

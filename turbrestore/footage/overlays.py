@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,11 +31,12 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.errors import DataError
+from ..core.gradient import sobel_gradient
 from ..io.images import read_image
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
-from .moments import Moments, measure_moments
-from .survey import Survey
+from .checks.missing_pixels import continued
+from .survey import Moments, Placement, Survey, measure_moments, within
 
 # Fewest and most frames of a clip in which an overlay is looked for.
 FEWEST, _MOST = 3, 1500
@@ -49,8 +51,8 @@ _STILL, _LEAST_STILL = 2.5, 1 / 255
 _CONSTANT, _DARK = 0.5, 0.25
 # Fewest standing edge pixels of an overlay, as a share of the frame, and the largest part of a frame that it may cover.
 _LEAST_EDGES, _LARGEST = 0.0005, 0.7
-# Share of the frame that no frame shows from which it is reported, and factor between the reaches of its fill.
-_REPORTED, _WIDER = 0.002, 3.0
+# Share of the frame that no frame shows from which it is reported.
+_REPORTED = 0.002
 # Pixels around an overlay that are replaced too, reach of the fill under which shifts are measured, and the share of a
 # reduced pixel beside an overlay that has to show the scene.
 _AROUND, _REACH, _FREE = 2, 12.0, 0.9
@@ -79,19 +81,14 @@ class Overlay:
     mask: NDArray[np.bool_]  # (H, W)
     scene: FloatArray  # (H', W') or (H', W', 3): mean of the frames at one place, without the overlay
     hidden: NDArray[np.bool_]  # (H, W): pixels of the scene, at its mean position, that no frame shows
-    origin: tuple[int, int]  # row and column of the scene at which a frame without shift begins
-    shifts: dict[int, tuple[int, int]]  # (dx, dy) of each frame by its number in the file, pixels
+    placement: Placement  # where frames lie in the scene
     window: Window  # rows and columns of the file that the mask spans
 
     def without(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Replace the pixels that stand in a frame, or in a window of it, by the scene behind them."""
-        dx, dy = self.shifts[number]
-        down, across = (part.start - own.start for part, own in zip(window, self.window, strict=True))
-        top, left = self.origin[0] - dy + down, self.origin[1] - dx + across
-        behind = self.scene[top : top + len(values), left : left + values.shape[1]]
-        replaced = values.copy()
-        chosen = self.mask[down : down + len(values), across : across + values.shape[1]]
-        replaced[chosen] = behind[chosen]
+        part = within(self.window, window)
+        replaced, chosen = values.copy(), self.mask[part]
+        replaced[chosen] = self.scene[self.placement.place(number)][part][chosen]
         return replaced
 
 
@@ -105,11 +102,8 @@ class Title:
 
     def without(self, _: int, values: FloatArray, window: Window) -> FloatArray:
         """Continue a frame, or a window of it, over the pixels that stand."""
-        down, across = (
-            slice(wanted.start - own.start, wanted.stop - own.start)
-            for wanted, own in zip(window, self.window, strict=True)
-        )
-        return _continued(values, ~self.mask[down, across]) if self.mask[down, across].any() else values
+        mask = self.mask[within(self.window, window)]
+        return continued(values, ~mask) if mask.any() else values
 
     def put_back(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:
         """Give an image, whose first pixel is at (left, top) of the frame, the pixels that stand, with a soft edge."""
@@ -164,7 +158,7 @@ def without_overlay(
         choice = f"{100 * float(title.mask.mean()):.1f} % of the frame kept as in the mean of the frames"
         reason = "it stands while the air bends the scene around it; it is neither moved nor deblurred"
         return survey.adjusted(title.without, small), title.mask, title, (Decision("overlay", choice, reason),)
-    overlay = _overlay(survey, mask, np.rint(shifts).astype(int))
+    overlay = _overlay(survey, mask, shifts)
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
     reason = "asked for" if given else "it stands while the scene moves"
     hidden = float(overlay.hidden.mean())
@@ -180,7 +174,7 @@ def _standing(source: FrameSource, moments: Moments) -> tuple[NDArray[np.bool_] 
     mean, usual, deviation = luminance(moments.mean), moments.noise, np.sqrt(moments.variance)
     floor = max(_STILL * usual, _LEAST_STILL)
     still = deviation < floor
-    gradient = np.hypot(cv2.Sobel(mean, cv2.CV_32F, 1, 0), cv2.Sobel(mean, cv2.CV_32F, 0, 1)) / 8
+    gradient = np.hypot(*sobel_gradient(mean))
     clear = gradient > _DEVIATIONS / _STILL * floor
     motion = _motion(deviation[clear], gradient[clear], usual)
     edges = still & clear & (gradient * min(_STANDS * motion, 1.0) > deviation)
@@ -190,19 +184,17 @@ def _standing(source: FrameSource, moments: Moments) -> tuple[NDArray[np.bool_] 
     # A flat part of the scene does not change either; what stands has no noise of the scene, or is dark like a stop.
     black = float(mean.min())
     dark = mean < black + _DARK * (float(np.median(mean[~still])) - black) if (~still).any() else still
-    mask = _connected((still & dark) | constant | edges, edges)
+    mask = _regions((still & dark) | constant | edges, edges)
     if mask.mean() > _LARGEST:
         return None, None
-    mask = cv2.dilate(mask.astype(np.uint8), np.ones((2 * _AROUND + 1,) * 2, np.uint8)) > 0
+    mask = _around(mask, _AROUND)
     # The camera draws a title over its noise, which no edge of the scene lacks.
     edges &= deviation < _NOISELESS * max(usual, _LEAST_STILL / _STILL)
     if motion < _LEAST_BENDING or edges.sum() < _LEAST_EDGES * edges.size:
         return mask, None
-    near = cv2.dilate(edges.astype(np.uint8), np.ones((2 * _NEAR + 1,) * 2, np.uint8)) > 0
-    letters = _connected((constant & near) | edges, edges).astype(np.uint8)
+    letters = _regions((constant & _around(edges, _NEAR)) | edges, edges).astype(np.uint8)
     letters = cv2.morphologyEx(letters, cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
-    letters = cv2.dilate(letters, np.ones((3, 3), np.uint8)) > 0
-    return mask, Title(letters, moments.mean, source.window)
+    return mask, Title(_around(letters, 1), moments.mean, source.window)
 
 
 def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -213,7 +205,7 @@ def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> N
     for frame in part:
         grey = luminance(frame)
         if before is not None:
-            edge = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8 > clear
+            edge = np.hypot(*sobel_gradient(grey)) > clear
             edges += edge
             standing += edge & (np.abs(grey - before) < same)
         before = grey
@@ -227,7 +219,7 @@ def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> N
     share[standing < _TIMES] = 0
     digits = _large(share > _REMAINS * usual)
     if usual <= _ALMOST_USUAL:
-        near = cv2.dilate((digits | mask).astype(np.uint8), np.ones((2 * _BESIDE + 1,) * 2, np.uint8)) > 0
+        near = _around(digits | mask, _BESIDE)
         digits |= _large(near & (share > _REMAINS_BESIDE * usual))
     return digits if digits.mean() <= _MOST_DIGITS else np.zeros_like(digits)
 
@@ -235,17 +227,14 @@ def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> N
 def _large(strokes: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Regions of many strokes, with the gaps between them."""
     closed = cv2.morphologyEx(strokes.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
-    _, labels = cv2.connectedComponents(closed, connectivity=8)
-    counts = np.bincount(labels[strokes], minlength=int(labels.max()) + 1)
-    counts[0] = 0
-    return np.asarray((counts >= _FEWEST_STROKES)[labels])
+    return _regions(closed, strokes, _FEWEST_STROKES)
 
 
 def _with_digits(
     mask: NDArray[np.bool_], title: Title | None, digits: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], Title | None]:
     """Add digits, and a pixel around them, to what stands; a digit that a box surrounds is a hole in it."""
-    wide = cv2.dilate(digits.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    wide = _around(digits, 2)
     if title is None:
         return mask | wide, None
     letters = title.mask | wide
@@ -261,12 +250,17 @@ def _motion(deviation: NDArray[np.float64], gradient: FloatArray, noise: float) 
     return float(np.sqrt(np.median(np.maximum(deviation**2 - noise**2, 0) / gradient**2)))
 
 
-def _connected(grown: NDArray[np.bool_], edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Regions that have edges that stand."""
+def _regions(grown: NDArray[Any], marks: NDArray[np.bool_], fewest: int = 1) -> NDArray[np.bool_]:
+    """Keep the connected regions that have marks."""
     _, labels = cv2.connectedComponents(grown.astype(np.uint8), connectivity=8)
-    counts = np.bincount(labels[edges], minlength=int(labels.max()) + 1)
+    counts = np.bincount(labels[marks], minlength=int(labels.max()) + 1)
     counts[0] = 0
-    return np.asarray((counts > 0)[labels])
+    return np.asarray((counts >= fewest)[labels])
+
+
+def _around(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    """Mark what lies up to a radius from what is marked."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
 
 
 def _continued_small(small: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:
@@ -284,33 +278,13 @@ def _continued_small(small: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:
     return filled
 
 
-def _overlay(survey: Survey, mask: NDArray[np.bool_], shifts: NDArray[np.int_]) -> Overlay:
+def _overlay(survey: Survey, mask: NDArray[np.bool_], shifts: NDArray[np.float64]) -> Overlay:
     """Average what the whole frames show of the scene, without the overlay."""
-    low, high = shifts.min(axis=0), shifts.max(axis=0)
-    height, width = mask.shape
-    shape = height + high[1] - low[1], width + high[0] - low[0]
-    total, count = np.zeros((*shape, *survey.clip.shape[3:])), np.zeros(shape)
-    origin = int(high[1]), int(high[0])
-    places = {number: (int(dx), int(dy)) for number, (dx, dy) in zip(survey.clip.numbers, shifts, strict=True)}
+    placement = Placement.by(shifts, survey.clip.numbers, (mask.shape[0], mask.shape[1]))
+    total, count = np.zeros((*placement.shape, *survey.clip.shape[3:])), np.zeros(placement.shape)
     for number, frame in zip(survey.numbers, survey, strict=True):
-        dx, dy = places[number]
-        place = np.s_[origin[0] - dy : origin[0] - dy + height, origin[1] - dx : origin[1] - dx + width]
+        place = placement.place(number)
         total[place][~mask] += frame[~mask]
         count[place][~mask] += 1
-    scene = _continued((total.T / np.maximum(count, 1).T).T.astype(np.float32), count > 0)
-    hidden = count[origin[0] : origin[0] + height, origin[1] : origin[1] + width] == 0
-    return Overlay(mask, scene, hidden, origin, places, survey.clip.window)
-
-
-def _continued(scene: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
-    """Continue a scene into what is not known, by averages in wider and wider windows of what is."""
-    filled, missing, reach = scene.copy(), ~known, 1.0
-    weight = known.astype(np.float32)
-    while missing.any() and reach < 4 * max(known.shape):
-        around = cv2.GaussianBlur(weight, (0, 0), reach, borderType=cv2.BORDER_CONSTANT)
-        total = cv2.GaussianBlur((scene.T * weight.T).T, (0, 0), reach, borderType=cv2.BORDER_CONSTANT)
-        near = missing & (around > 0.05)
-        filled[near] = (total[near].T / around[near]).T
-        missing &= ~near
-        reach *= _WIDER
-    return filled
+    scene = continued((total.T / np.maximum(count, 1).T).T.astype(np.float32), count > 0)
+    return Overlay(mask, scene, count[placement.of_shift(0, 0)] == 0, placement, survey.clip.window)

@@ -33,7 +33,7 @@ from ..core.decision import Decision
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
 from ..runtime.scratch import iter_frames
-from .survey import Survey, spread
+from .survey import Placement, Survey, reduced, spread, within
 
 # Frames of which the median is taken, the fewest that tell what passes, and rows that it is taken of at once.
 _SAMPLES, _FEWEST, _ROWS = 25, 9, 64
@@ -82,15 +82,11 @@ class Background:
         """
         if number not in self.weights:
             return values
-        down, across = (
-            slice(wanted.start - own.start, wanted.stop - own.start)
-            for wanted, own in zip(window, self.window, strict=True)
-        )
-        place = self.placement.place(number)
-        stored = np.asarray(cv2.imdecode(self.weights[number], cv2.IMREAD_GRAYSCALE))[down, across]
-        weight = stored.astype(np.float32) / np.float32(255) * self.known[place][down, across]
+        place, part = self.placement.place(number), within(self.window, window)
+        stored = np.asarray(cv2.imdecode(self.weights[number], cv2.IMREAD_GRAYSCALE))[part]
+        weight = stored.astype(np.float32) / np.float32(255) * self.known[place][part]
         weight = weight if values.ndim == 2 else weight[..., None]
-        return values + weight * (self.image[place][down, across] - values)
+        return values + weight * (self.image[place][part] - values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,16 +133,16 @@ def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
     sample = map(source.intensities, numbers, iter_frames(map(survey.pixels.__getitem__, places)))
     for plane, frame in zip(stack, sample, strict=True):
         np.rint(255 * np.clip(luminance(frame), 0, 1), out=plane, casting="unsafe")
-    still = Placement.still(source)
+    still = Placement(dict.fromkeys(source.numbers, (0, 0)), (source.shape[1], source.shape[2]))
     usual = _usual(stack, numbers, still)
     found = _passed_by(stack, numbers, usual, still)
     if found is not None:
         return found, still
-    if not _moves(measured_shifts(map(_grey, stack), stack.shape)):
+    if not _moves(_shifts(_reduced(map(_grey, stack), stack.shape), stack.shape)):
         return None
     # For a camera that moves the scene passes too; what moves as most of the frame does is the scene.
     small = luminance(survey.small)
-    moving = placed(source, shifts_of_reduced(reduced(small, small.shape), source.shape))
+    moving = Placement.by(_shifts(_reduced(small, small.shape), source.shape), source.numbers, still.size)
     if np.prod(moving.shape) > _LARGEST_SCENE * np.prod(moving.size):
         return None
     followed = _usual(stack, numbers, moving)
@@ -156,6 +152,16 @@ def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
 
 def _moves(shifts: NDArray[np.float64]) -> bool:
     return float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) >= _CAMERA
+
+
+def _reduced(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> FloatArray:
+    """Reduce and smooth T frames of (H, W) pixels, ``shape`` beginning with (T, H, W), to measure their shifts."""
+    return reduced(frames, shape[:3], _REDUCED_SIDE, 16, 1.0)
+
+
+def _shifts(small: FloatArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Shifts (dx, dy) of reduced frames, in pixels of the frames, (T, 2)."""
+    return known_shifts(small)[0] * (shape[2] / small.shape[2], shape[1] / small.shape[1])
 
 
 def _grey(plane: NDArray[np.uint8]) -> FloatArray:
@@ -202,11 +208,10 @@ def _stands(
     A planet that drifts over a black sky passes through nothing.
     """
     seen = zip(stack, masks, parts, strict=True)
-    left = reduced((np.where(mask > 0, part.median, _grey(plane)) for plane, mask, part in seen), stack.shape)
-    edges = [
-        np.hypot(*np.gradient(some, axis=(1, 2))).sum() for some in (reduced(map(_grey, stack), stack.shape), left)
-    ]
-    away = shifts_of_reduced(left, stack.shape) - shifts
+    left = _reduced((np.where(mask > 0, part.median, _grey(plane)) for plane, mask, part in seen), stack.shape)
+    both = _reduced(map(_grey, stack), stack.shape), left
+    edges = [np.hypot(*np.gradient(some, axis=(1, 2))).sum() for some in both]
+    away = _shifts(left, stack.shape) - shifts
     # Snow has more edges than the scene.
     own = parts[0].excess is not None or bool(edges[1] > _OWN_EDGES * edges[0])
     return own and not _moves(away - away.mean(axis=0))
@@ -317,59 +322,3 @@ def _background(source: FrameSource, usual: _Usual, placement: Placement) -> tup
 
 def _disc(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2), np.uint8)
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Shifts of frames, and the part of the scene that they show together."""
-
-    shifts: dict[int, tuple[int, int]]  # (dx, dy) of each frame by its number in the file, pixels
-    size: tuple[int, int]  # (H, W) of a frame
-
-    @classmethod
-    def still(cls, source: FrameSource) -> Placement:
-        """Place all frames alike."""
-        return cls(dict.fromkeys(source.numbers, (0, 0)), (source.shape[1], source.shape[2]))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(H', W') of the part of the scene that the frames show together."""
-        (left, right), (top, bottom) = (self._range(axis) for axis in (0, 1))
-        return self.size[0] + bottom - top, self.size[1] + right - left
-
-    def place(self, number: int) -> Window:
-        """Return the rows and columns of the scene that a frame shows."""
-        dx, dy = self.shifts[number]
-        top, left = self._range(1)[1] - dy, self._range(0)[1] - dx
-        return slice(top, top + self.size[0]), slice(left, left + self.size[1])
-
-    def _range(self, axis: int) -> tuple[int, int]:
-        values = [shift[axis] for shift in self.shifts.values()]
-        return min(values), max(values)
-
-
-def reduced(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> FloatArray:
-    """Reduce and smooth T frames of (H, W) pixels, ``shape`` beginning with (T, H, W), to measure their shifts."""
-    count, height, width = shape[:3]
-    factor = max(1.0, max(height, width) / _REDUCED_SIDE)
-    size = max(16, round(width / factor)), max(16, round(height / factor))
-    small = np.empty((count, size[1], size[0]), np.float32)
-    for plane, frame in zip(small, frames, strict=True):
-        plane[...] = cv2.GaussianBlur(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
-    return small
-
-
-def shifts_of_reduced(small: FloatArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Shifts (dx, dy) of frames that :func:`reduced` has reduced, in pixels of the frames, shape (T, 2)."""
-    return known_shifts(small)[0] * (shape[2] / small.shape[2], shape[1] / small.shape[1])
-
-
-def measured_shifts(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Shifts (dx, dy) of T frames of (H, W) pixels, ``shape`` beginning with (T, H, W), in pixels, shape (T, 2)."""
-    return shifts_of_reduced(reduced(frames, shape), shape)
-
-
-def placed(source: FrameSource, shifts: NDArray[np.float64]) -> Placement:
-    """Place the frames of a source by shifts of shape (T, 2)."""
-    whole = ((int(dx), int(dy)) for dx, dy in np.rint(shifts))
-    return Placement(dict(zip(source.numbers, whole, strict=True)), (source.shape[1], source.shape[2]))

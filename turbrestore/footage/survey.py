@@ -8,14 +8,17 @@ frames are corrected.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, luminance
+from ..core.noise import estimate_noise
 from ..io.pixels import PixelArray
 from ..io.source import FrameSource, Window
 from ..runtime.scratch import drop_pages, iter_frames, new_stack
@@ -63,6 +66,38 @@ def take_survey(clip: FrameSource, scratch: Path | None = None) -> Survey:
     return Survey(clip, tuple(clip.numbers[place] for place in places), tuple(stack), small)
 
 
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Moments over time of some frames of a clip, from which what stands in them is found."""
+
+    mean: FloatArray  # (H, W) or (H, W, 3)
+    variance: FloatArray  # (H, W): of the luminance
+    change: FloatArray  # (H, W): half of the mean squared difference from one frame to the next
+    noise: float  # standard deviation of the noise of a frame, median over the frames
+    count: int
+
+
+def measure_moments(survey: Survey) -> Moments:
+    """Take the moments of the whole frames of a survey."""
+    shape = survey.clip.shape[1:]
+    total, sums, noise = np.zeros(shape), np.zeros((3, *shape[:2])), []
+    before: FloatArray | None = None
+    for frame in survey:
+        grey = luminance(frame)
+        if before is not None:
+            cv2.accumulateSquare(grey - before, sums[2])
+        before = grey
+        cv2.accumulate(frame, total)
+        cv2.accumulate(grey, sums[0])
+        cv2.accumulateSquare(grey, sums[1])
+        noise.append(estimate_noise(grey))
+    count = len(survey.numbers)
+    change = (sums[2] / (2 * max(count - 1, 1))).astype(np.float32)
+    sums /= count
+    variance = np.maximum(sums[1] - np.square(sums[0]), 0).astype(np.float32)
+    return Moments((total / count).astype(np.float32), variance, change, float(np.median(noise)), count)
+
+
 def survey_memory(shape: tuple[int, ...], in_scratch: bool) -> float:
     """Bytes that a survey takes of frames of shape (T, H, W) or (T, H, W, 3): what is whole, and what is small."""
     whole = float(np.prod(shape[1:])) * 4 * (2 if in_scratch else _whole_frames(shape, 4))
@@ -91,3 +126,60 @@ def _small_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
 def spread(count: int, most: int) -> list[int]:
     """Places of at most ``most`` of ``count`` things, spread evenly."""
     return [int(place) for place in np.linspace(0, count - 1, min(most, count)).round()]
+
+
+def reduced(frames: Iterable[FloatArray], shape: tuple[int, ...], side: int, shortest: int, blur: float) -> FloatArray:
+    """Reduce frames to a longest side and, if they are smaller, to a shortest, and blur them.
+
+    ``shape`` (T, H, W) or (T, H, W, 3); returns (T, h, w) or (T, h, w, 3).
+    """
+    factor = max(1.0, max(shape[1:3]) / side)
+    height, width = (max(shortest, round(length / factor)) for length in shape[1:3])
+    small = np.empty((shape[0], height, width, *shape[3:]), np.float32)
+    for plane, frame in zip(small, frames, strict=True):
+        plane[...] = cv2.GaussianBlur(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), (0, 0), blur)
+    return small
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Shifts of frames, and the part of the scene that they show together."""
+
+    shifts: dict[int, tuple[int, int]]  # (dx, dy) of each frame by its number in the file, pixels
+    size: tuple[int, int]  # (H, W) of a frame
+
+    @classmethod
+    def by(cls, shifts: NDArray[np.float64], numbers: Sequence[int], size: tuple[int, int]) -> Placement:
+        """Place frames by shifts (T, 2), rounded to whole pixels."""
+        whole = ((int(dx), int(dy)) for dx, dy in np.rint(shifts))
+        return cls(dict(zip(numbers, whole, strict=True)), size)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H', W') of the part of the scene that the frames show together."""
+        (left, top), (right, bottom) = self._range
+        return self.size[0] + bottom - top, self.size[1] + right - left
+
+    def place(self, number: int) -> Window:
+        """Return the rows and columns of the scene that a frame shows."""
+        return self.of_shift(*self.shifts[number])
+
+    def of_shift(self, dx: int, dy: int) -> Window:
+        """Return the rows and columns of the scene that a frame of this shift shows."""
+        right, bottom = self._range[1]
+        top, left = bottom - dy, right - dx
+        return slice(top, top + self.size[0]), slice(left, left + self.size[1])
+
+    @cached_property
+    def _range(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Least and greatest (dx, dy)."""
+        across, down = zip(*self.shifts.values(), strict=True)
+        return (min(across), min(down)), (max(across), max(down))
+
+
+def within(whole: Window, window: Window) -> Window:
+    """Return the rows and columns of a window, counted from where another begins."""
+    rows, columns = (
+        slice(part.start - own.start, part.stop - own.start) for own, part in zip(whole, window, strict=True)
+    )
+    return rows, columns

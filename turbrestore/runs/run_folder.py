@@ -13,6 +13,7 @@ filtered    the dynamics, settings of the filter, the share of best frames
 deblurred   the filtered image, settings of deconvolution and guards
 ==========  =========================================================================================================
 
+Results, ``mean.npy`` among them, are kept as the stages made them: stretched, where frames use a part of the scale.
 Threads and a memory limit change no result, so nothing depends on them; but where a limit leaves fewer training frames,
 or whole frames do not fit, the centroid depends on those frames and on the size of the tiles.
 """
@@ -37,6 +38,7 @@ from ..core.errors import DataError, OutputError, require
 from ..deconvolution.deconvolve import Deconvolution
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import FilterCheckpoint, Filtered
+from ..footage.levels import Levels
 from ..io.npy import map_npy
 from ..io.output import atomic_output
 from ..io.source import FrameSource
@@ -51,7 +53,7 @@ from .digests import file_digest
 from .json_fields import JsonFields
 from .run_files import MEAN, RECORD, RUN_FILES, read_stages, save_results, write_record
 from .run_record import RunRecord
-from .stage_files import load_artifact, save_artifact
+from .stage_files import load_stage, save_stage
 
 CHECKPOINT = "checkpoint.npz"
 FILES = {
@@ -99,6 +101,7 @@ class RunFolder:
         self._outputs: tuple[str, ...] = ()
         self._completed: dict[str, Any] = {}
         self._newest: FilterCheckpoint | None = None
+        self._levels = Levels()
         self._written = 0
         self.notes = tuple[str, ...]()
         record = read_stages(self.folder) if resume else None
@@ -119,6 +122,10 @@ class RunFolder:
         result = compute()
         self._save(name, result)
         return result
+
+    def begin(self, levels: Levels) -> None:
+        """Take the levels of the stages, which their files record."""
+        self._levels = levels
 
     def filter_start(self) -> FilterCheckpoint | None:
         """Return the checkpoint from which the filter continues."""
@@ -203,17 +210,17 @@ class RunFolder:
             return self._load_deblurred()
         if f"{name}.npz" not in self._files:
             return None
-        return load_artifact(self.folder / f"{name}.npz", _KINDS[_kind(name)], self._scratch)
+        return load_stage(self.folder / f"{name}.npz", _KINDS[_kind(name)], self._scratch)
 
     def _load_deblurred(self) -> Deblurred | None:
         parts = (("estimated", "blur.npz"), ("measured", "posterior.npz"))
         whole = all(self._verdict.get(flag) is (name in self._files) for flag, name in parts)
         if "deconvolution.npz" not in self._files or not whole:
             return None
-        result = load_artifact(self.folder / "deconvolution.npz", Deconvolution, self._scratch)
-        blur = load_artifact(self.folder / "blur.npz", BlurEstimate) if "blur.npz" in self._files else None
+        result = load_stage(self.folder / "deconvolution.npz", Deconvolution, self._scratch)
+        blur = load_stage(self.folder / "blur.npz", BlurEstimate) if "blur.npz" in self._files else None
         measured = "posterior.npz" in self._files
-        posterior = load_artifact(self.folder / "posterior.npz", BlurPosterior) if measured else None
+        posterior = load_stage(self.folder / "posterior.npz", BlurPosterior) if measured else None
         fields = JsonFields(self.folder / RECORD, self._verdict)
         readings, decisions = fields.guard_readings("readings"), fields.decisions("decisions")
         return Deblurred(result, blur, None, readings, decisions, posterior)
@@ -232,7 +239,7 @@ class RunFolder:
         for part, value in results.items():
             self._files.pop(f"{part}.npz", None)
             if value is not None:
-                save_artifact(self.folder / f"{part}.npz", value, overwrite=True)
+                save_stage(self.folder / f"{part}.npz", value, self._levels)
                 self._files[f"{part}.npz"] = file_digest(self.folder / f"{part}.npz")
         self._write_record()
         if name == "filtered":

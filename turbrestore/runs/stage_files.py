@@ -1,6 +1,8 @@
 """Stage results on disk: one ``.npz`` file each, arrays plus a JSON header, never a pickle.
 
-The header names the kind of result and the version of this layout, and holds every field that is not an array.
+The header names the kind of result and the version of this layout, and holds every field that is not an array.  A run
+keeps results as its stages made them, so that it continues with the same bits; where the frames were stretched, the
+header says how, and whoever reads a file gets the levels of the clip.
 Flow stacks by themselves are plain ``.npy`` files, which anything reads and which can be memory-mapped.
 """
 
@@ -22,12 +24,14 @@ from ..core.errors import DataError, InputNotFoundError
 from ..deconvolution.deconvolve import Deconvolution
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
+from ..footage.levels import Levels
 from ..io.images import read_image
 from ..io.limits import check_input
 from ..io.npy import map_npy, read_npz, write_npz
 from ..io.output import atomic_output, check_output
 from ..registration.centroid import Centroid
 from ..registration.recentring import recentre
+from ..results import at_levels_of_clip
 from .stage_fields import check_fields
 
 if TYPE_CHECKING:
@@ -43,6 +47,8 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "posterior": BlurPosterior,
 }
 _HEADER = "header"
+# Frames are never stretched as much.
+_MOST_GAIN = 1e30
 
 Result = TypeVar("Result", bound="DataclassInstance")
 
@@ -79,19 +85,24 @@ def save_artifact(path: str | os.PathLike[str], result: DataclassInstance, overw
     >>> bool((again.A == dynamics.A).all())
     True
     """
-    target = Path(path)
-    check_output(target, overwrite=overwrite, suffixes=(".npz",))
+    check_output(Path(path), overwrite=overwrite, suffixes=(".npz",))
+    save_stage(Path(path), result, Levels(), overwrite)
+
+
+def save_stage(target: Path, result: DataclassInstance, levels: Levels, overwrite: bool = True) -> None:
+    """Write a stage result that has the levels of the stages."""
     kind = _kind_of(type(result))
     values = {item.name: getattr(result, item.name) for item in dataclasses.fields(result)}
     arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
     others = {name: value for name, value in values.items() if name not in arrays}
-    header = json.dumps({"kind": kind, "schema": SCHEMA, "fields": others})
+    stretched = {"levels": [levels.low, levels.gain]} if levels.changed else {}
+    header = json.dumps({"kind": kind, "schema": SCHEMA, "fields": others, **stretched})
     with atomic_output(target, overwrite) as temporary, temporary.open("wb") as stream:
         write_npz(stream, {_HEADER: np.array(header), **arrays})
 
 
 def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Path | None = None) -> Result:
-    """Read a stage result back.
+    """Read a stage result back, at the levels of the clip.
 
     Parameters
     ----------
@@ -121,10 +132,13 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Pat
     ...
     turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
     """
-    name, (found, fields) = _kind_of(kind), _read(Path(path), scratch)
-    if found != name:
-        raise DataError(f"{path}: expected a {name} stage file, found a {found} stage file")
-    return _build(kind, fields)
+    fields, levels = _read_kind(Path(path), kind, scratch)
+    return at_levels_of_clip(_build(kind, fields), levels)
+
+
+def load_stage(path: Path, kind: type[Result], scratch: Path | None = None) -> Result:
+    """Read a stage result back as its stage made it."""
+    return _build(kind, _read_kind(path, kind, scratch)[0])
 
 
 def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
@@ -145,8 +159,8 @@ def load_guide(path: str | os.PathLike[str], image: str | os.PathLike[str]) -> F
     centroid is moved as the filtered image was, as :func:`turbrestore.restore` does.
     Returns (H, W) or (H, W, 3).
     """
-    (kind, fields), (other, fields_of_image) = _read(Path(path)), _read(Path(image))
-    guide = _image_of(Path(path), kind, fields)
+    (kind, fields, levels), (other, fields_of_image, _) = _read(Path(path)), _read(Path(image))
+    guide = _image_of(Path(path), kind, fields, levels)
     if (kind, other) != ("centroid", "filtered"):
         return guide
     mean_flow = fields_of_image["mean_flow"]
@@ -185,8 +199,16 @@ def load_flows(path: str | os.PathLike[str]) -> FloatArray:
     return check_flow(flows, str(source))
 
 
-def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any]]:
-    """Kind and fields of a stage file."""
+def _read_kind(source: Path, kind: type, scratch: Path | None) -> tuple[dict[str, Any], Levels]:
+    """Fields and levels of a stage file of one kind."""
+    name, (found, fields, levels) = _kind_of(kind), _read(source, scratch)
+    if found != name:
+        raise DataError(f"{source}: expected a {name} stage file, found a {found} stage file")
+    return fields, levels
+
+
+def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any], Levels]:
+    """Kind, fields and levels of a stage file."""
     if source.is_dir() or not source.exists():
         raise InputNotFoundError(f"{source}: no such file")
     check_input(source)
@@ -194,21 +216,24 @@ def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any
         arrays = read_npz(source, scratch=scratch)
         header: dict[str, Any] = json.loads(str(arrays.pop(_HEADER)))
         kind, schema, fields = header["kind"], header["schema"], {**header["fields"], **arrays}
+        low, gain = map(float, header.get("levels", (0.0, 1.0)))
         known = kind in KINDS
-    except (DataError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        if not (abs(low) <= 1 <= gain <= _MOST_GAIN):
+            raise ValueError(f"levels of {low} and {gain}")
+    except (DataError, KeyError, TypeError, ValueError, OverflowError, AttributeError, RecursionError) as error:
         raise DataError(f"{source}: expected a stage file of turbrestore, found something else or damage") from error
     if type(schema) is not int or schema != SCHEMA or not known:
         raise DataError(
             f"{source}: expected a stage file of layout {SCHEMA}, found a {kind!r:.40} of layout {schema!r:.40}"
         )
     check_fields(kind, fields, str(source))
-    return kind, fields
+    return kind, fields, Levels(low, gain)
 
 
-def _image_of(source: Path, kind: str, fields: dict[str, Any]) -> FloatArray:
+def _image_of(source: Path, kind: str, fields: dict[str, Any], levels: Levels) -> FloatArray:
     if "image" not in fields:
         raise DataError(f"{source}: expected a stage file with an image, found a {kind} stage file")
-    return check_image(fields["image"], str(source))
+    return levels.original(check_image(fields["image"], str(source)))
 
 
 def _build(kind: type[Result], fields: dict[str, Any]) -> Result:

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import ConfigurationError, DataError
-from ..footage.object_crop import find_object
-from ..io.pixels import PixelArray
+from ..footage.object_crop import find_object, unrepaired
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import correlation
 from ..registration.warp import warp
@@ -44,22 +43,13 @@ _COMPARED, _WITHIN, _DETAIL = 40, 0.8, 4.0
 
 @dataclass(frozen=True)
 class Rotation:
-    """How a planet turns.
+    """How a planet turns."""
 
-    Attributes
-    ----------
-    period : float
-        Hours.
-    flattening : float
-    angle : float or None
-        Of the equator in the image, degrees from the x axis towards the y axis; None where the outline tells it.
-    latitude : float
-        Of the centre of the disc, degrees, positive where the pole that is up in the image is turned to the observer.
-    """
-
-    period: float
+    period: float  # hours
     flattening: float
+    # Of the equator in the image, degrees from the x axis towards the y axis; None where the outline tells it.
     angle: float | None = None
+    # Of the centre of the disc, degrees, positive where the pole that is up in the image is turned to the observer.
     latitude: float = 0.0
 
 
@@ -125,7 +115,7 @@ def derotated(source: FrameSource, rotation: Rotation) -> FrameSource:
         f"{2 * disc.radius:.0f} pixels at {np.degrees(disc.angle):.1f}°"
     )
     found = source.adjusted(turn_back)
-    return dataclasses.replace(found, repair=source.repair or _unchanged, warnings=(*source.warnings, remark))
+    return dataclasses.replace(found, repair=source.repair or unrepaired, warnings=(*source.warnings, remark))
 
 
 def find_disc(image: FloatArray, rotation: Rotation) -> Disc:
@@ -143,7 +133,8 @@ def find_disc(image: FloatArray, rotation: Rotation) -> Disc:
     largest = 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA]))
     rows, columns = np.nonzero(labels == largest)
     variances, axes = np.linalg.eigh(np.cov(np.stack([columns, rows])))
-    polar = _polar_radius(rotation)
+    latitude = np.radians(rotation.latitude)
+    polar = float(np.hypot((1 - rotation.flattening) * np.cos(latitude), np.sin(latitude)))
     angle = 0.0 if rotation.angle is None else float(np.radians(rotation.angle))
     if rotation.angle is None and 1 - np.sqrt(variances[0] / variances[1]) > _FLAT:
         angle = float(np.arctan2(axes[1, 1], axes[0, 1]))
@@ -177,12 +168,6 @@ def rotation_flow(shape: tuple[int, ...], disc: Disc, rotation: Rotation, second
     seen = (root > 0) & (qx * cos_b + pz / q2 * sin_b > 0)
     du, dv = np.where(seen, du, 0), np.where(seen, dv, 0)
     return (disc.radius * np.stack([cosine * du + sine * dv, sine * du - cosine * dv], -1)).astype(np.float32)
-
-
-def _polar_radius(rotation: Rotation) -> float:
-    """Polar over equatorial radius of the outline."""
-    latitude = np.radians(rotation.latitude)
-    return float(np.hypot((1 - rotation.flattening) * np.cos(latitude), np.sin(latitude)))
 
 
 def _times(source: FrameSource) -> NDArray[np.float64]:
@@ -225,8 +210,3 @@ def _likeness(a: FloatArray, b: FloatArray, disc: Disc) -> float:
     within = np.hypot(x - disc.x, y - disc.y) < _WITHIN * disc.radius
     details = [cv2.GaussianBlur(one, (0, 0), 1.0) - cv2.GaussianBlur(one, (0, 0), _DETAIL) for one in (a, b)]
     return correlation(*(detail[within] for detail in details))
-
-
-def _unchanged(pixels: PixelArray) -> PixelArray:
-    """Repair nothing: where there is a repair, a kept run depends on the remarks, and with them on the rotation."""
-    return pixels

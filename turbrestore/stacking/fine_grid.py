@@ -24,7 +24,7 @@ that nothing was folded back, the image reduced to the usual grid is the usual r
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -38,7 +38,7 @@ from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, deconvolve_steps
 from ..preparation import Prepared
 from ..results import Restoration
-from ..runtime.runtime import DEFAULT, Runtime
+from ..runtime.runtime import Runtime
 from ..runtime.steps import finish
 from ..runtime.threads import sum_in_threads
 from ..settings import RestoreParams
@@ -54,43 +54,28 @@ _PARTS = 8
 _REACH = 4.0
 
 
-@dataclass(frozen=True, eq=False)
-class Finer:
-    """A restored image on a finer grid.
-
-    Attributes
-    ----------
-    image : ndarray, float32, shape (s·H, s·W) or (s·H, s·W, 3)
-        At the levels of the clip.
-    sigma : float
-        Width of the blur that was removed beside the pixel, fine pixels.
-    decisions : tuple of Decision
-    """
-
-    image: FloatArray
-    sigma: float
-    decisions: tuple[Decision, ...]
-
-
 def fine_image(
-    prepared: Prepared, restoration: Restoration, params: RestoreParams, runtime: Runtime = DEFAULT
-) -> Finer:
-    """Fuse the frames of a restoration on the finer grid, and remove blur and pixel there."""
-    scale, levels = params.scale, prepared.levels
+    prepared: Prepared, restoration: Restoration, params: RestoreParams, runtime: Runtime
+) -> tuple[FloatArray, Decision]:
+    """Fuse the frames of a restoration on the finer grid, and remove blur and pixel there.
+
+    Returns (s·H, s·W) or (s·H, s·W, 3).
+    """
+    scale, full_scale = params.scale, prepared.levels.full_scale
     filtered, done = restoration.filtered, restoration.deconvolution
     counts = np.ones(restoration.frame_count) if filtered is None else filtered.shares * restoration.frame_count
-    flows = registering_flows(prepared, restoration, params, runtime)
+    flows = registering_flows(prepared.source, restoration, restoration.centroid.image, params, runtime)
     halves = fuse_finely(flows, counts, prepared.source.shape[1:], scale, runtime.threads)
     image = (halves.first + halves.second) / np.float32(2)
     if done is None:
         choice, reason = f"{scale:g} times as fine, blurred", "no blur is removed before the last stage"
-        return Finer(levels.original(image), 0.0, (Decision("scale", choice, reason),))
+        return image, Decision("scale", choice, reason)
     removed = _removed(image, done.sigma, params, restoration, runtime)
-    sharp = _with_usual(levels.original(removed.image), done.image, done.sigma)
-    agreed = keep_agreed(sharp, Halves(*map(levels.original, (halves.first, halves.second))))
+    sharp = np.clip(_with_usual(removed.image, done.image, done.sigma), *full_scale)
+    agreed = keep_agreed(sharp, halves, full_scale)
     choice = f"{scale:g} times as fine, with {removed.sigma:.2f} fine pixels of blur and the pixel removed"
     reason = f"{restoration.motion:.2f} pixels of motion place {restoration.frame_count} frames between its pixels"
-    return Finer(agreed.image, removed.sigma, (Decision("scale", choice, reason),))
+    return agreed.image, Decision("scale", choice, reason)
 
 
 def fuse_finely(
@@ -168,7 +153,7 @@ def _with_usual(fine: FloatArray, usual: FloatArray, sigma: float) -> FloatArray
     share = np.float32(1 - np.exp(-((np.pi * sigma) ** 2) / 2))
     rest = usual - cv2.resize(fine, usual.shape[1::-1], interpolation=cv2.INTER_AREA)
     size = fine.shape[1::-1]
-    return np.clip(fine + share * cv2.resize(rest, size, interpolation=cv2.INTER_CUBIC), 0, 1)
+    return fine + share * cv2.resize(rest, size, interpolation=cv2.INTER_CUBIC)
 
 
 def _removed(

@@ -28,46 +28,28 @@ from ..footage.frame_selection import best_frames, frame_quality
 SHARES = (0.1, 0.25, 0.5)
 # Error of the models of blur and registration, intensity, as in Wiener deconvolution.
 _ERROR, _DARK = 0.002, 1e-3
+# Best frames, and worst ones, that are listed.
+_LISTED = 10
 # Side of the image that the filter of the quality is tried on, pixels.
 _SIDE = 64
 
 
 @dataclass(frozen=True)
 class KeptShare:
-    """What keeping the best frames means.
+    """What keeping the best frames means."""
 
-    Attributes
-    ----------
-    share : float
-        Share of the frames, 0 to 1.
-    frames : int
-    noise : float
-        Noise of their mean over that of the mean of all frames.
-    sharpness : float
-        Fine detail of their mean over that of all frames, if both are registered.
-    """
-
-    share: float
+    share: float  # of the frames, 0 to 1
     frames: int
-    noise: float
-    sharpness: float
+    noise: float  # of their mean over that of the mean of all frames
+    sharpness: float  # fine detail of their mean over that of all frames, if both are registered
 
 
 @dataclass(frozen=True, eq=False)
 class QualityList:
-    """Quality of the frames of a clip.
+    """Quality of the frames of a clip."""
 
-    Attributes
-    ----------
-    quality : ndarray, float64, shape (T,)
-        q_k, in the order of the frames.
-    kept : tuple of KeptShare
-        For 10, 25 and 50 % of the frames.
-    suggested : KeptShare
-    """
-
-    quality: NDArray[np.float64]
-    kept: tuple[KeptShare, ...]
+    quality: NDArray[np.float64]  # (T,): q_k, in the order of the frames
+    kept: tuple[KeptShare, ...]  # for 10, 25 and 50 % of the frames
     suggested: KeptShare
 
     @property
@@ -83,7 +65,8 @@ def quality_list(frames: Iterable[FloatArray]) -> QualityList:
 
 def measure_quality(frames: Iterable[FloatArray]) -> NDArray[np.float64]:
     """Quality, noise and mean brightness of every frame, (T, 3)."""
-    return np.array([_facts(luminance(frame)) for frame in frames])
+    greys = map(luminance, frames)
+    return np.array([(frame_quality([grey])[0], estimate_noise(grey), max(grey.mean(), _DARK)) for grey in greys])
 
 
 def sort_by_quality(measured: NDArray[np.float64]) -> QualityList:
@@ -103,7 +86,7 @@ def sort_by_quality(measured: NDArray[np.float64]) -> QualityList:
     return QualityList(quality, kept, keeping(best + 1))
 
 
-def quality_table(found: QualityList, numbers: Iterable[int], listed: int = 10) -> str:
+def quality_table(found: QualityList, numbers: Iterable[int]) -> str:
     """Write the list for a terminal: what shares cost and gain, and the best and the worst frames."""
     names = list(numbers)
     lines = ["share kept   frames   noise   sharpness"]
@@ -113,8 +96,8 @@ def quality_table(found: QualityList, numbers: Iterable[int], listed: int = 10) 
     top = float(found.quality.max()) or 1.0
     order = found.order
     places: list[int | None] = list(range(len(order)))
-    if len(order) > 2 * listed:
-        places[listed:-listed] = [None]
+    if len(order) > 2 * _LISTED:
+        places[_LISTED:-_LISTED] = [None]
     lines.append("rank    frame   quality")
     for place in places:
         if place is None:
@@ -123,11 +106,6 @@ def quality_table(found: QualityList, numbers: Iterable[int], listed: int = 10) 
         share = found.quality[order[place]] / top
         lines.append(f"{place + 1:>4} {names[order[place]]:>8}   {share:>6.1%} {'▇' * round(30 * share)}")
     return "\n".join(lines)
-
-
-def _facts(grey: FloatArray) -> tuple[float, float, float]:
-    """Quality, noise and mean brightness of a frame."""
-    return float(frame_quality([grey])[0]), estimate_noise(grey), max(float(grey.mean()), _DARK)
 
 
 def _noise_energy() -> float:

@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..footage.frame_selection import frame_quality
 from ..io.source import FrameSource
-from ..preparation import Prepared, prepare
+from ..preparation import prepare
 from ..registration.flow import iterate_flows
 from ..registration.flow_algebra import compose_flows
 from ..registration.recentring import recentre, recentring_flow
@@ -116,7 +115,8 @@ def registered_frames(
             image = image if kept is None else kept.put_back(image)
         return image, float(frame_quality([prepared.levels.original(frame)])[0])
 
-    flows = registering_flows(prepared, restoration, params, runtime)
+    start = prepared.levels.stretched(restoration.centroid.image)
+    flows = registering_flows(prepared.source, restoration, start, params, runtime)
     for number, ((_, flow), (image, quality)) in enumerate(map_ahead(finish, flows, runtime.threads)):
         yield RegisteredFrame(
             source.numbers[number], image, flow, float(shares[number]), float(sharpness[number]), quality
@@ -124,21 +124,19 @@ def registered_frames(
 
 
 def registering_flows(
-    prepared: Prepared, restoration: Restoration, params: RestoreParams, runtime: Runtime
+    source: FrameSource, restoration: Restoration, centroid: FloatArray, params: RestoreParams, runtime: Runtime
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield every prepared frame with the flow W' that leads to it from the geometry of the restored image."""
-    source, train, centroid = prepared.source, restoration.train, restoration.centroid
-    mean_flow = _mean_flow(restoration)
+    """Yield every prepared frame with the flow W' that leads to it from the geometry of the restored image.
+
+    ``centroid`` (H, W) or (H, W, 3) is the centroid at the levels of the frames.
+    """
+    train, filtered = restoration.train, restoration.filtered
+    mean_flow = np.zeros((*centroid.shape[:2], 2), np.float32) if filtered is None else filtered.mean_flow
     V = recentring_flow(mean_flow)
-    known = (compose_flows(flow, V) if V.any() else np.array(flow) for flow in iter_frames(centroid.flows))
+    flows = iter_frames(restoration.centroid.flows)
+    known = (compose_flows(flow, V) if V.any() else np.array(flow) for flow in flows)
     trained: Iterator[tuple[FloatArray, FloatArray]] = zip(source.select(frames=(0, train)), known, strict=True)
     if train == len(source):
         return trained
-    image = recentre(prepared.levels.stretched(centroid.image), mean_flow)
-    return chain(trained, iterate_flows(image, source.select(frames=(train, None)), params.flow, runtime))
-
-
-def _mean_flow(restoration: Restoration) -> NDArray[np.float32]:
-    if restoration.filtered is None:
-        return np.zeros((*restoration.mean.shape[:2], 2), np.float32)
-    return restoration.filtered.mean_flow
+    later = source.select(frames=(train, None))
+    return chain(trained, iterate_flows(recentre(centroid, mean_flow), later, params.flow, runtime))

@@ -41,12 +41,14 @@ from .displacement import (
     expected_motion,
     largest_displacement,
     mean_displacement,
+    moving_mask,
+    path_length,
     whole_displacement,
     without_camera,
+    witnesses,
 )
 from .fusion import fuse
 from .grid import enlarged, follow, grid_of, inverted, pixel_of
-from .motion import moving_mask, path_length, witnesses
 from .settings import SteadyParams
 from .windows import Window, WindowFrame, contrast_levels, light_between, relit
 

@@ -17,19 +17,30 @@ with a the acceleration of the point.  Over several i the displacements of the n
 
 with |S_i|² averaged in a small window.  A large S_i is motion rather than turbulence: it has little weight, and where
 all are large the frame passes as it is.  Without a neighbour on the other side motion does not cancel, so such an S_i
-counts less where something moves (:mod:`turbrestore.steady.motion`).  The ½ is the share of the frame itself, whose
-flow to itself is zero.
+counts less where something moves.  The ½ is the share of the frame itself, whose flow to itself is zero.
 
 Curved motion and turbulence cannot be told apart in a few frames.  While the camera stands still, most of a scene does,
 and c follows the median of |S_i| between 1 and 4 pixels; while it moves, c is 1 pixel.
+
+What moves
+----------
+G_i : F_i − A_i, the flow without the motion of the camera
+v : velocity, pixels a frame: ``Σ i G_i / Σ i²``, the least squares fit
+I, I_i : the frame; a neighbour, brought onto it by the motion of the camera alone
+
+A point moves where its path is longer than turbulence displaces, ``|v| i > 2 c`` for the furthest neighbour, and where
+two neighbours, one on either side if there are, both differ from I: in flat regions a flow is arbitrary, but the images
+are alike.  A point moves as well where the registered neighbours show something else than the frame
+(:mod:`turbrestore.steady.fusion`), as beside an object that covers the background.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from .camera_path.camera import Matrix, camera_flow, camera_size
@@ -42,19 +53,21 @@ _SIZES, _LEAST, _MOST = 2.5, 1.0, 4.0
 _SHAKE = 2.0
 # Path, in units of c, at which an S_i of one neighbour counts half.
 _PATH = 1.5
+# Agreement of the neighbours below which a point moves; longest path of turbulence, in units of c.
+_AGREEMENT, _LONGEST_PATH = 0.5, 2.0
+# Window of the differences of images, pixels, and the smallest that counts, intensity.
+_IMAGE_WINDOW, _DIFFERENCE = 2.0, 0.04
 # Every so many pixels of the grid enter the median.
 _SAMPLE = 3
 # What turbulence moves whole frames by, in medians of |S_i|.
 _WHOLE = 1.4
 
 
-def mean_displacement(
-    flows: Mapping[int, FloatArray], largest: float, path: FloatArray, pixel: float = 1.0
-) -> FloatArray:
+def mean_displacement(flows: Mapping[int, FloatArray], largest: float, path: FloatArray, pixel: float) -> FloatArray:
     """Weighted mean D of flows without the motion of the camera.
 
-    ``flows`` (h, w, 2) on a grid whose pixel is so many of the image wide; ``path`` (h, w) of
-    :func:`turbrestore.steady.motion.path_length`; returns (h, w, 2).
+    ``flows`` (h, w, 2) on a grid whose pixel is so many of the image wide; ``path`` (h, w) of :func:`path_length`;
+    returns (h, w, 2).
     """
     stands = 1 / (1 + (path / (_PATH * largest)) ** 4)
     total, weights = 0.0, _OWN_SHARE
@@ -117,6 +130,51 @@ def without_camera(
     ``flows`` (h, w, 2) on a grid over an image of this shape; ``cameras`` (2, 3).
     """
     return {offset: flow - camera_flow(cameras[offset], shape, flow.shape) for offset, flow in flows.items()}
+
+
+def moving_mask(
+    path: FloatArray, image: FloatArray, placed: Sequence[FloatArray], agreement: FloatArray, pixel: float
+) -> NDArray[np.bool_]:
+    """Mark the points that move, on a grid whose pixel is so many of the image wide.
+
+    ``path`` (h, w), in units of what turbulence displaces at most; ``image`` (h, w); ``placed`` (h, w) each;
+    ``agreement`` (h, w); returns (h, w).
+    """
+    moving = agreement < _AGREEMENT
+    if not placed:
+        return moving
+    squares = [cv2.GaussianBlur((other - image) ** 2, (0, 0), _IMAGE_WINDOW / pixel) for other in placed]
+    return moving | ((path > _LONGEST_PATH) & np.logical_and.reduce([square > _DIFFERENCE**2 for square in squares]))
+
+
+def path_length(flows: Mapping[int, FloatArray]) -> FloatArray:
+    """Length of the path to the furthest neighbour at constant velocity.
+
+    ``flows`` (h, w, 2), at least one; returns (h, w).
+    """
+    pairs = {offset: flow for offset, flow in flows.items() if -offset in flows}
+    if 3 * max(pairs, default=0) >= max(map(abs, flows)):
+        # The displacement of the frame itself cancels in pairs.
+        flows = pairs
+    moments = [np.float32(offset) * flow for offset, flow in flows.items()]
+    velocity = np.add.reduce(moments)
+    furthest, squares = max(map(abs, flows)), sum(offset**2 for offset in flows)
+    return np.hypot(velocity[..., 0], velocity[..., 1]) * np.float32(furthest / squares)
+
+
+def witnesses(offsets: Iterable[int]) -> tuple[int, ...]:
+    """Choose the neighbours that show whether something moved: the furthest, and one like it on the other side.
+
+    Where the other side is shorter than half, it is one half as far on the same side.
+    """
+    offsets = sorted(offsets, key=abs)
+    if len(offsets) < 2:
+        return ()
+    furthest = offsets[-1]
+    others = sorted(offsets[:-1], key=lambda offset: abs(offset + furthest))
+    if 2 * abs(others[0] + furthest) > abs(furthest):
+        others = sorted(offsets[:-1], key=lambda offset: abs(2 * offset - furthest))
+    return furthest, others[0]
 
 
 def _straight_path(cameras: Mapping[int, Matrix]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ C : affine map from the steadied frame k to the one before; N : from the steadie
 E : pose, affine map from the steadied frame to the grid of Z
 R : flow from Z to F; A its affine part; r = R − A
 w : agreement of ``F ∘ (id + R)`` with Z (:mod:`turbrestore.steady.fusion`), less where r is more than turbulence, 0 in
-    objects that move (:mod:`turbrestore.steady.motion`)
+    objects that move (:mod:`turbrestore.steady.displacement`)
 g : gain, 1 over the number of frames since the memory began, at least 1/64
 s : steadiness, 0 to 1, of the camera, less where turbulence is weak: the window averages that out, and what is left
     is motion, of leaves or water

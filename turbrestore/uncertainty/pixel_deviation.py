@@ -63,7 +63,6 @@ _GRID = 256
 def measure_deviation(
     image: FloatArray,
     filtered: Filtered,
-    stretched: FloatArray,
     dynamics: FlowDynamics,
     known: NDArray[np.bool_],
     params: DeconvolutionParams,
@@ -71,16 +70,15 @@ def measure_deviation(
 ) -> FloatArray:
     """Measure the standard deviation of every pixel of a restored image.
 
-    ``image`` (H, W) or (H, W, 3); ``stretched`` is the filtered image at the levels of the deconvolution; returns
-    (H, W).
+    ``image`` (H, W) or (H, W, 3); returns (H, W).
     """
     gain, by_blur = 1.0, np.zeros(1, np.float32)
     if deblurred is not None:
         done, posterior = deblurred.deconvolution, deblurred.posterior
         blur, exponent = posterior or deblurred.blur, params.exponent
-        fidelity = quadratic_fidelity(stretched, params.method, done.fidelity)
+        fidelity = quadratic_fidelity(filtered.image, params.method, done.fidelity)
         exponent = blur.exponent if exponent is None and blur is not None else exponent
-        gain = posterior_gain((stretched.shape[0], stretched.shape[1]), fidelity, done.sigma, exponent)
+        gain = posterior_gain((image.shape[0], image.shape[1]), fidelity, done.sigma, exponent)
         if posterior is not None:
             low, _, high = posterior.width
             by_blur = variance_by_blur(filtered.image, fidelity, (float(low), float(high)), exponent or GAUSSIAN)
@@ -151,10 +149,10 @@ def position_variance(dynamics: FlowDynamics) -> FloatArray:
     return cv2.GaussianBlur(dynamics.residual_variance, (0, 0), _SMOOTH) * np.float32(_ERROR_SHARE)
 
 
-def saturation_level(brightest: float, noise: float, step: float) -> float:
-    """Return the intensity from which the temporal mean is saturated.
+def saturation_level(brightest: float, noise: float, step: float, saturated: float) -> float:
+    """Return the intensity from which the temporal mean is saturated, where a frame is from ``saturated`` on.
 
     A camera of 12 bits saturates far below the full scale of a file of 16. A pixel that has the largest intensity of
     the clip in every frame is saturated if the frames are noisy, and else may be a white part of the scene.
     """
-    return min(SATURATED, brightest - step / 2) if noise >= step else SATURATED
+    return min(saturated, brightest - step / 2) if noise >= step else saturated

@@ -29,7 +29,7 @@ from ...core.decision import Decision
 from ...core.errors import ConfigurationError, DataError, require_between
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
-from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, BackdropSum, fill_holes
+from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, fill_holes, mean_backdrop
 from .repeats import RepeatDetector
 from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
 from .stuck_pixels import StuckPixelDetector, repair_stuck
@@ -266,6 +266,8 @@ class _ContentScan:
         else:
             stuck[:, 0] += rows.start
             stuck[:, 1] += columns.start
+        # Frames are read again, as few clips lack so much.
+        needed, shape = self._needs_backdrop, self._source.shape[1:]
         report = ContentReport(
             numbers=self._source.numbers,
             filled=tuple(self._filled),
@@ -278,7 +280,7 @@ class _ContentScan:
             contrast=float(contrasts.max()),
             left_out=frozenset(numbers[left_out].tolist()),
             warnings=(),
-            backdrop=self._backdrop() if self._needs_backdrop else None,
+            backdrop=mean_backdrop(self._source.native(), shape) if needed else None,
         )
         return dataclasses.replace(report, warnings=tuple(_in_words(report, bool(repeated))))
 
@@ -305,13 +307,6 @@ class _ContentScan:
             self._needs_backdrop = True
             filled = np.where(np.isfinite(filled), filled, np.nanmean(filled)).astype(np.float32)
         return filled
-
-    def _backdrop(self) -> Backdrop:
-        """Average what the frames show; they are read again, as few clips lack so much."""
-        total = BackdropSum(self._source.shape[1:])
-        for pixels in self._source.native():
-            total.add(pixels)
-        return total.backdrop()
 
 
 def _in_words(report: ContentReport, repeated: bool) -> list[str]:

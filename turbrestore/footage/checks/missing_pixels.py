@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +14,8 @@ from ...io.pixels import PixelArray
 
 # Share of a frame that may be missing and is filled from around, and from which the frame shows too little.
 FEW_MISSING, MOST_MISSING = 0.01, 0.5
+# Factor between the windows from which what no frame shows is continued.
+_WIDER = 3.0
 # Number of rings of values that are filled from the edge of a hole inwards.
 _WIDEST_HOLE = 32
 
@@ -53,35 +56,33 @@ class Backdrop:
         return np.where(missing, self.values, pixels).astype(np.float32)
 
 
-class BackdropSum:
-    """Sum of what frames show, from which a :class:`Backdrop` is made."""
+def mean_backdrop(frames: Iterable[PixelArray], shape: tuple[int, ...]) -> Backdrop:
+    """Average what frames show, and continue it smoothly to where none shows anything.
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self._total = np.zeros(shape)
-        self._count = np.zeros(shape, np.int64)
-
-    def add(self, pixels: PixelArray) -> None:
-        """Add a frame; missing pixels are NaN or infinite."""
+    ``frames`` (H, W) or (H, W, 3) each, as ``shape`` says; missing pixels are NaN or infinite.
+    """
+    total, count = np.zeros(shape), np.zeros(shape, np.int64)
+    for pixels in frames:
         known = np.isfinite(pixels)
-        self._total[known] += pixels[known]
-        self._count += known
-
-    def backdrop(self) -> Backdrop:
-        """Divide the sum, and continue it smoothly to where no frame shows anything."""
-        mean = (self._total / np.maximum(self._count, 1)).astype(np.float32)
-        known = self._count > 0
-        unseen = np.asarray(~known if known.ndim == 2 else ~known.all(axis=2))
-        return Backdrop(_continued(mean, known.astype(np.float32)), unseen)
+        total[known] += pixels[known]
+        count += known
+    known = count > 0
+    mean = (total / np.maximum(count, 1)).astype(np.float32)
+    return Backdrop(continued(mean, known), np.asarray(~known if known.ndim == 2 else ~known.all(axis=2)))
 
 
-def _continued(values: FloatArray, weight: FloatArray) -> FloatArray:
-    """Continue values by averages in wider and wider windows of what is known."""
-    filled, missing, reach = values.copy(), weight == 0, 1.0
-    while missing.any() and reach < 4 * max(values.shape):
+def continued(values: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
+    """Continue values into what is not known, by averages in wider and wider windows of what is.
+
+    ``values`` (H, W) or (H, W, 3); ``known`` of the same shape, or (H, W).
+    """
+    filled, missing, reach = values.copy(), ~known, 1.0
+    weight = known.astype(np.float32)
+    while missing.any() and reach < 4 * max(known.shape):
         around = cv2.GaussianBlur(weight, (0, 0), reach, borderType=cv2.BORDER_CONSTANT)
-        total = cv2.GaussianBlur(values * weight, (0, 0), reach, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.GaussianBlur((values.T * weight.T).T, (0, 0), reach, borderType=cv2.BORDER_CONSTANT)
         near = missing & (around > 0.05)
-        filled[near] = total[near] / around[near]
+        filled[near] = (total[near].T / around[near]).T
         missing &= ~near
-        reach *= 3
+        reach *= _WIDER
     return filled

@@ -92,7 +92,7 @@ def _measure_light(survey: Survey, frames: FloatArray) -> tuple[Light | None, tu
     reference = None if as_a_whole and along_rows else _reference_of(frames)
     if reference is None:
         return None, ()
-    anchor = _shift_reference(np.nan_to_num(reference))
+    anchor = prepare_shift_reference(_at_unit_contrast(np.nan_to_num(reference)))
     # Bands are in all frames or in none, so that some of them tell.
     some = frames[:: max(len(frames) // _SOME, 1)] if as_a_whole else frames
     light = _chosen([_fit_frame(frame, reference, anchor) for frame in some])
@@ -196,7 +196,7 @@ def _reference_of(frames: FloatArray) -> FloatArray | None:
     first = frames[len(frames) // 2]
     if float(np.ptp(first)) <= 0:
         return None
-    anchor = _shift_reference(first)
+    anchor = prepare_shift_reference(_at_unit_contrast(first))
     total, count = np.zeros(first.shape), np.zeros(first.shape)
     for frame in frames:
         placed, _ = _placed(frame, anchor)
@@ -230,10 +230,6 @@ def _fit_frame(frame: FloatArray, reference: FloatArray, anchor: ShiftReference)
     return _Fit(
         float(plain[0]), rows, affine, (still, plainly, by_rows, affinely), level, shown.size > 0 and plain[0] > 0
     )
-
-
-def _shift_reference(image: FloatArray) -> ShiftReference:
-    return prepare_shift_reference(_at_unit_contrast(image))
 
 
 def _at_unit_contrast(image: FloatArray) -> FloatArray:

@@ -42,18 +42,10 @@ _ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class Shade:
-    """Gain of frames, a smooth field.
+    """Gain of frames, a smooth field."""
 
-    Attributes
-    ----------
-    gains : dict of int to ndarray, float16, shape (h, w)
-        g on a reduced grid, by the number of the frame in the file.
-    window : tuple of slice
-        Rows and columns of the file that the grid spans.
-    """
-
-    gains: dict[int, NDArray[np.float16]]
-    window: Window
+    gains: dict[int, NDArray[np.float16]]  # (h, w): g on a reduced grid, by the number of the frame in the file
+    window: Window  # rows and columns of the file that the grid spans
 
     def lit(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Correct the light of a frame, or of a window of it."""

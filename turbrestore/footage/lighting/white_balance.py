@@ -12,17 +12,14 @@ the colours of the mean stay.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
 from ...core.decision import Decision
-from ...io.source import Window
 from ...registration.camera.global_shift import known_shifts
-from ..survey import Survey
+from ..survey import Survey, reduced
 
 # Longest side of the reduced frames, pixels, and their blur.
 _SIDE, _BLUR = 64, 1.5
@@ -33,43 +30,22 @@ _DARK, _SATURATED = 0.02, 0.98
 _ROUNDS = 4
 
 
-@dataclass(frozen=True, eq=False)
-class WhiteBalance:
-    """Ratios of channels, ndarray of float32 and shape (3,), by the number of the frame in the file."""
-
-    ratios: dict[int, NDArray[np.float32]]
-
-    def steady(self, number: int, values: FloatArray, window: Window) -> FloatArray:
-        """Correct the colours of a frame, or of a window of it."""
-        return values / self.ratios[number]
-
-
 def steady_white_balance(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
     """Take a white balance that changes out of the frames; others, and grey frames, are returned as they are."""
     if survey.small.ndim != 4 or len(survey.small) < 3:
         return survey, ()
-    ratios = _ratios(_reduced(survey.small))
+    ratios = _ratios(reduced(survey.small, survey.small.shape, _SIDE, 1, _BLUR))
     changes = ratios.std(axis=0)
     if changes.max() < _LEAST_CHANGE:
         return survey, ()
     factors = np.exp(ratios).astype(np.float32)
-    found = WhiteBalance(dict(zip(survey.clip.numbers, factors, strict=True)))
+    balance = dict(zip(survey.clip.numbers, factors, strict=True))
     name = ("red", "green", "blue")[int(changes.argmax())]
     low, high = np.exp(ratios[:, changes.argmax()].min()), np.exp(ratios[:, changes.argmax()].max())
     reason = f"{name} varies from {low:.2f} to {high:.2f} of its mean against the other colours"
     decision = Decision("white balance", "colours of each frame evened out", reason)
-    return survey.adjusted(found.steady, survey.small / factors[:, None, None]), (decision,)
-
-
-def _reduced(frames: FloatArray) -> FloatArray:
-    """Reduce and blur frames, (T, H, W, 3) to (T, h, w, 3)."""
-    height, width = frames.shape[1:3]
-    factor = max(1.0, max(height, width) / _SIDE)
-    size = max(1, round(width / factor)), max(1, round(height / factor))
-    stack = np.empty((len(frames), size[1], size[0], 3), np.float32)
-    for small, frame in zip(stack, frames, strict=True):
-        small[...] = cv2.GaussianBlur(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), (0, 0), _BLUR)
-    return stack
+    small = survey.small / factors[:, None, None]
+    return survey.adjusted(lambda number, values, _: values / balance[number], small), (decision,)
 
 
 def _ratios(frames: FloatArray) -> NDArray[np.float64]:
