@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..blur.estimation import BlurEstimate
 from ..blur.posterior import BlurPosterior
-from ..core.arrays import FloatArray, check_flow, check_image
+from ..core.arrays import FloatArray, check_flow
 from ..core.errors import DataError, InputNotFoundError
 from ..deconvolution.deconvolve import Deconvolution
 from ..dynamics.flow_model import FlowDynamics
@@ -29,6 +29,7 @@ from ..io.output import atomic_output, check_output
 from ..registration.centroid import Centroid
 from ..registration.recentring import recentre
 from .stage_fields import check_fields
+from .typed_records import convert_to
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -38,9 +39,9 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "centroid": Centroid,
     "dynamics": FlowDynamics,
     "filtered": Filtered,
-    "deconvolution": Deconvolution,
     "blur": BlurEstimate,
     "posterior": BlurPosterior,
+    "deconvolution": Deconvolution,
 }
 _HEADER = "header"
 
@@ -121,10 +122,11 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Pat
     ...
     turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
     """
-    name, (found, fields) = _kind_of(kind), _read(Path(path), scratch)
-    if found != name:
-        raise DataError(f"{path}: expected a {name} stage file, found a {found} stage file")
-    return _build(kind, fields)
+    result = _read(Path(path), scratch)
+    if not isinstance(result, kind):
+        found = _kind_of(type(result))
+        raise DataError(f"{path}: expected a {_kind_of(kind)} stage file, found a {found} stage file")
+    return result
 
 
 def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
@@ -135,7 +137,7 @@ def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
     source = Path(path)
     if source.suffix.lower() != ".npz":
         return read_image(source).image
-    return _image_of(source, *_read(source))
+    return _image_of(source, _read(source))
 
 
 def load_guide(path: str | os.PathLike[str], image: str | os.PathLike[str]) -> FloatArray:
@@ -145,14 +147,13 @@ def load_guide(path: str | os.PathLike[str], image: str | os.PathLike[str]) -> F
     centroid is moved as the filtered image was, as :func:`turbrestore.restore` does.
     Returns (H, W) or (H, W, 3).
     """
-    (kind, fields), (other, fields_of_image) = _read(Path(path)), _read(Path(image))
-    guide = _image_of(Path(path), kind, fields)
-    if (kind, other) != ("centroid", "filtered"):
+    result, guided = _read(Path(path)), _read(Path(image))
+    guide = _image_of(Path(path), result)
+    if not (isinstance(result, Centroid) and isinstance(guided, Filtered)):
         return guide
-    mean_flow = fields_of_image["mean_flow"]
-    if guide.shape[:2] != mean_flow.shape[:2]:
-        raise DataError(f"{path}: expected the size of {image}, {mean_flow.shape[:2]}, found {guide.shape[:2]}")
-    return recentre(guide, mean_flow)
+    if guide.shape[:2] != guided.mean_flow.shape[:2]:
+        raise DataError(f"{path}: expected the size of {image}, {guided.mean_flow.shape[:2]}, found {guide.shape[:2]}")
+    return recentre(guide, guided.mean_flow)
 
 
 def save_flows(path: str | os.PathLike[str], flows: ArrayLike, overwrite: bool = False) -> None:
@@ -185,8 +186,8 @@ def load_flows(path: str | os.PathLike[str]) -> FloatArray:
     return check_flow(flows, str(source))
 
 
-def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any]]:
-    """Kind and fields of a stage file."""
+def _read(source: Path, scratch: Path | None = None) -> DataclassInstance:
+    """Read the result in a stage file."""
     if source.is_dir() or not source.exists():
         raise InputNotFoundError(f"{source}: no such file")
     check_input(source)
@@ -201,18 +202,15 @@ def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any
         raise DataError(
             f"{source}: expected a stage file of layout {SCHEMA}, found a {kind!r:.40} of layout {schema!r:.40}"
         )
-    check_fields(kind, fields, str(source))
-    return kind, fields
+    result = convert_to(KINDS[kind], fields, str(source))
+    check_fields(kind, result, str(source))
+    return result
 
 
-def _image_of(source: Path, kind: str, fields: dict[str, Any]) -> FloatArray:
-    if "image" not in fields:
-        raise DataError(f"{source}: expected a stage file with an image, found a {kind} stage file")
-    return check_image(fields["image"], str(source))
-
-
-def _build(kind: type[Result], fields: dict[str, Any]) -> Result:
-    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})
+def _image_of(source: Path, result: DataclassInstance) -> FloatArray:
+    if not isinstance(result, Centroid | Filtered | Deconvolution):
+        raise DataError(f"{source}: expected a stage file with an image, found a {_kind_of(type(result))} stage file")
+    return result.image
 
 
 def _kind_of(cls: type) -> str:
