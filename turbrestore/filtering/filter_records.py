@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray
 from ..core.errors import DataError, require, require_between
-from ..display.plots import plot_frames
+from ..display.curves import plot_frames
 from ..display.preview import preview
 from ..dynamics.flow_model import FlowDynamics
 from ..registration.recentring import recentring_flow
