@@ -108,24 +108,24 @@ def write_record(folder: Path, record: KeptRecord) -> None:
 
 def read_record(folder: Path) -> KeptRecord | None:
     """Read ``run.json``."""
-    found = _read_json(folder / RECORD)
+    path = folder / RECORD
+    found = _read_json(path)
     if found is None:
         return None
-    layout = _layout_of(found)
+    layout = found.get("schema")
     if layout != SCHEMA:
-        raise DataError(
-            f"{folder / RECORD}: expected the record of a run, layout {SCHEMA}, found layout {layout or 'none'}"
-        )
+        raise DataError(f"{path}: expected the record of a run, layout {SCHEMA}, found layout {layout!r:.40}")
     # An earlier version wrote an empty part where nothing was deblurred.
-    return convert_to(KeptRecord, {**found, "deblurred": found.get("deblurred") or None}, str(folder / RECORD))
+    return convert_to(KeptRecord, {**found, "deblurred": found.get("deblurred") or None}, str(path))
 
 
 def read_stages(folder: str | os.PathLike[str]) -> KeptRecord | None:
     """Read the record of the stages that are kept in a folder; one of an older layout says nothing of them."""
     place = Path(folder)
     try:
-        found = _read_json(place / RECORD)
-        if 0 < _layout_of(found) < SCHEMA and "facts" in found:
+        found = _read_json(place / RECORD) or {}
+        layout = found.get("schema")
+        if type(layout) is int and 0 < layout < SCHEMA and "facts" in found:
             return KeptRecord(facts={})
         record = read_record(place)
     except DataError as error:
@@ -178,23 +178,17 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
     return restoration, run
 
 
-def _read_json(path: Path) -> Any:
-    """Content of a file, None if there is none."""
+def _read_json(path: Path) -> dict[str, Any] | None:
+    """Return the object in a file, an empty one where the file holds something else, None if there is no file."""
     if path.exists() and not path.is_file():
         raise DataError(f"{path}: expected the record of a run, found no file")
     try:
-        # A file that holds null is no record either.
-        return json.loads(path.read_text("utf-8")) or {}
+        found = json.loads(path.read_text("utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: expected the record of a run, found something else or damage") from error
-
-
-def _layout_of(record: Any) -> int:
-    """Version of the layout of a record, 0 where it states none."""
-    found = record.get("schema") if isinstance(record, dict) else None
-    return found if type(found) is int else 0
+    return found if isinstance(found, dict) else {}
 
 
 def _read_images(path: Path) -> dict[str, FloatArray]:
