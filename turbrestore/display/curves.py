@@ -69,9 +69,10 @@ def plot_over_frames(rows: Mapping[str, ArrayLike], reference: float | None = No
         edges = np.arange(0, values.size, -(-values.size // _POINTS) or 1)
         means = _bin_means(values, edges)
         axes.plot(edges, means, color=ACCENT, linewidth=1.2, marker="o" if values.size <= 60 else None, markersize=2.5)
+        axes.set_ylim(bottom=0)
+        # Drawn within the limits of the curve.
         if reference is not None:
             axes.axhline(reference, color=INK, linewidth=0.9, linestyle="--")
-        axes.set_ylim(bottom=0)
         use_integer_ticks(axes)
         if not last:
             axes.tick_params(labelbottom=False)
