@@ -1,6 +1,7 @@
 """What the arrays and numbers of every kind of stage file are: shape and range, checked when one is read.
 
-The types of numbers, flags and texts are those of the record that the file becomes.
+The types of numbers, flags and texts are those of the record that the file becomes.  A number that is not listed lies
+between 0 and a billion.
 
 Shapes name their axes; one name stands for one length within a stage file:
 
@@ -73,7 +74,6 @@ FIELDS: dict[str, dict[str, Array | Number]] = {
         "A": Array("f8", "n n"),
         "C": Array("f4", "P n"),
         "Q": Array("f8", "n n"),
-        "R": Number(),
         "residual_variance": Array("f4", "H W", low=0),
         "states": Array("f8", "n τ"),
         "singular_values": Array("f8", "τ", low=0),
@@ -87,33 +87,23 @@ FIELDS: dict[str, dict[str, Array | Number]] = {
         "innovations": Array("f8", "N", low=0, gaps=True),
         "sharpness": Array("f8", "N", gaps=True),
         "shares": Array("f8", "N", low=0, high=1 + _ROUNDING),
-        "image_noise": Number(),
-        "sharpness_weight": Number(),
         "mean_flow": Array("f4", "H W 2"),
     },
     "deconvolution": {
         "image": _IMAGE,
-        "sigma": Number(),
         "fidelity": Number(high=_INFINITE),
-        "noise": Number(),
-        "iterations": Number(),
         "recorded": Array("i8", "k", low=0),
         "objective": Array("f8", "k", low=-_INFINITE, high=_INFINITE, gaps=True),
         "changes": Array("f8", "k", low=0, high=_INFINITE, gaps=True),
     },
     "blur": {
-        "sigma": Number(),
         "uncertainty": Number(high=_INFINITE),
-        "exponent": Number(),
-        "noise": Number(),
         "reduction": Number(low=1),
         "evidence": Number(low=-_INFINITE, high=_INFINITE),
         "widths": Array("f8", "k", low=0),
         "costs": Array("f8", "k", low=-_INFINITE, high=_INFINITE),
     },
     "posterior": {
-        "removed": Number(),
-        "exponent": Number(),
         "width": Array("f8", "3", low=0),
         **dict.fromkeys(("by_displacement", "by_variation", "by_image"), Array("f8", "3", low=0, gaps=True)),
         "air": Number(high=1 + _ROUNDING),
@@ -130,7 +120,8 @@ FIELDS: dict[str, dict[str, Array | Number]] = {
 def check_fields(kind: str, result: DataclassInstance, name: str) -> None:
     """Refuse a result that a stage cannot have made."""
     sizes: dict[str, int] = {}
-    for field, wanted in FIELDS[kind].items():
+    numbers = [field for field, value in vars(result).items() if isinstance(value, int | float)]
+    for field, wanted in {**dict.fromkeys(numbers, Number()), **FIELDS[kind]}.items():
         value = getattr(result, field)
         if isinstance(wanted, Array):
             complaint = _array_complaint(value, wanted, sizes)
