@@ -56,7 +56,7 @@ def save_run(folder: str | os.PathLike[str], restoration: Restoration, run: RunR
     Examples
     --------
     >>> import numpy as np, tempfile
-    >>> from turbrestore.pipeline import restore
+    >>> from turbrestore.pipeline import RestoreParams, restore
     >>> frames = np.random.default_rng(0).uniform(size=(4, 32, 32)).astype(np.float32)
     >>> restoration = restore(frames, RestoreParams(until="centroid"))
     >>> with tempfile.TemporaryDirectory() as folder:
