@@ -20,6 +20,7 @@ from turbrestore.io.limits import input_errors
 from turbrestore.io.output import atomic_write, check_output
 from turbrestore.io.video import frame_files
 from turbrestore.report.batch_page import ClipRow, write_batch_page
+from turbrestore.runs.typed_records import convert_to
 
 if TYPE_CHECKING:
     from .restoring import Order
@@ -114,20 +115,16 @@ def key_of(order: Order) -> str:
 
 
 def read_journal(path: Path) -> dict[str, ClipRow]:
-    """Read the newest row of every result, by its name; a last line that was cut off is passed over."""
+    """Read the newest row of every result, by its name; lines that are no rows, such as a cut one, are passed over."""
     found: dict[str, ClipRow] = {}
     if not path.is_file():
         return found
-    names = {field.name: field for field in dataclasses.fields(ClipRow)}
     with input_errors(path):
         lines = path.read_text("utf-8", "replace").splitlines()
     for line in lines:
-        try:
-            record = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(record, dict) and set(record) == set(names) and isinstance(record["output"], str):
-            found[Path(record["output"]).name] = ClipRow(**record)
+        with suppress(ValueError, RecursionError, DataError):
+            row = convert_to(ClipRow, json.loads(line), str(path))
+            found[Path(row.output).name] = row
     return found
 
 

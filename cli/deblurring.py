@@ -17,7 +17,8 @@ from turbrestore.core.errors import ConfigurationError, require, require_between
 from turbrestore.core.gradient import sobel_gradient
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.deconvolution.deconvolve import deconvolve as deconvolve_image
-from turbrestore.display.plots import new_figure, plot_images
+from turbrestore.display.figure import new_figure
+from turbrestore.display.maps import plot_images
 from turbrestore.io.images import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, check_output

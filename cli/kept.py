@@ -63,7 +63,7 @@ def own_outputs(folder: Path) -> set[Path]:
     """List the outputs that an earlier run was writing when it died; it may replace them."""
     # A link is refused later on.
     record = None if (folder / RECORD).is_symlink() else read_stages(folder)
-    return set() if record is None else {Path(name) for name in record["outputs"]}
+    return set() if record is None else {Path(name) for name in record.outputs}
 
 
 def check_room(source: FrameSource, params: RestoreParams, runtime: Runtime, output: Path, folder: Path | None) -> None:

@@ -10,7 +10,9 @@ from cyclopts import Parameter
 
 from turbrestore.core.errors import DataError, require
 from turbrestore.deconvolution.deconvolve import Deconvolution
-from turbrestore.display.plots import new_figure, plot_images, plot_prediction
+from turbrestore.display.figure import new_figure
+from turbrestore.display.maps import plot_images
+from turbrestore.display.spectra import plot_prediction
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.dynamics.dynamic_texture import identify as identify_flows
 from turbrestore.dynamics.flow_model import FlowDynamics, predict_flow, project_deviation

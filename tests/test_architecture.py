@@ -18,7 +18,7 @@ ORDER = [
     "report",
 ]  # fmt: skip
 HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
-HEAVY |= {"astropy", "dask", "distributed", "rawpy"}
+HEAVY |= {"astropy", "dask", "distributed", "rawpy", "msgspec"}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")
 
 

@@ -21,6 +21,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -169,7 +170,10 @@ def _choices(
 ) -> Iterator[_Choice]:
     """Yield what may be done, the best first; only tiles that are not larger than ``tile``, if that is given."""
     if tile is None:
-        yield from _choices_of_whole_frames(train, most, params)
+        fewest = train if params.train is not None else min(train, _FEWEST_IN_NEED)
+        for count, threads in product(range(train, fewest - 1, -1), range(most, 0, -1)):
+            yield _Choice(count, threads)
+            yield _Choice(count, threads, in_scratch=True)
     # A file holds more frames than memory does without a limit.
     train = train if params.train is not None else max(train, min(_FEWEST_IN_NEED, shape[0]))
     longest = max(shape[1:3])
@@ -180,14 +184,6 @@ def _choices(
         yield _tiles_of(shape, train, _THREADS_OF_TILES, side)
     for side in reversed(range(4 * HALO, min(_WORTH, longest), _SIDE_STEP)):
         yield _tiles_of(shape, train, 1, side)
-
-
-def _choices_of_whole_frames(train: int, most: int, params: RestoreParams) -> Iterator[_Choice]:
-    fewest = train if params.train is not None else min(train, _FEWEST_IN_NEED)
-    for count in range(train, fewest - 1, -1):
-        for threads in range(most, 0, -1):
-            yield _Choice(count, threads)
-            yield _Choice(count, threads, in_scratch=True)
 
 
 def _tiles_of(shape: tuple[int, ...], train: int, threads: int, side: int) -> _Choice:
@@ -296,37 +292,31 @@ def _decisions(
     shape: tuple[int, ...], params: RestoreParams, choice: _Choice, wanted: _Choice, base: float, limit: float
 ) -> Iterator[Decision]:
     """Put into words what the limit has changed."""
-    yield from _on_frames(shape, params, choice, wanted, base, limit)
-    side = _deconvolution_side(shape, params, choice, limit - base)
-    if side is not None and params.runs("deconvolve"):
-        words = f"deconvolution in tiles of up to {side} pixels"
-        yield Decision("memory", words, f"the whole image would take more than the {size_text(limit)} allowed")
-
-
-def _on_frames(
-    shape: tuple[int, ...], params: RestoreParams, choice: _Choice, wanted: _Choice, base: float, limit: float
-) -> Iterator[Decision]:
-    allowed = f"of {size_text(limit)} allowed"
+    allowed = size_text(limit)
 
     def needed(other: _Choice) -> str:
-        return f"{size_text(base + _peak(shape, params, other, limit - base))} {allowed}"
+        return f"{size_text(base + _peak(shape, params, other, limit - base))} of {allowed} allowed"
 
+    few_threads = f"{choice.threads} of {wanted.threads} threads" if choice.threads < wanted.threads else None
     if choice.tile is not None:
         height, width = largest_tile((shape[1], shape[2]), choice.tile)
         count = len(halo_tiles((shape[1], shape[2]), choice.tile))
         words = f"{count} tiles of up to {width}×{height} pixels, training frames in a scratch file"
-        because = f"whole frames would take more than the {size_text(limit)} allowed"
+        because = f"whole frames would take more than the {allowed} allowed"
         yield Decision("memory", words, because if wanted.tile is None else "tiles were asked for")
-        if choice.threads < wanted.threads:
-            words = f"{choice.threads} of {wanted.threads} threads"
-            yield Decision("memory", words, "more threads would need smaller tiles")
-        return
-    if choice.train < wanted.train:
-        every = needed(_Choice(wanted.train, 1, in_scratch=True))
-        yield Decision("memory", f"{choice.train} training frames, not {wanted.train}", f"all would take {every}")
-    if choice.in_scratch:
-        size = size_text(_scratch_bytes(shape, params, choice))
-        yield Decision("memory", "training frames in a scratch file", f"with flows and modes they take {size}")
-    if choice.threads < wanted.threads:
-        every = needed(replace(choice, threads=wanted.threads))
-        yield Decision("memory", f"{choice.threads} of {wanted.threads} threads", f"all would take {every}")
+        if few_threads:
+            yield Decision("memory", few_threads, "more threads would need smaller tiles")
+    else:
+        if choice.train < wanted.train:
+            every = needed(_Choice(wanted.train, 1, in_scratch=True))
+            yield Decision("memory", f"{choice.train} training frames, not {wanted.train}", f"all would take {every}")
+        if choice.in_scratch:
+            size = size_text(_scratch_bytes(shape, params, choice))
+            yield Decision("memory", "training frames in a scratch file", f"with flows and modes they take {size}")
+        if few_threads:
+            every = needed(replace(choice, threads=wanted.threads))
+            yield Decision("memory", few_threads, f"all would take {every}")
+    side = _deconvolution_side(shape, params, choice, limit - base)
+    if side is not None and params.runs("deconvolve"):
+        words = f"deconvolution in tiles of up to {side} pixels"
+        yield Decision("memory", words, f"the whole image would take more than the {allowed} allowed")

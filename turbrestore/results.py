@@ -15,7 +15,7 @@ from .blur.posterior import BlurPosterior
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .deconvolution.deconvolve import Deconvolution
-from .display.plots import plot_images
+from .display.maps import plot_images
 from .display.preview import preview
 from .dynamics.flow_model import FlowDynamics
 from .filtering.alternating import FilterCheckpoint, Filtered

@@ -115,10 +115,13 @@ class RestoreParams:
         require(self.train is None or self.train >= 2, f"train: expected 2 frames or more, found {self.train}")
         require(self.until in STAGES, f"until: expected one of {', '.join(STAGES)}, found {self.until!r}")
         require(self.border in BORDERS, f"border: expected one of {', '.join(BORDERS)}, found {self.border!r}")
-        require(
-            self.until == STAGES[-1] or self.deconvolution.sigma is None,
-            f"deconvolution.sigma: has no effect with until = {self.until}; leave one of them out",
-        )
+        for name, stage, is_usual in (
+            ("deconvolution.sigma", "deconvolve", self.deconvolution.sigma is None),
+            ("scale", "filter", self.scale == 1),
+            ("keep_best", "filter", self.keep_best == 1),
+        ):
+            words = f"{name}: has no effect with until = {self.until}; leave one of them out"
+            require(is_usual or self.runs(stage), words)
         require(
             self.psf is None or (self.until == STAGES[-1] and self.deconvolution.sigma is None),
             "psf: contradicts deconvolution.sigma, and until without a deconvolution; leave one of them out",
@@ -136,16 +139,8 @@ class RestoreParams:
             "like: expected filter.training = filter, because the known flows are those of all frames",
         )
         require_between("scale", self.scale, 1, 3)
-        require(
-            self.scale == 1 or self.until in STAGES[2:],
-            f"scale: has no effect with until = {self.until}; leave one of them out",
-        )
         check_share(self.keep_best)
         known_optics(self.pixel_scale, self.aperture, self.wavelength, self.distance)
-        require(
-            self.keep_best == 1 or self.until in STAGES[2:],
-            f"keep_best: has no effect with until = {self.until}; leave one of them out",
-        )
 
     @property
     def optics(self) -> Optics | None:

@@ -116,6 +116,7 @@ class TestJournal:
     def test_the_newest_row_counts_and_a_torn_line_does_not(self, tmp_path):
         done = ClipRow("a.mkv", "out/a.png", "done", frames=8, blur=1.25)
         text = journal_line(ClipRow("a.mkv", "out/a.png")) + journal_line(done) + '{"input": 3}\n[]\n'
+        text += journal_line(dataclasses.replace(done, blur="wide")) + "[" * 100_000 + "\n"
         (tmp_path / "j").write_text(text + journal_line(dataclasses.replace(done, state="failed"))[:40])
         assert read_journal(tmp_path / "j") == {"a.png": done}
         assert read_journal(tmp_path / "none") == {}

@@ -17,9 +17,11 @@ from turbrestore.blur.estimation import BlurEstimate, estimate_blur
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
-from turbrestore.display import plots
+from turbrestore.display.curves import plot_blur, plot_convergence, plot_filter, plot_frames, plot_objective
 from turbrestore.display.figure import ACCENT, INK, REST
+from turbrestore.display.maps import plot_displacements, plot_flow, plot_images
 from turbrestore.display.preview import encode_image, preview
+from turbrestore.display.spectra import plot_dynamics, plot_eigenvalues, plot_singular_values
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 
@@ -41,7 +43,7 @@ class TestMaps:
     def test_flow_is_drawn_in_place_and_enlarged_as_the_label_says(self):
         flow = np.zeros((40, 60, 2), np.float32)
         flow[..., 0], flow[..., 1] = 0.3, -0.4
-        axes = plots.plot_flow(flow).axes[0]
+        axes = plot_flow(flow).axes[0]
         arrows = vectors(axes)
         assert np.allclose([arrows.U, arrows.V], [[0.3], [-0.4]])
         # Row numbers grow downward on the axes, as they do in the image.
@@ -56,7 +58,7 @@ class TestMaps:
         lengths = RNG.normal(size=(50, 1, 1, 1))
         along = np.array([0.6, 0.8])
         flows = lengths * along + np.zeros((1, 40, 60, 1)) + 7.0
-        axes = plots.plot_displacements(flows).axes[0]
+        axes = plot_displacements(flows).axes[0]
         assert np.allclose(axes.images[0].get_array(), lengths.std(), rtol=1e-4)
         strokes = vectors(axes)
         assert np.allclose(strokes.U * along[1], strokes.V * along[0], atol=1e-5)
@@ -65,20 +67,20 @@ class TestMaps:
     def test_image_shows_through_and_must_fit(self):
         image = np.zeros((40, 60, 3), np.float32)
         image[:, 30:] = 1
-        axes = plots.plot_flow(np.zeros((40, 60, 2)), image).axes[0]
+        axes = plot_flow(np.zeros((40, 60, 2)), image).axes[0]
         blend = axes.images[1].get_array()
         assert (blend[:, 45] > blend[:, 15] + 0.2).all()
         with pytest.raises(DataError, match="60×40 pixels as the flow, found 40×60"):
-            plots.plot_flow(FLOWS[0], np.zeros((60, 40)))
+            plot_flow(FLOWS[0], np.zeros((60, 40)))
 
     def test_large_maps_are_reduced_and_keep_their_extent(self):
-        axes = plots.plot_displacements(np.zeros((2, 400, 1000, 2))).axes[0]
+        axes = plot_displacements(np.zeros((2, 400, 1000, 2))).axes[0]
         assert max(axes.images[0].get_array().shape) == 320
         assert tuple(axes.images[0].get_extent()) == (-0.5, 999.5, 399.5, -0.5)
 
     @pytest.mark.parametrize(
         ("draw", "flow"),
-        [(plots.plot_flow, FLOWS), (plots.plot_displacements, FLOWS[0]), (plots.plot_displacements, FLOWS[:1])],
+        [(plot_flow, FLOWS), (plot_displacements, FLOWS[0]), (plot_displacements, FLOWS[:1])],
     )
     def test_other_shapes_are_refused(self, draw, flow):
         with pytest.raises(DataError, match="expected"):
@@ -88,7 +90,7 @@ class TestMaps:
 class TestCurves:
     def test_kept_singular_values_are_coloured_and_rounding_is_left_out(self):
         values = np.array([9.0, 5.0, 2.0, 0.5, 1e-9])
-        axes = plots.plot_singular_values(values, 2).axes[0]
+        axes = plot_singular_values(values, 2).axes[0]
         (kept,), (rest,) = curves(axes), curves(axes, REST)
         assert kept.get_xydata().tolist() == [[1, 9], [2, 5]]
         assert rest.get_xydata().tolist() == [[3, 2], [4, 0.5]]
@@ -96,12 +98,12 @@ class TestCurves:
 
     @pytest.mark.parametrize("values", [np.zeros(0), np.zeros(4)])
     def test_nothing_moves(self, values):
-        plots.plot_singular_values(values, 0).savefig("/dev/null", format="svg")
-        plots.plot_eigenvalues(np.zeros(0)).savefig("/dev/null", format="svg")
+        plot_singular_values(values, 0).savefig("/dev/null", format="svg")
+        plot_eigenvalues(np.zeros(0)).savefig("/dev/null", format="svg")
 
     def test_eigenvalues_lie_about_the_unit_circle(self):
         values = np.array([0.9 + 0.3j, 0.9 - 0.3j, 1.4])
-        axes = plots.plot_eigenvalues(values).axes[0]
+        axes = plot_eigenvalues(values).axes[0]
         assert curves(axes)[0].get_xydata().tolist() == [[0.9, 0.3], [0.9, -0.3], [1.4, 0]]
         (circle,) = (patch for patch in axes.patches if isinstance(patch, Circle))
         assert (circle.center, circle.radius) == ((0, 0), 1)
@@ -109,24 +111,24 @@ class TestCurves:
         assert axes.get_xlim()[1] > 1.4
 
     def test_both_of_the_dynamics(self):
-        left, right = plots.plot_dynamics([3.0, 1.0, 0.1], [0.5, -0.5]).axes
+        left, right = plot_dynamics([3.0, 1.0, 0.1], [0.5, -0.5]).axes
         assert (len(curves(left)[0].get_xdata()), len(curves(right)[0].get_xdata())) == (2, 2)
 
     def test_convergence_and_tolerance(self):
-        axes = plots.plot_convergence([0.8, 0.1], 0.2).axes[0]
+        axes = plot_convergence([0.8, 0.1], 0.2).axes[0]
         assert curves(axes)[0].get_xydata().tolist() == [[1, 0.8], [2, 0.1]]
         assert curves(axes, INK)[0].get_ydata()[0] == 0.2
-        assert not curves(plots.plot_convergence([0.8]).axes[0], INK)
+        assert not curves(plot_convergence([0.8]).axes[0], INK)
 
     def test_frames_against_an_equal_share(self):
         sharpness, shares = np.array([0.9, 1.1, 1.0, 1.0]), np.array([0.1, 0.4, 0.25, 0.25])
-        upper, lower = plots.plot_frames(sharpness, shares).axes
+        upper, lower = plot_frames(sharpness, shares).axes
         assert np.array_equal(curves(upper)[0].get_ydata(), sharpness)
         assert np.allclose(curves(lower)[0].get_ydata(), [0.4, 1.6, 1, 1])
 
     def test_long_runs_are_averaged_over_neighbours(self):
         gains = RNG.uniform(size=1801)
-        upper, lower = plots.plot_filter(gains, np.ones(1801)).axes
+        upper, lower = plot_filter(gains, np.ones(1801)).axes
         shown = curves(upper)[0]
         assert len(shown.get_xdata()) == 451
         assert shown.get_ydata()[1] == pytest.approx(gains[4:8].mean())
@@ -136,43 +138,43 @@ class TestCurves:
     def test_frames_that_do_not_count_are_gaps(self):
         sharpness = np.full(1201, np.nan)
         sharpness[:4] = [1, np.nan, 3, 5]
-        lower = plots.plot_filter(np.ones(1201), sharpness).axes[1]
+        lower = plot_filter(np.ones(1201), sharpness).axes[1]
         assert np.array_equal(curves(lower)[0].get_ydata()[:3], [2, 5, np.nan], equal_nan=True)
-        assert np.isnan(curves(plots.plot_frames([1, np.nan, 1], [0.5, 0, 0.5]).axes[0])[0].get_ydata()[1])
+        assert np.isnan(curves(plot_frames([1, np.nan, 1], [0.5, 0, 0.5]).axes[0])[0].get_ydata()[1])
 
     def test_blur_and_its_band(self):
-        figure = plots.plot_blur([0.5, 1.0, 1.5], [0.5, 0.2, 0.4], 1.1, 0.25)
+        figure = plot_blur([0.5, 1.0, 1.5], [0.5, 0.2, 0.4], 1.1, 0.25)
         axes = figure.axes[0]
         assert np.allclose(curves(axes)[0].get_ydata(), [0.3, 0, 0.2])
         assert curves(axes, INK)[0].get_xdata()[0] == 1.1
         box = axes.patches[0].get_extents().transformed(axes.transData.inverted())
         assert (box.x0, box.x1) == pytest.approx((0.85, 1.35))
-        assert not plots.plot_blur([0.5, 1.0], [0.5, 0.2], 1.1, np.inf).axes[0].patches
+        assert not plot_blur([0.5, 1.0], [0.5, 0.2], 1.1, np.inf).axes[0].patches
 
     def test_nothing_to_show_is_said(self):
-        for figure in (plots.plot_blur([], [], 0, np.inf), plots.plot_objective([], [])):
+        for figure in (plot_blur([], [], 0, np.inf), plot_objective([], [])):
             (text,) = figure.axes[0].texts
             assert "no" in text.get_text()
 
     def test_images_stand_side_by_side(self):
-        left, right = plots.plot_images({"mean": np.zeros((4, 6)), "result": np.full((4, 6, 3), 2.0)}).axes
+        left, right = plot_images({"mean": np.zeros((4, 6)), "result": np.full((4, 6, 3), 2.0)}).axes
         assert (left.get_title(loc="left"), right.get_title(loc="left")) == ("mean", "result")
         assert right.images[0].get_array().max() == 1
 
 
 def test_notebooks_get_svg():
-    assert "<svg" in plots.plot_convergence([1.0])._repr_svg_()
+    assert "<svg" in plot_convergence([1.0])._repr_svg_()
 
 
 def test_missing_matplotlib_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ConfigurationError, match=r"pip install 'matplotlib.*'$"):
-        plots.plot_convergence([1.0])
+        plot_convergence([1.0])
 
 
 def test_pyplot_stays_out():
     code = (
-        "import sys; from turbrestore.display.plots import plot_dynamics\n"
+        "import sys; from turbrestore.display.spectra import plot_dynamics\n"
         "plot_dynamics([2.0, 1.0], [0.5]).savefig('/dev/null', format='svg')\n"
         "print('matplotlib.pyplot' in sys.modules)"
     )

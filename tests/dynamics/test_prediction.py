@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import DataError
-from turbrestore.display.plots import plot_prediction
+from turbrestore.display.spectra import plot_prediction
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import predict_flow, project_deviation
 from turbrestore.dynamics.prediction import flow_error, prediction_error, study_prediction

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from turbrestore.core.arrays import from_unit
-from turbrestore.display.plots import plot_convergence, plot_eigenvalues, plot_filter, plot_flow
+from turbrestore.display.curves import plot_convergence, plot_filter
+from turbrestore.display.maps import plot_flow
+from turbrestore.display.spectra import plot_eigenvalues
 from turbrestore.report import facts, pictures
 from turbrestore.report.alignment import align_curves, align_map, take_title
 from turbrestore.report.vector import inline_svg

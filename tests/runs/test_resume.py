@@ -62,10 +62,10 @@ def test_the_record_names_the_outputs_only_while_they_are_written(place):
     with pytest.MonkeyPatch.context() as patch:
         interrupt(patch, "turbrestore_cli.restoring.write_settings", 1)
         assert main(WORDS) == 130
-    names = {Path(name).name for name in read_stages("kept")["outputs"]}
+    names = {Path(name).name for name in read_stages("kept").outputs}
     assert names == {"sharp.png", "sharp.png.toml"}
     assert main([*WORDS, "--resume"]) == 0
-    assert read_stages("kept")["outputs"] == []
+    assert read_stages("kept").outputs == ()
 
 
 def test_a_run_that_dies_twice_may_still_replace_its_own_outputs(place):

@@ -44,7 +44,7 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, check_grey
 from ..core.errors import require
 from ..core.noise import estimate_noise
-from ..display.plots import plot_blur
+from ..display.curves import plot_blur
 from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import ThreadTeam, one_thread_each

@@ -27,7 +27,7 @@ from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, psf_to_otf
 from ..core.arrays import FloatArray, check_grey, check_image, luminance
 from ..core.errors import ConfigurationError, DataError, require, require_between
 from ..core.noise import NoiseCurve, estimate_noise
-from ..display.plots import plot_objective
+from ..display.curves import plot_objective
 from ..display.preview import preview
 from ..runtime.device import find_device, memory_of
 from ..runtime.image_stacks import Stack, load, store

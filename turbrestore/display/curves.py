@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from .figure import ACCENT, FONT, INK, WIDTH, add_axes, new_figure, use_integer_ticks, write_instead
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Largest number of points along a curve over the frames.
@@ -46,10 +45,7 @@ def plot_filter(gains: ArrayLike, innovations: ArrayLike) -> Figure:
 
     ``gains`` (N,); ``innovations`` (N,).
     """
-    figure = new_figure(WIDTH, WIDTH * 0.84)
-    rows = {"Gain of the image": np.asarray(gains, float), "Innovation of the flow, pixels": np.asarray(innovations)}
-    _draw_rows(figure, rows)
-    return figure
+    return plot_over_frames({"Gain of the image": gains, "Innovation of the flow, pixels": innovations})
 
 
 def plot_frames(sharpness: ArrayLike, shares: ArrayLike) -> Figure:
@@ -62,14 +58,24 @@ def plot_frames(sharpness: ArrayLike, shares: ArrayLike) -> Figure:
 
 
 def plot_over_frames(rows: Mapping[str, ArrayLike], reference: float | None = None) -> Figure:
-    """Show values of every frame, a row of the figure for each kind.
+    """Show values of every frame, a row of the figure for each kind; long curves show means of neighbouring frames.
 
     ``rows`` (N,).
     """
     figure = new_figure(WIDTH, WIDTH * 0.42 * len(rows))
-    for axes in _draw_rows(figure, {name: np.asarray(values, float) for name, values in rows.items()}):
+    for number, (title, row) in enumerate(rows.items(), 1):
+        values, last = np.asarray(row, float), number == len(rows)
+        axes = add_axes(figure, title, "frame" if last else "", place=(len(rows), 1, number))
+        edges = np.arange(0, values.size, -(-values.size // _POINTS) or 1)
+        means = _bin_means(values, edges)
+        axes.plot(edges, means, color=ACCENT, linewidth=1.2, marker="o" if values.size <= 60 else None, markersize=2.5)
+        axes.set_ylim(bottom=0)
+        # Drawn within the limits of the curve.
         if reference is not None:
             axes.axhline(reference, color=INK, linewidth=0.9, linestyle="--")
+        use_integer_ticks(axes)
+        if not last:
+            axes.tick_params(labelbottom=False)
     return figure
 
 
@@ -103,24 +109,6 @@ def plot_blur(widths: ArrayLike, costs: ArrayLike, sigma: float, uncertainty: fl
         axes.axvspan(sigma - uncertainty, sigma + uncertainty, color=ACCENT, alpha=0.15, linewidth=0)
     axes.set_ylim(bottom=0)
     return figure
-
-
-def _draw_rows(figure: Figure, rows: Mapping[str, NDArray[Any]]) -> list[Axes]:
-    """One curve a row over the frames; long curves show means of neighbouring frames."""
-    drawn = []
-    for number, (title, values) in enumerate(rows.items(), 1):
-        last = number == len(rows)
-        axes = add_axes(figure, title, "frame" if last else "", place=(len(rows), 1, number))
-        step = -(-values.size // _POINTS) or 1
-        edges = np.arange(0, values.size, step)
-        means = _bin_means(np.asarray(values, float), edges)
-        axes.plot(edges, means, color=ACCENT, linewidth=1.2, marker="o" if values.size <= 60 else None, markersize=2.5)
-        axes.set_ylim(bottom=0)
-        use_integer_ticks(axes)
-        if not last:
-            axes.tick_params(labelbottom=False)
-        drawn.append(axes)
-    return drawn
 
 
 def _bin_means(values: NDArray[np.float64], edges: NDArray[Any]) -> NDArray[np.float64]:

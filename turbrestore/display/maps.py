@@ -17,7 +17,6 @@ from .preview import shrink
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
 # Longest side of a map, pixels, and number of arrows along it.
@@ -109,7 +108,12 @@ def _draw_map(values: FloatArray, image: ArrayLike | None, title: str) -> tuple[
     axes = figure.add_subplot()
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
     top = max(float(np.quantile(values, _SCALE_QUANTILE)), 1e-6)
-    drawn = axes.imshow(reduced, cmap=_colour_map(), vmin=0, vmax=top, extent=extent, interpolation="none")
+    # Only now is it known to be installed.
+    import matplotlib as mpl
+
+    # Each colour of the bar is a separate path in SVG, so there are fewer than usual.
+    colours = mpl.colormaps["viridis"].resampled(64)
+    drawn = axes.imshow(reduced, cmap=colours, vmin=0, vmax=top, extent=extent, interpolation="none")
     if image is not None:
         grey = check_grey(image)
         if grey.shape != values.shape:
@@ -126,13 +130,6 @@ def _draw_map(values: FloatArray, image: ArrayLike | None, title: str) -> tuple[
     bar.ax.tick_params(colors=INK, labelsize=FONT, color=REST)
     set_labels(axes, title, "", "")
     return figure, axes
-
-
-def _colour_map() -> Colormap:
-    # Each colour of the bar is a separate path in SVG, so there are fewer than usual.
-    import matplotlib as mpl
-
-    return mpl.colormaps["viridis"].resampled(64)
 
 
 def _draw_arrows(axes: Axes, rows: NDArray[Any], columns: NDArray[Any], vectors: NDArray[Any], heads: bool) -> None:

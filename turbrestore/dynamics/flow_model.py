@@ -23,8 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import FloatArray
 from ..core.errors import DataError
-from ..display.plots import plot_dynamics
 from ..display.preview import preview
+from ..display.spectra import plot_dynamics
 from ..runtime.jit import jit
 from ..runtime.scratch import iter_parts, iter_slices
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray
 from ..core.errors import require, require_between
-from ..display.plots import plot_frames
+from ..display.curves import plot_frames
 from ..display.preview import preview
 from ..registration.recentring import recentring_flow
 from ..registration.warp import warp

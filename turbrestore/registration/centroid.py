@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_frames
 from ..core.errors import require, require_between
-from ..display.plots import plot_displacements
+from ..display.maps import plot_displacements
 from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack

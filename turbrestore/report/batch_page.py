@@ -10,8 +10,8 @@ from pathlib import Path
 from ..core.arrays import FloatArray, from_unit
 from ..display.preview import data_uri, encode_image, shrink
 from ..io.output import atomic_write
-from .comparison import environment, text_file
-from .page import policy
+from .comparison import environment
+from .page import page_code
 
 # Longest side of a picture, pixels, and its quality as WebP.
 _LONGEST, _QUALITY = 320, 90
@@ -49,14 +49,11 @@ def thumbnail_uri(image: FloatArray) -> str:
 
 def render_batch(rows: Sequence[ClipRow], folder: str = "") -> str:
     """Return the page of a batch as HTML."""
-    templates = environment()
-    from markupsafe import Markup
-
-    style = "".join(text_file(name) for name in ("palette.css", "style.css"))
+    template = environment().get_template("batch.html")
     counts = {state: sum(row.state == state for row in rows) for state in ("done", "failed", "planned")}
     links = {row.output: Path(row.output).name for row in rows}
-    return templates.get_template("batch.html").render(
-        rows=rows, counts=counts, links=links, folder=folder, policy=policy(style), style=Markup(style)
+    return template.render(
+        page_code(("palette.css", "style.css")), rows=rows, counts=counts, links=links, folder=folder
     )
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
-from ..core.errors import ConfigurationError
 from ..core.extras import missing_package
 
 if TYPE_CHECKING:
@@ -40,7 +39,9 @@ def _markup(
 ) -> str:
     """Fill the template that images and films share."""
     template = environment().get_template("compare.html")
-    return template.render(layers=layers, right=right, stretch=stretch, hint=hint, film=film, address=address)
+    from markupsafe import Markup
+
+    return Markup(template.render(layers=layers, right=right, stretch=stretch, hint=hint, film=film, address=address))
 
 
 def environment() -> jinja2.Environment:
@@ -48,7 +49,7 @@ def environment() -> jinja2.Environment:
     try:
         import jinja2
     except ImportError as error:
-        raise missing("jinja2") from error
+        raise missing_package("report", "jinja2", "report") from error
     return jinja2.Environment(
         loader=jinja2.FunctionLoader(text_file),
         autoescape=True,
@@ -61,8 +62,3 @@ def environment() -> jinja2.Environment:
 def text_file(name: str) -> str:
     """Read a template, a style sheet or a script of this folder."""
     return files(__package__).joinpath(name).read_text("utf-8")
-
-
-def missing(package: str) -> ConfigurationError:
-    """Return the error for a package of the extra ``report`` that is not installed."""
-    return missing_package("report", package, "report")

@@ -13,10 +13,11 @@ import shlex
 from collections.abc import Iterable
 from importlib.util import find_spec
 
+from ..core.extras import missing_package
 from ..io.output import atomic_write, check_output
 from ..results import Restoration
 from ..runs.run_record import RunRecord
-from .comparison import comparison, environment, missing, text_file
+from .comparison import comparison, environment, text_file
 from .facts import findings, headline, laps, settings, verdict
 from .panels import draw_panels
 from .pictures import encode_gallery, stages
@@ -33,7 +34,7 @@ def check_report(
     # The packages are only looked for here; loading them takes memory that the restoration needs.
     for package in _PACKAGES:
         if find_spec(package) is None:
-            raise missing(package)
+            raise missing_package("report", package, "report")
 
 
 def write_report(
@@ -79,19 +80,14 @@ def write_report(
 
 def render_report(restoration: Restoration, run: RunRecord) -> str:
     """Return the report of a restoration as HTML."""
-    from markupsafe import Markup
-
     template = environment().get_template("template.html")
-    style, script = "".join(map(text_file, ("palette.css", "compare.css", "style.css"))), text_file("compare.js")
     gallery = encode_gallery(stages(restoration, run.frame), run.frame_number)
     panels = draw_panels(restoration, run)
     return template.render(
+        page_code(("palette.css", "compare.css", "style.css"), ("compare.js",)),
         run=run,
         restoration=restoration,
-        policy=policy(style, script),
-        style=Markup(style),
-        script=Markup(script),
-        comparison=Markup(comparison(gallery)),
+        comparison=comparison(gallery),
         groups=[[panel for panel in panels if panel.is_map == wanted] for wanted in (True, False)],
         headline=headline(restoration),
         findings=findings(restoration),
@@ -102,11 +98,16 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
     )
 
 
-def policy(style: str, script: str = "", media: str = "'none'") -> str:
-    """Content security policy that allows only what the page itself contains."""
-    hashes = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script))
-    style_hash, script_hash = hashes
-    return (
+def page_code(styles: Iterable[str], scripts: Iterable[str] = (), media: str = "'none'") -> dict[str, str]:
+    """Return style sheet and script of a page, and the content security policy that allows only what it contains."""
+    from markupsafe import Markup
+
+    style, script = ("".join(map(text_file, names)) for names in (styles, scripts))
+    style_hash, script_hash = (
+        base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script)
+    )
+    policy = (
         f"default-src 'none'; img-src data:; media-src {media}; style-src 'sha256-{style_hash}'; "
         f"script-src 'sha256-{script_hash}'; base-uri 'none'; form-action 'none'"
     )
+    return {"style": Markup(style), "script": Markup(script), "policy": policy}

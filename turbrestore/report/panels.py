@@ -11,22 +11,10 @@ import numpy as np
 from ..blur.posterior import BlurPosterior
 from ..blur.psf import radial_otf
 from ..deconvolution.deconvolve import Deconvolution
-from ..display.plots import (
-    plot_blur,
-    plot_convergence,
-    plot_disagreement,
-    plot_displacements,
-    plot_eigenvalues,
-    plot_filter,
-    plot_flow,
-    plot_frames,
-    plot_objective,
-    plot_singular_values,
-    plot_transfer,
-    plot_uncertainty,
-    plot_variation,
-    plot_witnesses,
-)
+from ..display.curves import plot_blur, plot_convergence, plot_filter, plot_frames, plot_objective
+from ..display.maps import plot_disagreement, plot_displacements, plot_flow, plot_uncertainty
+from ..display.spectra import plot_eigenvalues, plot_singular_values
+from ..display.witnesses import plot_transfer, plot_variation, plot_witnesses
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
 from ..results import Restoration

@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
-from ..display.plots import plot_over_frames
+from ..display.curves import plot_over_frames
 from ..io.output import atomic_write
 from ..io.source import FrameSource
 from ..metrics import sharpness
 from ..runs.run_record import RunRecord
 from ..steady.settings import SteadyParams
-from .comparison import environment, film_comparison, text_file
+from .comparison import environment, film_comparison
 from .facts import Fact, duration, settings
 from .film import film_length, write_film
-from .page import check_report, policy
+from .page import check_report, page_code
 from .panels import Panel, make_panel
 
 # Quality of the film as a rate factor of H.264.
@@ -60,8 +60,6 @@ def write_steady_report(
     Memory does not grow with the length of the video but by the film, see :func:`film_length`.
     ``masks`` (H, W) each.
     """
-    from markupsafe import Markup
-
     check_report(path, overwrite=overwrite)
     sharp: list[float] = []
     change: list[float] = []
@@ -71,14 +69,10 @@ def write_steady_report(
         pairs = _compared(sources, sharp, change)
         film = write_film(path_of_film, pairs, count, sources[0].fps or _USUAL_RATE, _RATE_FACTOR, masks)
         address = "data:video/mp4;base64," + base64.b64encode(path_of_film.read_bytes()).decode("ascii")
-    style = "".join(map(text_file, ("palette.css", "compare.css", "style.css")))
-    script = "".join(map(text_file, ("film.js", "compare.js")))
     page = environment().get_template("steadied.html").render(
+        page_code(("palette.css", "compare.css", "style.css"), ("film.js", "compare.js"), media="data:"),
         run=run,
-        policy=policy(style, script, media="data:"),
-        style=Markup(style),
-        script=Markup(script),
-        comparison=Markup(film_comparison(film, address)),
+        comparison=film_comparison(film, address),
         shown=count,
         frames=len(sources[0]),
         scenes=figures.scenes,

@@ -7,15 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.errors import DataError, InputNotFoundError
+from ..core.errors import DataError
 from ..filtering.filter_records import FilterCheckpoint, FilterState, FrameRecord
 from ..filtering.kalman import Gaussian, PixelGaussian
 from ..io.npy import read_npz
 from ..io.output import atomic_output
 
 _FIGURES = ("gain", "innovation", "sharpness", "information")
-_STATE = ("image", "variance", "flow", "covariance", "flow_sum", "training_flow")
-_ARRAYS = (*_STATE, "reference", "flow_states", *_FIGURES)
 
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, key: str) -> None:
@@ -32,36 +30,16 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: FilterCheckpoint, 
 
 def load_checkpoint(path: str | os.PathLike[str], key: str) -> FilterCheckpoint:
     """Read a checkpoint back."""
-    source = Path(path)
-    kept = _read(source, key)
     try:
-        arrays = {name: kept[name] for name in _ARRAYS}
-        states, figures = arrays["flow_states"], np.stack([arrays[name] for name in _FIGURES], axis=-1)
-        records = tuple(FrameRecord(state, *map(float, row)) for state, row in zip(states, figures, strict=True))
-        state = FilterState(
-            PixelGaussian(arrays["image"], arrays["variance"]),
-            Gaussian(arrays["flow"], arrays["covariance"]),
-            arrays["flow_sum"],
-            arrays["training_flow"],
-        )
-    except (DataError, KeyError, ValueError, AttributeError, TypeError) as error:
-        raise _something_else(source) from error
-    return FilterCheckpoint(state, records, arrays["reference"])
-
-
-def _read(source: Path, key: str) -> dict[str, np.ndarray]:
-    """Read the arrays of a checkpoint that has the key."""
-    if not source.is_file():
-        raise InputNotFoundError(f"{source}: no such file")
-    try:
-        kept = read_npz(source)
+        kept = read_npz(Path(path))
         found = str(kept["key"])
-    except (DataError, KeyError) as error:
-        raise _something_else(source) from error
+        figures = np.stack([kept[name] for name in _FIGURES], axis=-1)
+        records = [FrameRecord(one, *map(float, row)) for one, row in zip(kept["flow_states"], figures, strict=True)]
+        image, flow = PixelGaussian(kept["image"], kept["variance"]), Gaussian(kept["flow"], kept["covariance"])
+        state = FilterState(image, flow, kept["flow_sum"], kept["training_flow"])
+        checkpoint = FilterCheckpoint(state, tuple(records), kept["reference"])
+    except (DataError, KeyError, ValueError, AttributeError, TypeError) as error:
+        raise DataError(f"{path}: expected a checkpoint of the filter, found something else or damage") from error
     if found != key:
-        raise DataError(f"{source}: expected a checkpoint of this run, found one of other frames or settings")
-    return kept
-
-
-def _something_else(source: Path) -> DataError:
-    return DataError(f"{source}: expected a checkpoint of the filter, found something else or damage")
+        raise DataError(f"{path}: expected a checkpoint of this run, found one of other frames or settings")
+    return checkpoint

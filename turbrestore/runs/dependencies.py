@@ -36,7 +36,7 @@ def stage_dependencies(source: FrameSource, params: RestoreParams, plan: MemoryP
             **({} if plan.tile is None else {"tile": plan.tile}),
             "region": [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start],
             "device": plan.runtime.device,
-            "static_mask": _mask_digest(params.static_mask),
+            "static_mask": params.static_mask if params.static_mask in ("auto", "off") else _digest(params.static_mask),
             "reference": _geometry_digest(params.reference),
             "like": _geometry_digest(params.like),
             "flow": settings["flow"],
@@ -59,11 +59,6 @@ def filter_key(facts: dict[str, dict[str, Any]]) -> str:
     """Return a checksum of all that the filter depends on."""
     parts = [facts[stage] for stage in ("centroid", "dynamics", "filtered")]
     return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=16).hexdigest()
-
-
-def _mask_digest(mask: str) -> str:
-    """Return the setting of the mask, or the checksum of its file."""
-    return mask if mask in ("auto", "off") else _digest(mask)
 
 
 def _digest(path: str) -> str:

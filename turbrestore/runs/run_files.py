@@ -10,42 +10,30 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
-from ..blur.estimation import BlurEstimate
-from ..blur.posterior import BlurPosterior
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, InputNotFoundError, OutputError
-from ..deconvolution.deconvolve import Deconvolution
-from ..dynamics.flow_model import FlowDynamics
-from ..filtering.alternating import Filtered
 from ..io.npy import read_npz, write_npz
 from ..io.output import atomic_output, atomic_write
-from ..registration.centroid import Centroid
-from ..registration.coverage import Rectangle
+from ..registration.centroid import CentroidParams
 from ..results import Restoration
-from ..settings import RestoreParams
-from .json_fields import JsonFields
 from .run_record import RunRecord
-from .stage_files import load_artifact, save_artifact
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
+from .stage_files import KINDS, load_artifact, save_artifact
+from .typed_records import KeptRecord, convert_to
 
 SCHEMA = 4
 RECORD, IMAGES, MEAN = "run.json", "images.npz", "mean.npy"
-RESULTS = ("centroid", "dynamics", "filtered", "blur", "posterior", "deconvolution")
 # All files of a kept run.
-RUN_FILES = (*(f"{name}.npz" for name in RESULTS), MEAN, IMAGES, RECORD)
+RUN_FILES = (*(f"{name}.npz" for name in KINDS), MEAN, IMAGES, RECORD)
 _ANEW = "start anew without resuming, or keep the stages in another folder"
+# Fields of a restoration that lie in no other file.
+_DESCRIBED = ("crop", "guard_readings", "decisions", "train", "frame_count", "seconds", "seeing")
 # Maps of the size of the result: the largest value, and what it is.
 _MAPS = {"uncertainty": (math.inf, "deviations"), "disagreement": (1.0, "shares")}
 # Where `turbrestore report` writes by default.
 REPORT = "report.html"
-
-Stage = TypeVar("Stage", bound="DataclassInstance")
 
 
 def save_run(folder: str | os.PathLike[str], restoration: Restoration, run: RunRecord) -> None:
@@ -68,7 +56,7 @@ def save_run(folder: str | os.PathLike[str], restoration: Restoration, run: RunR
     Examples
     --------
     >>> import numpy as np, tempfile
-    >>> from turbrestore.pipeline import restore
+    >>> from turbrestore.pipeline import RestoreParams, restore
     >>> frames = np.random.default_rng(0).uniform(size=(4, 32, 32)).astype(np.float32)
     >>> restoration = restore(frames, RestoreParams(until="centroid"))
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -84,81 +72,65 @@ def save_run(folder: str | os.PathLike[str], restoration: Restoration, run: RunR
         (place / RECORD).unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{place}: cannot be written to ({error.strerror})") from error
-    write_record(place, save_results(place, restoration, run, ()))
+    save_results(place, restoration, run, KeptRecord())
 
 
-def save_results(folder: Path, restoration: Restoration, run: RunRecord, stored: Collection[str]) -> dict[str, Any]:
-    """Write the images, and the results of the stages that are not there yet."""
+def save_results(folder: Path, restoration: Restoration, run: RunRecord, record: KeptRecord) -> None:
+    """Write the images, the results of the stages that are not there yet, and the record of all."""
     # A report would be of an earlier run.
     (folder / REPORT).unlink(missing_ok=True)
-    results = {name: getattr(restoration, name) for name in RESULTS}
+    results = {name: getattr(restoration, name) for name in KINDS}
     for name, result in results.items():
         if result is None:
             (folder / f"{name}.npz").unlink(missing_ok=True)
-        elif f"{name}.npz" not in stored:
+        elif f"{name}.npz" not in record.files:
             save_artifact(folder / f"{name}.npz", result, overwrite=True)
     with atomic_output(folder / IMAGES, overwrite=True) as temporary, temporary.open("wb") as stream:
         images = {"frame": run.frame, "mean": restoration.mean, "image": restoration.image}
         images |= {name: part for name in _MAPS if (part := getattr(restoration, name)) is not None}
         write_npz(stream, images)
-    described = {item.name: getattr(run, item.name) for item in dataclasses.fields(run) if item.name != "frame"}
-    restored = {
+    record.run = {item.name: getattr(run, item.name) for item in dataclasses.fields(run) if item.name != "frame"}
+    record.restoration = {
         "results": [name for name, result in results.items() if result is not None],
-        "crop": list(restoration.crop),
-        "guard_readings": [dataclasses.asdict(reading) for reading in restoration.guard_readings],
-        "decisions": [dataclasses.asdict(decision) for decision in restoration.decisions],
-        "train": restoration.train,
-        "frame_count": restoration.frame_count,
-        "seconds": restoration.seconds,
-        "seeing": None if restoration.seeing is None else dataclasses.asdict(restoration.seeing),
+        **{name: getattr(restoration, name) for name in _DESCRIBED},
     }
-    return {"run": described, "restoration": restored}
+    write_record(folder, record)
 
 
-def write_record(folder: Path, parts: Mapping[str, Any]) -> None:
+def write_record(folder: Path, record: KeptRecord) -> None:
     """Write ``run.json``; an older one is replaced when the new one is complete."""
-    text = json.dumps({"schema": SCHEMA, **parts}, indent=1) + "\n"
+    parts = {name: part for name, part in vars(record).items() if part is not None}
+    # In one order, whichever of the stages were taken over.
+    parts["files"] = dict(sorted(record.files.items()))
+    text = json.dumps({"schema": SCHEMA, **parts}, indent=1, default=dataclasses.asdict) + "\n"
     atomic_write(folder / RECORD, text.encode(), overwrite=True)
 
 
-def read_record(folder: Path) -> dict[str, Any] | None:
+def read_record(folder: Path) -> KeptRecord | None:
     """Read ``run.json``."""
-    record = _read_json(folder / RECORD)
-    if record is None:
+    path = folder / RECORD
+    found = _read_json(path)
+    if found is None:
         return None
-    found = _layout_of(record)
-    if found != SCHEMA:
-        raise DataError(
-            f"{folder / RECORD}: expected the record of a run, layout {SCHEMA}, found layout {found or 'none'}"
-        )
-    return record
+    layout = found.get("schema")
+    if layout != SCHEMA:
+        raise DataError(f"{path}: expected the record of a run, layout {SCHEMA}, found layout {layout!r:.40}")
+    # An earlier version wrote an empty part where nothing was deblurred.
+    return convert_to(KeptRecord, {**found, "deblurred": found.get("deblurred") or None}, str(path))
 
 
-def read_stages(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Read the record of the stages that are kept in a folder."""
+def read_stages(folder: str | os.PathLike[str]) -> KeptRecord | None:
+    """Read the record of the stages that are kept in a folder; one of an older layout says nothing of them."""
     place = Path(folder)
     try:
-        kept = _read_json(place / RECORD)
-        if 0 < _layout_of(kept) < SCHEMA and "facts" in kept:
-            return {"facts": {}, "files": {}, "deblurred": {}, "outputs": []}
+        found = _read_json(place / RECORD) or {}
+        layout = found.get("schema")
+        if type(layout) is int and 0 < layout < SCHEMA and "facts" in found:
+            return KeptRecord(facts={})
         record = read_record(place)
-        if record is None or "facts" not in record:
-            return None
-        fields = JsonFields(place / RECORD, record)
-        facts = fields.part("facts")
-        for stage in facts.record:
-            facts.part(stage)
-        fields.named_texts("files")
-        fields.texts("outputs")
-        verdict = fields.part("deblurred")
-        if verdict.record:
-            verdict.flag("estimated")
-            verdict.flag("measured")
-            verdict.guard_readings("readings")
-            verdict.decisions("decisions")
     except DataError as error:
         raise DataError(f"{error}; {_ANEW}") from error
-    return record
+    return None if record is None or record.facts is None else record
 
 
 def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
@@ -189,79 +161,37 @@ def load_run(folder: str | os.PathLike[str]) -> tuple[Restoration, RunRecord]:
     turbrestore.core.errors.InputNotFoundError: missing: expected the folder of a kept run, ...
     """
     place = Path(folder)
-    record = read_record(place)
-    if record is None or "restoration" not in record:
+    record, name = read_record(place), str(place / RECORD)
+    if record is None or record.restoration is None:
         raise InputNotFoundError(f"{place}: expected the folder of a kept run, found no complete {RECORD} in it")
-    fields = JsonFields(place / RECORD, record)
-    facts, run = fields.part("restoration"), fields.part("run")
-    names = facts.texts("results")
-    if "centroid" not in names or not set(names) <= set(RESULTS):
-        raise DataError(f"{fields.path}: expected results among {', '.join(RESULTS)}, found {', '.join(names)}")
-    crop = _crop(facts)
-    images = _read_images(place / IMAGES, crop)
-    restoration = Restoration(
-        image=images["image"],
-        crop=crop,
-        mean=images["mean"],
-        centroid=load_artifact(place / "centroid.npz", Centroid),
-        dynamics=_stage(place, names, "dynamics", FlowDynamics),
-        filtered=_stage(place, names, "filtered", Filtered),
-        blur=_stage(place, names, "blur", BlurEstimate),
-        posterior=_stage(place, names, "posterior", BlurPosterior),
-        deconvolution=_stage(place, names, "deconvolution", Deconvolution),
-        guard_readings=facts.guard_readings("guard_readings"),
-        decisions=facts.decisions("decisions"),
-        train=facts.value("train", int),
-        frame_count=facts.value("frame_count", int),
-        seconds=facts.numbers("seconds"),
-        seeing=facts.seeing("seeing"),
-        **{name: images.get(name) for name in _MAPS},
-    )
-    return restoration, RunRecord(
-        name=run.value("name", str),
-        frame=images["frame"],
-        frame_number=run.value("frame_number", int),
-        source=run.value("source", str),
-        settings=run.part("settings").like(dataclasses.asdict(RestoreParams())),
-        command=run.texts("command"),
-        warnings=run.texts("warnings"),
-        versions={name: str(text) for name, text in run.value("versions", dict).items()},
-        finished=run.value("finished", str),
-    )
+    images = _read_images(place / IMAGES)
+    run = convert_to(RunRecord, {**(record.run or {}), "frame": images.pop("frame")}, f"{name}: run")
+    # The report shows settings as they are, and computes with one of the centroid.
+    convert_to(CentroidParams, run.settings.get("centroid", {}), f"{name}: run.settings.centroid")
+    results = convert_to(tuple[str, ...], record.restoration.get("results"), f"{name}: restoration.results")
+    if "centroid" not in results or not set(results) <= KINDS.keys():
+        raise DataError(f"{name}: expected results among {', '.join(KINDS)}, found {results!r:.80}")
+    stages = {stage: load_artifact(place / f"{stage}.npz", KINDS[stage]) for stage in results}
+    parts = {**dict.fromkeys(KINDS), **record.restoration, **stages, **images}
+    restoration = convert_to(Restoration, parts, f"{name}: restoration")
+    _check_sizes(place / IMAGES, restoration, run.frame)
+    return restoration, run
 
 
-def _read_json(path: Path) -> Any:
-    """Content of a file, None if there is none."""
+def _read_json(path: Path) -> dict[str, Any] | None:
+    """Return the object in a file, an empty one where the file holds something else, None if there is no file."""
     if path.exists() and not path.is_file():
         raise DataError(f"{path}: expected the record of a run, found no file")
     try:
-        # A file that holds null is no record either.
-        return json.loads(path.read_text("utf-8")) or {}
+        found = json.loads(path.read_text("utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: expected the record of a run, found something else or damage") from error
+    return found if isinstance(found, dict) else {}
 
 
-def _layout_of(record: Any) -> int:
-    """Version of the layout of a record, 0 where it states none."""
-    found = record.get("schema") if isinstance(record, dict) else None
-    return found if type(found) is int else 0
-
-
-def _stage(place: Path, names: tuple[str, ...], name: str, kind: type[Stage]) -> Stage | None:
-    return load_artifact(place / f"{name}.npz", kind) if name in names else None
-
-
-def _crop(fields: JsonFields) -> Rectangle:
-    found = fields.value("crop", list)
-    if len(found) != 4 or not all(type(number) is int and number >= 0 for number in found):
-        raise DataError(f"{fields.path}: expected crop to be x, y, width and height, found {found!r:.40}")
-    x, y, width, height = found
-    return x, y, width, height
-
-
-def _read_images(path: Path, crop: Rectangle) -> dict[str, FloatArray]:
+def _read_images(path: Path) -> dict[str, FloatArray]:
     if not path.is_file():
         raise InputNotFoundError(f"{path}: no such file")
     try:
@@ -270,14 +200,21 @@ def _read_images(path: Path, crop: Rectangle) -> dict[str, FloatArray]:
     except (DataError, KeyError) as error:
         raise DataError(f"{path}: expected the images of a run, found something else or damage") from error
     images = {name: check_image(array, f"{path}: {name}") for name, array in arrays.items()}
-    x, y, width, height = crop
-    if images["frame"].shape != images["mean"].shape or images["image"].shape[:2] != (height, width):
-        raise DataError(f"{path}: expected images of one size, found {[image.shape for image in images.values()]}")
-    if x + width > images["mean"].shape[1] or y + height > images["mean"].shape[0]:
-        raise DataError(f"{path}: expected the result to lie within the frames, found it at {crop}")
-    for name in found.keys() & _MAPS.keys():
-        part, (most, what) = found[name], _MAPS[name]
+    return {**images, **{name: found[name] for name in found.keys() & _MAPS.keys()}}
+
+
+def _check_sizes(path: Path, restoration: Restoration, frame: FloatArray) -> None:
+    """Refuse images that do not fit each other, and maps with values that no map has."""
+    x, y, width, height = restoration.crop
+    image, mean = restoration.image, restoration.mean
+    if frame.shape != mean.shape or image.shape[:2] != (height, width):
+        shapes = [part.shape for part in (frame, mean, image)]
+        raise DataError(f"{path}: expected images of one size, found {shapes} and {restoration.crop}")
+    if min(x, y) < 0 or x + width > mean.shape[1] or y + height > mean.shape[0]:
+        raise DataError(f"{path}: expected the result to lie within the frames, found it at {restoration.crop}")
+    for name, (most, what) in _MAPS.items():
+        part = getattr(restoration, name)
+        if part is None:
+            continue
         if part.shape != (height, width) or part.dtype.str != "<f4" or not ((part >= 0) & (part <= most)).all():
             raise DataError(f"{path}: expected {what} of shape {(height, width)}, found {part.shape}")
-        images[name] = part
-    return images

@@ -20,13 +20,12 @@ or whole frames do not fit, the centroid depends on those frames and on the size
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
@@ -36,24 +35,25 @@ from ..blur.posterior import BlurPosterior
 from ..core.arrays import check_image
 from ..core.errors import DataError, OutputError, require
 from ..deconvolution.deconvolve import Deconvolution
-from ..dynamics.flow_model import FlowDynamics
-from ..filtering.alternating import FilterCheckpoint, Filtered
+from ..filtering.filter_records import FilterCheckpoint
 from ..footage.levels import Levels
 from ..io.npy import map_npy
 from ..io.output import atomic_output
 from ..io.source import FrameSource
 from ..memory_plan import plan_memory
-from ..registration.centroid import Centroid
 from ..results import Restoration
 from ..runtime.runtime import DEFAULT, Runtime
 from ..settings import RestoreParams
 from .checkpoint import load_checkpoint, save_checkpoint
 from .dependencies import filter_key, list_changes, stage_dependencies
 from .digests import file_digest
-from .json_fields import JsonFields
-from .run_files import MEAN, RECORD, RUN_FILES, read_stages, save_results, write_record
+from .run_files import MEAN, RUN_FILES, read_stages, save_results, write_record
 from .run_record import RunRecord
-from .stage_files import load_stage, save_stage
+from .stage_files import KINDS, load_stage, save_stage
+from .typed_records import DeblurringRecord, KeptRecord
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 CHECKPOINT = "checkpoint.npz"
 FILES = {
@@ -63,12 +63,12 @@ FILES = {
     "deblurred": ("deconvolution.npz", "blur.npz", "posterior.npz"),
 }
 TITLES = {"centroid": "centroid", "dynamics": "flow model", "filtered": "filter", "deblurred": "deconvolution"}
-_KINDS: dict[str, type] = {"centroid": Centroid, "dynamics": FlowDynamics, "filtered": Filtered}
 _TILE = re.compile(r"filtered_tile_\d+")
 # Left by a writer that was killed.
 _PART = re.compile(r"\.[0-9a-f]{16}\.part")
 
 Result = TypeVar("Result")
+Stage = TypeVar("Stage", bound="DataclassInstance")
 
 
 class RunFolder:
@@ -94,25 +94,22 @@ class RunFolder:
         self.folder, self._every, self._block = Path(folder), every, params.filter.block
         plan = plan_memory(source.shape, params, runtime)
         self._scratch = plan.runtime.scratch
-        self._facts = stage_dependencies(source, params, plan)
-        self._key = filter_key(self._facts)
-        self._files: dict[str, str] = {}
-        self._verdict: dict[str, Any] = {}
-        self._outputs: tuple[str, ...] = ()
-        self._completed: dict[str, Any] = {}
+        facts = stage_dependencies(source, params, plan)
+        self._key = filter_key(facts)
+        self._record = KeptRecord(facts)
         self._newest: FilterCheckpoint | None = None
         self._levels = Levels()
         self._written = 0
         self.notes = tuple[str, ...]()
         record = read_stages(self.folder) if resume else None
         if record is not None:
-            self._take_over(record)
+            self._take_over(record, facts)
         self._remove_the_rest()
 
     @property
     def stored(self) -> frozenset[str]:
         """Names of the files on disk that hold the results of stages."""
-        return frozenset(self._files)
+        return frozenset(self._record.files)
 
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
         """Return a result that was kept, else compute and keep it."""
@@ -146,142 +143,125 @@ class RunFolder:
 
     def expect(self, *outputs: Path) -> None:
         """Note which outputs are about to be written, so that a run that dies meanwhile may replace its own."""
-        self._outputs = tuple(str(path.absolute()) for path in outputs)
-        self._write_record()
+        self._record.outputs = tuple(str(path.absolute()) for path in outputs)
+        write_record(self.folder, self._record)
 
     def progress(self) -> str:
         """Say how far the results on disk go."""
-        stages = itertools.takewhile(lambda stage: FILES[stage][0] in self._files, FILES)
+        stages = itertools.takewhile(lambda stage: FILES[stage][0] in self.stored, FILES)
         last = [TITLES[stage] for stage in stages][-1:]
         words = f"after the {last[0]}" if last else "from the start"
-        tiles = sum(1 for name in self._files if _TILE.fullmatch(name.removesuffix(".npz")))
+        tiles = _tiles(self.stored)
         if tiles:
-            return f"{words} and {tiles} tiles of the filter"
+            return f"{words} and {len(tiles)} tiles of the filter"
         return f"{words} and {self._written} frames of the filter" if self._written else words
 
     def withdraw(self) -> None:
         """Remove the record of a run that failed before it stored a result."""
-        if self._files or self._written:
+        if self.stored or self._written:
             return
         for name in (*RUN_FILES, CHECKPOINT):
             (self.folder / name).unlink(missing_ok=True)
 
     def complete(self, restoration: Restoration, run: RunRecord) -> None:
         """Write what :func:`turbrestore.load_run` needs beside the results of the stages."""
-        self._completed = save_results(self.folder, restoration, run, self.stored)
-        self._write_record()
+        save_results(self.folder, restoration, run, self._record)
 
-    def _take_over(self, record: dict[str, Any]) -> None:
+    def _take_over(self, record: KeptRecord, facts: dict[str, dict[str, Any]]) -> None:
         """Find what still holds, and say where and why something starts again."""
-        if not record["facts"]:
+        if not record.facts:
             self.notes = ("starts again: an earlier version of turbrestore kept these stages",)
             return
         notes: list[str] = []
         holds = []
-        for stage, expected in self._facts.items():
-            changes = list(list_changes(record["facts"].get(stage, {}), expected))
+        for stage, expected in facts.items():
+            changes = list(list_changes(record.facts.get(stage, {}), expected))
             if changes:
                 notes.append(f"starts again at the {TITLES[stage]}: {'; '.join(changes)}")
                 break
             holds.append(stage)
         names = [name for stage in holds for name in FILES[stage]]
         if "filtered" in holds:
-            names += [name for name in record["files"] if _TILE.fullmatch(name.removesuffix(".npz"))]
+            names += _tiles(record.files)
         for name in names:
-            wanted = record["files"].get(name)
+            wanted = record.files.get(name)
             if wanted is not None and _is_whole(self.folder / name, wanted):
-                self._files[name] = wanted
+                self._record.files[name] = wanted
             elif wanted is not None:
                 notes.append(f"{name} is missing or damaged and is made again")
-        self._verdict, self._outputs = record["deblurred"], tuple(record["outputs"])
-        if "filtered" in holds and "filtered.npz" not in self._files and (self.folder / CHECKPOINT).exists():
+        self._record.deblurred, self._record.outputs = record.deblurred, record.outputs
+        if "filtered" in holds and "filtered.npz" not in self.stored and (self.folder / CHECKPOINT).exists():
             try:
                 self._newest = load_checkpoint(self.folder / CHECKPOINT, self._key)
                 self._written = len(self._newest.records)
             except DataError as error:
                 notes.append(str(error))
-        self.notes = (*notes, *([] if notes and not self._files else [f"continues {self.progress()}"]))
+        self.notes = (*notes, *([] if notes and not self.stored else [f"continues {self.progress()}"]))
 
     def _load(self, name: str) -> object | None:
         """Read a result whose files are as they were written."""
-        if name == "mean":
-            return check_image(map_npy(self.folder / MEAN), MEAN) if MEAN in self._files else None
         if name == "deblurred":
             return self._load_deblurred()
-        if f"{name}.npz" not in self._files:
-            return None
-        return load_stage(self.folder / f"{name}.npz", _KINDS[_kind(name)], self._scratch)
+        if name == "mean":
+            return check_image(map_npy(self.folder / MEAN), MEAN) if MEAN in self.stored else None
+        return self._load_stage(name, KINDS["filtered" if _TILE.fullmatch(name) else name], self._scratch)
+
+    def _load_stage(self, name: str, kind: type[Stage], scratch: Path | None = None) -> Stage | None:
+        return load_stage(self.folder / f"{name}.npz", kind, scratch) if f"{name}.npz" in self.stored else None
 
     def _load_deblurred(self) -> Deblurred | None:
-        parts = (("estimated", "blur.npz"), ("measured", "posterior.npz"))
-        whole = all(self._verdict.get(flag) is (name in self._files) for flag, name in parts)
-        if "deconvolution.npz" not in self._files or not whole:
+        known, result = self._record.deblurred, self._load_stage("deconvolution", Deconvolution, self._scratch)
+        if known is None or result is None:
             return None
-        result = load_stage(self.folder / "deconvolution.npz", Deconvolution, self._scratch)
-        blur = load_stage(self.folder / "blur.npz", BlurEstimate) if "blur.npz" in self._files else None
-        measured = "posterior.npz" in self._files
-        posterior = load_stage(self.folder / "posterior.npz", BlurPosterior) if measured else None
-        fields = JsonFields(self.folder / RECORD, self._verdict)
-        readings, decisions = fields.guard_readings("readings"), fields.decisions("decisions")
-        return Deblurred(result, blur, None, readings, decisions, posterior)
+        blur, posterior = self._load_stage("blur", BlurEstimate), self._load_stage("posterior", BlurPosterior)
+        if (known.estimated, known.measured) != (blur is not None, posterior is not None):
+            return None
+        return Deblurred(result, blur, None, known.readings, known.decisions, posterior)
 
     def _save(self, name: str, result: Any) -> None:
         """Write the files of a result, and then the record that they are there."""
-        results = {name: result}
+        results, record = {name: result}, self._record
         if name == "mean":
             with atomic_output(self.folder / MEAN, overwrite=True) as temporary, temporary.open("wb") as stream:
                 np.save(stream, np.asarray(result), allow_pickle=False)
-            self._files[MEAN] = file_digest(self.folder / MEAN)
+            record.files[MEAN] = file_digest(self.folder / MEAN)
             results = {}
         elif name == "deblurred":
             results = {"deconvolution": result.deconvolution, "blur": result.blur, "posterior": result.posterior}
-            self._verdict = _verdict(result)
+            record.deblurred = DeblurringRecord(
+                result.blur is not None, result.posterior is not None, result.readings, result.decisions
+            )
         for part, value in results.items():
-            self._files.pop(f"{part}.npz", None)
+            record.files.pop(f"{part}.npz", None)
             if value is not None:
                 save_stage(self.folder / f"{part}.npz", value, self._levels)
-                self._files[f"{part}.npz"] = file_digest(self.folder / f"{part}.npz")
-        self._write_record()
+                record.files[f"{part}.npz"] = file_digest(self.folder / f"{part}.npz")
+        write_record(self.folder, record)
         if name == "filtered":
             self._remove_filter_states()
 
     def _remove_filter_states(self) -> None:
         """Remove checkpoint and tiles once the filter is done."""
-        tiles = [name for name in self._files if _TILE.fullmatch(name.removesuffix(".npz"))]
+        tiles = _tiles(self.stored)
         for name in (CHECKPOINT, *tiles):
-            self._files.pop(name, None)
+            self._record.files.pop(name, None)
             (self.folder / name).unlink(missing_ok=True)
         self._newest, self._written = None, 0
         if tiles:
-            self._write_record()
+            write_record(self.folder, self._record)
 
     def _remove_the_rest(self) -> None:
         """Remove what does not belong to this run, such as files of other runs."""
-        kept = {*self._files, *([CHECKPOINT] if self._written else [])}
+        kept = {*self.stored, *([CHECKPOINT] if self._written else [])}
         try:
-            tiles = {
-                path.name for path in self.folder.iterdir() if path.suffix == ".npz" and _TILE.fullmatch(path.stem)
-            }
-            for name in {*RUN_FILES, CHECKPOINT, *tiles} - kept:
+            there = [path.name for path in self.folder.iterdir()]
+            parts = [name for name in there if is_part(self.folder / name)]
+            for name in {*RUN_FILES, CHECKPOINT, *_tiles(there), *parts} - kept:
                 (self.folder / name).unlink(missing_ok=True)
-            for path in [path for path in self.folder.iterdir() if is_part(path)]:
-                path.unlink(missing_ok=True)
             # Written before any result, so that every later file belongs to this run.
-            self._write_record()
+            write_record(self.folder, self._record)
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written to ({error.strerror or error})") from error
-
-    def _record(self) -> dict[str, Any]:
-        return {
-            "facts": self._facts,
-            "files": dict(sorted(self._files.items())),
-            "deblurred": self._verdict,
-            "outputs": list(self._outputs),
-            **self._completed,
-        }
-
-    def _write_record(self) -> None:
-        write_record(self.folder, self._record())
 
 
 def is_part(path: Path) -> bool:
@@ -289,8 +269,9 @@ def is_part(path: Path) -> bool:
     return _PART.fullmatch(path.name) is not None
 
 
-def _kind(name: str) -> str:
-    return "filtered" if _TILE.fullmatch(name) else name
+def _tiles(names: Iterable[str]) -> list[str]:
+    """Return those of the names that are files of filtered tiles."""
+    return [name for name in names if name.endswith(".npz") and _TILE.fullmatch(name.removesuffix(".npz"))]
 
 
 def _is_whole(path: Path, digest: str) -> bool:
@@ -298,13 +279,3 @@ def _is_whole(path: Path, digest: str) -> bool:
         return file_digest(path) == digest
     except OSError:
         return False
-
-
-def _verdict(deblurred: Deblurred) -> dict[str, Any]:
-    """List the fields of a deblurred image that have no stage file."""
-    return {
-        "estimated": deblurred.blur is not None,
-        "measured": deblurred.posterior is not None,
-        "readings": [dataclasses.asdict(item) for item in deblurred.readings],
-        "decisions": [dataclasses.asdict(item) for item in deblurred.decisions],
-    }

@@ -1,4 +1,7 @@
-"""What the fields of every kind of stage file are: type, shape and range, checked when one is read.
+"""What the arrays and numbers of every kind of stage file are: shape and range, checked when one is read.
+
+The types of numbers, flags and texts are those of the record that the file becomes.  A number that is not listed lies
+between 0 and a billion.
 
 Shapes name their axes; one name stands for one length within a stage file:
 
@@ -17,14 +20,18 @@ k       values of a record, such as one an iteration
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import DataError
+from ..dynamics.flow_model import FlowDynamics
 from ..runtime.scratch import iter_parts
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 # Far beyond what pixels and intensities are, and small enough to be squared.
 _MOST = 1e9
@@ -50,43 +57,27 @@ class Array:
 class Number:
     """A number of a stage file."""
 
-    whole: bool = False  # whether it is whole
     # Least and largest value; infinite ones are allowed where a bound is infinite.
     low: float = 0
     high: float = _MOST
 
 
-@dataclass(frozen=True)
-class Flag:
-    """True or false."""
-
-
-@dataclass(frozen=True)
-class Lines:
-    """A list of text."""
-
-
-Field = Array | Number | Flag | Lines
 _IMAGE = Array("f4", "H W|H W 3")
-FIELDS: dict[str, dict[str, Field]] = {
+FIELDS: dict[str, dict[str, Array | Number]] = {
     "centroid": {
         "image": _IMAGE,
         "flows": Array("f4", "T H W 2"),
         "mean_flow_sizes": Array("f8", "i", low=0),
-        "converged": Flag(),
     },
     "dynamics": {
         "mean_flow": Array("f4", "H W 2"),
         "A": Array("f8", "n n"),
         "C": Array("f4", "P n"),
         "Q": Array("f8", "n n"),
-        "R": Number(),
         "residual_variance": Array("f4", "H W", low=0),
         "states": Array("f8", "n τ"),
         "singular_values": Array("f8", "τ", low=0),
         "energy_share": Number(high=1 + _ROUNDING),
-        "overfitted": Flag(),
-        "notes": Lines(),
     },
     "filtered": {
         "image": _IMAGE,
@@ -96,39 +87,26 @@ FIELDS: dict[str, dict[str, Field]] = {
         "innovations": Array("f8", "N", low=0, gaps=True),
         "sharpness": Array("f8", "N", gaps=True),
         "shares": Array("f8", "N", low=0, high=1 + _ROUNDING),
-        "image_noise": Number(),
-        "sharpness_weight": Number(),
         "mean_flow": Array("f4", "H W 2"),
     },
     "deconvolution": {
         "image": _IMAGE,
-        "sigma": Number(),
         "fidelity": Number(high=_INFINITE),
-        "noise": Number(),
-        "iterations": Number(whole=True),
-        "converged": Flag(),
         "recorded": Array("i8", "k", low=0),
         "objective": Array("f8", "k", low=-_INFINITE, high=_INFINITE, gaps=True),
         "changes": Array("f8", "k", low=0, high=_INFINITE, gaps=True),
     },
     "blur": {
-        "sigma": Number(),
         "uncertainty": Number(high=_INFINITE),
-        "exponent": Number(),
-        "noise": Number(),
-        "reduction": Number(whole=True, low=1),
+        "reduction": Number(low=1),
         "evidence": Number(low=-_INFINITE, high=_INFINITE),
         "widths": Array("f8", "k", low=0),
         "costs": Array("f8", "k", low=-_INFINITE, high=_INFINITE),
-        "edge_limited": Flag(),
     },
     "posterior": {
-        "removed": Number(),
-        "exponent": Number(),
         "width": Array("f8", "3", low=0),
         **dict.fromkeys(("by_displacement", "by_variation", "by_image"), Array("f8", "3", low=0, gaps=True)),
         "air": Number(high=1 + _ROUNDING),
-        "edge_limited": Flag(),
         **dict.fromkeys(("frequencies", "transfer", "lowest", "highest"), Array("f8", "k", low=0)),
         **{
             f"{prefix}{name}{suffix}": Array("f8", "k", gaps=True)
@@ -139,42 +117,26 @@ FIELDS: dict[str, dict[str, Field]] = {
 }
 
 
-def check_fields(kind: str, fields: Mapping[str, Any], name: str) -> None:
-    """Refuse fields that a stage cannot have made."""
-    layout = FIELDS[kind]
-    if set(fields) != set(layout):
-        raise DataError(f"{name}: expected the fields {sorted(layout)}, found {sorted(fields)}")
+def check_fields(kind: str, result: DataclassInstance, name: str) -> None:
+    """Refuse a result that a stage cannot have made."""
     sizes: dict[str, int] = {}
-    for field, wanted in layout.items():
-        complaint = _complaint(fields[field], wanted, sizes)
+    numbers = [field for field, value in vars(result).items() if isinstance(value, int | float)]
+    for field, wanted in {**dict.fromkeys(numbers, Number()), **FIELDS[kind]}.items():
+        value = getattr(result, field)
+        if isinstance(wanted, Array):
+            complaint = _array_complaint(value, wanted, sizes)
+        else:
+            complaint = "" if wanted.low <= value <= wanted.high else _range(wanted, value)
         if complaint:
             raise DataError(f"{name}: expected {field} {complaint}; the file is damaged")
-    if kind == "dynamics":
-        _check_dynamics(fields, name)
+    if isinstance(result, FlowDynamics):
+        _check_dynamics(result, name)
 
 
-def _complaint(value: object, wanted: Field, sizes: dict[str, int]) -> str:
-    """Say what is expected of a value and what it is instead; nothing where it is right."""
-    if isinstance(wanted, Array):
-        return _array_complaint(value, wanted, sizes)
-    if isinstance(wanted, Flag):
-        return "" if isinstance(value, bool) else f"to be true or false, found {value!r:.40}"
-    if isinstance(wanted, Lines):
-        right = isinstance(value, list) and all(isinstance(line, str) for line in value)
-        return "" if right else f"to be a list of text, found {value!r:.40}"
-    # A whole number of any length would be read, but not every one is a float.
-    too_long = isinstance(value, int) and value.bit_length() > 64
-    if not isinstance(value, int if wanted.whole else (int, float)) or isinstance(value, bool) or too_long:
-        return f"to be a {'whole ' if wanted.whole else ''}number, found {value!r:.40}"
-    return "" if wanted.low <= value <= wanted.high else _range(wanted, value)
-
-
-def _array_complaint(value: object, wanted: Array, sizes: dict[str, int]) -> str:
-    dtype = np.dtype(wanted.dtype)
-    if not isinstance(value, np.ndarray):
-        return f"to be an array, found {value!r:.40}"
-    if value.dtype != dtype:
-        return f"to be of {dtype}, found {value.dtype}"
+def _array_complaint(value: NDArray[Any], wanted: Array, sizes: dict[str, int]) -> str:
+    """Say what is expected of an array and what it is instead; nothing where it is right."""
+    if value.dtype != np.dtype(wanted.dtype):
+        return f"to be of {np.dtype(wanted.dtype)}, found {value.dtype}"
     if not any(_fits(value.shape, shape.split(), sizes) for shape in wanted.shape.split("|")):
         known = ", ".join(f"{axis} = {size}" for axis, size in sizes.items())
         shape = wanted.shape.replace(" ", ", ").replace("|", ") or (")
@@ -194,7 +156,7 @@ def _array_complaint(value: object, wanted: Array, sizes: dict[str, int]) -> str
 
 
 def _range(wanted: Array | Number, found: float) -> str:
-    return f"from {wanted.low:g} to {wanted.high:g}, found {found}"
+    return f"from {wanted.low:g} to {wanted.high:g}, found {found!s:.40}"
 
 
 def _fits(shape: tuple[int, ...], axes: list[str], sizes: dict[str, int]) -> bool:
@@ -213,9 +175,9 @@ def _fits(shape: tuple[int, ...], axes: list[str], sizes: dict[str, int]) -> boo
     return True
 
 
-def _check_dynamics(fields: Mapping[str, Any], name: str) -> None:
+def _check_dynamics(dynamics: FlowDynamics, name: str) -> None:
     """Refuse a covariance with a negative eigenvalue, and more states than there are flows."""
-    Q, count = fields["Q"], fields["states"].shape[1]
+    Q, count = dynamics.Q, dynamics.states.shape[1]
     if len(Q) > count:
         raise DataError(f"{name}: expected up to {count} states, one a flow, found {len(Q)}; the file is damaged")
     largest = np.abs(Q).max(initial=0.0)

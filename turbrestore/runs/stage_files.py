@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from ..blur.estimation import BlurEstimate
 from ..blur.posterior import BlurPosterior
-from ..core.arrays import FloatArray, check_flow, check_image
+from ..core.arrays import FloatArray, check_flow
 from ..core.errors import DataError, InputNotFoundError
 from ..deconvolution.deconvolve import Deconvolution
 from ..dynamics.flow_model import FlowDynamics
@@ -33,6 +33,7 @@ from ..registration.centroid import Centroid
 from ..registration.recentring import recentre
 from ..results import at_levels_of_clip
 from .stage_fields import check_fields
+from .typed_records import convert_to
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -42,9 +43,9 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "centroid": Centroid,
     "dynamics": FlowDynamics,
     "filtered": Filtered,
-    "deconvolution": Deconvolution,
     "blur": BlurEstimate,
     "posterior": BlurPosterior,
+    "deconvolution": Deconvolution,
 }
 _HEADER = "header"
 # Frames are never stretched as much.
@@ -132,13 +133,12 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Pat
     ...
     turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
     """
-    fields, levels = _read_kind(Path(path), kind, scratch)
-    return at_levels_of_clip(_build(kind, fields), levels)
+    return at_levels_of_clip(*_read_kind(Path(path), kind, scratch))
 
 
 def load_stage(path: Path, kind: type[Result], scratch: Path | None = None) -> Result:
     """Read a stage result back as its stage made it."""
-    return _build(kind, _read_kind(path, kind, scratch)[0])
+    return _read_kind(path, kind, scratch)[0]
 
 
 def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
@@ -149,7 +149,7 @@ def load_stage_image(path: str | os.PathLike[str]) -> FloatArray:
     source = Path(path)
     if source.suffix.lower() != ".npz":
         return read_image(source).image
-    return _image_of(source, *_read(source))
+    return _image_of(source, at_levels_of_clip(*_read(source)))
 
 
 def load_guide(path: str | os.PathLike[str], image: str | os.PathLike[str]) -> FloatArray:
@@ -159,14 +159,13 @@ def load_guide(path: str | os.PathLike[str], image: str | os.PathLike[str]) -> F
     centroid is moved as the filtered image was, as :func:`turbrestore.restore` does.
     Returns (H, W) or (H, W, 3).
     """
-    (kind, fields, levels), (other, fields_of_image, _) = _read(Path(path)), _read(Path(image))
-    guide = _image_of(Path(path), kind, fields, levels)
-    if (kind, other) != ("centroid", "filtered"):
+    result, guided = (at_levels_of_clip(*_read(Path(name))) for name in (path, image))
+    guide = _image_of(Path(path), result)
+    if not (isinstance(result, Centroid) and isinstance(guided, Filtered)):
         return guide
-    mean_flow = fields_of_image["mean_flow"]
-    if guide.shape[:2] != mean_flow.shape[:2]:
-        raise DataError(f"{path}: expected the size of {image}, {mean_flow.shape[:2]}, found {guide.shape[:2]}")
-    return recentre(guide, mean_flow)
+    if guide.shape[:2] != guided.mean_flow.shape[:2]:
+        raise DataError(f"{path}: expected the size of {image}, {guided.mean_flow.shape[:2]}, found {guide.shape[:2]}")
+    return recentre(guide, guided.mean_flow)
 
 
 def save_flows(path: str | os.PathLike[str], flows: ArrayLike, overwrite: bool = False) -> None:
@@ -199,16 +198,17 @@ def load_flows(path: str | os.PathLike[str]) -> FloatArray:
     return check_flow(flows, str(source))
 
 
-def _read_kind(source: Path, kind: type, scratch: Path | None) -> tuple[dict[str, Any], Levels]:
-    """Fields and levels of a stage file of one kind."""
-    name, (found, fields, levels) = _kind_of(kind), _read(source, scratch)
-    if found != name:
-        raise DataError(f"{source}: expected a {name} stage file, found a {found} stage file")
-    return fields, levels
+def _read_kind(source: Path, kind: type[Result], scratch: Path | None) -> tuple[Result, Levels]:
+    """Read the result in a stage file of one kind, and its levels."""
+    result, levels = _read(source, scratch)
+    if not isinstance(result, kind):
+        found = _kind_of(type(result))
+        raise DataError(f"{source}: expected a {_kind_of(kind)} stage file, found a {found} stage file")
+    return result, levels
 
 
-def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any], Levels]:
-    """Kind, fields and levels of a stage file."""
+def _read(source: Path, scratch: Path | None = None) -> tuple[DataclassInstance, Levels]:
+    """Read the result in a stage file, and its levels."""
     if source.is_dir() or not source.exists():
         raise InputNotFoundError(f"{source}: no such file")
     check_input(source)
@@ -226,18 +226,15 @@ def _read(source: Path, scratch: Path | None = None) -> tuple[str, dict[str, Any
         raise DataError(
             f"{source}: expected a stage file of layout {SCHEMA}, found a {kind!r:.40} of layout {schema!r:.40}"
         )
-    check_fields(kind, fields, str(source))
-    return kind, fields, Levels(low, gain)
+    result = convert_to(KINDS[kind], fields, str(source))
+    check_fields(kind, result, str(source))
+    return result, Levels(low, gain)
 
 
-def _image_of(source: Path, kind: str, fields: dict[str, Any], levels: Levels) -> FloatArray:
-    if "image" not in fields:
-        raise DataError(f"{source}: expected a stage file with an image, found a {kind} stage file")
-    return levels.original(check_image(fields["image"], str(source)))
-
-
-def _build(kind: type[Result], fields: dict[str, Any]) -> Result:
-    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})
+def _image_of(source: Path, result: DataclassInstance) -> FloatArray:
+    if not isinstance(result, Centroid | Filtered | Deconvolution):
+        raise DataError(f"{source}: expected a stage file with an image, found a {_kind_of(type(result))} stage file")
+    return result.image
 
 
 def _kind_of(cls: type) -> str:
