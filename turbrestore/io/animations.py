@@ -1,19 +1,17 @@
-"""Animated PNG, WebP and GIF files, read and written by imageio through Pillow."""
+"""Animated PNG, WebP and GIF files, read and written by Pillow."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..core.arrays import FloatArray, from_unit
 from ..core.errors import DataError
-from .images import image_errors, image_header, opened_images, read_file
+from .images import ORIENTATION, image_errors, opened_image, read_file
 from .limits import DEFAULT_LIMITS, Limits
 from .output import atomic_write, frames_of_one_size
 from .pixels import PixelArray, upright
@@ -21,6 +19,7 @@ from .source import FrameSource, check_cut_short
 
 ANIMATION_SUFFIXES = (".png", ".apng", ".webp")
 ANIMATION_OUTPUT_SUFFIXES = (".gif", ".webp")
+_FORMATS = ("PNG", "WEBP")
 
 
 def open_animation(
@@ -33,31 +32,37 @@ def open_animation(
     :func:`turbrestore.io.video.open_frames`.
     """
     data = read_file(path, limits)
-    with image_header(path, data, limits, ("PNG", "WEBP")) as header:
-        animation = _Animation(data, header.mode, bool(header.info.get("default_image")))
-        count, kind = getattr(header, "n_frames", 1) - animation.skips_first, str(header.format).lower()
+    with opened_image(path, data, limits, _FORMATS) as image:
+        # A still image that is no frame may come first.
+        skipped = int(bool(image.info.get("default_image")))
+        count, kind, mode = getattr(image, "n_frames", 1) - skipped, str(image.format).lower(), image.mode
     if count < 2:
         raise DataError(f"{path}: a single image; name the folder that holds the frames")
     limits.check_count(count, str(path))
-    shape, durations = _scan(path, animation)
+    shape: tuple[int, ...] = ()
+    durations: list[float] = []
+    with contextlib.suppress(DataError), image_errors(path):
+        for pixels, duration in _frames(data, skipped):
+            shape = pixels.shape
+            durations.append(duration)
     present = len(durations)
     if kind == "png" and present == count:
-        with image_header(path, data, limits, ("PNG",)) as header:
+        with opened_image(path, data, limits, _FORMATS) as image:
             # Decoding does not compare the checksums.
-            header.verify()
-    deep = animation.mode == "I;16"
-    notes: tuple[str, ...] = ("alpha channel ignored",) if animation.mode in ("LA", "RGBA") else ()
+            image.verify()
+    deep = mode == "I;16"
+    notes: tuple[str, ...] = ("alpha channel ignored",) if mode in ("LA", "RGBA") else ()
     notes += ("16-bit values read as 8 bits",) if kind == "png" and data[24] == 16 and not deep else ()
     notes += ("variable frame rate",) if len(set(durations[:-1])) > 1 else ()
     notes += check_cut_short(path, present, stop, skip_damaged, "damaged or cut short") if present < count else ()
     times = np.cumsum([0.0, *durations[:-1]]) / 1000
     return FrameSource(
         name=path.name,
-        format=f"{kind}/{animation.mode}",
+        format=f"{kind}/{mode}",
         file_shape=(present, *shape),
         full_scale=65535 if deep else 255,
         bit_depth=16 if deep else 8,
-        pixels=lambda chosen: _chosen_frames(path, animation, chosen),
+        pixels=lambda chosen: _chosen_frames(path, _frames(data, skipped), chosen),
         path=path,
         fps=(present - 1) / float(times[-1]) if times[-1] > 0 else None,
         timestamps=times if times[-1] > 0 else None,
@@ -70,48 +75,32 @@ def write_animation(path: Path, frames: Iterable[FloatArray], fps: float, overwr
 
     All frames are in memory at 8 bits until the end. GIF counts hundredths of a second, WebP thousandths.
     """
-    import imageio.v3 as iio
+    import PIL.Image
 
-    suffix = path.suffix.lower()
+    images = [PIL.Image.fromarray(from_unit(frame, 8)) for frame in frames_of_one_size(frames, path)]
     buffer = io.BytesIO()
-    writer: Any = iio.imopen(buffer, "w", plugin="pillow", extension=suffix)
-    with writer as output:
-        for frame in frames_of_one_size(frames, path):
-            output.write(from_unit(frame, 8), is_batch=False, duration=1000 / fps, loop=0, lossless=True)
+    kind, rest = path.suffix[1:].upper(), images[1:]
+    images[0].save(buffer, kind, save_all=True, append_images=rest, duration=1000 / fps, loop=0, lossless=True)
     atomic_write(path, buffer.getbuffer(), overwrite)
 
 
-@dataclass(frozen=True, eq=False)
-class _Animation:
-    """Content of an animated file, its mode, and whether a still image that is no frame comes first."""
+def _frames(data: bytes, skipped: int) -> Iterator[tuple[PixelArray, float]]:
+    """Decode all frames: pixels, grey or RGB, and duration in milliseconds."""
+    import PIL.Image
+    from PIL import ImageSequence
 
-    data: bytes
-    mode: str
-    skips_first: bool
-
-    def frames(self) -> Iterator[tuple[PixelArray, float]]:
-        """Decode all frames: pixels, grey or RGB, and duration in milliseconds."""
-        target = None if self.mode == "I;16" else "L" if self.mode in ("1", "L", "LA") else "RGB"
-        with opened_images(self.data) as file:
-            for index, pixels in enumerate(file.iter(mode=target)):
-                if index >= self.skips_first:
-                    facts = file.metadata(index=index, exclude_applied=False)
-                    yield upright(pixels, facts.get("Orientation")), float(facts.get("duration", 0))
+    with PIL.Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+        target = image.mode if image.mode == "I;16" else "L" if image.mode in ("1", "L", "LA") else "RGB"
+        for number, frame in enumerate(ImageSequence.Iterator(image)):
+            if number >= skipped:
+                pixels = np.array(frame.convert(target))
+                yield upright(pixels, frame.getexif().get(ORIENTATION)), float(frame.info.get("duration", 0))
 
 
-def _scan(path: Path, animation: _Animation) -> tuple[tuple[int, ...], list[float]]:
-    """Shape of the frames, and duration of every frame up to the first that is damaged or missing."""
-    shape: tuple[int, ...] = ()
-    durations: list[float] = []
-    with contextlib.suppress(DataError), image_errors(path):
-        for pixels, duration in animation.frames():
-            shape = pixels.shape
-            durations.append(duration)
-    return shape, durations
-
-
-def _chosen_frames(path: Path, animation: _Animation, chosen: Sequence[int]) -> Iterator[PixelArray]:
-    wanted, frames = frozenset(chosen), animation.frames()
+def _chosen_frames(
+    path: Path, frames: Iterator[tuple[PixelArray, float]], chosen: Sequence[int]
+) -> Iterator[PixelArray]:
+    wanted = frozenset(chosen)
     for number in range(chosen[-1] + 1):
         with image_errors(path):
             pixels, _ = next(frames)

@@ -1,4 +1,4 @@
-"""Still images, read and written by imageio through Pillow.
+"""Still images, read by Pillow.
 
 Pillow reduces 16-bit colour to 8 bits, so OpenCV decodes those images once Pillow has found them whole; TIFF is read by
 :mod:`turbrestore.io.tiff`. The size in the header is checked before anything is decoded.
@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -45,10 +45,12 @@ if TYPE_CHECKING:
     import PIL.Image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", *RAW_SUFFIXES)
+# Tag of EXIF and TIFF.
+ORIENTATION = 274
 # Pillow knows many more formats, some of which run other programs.
 _FORMATS = ("PNG", "JPEG", "BMP", "PPM", "WEBP")
-# Modes of Pillow that are converted to RGB.
-_OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV", "RGBX", "RGBa")
+# Modes of Pillow that become RGB, or RGBA where a palette has transparent colours.
+_OTHER_COLOURS = ("P", "CMYK", "YCbCr", "LAB", "HSV", "RGBX", "RGBa")
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,15 +216,14 @@ def read_file(path: Path, limits: Limits) -> bytes:
 
 def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
     """Upright pixels of the only or first image, with all channels."""
-    with image_header(path, data, limits, _FORMATS) as header:
-        mode, kind = header.mode, header.format
-        transparent = mode == "P" and "transparency" in header.info
-        if kind == "PNG":
+    with opened_image(path, data, limits, _FORMATS) as image:
+        if image.format == "PNG":
             # Decoding does not compare the checksums.
-            header.verify()
-    with image_errors(path), opened_images(data) as file:
-        pixels = file.read(index=0, mode="RGBA" if transparent else "RGB" if mode in _OTHER_COLOURS else None)
-        orientation = file.metadata(index=0, exclude_applied=False).get("Orientation")
+            image.verify()
+    with opened_image(path, data, limits, _FORMATS) as image:
+        kind, orientation = image.format, image.getexif().get(ORIENTATION)
+        target = "RGBA" if image.mode == "P" and "transparency" in image.info else "RGB"
+        pixels = np.array(image.convert(target) if image.mode in _OTHER_COLOURS else image)
     if kind == "PPM" or (kind == "PNG" and data[24] == 16):
         pixels = _opencv_pixels(path, data)
         # OpenCV returns grey with alpha (type 4) as RGBA.
@@ -242,15 +243,8 @@ def _at_full_range(pixels: PixelArray, data: bytes) -> PixelArray:
     return np.rint(np.minimum(pixels, white) * (full / white)).astype(pixels.dtype)
 
 
-def opened_images(data: bytes) -> Any:
-    """Reader of imageio for all images in a file."""
-    import imageio.v3 as iio
-
-    return iio.imopen(data, "r", plugin="pillow")
-
-
 def _opencv_pixels(path: Path, data: bytes) -> PixelArray:
-    """Grey, RGB or RGBA pixels; imageio would pass the bytes to OpenCV through a temporary file."""
+    """Grey, RGB or RGBA pixels."""
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -261,13 +255,13 @@ def _opencv_pixels(path: Path, data: bytes) -> PixelArray:
 
 
 @contextlib.contextmanager
-def image_header(path: Path, data: bytes, limits: Limits, formats: tuple[str, ...]) -> Iterator[PIL.Image.Image]:
+def opened_image(path: Path, data: bytes, limits: Limits, formats: tuple[str, ...]) -> Iterator[PIL.Image.Image]:
     """Image of Pillow that is not decoded yet and has no more pixels than allowed."""
     import PIL.Image
 
-    with image_errors(path), PIL.Image.open(io.BytesIO(data), formats=formats) as header:
-        limits.check_size(*header.size, str(path))
-        yield header
+    with image_errors(path), PIL.Image.open(io.BytesIO(data), formats=formats) as image:
+        limits.check_size(*image.size, str(path))
+        yield image
 
 
 @contextlib.contextmanager
