@@ -155,7 +155,7 @@ def _source(
         path=image.path,
         warnings=notes,
         levels=None if levels.counts is None else levels.counts.levels,
-        header=image.cards[:-1],
+        header=image.cards,
         develop=None if bayer is None else lambda mosaic: demosaic(mosaic, bayer),
     )
 

@@ -7,6 +7,7 @@ import re
 import unicodedata
 import warnings
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,11 +26,10 @@ if TYPE_CHECKING:
 FITS_OUTPUT_SUFFIX = ".fits"
 # Headers and data fill blocks of so many bytes.
 _BLOCK = 2880
-# What describes the numbers and axes of the input, and not the scene.
-_STRUCTURE = re.compile(
-    r"SIMPLE|XTENSION|EXTEND|EXTNAME|EXTVER|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|GROUPS|BSCALE|BZERO|BLANK|BUNIT|DATAMIN|"
-    r"DATAMAX|CHECKSUM|DATASUM|BAYERPAT|[XY]BAYROFF|WCSAXES|(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|CNAME)[3-9]|"
-    r"(CD|PC)(\d_[3-9]|[3-9]_\d)|END"
+# What describes the numbers and the further axes of the input, beside what Astropy takes for structure.
+_ABOUT_NUMBERS = re.compile(
+    r"EXTNAME|EXTVER|BLANK|BUNIT|DATAMIN|DATAMAX|CHECKSUM|DATASUM|BAYERPAT|[XY]BAYROFF|WCSAXES|"
+    r"(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|CNAME)[3-9]|(CD|PC)(\d_[3-9]|[3-9]_\d)|"
 )
 
 
@@ -110,16 +110,13 @@ def write_fits_cube(
 
 def _kept(cards: Sequence[str], origin: tuple[int, int], fits: Any) -> Header:
     """Cards of the input that are still true of the image."""
-    header = fits.Header()
-    for text in cards:
-        card = fits.Card.fromstring(text.encode("ascii", "replace"))
-        if _STRUCTURE.fullmatch(card.keyword) or not text.strip():
-            continue
-        try:
-            header.append(fits.Card(card.keyword, card.value, card.comment), end=True)
-        except (ValueError, fits.VerifyError):
+    header, before = fits.Header(), fits.Header.fromstring("".join(cards).encode("ascii", "replace"))
+    before.strip()
+    for card in before.cards:
+        if not _ABOUT_NUMBERS.fullmatch(card.keyword):
             # A card that cannot be read has nothing to keep.
-            continue
+            with suppress(ValueError, fits.VerifyError):
+                header.append(fits.Card(card.keyword, card.value, card.comment), end=True)
     for place, name in enumerate(("CRPIX1", "CRPIX2")):
         if isinstance(header.get(name), int | float):
             header[name] -= origin[place]
