@@ -23,9 +23,8 @@ from ..core.errors import DataError
 from ..runtime.scratch import iter_parts, new_stack
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
 from .output import atomic_output, frames_of_one_size
-from .pixels import depth_of
 from .source import FrameSource
-from .values.counts import from_counts, holds_counts, scale_of_numbers
+from .values.counts import source_of_numbers
 
 # Arrays of more bytes may be moved to a scratch file.
 _LARGE = 1 << 22
@@ -133,19 +132,10 @@ def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     """
     array, order = _frames_first(path, map_npy(path))
     remark = f"its axes are taken for {order}; save it as (T, H, W) or (T, H, W, 3) if that is wrong"
-    source = FrameSource(
-        name=path.name,
-        format=f"npy/{array.dtype}",
-        file_shape=array.shape,
-        full_scale=scale_of_numbers(array.dtype, path.name),
-        bit_depth=depth_of(array.dtype),
-        pixels=MappedFrames.of(array),
-        path=path,
-        warnings=(remark,) if order else (),
+    notes = (remark,) if order else ()
+    return source_of_numbers(
+        path, f"npy/{array.dtype}", array.shape, array.dtype, MappedFrames.of(array), notes, limits
     )
-    limits.check_size(source.shape[2], source.shape[1], str(path))
-    limits.check_count(len(source), str(path))
-    return from_counts(source) if holds_counts(array.dtype) else source
 
 
 def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:

@@ -10,19 +10,21 @@ import io
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, from_unit_to_type
 from ..core.errors import DataError
 from .limits import DEFAULT_LIMITS, Limits, format_errors, input_errors
 from .npy import MappedFrames
 from .output import atomic_output, frames_of_one_size
-from .pixels import PixelArray, check_depth, depth_of, upright
+from .pixels import PixelArray, check_depth, upright
 from .source import FrameSource
-from .values.counts import from_counts, holds_counts, scale_of_numbers
+from .values.counts import source_of_numbers
 
 if TYPE_CHECKING:
     import tifffile
@@ -55,26 +57,28 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
         _check_page(path, page, limits)
         packed = _packed_stack(path, tiff) if count == 1 else None
         if packed is not None:
-            return packed
+            form = f"tiff/{packed.dtype.newbyteorder('=')}"
+            return source_of_numbers(path, form, packed.shape, packed.dtype, MappedFrames.of(packed), (), limits)
         channels, planes = _channels(page), _plane_pages(path, tiff, count, whole)
-        reduced = count - len(whole)
-        remarks = (f"{reduced} page{'s' * (reduced > 1)} of reduced size left out",) if reduced else ()
         if channels is None:
             kind = f"{getattr(page.photometric, 'name', page.photometric)} with {page.samplesperpixel} channels"
             raise DataError(f"{path}: expected grey or RGB pages, found {kind}; convert the file")
-        dtype = np.dtype(page.dtype)
-        integer = np.issubdtype(dtype, np.unsignedinteger)
-        source = FrameSource(
-            name=path.name,
-            format=f"tiff/{dtype}",
-            file_shape=(len(planes), page.imagelength, page.imagewidth, *((3,) if len(planes[0]) == 3 else channels)),
-            full_scale=2**page.bitspersample - 1 if integer else scale_of_numbers(dtype, str(path)),
-            bit_depth=min(page.bitspersample, 32) if integer else depth_of(dtype),
-            pixels=lambda chosen: _frames(path, [planes[number] for number in chosen], limits),
-            path=path,
-            warnings=(*_notes(page), *remarks),
+        dtype, bits, notes = np.dtype(page.dtype), page.bitspersample, _notes(page)
+        if count > len(whole):
+            reduced = count - len(whole)
+            notes += (f"{reduced} page{'s' * (reduced > 1)} of reduced size left out",)
+        source = source_of_numbers(
+            path,
+            f"tiff/{dtype}",
+            (len(planes), page.imagelength, page.imagewidth, *((3,) if len(planes[0]) == 3 else channels)),
+            dtype,
+            lambda chosen: _frames(path, [planes[number] for number in chosen], limits),
+            notes,
+            limits,
         )
-        return from_counts(source) if holds_counts(dtype) else source
+        # Numbers of 12 bits, say, come in 16.
+        packed_bits = dtype.kind == "u" and bits < 8 * dtype.itemsize
+        return replace(source, full_scale=2**bits - 1, bit_depth=bits) if packed_bits else source
 
 
 def read_tiff(path: Path, data: bytes, limits: Limits) -> tuple[PixelArray | None, tuple[str, ...]]:
@@ -174,25 +178,13 @@ def _plane_pages(path: Path, tiff: tifffile.TiffFile, count: int, whole: list[in
     return [tuple(frame) for frame in numbers.reshape(-1, 3 if channels else 1).tolist()]
 
 
-def _packed_stack(path: Path, tiff: tifffile.TiffFile) -> FrameSource | None:
-    """Open frames that follow each other behind a single page, as ImageJ writes stacks of 4 GB and more."""
+def _packed_stack(path: Path, tiff: tifffile.TiffFile) -> NDArray[Any] | None:
+    """Map frames that follow each other behind a single page, as ImageJ writes stacks of 4 GB and more."""
     series, page = tiff.series[0], tiff.pages.first
     if series.dataoffset is None or series.size <= page.imagewidth * page.imagelength * page.samplesperpixel:
         return None
-    dtype = series.dtype.newbyteorder(tiff.byteorder)
-    array = np.memmap(path, dtype, "r", series.dataoffset, series.shape)
-    if series.axes in ("TCYX", "ZCYX") and series.shape[1] == 3:
-        array = np.moveaxis(array, 1, -1)
-    source = FrameSource(
-        name=path.name,
-        format=f"tiff/{series.dtype}",
-        file_shape=array.shape,
-        full_scale=scale_of_numbers(array.dtype, str(path)),
-        bit_depth=depth_of(array.dtype),
-        pixels=MappedFrames.of(array),
-        path=path,
-    )
-    return from_counts(source) if holds_counts(array.dtype) else source
+    array = np.memmap(path, series.dtype.newbyteorder(tiff.byteorder), "r", series.dataoffset, series.shape)
+    return np.moveaxis(array, 1, -1) if series.axes in ("TCYX", "ZCYX") and series.shape[1] == 3 else array
 
 
 def _frames(path: Path, chosen: Sequence[tuple[int, ...]], limits: Limits) -> Iterator[PixelArray]:

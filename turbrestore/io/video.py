@@ -36,11 +36,11 @@ from .images import IMAGE_SUFFIXES, read_pixels
 from .limits import DEFAULT_LIMITS, Limits, check_input, input_errors
 from .npy import open_npy, write_npy
 from .output import check_output, size_text
-from .pixels import PixelArray, check_depth, depth_of, to_unit
+from .pixels import PixelArray, check_depth, to_unit
 from .source import FrameRange, FrameSource, Roi, check_frame_range, numbers_text
 from .tiff import TIFF_SUFFIXES, open_tiff, write_tiff
 from .values.bayer import as_bayer
-from .values.counts import from_counts, holds_counts, scale_of_numbers
+from .values.counts import source_of_numbers
 from .values.frame_names import in_order, one_of_each_shot
 
 VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES, *FITS_SUFFIXES)
@@ -264,17 +264,15 @@ def _open_folder(folder: Path, limits: Limits) -> FrameSource:
     if fits:
         raise DataError(f"{folder}: expected images of one kind, found {fits} FITS files among {len(files)} images")
     first, notes = read_pixels(files[0], limits)
-    source = FrameSource(
-        name=folder.name,
-        format=f"images/{files[0].suffix.lower()[1:]}",
-        file_shape=(len(files), *first.shape),
-        full_scale=scale_of_numbers(first.dtype, str(files[0])),
-        bit_depth=depth_of(first.dtype),
-        pixels=lambda chosen: _images(files, chosen, first.dtype, first.shape, limits),
-        path=folder,
-        warnings=(*notes, *remarks),
+    return source_of_numbers(
+        folder,
+        f"images/{files[0].suffix.lower()[1:]}",
+        (len(files), *first.shape),
+        first.dtype,
+        lambda chosen: _images(files, chosen, first.dtype, first.shape, limits),
+        (*notes, *remarks),
+        limits,
     )
-    return from_counts(source) if holds_counts(first.dtype) else source
 
 
 def _images(

@@ -8,9 +8,10 @@ not widen the range to more than twice what the others span; they are clipped in
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 from ...core.arrays import FloatArray
 from ...core.errors import DataError
 from ...runtime.scratch import iter_frames
-from ..pixels import FLOAT_MARGIN, PixelArray, full_scale_of
+from ..limits import Limits
+from ..pixels import FLOAT_MARGIN, PixelArray, depth_of, full_scale_of
 from ..source import FrameSource
 
 # Percentage of the frames at either end whose extremes do not count.
@@ -65,9 +67,32 @@ def holds_counts(dtype: np.dtype[Any]) -> bool:
     return dtype.kind in "if" or (dtype.kind == "u" and dtype.itemsize >= 4)
 
 
-def scale_of_numbers(dtype: np.dtype[Any], name: str) -> int:
-    """Value that means intensity 1 until the range of the numbers is known; DataError for other types than numbers."""
-    return 1 if dtype.kind == "i" else full_scale_of(dtype, name)
+def source_of_numbers(
+    path: Path,
+    form: str,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    pixels: Callable[[Sequence[int]], Iterator[PixelArray]],
+    notes: tuple[str, ...],
+    limits: Limits,
+) -> FrameSource:
+    """Describe a video of numbers of a type; where they may be counts, every frame is read once to find their range.
+
+    Other types than numbers, and sizes beyond the limits, raise DataError.
+    """
+    source = FrameSource(
+        name=path.name,
+        format=form,
+        file_shape=shape,
+        full_scale=1 if dtype.kind == "i" else full_scale_of(dtype, str(path)),
+        bit_depth=depth_of(dtype),
+        pixels=pixels,
+        path=path,
+        warnings=notes,
+    )
+    limits.check_size(shape[2], shape[1], str(path))
+    limits.check_count(shape[0], str(path))
+    return _from_counts(source) if holds_counts(dtype) else source
 
 
 def range_of_counts(frames: Iterable[PixelArray], name: str, kind: str | None = None) -> CountRange | None:
@@ -118,7 +143,7 @@ def _ends(frame: PixelArray) -> tuple[float, float, float, float]:
     return lowest, low, high, highest
 
 
-def from_counts(source: FrameSource) -> FrameSource:
+def _from_counts(source: FrameSource) -> FrameSource:
     """Scale the counts of a video by one range for all its frames; intensities stay as they are.
 
     Every frame is read once. What follows a damaged frame is scaled by the range of what comes before.
