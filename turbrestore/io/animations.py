@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -41,8 +41,8 @@ def open_animation(
     limits.check_count(count, str(path))
     shape: tuple[int, ...] = ()
     durations: list[float] = []
-    with contextlib.suppress(DataError), image_errors(path):
-        for pixels, duration in _frames(data, skipped):
+    with contextlib.suppress(DataError):
+        for pixels, duration in _frames(path, data, range(skipped, skipped + count)):
             shape = pixels.shape
             durations.append(duration)
     present = len(durations)
@@ -62,7 +62,7 @@ def open_animation(
         file_shape=(present, *shape),
         full_scale=65535 if deep else 255,
         bit_depth=16 if deep else 8,
-        pixels=lambda chosen: _chosen_frames(path, _frames(data, skipped), chosen),
+        pixels=lambda chosen: (frame for frame, _ in _frames(path, data, [skipped + number for number in chosen])),
         path=path,
         fps=(present - 1) / float(times[-1]) if times[-1] > 0 else None,
         timestamps=times if times[-1] > 0 else None,
@@ -84,25 +84,14 @@ def write_animation(path: Path, frames: Iterable[FloatArray], fps: float, overwr
     atomic_write(path, buffer.getbuffer(), overwrite)
 
 
-def _frames(data: bytes, skipped: int) -> Iterator[tuple[PixelArray, float]]:
-    """Decode all frames: pixels, grey or RGB, and duration in milliseconds."""
+def _frames(path: Path, data: bytes, places: Iterable[int]) -> Iterator[tuple[PixelArray, float]]:
+    """Decode the images at these places: pixels, grey or RGB, and duration in milliseconds."""
     import PIL.Image
-    from PIL import ImageSequence
 
     with PIL.Image.open(io.BytesIO(data), formats=_FORMATS) as image:
         target = image.mode if image.mode == "I;16" else "L" if image.mode in ("1", "L", "LA") else "RGB"
-        for number, frame in enumerate(ImageSequence.Iterator(image)):
-            if number >= skipped:
-                pixels = np.array(frame.convert(target))
-                yield upright(pixels, frame.getexif().get(ORIENTATION)), float(frame.info.get("duration", 0))
-
-
-def _chosen_frames(
-    path: Path, frames: Iterator[tuple[PixelArray, float]], chosen: Sequence[int]
-) -> Iterator[PixelArray]:
-    wanted = frozenset(chosen)
-    for number in range(chosen[-1] + 1):
-        with image_errors(path):
-            pixels, _ = next(frames)
-        if number in wanted:
-            yield pixels
+        for place in places:
+            with image_errors(path):
+                image.seek(place)
+                pixels = upright(np.array(image.convert(target)), image.getexif().get(ORIENTATION))
+            yield pixels, float(image.info.get("duration", 0))

@@ -183,12 +183,7 @@ def write_image(
             raise StorageError(f"{path}: the PNG encoder failed on an image of shape {pixels.shape}")
         atomic_write(path, data.data, overwrite)
         return
-    import tifffile
-
-    pixels = at_levels(pixels, levels)
-    check_space(path, pixels.nbytes)
-    with atomic_output(path, overwrite) as temporary:
-        tifffile.imwrite(temporary, pixels, photometric="minisblack" if pixels.ndim == 2 else "rgb", metadata=None)
+    _write_page(path, at_levels(pixels, levels), overwrite)
 
 
 def write_map(path: str | os.PathLike[str], values: FloatArray, overwrite: bool = False) -> None:
@@ -196,12 +191,16 @@ def write_map(path: str | os.PathLike[str], values: FloatArray, overwrite: bool 
 
     ``values`` (H, W).
     """
+    check_output(path, overwrite=overwrite, suffixes=(".tif", ".tiff"))
+    _write_page(path, values.astype(np.float32), overwrite)
+
+
+def _write_page(path: str | os.PathLike[str], pixels: PixelArray, overwrite: bool) -> None:
     import tifffile
 
-    check_output(path, overwrite=overwrite, suffixes=(".tif", ".tiff"))
-    check_space(path, values.nbytes)
+    check_space(path, pixels.nbytes)
     with atomic_output(path, overwrite) as temporary:
-        tifffile.imwrite(temporary, values.astype(np.float32), photometric="minisblack", metadata=None)
+        tifffile.imwrite(temporary, pixels, photometric="minisblack" if pixels.ndim == 2 else "rgb", metadata=None)
 
 
 def read_file(path: Path, limits: Limits) -> bytes:
