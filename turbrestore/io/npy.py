@@ -26,7 +26,7 @@ from .output import atomic_output, frames_of_one_size
 from .source import FrameSource
 from .values.counts import source_of_numbers
 
-# Arrays of more bytes may be moved to a scratch file.
+# Arrays of more bytes may be read to a scratch file.
 _LARGE = 1 << 22
 # Places along each axis at which the order of the axes is judged, and the factor by which the mean over time has more
 # contrast than the mean over rows; by the larger one where the air changes frames more than rows differ.
@@ -52,12 +52,11 @@ def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
 
 
 def read_npz(
-    path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, scratch: Path | None = None, large: int | None = None
+    path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, scratch: Path | None = None
 ) -> dict[str, NDArray[Any]]:
     """Read all arrays of an uncompressed ``.npz`` file, as :func:`numpy.savez` writes it.
 
-    Where ``scratch`` is a folder, arrays of float32 of more than ``large`` bytes (by default 4 MiB) go to scratch files
-    there.
+    Where ``scratch`` is a folder, arrays of float32 of more than 4 MiB go to scratch files there.
     """
     path = Path(path)
     size = check_input(path).st_size
@@ -71,8 +70,7 @@ def read_npz(
         # Uncompressed members hold more than the file only if they overlap.
         if sum(member.file_size for member in members) > size:
             raise ValueError(f"its members hold more than its {size} bytes")
-        least = _LARGE if large is None else large
-        return {name: _member(archive, member, scratch, least) for name, member in zip(names, members, strict=True)}
+        return {name: _member(archive, member, scratch) for name, member in zip(names, members, strict=True)}
 
 
 def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -207,12 +205,12 @@ def _write_header(file: IO[bytes], shape: tuple[int, ...], dtype: np.dtype[Any])
     np.lib.format.write_array_header_1_0(file, {"descr": description, "fortran_order": False, "shape": shape})
 
 
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | None, large: int) -> NDArray[Any]:
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | None) -> NDArray[Any]:
     if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
         raise ValueError(f"{member.filename} is compressed; expected it as numpy.savez writes it")
     with archive.open(member) as stream:
         shape, is_fortran, dtype = _header(stream)
-        if scratch is not None and member.file_size > large and dtype == np.float32:
+        if scratch is not None and member.file_size > _LARGE and dtype == np.float32:
             stack = _stack_of(stream, shape[::-1] if is_fortran else shape, member, scratch)
             return stack.T if is_fortran else stack
         # zipfile compares the checksum at the end of the member.
