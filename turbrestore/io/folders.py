@@ -10,13 +10,13 @@ from pathlib import Path
 from ..core.errors import DataError
 from .astronomy.fits import open_fits_folder
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
+from .counts import source_of_numbers
 from .images import IMAGE_SUFFIXES, read_pixels
 from .limits import Limits, input_errors
 from .output import size_text
 from .pixels import PixelArray
+from .raw_files import RAW_SUFFIXES
 from .source import FrameSource
-from .values.counts import source_of_numbers
-from .values.raw_files import RAW_SUFFIXES
 
 # Number, dot and number, not within a longer chain such as a date.
 _FRACTION = re.compile(r"(?<![\d.])(\d+)\.(\d+)(?!\.?\d)")

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from ..core.arrays import CHANNELS, FloatArray, from_unit_to_type
 from ..core.errors import DataError
 from ..runtime.scratch import iter_parts, new_stack
+from .counts import source_of_numbers
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
 from .output import atomic_output, frames_of_one_size
 from .source import FrameSource
-from .values.counts import source_of_numbers
 
 # Arrays of more bytes may be read to a scratch file.
 _LARGE = 1 << 22

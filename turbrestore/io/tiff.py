@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, from_unit_to_type
 from ..core.errors import DataError
+from .counts import source_of_numbers
 from .limits import DEFAULT_LIMITS, Limits, format_errors, input_errors
 from .npy import MappedFrames
 from .output import atomic_output, frames_of_one_size
 from .pixels import PixelArray, check_depth, upright
 from .source import FrameSource
-from .values.counts import source_of_numbers
 
 if TYPE_CHECKING:
     import tifffile

@@ -26,14 +26,13 @@ import numpy as np
 
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, require
-from .animations import ANIMATION_OUTPUT_SUFFIXES, ANIMATION_SUFFIXES, open_animation, write_animation
 from .astronomy.fits import open_fits
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .astronomy.ser import open_ser, write_ser
 from .containers.decoding import CONTAINER_SUFFIXES, is_container, open_container
 from .containers.encoding import BY_SUFFIX, Encoding, Soundtrack, write_container
 from .folders import open_folder
-from .images import IMAGE_SUFFIXES
+from .images import ANIMATION_OUTPUT_SUFFIXES, ANIMATION_SUFFIXES, IMAGE_SUFFIXES, open_animation, write_animation
 from .limits import DEFAULT_LIMITS, Limits, check_input
 from .npy import open_npy, write_npy
 from .output import check_output

@@ -43,11 +43,11 @@ from numpy.typing import NDArray
 
 from ...core.errors import DataError
 from ...runtime.scratch import iter_frames
+from ..counts import CountRange, range_of_counts
 from ..limits import DEFAULT_LIMITS, Limits
 from ..npy import MappedFrames
 from ..pixels import PixelArray, demosaic, depth_of, full_scale_of
 from ..source import FrameSource
-from ..values.counts import CountRange, range_of_counts
 from .fits_header import FitsImage, find_images
 
 

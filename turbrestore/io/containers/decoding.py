@@ -26,9 +26,9 @@ from ...core.errors import DataError
 from ..limits import DEFAULT_LIMITS, Limits, input_errors
 from ..pixels import BAYER_REMARK, PixelArray, looks_like_bayer, upright
 from ..source import FrameRange, FrameSource, check_cut_short, check_frame_range
-from ..values.pixel_formats import PixelFormat, frame_pixels, has_grey_palette, layout_of
-from ..values.transfer_curves import BT709, remark_on_curve
 from .integrity import ends_early, ffv1_slices_intact, is_cut_short, varies_in_time
+from .pixel_formats import PixelFormat, frame_pixels, has_grey_palette, layout_of
+from .transfer_curves import BT709, remark_on_curve
 
 if TYPE_CHECKING:
     import av

@@ -21,8 +21,8 @@ from ...core.arrays import FloatArray, from_unit
 from ...core.errors import DataError, StorageError, require, require_between
 from ..output import atomic_output, frames_of_one_size
 from ..pixels import check_depth
-from ..values.pixel_formats import FULL_RANGE, RGB, VIDEO_RANGE, convert
-from ..values.transfer_curves import BT709, BT2020, CURVES, UNKNOWN
+from .pixel_formats import FULL_RANGE, RGB, VIDEO_RANGE, convert
+from .transfer_curves import BT709, BT2020, CURVES, UNKNOWN
 
 if TYPE_CHECKING:
     import av

@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.arrays import FloatArray
-from ...core.errors import DataError
-from ...runtime.scratch import iter_frames
-from ..limits import Limits
-from ..pixels import FLOAT_MARGIN, PixelArray, depth_of, full_scale_of
-from ..source import FrameSource
+from ..core.arrays import FloatArray
+from ..core.errors import DataError
+from ..runtime.scratch import iter_frames
+from .limits import Limits
+from .pixels import FLOAT_MARGIN, PixelArray, depth_of, full_scale_of
+from .source import FrameSource
 
 # Percentage of the frames at either end whose extremes do not count.
 _FEW = 10
