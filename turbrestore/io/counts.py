@@ -16,7 +16,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..core.errors import DataError
@@ -92,7 +91,25 @@ def source_of_numbers(
     )
     limits.check_size(shape[2], shape[1], str(path))
     limits.check_count(shape[0], str(path))
-    return _from_counts(source) if holds_counts(dtype) else source
+    if not holds_counts(dtype):
+        return source
+
+    def whole() -> Iterator[PixelArray]:
+        # What follows a damaged frame is scaled by the range of what comes before.
+        with suppress(DataError):
+            yield from pixels(range(shape[0]))
+
+    found = range_of_counts(whole(), path.name)
+    if found is None:
+        return source
+    return dataclasses.replace(
+        source,
+        full_scale=1,
+        bit_depth=32,
+        pixels=lambda chosen: (found.unit(frame) for frame in iter_frames(pixels(chosen))),
+        warnings=(*notes, found.remark),
+        levels=found.levels,
+    )
 
 
 def range_of_counts(frames: Iterable[PixelArray], name: str, kind: str | None = None) -> CountRange | None:
@@ -141,31 +158,3 @@ def _ends(frame: PixelArray) -> tuple[float, float, float, float]:
     high = float(np.minimum(up, cv2.dilate(up, _NEIGHBOURS)).max())
     low = float(np.maximum(down, cv2.erode(down, _NEIGHBOURS)).min())
     return lowest, low, high, highest
-
-
-def _from_counts(source: FrameSource) -> FrameSource:
-    """Scale the counts of a video by one range for all its frames; intensities stay as they are.
-
-    Every frame is read once. What follows a damaged frame is scaled by the range of what comes before.
-    """
-    read = source.pixels
-
-    def whole() -> Iterator[PixelArray]:
-        with suppress(DataError):
-            yield from read(range(source.file_shape[0]))
-
-    found = range_of_counts(whole(), source.name)
-    if found is None:
-        return source
-
-    def pixels(chosen: Sequence[int]) -> Iterator[NDArray[np.float32]]:
-        return (found.unit(frame) for frame in iter_frames(read(chosen)))
-
-    return dataclasses.replace(
-        source,
-        full_scale=1,
-        bit_depth=32,
-        pixels=pixels,
-        warnings=(*source.warnings, found.remark),
-        levels=found.levels,
-    )

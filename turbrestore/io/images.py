@@ -29,7 +29,7 @@ from .counts import holds_counts, range_of_counts
 from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
 from .output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
 from .pixels import PixelArray, at_levels, check_depth, depth_of, full_scale_of, to_unit, upright, without_alpha
-from .raw_files import RAW_SUFFIXES, is_raw, read_raw_file
+from .raw_files import RAW_SUFFIXES, read_raw_file
 from .source import FrameSource, check_cut_short
 from .tiff import TIFF_SUFFIXES, read_tiff
 
@@ -111,7 +111,7 @@ def read_pixels(
     if suffix not in IMAGE_SUFFIXES:
         names = ", ".join((*IMAGE_SUFFIXES, *FITS_SUFFIXES))
         raise DataError(f"{path}: expected an image ({names}), found {suffix or 'no suffix'}")
-    if is_raw(path):
+    if suffix in RAW_SUFFIXES:
         return read_raw_file(path, limits, like), ()
     data = _read_file(path, limits)
     if suffix in TIFF_SUFFIXES:

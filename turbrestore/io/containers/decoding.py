@@ -94,6 +94,7 @@ def open_container(
                 raise DataError(f"{path}: expected at least one frame, found none")
             layout = layout_of(path, frame, keep_hdr)
             notes, interlaced = _notes(frame, layout, stream), frame.interlaced_frame
+            size = (frame.height, frame.width)
             notes += remark_on_curve(int(frame.color_trc), {**container.metadata, **stream.metadata}, keep_hdr)
             colour = (int(frame.color_primaries), int(frame.color_trc)) if layout.transfer is None else (BT709, BT709)
             if codec == "rawvideo" and not layout.channels and looks_like_bayer(frame_pixels(frame, layout)):
@@ -116,7 +117,7 @@ def open_container(
     return FrameSource(
         name=path.name,
         format=f"{codec}/{layout.name}",
-        file_shape=(scan.intact, *_upright_size(frame, layout), *layout.channels),
+        file_shape=(scan.intact, *(size[::-1] if layout.orientation > 4 else size), *layout.channels),
         full_scale=layout.full_scale,
         bit_depth=layout.bit_depth,
         pixels=lambda chosen: _frames(path, layout, chosen, intra, interlaced, limits, scan),
@@ -175,10 +176,6 @@ def _notes(frame: av.VideoFrame, layout: PixelFormat, stream: av.VideoStream) ->
         shape = f"{aspect.numerator}:{aspect.denominator}"
         notes.append(f"pixels of {shape} are taken for square; widen the result by that ratio to see it as players do")
     return tuple(notes)
-
-
-def _upright_size(frame: av.VideoFrame, layout: PixelFormat) -> tuple[int, int]:
-    return (frame.width, frame.height) if layout.orientation > 4 else (frame.height, frame.width)
 
 
 def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
