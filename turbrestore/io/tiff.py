@@ -76,9 +76,9 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
             notes,
             limits,
         )
-        # Numbers of 12 bits, say, come in 16.
-        packed_bits = dtype.kind == "u" and bits < 8 * dtype.itemsize
-        return replace(source, full_scale=2**bits - 1, bit_depth=bits) if packed_bits else source
+        # Numbers of 12 bits, say, come in 16; wider ones are counts.
+        narrow = dtype.kind == "u" and bits < 8 * dtype.itemsize <= 16
+        return replace(source, full_scale=2**bits - 1, bit_depth=bits) if narrow else source
 
 
 def read_tiff(path: Path, data: bytes, limits: Limits) -> tuple[PixelArray | None, tuple[str, ...]]:
