@@ -208,28 +208,18 @@ def _write_header(file: IO[bytes], shape: tuple[int, ...], dtype: np.dtype[Any])
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | None) -> NDArray[Any]:
     if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
         raise ValueError(f"{member.filename} is compressed; expected it as numpy.savez writes it")
+    # zipfile compares the checksum at the end of the member.
     with archive.open(member) as stream:
         shape, is_fortran, dtype = _header(stream)
-        if scratch is not None and member.file_size > _LARGE and dtype == np.float32:
-            stack = _stack_of(stream, shape[::-1] if is_fortran else shape, member, scratch)
-            return stack.T if is_fortran else stack
-        # zipfile compares the checksum at the end of the member.
-        data = stream.read()
-    if math.prod(shape) * dtype.itemsize != len(data):
-        raise ValueError(f"{member.filename} has {len(data)} bytes, which do not fit shape {shape}")
-    return np.frombuffer(bytearray(data), dtype).reshape(shape, order="F" if is_fortran else "C")
-
-
-def _stack_of(stream: IO[bytes], shape: tuple[int, ...], member: zipfile.ZipInfo, scratch: Path) -> NDArray[np.float32]:
-    """Copy a stack to a scratch file, part by part."""
-    if not 0 < 4 * math.prod(shape) <= member.file_size:
-        raise ValueError(f"{member.filename} has {member.file_size} bytes, which do not fit shape {shape}")
-    stack = new_stack(shape, scratch)
-    for part in iter_parts(stack):
-        part[...] = np.frombuffer(stream.read(part.nbytes), np.float32).reshape(part.shape)
-    if stream.read(1):
-        raise ValueError(f"{member.filename} has more bytes than shape {shape}")
-    return stack
+        size = member.file_size - stream.tell()
+        if math.prod(shape) * dtype.itemsize != size:
+            raise ValueError(f"{member.filename} has {size} bytes, which do not fit shape {shape}")
+        if scratch is None or size <= _LARGE or dtype != np.float32:
+            return np.frombuffer(bytearray(stream.read()), dtype).reshape(shape, order="F" if is_fortran else "C")
+        stack = new_stack(shape[::-1] if is_fortran else shape, scratch)
+        for part in iter_parts(stack):
+            part[...] = np.frombuffer(stream.read(part.nbytes), np.float32).reshape(part.shape)
+        return stack.T if is_fortran else stack
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
