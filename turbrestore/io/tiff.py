@@ -33,8 +33,9 @@ TIFF_SUFFIXES = (".tif", ".tiff")
 # Compressions whose decoders are told how much a part may hold: none, fax, LZW, deflate, PackBits, LZMA, Zstandard.
 _BOUNDED = (1, 2, 3, 4, 5, 8, 32946, 50013, 32773, 34925, 34926, 50000)
 # Those whose parts are images with sizes of their own: JPEG, JPEG 2000, PNG and WebP.
+_IMAGES = (6, 7, 33007, 34892, 33003, 33004, 33005, 34712, 34933, 34927, 50001)
+# JPEG of which OpenCV reads what is neither grey nor RGB.
 _JPEG = (6, 7)
-_IMAGES = (*_JPEG, 33007, 34892, 33003, 33004, 33005, 34712, 34933, 34927, 50001)
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
 _NOT_TIFF = "not a TIFF file, or damaged"
 _MOST_SAMPLES = 16
@@ -204,11 +205,11 @@ def _frames(path: Path, chosen: Sequence[tuple[int, ...]], limits: Limits) -> It
 
 def _page_pixels(path: Path, page: tifffile.TiffPage, limits: Limits) -> PixelArray:
     """Pixels of a page, grey or RGB, with white as the highest value."""
-    parts = list(zip(page.dataoffsets, page.databytecounts, strict=True))
+    parts = [part for part in zip(page.dataoffsets, page.databytecounts, strict=True) if part[1] > 0]
     if page.compression not in (*_BOUNDED, *_IMAGES):
         name = getattr(page.compression, "name", page.compression)
         raise DataError(f"{path}: expected a compression such as deflate, LZW or JPEG, found {name}; convert the file")
-    if page.compression != 1 and sum(size > 0 for _, size in parts) < math.prod(page.chunked):
+    if page.compression != 1 and len(parts) < math.prod(page.chunked):
         raise DataError(f"{path}: expected {math.prod(page.chunked)} parts, found {len(parts)}; the file is damaged")
     with format_errors(path, _NOT_TIFF if page.compression == 1 else "compressed pixels are damaged"):
         if page.compression in _IMAGES:

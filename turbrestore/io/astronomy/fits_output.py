@@ -27,7 +27,7 @@ FITS_OUTPUT_SUFFIX = ".fits"
 # What describes the numbers and the further axes of the input, beside what Astropy takes for structure.
 _ABOUT_NUMBERS = re.compile(
     r"EXTNAME|EXTVER|BLANK|BUNIT|DATAMIN|DATAMAX|CHECKSUM|DATASUM|BAYERPAT|[XY]BAYROFF|WCSAXES|"
-    r"(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|CNAME)[3-9]|(CD|PC)(\d_[3-9]|[3-9]_\d)|"
+    r"(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|CNAME)[3-9]|(CD|PC)(\d_[3-9]|[3-9]_\d)"
 )
 
 
@@ -108,7 +108,7 @@ def _kept(cards: Sequence[str], origin: tuple[int, int], fits: Any) -> Header:
     header, before = fits.Header(), fits.Header.fromstring("".join(cards).encode("ascii", "replace"))
     before.strip()
     for card in before.cards:
-        if not _ABOUT_NUMBERS.fullmatch(card.keyword):
+        if card.keyword and not _ABOUT_NUMBERS.fullmatch(card.keyword):
             # A card that cannot be read has nothing to keep.
             with suppress(ValueError, fits.VerifyError):
                 header.append(fits.Card(card.keyword, card.value, card.comment), end=True)
