@@ -120,9 +120,7 @@ def read_pixels(
     return without_alpha(_decoded(path, data, limits))
 
 
-def open_animation(
-    path: Path, stop: int | None = None, limits: Limits = DEFAULT_LIMITS, skip_damaged: bool = False
-) -> FrameSource:
+def open_animation(path: Path, stop: int | None, limits: Limits, skip_damaged: bool) -> FrameSource:
     """Open an animated PNG or WebP file; all frames are decoded once to find out whether they are whole.
 
     Frames from ``stop`` on are not needed, so they may be missing. With ``skip_damaged`` the whole frames of a PNG file

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import DataError
-from ..limits import DEFAULT_LIMITS, Limits, input_errors
+from ..limits import Limits, input_errors
 from ..pixels import BAYER_REMARK, PixelArray, looks_like_bayer, upright
 from ..source import FrameRange, FrameSource, check_cut_short, check_frame_range
 from .integrity import ends_early, ffv1_slices_intact, is_cut_short, varies_in_time
@@ -71,11 +71,7 @@ class _Scan:
 
 
 def open_container(
-    path: Path,
-    frames: FrameRange | None = None,
-    limits: Limits = DEFAULT_LIMITS,
-    skip_damaged: bool = False,
-    keep_hdr: bool = False,
+    path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool, keep_hdr: bool
 ) -> FrameSource:
     """Open a video file; the errors are those of :func:`turbrestore.io.video.open_frames`.
 
