@@ -40,7 +40,6 @@ IMPORTED = (
     "av",
     "tifffile",
     "PIL.Image",
-    "imageio.v3",
     "turbrestore_cli.restoring",
     "turbrestore_cli.stages",
     "turbrestore_cli.inspection",

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from turbrestore import __version__
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, OutputError
+from turbrestore.io.folders import frame_files
 from turbrestore.io.limits import input_errors
 from turbrestore.io.output import atomic_write, check_output
-from turbrestore.io.video import frame_files
 from turbrestore.report.batch_page import ClipRow, write_batch_page
 from turbrestore.runs.typed_records import convert_to
 

@@ -35,6 +35,7 @@ REQUIRED = {
     "PIL": "pillow",
     "av": "av",
     "tifffile": "tifffile",
+    "imagecodecs": "imagecodecs",
     "numba": "numba",
     "threadpoolctl": "threadpoolctl",
 }

@@ -31,8 +31,8 @@ from .footage.object_crop import crop_to_object as crop_to_object
 from .io.images import read_image as read_image
 from .io.images import write_image as write_image
 from .io.limits import Limits as Limits
-from .io.live.stream import live_frames as live_frames
 from .io.source import FrameSource as FrameSource
+from .io.stream import live_frames as live_frames
 from .io.video import open_frames as open_frames
 from .io.video import write_video as write_video
 from .metrics import appearance as appearance

@@ -7,7 +7,7 @@ from usual_files import HLG, PQ, hdr
 
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.io.containers.encoding import Encoding
-from turbrestore.io.values.transfer_curves import remark_on_curve, sdr_of
+from turbrestore.io.containers.transfer_curves import remark_on_curve, sdr_of
 from turbrestore.io.video import open_frames, write_video
 from turbrestore_cli.__main__ import main
 

@@ -257,13 +257,18 @@ class TestWriting:
 
     def test_header_of_the_input_is_kept_where_it_is_true(self, written, tmp_path):
         source = open_frames(
-            written(UINT16, OBJECT="Moon", CRPIX1=10.0, CRPIX2=4.0, CRPIX3=1.0, CTYPE3="TIME", DATAMAX=9, CHECKSUM="x")
+            written(
+                UINT16,
+                **{"OBJECT": "Moon", "LONG": 100 * "long ", "CRPIX1": 10.0, "CRPIX2": 4.0, "CRPIX3": 1.0},
+                **{"CTYPE3": "TIME", "DATAMAX": 9, "CHECKSUM": "x"},
+            )
         )
         write_fits(
             tmp_path / "b.fits", np.zeros((3, 3)), 16, header=source.header, history=["σ = 1.2 px"], origin=(2, 1)
         )
         header = fits.getheader(tmp_path / "b.fits")
         assert header["OBJECT"] == "Moon" and (header["CRPIX1"], header["CRPIX2"]) == (8, 3)
+        assert header["LONG"] == (100 * "long ").rstrip()
         assert not {"CRPIX3", "CTYPE3", "DATAMAX", "CHECKSUM", "NAXIS3"} & set(header)
         assert str(header["HISTORY"]) == "? = 1.2 px"
 

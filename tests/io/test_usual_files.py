@@ -12,9 +12,9 @@ from usual_files import without_times
 
 from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.io.astronomy.fits_output import write_fits
+from turbrestore.io.counts import range_of_counts
+from turbrestore.io.folders import in_order
 from turbrestore.io.images import write_image
-from turbrestore.io.values.counts import range_of_counts
-from turbrestore.io.values.frame_names import in_order
 from turbrestore.io.video import open_frames
 
 RNG = np.random.default_rng(6)

@@ -105,11 +105,7 @@ def from_unit_to_type(image: FloatArray, bit_depth: int) -> NDArray[Any]:
     """Convert intensities to the type of a file: uint8 up to 8 bits, uint16 up to 16, clipped float32 for 32."""
     if bit_depth != 32:
         return from_unit(image, 8 if bit_depth <= 8 else 16)
-    pixels, done = np.empty(image.shape, np.float32), 0
-    for part in _parts(image):
-        np.clip(part, 0, 1, out=pixels[done : done + len(part)])
-        done += len(part)
-    return pixels
+    return np.clip(image, 0, 1, dtype=np.float32)
 
 
 def _parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:

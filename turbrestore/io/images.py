@@ -1,4 +1,4 @@
-"""Still images, read and written by imageio through Pillow.
+"""Still images, and animated PNG, WebP and GIF files, by Pillow.
 
 Pillow reduces 16-bit colour to 8 bits, so OpenCV decodes those images once Pillow has found them whole; TIFF is read by
 :mod:`turbrestore.io.tiff`. The size in the header is checked before anything is decoded.
@@ -11,44 +11,40 @@ import io
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_image, from_unit_to_type
+from ..core.arrays import FloatArray, check_image, from_unit, from_unit_to_type
 from ..core.errors import DataError, StorageError, TurbrestoreError
 from .astronomy.fits import read_fits
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .astronomy.fits_output import write_fits
+from .counts import holds_counts, range_of_counts
 from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
-from .output import atomic_output, atomic_write, check_output, check_space
-from .pixels import (
-    PixelArray,
-    at_levels,
-    check_depth,
-    depth_of,
-    full_scale_of,
-    to_unit,
-    upright,
-    without_alpha,
-)
+from .output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
+from .pixels import PixelArray, at_levels, check_depth, depth_of, full_scale_of, to_unit, upright, without_alpha
+from .raw_files import RAW_SUFFIXES, read_raw_file
+from .source import FrameSource, check_cut_short
 from .tiff import TIFF_SUFFIXES, read_tiff
-from .values.counts import holds_counts, range_of_counts
-from .values.raw_files import RAW_SUFFIXES, is_raw, read_raw_file
 
 if TYPE_CHECKING:
     import PIL.Image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", *RAW_SUFFIXES)
+ANIMATION_SUFFIXES = (".png", ".apng", ".webp")
+ANIMATION_OUTPUT_SUFFIXES = (".gif", ".webp")
+# Tag of EXIF and TIFF.
+_ORIENTATION = 274
 # Pillow knows many more formats, some of which run other programs.
-_FORMATS = ("PNG", "JPEG", "BMP", "PPM", "WEBP")
-# Modes of Pillow that are converted to RGB.
-_OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV", "RGBX", "RGBa")
+_FORMATS, _ANIMATED = ("PNG", "JPEG", "BMP", "PPM", "WEBP"), ("PNG", "WEBP")
+# Modes of Pillow that become RGB, or RGBA where a palette has transparent colours.
+_OTHER_COLOURS = ("P", "CMYK", "YCbCr", "LAB", "HSV", "RGBX", "RGBa")
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,13 +111,61 @@ def read_pixels(
     if suffix not in IMAGE_SUFFIXES:
         names = ", ".join((*IMAGE_SUFFIXES, *FITS_SUFFIXES))
         raise DataError(f"{path}: expected an image ({names}), found {suffix or 'no suffix'}")
-    if is_raw(path):
+    if suffix in RAW_SUFFIXES:
         return read_raw_file(path, limits, like), ()
-    data = read_file(path, limits)
+    data = _read_file(path, limits)
     if suffix in TIFF_SUFFIXES:
         pixels, notes = read_tiff(path, data, limits)
         return (pixels, notes) if pixels is not None else without_alpha(_opencv_pixels(path, data))
     return without_alpha(_decoded(path, data, limits))
+
+
+def open_animation(path: Path, stop: int | None, limits: Limits, skip_damaged: bool) -> FrameSource:
+    """Open an animated PNG or WebP file; all frames are decoded once to find out whether they are whole.
+
+    Frames from ``stop`` on are not needed, so they may be missing. With ``skip_damaged`` the whole frames of a PNG file
+    that is cut short are read. 16-bit colour is read as 8 bits. The errors are those of
+    :func:`turbrestore.io.video.open_frames`.
+    """
+    data = _read_file(path, limits)
+    with _opened_image(path, data, limits, _ANIMATED) as image:
+        # A still image that is no frame may come first.
+        skipped = int(bool(image.info.get("default_image")))
+        count, kind, mode = getattr(image, "n_frames", 1) - skipped, str(image.format).lower(), image.mode
+    if count < 2:
+        raise DataError(f"{path}: a single image; name the folder that holds the frames")
+    limits.check_count(count, str(path))
+    shape: tuple[int, ...] = ()
+    durations: list[float] = []
+    with contextlib.suppress(DataError):
+        for pixels, duration in _animation_frames(path, data, range(skipped, skipped + count)):
+            shape = pixels.shape
+            durations.append(duration)
+    present = len(durations)
+    if kind == "png" and present == count:
+        with _opened_image(path, data, limits, _ANIMATED) as image:
+            # Decoding does not compare the checksums.
+            image.verify()
+    deep = mode == "I;16"
+    notes: tuple[str, ...] = ("alpha channel ignored",) if mode in ("LA", "RGBA") else ()
+    notes += ("16-bit values read as 8 bits",) if kind == "png" and data[24] == 16 and not deep else ()
+    notes += ("variable frame rate",) if len(set(durations[:-1])) > 1 else ()
+    notes += check_cut_short(path, present, stop, skip_damaged, "damaged or cut short") if present < count else ()
+    times = np.cumsum([0.0, *durations[:-1]]) / 1000
+    return FrameSource(
+        name=path.name,
+        format=f"{kind}/{mode}",
+        file_shape=(present, *shape),
+        full_scale=65535 if deep else 255,
+        bit_depth=16 if deep else 8,
+        pixels=lambda chosen: (
+            frame for frame, _ in _animation_frames(path, data, [skipped + number for number in chosen])
+        ),
+        path=path,
+        fps=(present - 1) / float(times[-1]) if times[-1] > 0 else None,
+        timestamps=times if times[-1] > 0 else None,
+        warnings=notes,
+    )
 
 
 def write_image(
@@ -181,12 +225,7 @@ def write_image(
             raise StorageError(f"{path}: the PNG encoder failed on an image of shape {pixels.shape}")
         atomic_write(path, data.data, overwrite)
         return
-    import tifffile
-
-    pixels = at_levels(pixels, levels)
-    check_space(path, pixels.nbytes)
-    with atomic_output(path, overwrite) as temporary:
-        tifffile.imwrite(temporary, pixels, photometric="minisblack" if pixels.ndim == 2 else "rgb", metadata=None)
+    _write_page(path, at_levels(pixels, levels), overwrite)
 
 
 def write_map(path: str | os.PathLike[str], values: FloatArray, overwrite: bool = False) -> None:
@@ -194,15 +233,33 @@ def write_map(path: str | os.PathLike[str], values: FloatArray, overwrite: bool 
 
     ``values`` (H, W).
     """
+    check_output(path, overwrite=overwrite, suffixes=(".tif", ".tiff"))
+    _write_page(path, values.astype(np.float32), overwrite)
+
+
+def _write_page(path: str | os.PathLike[str], pixels: PixelArray, overwrite: bool) -> None:
     import tifffile
 
-    check_output(path, overwrite=overwrite, suffixes=(".tif", ".tiff"))
-    check_space(path, values.nbytes)
+    check_space(path, pixels.nbytes)
     with atomic_output(path, overwrite) as temporary:
-        tifffile.imwrite(temporary, values.astype(np.float32), photometric="minisblack", metadata=None)
+        tifffile.imwrite(temporary, pixels, photometric="minisblack" if pixels.ndim == 2 else "rgb", metadata=None)
 
 
-def read_file(path: Path, limits: Limits) -> bytes:
+def write_animation(path: Path, frames: Iterable[FloatArray], fps: float, overwrite: bool = False) -> None:
+    """Write frames for viewing as GIF of 256 colours or lossless WebP of 8 bits, repeated without end.
+
+    All frames are in memory at 8 bits until the end. GIF counts hundredths of a second, WebP thousandths.
+    """
+    import PIL.Image
+
+    images = [PIL.Image.fromarray(from_unit(frame, 8)) for frame in frames_of_one_size(frames, path)]
+    buffer = io.BytesIO()
+    kind, rest = path.suffix[1:].upper(), images[1:]
+    images[0].save(buffer, kind, save_all=True, append_images=rest, duration=1000 / fps, loop=0, lossless=True)
+    atomic_write(path, buffer.getbuffer(), overwrite)
+
+
+def _read_file(path: Path, limits: Limits) -> bytes:
     """Read a whole file that is not empty."""
     limits.check_bytes(check_input(path).st_size, str(path))
     with input_errors(path):
@@ -214,15 +271,14 @@ def read_file(path: Path, limits: Limits) -> bytes:
 
 def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
     """Upright pixels of the only or first image, with all channels."""
-    with image_header(path, data, limits, _FORMATS) as header:
-        mode, kind = header.mode, header.format
-        transparent = mode == "P" and "transparency" in header.info
-        if kind == "PNG":
+    with _opened_image(path, data, limits, _FORMATS) as image:
+        if image.format == "PNG":
             # Decoding does not compare the checksums.
-            header.verify()
-    with image_errors(path), opened_images(data) as file:
-        pixels = file.read(index=0, mode="RGBA" if transparent else "RGB" if mode in _OTHER_COLOURS else None)
-        orientation = file.metadata(index=0, exclude_applied=False).get("Orientation")
+            image.verify()
+    with _opened_image(path, data, limits, _FORMATS) as image:
+        kind, orientation = image.format, image.getexif().get(_ORIENTATION)
+        target = "RGBA" if image.mode == "P" and "transparency" in image.info else "RGB"
+        pixels = np.array(image.convert(target) if image.mode in _OTHER_COLOURS else image)
     if kind == "PPM" or (kind == "PNG" and data[24] == 16):
         pixels = _opencv_pixels(path, data)
         # OpenCV returns grey with alpha (type 4) as RGBA.
@@ -231,6 +287,19 @@ def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
     if pixels.dtype == bool:
         pixels = np.uint8(255) * pixels
     return upright(pixels, orientation)
+
+
+def _animation_frames(path: Path, data: bytes, places: Iterable[int]) -> Iterator[tuple[PixelArray, float]]:
+    """Decode the images at these places: pixels, grey or RGB, and duration in milliseconds."""
+    import PIL.Image
+
+    with PIL.Image.open(io.BytesIO(data), formats=_ANIMATED) as image:
+        target = image.mode if image.mode == "I;16" else "L" if image.mode in ("1", "L", "LA") else "RGB"
+        for place in places:
+            with _image_errors(path):
+                image.seek(place)
+                pixels = upright(np.array(image.convert(target)), image.getexif().get(_ORIENTATION))
+            yield pixels, float(image.info.get("duration", 0))
 
 
 def _at_full_range(pixels: PixelArray, data: bytes) -> PixelArray:
@@ -242,15 +311,8 @@ def _at_full_range(pixels: PixelArray, data: bytes) -> PixelArray:
     return np.rint(np.minimum(pixels, white) * (full / white)).astype(pixels.dtype)
 
 
-def opened_images(data: bytes) -> Any:
-    """Reader of imageio for all images in a file."""
-    import imageio.v3 as iio
-
-    return iio.imopen(data, "r", plugin="pillow")
-
-
 def _opencv_pixels(path: Path, data: bytes) -> PixelArray:
-    """Grey, RGB or RGBA pixels; imageio would pass the bytes to OpenCV through a temporary file."""
+    """Grey, RGB or RGBA pixels."""
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -261,17 +323,17 @@ def _opencv_pixels(path: Path, data: bytes) -> PixelArray:
 
 
 @contextlib.contextmanager
-def image_header(path: Path, data: bytes, limits: Limits, formats: tuple[str, ...]) -> Iterator[PIL.Image.Image]:
+def _opened_image(path: Path, data: bytes, limits: Limits, formats: tuple[str, ...]) -> Iterator[PIL.Image.Image]:
     """Image of Pillow that is not decoded yet and has no more pixels than allowed."""
     import PIL.Image
 
-    with image_errors(path), PIL.Image.open(io.BytesIO(data), formats=formats) as header:
-        limits.check_size(*header.size, str(path))
-        yield header
+    with _image_errors(path), PIL.Image.open(io.BytesIO(data), formats=formats) as image:
+        limits.check_size(*image.size, str(path))
+        yield image
 
 
 @contextlib.contextmanager
-def image_errors(path: Path) -> Iterator[None]:
+def _image_errors(path: Path) -> Iterator[None]:
     """Turn the exceptions of Pillow into DataError, and silence its warnings."""
     import PIL.Image
 

@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 from ..core.arrays import CHANNELS, FloatArray, from_unit_to_type
 from ..core.errors import DataError
 from ..runtime.scratch import iter_parts, new_stack
+from .counts import source_of_numbers
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
 from .output import atomic_output, frames_of_one_size
-from .pixels import depth_of
 from .source import FrameSource
-from .values.counts import from_counts, holds_counts, scale_of_numbers
 
-# Arrays of more bytes may be moved to a scratch file.
+# Arrays of more bytes may be read to a scratch file.
 _LARGE = 1 << 22
 # Places along each axis at which the order of the axes is judged, and the factor by which the mean over time has more
 # contrast than the mean over rows; by the larger one where the air changes frames more than rows differ.
@@ -53,12 +52,11 @@ def map_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
 
 
 def read_npz(
-    path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, scratch: Path | None = None, large: int | None = None
+    path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, scratch: Path | None = None
 ) -> dict[str, NDArray[Any]]:
     """Read all arrays of an uncompressed ``.npz`` file, as :func:`numpy.savez` writes it.
 
-    Where ``scratch`` is a folder, arrays of float32 of more than ``large`` bytes (by default 4 MiB) go to scratch files
-    there.
+    Where ``scratch`` is a folder, arrays of float32 of more than 4 MiB go to scratch files there.
     """
     path = Path(path)
     size = check_input(path).st_size
@@ -72,8 +70,7 @@ def read_npz(
         # Uncompressed members hold more than the file only if they overlap.
         if sum(member.file_size for member in members) > size:
             raise ValueError(f"its members hold more than its {size} bytes")
-        least = _LARGE if large is None else large
-        return {name: _member(archive, member, scratch, least) for name, member in zip(names, members, strict=True)}
+        return {name: _member(archive, member, scratch) for name, member in zip(names, members, strict=True)}
 
 
 def write_npz(stream: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -133,19 +130,10 @@ def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     """
     array, order = _frames_first(path, map_npy(path))
     remark = f"its axes are taken for {order}; save it as (T, H, W) or (T, H, W, 3) if that is wrong"
-    source = FrameSource(
-        name=path.name,
-        format=f"npy/{array.dtype}",
-        file_shape=array.shape,
-        full_scale=scale_of_numbers(array.dtype, path.name),
-        bit_depth=depth_of(array.dtype),
-        pixels=MappedFrames.of(array),
-        path=path,
-        warnings=(remark,) if order else (),
+    notes = (remark,) if order else ()
+    return source_of_numbers(
+        path, f"npy/{array.dtype}", array.shape, array.dtype, MappedFrames.of(array), notes, limits
     )
-    limits.check_size(source.shape[2], source.shape[1], str(path))
-    limits.check_count(len(source), str(path))
-    return from_counts(source) if holds_counts(array.dtype) else source
 
 
 def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
@@ -217,31 +205,21 @@ def _write_header(file: IO[bytes], shape: tuple[int, ...], dtype: np.dtype[Any])
     np.lib.format.write_array_header_1_0(file, {"descr": description, "fortran_order": False, "shape": shape})
 
 
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | None, large: int) -> NDArray[Any]:
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, scratch: Path | None) -> NDArray[Any]:
     if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
         raise ValueError(f"{member.filename} is compressed; expected it as numpy.savez writes it")
+    # zipfile compares the checksum at the end of the member.
     with archive.open(member) as stream:
         shape, is_fortran, dtype = _header(stream)
-        if scratch is not None and member.file_size > large and dtype == np.float32:
-            stack = _stack_of(stream, shape[::-1] if is_fortran else shape, member, scratch)
-            return stack.T if is_fortran else stack
-        # zipfile compares the checksum at the end of the member.
-        data = stream.read()
-    if math.prod(shape) * dtype.itemsize != len(data):
-        raise ValueError(f"{member.filename} has {len(data)} bytes, which do not fit shape {shape}")
-    return np.frombuffer(bytearray(data), dtype).reshape(shape, order="F" if is_fortran else "C")
-
-
-def _stack_of(stream: IO[bytes], shape: tuple[int, ...], member: zipfile.ZipInfo, scratch: Path) -> NDArray[np.float32]:
-    """Copy a stack to a scratch file, part by part."""
-    if not 0 < 4 * math.prod(shape) <= member.file_size:
-        raise ValueError(f"{member.filename} has {member.file_size} bytes, which do not fit shape {shape}")
-    stack = new_stack(shape, scratch)
-    for part in iter_parts(stack):
-        part[...] = np.frombuffer(stream.read(part.nbytes), np.float32).reshape(part.shape)
-    if stream.read(1):
-        raise ValueError(f"{member.filename} has more bytes than shape {shape}")
-    return stack
+        size = member.file_size - stream.tell()
+        if math.prod(shape) * dtype.itemsize != size:
+            raise ValueError(f"{member.filename} has {size} bytes, which do not fit shape {shape}")
+        if scratch is None or size <= _LARGE or dtype != np.float32:
+            return np.frombuffer(bytearray(stream.read()), dtype).reshape(shape, order="F" if is_fortran else "C")
+        stack = new_stack(shape[::-1] if is_fortran else shape, scratch)
+        for part in iter_parts(stack):
+            part[...] = np.frombuffer(stream.read(part.nbytes), np.float32).reshape(part.shape)
+        return stack.T if is_fortran else stack
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

@@ -51,7 +51,10 @@ def check_output(
         if not folder.is_dir():
             raise OutputError(f"{path}: the folder {folder} does not exist; create it first")
         for source in map(Path, inputs):
-            _check_not_input(path, folder, source)
+            if source.is_dir() and source.samefile(folder):
+                raise OutputError(f"{path}: lies in the input folder {source}; choose another folder")
+            if path.exists() and source.exists() and path.samefile(source):
+                raise OutputError(f"{path}: is the input {source}; choose another name")
         if path.exists() and not overwrite:
             raise OutputError(f"{path}: exists already; choose another name or allow overwriting")
         if not os.access(folder, os.W_OK):
@@ -122,10 +125,3 @@ def frames_of_one_size(frames: Iterable[FloatArray], path: str | os.PathLike[str
         yield frame
     if shape is None:
         raise DataError(f"{path}: expected at least one frame, found none")
-
-
-def _check_not_input(path: Path, folder: Path, source: Path) -> None:
-    if source.is_dir() and source.samefile(folder):
-        raise OutputError(f"{path}: lies in the input folder {source}; choose another folder")
-    if path.exists() and source.exists() and path.samefile(source):
-        raise OutputError(f"{path}: is the input {source}; choose another name")

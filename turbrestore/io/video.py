@@ -9,7 +9,7 @@ input                                  module                       output
 .npy, shape (T, H, W) or (T, H, W, 3)  :mod:`.npy`                  .npy
 .png .apng .webp (an animation)        :mod:`.images`               .gif .webp (for viewing)
 .fits .fit .fts (a cube), also .gz     :mod:`.astronomy.fits`
-a folder of images, raw or FITS files  here, :mod:`.images`
+a folder of images, raw or FITS files  :mod:`.folders`
 =====================================  ===========================  ===================================
 """
 
@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -26,22 +26,19 @@ import numpy as np
 
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, require
-from .animations import ANIMATION_OUTPUT_SUFFIXES, ANIMATION_SUFFIXES, open_animation, write_animation
-from .astronomy.fits import open_fits, open_fits_folder
+from .astronomy.fits import open_fits
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .astronomy.ser import open_ser, write_ser
 from .containers.decoding import CONTAINER_SUFFIXES, is_container, open_container
 from .containers.encoding import BY_SUFFIX, Encoding, Soundtrack, write_container
-from .images import IMAGE_SUFFIXES, read_pixels
-from .limits import DEFAULT_LIMITS, Limits, check_input, input_errors
+from .folders import open_folder
+from .images import ANIMATION_OUTPUT_SUFFIXES, ANIMATION_SUFFIXES, IMAGE_SUFFIXES, open_animation, write_animation
+from .limits import DEFAULT_LIMITS, Limits, check_input
 from .npy import open_npy, write_npy
-from .output import check_output, size_text
-from .pixels import PixelArray, check_depth, depth_of, to_unit
+from .output import check_output
+from .pixels import BAYER_CODES, check_depth, demosaic, to_unit
 from .source import FrameRange, FrameSource, Roi, check_frame_range, numbers_text
 from .tiff import TIFF_SUFFIXES, open_tiff, write_tiff
-from .values.bayer import as_bayer
-from .values.counts import from_counts, holds_counts, scale_of_numbers
-from .values.frame_names import in_order, one_of_each_shot
 
 VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES, *FITS_SUFFIXES)
 VIDEO_OUTPUT_SUFFIXES = (".mkv", ".mp4", ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_OUTPUT_SUFFIXES)
@@ -109,7 +106,7 @@ def open_frames(
     """
     require(hdr in ("sdr", "keep"), f"hdr: expected sdr or keep, found {hdr!r}")
     source = _open(Path(path), frames, limits, skip_damaged, hdr == "keep")
-    source = source if bayer is None else as_bayer(source, bayer)
+    source = source if bayer is None else _as_bayer(source, bayer)
     source = source.select(frames, roi)
     source = source.without(source.damaged, f"checksum fails: {numbers_text(source.damaged)} left out")
     # Only the reader of a container sets a colour.  It has decoded the first frame of the file, and no frame of a video
@@ -196,24 +193,13 @@ def _soundtrack(companion: FrameSource | None) -> Soundtrack | None:
     return Soundtrack(companion.path, companion.timestamps) if known else None
 
 
-def frame_files(folder: Path) -> list[Path]:
-    """Images of a folder that are the frames of a video, without hidden files, folders and broken links.
-
-    They are sorted by name, with digits compared as numbers, see :func:`in_order`.
-    """
-    named = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES or is_fits(path))
-    return in_order(path for path in named if path.name[0] != "." and path.is_file())
-
-
 def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool, keep_hdr: bool) -> FrameSource:
     """Open a whole video by the reader of its format."""
     stop = check_frame_range(frames).stop
     is_folder = stat.S_ISDIR(check_input(path).st_mode)
     suffix = path.suffix.lower()
     if is_folder:
-        source = _open_folder(path, limits)
-    elif suffix in CONTAINER_SUFFIXES:
-        source = open_container(path, frames, limits, skip_damaged, keep_hdr)
+        source = open_folder(path, limits)
     elif suffix == ".ser":
         source = open_ser(path, stop, limits, skip_damaged)
     elif suffix in TIFF_SUFFIXES:
@@ -224,9 +210,28 @@ def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: b
         source = open_fits(path, limits)
     elif suffix in ANIMATION_SUFFIXES:
         source = open_animation(path, stop, limits, skip_damaged)
+    elif suffix in IMAGE_SUFFIXES:
+        raise DataError(f"{path}: a single image; name the folder that holds the frames")
+    elif suffix in CONTAINER_SUFFIXES or is_container(path):
+        source = open_container(path, frames, limits, skip_damaged, keep_hdr)
     else:
-        source = _open_unknown(path, frames, limits, skip_damaged, keep_hdr)
+        names, found = ", ".join(VIDEO_SUFFIXES), suffix or "no suffix"
+        raise DataError(f"{path}: expected a folder of images or one of {names}, found {found}")
     return source
+
+
+def _as_bayer(source: FrameSource, pattern: str) -> FrameSource:
+    """Take grey frames for mosaics of a Bayer sensor whose file does not say so."""
+    require(pattern in BAYER_CODES, f"bayer: expected one of {', '.join(BAYER_CODES)}, found {pattern!r}")
+    if len(source.file_shape) != 3 or source.bit_depth > 16:
+        kind = "floating point" if len(source.file_shape) == 3 else "colours"
+        raise DataError(f"{source.name}: --bayer: expected grey frames of 8 or 16 bits, found {kind}; leave it out")
+    return dataclasses.replace(
+        source,
+        file_shape=(*source.file_shape, 3),
+        format=f"{source.format} as {pattern}",
+        develop=lambda pixels: demosaic(pixels, pattern),
+    )
 
 
 def _check_first(source: FrameSource) -> None:
@@ -235,67 +240,3 @@ def _check_first(source: FrameSource) -> None:
     if np.issubdtype(pixels.dtype, np.floating):
         pixels = np.where(np.isfinite(pixels), pixels, 0)
     to_unit(pixels, source.full_scale, f"{source.name}: frame {source.numbers[0]}")
-
-
-def _open_unknown(
-    path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool, keep_hdr: bool
-) -> FrameSource:
-    """Open a file of an unknown suffix, or none, if its content is that of a video."""
-    if path.suffix.lower() in IMAGE_SUFFIXES:
-        raise DataError(f"{path}: a single image; name the folder that holds the frames")
-    if not is_container(path):
-        names, found = ", ".join(VIDEO_SUFFIXES), path.suffix.lower() or "no suffix"
-        raise DataError(f"{path}: expected a folder of images or one of {names}, found {found}")
-    return open_container(path, frames, limits, skip_damaged, keep_hdr)
-
-
-def _open_folder(folder: Path, limits: Limits) -> FrameSource:
-    with input_errors(folder):
-        files = frame_files(folder)
-    if not files:
-        names = ", ".join((*IMAGE_SUFFIXES, *FITS_SUFFIXES))
-        raise DataError(f"{folder}: expected images ({names}), found none in the folder")
-    files, remarks = one_of_each_shot(files)
-    limits.check_count(len(files), str(folder))
-    fits = sum(map(is_fits, files))
-    if fits == len(files):
-        source = open_fits_folder(folder, files, limits)
-        return dataclasses.replace(source, warnings=(*source.warnings, *remarks))
-    if fits:
-        raise DataError(f"{folder}: expected images of one kind, found {fits} FITS files among {len(files)} images")
-    first, notes = read_pixels(files[0], limits)
-    source = FrameSource(
-        name=folder.name,
-        format=f"images/{files[0].suffix.lower()[1:]}",
-        file_shape=(len(files), *first.shape),
-        full_scale=scale_of_numbers(first.dtype, str(files[0])),
-        bit_depth=depth_of(first.dtype),
-        pixels=lambda chosen: _images(files, chosen, first.dtype, first.shape, limits),
-        path=folder,
-        warnings=(*notes, *remarks),
-    )
-    return from_counts(source) if holds_counts(first.dtype) else source
-
-
-def _images(
-    files: list[Path], chosen: Sequence[int], dtype: np.dtype, shape: tuple[int, ...], limits: Limits
-) -> Iterator[PixelArray]:
-    for number in chosen:
-        pixels, _ = read_pixels(files[number], limits, like=files[0])
-        if pixels.dtype != dtype or pixels.shape != shape:
-            raise _odd_image(files, number, limits)
-        yield pixels
-
-
-def _odd_image(files: list[Path], number: int, limits: Limits) -> DataError:
-    """Error for an image that is not like the first; of three images it names the one that differs from the others."""
-    others = [0, number, number + 1 if number + 1 < len(files) else number // 2]
-    kinds = []
-    for place in others:
-        pixels, _ = read_pixels(files[place], limits)
-        kinds.append(f"{size_text(pixels.shape)} {pixels.dtype}")
-    odd, usual = (0, 1) if kinds[1] == kinds[2] else (1, 0)
-    return DataError(
-        f"{files[others[odd]]}: expected {kinds[usual]} as {files[others[usual]].name}, found {kinds[odd]}; "
-        "take it out of the folder if it is not a frame"
-    )

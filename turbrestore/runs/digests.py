@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..io.folders import frame_files
 from ..io.limits import input_errors
 from ..io.source import FrameSource
-from ..io.video import frame_files
 
 # Larger files are sampled: so many bytes, in so many pieces.
 _WHOLE, _PIECE, _PIECES = 4 << 30, 1 << 16, 1024

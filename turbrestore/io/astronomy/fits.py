@@ -31,9 +31,8 @@ NaN, BLANK                          missing: filled from around, where a frame h
 
 from __future__ import annotations
 
-import dataclasses
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,11 +42,11 @@ from numpy.typing import NDArray
 
 from ...core.errors import DataError
 from ...runtime.scratch import iter_frames
+from ..counts import CountRange, range_of_counts
 from ..limits import DEFAULT_LIMITS, Limits
 from ..npy import MappedFrames
 from ..pixels import PixelArray, demosaic, depth_of, full_scale_of
 from ..source import FrameSource
-from ..values.counts import CountRange, range_of_counts
 from .fits_header import FitsImage, find_images
 
 
@@ -85,9 +84,7 @@ def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, sin
     path = Path(path)
     images = find_images(path, limits)
     if len(images) > 1:
-        source = _open_images(images, path, limits)
-        remark = f"its {len(images)} extensions of one size are taken for frames"
-        return dataclasses.replace(source, warnings=(*source.warnings, remark))
+        return _open_images(images, path, limits, f"its {len(images)} extensions of one size are taken for frames")
     image = images[0]
     frames = _as_frames(image, image.numbers(limits))
     if single and frames.ndim == 2:
@@ -95,14 +92,8 @@ def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, sin
     if frames.ndim == 2:
         raise DataError(f"{path}: a single image; name the folder that holds the frames")
     limits.check_count(len(frames), str(path))
-    levels, notes = _levels(images, ((image, frame) for frame in iter_frames(frames)))
-
     read = MappedFrames.of(frames) if isinstance(frames, np.memmap) else lambda chosen: (frames[n] for n in chosen)
-
-    def pixels(chosen: Sequence[int]) -> Iterator[PixelArray]:
-        return (levels.pixels(frame, image) for frame in iter_frames(read(chosen)))
-
-    return _source(image, levels, frames.shape, pixels, notes)
+    return _source(images, path, frames.shape, lambda chosen: ((image, frame) for frame in iter_frames(read(chosen))))
 
 
 def open_fits_folder(folder: Path, files: Sequence[Path], limits: Limits = DEFAULT_LIMITS) -> FrameSource:
@@ -115,19 +106,15 @@ def open_fits_folder(folder: Path, files: Sequence[Path], limits: Limits = DEFAU
     return _open_images(images, folder, limits)
 
 
-def _open_images(images: Sequence[FitsImage], path: Path, limits: Limits) -> FrameSource:
+def _open_images(images: Sequence[FitsImage], path: Path, limits: Limits, *remarks: str) -> FrameSource:
     """Open images of one kind, each of which is a frame and may have a scaling of its own."""
 
     def numbers(chosen: Sequence[int]) -> Iterator[tuple[FitsImage, NDArray[Any]]]:
         for number in chosen:
             yield images[number], _as_image(images[number], images[number].numbers(limits))
 
-    def pixels(chosen: Sequence[int]) -> Iterator[PixelArray]:
-        return (levels.pixels(frame, image) for image, frame in numbers(chosen))
-
-    levels, notes = _levels(images, numbers(range(len(images))))
-    shape = (len(images), *next(numbers(range(1)))[1].shape)
-    return dataclasses.replace(_source(images[0], levels, shape, pixels, notes), name=path.name, path=path)
+    _, first = next(numbers([0]))
+    return _source(images, path, (len(images), *first.shape), numbers, *remarks)
 
 
 def read_fits(path: Path, limits: Limits) -> tuple[PixelArray, tuple[str, ...]]:
@@ -140,22 +127,29 @@ def read_fits(path: Path, limits: Limits) -> tuple[PixelArray, tuple[str, ...]]:
 
 
 def _source(
-    image: FitsImage, levels: _Levels, shape: tuple[int, ...], pixels: Any, notes: tuple[str, ...]
+    images: Sequence[FitsImage],
+    path: Path,
+    shape: tuple[int, ...],
+    numbers: Callable[[Sequence[int]], Iterator[tuple[FitsImage, NDArray[Any]]]],
+    *remarks: str,
 ) -> FrameSource:
+    """Describe a video; ``numbers`` reads frames of given places, each with the image that it is of."""
+    levels, notes = _levels(images, numbers(range(shape[0])))
+    image, counts = images[0], levels.counts
     dtype = levels.unsigned or image.dtype.newbyteorder("=")
     unsigned = levels.unsigned is not None and not levels.missing
     bayer = image.bayer if len(shape) == 3 else None
     return FrameSource(
-        name=image.path.name,
+        name=path.name,
         format=f"fits/{dtype}" if bayer is None else f"fits/{dtype} as {bayer}",
         file_shape=shape if bayer is None else (*shape, 3),
-        full_scale=full_scale_of(dtype, str(image.path)) if unsigned else 1,
-        bit_depth=depth_of(dtype) if levels.counts is None else 32,
-        pixels=pixels,
-        path=image.path,
-        warnings=notes,
-        levels=None if levels.counts is None else levels.counts.levels,
-        header=image.cards[:-1],
+        full_scale=full_scale_of(dtype, str(path)) if unsigned else 1,
+        bit_depth=depth_of(dtype) if counts is None else 32,
+        pixels=lambda chosen: (levels.pixels(frame, part) for part, frame in numbers(chosen)),
+        path=path,
+        warnings=(*notes, *remarks),
+        levels=None if counts is None else counts.levels,
+        header=image.cards,
         develop=None if bayer is None else lambda mosaic: demosaic(mosaic, bayer),
     )
 

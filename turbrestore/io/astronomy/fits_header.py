@@ -1,7 +1,7 @@
 """Where the image of a FITS file lies, and what its numbers mean; headers are checked before any data are read.
 
-Astropy reads the cards of a header. The blocks of a file are followed here, one after the other, so that a header
-without an end, a size beyond the limits or a compressed file that holds far more than it seems ends in one line.
+Astropy reads the cards of a header, and would read one without an end as a whole, however long. Headers are therefore
+looked up here, one after the other, and compared with the limits before anything else is read.
 """
 
 from __future__ import annotations
@@ -31,10 +31,8 @@ if TYPE_CHECKING:
 FITS_SUFFIXES = (".fits", ".fit", ".fts")
 _BLOCK = 2880
 _PIECE = 1 << 20
-# Blocks of a header: 36 cards each.
-_MOST_BLOCKS = 1000
-# Headers of a file before its first image.
-_MOST_HEADERS = 100
+# Cards of a header, and headers of a file before its first image.
+_MOST_CARDS, _MOST_HEADERS = 36_000, 100
 # Images of this name show the scene, and those of the other names say something about it.
 _SCENE = "SCI"
 _ABOUT_SCENE = {"ERR", "ERROR", "DQ", "VAR", "STAT", "WHT", "WEIGHT", "CTX", "MASK", "UNCERT", "SIGMA", "FLOW", "BPM"}
@@ -48,7 +46,7 @@ class FitsImage:
     """An image of a FITS file."""
 
     path: Path
-    cards: tuple[str, ...]  # the header, 80 characters each
+    cards: tuple[str, ...]  # the header without its end, 80 characters each
     shape: tuple[int, ...]  # in the order of NumPy, the fastest axis last
     dtype: np.dtype[Any]  # of the numbers in the file
     offset: int  # of the first number, bytes
@@ -68,12 +66,13 @@ class FitsImage:
     def numbers(self, limits: Limits) -> NDArray[Any]:
         """Map the numbers of the file into memory, or load them from a compressed file."""
         with input_errors(self.path), format_errors(self.path, _DAMAGED):
-            if self.tiles is not None:
-                return self._from_tiles(limits)
-            if not _is_compressed(self.path):
+            if self.tiles is None and not _is_compressed(self.path):
                 return np.memmap(self.path, self.dtype, "r", self.offset, self.shape)
             end = self.offset + math.prod(self.shape) * self.dtype.itemsize
             limits.check_bytes(end, str(self.path))
+            if self.tiles is not None:
+                with _astropy_file(self.path) as tiled:
+                    return np.array(tiled[self.tiles].data)
             with _opened(self.path) as file:
                 data = file.read(end)
                 # The checksum stands at the end; what other images follow is passed over.
@@ -83,11 +82,6 @@ class FitsImage:
             if len(data) < end:
                 raise DataError(f"{self.path}: expected {end} bytes, found {len(data)}; {_CUT}")
             return np.frombuffer(data, self.dtype, offset=self.offset).reshape(self.shape)
-
-    def _from_tiles(self, limits: Limits) -> NDArray[Any]:
-        limits.check_bytes(math.prod(self.shape) * self.dtype.itemsize, str(self.path))
-        with _astropy_file(self.path) as file:
-            return np.array(file[self.tiles].data)
 
 
 def is_fits(path: Path) -> bool:
@@ -129,17 +123,21 @@ def find_images(path: Path, limits: Limits) -> tuple[FitsImage, ...]:
 def _images(path: Path, limits: Limits) -> Iterator[FitsImage]:
     """Yield the images of a file in their order, as their headers describe them."""
     fits = astropy_fits()
-    size, offset, count = check_input(path).st_size, 0, 0
+    size, count = check_input(path).st_size, 0
     with input_errors(path), _opened(path) as file:
         for index in range(limits.max_frames + _MOST_HEADERS):
-            cards = _read_cards(path, file, offset)
+            cards = _read_cards(path, file, first=index == 0)
             if not cards or (index >= _MOST_HEADERS and not count):
                 return
-            header, offset = fits.Header.fromstring("".join(cards)), offset + -(-len(cards) // 36) * _BLOCK
-            length = _data_bytes(path, header)
+            header = fits.Header.fromstring("".join(cards))
+            offset, length = file.tell(), _data_bytes(path, header)
             image = None
             if header.get("ZIMAGE", False):
-                image = _tiled_image(path, index)
+                # Astropy knows the header that the image had before.
+                with _astropy_file(path) as tiled:
+                    header = tiled[index].header
+                    cards = [card.image[:80].ljust(80) for card in header.cards]
+                    image = replace(_image(path, cards, header, 0), tiles=index)
             elif header.get("XTENSION", "IMAGE").strip() == "IMAGE" and header["NAXIS"] >= 2 and length:
                 image = _image(path, cards, header, offset)
             if image is not None:
@@ -150,39 +148,34 @@ def _images(path: Path, limits: Limits) -> Iterator[FitsImage]:
                     raise DataError(f"{path}: expected {offset + length} bytes, found {size}; {_CUT}")
                 yield image
             offset += -(-length // _BLOCK) * _BLOCK
-            _skip_to(path, file, offset, limits)
-
-
-def _tiled_image(path: Path, index: int) -> FitsImage:
-    """Describe an image in compressed tiles by the header that it had before."""
-    with _astropy_file(path) as file:
-        header = file[index].header
-        cards = tuple(card.image[:80].ljust(80) for card in header.cards)
-        return replace(_image(path, (*cards, "END".ljust(80)), header, 0), tiles=index)
+            if _is_compressed(path):
+                limits.check_bytes(offset, str(path))
+            file.seek(offset)
 
 
 def _astropy_file(path: Path) -> Any:
     return astropy_fits().open(path, do_not_scale_image_data=True, memmap=False)
 
 
-def _read_cards(path: Path, file: IO[bytes], offset: int) -> tuple[str, ...]:
-    """Read one header with its end, or nothing at the end of the file."""
+def _read_cards(path: Path, file: IO[bytes], first: bool) -> list[str]:
+    """Read the next header up to its end; nothing where no other follows."""
     cards: list[str] = []
-    while len(cards) < 36 * _MOST_BLOCKS:
+    while len(cards) < _MOST_CARDS:
         block = file.read(_BLOCK)
         if not cards and (len(block) < _BLOCK or not block.startswith((b"SIMPLE  =", b"XTENSION="))):
-            if offset:
-                # What follows the last header is no concern of ours.
-                return ()
-            raise DataError(f"{path}: not a FITS file; it does not begin with SIMPLE and a whole header")
+            if first:
+                raise DataError(f"{path}: not a FITS file; it does not begin with SIMPLE and a whole header")
+            # What follows the last header is no concern of ours.
+            return []
         if len(block) < _BLOCK:
             raise DataError(f"{path}: damaged; its header does not end")
         text = block.decode("ascii", "replace").replace("\ufffd", "?")
         for start in range(0, _BLOCK, 80):
-            cards.append(text[start : start + 80])
-            if cards[-1].rstrip() == "END":
-                return tuple(cards)
-    raise DataError(f"{path}: expected a header of up to {36 * _MOST_BLOCKS} cards, found more")
+            card = text[start : start + 80]
+            if card.rstrip() == "END":
+                return cards
+            cards.append(card)
+    raise DataError(f"{path}: expected a header of up to {_MOST_CARDS} cards, found more")
 
 
 def _data_bytes(path: Path, header: Header) -> int:
@@ -193,7 +186,7 @@ def _data_bytes(path: Path, header: Header) -> int:
     return abs(counts[0]) // 8 * counts[-1] * (counts[-2] + math.prod(axes)) if axes else 0
 
 
-def _image(path: Path, cards: tuple[str, ...], header: Header, offset: int) -> FitsImage:
+def _image(path: Path, cards: list[str], header: Header, offset: int) -> FitsImage:
     shape = tuple(int(header[f"NAXIS{place}"]) for place in range(header["NAXIS"], 0, -1))
     dtype = np.dtype(_TYPES[header["BITPIX"]])
     scale, zero, blank = float(header.get("BSCALE", 1)), float(header.get("BZERO", 0)), header.get("BLANK")
@@ -209,7 +202,7 @@ def _image(path: Path, cards: tuple[str, ...], header: Header, offset: int) -> F
         notes.append(f"the Bayer pattern {pattern} is unknown, so it is not made into colour")
     missing = blank if dtype.kind in "iu" and isinstance(blank, int) else None
     name = re.sub(r"[\s_-]*\d*$", "", str(header.get("EXTNAME", "")).strip().upper())
-    return FitsImage(path, cards, shape, dtype, offset, (scale, zero), missing, tuple(notes), bayer, name)
+    return FitsImage(path, tuple(cards), shape, dtype, offset, (scale, zero), missing, tuple(notes), bayer, name)
 
 
 def _first_colours(pattern: str, header: Header, rows: int | None) -> str | None:
@@ -234,13 +227,6 @@ def _check_size(image: FitsImage, limits: Limits) -> None:
         height, width = image.shape[1:3]
     limits.check_size(width, height, str(image.path))
     limits.check_count(max(image.shape[:-2], default=1), str(image.path))
-
-
-def _skip_to(path: Path, file: IO[bytes], offset: int, limits: Limits) -> None:
-    """Go to the next header; a compressed file is not unpacked beyond the limit for that."""
-    if _is_compressed(path):
-        limits.check_bytes(offset, str(path))
-    file.seek(offset)
 
 
 def _is_compressed(path: Path) -> bool:

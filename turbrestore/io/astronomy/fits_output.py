@@ -7,6 +7,7 @@ import re
 import unicodedata
 import warnings
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,13 +24,10 @@ if TYPE_CHECKING:
     from astropy.io.fits import Header
 
 FITS_OUTPUT_SUFFIX = ".fits"
-# Headers and data fill blocks of so many bytes.
-_BLOCK = 2880
-# What describes the numbers and axes of the input, and not the scene.
-_STRUCTURE = re.compile(
-    r"SIMPLE|XTENSION|EXTEND|EXTNAME|EXTVER|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|GROUPS|BSCALE|BZERO|BLANK|BUNIT|DATAMIN|"
-    r"DATAMAX|CHECKSUM|DATASUM|BAYERPAT|[XY]BAYROFF|WCSAXES|(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|CNAME)[3-9]|"
-    r"(CD|PC)(\d_[3-9]|[3-9]_\d)|END"
+# What describes the numbers and the further axes of the input, beside what Astropy takes for structure.
+_ABOUT_NUMBERS = re.compile(
+    r"EXTNAME|EXTVER|BLANK|BUNIT|DATAMIN|DATAMAX|CHECKSUM|DATASUM|BAYERPAT|[XY]BAYROFF|WCSAXES|"
+    r"(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|CNAME)[3-9]|(CD|PC)(\d_[3-9]|[3-9]_\d)"
 )
 
 
@@ -89,37 +87,31 @@ def write_fits_cube(
     """
     fits, stream = astropy_fits(), frames_of_one_size(frames, path)
     depth, first = check_depth(bit_depth), next(stream)
-    middle = 0.0
-    with warnings.catch_warnings(), atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+    images = (_planes_first(at_levels(from_unit_to_type(frame, depth), levels)) for frame in chain([first], stream))
+    with warnings.catch_warnings(), atomic_output(path, overwrite) as temporary:
         warnings.simplefilter("ignore")
-        for number, frame in enumerate(chain([first], stream)):
-            pixels = _planes_first(at_levels(from_unit_to_type(frame, depth), levels))
-            if number == 0:
-                header = fits.PrimaryHDU(np.zeros((1, *pixels.shape), pixels.dtype)).header
-                header[f"NAXIS{pixels.ndim + 1}"] = count
-                for line in history:
-                    header.add_history(_ascii(line))
-                check_space(path, count * pixels.nbytes)
-                file.write(header.tostring().encode("ascii"))
-                middle = header.get("BZERO", 0)
-            # FITS has no unsigned numbers of 16 bits: zero is written as the least signed one.
-            stored = (pixels.astype(np.int64) - int(middle)).astype("i2") if middle else pixels
-            file.write(stored.astype(stored.dtype.newbyteorder(">")).tobytes())
-        file.write(bytes(-file.tell() % _BLOCK))
+        pixels = _planes_first(from_unit_to_type(first, depth))[None]
+        check_space(path, count * pixels.nbytes)
+        header = fits.PrimaryHDU(pixels).header
+        header[f"NAXIS{pixels.ndim}"] = count
+        for line in history:
+            header.add_history(_ascii(line))
+        # FITS has no unsigned numbers of 16 bits: zero is written as the least signed one.
+        middle = header.get("BZERO", 0)
+        with fits.StreamingHDU(str(temporary), header) as cube:
+            for pixels in images:
+                cube.write((pixels.astype(np.int32) - int(middle)).astype(np.int16) if middle else pixels)
 
 
 def _kept(cards: Sequence[str], origin: tuple[int, int], fits: Any) -> Header:
     """Cards of the input that are still true of the image."""
-    header = fits.Header()
-    for text in cards:
-        card = fits.Card.fromstring(text.encode("ascii", "replace"))
-        if _STRUCTURE.fullmatch(card.keyword) or not text.strip():
-            continue
-        try:
-            header.append(fits.Card(card.keyword, card.value, card.comment), end=True)
-        except (ValueError, fits.VerifyError):
+    header, before = fits.Header(), fits.Header.fromstring("".join(cards).encode("ascii", "replace"))
+    before.strip()
+    for card in before.cards:
+        if card.keyword and not _ABOUT_NUMBERS.fullmatch(card.keyword):
             # A card that cannot be read has nothing to keep.
-            continue
+            with suppress(ValueError, fits.VerifyError):
+                header.append(fits.Card(card.keyword, card.value, card.comment), end=True)
     for place, name in enumerate(("CRPIX1", "CRPIX2")):
         if isinstance(header.get(name), int | float):
             header[name] -= origin[place]

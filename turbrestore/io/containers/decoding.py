@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import DataError
-from ..limits import DEFAULT_LIMITS, Limits, input_errors
+from ..limits import Limits, input_errors
 from ..pixels import BAYER_REMARK, PixelArray, looks_like_bayer, upright
 from ..source import FrameRange, FrameSource, check_cut_short, check_frame_range
-from ..values.pixel_formats import PixelFormat, frame_pixels, has_grey_palette, layout_of
-from ..values.transfer_curves import BT709, remark_on_curve
 from .integrity import ends_early, ffv1_slices_intact, is_cut_short, varies_in_time
+from .pixel_formats import PixelFormat, frame_pixels, has_grey_palette, layout_of
+from .transfer_curves import BT709, remark_on_curve
 
 if TYPE_CHECKING:
     import av
@@ -71,11 +71,7 @@ class _Scan:
 
 
 def open_container(
-    path: Path,
-    frames: FrameRange | None = None,
-    limits: Limits = DEFAULT_LIMITS,
-    skip_damaged: bool = False,
-    keep_hdr: bool = False,
+    path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool, keep_hdr: bool
 ) -> FrameSource:
     """Open a video file; the errors are those of :func:`turbrestore.io.video.open_frames`.
 
@@ -94,6 +90,7 @@ def open_container(
                 raise DataError(f"{path}: expected at least one frame, found none")
             layout = layout_of(path, frame, keep_hdr)
             notes, interlaced = _notes(frame, layout, stream), frame.interlaced_frame
+            size = (frame.height, frame.width)
             notes += remark_on_curve(int(frame.color_trc), {**container.metadata, **stream.metadata}, keep_hdr)
             colour = (int(frame.color_primaries), int(frame.color_trc)) if layout.transfer is None else (BT709, BT709)
             if codec == "rawvideo" and not layout.channels and looks_like_bayer(frame_pixels(frame, layout)):
@@ -116,7 +113,7 @@ def open_container(
     return FrameSource(
         name=path.name,
         format=f"{codec}/{layout.name}",
-        file_shape=(scan.intact, *_upright_size(frame, layout), *layout.channels),
+        file_shape=(scan.intact, *(size[::-1] if layout.orientation > 4 else size), *layout.channels),
         full_scale=layout.full_scale,
         bit_depth=layout.bit_depth,
         pixels=lambda chosen: _frames(path, layout, chosen, intra, interlaced, limits, scan),
@@ -175,10 +172,6 @@ def _notes(frame: av.VideoFrame, layout: PixelFormat, stream: av.VideoStream) ->
         shape = f"{aspect.numerator}:{aspect.denominator}"
         notes.append(f"pixels of {shape} are taken for square; widen the result by that ratio to see it as players do")
     return tuple(notes)
-
-
-def _upright_size(frame: av.VideoFrame, layout: PixelFormat) -> tuple[int, int]:
-    return (frame.width, frame.height) if layout.orientation > 4 else (frame.height, frame.width)
 
 
 def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:

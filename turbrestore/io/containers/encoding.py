@@ -21,8 +21,8 @@ from ...core.arrays import FloatArray, from_unit
 from ...core.errors import DataError, StorageError, require, require_between
 from ..output import atomic_output, frames_of_one_size
 from ..pixels import check_depth
-from ..values.pixel_formats import FULL_RANGE, RGB, VIDEO_RANGE, convert
-from ..values.transfer_curves import BT709, BT2020, CURVES, UNKNOWN
+from .pixel_formats import FULL_RANGE, RGB, VIDEO_RANGE, convert
+from .transfer_curves import BT709, BT2020, CURVES, UNKNOWN
 
 if TYPE_CHECKING:
     import av
@@ -136,6 +136,8 @@ def _encode(
     sound: Soundtrack | None,
     colour: tuple[int, int] | None,
 ) -> None:
+    import av
+
     first = next(frames)
     # Rates such as 30000/1001 stay exact.
     rate = Fraction(fps).limit_denominator(1001)
@@ -143,6 +145,7 @@ def _encode(
         expected, found = f"{_SMALLEST_HEVC}×{_SMALLEST_HEVC}", f"{first.shape[1]}×{first.shape[0]}"
         raise DataError(f"HEVC: expected frames of at least {expected} pixels, found {found}; choose another codec")
     depth, pixel_format, options = _layout(first.shape, bit_depth, codec, crf)
+    native = _GREY_DEPTHS[depth] if first.ndim == 2 else "rgb24" if depth == 8 else _RGB_DEPTHS[depth]
     ahead = [first]
     if codec == "hevc":
         ahead += itertools.islice(frames, _REORDERED_HEVC)
@@ -160,7 +163,8 @@ def _encode(
         stream.codec_context.time_base = tick
     with _copier(output, sound) as copy_until:
         for number, frame in enumerate(itertools.chain(ahead, frames)):
-            picture = convert(_picture(frame, depth), pixel_format, *tags)
+            whole = av.VideoFrame.from_ndarray(from_unit(frame, depth), format=native)
+            picture = convert(whole, pixel_format, *tags)
             picture.pts, picture.time_base = number if ticks is None else ticks[number], tick
             output.mux(stream.encode(picture))
             copy_until(float(picture.pts * tick))
@@ -234,13 +238,6 @@ def _copier(output: OutputContainer, sound: Soundtrack | None) -> Iterator[Calla
                     output.mux(packet)
 
         yield copy_until
-
-
-def _picture(frame: FloatArray, depth: int) -> av.VideoFrame:
-    import av
-
-    kind = _GREY_DEPTHS[depth] if frame.ndim == 2 else "rgb24" if depth == 8 else _RGB_DEPTHS[depth]
-    return av.VideoFrame.from_ndarray(from_unit(frame, depth), format=kind)
 
 
 class _Sink:

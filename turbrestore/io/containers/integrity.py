@@ -11,6 +11,7 @@ it is applied to bit-reversed bytes.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -33,11 +34,11 @@ def is_cut_short(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(12)
         if head.startswith(_EBML_HEADER):
-            return _matroska_end(file, size) > size
+            return _end(file, size, _matroska_length) > size
         if head.startswith(b"RIFF"):
-            return _riff_end(file, size) > size + _RIFF_SLACK
+            return _end(file, size, _riff_length) > size + _RIFF_SLACK
         if head[4:8] in _MP4_BOXES:
-            return _mp4_end(file, size) > size
+            return _end(file, size, _mp4_length) > size
         if head.startswith(b"GIF8"):
             file.seek(max(0, size - 256))
             return not file.read().rstrip(b"\0").endswith(b";")
@@ -58,50 +59,42 @@ def ffv1_slices_intact(packet: bytes) -> bool | None:
     return intact
 
 
-def _matroska_end(file: BinaryIO, size: int) -> int:
+def _end(file: BinaryIO, size: int, length_of: Callable[[bytes, int], int]) -> int:
+    """Where the last of the outermost elements ends; ``length_of`` is 0 for what other programs have appended."""
     position = 0
     while position < size:
         file.seek(position)
-        head = file.read(12)
-        # Other programs may append data after the Matroska structure.
-        if not head.startswith((_EBML_HEADER, _MATROSKA_SEGMENT)) or len(head) < 5:
+        length = length_of(file.read(16), size - position)
+        if length == 0:
             break
-        length = 9 - head[4].bit_length()
-        field = head[4 : 4 + length]
-        if length > 8 or len(field) < length:
-            break
-        content = int.from_bytes(field, "big") & ((1 << 7 * length) - 1)
-        if content == (1 << 7 * length) - 1:
-            break  # all ones: a live recording of unknown size
-        position += 4 + length + content
-    return position
-
-
-def _riff_end(file: BinaryIO, size: int) -> int:
-    position = 0
-    while position + 8 <= size:
-        file.seek(position)
-        tag, length = file.read(4), int.from_bytes(file.read(4), "little")
-        if tag != b"RIFF" or length == 0:
-            break
-        position += 8 + length + length % 2
-    return position
-
-
-def _mp4_end(file: BinaryIO, size: int) -> int:
-    position = 0
-    while position + 8 <= size:
-        file.seek(position)
-        head = file.read(16)
-        length = int.from_bytes(head[:4], "big")
-        if head[4:8] not in _MP4_BOXES and position + length > size:
-            break  # appended by other programs
-        if length == 1:
-            length = int.from_bytes(head[8:], "big")
-        if length < 8:
-            break  # 0: to the end of the file
         position += length
     return position
+
+
+def _matroska_length(head: bytes, left: int) -> int:
+    width = 9 - head[4].bit_length() if len(head) > 4 else 9
+    field = head[4 : 4 + width]
+    if not head.startswith((_EBML_HEADER, _MATROSKA_SEGMENT)) or width > 8 or len(field) < width:
+        return 0
+    unknown = (1 << 7 * width) - 1
+    content = int.from_bytes(field, "big") & unknown
+    # A live recording does not know its size.
+    return 0 if content == unknown else 4 + width + content
+
+
+def _riff_length(head: bytes, left: int) -> int:
+    length = int.from_bytes(head[4:8], "little")
+    return 8 + length + length % 2 if head.startswith(b"RIFF") and length else 0
+
+
+def _mp4_length(head: bytes, left: int) -> int:
+    length = int.from_bytes(head[:4], "big")
+    if head[4:8] not in _MP4_BOXES and length > left:
+        return 0
+    if length == 1:
+        length = int.from_bytes(head[8:], "big")
+    # A box of length 0 goes to the end of the file.
+    return length if length >= 8 else 0
 
 
 def ends_early(times: NDArray[np.float64] | None, last: float, duration: float) -> bool:

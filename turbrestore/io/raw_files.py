@@ -7,20 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import DataError
-from ...core.extras import missing_package
-from ..limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
-from ..pixels import PixelArray
+from ..core.errors import DataError
+from ..core.extras import missing_package
+from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
+from .pixels import PixelArray
 
 RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw", ".3fr"),
     *(".iiq", ".rwl", ".erf", ".mrw"),
 )
-
-
-def is_raw(path: Path) -> bool:
-    """Whether a name is that of a raw file."""
-    return path.suffix.lower() in RAW_SUFFIXES
 
 
 def read_raw_file(path: Path, limits: Limits = DEFAULT_LIMITS, like: Path | None = None) -> PixelArray:
@@ -29,7 +24,10 @@ def read_raw_file(path: Path, limits: Limits = DEFAULT_LIMITS, like: Path | None
     The white balance is that of the camera, of the file ``like`` for the frames of one video: a camera that chooses it
     for every shot would make them differ.
     """
-    rawpy = _rawpy(path)
+    try:
+        import rawpy
+    except ImportError as error:
+        raise missing_package(str(path), "rawpy", "raw") from error
     limits.check_bytes(check_input(path).st_size, str(path))
     balance = _white_balance(rawpy, path if like is None else like)
     with input_errors(path):
@@ -62,11 +60,3 @@ def _white_balance(rawpy: Any, path: Path) -> list[float] | None:
     except rawpy.LibRawError:
         return None
     return found if min(found[:3]) > 0 else None
-
-
-def _rawpy(path: Path) -> Any:
-    try:
-        import rawpy
-    except ImportError as error:
-        raise missing_package(str(path), "rawpy", "raw") from error
-    return rawpy

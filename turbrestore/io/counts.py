@@ -8,20 +8,21 @@ not widen the range to more than twice what the others span; they are clipped in
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ...core.arrays import FloatArray
-from ...core.errors import DataError
-from ...runtime.scratch import iter_frames
-from ..pixels import FLOAT_MARGIN, PixelArray, full_scale_of
-from ..source import FrameSource
+from ..core.arrays import FloatArray
+from ..core.errors import DataError
+from ..runtime.scratch import iter_frames
+from .limits import Limits
+from .pixels import FLOAT_MARGIN, PixelArray, depth_of, full_scale_of
+from .source import FrameSource
 
 # Percentage of the frames at either end whose extremes do not count.
 _FEW = 10
@@ -65,9 +66,50 @@ def holds_counts(dtype: np.dtype[Any]) -> bool:
     return dtype.kind in "if" or (dtype.kind == "u" and dtype.itemsize >= 4)
 
 
-def scale_of_numbers(dtype: np.dtype[Any], name: str) -> int:
-    """Value that means intensity 1 until the range of the numbers is known; DataError for other types than numbers."""
-    return 1 if dtype.kind == "i" else full_scale_of(dtype, name)
+def source_of_numbers(
+    path: Path,
+    form: str,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    pixels: Callable[[Sequence[int]], Iterator[PixelArray]],
+    notes: tuple[str, ...],
+    limits: Limits,
+) -> FrameSource:
+    """Describe a video of numbers of a type; where they may be counts, every frame is read once to find their range.
+
+    Other types than numbers, and sizes beyond the limits, raise DataError.
+    """
+    source = FrameSource(
+        name=path.name,
+        format=form,
+        file_shape=shape,
+        full_scale=1 if dtype.kind == "i" else full_scale_of(dtype, str(path)),
+        bit_depth=depth_of(dtype),
+        pixels=pixels,
+        path=path,
+        warnings=notes,
+    )
+    limits.check_size(shape[2], shape[1], str(path))
+    limits.check_count(shape[0], str(path))
+    if not holds_counts(dtype):
+        return source
+
+    def whole() -> Iterator[PixelArray]:
+        # What follows a damaged frame is scaled by the range of what comes before.
+        with suppress(DataError):
+            yield from pixels(range(shape[0]))
+
+    found = range_of_counts(whole(), path.name)
+    if found is None:
+        return source
+    return dataclasses.replace(
+        source,
+        full_scale=1,
+        bit_depth=32,
+        pixels=lambda chosen: (found.unit(frame) for frame in iter_frames(pixels(chosen))),
+        warnings=(*notes, found.remark),
+        levels=found.levels,
+    )
 
 
 def range_of_counts(frames: Iterable[PixelArray], name: str, kind: str | None = None) -> CountRange | None:
@@ -116,31 +158,3 @@ def _ends(frame: PixelArray) -> tuple[float, float, float, float]:
     high = float(np.minimum(up, cv2.dilate(up, _NEIGHBOURS)).max())
     low = float(np.maximum(down, cv2.erode(down, _NEIGHBOURS)).min())
     return lowest, low, high, highest
-
-
-def from_counts(source: FrameSource) -> FrameSource:
-    """Scale the counts of a video by one range for all its frames; intensities stay as they are.
-
-    Every frame is read once. What follows a damaged frame is scaled by the range of what comes before.
-    """
-    read = source.pixels
-
-    def whole() -> Iterator[PixelArray]:
-        with suppress(DataError):
-            yield from read(range(source.file_shape[0]))
-
-    found = range_of_counts(whole(), source.name)
-    if found is None:
-        return source
-
-    def pixels(chosen: Sequence[int]) -> Iterator[NDArray[np.float32]]:
-        return (found.unit(frame) for frame in iter_frames(read(chosen)))
-
-    return dataclasses.replace(
-        source,
-        full_scale=1,
-        bit_depth=32,
-        pixels=pixels,
-        warnings=(*source.warnings, found.remark),
-        levels=found.levels,
-    )

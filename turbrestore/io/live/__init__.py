@@ -1,1 +1,0 @@
-"""Frames that come one by one, and only once."""
