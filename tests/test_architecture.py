@@ -17,7 +17,7 @@ ORDER = [
     "results", "settings", "memory_plan", "runs", "preparation", "stacking", "fusion", "pipeline",
     "report",
 ]  # fmt: skip
-HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
+HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}
 HEAVY |= {"imagecodecs", "astropy", "dask", "distributed", "rawpy", "msgspec"}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")
 

@@ -250,13 +250,12 @@ def write_animation(path: Path, frames: Iterable[FloatArray], fps: float, overwr
 
     All frames are in memory at 8 bits until the end. GIF counts hundredths of a second, WebP thousandths.
     """
-    import PIL.Image
+    import imageio.v3 as iio
 
-    images = [PIL.Image.fromarray(from_unit(frame, 8)) for frame in frames_of_one_size(frames, path)]
-    buffer = io.BytesIO()
-    kind, rest = path.suffix[1:].upper(), images[1:]
-    images[0].save(buffer, kind, save_all=True, append_images=rest, duration=1000 / fps, loop=0, lossless=True)
-    atomic_write(path, buffer.getbuffer(), overwrite)
+    images = [from_unit(frame, 8) for frame in frames_of_one_size(frames, path)]
+    kind = {"extension": path.suffix.lower(), "plugin": "pillow"}
+    data = iio.imwrite("<bytes>", images, **kind, duration=1000 / fps, loop=0, lossless=True)
+    atomic_write(path, data, overwrite)
 
 
 def _read_file(path: Path, limits: Limits) -> bytes:
