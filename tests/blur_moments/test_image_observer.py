@@ -1,25 +1,20 @@
 """Observers on the whole image against general solvers; erratum 9 of the papers."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
-from turbrestore.blur_moments.experiments.scenarios import (
-    MirrorParams,
-    WavefrontParams,
-    mirror_model,
-    mirror_oscillator,
-    record_mirror,
-    record_wavefront,
-    wavefront_model,
-)
+from turbrestore.blur_moments.experiments.scenarios import mirror_setup, record, wavefront_setup
 from turbrestore.blur_moments.moments import BlurModel
 from turbrestore.blur_moments.sensor import GaussianKernel, LineSensor, expose
 from turbrestore.blur_moments.state_estimation.image_observer import ImageFilter
 from turbrestore.blur_moments.state_estimation.observers import run_observer, steady_kalman
 from turbrestore.filtering.kalman import Gaussian
 
-MODEL = wavefront_model()
-MIRROR = mirror_model()
+WAVES = wavefront_setup()
+MODEL = WAVES.model
+MIRROR = mirror_setup().model
 START = Gaussian(np.zeros(2), steady_kalman(MODEL)[1])
 
 
@@ -33,7 +28,7 @@ def image_of(model, state, inputs):
 
 class TestImageFilter:
     def test_map_is_the_minimum_that_scipy_finds(self):
-        recording = record_wavefront([1], WavefrontParams(frames=1, burn_in=0))
+        recording = record(replace(WAVES, frames=1), [1])
         frame, inputs = recording.frames[0, 0], recording.inputs[0, 0]
         after, innovation = ImageFilter().step(MODEL, START, frame, inputs)
         root, deviation = np.linalg.inv(np.linalg.cholesky(START.cov)), np.sqrt(0.1 / 0.02)
@@ -80,7 +75,7 @@ class TestImageFilter:
         np.testing.assert_allclose(after.mean, np.tile(truth, (50, 1)), rtol=0.01)
 
     def test_infinity_norm_comes_close_to_the_minimum(self):
-        recording = record_mirror([3], MirrorParams(frames=1, burn_in=0))
+        recording = record(replace(mirror_setup(), frames=1), [3])
         frame, inputs, truth = recording.frames[0, 0], recording.inputs[0, 0], recording.states[0, 0, :2]
         start = Gaussian(truth, np.diag([0.1, 3.0]) ** 2)
         after, _ = ImageFilter("infinity", multistart=False).step(MIRROR, start, frame, inputs)
@@ -102,10 +97,10 @@ class TestImageFilter:
         np.testing.assert_allclose(several.mean, truth, rtol=0.02)
 
     def test_plant_is_learnt(self):
-        params = MirrorParams(frames=15, burn_in=0, deviation=7.0)
-        recording = record_mirror(range(4), params)
+        setup = replace(mirror_setup(deviation=7.0), frames=15)
+        recording = record(setup, range(4))
         cov = np.diag([0.3, 10.0, 0.4, 0.15, 0.35]) ** 2
-        model = BlurModel(mirror_oscillator(params), MIRROR.sensor)
+        model = BlurModel(setup.truth, MIRROR.sensor)
         start = Gaussian(np.zeros((4, 5)), cov)
         results = run_observer(ImageFilter(), model, start, recording.frames, recording.inputs)
         away = results[-1][0].mean[:, 2:] - recording.states[-1, :, 2:]

@@ -1,18 +1,13 @@
 """Observers against each other, the batch solution and the laws they obey; errata 5 and 6 of the papers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blur_moments.experiments.scenarios import (
-    WavefrontParams,
-    mirror_model,
-    record_wavefront,
-    wavefront_model,
-)
+from turbrestore.blur_moments.experiments.scenarios import mirror_setup, record, wavefront_setup
 from turbrestore.blur_moments.moments import BlurModel, image_moments, moment_noise, predicted_moments
 from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid, expose
 from turbrestore.blur_moments.state_estimation.augmented import Oscillator, OscillatorMotion
@@ -28,8 +23,9 @@ from turbrestore.blur_moments.state_estimation.observers import (
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.filtering.kalman import Gaussian, update
 
-MODEL = wavefront_model()
-MIRROR = mirror_model()
+WAVES = wavefront_setup()
+MODEL = WAVES.model
+MIRROR = mirror_setup().model
 KALMAN, SETTLED = steady_kalman(MODEL)
 START = Gaussian(np.zeros(2), SETTLED)
 OBSERVERS = {
@@ -49,7 +45,7 @@ OBSERVERS = {
 
 @pytest.fixture(scope="module")
 def recording():
-    return record_wavefront(range(3), WavefrontParams(frames=6, burn_in=0))
+    return record(replace(WAVES, frames=6), range(3))
 
 
 def path_of(motion, state, inputs):
@@ -162,7 +158,7 @@ class TestErrata:
         h, H, _ = predicted_moments(MODEL, H_x, np.zeros(200), (2,))
         kernel = MODEL.sensor.kernel.sigma**2
         np.testing.assert_allclose(H @ H_x, 2 * (h - kernel), atol=1e-12)
-        recording = record_wavefront(range(60))
+        recording = record(WAVES, range(60))
         start = everyone(START, 60)
         printed, correct, first = (
             mean_errors(run_observer(o, MODEL, start, recording.frames, recording.inputs), recording)[10:].mean(0)
@@ -274,7 +270,7 @@ class TestRefusals:
 
 def test_fixed_gain_keeps_books_of_any_gain():
     """The covariance that a poor gain claims is the one its errors have."""
-    recording = record_wavefront(range(60))
+    recording = record(WAVES, range(60))
     observer = FixedGain(1.6 * KALMAN.gain)
     results = run_observer(observer, MODEL, everyone(START, 60), recording.frames, recording.inputs)
     squared = np.mean(mean_errors(results, recording)[10:] ** 2)
