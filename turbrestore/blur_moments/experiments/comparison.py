@@ -132,10 +132,10 @@ def follow(contestant: Contestant, recording: Recording, of_state: bool) -> Trac
     motion, start = contestant.model.motion, contestant.start
     prior = Gaussian(np.broadcast_to(start.mean, (recording.states.shape[1], start.mean.size)), start.cov)
     results = run_observer(contestant.observer, contestant.model, prior, recording.frames, recording.inputs)
-    pairs = zip(results, recording.inputs, strict=True)
-    estimates = np.array([motion.fast_output(state, held)[0] for (state, _), held in pairs])
+    means, steps = np.array([state.mean for state, _ in results]), motion.timing.frame_steps
+    estimates, _ = motion.path_and_jacobian(means, recording.inputs, steps)
     if of_state:
-        errors = np.linalg.norm(np.array([state.mean for state, _ in results]) - recording.states, axis=-1)
+        errors = np.linalg.norm(means - recording.states, axis=-1)
     else:
         exposed = slice(motion.timing.exposure_steps)
         errors = np.sqrt(((estimates - recording.outputs)[..., exposed] ** 2).mean(-1))

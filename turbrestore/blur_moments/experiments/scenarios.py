@@ -26,10 +26,10 @@ import numpy as np
 
 from ...core.errors import require_between
 from ...filtering.kalman import Gaussian
-from ..moments import BlurModel
+from ..moments import BlurModel, Motion
 from ..sensor import ExposureTiming, Float64Array, GaussianKernel, LineSensor, PixelGrid, expose
 from ..state_estimation.augmented import Oscillator, OscillatorMotion
-from ..state_estimation.lifting import FastSystem, LiftedSystem, Motion, discretise, lift
+from ..state_estimation.lifting import FastSystem, LiftedSystem, discretise, lift
 from ..state_estimation.observers import steady_kalman
 
 # Standard deviation of what is added to the slope between exposures.
@@ -127,13 +127,12 @@ def record(setup: Setup, seeds: Sequence[int]) -> Recording:
     certain = np.zeros((motion.order, motion.order))
     states, outputs, frames = [], [], []
     for held, disturbance, noise in zip(all_inputs, disturbances, noises, strict=True):
-        now = Gaussian(state, certain)
-        output, _ = motion.fast_output(now, held)
+        output, _ = motion.path_and_jacobian(state, held, motion.timing.frame_steps)
         image = expose(output[:, : motion.timing.exposure_steps], sensor.kernel, sensor.pixels, sensor.total)
         states.append(state)
         outputs.append(output)
         frames.append(image + sensor.deviation * noise)
-        state = motion.advance(now, held).mean + disturbance
+        state = motion.advance(Gaussian(state, certain), held).mean + disturbance
     return Recording(all_inputs, np.array(states), np.array(outputs), np.array(frames))
 
 

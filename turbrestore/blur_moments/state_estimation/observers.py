@@ -1,9 +1,9 @@
 """Observers of a fast system behind a slow integrative sensor: fixed gains and filters on moments.
 
 Every observer has one method, ``step(model, state, frame, inputs) -> (state, innovation)``: it corrects the predicted
-state at the start of an exposure by the frame of that exposure.  ``model.motion.advance`` then predicts the state at
-the start of the next exposure, so one loop, :func:`run_observer`, runs all of them.  The observers on the whole image
-are in :mod:`.image_observer`.  Leading axes are batches.
+state at the start of an exposure by the frame of that exposure, ``frame`` (..., count) and ``inputs`` (..., N).
+``model.motion.advance`` then predicts the state at the start of the next exposure, so one loop, :func:`run_observer`,
+runs all of them.  The observers on the whole image are in :mod:`.image_observer`.  Leading axes are batches.
 
 Symbols (paper 1, section V; paper 2, section IV)
 -------------------------------------------------
@@ -24,7 +24,6 @@ has H = 0 at rest: only an input, noise or the unscented form resolves the ambig
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,22 +34,12 @@ from ...core.errors import ConfigurationError, DataError, require
 from ...filtering.kalman import Gaussian, Innovation, predict, update
 from ..moments import BASES, BlurModel, image_moments, moment_noise, predicted_moments
 from ..sensor import Float64Array
-from .lifting import LiftedSystem, check_inputs
+from .image_observer import ImageFilter
+from .lifting import LiftedSystem
 
 METHODS = ("extended", "iterated", "unscented")
-
-
-class Observer(Protocol):
-    """The interface that :func:`run_observer` calls."""
-
-    def step(
-        self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
-    ) -> tuple[Gaussian, Innovation]:
-        """Correct the predicted state at the start of an exposure by its frame.
-
-        ``frame`` (..., count); ``inputs`` (..., N).
-        """
-        ...
+# Of the iterated method.
+_ITERATIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +54,7 @@ class FixedGain:
     def step(
         self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
     ) -> tuple[Gaussian, Innovation]:
-        """Correct the predicted state by its frame; see :meth:`Observer.step`."""
+        """Correct the predicted state by its frame."""
         order, size = model.motion.order, np.shape(self.gain)
         require(size == (order,), f"gain: expected shape {(order,)}, found {size}")
         measured, expected, H, R = _extended_terms(model, state, frame, inputs, MomentFilter((1,)))
@@ -86,33 +75,28 @@ class MomentFilter:
     basis: str = "monomial"  # or "legendre", whose moments have less noise, see :mod:`.moments`
     # Linearisation at the prediction, repeated at the estimate ("iterated"), or sigma points ("unscented").
     method: str = "extended"
-    iterations: int = 5  # of the iterated method
 
     def __post_init__(self) -> None:
         ascending = all(a < b for a, b in zip((0, *self.orders), self.orders, strict=False))
         require(bool(self.orders) and ascending, f"orders: expected ascending orders from 1, found {self.orders}")
         require(self.basis in BASES, f"basis: expected one of {', '.join(BASES)}, found {self.basis!r}")
         require(self.method in METHODS, f"method: expected one of {', '.join(METHODS)}, found {self.method!r}")
-        require(self.iterations >= 1, f"iterations: expected at least 1, found {self.iterations}")
 
     def step(
         self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
     ) -> tuple[Gaussian, Innovation]:
-        """Correct the predicted state by its frame; see :meth:`Observer.step`."""
+        """Correct the predicted state by its frame."""
         terms = _sigma_point_terms if self.method == "unscented" else _extended_terms
         measured, expected, H, R = terms(model, state, frame, inputs, self)
         after, innovation = update(state, measured, H, R, expected)
-        for _ in range(self.iterations if self.method == "iterated" else 0):
-            h, H, _ = self.predicted(model, after.mean, np.asarray(inputs))
+        for _ in range(_ITERATIONS if self.method == "iterated" else 0):
+            h, H, _ = predicted_moments(model, after.mean, np.asarray(inputs), self.orders, self.basis)
             expected = h + np.einsum("...mn,...n->...m", H, state.mean - after.mean)
             after, innovation = update(state, measured, H, R, expected)
         return after, innovation
 
-    def predicted(
-        self, model: BlurModel, mean: Float64Array, inputs: Float64Array
-    ) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Predict the moments of this filter, with H and R; see :func:`.moments.predicted_moments`."""
-        return predicted_moments(model, mean, inputs, self.orders, self.basis)
+
+Observer = FixedGain | MomentFilter | ImageFilter
 
 
 def run_observer(
@@ -181,15 +165,16 @@ def _extended_terms(
     model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike, moments: MomentFilter
 ) -> _Terms:
     """Measured and expected moments, H and R, linearised at the prediction."""
-    values = check_inputs(model.motion, state, inputs)
-    return _measured(model, frame, moments), *moments.predicted(model, state.mean, values)
+    values = model.check_inputs(state, inputs)
+    predicted = predicted_moments(model, state.mean, values, moments.orders, moments.basis)
+    return _measured(model, frame, moments), *predicted
 
 
 def _sigma_point_terms(
     model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike, moments: MomentFilter
 ) -> _Terms:
     """Statistical linearisation: regression of the moments on sigma points; R includes the regression residual."""
-    values, n = check_inputs(model.motion, state, inputs), model.motion.order
+    values, n = model.check_inputs(state, inputs), model.motion.order
     # n + κ = 3 matches the fourth moments of a Gaussian; κ ≥ 0 keeps the weights non-negative.
     kappa = max(3 - n, 0)
     try:
@@ -200,7 +185,7 @@ def _sigma_point_terms(
     weights = np.full(2 * n + 1, 0.5 / (n + kappa))
     weights[0] = kappa / (n + kappa)
     points = state.mean[..., None, :] + np.swapaxes(offsets, -1, -2)
-    predictions, _, R = moments.predicted(model, points, values[..., None, :])
+    predictions, _, R = predicted_moments(model, points, values[..., None, :], moments.orders, moments.basis)
     expected = np.einsum("i,...im->...m", weights, predictions)
     spread = predictions - expected[..., None, :]
     cross = np.einsum("i,...im,...ni->...mn", weights, spread, offsets)
