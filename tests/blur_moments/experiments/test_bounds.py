@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from turbrestore.blur_moments.experiments.bounds import error_bound, information, posterior_bound
+from turbrestore.blur_moments.experiments.comparison import error_bound, information, posterior_bound
 from turbrestore.blur_moments.experiments.scenarios import wavefront_setup
 from turbrestore.blur_moments.moments import predicted_moments
 from turbrestore.blur_moments.state_estimation.observers import steady_kalman
@@ -13,7 +13,7 @@ MODEL = wavefront_setup().model
 
 
 def test_of_a_linear_measurement_is_the_kalman_covariance(monkeypatch):
-    monkeypatch.setattr("turbrestore.blur_moments.experiments.bounds.MOMENTS", {"first": (1,)})
+    monkeypatch.setattr("turbrestore.blur_moments.experiments.comparison._MOMENTS", {"first": (1,)})
     _, settled = steady_kalman(MODEL)
     _, H, R = predicted_moments(MODEL, np.zeros(2), np.zeros(200), (1,))
     gained = information(MODEL, np.zeros(2), np.zeros(200))["first"]

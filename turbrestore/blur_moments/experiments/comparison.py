@@ -3,6 +3,14 @@
 A recording holds many seeds at once, so every observer corrects all of them in one step.  Errors are compared within
 a seed, because the ratio of two observers has a much smaller standard error than either error.  The set-ups are in
 :mod:`.scenarios`.
+
+Symbols of the posterior Cramér–Rao bounds (Tichavský, Muravchik & Nehorai, 1998)
+---------------------------------------------------------------------------------
+J : Bayesian information about the state; J⁻¹ bounds the mean squared error of any estimate.
+A_s, Q : motion from one exposure to the next, and covariance of its disturbance.
+
+For a linear motion with Gaussian disturbance ``J⁺ = (Q + A_s J⁻¹ A_sᵀ)⁻¹ + E[Hᵀ R⁻¹ H]``, where the expectation is over
+the states that occur, and H is the derivative of the measurement at the true state.
 """
 
 from __future__ import annotations
@@ -16,12 +24,11 @@ from scipy.stats import chi2
 from ...core.errors import require
 from ...filtering.kalman import Gaussian
 from ...runtime.threads import map_ahead
-from ..moments import BlurModel
+from ..moments import BlurModel, predicted_moments
 from ..sensor import ExposureTiming, Float64Array
 from ..state_estimation.image_observer import ImageFilter
 from ..state_estimation.lifting import LiftedSystem
 from ..state_estimation.observers import MomentFilter, Observer, run_observer, steady_kalman
-from .bounds import error_bound, information
 from .scenarios import SLOPE_DISTURBANCE, Recording, Setup, mirror_setup, record, wavefront_setup
 
 # Share of the exposures with the spot on the sensor below which light is lost.
@@ -30,6 +37,8 @@ _LIT = 0.99
 _BAND = 0.025, 0.975
 # Seeds handled together: enough to amortise the overhead of NumPy, few enough to stay in the cache.
 _CHUNK = 25
+# Orders of the moments for which there is a bound.
+_MOMENTS = {"moments": (1, 2), "moments_1_to_4": (1, 2, 3, 4)}
 # Standard deviations of ln g, ln ω and ln ζ in the prior of the augmented state: ±7 dB are two of the gain.
 _PLANT = np.array([0.4, 0.15, 0.35])
 
@@ -166,6 +175,41 @@ def score(track: Track, first: Track, bound: float, burn_in: int) -> Score:
         innovation_squared=float(misfits.mean()),
         innovation_band=(float(low), float(high)),
     )
+
+
+def information(model: BlurModel, states: Float64Array, inputs: Float64Array) -> dict[str, Float64Array]:
+    """Information ``Hᵀ R⁻¹ H`` of a frame about the state, by what is measured: two or four moments, or the image.
+
+    ``states`` (..., n); ``inputs`` (..., N); returns (..., n, n) each.
+    """
+    found = {}
+    for name, orders in _MOMENTS.items():
+        _, H, R = predicted_moments(model, states, inputs, orders, "legendre")
+        found[name] = np.swapaxes(H, -1, -2) @ np.linalg.solve(R, H)
+    _, derivative = model.image_and_jacobian(states, inputs)
+    scaled = derivative / model.sensor.deviation
+    return {**found, "image": scaled @ np.swapaxes(scaled, -1, -2)}
+
+
+def posterior_bound(A: Float64Array, Q: Float64Array, start: Float64Array, gained: Float64Array) -> Float64Array:
+    """Bound on the covariance of the estimation error after every frame.
+
+    ``A, Q, start`` (n, n); ``gained`` (T, n, n), the information of the frames; returns (T, n, n).
+    """
+    before, bounds = start, []
+    for frame in gained:
+        after = np.linalg.inv(np.linalg.inv(before) + frame)
+        bounds.append(after)
+        before = A @ after @ A.T + Q
+    return np.array(bounds)
+
+
+def error_bound(motion: LiftedSystem, start: Float64Array, gained: Float64Array, burn_in: int, of_state: bool) -> float:
+    """Bound on the root mean square error of the state, or of the output within the exposure, after the burn-in."""
+    covariances = posterior_bound(motion.A, motion.Q, start, gained)[burn_in:]
+    free = motion.free[: motion.timing.exposure_steps]
+    weight = np.eye(motion.order) if of_state else free.T @ free / len(free)
+    return float(np.sqrt(np.einsum("ab,tba->t", weight, covariances).mean()))
 
 
 def _run(
