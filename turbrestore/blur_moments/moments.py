@@ -32,8 +32,7 @@ from scipy.special import comb
 
 from ..core.errors import ConfigurationError, DataError, require
 from ..filtering.kalman import Gaussian
-from .exposure_table import ExposureTable, tabulate
-from .sensor import Float64Array, GaussianKernel, LineSensor, PixelGrid
+from .sensor import ExposureTable, Float64Array, GaussianKernel, LineSensor, PixelGrid, tabulate
 from .state_estimation.augmented import OscillatorMotion
 from .state_estimation.lifting import LiftedSystem
 
