@@ -104,7 +104,7 @@ def vibration(frequency, count):
 
 @pytest.mark.parametrize("frequency", [0.13, 0.7])
 def test_frequency_is_found_also_above_half_the_frame_rate(frequency):
-    path = vibration(frequency, 20)
+    path = vibration(frequency, 16)
     frames = film(path, np.random.default_rng(0))
     params = TrackParams(Oscillation(0.1, 0.0, 1e-3, highest=0.9), SIGMA)
     track = track_blur(frames, (22, 20, 20, 20), params)
