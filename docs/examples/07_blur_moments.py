@@ -138,7 +138,7 @@ for warning in printed.warnings:
 
 # %%
 steered = mirror(range(5))
-table(steered, ("O1", "O2", "O3", "O3_map"))
+table(steered, ("O1", "O2", "O3", "O3_infinity", "O3_map"))
 
 # %%
 truth, steps = steered.truth, steered.timing.frame_steps

@@ -104,8 +104,9 @@ class TestMirror:
     def test_order_of_the_observers(self, known):
         assert at_most(known.scores["O2"], 0.98)
         assert surely_below(known.scores["O2"], 1)
-        for name in ("O3", "O3_map"):
+        for name in ("O3", "O3_infinity", "O3_map"):
             assert at_most(known.scores[name], 0.60)
+        assert known.scores["O3"].error < known.scores["O3_infinity"].error
 
     def test_none_beats_the_bound(self, known):
         for result in known.scores.values():

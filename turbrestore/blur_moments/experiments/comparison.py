@@ -128,7 +128,9 @@ def mirror(seeds: Sequence[int], deviation: float = 0.0) -> Experiment:
         "O3": Contestant(ImageFilter("two"), model, start, "image"),
         "O3_map": Contestant(ImageFilter(), model, start, "image"),
     }
-    if deviation > 0:
+    if deviation == 0:
+        contestants["O3_infinity"] = Contestant(ImageFilter("infinity", iterations=8), model, start, "image")
+    else:
         full = np.diag([0.0, 0.0, *_PLANT**2])
         full[:2, :2] = cov
         augmented = BlurModel(setup.truth, model.sensor)
