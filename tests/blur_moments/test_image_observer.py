@@ -54,7 +54,7 @@ class TestImageFilter:
         deviation = sensor.deviation
         frame = expose(path_of(MIRROR.motion, truth, inputs), sensor.kernel, sensor.pixels)
         frame = frame + deviation * rng.standard_normal(frame.shape)
-        after, _ = ImageFilter(multistart=False).step(MIRROR, prior, frame, inputs)
+        after, _ = ImageFilter().step(MIRROR, prior, frame, inputs)
 
         def cost(x):
             misfit = (frame - image_of(MIRROR, x, inputs)) / deviation
@@ -71,14 +71,14 @@ class TestImageFilter:
         frame = expose(path_of(quiet.motion, truth, inputs[0]), quiet.sensor.kernel, quiet.sensor.pixels)
         starts = truth + np.random.default_rng(0).normal(size=(50, 2)) * [0.15, 5.0]
         prior = Gaussian(starts, np.diag([0.3, 10.0]) ** 2)
-        after, _ = ImageFilter("two", multistart=False).step(quiet, prior, np.tile(frame, (50, 1)), inputs)
+        after, _ = ImageFilter("two").step(quiet, prior, np.tile(frame, (50, 1)), inputs)
         np.testing.assert_allclose(after.mean, np.tile(truth, (50, 1)), rtol=0.01)
 
     def test_infinity_norm_comes_close_to_the_minimum(self):
         recording = record(replace(mirror_setup(), frames=1), [3])
         frame, inputs, truth = recording.frames[0, 0], recording.inputs[0, 0], recording.states[0, 0, :2]
         start = Gaussian(truth, np.diag([0.1, 3.0]) ** 2)
-        after, _ = ImageFilter("infinity", multistart=False).step(MIRROR, start, frame, inputs)
+        after, _ = ImageFilter("infinity").step(MIRROR, start, frame, inputs)
 
         def largest(x):
             return np.abs(frame - image_of(MIRROR, x, inputs)).max()
@@ -86,13 +86,15 @@ class TestImageFilter:
         best = minimize(largest, truth, method="Nelder-Mead").fun
         assert largest(after.mean) < 1.03 * best
 
-    def test_starts_find_the_other_sign(self):
+    def test_starts_find_the_other_sign(self, monkeypatch):
         quiet = BlurModel(MIRROR.motion, LineSensor(MIRROR.sensor.kernel, MIRROR.sensor.pixels, noise=1e-4))
         truth, inputs = np.array([0.8, 10.0]), np.zeros(450)
         frame = expose(path_of(quiet.motion, truth, inputs), quiet.sensor.kernel, quiet.sensor.pixels)
         prior = Gaussian(-truth, np.diag([0.3, 10.0]) ** 2)
-        alone, _ = ImageFilter("two", multistart=False).step(quiet, prior, frame, inputs)
         several, _ = ImageFilter("two").step(quiet, prior, frame, inputs)
+        starts = "turbrestore.blur_moments.state_estimation.image_observer._starts"
+        monkeypatch.setattr(starts, lambda mean, cov: mean[:, None, :])
+        alone, _ = ImageFilter("two").step(quiet, prior, frame, inputs)
         assert np.abs(alone.mean - truth)[0] > 0.1
         np.testing.assert_allclose(several.mean, truth, rtol=0.02)
 
@@ -111,9 +113,7 @@ class TestImageFilter:
         truth, inputs = np.array([0.8, 10.0]), np.random.default_rng(0).normal(size=450)
         frame = expose(path_of(MIRROR.motion, truth, inputs), GaussianKernel(0.16), MIRROR.sensor.pixels)
         start = Gaussian(truth + np.array([0.05, 2.0]), np.diag([0.3, 10.0]) ** 2)
-        found = {
-            n: ImageFilter(n, multistart=False).step(MIRROR, start, frame, inputs)[0].mean for n in ("two", "infinity")
-        }
+        found = {n: ImageFilter(n).step(MIRROR, start, frame, inputs)[0].mean for n in ("two", "infinity")}
         misfits = {n: frame - image_of(MIRROR, x, inputs) for n, x in found.items()}
         assert np.linalg.norm(misfits["two"]) < np.linalg.norm(misfits["infinity"])
         assert np.abs(misfits["infinity"]).max() < np.abs(misfits["two"]).max()

@@ -34,7 +34,7 @@ OBSERVERS = {
     "both": MomentFilter((1, 2)),
     "legendre": MomentFilter((1, 2, 3, 4), "legendre"),
     "unscented": MomentFilter((1, 2), method="unscented"),
-    "image step": ImageFilter(iterations=1, multistart=False),
+    "image step": ImageFilter(iterations=1),
     "image map": ImageFilter(),
     "two norm": ImageFilter("two", iterations=5),
     "infinity norm": ImageFilter("infinity", iterations=3),

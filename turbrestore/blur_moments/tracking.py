@@ -173,11 +173,13 @@ def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackP
     if isinstance(params.motion, Oscillation) and params.motion.highest is not None:
         params = replace(params, motion=_most_likely(windows, params, params.motion))
     states, misfits, log_likelihood = _run(windows, params)
-    motion = lift_motion(params.motion, params.timing())
+    motion, (A, _) = lift_motion(params.motion, params.timing()), params.motion.dynamics()
+    # A random walk has no velocity among its states.
+    rate = np.full(1, np.nan) if len(A) == 1 else expm(A * params.timing().exposure / 2)[1]
     return Track(
         positions=states.mean @ motion.C,
         position_variances=motion.C @ states.cov @ motion.C,
-        velocities=_velocities(states.mean, params),
+        velocities=states.mean @ rate,
         paths=motion.free @ np.swapaxes(states.mean, 1, 2),
         states=states,
         misfits=misfits,
@@ -262,13 +264,6 @@ def _most_likely(windows: _Windows, params: TrackParams, motion: Oscillation) ->
     around = tried[max(best - 1, 0)], tried[min(best + 1, count - 1)]
     found = minimize_scalar(cost, bounds=around, method="bounded", options={"xatol": 1e-3 / duration})
     return replace(motion, frequency=float(found.x), highest=None)
-
-
-def _velocities(means: Float64Array, params: TrackParams) -> Float64Array:
-    A, _ = params.motion.dynamics()
-    if len(A) == 1:
-        return np.full((len(means), 2), np.nan)
-    return means @ expm(A * params.timing().exposure / 2)[1]
 
 
 def _cut_windows(stack: Float64Array, roi: tuple[int, int, int, int]) -> _Windows:

@@ -51,7 +51,6 @@ class ImageFilter:
 
     norm: str = "map"  # "map" misfit with the prior, "two" without it, "infinity" largest misfit of a pixel
     iterations: int = 20  # of the search
-    multistart: bool = True  # whether to start from the negative and from shifted states as well
 
     def __post_init__(self) -> None:
         if self.norm not in NORMS:
@@ -63,8 +62,7 @@ class ImageFilter:
     ) -> tuple[Gaussian, Innovation]:
         """Correct the predicted state by its frame; see :mod:`.observers`."""
         problem = _Problem(model, state, frame, inputs, self.norm)
-        starts = _starts(problem.start, problem.cov) if self.multistart else problem.start[:, None, :]
-        x = _search(problem, starts, self)[:, 0]
+        x = _search(problem, _starts(problem.start, problem.cov), self)[:, 0]
         # One linear update with the derivative taken at the minimum.
         residual, derivative, _ = problem.residual(np.arange(len(x)), x)
         H = np.swapaxes(derivative, -1, -2)
