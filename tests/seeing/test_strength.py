@@ -106,8 +106,8 @@ def moving_blocks(rng, frames, rho, spread=1.0, noise=0.0, side=8):
 
 
 def measure_blocks(found, monkeypatch) -> Seeing:
-    monkeypatch.setattr("turbrestore.seeing.strength.block_displacement", lambda *_: found)
-    monkeypatch.setattr("turbrestore.seeing.strength.rotation_share", lambda _: 0.1)
+    monkeypatch.setattr("turbrestore.seeing.displacement.block_displacement", lambda *_: found)
+    monkeypatch.setattr("turbrestore.seeing.displacement.rotation_share", lambda _: 0.1)
     still = np.full((2, 96, 96), 0.5, np.float32)
     return measure_seeing(still, np.zeros((2, 96, 96, 2), np.float32), still[0], still[0], OPTICS)
 
@@ -139,7 +139,7 @@ def test_r0_needs_neighbouring_blocks(monkeypatch):
     assert seeing.d_over_r0 is not None
     monkeypatch.undo()
     found.counts[1::2] = False
-    monkeypatch.setattr("turbrestore.seeing.strength.block_displacement", lambda *_: found)
+    monkeypatch.setattr("turbrestore.seeing.displacement.block_displacement", lambda *_: found)
     still = np.full((2, 96, 96), 0.5, np.float32)
     seeing = measure_seeing(still, np.zeros((2, 96, 96, 2), np.float32), still[0], still[0], OPTICS)
     assert seeing.d_over_r0 is None

@@ -51,6 +51,7 @@ Float64Array = NDArray[np.float64]
 _BLOCKS, _SMALLEST = 8, 6
 # Largest variance of the error of a block that counts, as a share of the variance of the displacement.
 _LARGEST_ERROR = 0.05
+_LEAST_BLOCKS = 4
 # Fewest frames whose displacement has a variance about its mean that says anything.
 LEAST_FRAMES = 3
 # Largest lag at which the autocovariance is used, as a share of the clip.
@@ -89,6 +90,30 @@ class MotionStatistics:
         """Whether the clip spans few correlation times, so that its mean takes away what cannot be put back."""
         persistent = len(self.autocorrelation) > 1 and self.autocorrelation[1] > _PERSISTENT
         return bool(persistent and self.independent_frames < _LEAST_INDEPENDENT)
+
+
+@dataclass(frozen=True, eq=False)
+class ClipMotion:
+    """Displacement of the blocks of a clip, and its statistics."""
+
+    displacement: Displacement
+    statistics: MotionStatistics
+    rotation: float  # as rotation_share gives it
+    correlation: Float64Array  # (S,): as separation_correlation gives it
+
+
+def measure_motion(
+    frames: Iterable[FloatArray], flows: Iterable[FloatArray], image: FloatArray, noise: float, threads: int = 0
+) -> ClipMotion | None:
+    """Measure the motion of a clip; None where too few blocks have enough structure.
+
+    ``frames`` (H, W) or (H, W, 3) each; ``flows`` (H, W, 2) each; ``image`` (H, W) or (H, W, 3).
+    """
+    found = block_displacement(frames, flows, image, noise, threads)
+    if found.counts.sum() < _LEAST_BLOCKS:
+        return None
+    statistics = motion_statistics(found.blocks[:, found.counts], found.noise_variance)
+    return ClipMotion(found, statistics, rotation_share(found), separation_correlation(found))
 
 
 def block_displacement(

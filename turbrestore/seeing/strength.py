@@ -38,15 +38,7 @@ from ..io.source import Window
 from ..registration.centroid import Centroid
 from ..runtime.scratch import mean_of
 from ..synthesis.atmosphere import fried_parameter
-from .displacement import (
-    Displacement,
-    Float64Array,
-    MotionStatistics,
-    block_displacement,
-    motion_statistics,
-    rotation_share,
-    separation_correlation,
-)
+from .displacement import Displacement, Float64Array, MotionStatistics, measure_motion, motion_statistics
 from .tilt_theory import MEAN_CONE, Optics, displacement_differences, strength_of_tilt
 
 # Relative error of a variance besides that of finitely many frames: on synthetic clips of D/r0 1 to 6 the variance of
@@ -57,8 +49,6 @@ _BLUR_ERROR = 0.1
 LARGEST_BLUR = 2.0
 # Largest part of an image that is compared by blur, pixels a side, and the tiles of it.
 _COMPARED, _TILES = 512, CueParams(tile=64, departure=1.0)
-# Fewest blocks with enough structure from which anything is reported.
-_LEAST_BLOCKS = 4
 # Share of rotation from which the displacement is not that of turbulence; without any relation of x and y it is 0.5.
 _ROTATING = 0.4
 _HALF, _E_FOLD = 0.5, float(np.exp(-1))
@@ -241,13 +231,13 @@ def measure_seeing(
     True
     """
     noise = estimate_noise(frames[0])
-    found = block_displacement(frames, flows, image, noise, threads)
+    motion = measure_motion(frames, flows, image, noise, threads)
     by_blur = _by_blur(mean, image, noise / np.sqrt(len(flows)))
-    if found.counts.sum() < _LEAST_BLOCKS:
+    if motion is None:
         remark = "too little structure or motion to measure the displacement: no strength of the turbulence is reported"
         return Seeing(displacement_by_blur=by_blur, remarks=(remark,))
+    found, whole, rotation = motion.displacement, motion.statistics, motion.rotation
     w = found.blocks[:, found.counts]
-    whole, rotation = motion_statistics(w, found.noise_variance), rotation_share(found)
     variance = max(float(np.mean(w**2)) - found.noise_variance, 0.0)
     by_flow = _with_deviation(variance, _MODEL_ERROR * variance)
     anisotropy, direction = _wind(w, whole, found.noise_variance)
@@ -274,7 +264,7 @@ def measure_seeing(
         displacement_variance_y=y,
         displacement_by_flow=by_flow,
         displacement_by_blur=by_blur,
-        isoplanatic_patch=_crossing(separation_correlation(found), _HALF, whole.freedom, float(found.spacing)),
+        isoplanatic_patch=_crossing(motion.correlation, _HALF, whole.freedom, float(found.spacing)),
         coherence_time=_crossing(whole.autocorrelation, _E_FOLD, whole.freedom, 1.0),
         wind_anisotropy=anisotropy,
         wind_direction=direction,
