@@ -74,6 +74,13 @@ class TestImageFilter:
         after, _ = ImageFilter("two").step(quiet, prior, np.tile(frame, (50, 1)), inputs)
         np.testing.assert_allclose(after.mean, np.tile(truth, (50, 1)), rtol=0.01)
 
+    def test_without_a_prior_the_covariance_is_that_of_the_frame(self):
+        recording = record(replace(mirror_setup(), frames=1), [3])
+        start = Gaussian(recording.states[0, 0, :2], np.diag([0.1, 3.0]) ** 2)
+        after, _ = ImageFilter("two").step(MIRROR, start, recording.frames[0, 0], recording.inputs[0, 0])
+        derivative = MIRROR.image_and_jacobian(after.mean, recording.inputs[0, 0])[1] / MIRROR.sensor.deviation
+        np.testing.assert_allclose(after.cov, np.linalg.inv(derivative @ derivative.T), rtol=1e-4)
+
     def test_infinity_norm_comes_close_to_the_minimum(self):
         recording = record(replace(mirror_setup(), frames=1), [3])
         frame, inputs, truth = recording.frames[0, 0], recording.inputs[0, 0], recording.states[0, 0, :2]

@@ -195,13 +195,10 @@ def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackP
 
 def _run(windows: _Windows, params: TrackParams) -> tuple[Gaussian, Float64Array, float]:
     """States (T, 2, n) at the start of the exposures, after their frames; misfits (T, 2); log-likelihood of all."""
-    motion, variance, orders = lift_motion(params.motion, params.timing()), params.sigma**2, (1, 2)[: params.order]
-    if isinstance(params.motion, RandomWalk):
-        # The variance of a Brownian path about its own mean is a sixth of what it gains, and says nothing about where
-        # it leads.
-        variance += params.motion.diffusion * motion.timing.exposure / 6
-        orders = (1,)
-    observer, kernel = MomentFilter(orders, "legendre", "unscented"), GaussianKernel(float(np.sqrt(variance)))
+    motion = lift_motion(params.motion, params.timing())
+    # The spread of a random walk within an exposure says nothing about where it leads.
+    orders = (1,) if isinstance(params.motion, RandomWalk) else (1, 2)[: params.order]
+    observer, kernel = MomentFilter(orders, "legendre", "unscented"), GaussianKernel(params.sigma)
     starts = _start(windows, params)
     axes = [_follow(windows, axis, starts[axis], motion, kernel, observer) for axis in range(2)]
     means, covs = (
