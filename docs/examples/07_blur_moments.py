@@ -23,12 +23,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from turbrestore.blur_moments.experiments.comparison import mirror, wavefront
-from turbrestore.blur_moments.experiments.scenarios import (
-    WAVEFRONT_AS_PRINTED,
-    MirrorParams,
-    mirror_model,
-    record_mirror,
-)
+from turbrestore.blur_moments.experiments.scenarios import mirror_setup, record
 from turbrestore.blur_moments.moments import image_moments
 
 plt.style.use("tableau-colorblind10")
@@ -49,11 +44,11 @@ def legend(figure):
 
 def table(experiment, names):
     """Print the errors of observers."""
-    print(f"{experiment.seeds} seeds        mean error   rms error   ratio of means to O1   innovation (1 is right)")
+    print("                 mean error   rms error   ratio of means to O1   innovation (1 is right)")
     for name in names:
         score = experiment.scores[name]
-        ratio = f"{score.ratio:.3f} ± {score.ratio_error:.3f}"
-        print(f"{name:16} {score.error:10.4f} {score.rms:11.4f}   {ratio:22} {score.innovation:.2f}")
+        ratio = f"{score.ratio:.3f} ± {score.ratio_standard_error:.3f}"
+        print(f"{name:16} {score.error:10.4f} {score.rms:11.4f}   {ratio:22} {score.innovation_squared:.2f}")
 
 
 # %% [markdown]
@@ -62,17 +57,16 @@ def table(experiment, names):
 # of 0.1 s; right, the images that it leaves, with their mean and spread.
 
 # %%
-model = mirror_model()
-recording = record_mirror([3])
-timing, pixels = model.motion.timing, model.sensor.pixels
+setup = mirror_setup()
+recording, timing, sensor = record(setup, [3]), setup.truth.timing, setup.model.sensor
 exposed = timing.exposure_steps
 figure, axes = plt.subplots(1, 2, figsize=(10, 2.9))
 for index, marker in zip((6, 8, 10), ("-", "--", ":"), strict=True):
     image = recording.frames[index, 0]
-    _, mean, square = image_moments(image, pixels, 2, total=model.sensor.total)
+    _, mean, square = image_moments(image, sensor.pixels, 2)
     spread = np.sqrt(max(square - mean**2, 0.0))
     axes[0].plot(1000 * timing.fast_period * np.arange(exposed), recording.outputs[index, 0, :exposed], marker)
-    axes[1].plot(pixels.centres, image, marker, label=f"frame {index}: mean {mean:.2f}, spread {spread:.2f}")
+    axes[1].plot(sensor.pixels.centres, image, marker, label=f"frame {index}: mean {mean:.2f}, spread {spread:.2f}")
 axes[0].set(xlabel="time within the exposure, ms", ylabel="position y")
 axes[1].set(xlabel="position η on the sensor", ylabel="intensity per length")
 axes[1].set_ylim(-0.5, 1.9)
@@ -100,19 +94,17 @@ t = slope.timing.trigger + slope.timing.fast_period * np.arange(truth.size)
 figure, axes = plt.subplots(2, 2, figsize=(11, 5.6))
 draw(axes[0, 0], "truth", t, truth)
 for name in ("O1", "O2"):
-    draw(axes[0, 0], name, t, slope.estimates[name].ravel())
+    draw(axes[0, 0], name, t, slope.tracks[name].example.ravel())
 axes[0, 0].set(title="Figure 4: one moment alone", xlabel="time, s", ylabel="θ")
 for name in ("O1", "O3", "image_map"):
-    draw(axes[0, 1], name, slope.errors[name])
-    draw(axes[1, 0], name, t, slope.estimates[name].ravel() - truth)
-axes[0, 1].set(
-    title=f"Figure 5: mean of {slope.seeds} seeds", xlabel="frame", ylabel="error of the state", ylim=(0, None)
-)
+    draw(axes[0, 1], name, slope.tracks[name].errors.mean(axis=1))
+    draw(axes[1, 0], name, t, slope.tracks[name].example.ravel() - truth)
+axes[0, 1].set(title="Figure 5: mean of twelve seeds", xlabel="frame", ylabel="error of the state", ylim=(0, None))
 axes[1, 0].set(title="Figure 6: error at the fast rate", xlabel="time, s", ylabel="error of θ")
 last = slice(truth.size - steps, None)
 draw(axes[1, 1], "truth", t[last], truth[last])
 for name in ("O1", "O3", "image_map"):
-    draw(axes[1, 1], name, t[last], slope.estimates[name].ravel()[last])
+    draw(axes[1, 1], name, t[last], slope.tracks[name].example.ravel()[last])
 axes[1, 1].set(title="Figure 7: within the last exposure", xlabel="time, s", ylabel="θ")
 legend(figure)
 
@@ -130,7 +122,7 @@ legend(figure)
 # the disturbance is 0.038; here it is the printed one.
 
 # %%
-printed = wavefront(range(12), WAVEFRONT_AS_PRINTED)
+printed = wavefront(range(6), slope_disturbance=0.1**0.5)
 table(printed, ("O1", "O2", "O3", "O3_legendre", "moments_1_to_4", "image_map"))
 for warning in printed.warnings:
     print(warning)
@@ -142,16 +134,17 @@ for warning in printed.warnings:
 # %% [markdown]
 # ## Steered mirror
 # Each slow step of 0.45 s has an exposure of 0.1 s. O1 is a Luenberger observer on the first moment, O2 uses the first
-# two moments, O3 finds the state whose predicted image fits best. Eight seeds are run here, 200 in the documentation.
+# two moments, O3 finds the state whose predicted image fits best. Five seeds are run here, 200 in the documentation.
 
 # %%
-steered = mirror(range(8))
-table(steered, ("O1", "O2", "O3", "O3_infinity", "moments_1_to_4", "O3_map"))
+steered = mirror(range(5))
+table(steered, ("O1", "O2", "O3", "O3_infinity", "O3_map"))
 
 # %%
 truth, steps = steered.truth, steered.timing.frame_steps
 t = steered.timing.trigger + steered.timing.fast_period * np.arange(truth.size)
-sizes = np.linalg.norm(steered.estimates["O1"] - truth, axis=1)
+estimates = {name: steered.tracks[name].example for name in ("O1", "O2", "O3")}
+sizes = np.linalg.norm(estimates["O1"] - truth, axis=1)
 typical = int(np.argsort(sizes)[len(sizes) // 2])
 parts = {
     "Figure 4: overview": slice(0, 8 * steps),
@@ -160,13 +153,13 @@ parts = {
 figure, axes = plt.subplots(2, 2, figsize=(11, 5.6))
 for ax, (title, part) in zip(axes[0], parts.items(), strict=True):
     draw(ax, "truth", t[part], truth.ravel()[part])
-    for name in ("O1", "O2", "O3"):
-        draw(ax, name, t[part], steered.estimates[name].ravel()[part])
+    for name, estimate in estimates.items():
+        draw(ax, name, t[part], estimate.ravel()[part])
     for start in range(part.start, part.stop, steps):
         ax.axvspan(t[start], t[start + steered.timing.exposure_steps], color="0.9", zorder=0)
     ax.set(title=f"{title}, exposures shaded", xlabel="time, s", ylabel="y")
-for name in ("O1", "O2", "O3"):
-    away = np.abs(steered.estimates[name] - truth)
+for name, estimate in estimates.items():
+    away = np.abs(estimate - truth)
     draw(axes[1, 0], name, away[:, 0])
     draw(axes[1, 1], name, np.sqrt((away**2).sum(axis=1)))
 axes[1, 0].set(title="Figure 6: at the start of the exposures", xlabel="frame", ylabel="error of y")
@@ -185,15 +178,16 @@ legend(figure)
 # along with the state. Shown is the ratio of each mean error to that of O1, with its standard error.
 
 # %%
-unknown = mirror(range(8), MirrorParams(deviation=7.0))
+unknown = mirror(range(5), deviation=7.0)
 shown = ("O1", "O2", "O3", "O3_map", "augmented")
 figure, ax = plt.subplots(figsize=(7, 3))
 for offset, (label, experiment) in zip(
     (-0.2, 0.2), {"plant known": steered, "off by up to 7 dB": unknown}.items(), strict=True
 ):
-    scores = [(k, experiment.scores[name]) for k, name in enumerate(shown) if name in experiment.scores]
-    places = [k + offset for k, _ in scores]
-    ax.bar(places, [s.ratio for _, s in scores], 0.38, yerr=[s.ratio_error for _, s in scores], capsize=3, label=label)
+    found = {k: experiment.scores[name] for k, name in enumerate(shown) if name in experiment.scores}
+    ratios = [score.ratio for score in found.values()]
+    errors = [score.ratio_standard_error for score in found.values()]
+    ax.bar([k + offset for k in found], ratios, 0.38, yerr=errors, capsize=3, label=label)
 ax.set_xticks(range(len(shown)), shown)
 ax.set(xlabel="observer", ylabel="mean error, ratio to O1")
 table(unknown, shown)
@@ -204,5 +198,4 @@ _ = ax.legend()
 # paper (0.34 against 0.59). Their innovations, well above 1, show that the model does not fit. Estimating the plant
 # along with the state brings the innovation back to 1 and the error far below all others.
 #
-# `turbrestore moments wavefront --seeds 200 --plot wavefront.png` makes the same figures from the command line, and
-# [the documentation](../blur_moments.md) has the errors with 200 seeds.
+# [The documentation](../blur_moments.md) has the errors with 200 seeds, and the commands that print them.

@@ -1,25 +1,20 @@
 """Observers on the whole image against general solvers; erratum 9 of the papers."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
-from turbrestore.blur_moments.experiments.scenarios import (
-    MirrorParams,
-    WavefrontParams,
-    mirror_model,
-    mirror_oscillator,
-    record_mirror,
-    record_wavefront,
-    wavefront_model,
-)
+from turbrestore.blur_moments.experiments.scenarios import mirror_setup, record, wavefront_setup
 from turbrestore.blur_moments.moments import BlurModel
 from turbrestore.blur_moments.sensor import GaussianKernel, LineSensor, expose
 from turbrestore.blur_moments.state_estimation.image_observer import ImageFilter
 from turbrestore.blur_moments.state_estimation.observers import run_observer, steady_kalman
 from turbrestore.filtering.kalman import Gaussian
 
-MODEL = wavefront_model()
-MIRROR = mirror_model()
+WAVES = wavefront_setup()
+MODEL = WAVES.model
+MIRROR = mirror_setup().model
 START = Gaussian(np.zeros(2), steady_kalman(MODEL)[1])
 
 
@@ -33,7 +28,7 @@ def image_of(model, state, inputs):
 
 class TestImageFilter:
     def test_map_is_the_minimum_that_scipy_finds(self):
-        recording = record_wavefront([1], WavefrontParams(frames=1, burn_in=0))
+        recording = record(replace(WAVES, frames=1), [1])
         frame, inputs = recording.frames[0, 0], recording.inputs[0, 0]
         after, innovation = ImageFilter().step(MODEL, START, frame, inputs)
         root, deviation = np.linalg.inv(np.linalg.cholesky(START.cov)), np.sqrt(0.1 / 0.02)
@@ -59,7 +54,7 @@ class TestImageFilter:
         deviation = sensor.deviation
         frame = expose(path_of(MIRROR.motion, truth, inputs), sensor.kernel, sensor.pixels)
         frame = frame + deviation * rng.standard_normal(frame.shape)
-        after, _ = ImageFilter(multistart=False).step(MIRROR, prior, frame, inputs)
+        after, _ = ImageFilter().step(MIRROR, prior, frame, inputs)
 
         def cost(x):
             misfit = (frame - image_of(MIRROR, x, inputs)) / deviation
@@ -76,14 +71,21 @@ class TestImageFilter:
         frame = expose(path_of(quiet.motion, truth, inputs[0]), quiet.sensor.kernel, quiet.sensor.pixels)
         starts = truth + np.random.default_rng(0).normal(size=(50, 2)) * [0.15, 5.0]
         prior = Gaussian(starts, np.diag([0.3, 10.0]) ** 2)
-        after, _ = ImageFilter("two", multistart=False).step(quiet, prior, np.tile(frame, (50, 1)), inputs)
+        after, _ = ImageFilter("two").step(quiet, prior, np.tile(frame, (50, 1)), inputs)
         np.testing.assert_allclose(after.mean, np.tile(truth, (50, 1)), rtol=0.01)
 
+    def test_without_a_prior_the_covariance_is_that_of_the_frame(self):
+        recording = record(replace(mirror_setup(), frames=1), [3])
+        start = Gaussian(recording.states[0, 0, :2], np.diag([0.1, 3.0]) ** 2)
+        after, _ = ImageFilter("two").step(MIRROR, start, recording.frames[0, 0], recording.inputs[0, 0])
+        derivative = MIRROR.image_and_jacobian(after.mean, recording.inputs[0, 0])[1] / MIRROR.sensor.deviation
+        np.testing.assert_allclose(after.cov, np.linalg.inv(derivative @ derivative.T), rtol=1e-4)
+
     def test_infinity_norm_comes_close_to_the_minimum(self):
-        recording = record_mirror([3], MirrorParams(frames=1, burn_in=0))
+        recording = record(replace(mirror_setup(), frames=1), [3])
         frame, inputs, truth = recording.frames[0, 0], recording.inputs[0, 0], recording.states[0, 0, :2]
         start = Gaussian(truth, np.diag([0.1, 3.0]) ** 2)
-        after, _ = ImageFilter("infinity", multistart=False).step(MIRROR, start, frame, inputs)
+        after, _ = ImageFilter("infinity").step(MIRROR, start, frame, inputs)
 
         def largest(x):
             return np.abs(frame - image_of(MIRROR, x, inputs)).max()
@@ -91,21 +93,23 @@ class TestImageFilter:
         best = minimize(largest, truth, method="Nelder-Mead").fun
         assert largest(after.mean) < 1.03 * best
 
-    def test_starts_find_the_other_sign(self):
+    def test_starts_find_the_other_sign(self, monkeypatch):
         quiet = BlurModel(MIRROR.motion, LineSensor(MIRROR.sensor.kernel, MIRROR.sensor.pixels, noise=1e-4))
         truth, inputs = np.array([0.8, 10.0]), np.zeros(450)
         frame = expose(path_of(quiet.motion, truth, inputs), quiet.sensor.kernel, quiet.sensor.pixels)
         prior = Gaussian(-truth, np.diag([0.3, 10.0]) ** 2)
-        alone, _ = ImageFilter("two", multistart=False).step(quiet, prior, frame, inputs)
         several, _ = ImageFilter("two").step(quiet, prior, frame, inputs)
+        starts = "turbrestore.blur_moments.state_estimation.image_observer._starts"
+        monkeypatch.setattr(starts, lambda mean, cov: mean[:, None, :])
+        alone, _ = ImageFilter("two").step(quiet, prior, frame, inputs)
         assert np.abs(alone.mean - truth)[0] > 0.1
         np.testing.assert_allclose(several.mean, truth, rtol=0.02)
 
     def test_plant_is_learnt(self):
-        params = MirrorParams(frames=15, burn_in=0, deviation=7.0)
-        recording = record_mirror(range(4), params)
+        setup = replace(mirror_setup(deviation=7.0), frames=15)
+        recording = record(setup, range(4))
         cov = np.diag([0.3, 10.0, 0.4, 0.15, 0.35]) ** 2
-        model = BlurModel(mirror_oscillator(params), MIRROR.sensor)
+        model = BlurModel(setup.truth, MIRROR.sensor)
         start = Gaussian(np.zeros((4, 5)), cov)
         results = run_observer(ImageFilter(), model, start, recording.frames, recording.inputs)
         away = results[-1][0].mean[:, 2:] - recording.states[-1, :, 2:]
@@ -116,9 +120,7 @@ class TestImageFilter:
         truth, inputs = np.array([0.8, 10.0]), np.random.default_rng(0).normal(size=450)
         frame = expose(path_of(MIRROR.motion, truth, inputs), GaussianKernel(0.16), MIRROR.sensor.pixels)
         start = Gaussian(truth + np.array([0.05, 2.0]), np.diag([0.3, 10.0]) ** 2)
-        found = {
-            n: ImageFilter(n, multistart=False).step(MIRROR, start, frame, inputs)[0].mean for n in ("two", "infinity")
-        }
+        found = {n: ImageFilter(n).step(MIRROR, start, frame, inputs)[0].mean for n in ("two", "infinity")}
         misfits = {n: frame - image_of(MIRROR, x, inputs) for n, x in found.items()}
         assert np.linalg.norm(misfits["two"]) < np.linalg.norm(misfits["infinity"])
         assert np.abs(misfits["infinity"]).max() < np.abs(misfits["two"]).max()

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from turbrestore.blur_moments.exposure_table import tabulate
-from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid, expose
+from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid, expose, tabulate
 from turbrestore.core.errors import ConfigurationError, DataError
 
 POINT = GaussianKernel(0.0)

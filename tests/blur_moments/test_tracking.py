@@ -1,29 +1,17 @@
-"""Tracking of targets whose motion is known, and the 2-D filter against 1-D ones and against sampling."""
+"""Tracking of targets whose motion is known."""
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from turbrestore.blur_moments.moments import BlurModel, predicted_moments
-from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid
-from turbrestore.blur_moments.state_estimation.lifting import FastSystem, lift
-from turbrestore.blur_moments.state_estimation.observers import MomentFilter, run_observer
-from turbrestore.blur_moments.targets import (
-    ConstantVelocity,
-    Oscillation,
-    PlaneModel,
-    PlaneMomentFilter,
-    RandomWalk,
-    lift_motion,
-)
+from turbrestore.blur_moments.sensor import GaussianKernel, PixelGrid
+from turbrestore.blur_moments.targets import ConstantVelocity, Oscillation, RandomWalk, lift_motion
 from turbrestore.blur_moments.tracking import TrackParams, track_blur
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.filtering.kalman import Gaussian
 
 STEPS = 16
 SIGMA, LIGHT, NOISE = 1.2, 20.0, 0.05
 FIELD = PixelGrid(-0.5, 63.5, 64)
-TIMING = ExposureTiming(fast_period=1 / STEPS, exposure=0.75, readout=0.0, frame_period=1.0)
 
 
 def expose_plane(path, sigma, columns, rows):
@@ -50,89 +38,6 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def plane_model(noise=0.01, size=(24, 20)):
-    """A target with velocity along x, another along y, in the middle of a window."""
-    h = TIMING.fast_period
-    fast = FastSystem([[1.0, h], [0.0, 0.98]], [0.0, 0.0], [1.0, h / 2])
-    motion = lift(fast, TIMING, np.diag([1e-4, 1e-3]))
-    columns, rows = (PixelGrid(-n / 2, n / 2, n) for n in size)
-    return PlaneModel(motion, 1.2, columns, rows, noise, total=2.0)
-
-
-def line_models(model):
-    """What the sums over rows and over columns show: the noise of a sum over n pixels has n times the density."""
-    for grid, other in ((model.columns, model.rows), (model.rows, model.columns)):
-        line = LineSensor(GaussianKernel(model.sigma), grid, model.noise * other.count * other.width, model.total)
-        yield BlurModel(model.axis, line)
-
-
-def test_separable_motion_in_the_plane_equals_two_runs_on_lines():
-    rng, model = np.random.default_rng(0), plane_model()
-    frames = rng.normal(0.01, 0.1, (5, 20, 24))
-    cov = np.diag([1.0, 4.0])
-    start = Gaussian(np.array([0.5, 1.0, -1.0, 0.3]), np.kron(np.eye(2), cov))
-    inputs = np.zeros((5, STEPS))
-    plane, state = [], start
-    for frame in frames:
-        plane.append(PlaneMomentFilter(order=1).step(model, state, frame))
-        state = model.advance(plane[-1][0])
-    for axis, line in enumerate(line_models(model)):
-        part = slice(2 * axis, 2 * axis + 2)
-        sums = frames.sum(axis=1 + axis)
-        alone = run_observer(MomentFilter((1,)), line, Gaussian(start.mean[part], cov), sums, inputs)
-        for (both, _), (one, _) in zip(plane, alone, strict=True):
-            assert both.mean[part] == pytest.approx(one.mean, abs=1e-12)
-            assert both.cov[part, part] == pytest.approx(one.cov, abs=1e-12)
-
-
-@pytest.mark.parametrize("basis", ["monomial", "legendre"])
-def test_moments_along_an_axis_are_those_of_a_line(basis):
-    model = plane_model()
-    state = Gaussian(np.array([0.5, 1.0, -1.0, 0.3]), np.zeros((4, 4)))
-    mean, H, spread = PlaneMomentFilter(2, basis).predicted(model, state)
-    assert np.abs(spread).max() == 0
-    for axis, line in enumerate(line_models(model)):
-        part = slice(2 * axis, 2 * axis + 2)
-        expected, slope, _ = predicted_moments(line, state.mean[part], np.zeros(STEPS), (1, 2), basis)
-        chosen = [0, 2] if axis == 0 else [1, 4]
-        assert mean[chosen] == pytest.approx(expected, abs=1e-12)
-        assert H[chosen, part] == pytest.approx(slope, abs=1e-12)
-
-
-@pytest.mark.parametrize("basis", ["monomial", "legendre"])
-def test_mean_and_covariance_of_the_moments_are_exact(basis):
-    """Against sampling; without the curvature the mean of the second moments would be off by up to P."""
-    rng, model, observer = np.random.default_rng(0), plane_model(), PlaneMomentFilter(2, basis)
-    root = rng.normal(0, 1, (4, 4))
-    state = Gaussian(np.array([0.5, 1.0, -1.0, 0.3]), root @ root.T)
-    mean, H, spread = observer.predicted(model, state)
-    draws = state.mean + rng.normal(0, 1, (3000, 4)) @ root.T
-    seen = np.stack([observer.predicted(model, Gaussian(draw, np.zeros((4, 4))))[0] for draw in draws])
-    cov = H @ state.cov @ H.T + spread
-    error = np.sqrt(np.diagonal(cov))
-    assert np.abs((seen.mean(axis=0) - mean) / error).max() < 4 / np.sqrt(3000)
-    assert np.abs((np.cov(seen.T) - cov) / np.outer(error, error)).max() < 0.15
-
-
-def test_moments_of_a_rendered_frame_are_predicted():
-    model, observer = plane_model(noise=1e-6), PlaneMomentFilter()
-    state = Gaussian(np.array([0.5, 2.0, -1.0, 1.0]), np.zeros((4, 4)))
-    path = np.einsum("san,n->sa", model.outputs(TIMING.exposure_steps), state.mean)
-    frame = 2.0 * expose_plane(path, 1.2, model.columns, model.rows)
-    _, innovation = observer.step(model, state, frame)
-    assert innovation.values == pytest.approx(np.zeros(5), abs=1e-4)
-
-
-def test_noise_of_the_moments_is_that_of_sampled_frames():
-    rng, model, observer = np.random.default_rng(0), plane_model(noise=0.04), PlaneMomentFilter()
-    still = Gaussian(np.zeros(4), np.zeros((4, 4)))
-    draws = [observer.step(model, still, rng.normal(0, 0.2, (20, 24)))[1] for _ in range(1500)]
-    cov = draws[0].cov
-    error = np.sqrt(np.diagonal(cov))
-    sampled = np.cov(np.stack([draw.values for draw in draws]).T)
-    assert np.abs((sampled - cov) / np.outer(error, error)).max() < 0.15
-
-
 def test_constant_velocity_is_recovered_and_beats_centroids():
     position, centroid, within = [], [], []
     for seed in range(6):
@@ -157,12 +62,11 @@ def test_innovations_and_errors_are_as_large_as_the_filter_says():
         velocity = np.array([0.4, 0.3]) + np.cumsum(rng.normal(0, np.sqrt(0.005 / STEPS), (25 * STEPS, 2)), axis=0)
         path = 25 + (np.cumsum(velocity, axis=0) / STEPS).reshape(25, STEPS, 2)
         track = track_blur(film(path, rng), (17, 17, 16, 16), TrackParams(ConstantVelocity(0.005), SIGMA))
-        squared += [innovation.normalised_squared for innovation in track.innovations[3:]]
-        away = (track.positions - path.mean(axis=1))[3:]
-        errors += [e @ np.linalg.solve(P, e) for e, P in zip(away, track.position_cov[3:], strict=True)]
-    # 95 % bands for 5 and 2 degrees of freedom; the total is known to a percent only, which widens both a little.
-    assert np.mean(squared) == pytest.approx(5, abs=2.5 * np.sqrt(10 / len(squared)) + 0.3)
-    assert np.mean(errors) == pytest.approx(2, abs=2.5 * np.sqrt(4 / len(errors)) * 2)
+        squared += list(track.misfits[3:].ravel())
+        errors += list(((track.positions - path.mean(axis=1)) ** 2 / track.position_variances)[3:].ravel())
+    # 95 % bands for 2 and 1 degrees of freedom; the total is known to a percent only, which widens both a little.
+    assert np.mean(squared) == pytest.approx(2, abs=2.5 * np.sqrt(4 / len(squared)) + 0.12)
+    assert np.mean(errors) == pytest.approx(1, abs=2.5 * np.sqrt(2 / len(errors)) * 2)
 
 
 @pytest.mark.parametrize("motion", [RandomWalk(0.3), ConstantVelocity(0.3), Oscillation(0.7, 0.2, 0.3, drift=0.1)])
@@ -200,11 +104,11 @@ def vibration(frequency, count):
 
 @pytest.mark.parametrize("frequency", [0.13, 0.7])
 def test_frequency_is_found_also_above_half_the_frame_rate(frequency):
-    path = vibration(frequency, 32)
+    path = vibration(frequency, 16)
     frames = film(path, np.random.default_rng(0))
     params = TrackParams(Oscillation(0.1, 0.0, 1e-3, highest=0.9), SIGMA)
     track = track_blur(frames, (22, 20, 20, 20), params)
-    assert track.frequency == pytest.approx(frequency, abs=0.003)
+    assert track.frequency == pytest.approx(frequency, abs=0.005)
     assert rms(track.positions[8:] - path[8:].mean(axis=1)) < 0.6 * rms(track.centroids[8:] - path[8:].mean(axis=1))
     assert rms(track.paths[8:] - path[8:]) < 0.3 * rms(track.centroids[8:, None] - path[8:])
 
@@ -278,8 +182,6 @@ def test_bad_input_is_named():
         track_blur(dark, (8, 8, 16, 16), params)
     with pytest.raises(ConfigurationError, match="observable"):
         track_blur(frames, (8, 8, 16, 16), TrackParams(Oscillation(0.5, 0.0, 1e-3), SIGMA))
-    with pytest.raises(DataError, match="frame"):
-        PlaneMomentFilter().step(plane_model(), Gaussian(np.zeros(4), np.eye(4)), np.zeros((20, 23)))
 
 
 @pytest.mark.parametrize(
@@ -291,10 +193,7 @@ def test_bad_input_is_named():
         (lambda: Oscillation(1.0, 0.1, 0.1, highest=0.5), "highest"),
         (lambda: TrackParams(RandomWalk(1.0), -1.0), "sigma"),
         (lambda: TrackParams(RandomWalk(1.0), 1.0, order=3), "order"),
-        (lambda: TrackParams(RandomWalk(1.0), 1.0, basis="cosine"), "basis"),
         (lambda: TrackParams(RandomWalk(1.0), 1.0, exposure=0.51), "exposure"),
-        (lambda: PlaneMomentFilter(order=0), "order"),
-        (lambda: plane_model(noise=0.0), "noise"),
     ],
 )
 def test_settings_are_checked(make, named):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.core.errors import DataError
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.sequence import CameraParams, exposed_frame, flows_between
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
@@ -84,6 +84,3 @@ def test_what_cannot_be_is_refused():
         exposed_frame(spot(), [])
     with pytest.raises(DataError, match="^flow"):
         exposed_frame(spot(), [np.zeros((4, 4, 2), np.float32)])
-    for shares in ((), (1.5,), (-0.1,)):
-        with pytest.raises(ConfigurationError, match="^shares"):
-            next(flows_between([constant(0, 0)] * 2, shares))

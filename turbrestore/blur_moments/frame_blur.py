@@ -94,7 +94,8 @@ def frame_blur(frames: ArrayLike, noise: float, params: CueParams | None = None)
     spectra = TileSpectra.of(stack.shape[1:3], params)
     averaging, k2, counts = spectra.cells()
     fit = _Fit(spectra, k2, counts, noise_floor(noise), params)
-    power = _ring_power(stack, spectra, averaging)
+    # (T, tiles, rings); float32 halves what stays in memory.
+    power = np.stack([spectra.power(luminance(frame)) @ averaging for frame in iter_frames(stack)])
     spectrum, misfit = _common_spectrum(power, fit)
     design = fit.design(spectrum)
     parts = [_blur_of_tiles(power[:, some], spectrum[some], misfit[some], design, fit) for some in _batches(power)]
@@ -117,15 +118,6 @@ class _Fit:
     def design(self, spectrum: Float64Array) -> Float64Array:
         """k² changed by the smear of the window, for the mean of all tiles, shape (rings,)."""
         return self.k2 * self.spectra.widening(2 * [spectrum.mean(axis=0)], self.k2)
-
-
-def _ring_power(frames: FloatArray, spectra: TileSpectra, averaging: FloatArray) -> FloatArray:
-    """Power of frames in rings, shape (T, tiles, rings)."""
-    tiles = len(spectra.grid.rows) * len(spectra.grid.columns)
-    power = np.empty((len(frames), tiles, averaging.shape[1]), np.float32)
-    for frame, found in zip(iter_frames(frames), power, strict=True):
-        np.matmul(spectra.power(luminance(frame)), averaging, out=found)
-    return power
 
 
 def _batches(power: FloatArray) -> list[slice]:
@@ -164,29 +156,22 @@ def _blur_of_tiles(
     power: FloatArray, spectrum: Float64Array, misfit: Float64Array, design: Float64Array, fit: _Fit
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Values s of the frames in some tiles, their deviation, and the best estimate above the sharpest; (T, tiles)."""
-    s, gathered, squared = _fit_frames(power, spectrum, misfit, design, fit)
-    s = s - s.mean(axis=0)
+    s, signal = np.zeros(power.shape[:2]), power.astype(np.float64) - fit.floor
+    for _ in range(2):
+        s, information, residual = _fit_relative(signal, spectrum, design, s, misfit, fit)
+    s = s + 2 * fit.spectra.smear * s**2
+    s -= s.mean(axis=0)
     # The deviation of s from the information in the rings and the mean squared residual of each.
+    gathered = information * design**2
     total = gathered.sum(axis=-1) + 1 / _PRIOR**2
-    excess = np.maximum(squared.mean(axis=0), 1.0)
-    variance = (CORRELATED * (gathered * excess).sum(axis=-1) + 1 / _PRIOR**2) / total**2
+    leverage = gathered / total[..., None]
+    squared = (residual / np.maximum(1 - leverage, 0.1)).mean(axis=0)
+    variance = (CORRELATED * (gathered * np.maximum(squared, 1.0)).sum(axis=-1) + 1 / _PRIOR**2) / total**2
     deviation = np.hypot(np.sqrt(variance), _WINDOW_ERROR * s)
     # The posterior mean, with the variance of s over the frames beyond that of its error as that of the prior.
     spread = np.maximum((s**2 - deviation**2).mean(axis=0), 0.0)
     estimate = s * spread / np.maximum(spread + deviation**2, 1e-30)
     return s, deviation, estimate - estimate.min(axis=0)
-
-
-def _fit_frames(
-    power: FloatArray, spectrum: Float64Array, misfit: Float64Array, design: Float64Array, fit: _Fit
-) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Fit s, shape (T, tiles), with a known spectrum; also the information and squared residual of every ring."""
-    s, signal = np.zeros(power.shape[:2]), power.astype(np.float64) - fit.floor
-    for _ in range(2):
-        s, information, residual = _fit_relative(signal, spectrum, design, s, misfit, fit)
-    gathered = information * design**2
-    leverage = gathered / (gathered.sum(axis=-1, keepdims=True) + 1 / _PRIOR**2)
-    return s + 2 * fit.spectra.smear * s**2, gathered, residual / np.maximum(1 - leverage, 0.1)
 
 
 def _fit_relative(

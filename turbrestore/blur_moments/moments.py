@@ -31,11 +31,13 @@ from numpy.typing import ArrayLike
 from scipy.special import comb
 
 from ..core.errors import ConfigurationError, DataError, require
-from .exposure_table import ExposureTable, tabulate
-from .sensor import Float64Array, GaussianKernel, LineSensor, PixelGrid
-from .state_estimation.lifting import Motion
+from ..filtering.kalman import Gaussian
+from .sensor import ExposureTable, Float64Array, GaussianKernel, LineSensor, PixelGrid, tabulate
+from .state_estimation.augmented import OscillatorMotion
+from .state_estimation.lifting import LiftedSystem
 
 BASES = ("monomial", "legendre")
+Motion = LiftedSystem | OscillatorMotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,16 @@ class BlurModel:
         ``mean`` (..., n); ``inputs`` (..., N); returns ``image`` (..., count), ``derivative`` (..., n, count).
         """
         return self.table.image_and_jacobian(*self.motion.path_and_jacobian(mean, inputs))
+
+    def check_inputs(self, state: Gaussian, inputs: ArrayLike) -> Float64Array:
+        """Return the inputs of a frame period as float64, after checking that state and inputs belong to the motion."""
+        order, steps = self.motion.order, self.motion.timing.frame_steps
+        if state.mean.shape[-1] != order:
+            raise DataError(f"state: expected a mean of shape (..., {order}), found {state.mean.shape}")
+        values = np.asarray(inputs, np.float64)
+        if values.ndim < 1 or values.shape[-1] != steps or not np.isfinite(values).all():
+            raise DataError(f"input: expected finite values of shape (..., {steps}), found shape {values.shape}")
+        return values
 
 
 def predicted_moments(

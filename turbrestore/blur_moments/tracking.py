@@ -1,26 +1,35 @@
 """Tip-tilt and tracking: the motion of a point or a small target in a video, also within the exposures.
 
 A moving target leaves a streak.  Its centroid is its mean position, its second moments show how far it moved during the
-exposure, and a model of the motion (:mod:`.targets`) connects the frames.
+exposure, and a model of the motion (:mod:`.targets`) connects the frames.  Both axes follow the same motion
+independently of each other.  The sums over the rows of a window around the target are the image of a line sensor along
+x, those over its columns of one along y, so each axis has an observer of papers 1 and 2.
 
 x counts columns and y rows, both in pixels, with pixel centres at whole numbers.
+
+Departure from the papers
+-------------------------
+Second moments are quadratic in the state.  The extended filter of the papers leaves out what the covariance of the
+state adds to their mean and covariance, which matters as long as the velocity is unknown; the unscented one counts it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag, expm
+from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 
 from ..core.arrays import check_frames, luminance
 from ..core.errors import ConfigurationError, DataError, require, require_between
 from ..filtering.kalman import Gaussian, Innovation
-from .moments import basis_functions
-from .sensor import ExposureTiming, Float64Array, PixelGrid
-from .targets import Oscillation, PlaneModel, PlaneMomentFilter, RandomWalk, TargetMotion, lift_motion
+from .moments import BlurModel
+from .sensor import ExposureTiming, Float64Array, GaussianKernel, LineSensor, PixelGrid
+from .state_estimation.lifting import LiftedSystem
+from .state_estimation.observers import MomentFilter
+from .targets import Oscillation, RandomWalk, TargetMotion, lift_motion
 
 # Width of the rim of the window that is taken to be background, pixels.
 _RIM = 2
@@ -51,8 +60,6 @@ class TrackParams:
         Fast steps in a frame period.
     order : {1, 2}
         Centroids only, or second moments as well; for a random walk always centroids.
-    basis : {"legendre", "monomial"}
-        Basis of the moments; Legendre moments carry less noise.
 
     Raises
     ------
@@ -72,13 +79,12 @@ class TrackParams:
     frame_period: float = 1.0
     steps: int = 16
     order: int = 2
-    basis: str = "legendre"
 
     def __post_init__(self) -> None:
         require(0 < self.frame_period < np.inf, f"frame_period: expected a number above 0, found {self.frame_period}")
         require_between("sigma", self.sigma, 0, 1000, "pixels")
         require_between("steps", self.steps, 2, 10000)
-        PlaneMomentFilter(self.order, self.basis)
+        require(self.order in (1, 2), f"order: expected 1 or 2, found {self.order}")
         self.timing()
 
     def timing(self) -> ExposureTiming:
@@ -89,17 +95,17 @@ class TrackParams:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Motion of a target."""
+    """Motion of a target; the last axis is (x, y) unless said otherwise."""
 
-    # (T, 2): (x, y) in the middle of the exposures, estimated from this and all earlier frames, pixels.
+    # (T, 2): in the middle of the exposures, estimated from this and all earlier frames, pixels.
     positions: Float64Array
-    position_cov: Float64Array  # (T, 2, 2): covariance of ``positions``, squared pixels
-    # (T, 2): velocity in the middle of the exposures, pixels per second; NaN for a random walk.
-    velocities: Float64Array
-    paths: Float64Array  # (T, steps, 2): (x, y) in the middle of the fast steps of each frame period, pixels
-    states: tuple[Gaussian, ...]  # state at the start of every exposure, after its frame
-    innovations: tuple[Innovation, ...]
-    log_likelihood: float  # log-likelihood of all frames
+    position_variances: Float64Array  # (T, 2): of ``positions``, squared pixels
+    velocities: Float64Array  # (T, 2): in the middle of the exposures, pixels per second; NaN for a random walk
+    paths: Float64Array  # (T, steps, 2): in the middle of the fast steps of each frame period, pixels
+    states: Gaussian  # (T, 2, n): of each axis at the start of every exposure, after its frame
+    # (T, 2): squared innovation in units of its covariance; its mean is the number of moments if the model is right.
+    misfits: Float64Array
+    log_likelihood: float  # of all frames
     frequency: float | None  # frequency of an oscillation, Hz; the most likely one if a range was searched
     centroids: Float64Array  # (T, 2): first moments of the frames alone, pixels
     # (T, 2, 2): central second moments of the frames alone, which contain still target and motion, squared pixels.
@@ -112,26 +118,15 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """The target cut out of every frame, with the positions and statistics of the windows."""
+    """The target cut out of every frame, without its background."""
 
-    images: Float64Array
-    centres: Float64Array
-    columns: PixelGrid
-    rows: PixelGrid
+    images: Float64Array  # (T, h, w)
+    centres: Float64Array  # (T, 2): of the windows, pixels
+    centroids: Float64Array  # (T, 2)
+    spreads: Float64Array  # (T, 2, 2)
     background: float
     noise: float
     total: float
-    centroids: Float64Array = field(init=False)
-    spreads: Float64Array = field(init=False)
-
-    def __post_init__(self) -> None:
-        x, y = basis_functions(self.columns, 2), basis_functions(self.rows, 2)
-        # Entry (p, q) is the moment of x^p y^q.
-        moments = x.T @ np.swapaxes(self.images, -1, -2) @ y / self.total
-        first = np.stack([moments[:, 1, 0], moments[:, 0, 1]], axis=-1)
-        second = np.stack([moments[:, [2, 1], [0, 1]], moments[:, [1, 0], [1, 2]]], axis=-2)
-        object.__setattr__(self, "centroids", first + self.centres)
-        object.__setattr__(self, "spreads", second - first[:, :, None] * first[:, None, :])
 
 
 def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackParams) -> Track:
@@ -177,20 +172,18 @@ def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackP
     windows = _cut_windows(stack, roi)
     if isinstance(params.motion, Oscillation) and params.motion.highest is not None:
         params = replace(params, motion=_most_likely(windows, params, params.motion))
-    states, innovations = _run(windows, params)
-    model = _model(windows, params)
-    steps = model.axis.timing.exposure_steps
-    outputs = model.outputs(params.steps)
-    middle = outputs[:steps].mean(axis=0)
-    means, covs = np.stack([state.mean for state in states]), np.stack([state.cov for state in states])
+    states, misfits, log_likelihood = _run(windows, params)
+    motion, (A, _) = lift_motion(params.motion, params.timing()), params.motion.dynamics()
+    # A random walk has no velocity among its states.
+    rate = np.full(1, np.nan) if len(A) == 1 else expm(A * params.timing().exposure / 2)[1]
     return Track(
-        positions=means @ middle.T,
-        position_cov=middle @ covs @ middle.T,
-        velocities=_velocities(means, params),
-        paths=np.einsum("tn,san->tsa", means, outputs),
+        positions=states.mean @ motion.C,
+        position_variances=motion.C @ states.cov @ motion.C,
+        velocities=states.mean @ rate,
+        paths=motion.free @ np.swapaxes(states.mean, 1, 2),
         states=states,
-        innovations=innovations,
-        log_likelihood=float(sum(innovation.log_likelihood for innovation in innovations)),
+        misfits=misfits,
+        log_likelihood=log_likelihood,
         frequency=params.motion.frequency if isinstance(params.motion, Oscillation) else None,
         centroids=windows.centroids,
         spreads=windows.spreads,
@@ -200,30 +193,44 @@ def track_blur(frames: ArrayLike, roi: tuple[int, int, int, int], params: TrackP
     )
 
 
-def _run(windows: _Windows, params: TrackParams) -> tuple[tuple[Gaussian, ...], tuple[Innovation, ...]]:
-    """States at the start of the exposures, after their frames."""
-    # The spread of a random walk within an exposure carries no information about its position.
-    order = 1 if isinstance(params.motion, RandomWalk) else params.order
-    model, observer = _model(windows, params), PlaneMomentFilter(order, params.basis)
-    state = _start(windows, params)
-    states, innovations = [], []
-    # The window moves with the target, so every frame has its own model.
-    for image, centre in zip(windows.images, windows.centres, strict=True):
-        state, innovation = observer.step(replace(model, centre=tuple(centre)), state, image)
-        states.append(state)
-        innovations.append(innovation)
-        state = model.advance(state)
-    return tuple(states), tuple(innovations)
-
-
-def _model(windows: _Windows, params: TrackParams) -> PlaneModel:
+def _run(windows: _Windows, params: TrackParams) -> tuple[Gaussian, Float64Array, float]:
+    """States (T, 2, n) at the start of the exposures, after their frames; misfits (T, 2); log-likelihood of all."""
     motion = lift_motion(params.motion, params.timing())
-    sigma = np.sqrt(params.sigma**2 + params.motion.smear(motion.timing.exposure))
-    return PlaneModel(motion, float(sigma), windows.columns, windows.rows, windows.noise**2, windows.total)
+    # The spread of a random walk within an exposure says nothing about where it leads.
+    orders = (1,) if isinstance(params.motion, RandomWalk) else (1, 2)[: params.order]
+    observer, kernel = MomentFilter(orders, "legendre", "unscented"), GaussianKernel(params.sigma)
+    starts = _start(windows, params)
+    axes = [_follow(windows, axis, starts[axis], motion, kernel, observer) for axis in range(2)]
+    means, covs = (
+        np.stack([[getattr(state, name) for state, _ in steps] for steps in axes], axis=1) for name in ("mean", "cov")
+    )
+    misfits = np.stack([[innovation.normalised_squared for _, innovation in steps] for steps in axes], axis=1)
+    return Gaussian(means, covs), misfits, float(sum(found.log_likelihood for steps in axes for _, found in steps))
 
 
-def _start(windows: _Windows, params: TrackParams) -> Gaussian:
-    """Rough state before the first frame: at rest in the first window, with a spread estimated from the frames."""
+def _follow(
+    windows: _Windows,
+    axis: int,
+    start: Gaussian,
+    motion: LiftedSystem,
+    kernel: GaussianKernel,
+    observer: MomentFilter,
+) -> list[tuple[Gaussian, Innovation]]:
+    """States of one axis after each frame, and innovations."""
+    lines, summed = windows.images.sum(axis=1 + axis), windows.images.shape[1 + axis]
+    half, still = lines.shape[1] / 2, np.zeros(motion.timing.frame_steps)
+    steps, state = [], start
+    # The window moves with the target, so every frame has its own sensor.
+    for line, centre in zip(lines, windows.centres[:, axis], strict=True):
+        pixels = PixelGrid(centre - half, centre + half, len(line))
+        sensor = LineSensor(kernel, pixels, summed * windows.noise**2, windows.total)
+        steps.append(observer.step(BlurModel(motion, sensor), state, line, still))
+        state = motion.advance(steps[-1][0], still)
+    return steps
+
+
+def _start(windows: _Windows, params: TrackParams) -> list[Gaussian]:
+    """Rough state of each axis before the first frame: at rest in the first window, with a spread from the frames."""
     moved = np.mean(np.diff(windows.centroids, axis=0) ** 2)
     streak = np.mean(windows.spreads[:, [0, 1], [0, 1]]) - params.sigma**2 - 1 / 12
     step = float(np.sqrt(moved + np.maximum(streak, 0.0) + _PLACED**2))
@@ -232,7 +239,7 @@ def _start(windows: _Windows, params: TrackParams) -> Gaussian:
     means[:, 0] = windows.centres[0]
     # The third state, if any, is the centre of an oscillation.
     means[:, 2:] = windows.centroids.mean(axis=0)[:, None]
-    return Gaussian(means.ravel(), block_diag(prior, prior))
+    return [Gaussian(mean, prior) for mean in means]
 
 
 def _most_likely(windows: _Windows, params: TrackParams, motion: Oscillation) -> Oscillation:
@@ -242,11 +249,10 @@ def _most_likely(windows: _Windows, params: TrackParams, motion: Oscillation) ->
     def cost(frequency: float) -> float:
         candidate = replace(motion, frequency=float(frequency), highest=None)
         try:
-            _, innovations = _run(windows, replace(params, motion=candidate))
+            return -_run(windows, replace(params, motion=candidate))[2]
         except ConfigurationError:
             # The frames do not determine the state, for example at half the frame rate.
             return np.inf
-        return -float(sum(innovation.log_likelihood for innovation in innovations))
 
     duration = len(windows.images) * params.frame_period
     count = int(np.clip(np.ceil((motion.highest - motion.frequency) * duration * _FINENESS), 2, _MOST_TRIED)) + 1
@@ -257,39 +263,38 @@ def _most_likely(windows: _Windows, params: TrackParams, motion: Oscillation) ->
     return replace(motion, frequency=float(found.x), highest=None)
 
 
-def _velocities(means: Float64Array, params: TrackParams) -> Float64Array:
-    A, _ = params.motion.dynamics()
-    if len(A) == 1:
-        return np.full((len(means), 2), np.nan)
-    row = expm(A * params.timing().exposure / 2)[1]
-    return means.reshape(len(means), 2, len(A)) @ row
-
-
 def _cut_windows(stack: Float64Array, roi: tuple[int, int, int, int]) -> _Windows:
     """Follow the target and cut it out of every frame."""
     left, top, width, height = _check_roi(roi, stack.shape[1:])
-    images, corners, corner = [], [], np.array([left, top])
+    parts, corners, corner = [], [], np.array([left, top])
     for number, frame in enumerate(stack):
         light, corner = _place(frame, corner, (width, height))
         if light <= 0:
             raise DataError(f"frame {number}: expected light in the window, found none; check roi")
         corners.append(corner)
-        images.append(frame[corner[1] : corner[1] + height, corner[0] : corner[0] + width])
-    cut = np.stack(images)
+        parts.append(frame[corner[1] : corner[1] + height, corner[0] : corner[0] + width])
+    cut = np.stack(parts)
     rim = cut[:, _rim(height, width)]
     background = float(np.median(rim))
     noise = 1.4826 * float(np.median(np.abs(rim - background)))
-    total = float(np.median((cut - background).sum((1, 2))))
+    images = cut - background
+    total = float(np.median(images.sum((1, 2))))
     if total <= 0:
         raise DataError(f"roi: expected a target brighter than its background, found a total of {total:g}; check roi")
+    x, y = (np.arange(size) - (size - 1) / 2 for size in (width, height))
+    along_x, along_y = images.sum(axis=1) / total, images.sum(axis=2) / total
+    first = np.stack([along_x @ x, along_y @ y], axis=-1)
+    mixed = images @ x @ y / total
+    second = np.stack([along_x @ x**2, mixed, mixed, along_y @ y**2], axis=-1).reshape(-1, 2, 2)
+    centres = np.stack(corners) + np.array([(width - 1) / 2, (height - 1) / 2])
     return _Windows(
-        images=cut - background,
-        centres=np.stack(corners) + np.array([(width - 1) / 2, (height - 1) / 2]),
-        columns=PixelGrid(-width / 2, width / 2, width),
-        rows=PixelGrid(-height / 2, height / 2, height),
+        images=images,
+        centres=centres,
+        centroids=first + centres,
+        spreads=second - first[:, :, None] * first[:, None, :],
         background=background,
         # The lower limit keeps the filter defined for noise-free synthetic frames.
-        noise=max(noise, _LEAST_NOISE * float(cut.max() - background)),
+        noise=max(noise, _LEAST_NOISE * float(images.max())),
         total=total,
     )
 

@@ -117,17 +117,17 @@ class Seeing:
         What a person should know, one line each.
     """
 
-    displacement_variance: Estimate | None
-    displacement_variance_x: Estimate | None
-    displacement_variance_y: Estimate | None
-    displacement_by_flow: Estimate | None
-    displacement_by_blur: Estimate | None
-    isoplanatic_patch: Estimate | None
-    coherence_time: Estimate | None
-    wind_anisotropy: Estimate | None
-    wind_direction: float
-    independent_frames: float
-    rotation: float
+    displacement_variance: Estimate | None = None
+    displacement_variance_x: Estimate | None = None
+    displacement_variance_y: Estimate | None = None
+    displacement_by_flow: Estimate | None = None
+    displacement_by_blur: Estimate | None = None
+    isoplanatic_patch: Estimate | None = None
+    coherence_time: Estimate | None = None
+    wind_anisotropy: Estimate | None = None
+    wind_direction: float = np.nan
+    independent_frames: float = np.nan
+    rotation: float = np.nan
     d_over_r0: Estimate | None = None
     r0: Estimate | None = None
     cn2: Estimate | None = None
@@ -235,7 +235,7 @@ def measure_seeing(
     by_blur = _by_blur(mean, image, noise / np.sqrt(len(flows)))
     if motion is None:
         remark = "too little structure or motion to measure the displacement: no strength of the turbulence is reported"
-        return _unmeasured(by_blur, remark)
+        return Seeing(displacement_by_blur=by_blur, remarks=(remark,))
     found, whole, rotation = motion.displacement, motion.statistics, motion.rotation
     w = found.blocks[:, found.counts]
     variance = max(float(np.mean(w**2)) - found.noise_variance, 0.0)
@@ -289,24 +289,6 @@ def _interval(variance: float, motion: MotionStatistics, freedom: float) -> Esti
     """Interval of a variance over a long time, without an upper bound where there are few independent frames."""
     found = chi_square_interval(variance, freedom, _MODEL_ERROR)
     return replace(found, high=np.inf) if motion.slow else found
-
-
-def _unmeasured(by_blur: Estimate | None, remark: str) -> Seeing:
-    nothing = float("nan")
-    return Seeing(
-        displacement_variance=None,
-        displacement_variance_x=None,
-        displacement_variance_y=None,
-        displacement_by_flow=None,
-        displacement_by_blur=by_blur,
-        isoplanatic_patch=None,
-        coherence_time=None,
-        wind_anisotropy=None,
-        wind_direction=nothing,
-        independent_frames=nothing,
-        rotation=nothing,
-        remarks=(remark,),
-    )
 
 
 def _strength(found: Displacement, whole: MotionStatistics, optics: Optics) -> dict[str, Estimate]:

@@ -44,7 +44,6 @@ from .phase_screen import Turbulence, draw_turbulence, tilt_flow
 from .pupil import (
     ComplexArray,
     Float64Array,
-    PsfBasis,
     Pupil,
     point_spread_functions,
     psf_basis,
@@ -162,9 +161,7 @@ class _View:
     rows: Float64Array
     nodes: tuple[Float64Array, Float64Array]
     to_pixels: tuple[FloatArray, FloatArray]
-    wavelengths: tuple[float, ...]
-    bases: tuple[PsfBasis, ...]
-    spectra: tuple[ComplexArray, ...]
+    channels: tuple[tuple[float, FloatArray, ComplexArray], ...]  # wavelength, h_0 … h_r and their spectra
     padded: tuple[int, int]
 
 
@@ -195,14 +192,13 @@ def _prepare(
     height, width = truth.shape[:2]
     turbulence = draw_turbulence(params, (height, width), rng)
     pupil = sample_pupil(turbulence)
-    wavelengths = _wavelengths(truth, params)
     # All channels are sampled at the same places.
     seed = rng.integers(2**63)
-    bases = tuple(
-        psf_basis(turbulence, pupil, wavelength, (height, width), np.random.default_rng(seed))
-        for wavelength in wavelengths
-    )
-    margin = max(basis.mean.shape[0] for basis in bases) // 2 + int(np.ceil(_WIDEST_TILT * params.tilt_rms()))
+    kernels = [
+        (wavelength, psf_basis(turbulence, pupil, wavelength, (height, width), np.random.default_rng(seed)))
+        for wavelength in _wavelengths(truth, params)
+    ]
+    margin = max(len(basis[0]) for _, basis in kernels) // 2 + int(np.ceil(_WIDEST_TILT * params.tilt_rms()))
     columns, rows = (np.arange(-margin, size + margin) - (size - 1) / 2 for size in (width, height))
     node_x, to_x = _linear_nodes(width, params.field_spacing)
     node_y, to_y = _linear_nodes(height, params.field_spacing)
@@ -219,9 +215,7 @@ def _prepare(
         rows,
         (nodes_x, nodes_y),
         (to_x, to_y),
-        wavelengths,
-        bases,
-        tuple(_spectra(basis, padded) for basis in bases),
+        tuple((wavelength, basis, _spectra(basis, padded)) for wavelength, basis in kernels),
         padded,
     )
 
@@ -243,13 +237,11 @@ def _blurred(view: _View, displaced: FloatArray, drift: Float64Array) -> FloatAr
     path = tilt_free_path(view.turbulence, view.pupil, *view.nodes, drift)
     to_x, to_y = view.to_pixels
     planes = []
-    for plane, wavelength, basis, spectra in zip(
-        _planes(displaced), view.wavelengths, view.bases, view.spectra, strict=True
-    ):
+    for plane, (wavelength, kernels, spectra) in zip(_planes(displaced), view.channels, strict=True):
         psfs = point_spread_functions(path, view.pupil.mask, wavelength, view.turbulence.params)
-        rank = len(basis.components)
-        weights = (psfs - basis.mean).reshape(len(psfs), -1) @ basis.components.reshape(rank, -1).T
-        maps = to_y @ weights.T.reshape(rank, to_y.shape[1], to_x.shape[1]) @ to_x.T
+        components = kernels[1:].reshape(len(kernels) - 1, -1)
+        weights = (psfs - kernels[0]).reshape(len(psfs), -1) @ components.T
+        maps = to_y @ weights.T.reshape(len(components), to_y.shape[1], to_x.shape[1]) @ to_x.T
         spectrum = fft.rfft2(plane, s=view.padded)
         rows, columns = (slice(view.margin, view.margin + len(matrix)) for matrix in (to_y, to_x))
         blurred = fft.irfft2(spectrum * spectra[0], s=view.padded)[rows, columns]
@@ -259,9 +251,8 @@ def _blurred(view: _View, displaced: FloatArray, drift: Float64Array) -> FloatAr
     return _joined(planes)
 
 
-def _spectra(basis: PsfBasis, shape: tuple[int, int]) -> ComplexArray:
-    """Fourier transforms of the mean and the components, centred on the first pixel."""
-    kernels = np.concatenate([basis.mean[None], basis.components])
+def _spectra(kernels: FloatArray, shape: tuple[int, int]) -> ComplexArray:
+    """Fourier transforms of kernels, centred on the first pixel."""
     grid = np.zeros((len(kernels), *shape), np.float32)
     size = kernels.shape[1]
     grid[:, :size, :size] = kernels

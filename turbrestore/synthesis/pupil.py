@@ -41,14 +41,6 @@ class Pupil:
     bends: tuple[tuple[NDArray[np.complex128], FloatArray], ...]
 
 
-@dataclass(frozen=True, eq=False)
-class PsfBasis:
-    """Low-rank basis of the point spread functions at one wavelength."""
-
-    mean: FloatArray  # (K, K): sums to 1
-    components: FloatArray  # (r, K, K): orthonormal; each sums to 0
-
-
 def pupil_mask(params: PhaseScreenParams) -> NDArray[np.bool_]:
     """Mask of the samples of the grid over the pupil that lie inside the aperture.
 
@@ -116,8 +108,11 @@ def point_spread_functions(
 
 def psf_basis(
     turbulence: Turbulence, pupil: Pupil, wavelength: float, shape: tuple[int, ...], rng: np.random.Generator
-) -> PsfBasis:
-    """Principal components of the point spread functions at random places of the screens."""
+) -> FloatArray:
+    """Mean of the point spread functions at random places of the screens, and their principal components.
+
+    Returns (1 + r, K, K): the mean sums to 1, the components are orthonormal, and each sums to 0.
+    """
     half_height, half_width = (size / 2 for size in shape[:2])
     samples = []
     for _ in range(_SAMPLED_INSTANTS):
@@ -131,8 +126,7 @@ def psf_basis(
     sizes, components = _principal_directions(centred)
     shares = np.cumsum(sizes**2) / max(np.sum(sizes**2), np.finfo(np.float64).tiny)
     rank = min(int(np.searchsorted(shares, _KEPT_VARIANCE)) + 1, _MOST_COMPONENTS)
-    kept = components[:rank].reshape(rank, *mean.shape)
-    return PsfBasis(mean.astype(np.float32), kept.astype(np.float32))
+    return np.concatenate([mean[None], components[:rank].reshape(rank, *mean.shape)]).astype(np.float32)
 
 
 def _axis(params: PhaseScreenParams) -> Float64Array:

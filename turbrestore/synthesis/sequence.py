@@ -185,10 +185,6 @@ def flows_between(flows: Iterable[FloatArray], shares: Sequence[float]) -> Itera
 
     ``flows`` (H, W, 2) each; yields (H, W, 2) each.
     """
-    require(
-        len(shares) > 0 and all(0 <= share <= 1 for share in shares),
-        f"shares: expected at least one, all of 0 to 1, found {tuple(shares)}",
-    )
     previous: FloatArray | None = None
     for flow in flows:
         if previous is not None:

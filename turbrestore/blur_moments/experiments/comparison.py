@@ -3,12 +3,20 @@
 A recording holds many seeds at once, so every observer corrects all of them in one step.  Errors are compared within
 a seed, because the ratio of two observers has a much smaller standard error than either error.  The set-ups are in
 :mod:`.scenarios`.
+
+Symbols of the posterior Cramér–Rao bounds (Tichavský, Muravchik & Nehorai, 1998)
+---------------------------------------------------------------------------------
+J : Bayesian information about the state; J⁻¹ bounds the mean squared error of any estimate.
+A_s, Q : motion from one exposure to the next, and covariance of its disturbance.
+
+For a linear motion with Gaussian disturbance ``J⁺ = (Q + A_s J⁻¹ A_sᵀ)⁻¹ + E[Hᵀ R⁻¹ H]``, where the expectation is over
+the states that occur, and H is the derivative of the measurement at the true state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
@@ -16,32 +24,23 @@ from scipy.stats import chi2
 from ...core.errors import require
 from ...filtering.kalman import Gaussian
 from ...runtime.threads import map_ahead
-from ..moments import BlurModel
+from ..moments import BlurModel, predicted_moments
 from ..sensor import ExposureTiming, Float64Array
 from ..state_estimation.image_observer import ImageFilter
 from ..state_estimation.lifting import LiftedSystem
-from ..state_estimation.observers import MomentFilter, Observer, luenberger, run_observer, steady_kalman
-from .bounds import error_bound, recorded_information
-from .scenarios import (
-    MIRROR,
-    WAVEFRONT,
-    MirrorParams,
-    Recording,
-    WavefrontParams,
-    mirror_model,
-    mirror_oscillator,
-    record_mirror,
-    record_wavefront,
-    wavefront_model,
-)
+from ..state_estimation.observers import MomentFilter, Observer, run_observer, steady_kalman
+from .scenarios import SLOPE_DISTURBANCE, Recording, Setup, mirror_setup, record, wavefront_setup
 
 # Share of the exposures with the spot on the sensor below which light is lost.
 _LIT = 0.99
-# Probability of the consistency band.
-_BAND = 0.95
+# Probabilities at the ends of the consistency band.
+_BAND = 0.025, 0.975
 # Seeds handled together: enough to amortise the overhead of NumPy, few enough to stay in the cache.
 _CHUNK = 25
-_LEGENDRE = "legendre"
+# Orders of the moments for which there is a bound.
+_MOMENTS = {"moments": (1, 2), "moments_1_to_4": (1, 2, 3, 4)}
+# Standard deviations of ln g, ln ω and ln ζ in the prior of the augmented state: ±7 dB are two of the gain.
+_PLANT = np.array([0.4, 0.15, 0.35])
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +58,8 @@ class Track:
     """Errors of an observer on a recording of T frames and S seeds."""
 
     errors: Float64Array  # (T, S): of the state, or of the output within the exposure
-    between: Float64Array  # (T, S): root mean square error of the output over all fast steps until the next exposure
-    misfits: Float64Array  # (T, S): normalised innovation squared
-    observed: int  # degrees of freedom of one of them
+    misfits: Float64Array  # (T, S): normalised innovation squared per degree of freedom
+    observed: int  # degrees of freedom of a frame
     example: Float64Array  # (T, N): estimated output of the first seed
 
 
@@ -70,219 +68,193 @@ class Score:
     """Accuracy of an observer over all seeds, after the frames in which it settles."""
 
     error: float  # mean error
-    # Mean error over that of the first observer, and its standard error.
+    # Mean error over that of the first observer.
     ratio: float
-    ratio_error: float
-    # Root mean square error, and its standard error.
+    ratio_standard_error: float
+    # Root mean square error, and the bound on it; NaN where none is known.
     rms: float
-    rms_error: float
-    bound: float  # Cramér–Rao bound on ``rms``; NaN where none is known
-    between: float  # mean error of the output over all fast steps until the next exposure
-    innovation: float  # normalised innovation squared per degree of freedom
-    # Band that contains it in 95 % of all runs if the model fits.
-    innovation_low: float
-    innovation_high: float
-    of_image: bool = False  # whether the observer uses the whole image, and not its moments
+    rms_standard_error: float
+    cramer_rao_bound: float
+    innovation_squared: float  # per degree of freedom
+    innovation_band: tuple[float, float]  # contains it in 95 % of all runs if the model fits
 
     @property
     def consistent(self) -> bool:
         """Whether the innovations are as large as their covariances say."""
-        return self.innovation_low <= self.innovation <= self.innovation_high
+        low, high = self.innovation_band
+        return low <= self.innovation_squared <= high
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """Outcome of an experiment."""
+    """Outcome of an experiment, by observer."""
 
-    seeds: int  # number of runs
-    scores: dict[str, Score]  # by observer; ratios are to the first
+    scores: dict[str, Score]  # ratios are to the first
+    tracks: dict[str, Track]
     # Cramér–Rao bounds on the root mean square error: ``moments`` (orders 1 and 2), ``moments_1_to_4``, ``image``.
     bounds: dict[str, float]
     timing: ExposureTiming
     truth: Float64Array  # (T, N): output of the first seed
-    estimates: dict[str, Float64Array]  # (T, N): of the first seed, by observer
-    errors: dict[str, Float64Array]  # (T,): error after every frame, mean over the seeds, by observer
     lit: float  # share of the exposures, over all seeds, in which the spot is on the sensor
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """One line for each observer of the whole image that errs more than O1 where the spot leaves the sensor."""
-        return tuple(
-            f"{name} errs {score.ratio:.2f} times as much as O1: an image without its light misleads it, and the spot "
-            f"is on the sensor for {100 * self.lit:.0f} % of the exposures"
-            for name, score in self.scores.items()
-            if score.of_image and self.lit < _LIT and score.ratio > 1 + score.ratio_error
-        )
+    warnings: tuple[str, ...]  # one line for each observer of the whole image that lost light misleads
 
 
-def wavefront(seeds: Sequence[int], params: WavefrontParams = WAVEFRONT) -> Experiment:
+def wavefront(seeds: Sequence[int], slope_disturbance: float = SLOPE_DISTURBANCE) -> Experiment:
     """Run the wavefront experiment."""
-    model = wavefront_model(params)
-    observer, cov = steady_kalman(model)
+    setup = wavefront_setup(slope_disturbance)
+    model = setup.model
+    linear, cov = steady_kalman(model)
     start = Gaussian(np.zeros(2), cov)
-    both = (1, 2)
     contestants = {
-        "O1": Contestant(observer, model, start, "moments"),
+        "O1": Contestant(linear, model, start, "moments"),
         "O2": Contestant(MomentFilter((2,)), model, start, "moments"),
-        "O3": Contestant(MomentFilter(both), model, start, "moments"),
-        "O3_legendre": Contestant(MomentFilter(both, _LEGENDRE), model, start, "moments"),
-        "O3_unscented": Contestant(MomentFilter(both, _LEGENDRE, "unscented"), model, start, "moments"),
-        "O3_iterated": Contestant(MomentFilter(both, _LEGENDRE, "iterated"), model, start, "moments"),
-        "moments_1_to_4": Contestant(MomentFilter((1, 2, 3, 4), _LEGENDRE), model, start, "moments_1_to_4"),
-        "image_one_step": Contestant(ImageFilter(iterations=1), model, start, "image"),
+        "O3": Contestant(MomentFilter((1, 2)), model, start, "moments"),
+        "O3_legendre": Contestant(MomentFilter((1, 2), "legendre"), model, start, "moments"),
+        "moments_1_to_4": Contestant(MomentFilter((1, 2, 3, 4), "legendre"), model, start, "moments_1_to_4"),
         "image_map": Contestant(ImageFilter(), model, start, "image"),
     }
-
-    def record(chunk: Sequence[int]) -> Recording:
-        return record_wavefront(chunk, params)
-
-    return _run(seeds, record, contestants, params.burn_in, of_state=True, linear=model)
+    return _run(setup, seeds, contestants, of_state=True)
 
 
-def mirror(seeds: Sequence[int], params: MirrorParams = MIRROR) -> Experiment:
-    """Run the mirror experiment."""
-    model = mirror_model(params)
-    motion = model.motion
-    assert isinstance(motion, LiftedSystem)
-    observer, cov = steady_kalman(model)
+def mirror(seeds: Sequence[int], deviation: float = 0.0) -> Experiment:
+    """Run the mirror experiment, its plant known, or off by up to ``deviation`` dB."""
+    setup = mirror_setup(deviation)
+    model = setup.model
+    linear, cov = steady_kalman(model)
     start = Gaussian(np.zeros(2), cov)
     contestants = {
-        "O1": Contestant(observer, model, start, "moments"),
+        "O1": Contestant(linear, model, start, "moments"),
         "O2": Contestant(MomentFilter((1, 2)), model, start, "moments"),
         "O3": Contestant(ImageFilter("two"), model, start, "image"),
         "O3_map": Contestant(ImageFilter(), model, start, "image"),
     }
-    if params.deviation > 0:
-        augmented = BlurModel(mirror_oscillator(params), model.sensor)
-        contestants["augmented"] = Contestant(ImageFilter(), augmented, _augmented_start(cov))
+    if deviation == 0:
+        contestants["O3_infinity"] = Contestant(ImageFilter("infinity", iterations=8), model, start, "image")
     else:
-        contestants |= {
-            "O1_poles_.02_.03": Contestant(luenberger(motion, [0.02, 0.03]), model, start, "moments"),
-            "O1_poles_.3_.35": Contestant(luenberger(motion, [0.3, 0.35]), model, start, "moments"),
-            "O2_legendre": Contestant(MomentFilter((1, 2), _LEGENDRE), model, start, "moments"),
-            "moments_1_to_4": Contestant(MomentFilter((1, 2, 3, 4), _LEGENDRE), model, start, "moments_1_to_4"),
-            "O3_one_start": Contestant(ImageFilter("two", multistart=False), model, start, "image"),
-            "O3_infinity": Contestant(ImageFilter("infinity", iterations=8), model, start, "image"),
-        }
-
-    def record(chunk: Sequence[int]) -> Recording:
-        return record_mirror(chunk, params)
-
-    linear = None if params.deviation > 0 else model
-    return _run(seeds, record, contestants, params.burn_in, of_state=False, linear=linear)
+        full = np.diag([0.0, 0.0, *_PLANT**2])
+        full[:2, :2] = cov
+        augmented = BlurModel(setup.truth, model.sensor)
+        contestants["augmented"] = Contestant(ImageFilter(), augmented, Gaussian(np.zeros(5), full))
+    return _run(setup, seeds, contestants, of_state=False, bounded=deviation == 0)
 
 
 def follow(contestant: Contestant, recording: Recording, of_state: bool) -> Track:
     """Run an observer over a recording; measure the norm of the error of the state, or the error of the output."""
     motion, start = contestant.model.motion, contestant.start
-    seeds = recording.states.shape[1]
-    prior = Gaussian(np.broadcast_to(start.mean, (seeds, start.mean.size)), start.cov)
+    prior = Gaussian(np.broadcast_to(start.mean, (recording.states.shape[1], start.mean.size)), start.cov)
     results = run_observer(contestant.observer, contestant.model, prior, recording.frames, recording.inputs)
-    pairs = zip(results, recording.inputs, strict=True)
-    estimates = np.array([motion.fast_output(state, held)[0] for (state, _), held in pairs])
-    squared = (estimates - recording.outputs) ** 2
+    means, steps = np.array([state.mean for state, _ in results]), motion.timing.frame_steps
+    estimates, _ = motion.path_and_jacobian(means, recording.inputs, steps)
     if of_state:
-        means = np.array([state.mean for state, _ in results])
         errors = np.linalg.norm(means - recording.states, axis=-1)
     else:
-        errors = np.sqrt(squared[..., : motion.timing.exposure_steps].mean(-1))
-    return Track(
-        errors=errors,
-        between=np.sqrt(squared.mean(-1)),
-        misfits=np.array([innovation.normalised_squared for _, innovation in results]),
-        observed=int(results[0][1].observed.flat[0]),
-        example=estimates[:, 0],
-    )
+        exposed = slice(motion.timing.exposure_steps)
+        errors = np.sqrt(((estimates - recording.outputs)[..., exposed] ** 2).mean(-1))
+    observed = int(results[0][1].observed.flat[0])
+    misfits = np.array([innovation.normalised_squared for _, innovation in results]) / observed
+    return Track(errors, misfits, observed, estimates[:, 0])
 
 
-def score(tracks: Mapping[str, Track], bounds: Mapping[str, float], burn_in: int) -> dict[str, Score]:
-    """Compare observers on the same recordings with the first of them and with the bounds known for some of them."""
-    reference = next(iter(tracks.values())).errors[burn_in:].mean(0)
-    return {
-        name: _score_one(track, reference, bounds.get(name, float("nan")), burn_in) for name, track in tracks.items()
-    }
-
-
-def _score_one(track: Track, reference: Float64Array, bound: float, burn_in: int) -> Score:
+def score(track: Track, first: Track, bound: float, burn_in: int) -> Score:
+    """Compare an observer with the first one on the same recordings, and with the bound on its error."""
     errors, misfits = track.errors[burn_in:], track.misfits[burn_in:]
-    seeds = errors.shape[1]
+    reference = first.errors[burn_in:].mean(0)
     mean, squares = errors.mean(0), (errors**2).mean(0)
     ratio, rms = mean.mean() / reference.mean(), np.sqrt(squares.mean())
-    spread = np.std(mean - ratio * reference, ddof=1) if seeds > 1 else np.nan
-    spread_squares = np.std(squares, ddof=1) if seeds > 1 else np.nan
+    spread, spread_squares = (
+        np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+        for values in (mean - ratio * reference, squares)
+    )
     freedom = misfits.size * track.observed
-    low, high = chi2.ppf([0.5 - _BAND / 2, 0.5 + _BAND / 2], freedom) / freedom
+    low, high = chi2.ppf(_BAND, freedom) / freedom
     return Score(
         error=float(mean.mean()),
         ratio=float(ratio),
-        ratio_error=float(spread / np.sqrt(seeds) / reference.mean()),
+        ratio_standard_error=float(spread / reference.mean()),
         rms=float(rms),
-        rms_error=float(spread_squares / np.sqrt(seeds) / (2 * rms)),
-        bound=float(bound),
-        between=float(track.between[burn_in:].mean()),
-        innovation=float(misfits.sum() / freedom),
-        innovation_low=float(low),
-        innovation_high=float(high),
+        rms_standard_error=float(spread_squares / (2 * rms)),
+        cramer_rao_bound=bound,
+        innovation_squared=float(misfits.mean()),
+        innovation_band=(float(low), float(high)),
     )
+
+
+def information(model: BlurModel, states: Float64Array, inputs: Float64Array) -> dict[str, Float64Array]:
+    """Information ``Hᵀ R⁻¹ H`` of a frame about the state, by what is measured: two or four moments, or the image.
+
+    ``states`` (..., n); ``inputs`` (..., N); returns (..., n, n) each.
+    """
+    found = {}
+    for name, orders in _MOMENTS.items():
+        _, H, R = predicted_moments(model, states, inputs, orders, "legendre")
+        found[name] = np.swapaxes(H, -1, -2) @ np.linalg.solve(R, H)
+    _, derivative = model.image_and_jacobian(states, inputs)
+    scaled = derivative / model.sensor.deviation
+    return {**found, "image": scaled @ np.swapaxes(scaled, -1, -2)}
+
+
+def posterior_bound(A: Float64Array, Q: Float64Array, start: Float64Array, gained: Float64Array) -> Float64Array:
+    """Bound on the covariance of the estimation error after every frame.
+
+    ``A, Q, start`` (n, n); ``gained`` (T, n, n), the information of the frames; returns (T, n, n).
+    """
+    before, bounds = start, []
+    for frame in gained:
+        after = np.linalg.inv(np.linalg.inv(before) + frame)
+        bounds.append(after)
+        before = A @ after @ A.T + Q
+    return np.array(bounds)
+
+
+def error_bound(motion: LiftedSystem, start: Float64Array, gained: Float64Array, burn_in: int, of_state: bool) -> float:
+    """Bound on the root mean square error of the state, or of the output within the exposure, after the burn-in."""
+    covariances = posterior_bound(motion.A, motion.Q, start, gained)[burn_in:]
+    free = motion.free[: motion.timing.exposure_steps]
+    weight = np.eye(motion.order) if of_state else free.T @ free / len(free)
+    return float(np.sqrt(np.einsum("ab,tba->t", weight, covariances).mean()))
 
 
 def _run(
-    seeds: Sequence[int],
-    record: Callable[[Sequence[int]], Recording],
-    contestants: dict[str, Contestant],
-    burn_in: int,
-    of_state: bool,
-    linear: BlurModel | None,
+    setup: Setup, seeds: Sequence[int], contestants: dict[str, Contestant], of_state: bool, bounded: bool = True
 ) -> Experiment:
-    """Record, follow and score in chunks of seeds."""
+    """Record and follow in chunks of seeds, and score all of them; bounds hold where the plant is known."""
     require(len(seeds) >= 1, "seeds: expected at least 1, found none")
-    chunks = [seeds[k : k + _CHUNK] for k in range(0, len(seeds), _CHUNK)]
+    model, pixels, start = setup.model, setup.model.sensor.pixels, contestants["O1"].start.cov
+    motion = model.motion
+    assert isinstance(motion, LiftedSystem)
 
-    first, bounds = contestants["O1"], dict[str, float]()
-    exposed, pixels = first.model.motion.timing.exposure_steps, first.model.sensor.pixels
-
-    def work(chunk: Sequence[int]) -> tuple[dict[str, Track], dict[str, Float64Array], Float64Array, float]:
-        recording = record(chunk)
+    def work(chunk: Sequence[int]) -> tuple[dict[str, Track], dict[str, Float64Array], Float64Array, int]:
+        recording = record(setup, chunk)
         tracks = {name: follow(contestant, recording, of_state) for name, contestant in contestants.items()}
-        seen = recording.outputs[burn_in:, :, :exposed]
-        lit = float(np.mean((seen >= pixels.start) & (seen <= pixels.stop)))
-        return tracks, recorded_information(linear, recording) if linear else {}, recording.outputs[:, 0], lit
+        gained = information(model, recording.states[..., :2], recording.inputs) if bounded else {}
+        seen = recording.outputs[setup.burn_in :, :, : motion.timing.exposure_steps]
+        lit = int(np.count_nonzero((seen >= pixels.start) & (seen <= pixels.stop)))
+        return tracks, {name: part.sum(1) for name, part in gained.items()}, recording.outputs[:, 0], lit
 
+    chunks = [seeds[k : k + _CHUNK] for k in range(0, len(seeds), _CHUNK)]
     parts = [part for _, part in map_ahead(work, chunks)]
     tracks = {name: _joined([part[0][name] for part in parts]) for name in contestants}
-    shares = [len(chunk) / len(seeds) for chunk in chunks]
-    if linear is not None:
-        for name in parts[0][1]:
-            information = np.asarray(sum(share * part[1][name] for share, part in zip(shares, parts, strict=True)))
-            bounds[name] = error_bound(linear, first.start.cov, information, burn_in, of_state)
-    of_observers = {name: bounds[c.bound] for name, c in contestants.items() if c.bound in bounds}
-    scores = score(tracks, of_observers, burn_in)
-    return Experiment(
-        seeds=len(seeds),
-        scores={
-            name: replace(found, of_image=isinstance(contestants[name].observer, ImageFilter))
-            for name, found in scores.items()
-        },
-        bounds=bounds,
-        timing=first.model.motion.timing,
-        truth=parts[0][2],
-        estimates={name: track.example for name, track in tracks.items()},
-        errors={name: track.errors.mean(1) for name, track in tracks.items()},
-        lit=sum(share * part[3] for share, part in zip(shares, parts, strict=True)),
+    bounds = {}
+    for name in parts[0][1]:
+        gained = np.asarray(sum(part[1][name] for part in parts)) / len(seeds)
+        bounds[name] = error_bound(motion, start, gained, setup.burn_in, of_state)
+    scores = {
+        name: score(track, tracks["O1"], bounds.get(contestants[name].bound, float("nan")), setup.burn_in)
+        for name, track in tracks.items()
+    }
+    exposures = len(seeds) * (setup.frames - setup.burn_in) * motion.timing.exposure_steps
+    lit = sum(part[3] for part in parts) / exposures
+    of_image = [name for name, contestant in contestants.items() if isinstance(contestant.observer, ImageFilter)]
+    warnings = tuple(
+        f"{name} errs {scores[name].ratio:.2f} times as much as O1: an image without its light misleads it, and the "
+        f"spot is on the sensor for {100 * lit:.0f} % of the exposures"
+        for name in of_image
+        if lit < _LIT and scores[name].ratio > 1 + scores[name].ratio_standard_error
     )
+    return Experiment(scores, tracks, bounds, motion.timing, parts[0][2], lit, warnings)
 
 
 def _joined(tracks: list[Track]) -> Track:
     """Join the tracks of an observer over different seeds."""
-    errors, between, misfits = (
-        np.concatenate([getattr(track, name) for track in tracks], 1) for name in ("errors", "between", "misfits")
-    )
-    return Track(errors, between, misfits, tracks[0].observed, tracks[0].example)
-
-
-def _augmented_start(cov: Float64Array) -> Gaussian:
-    """Prior of the augmented state: ±7 dB taken as two standard deviations of the gain."""
-    full = np.zeros((5, 5))
-    full[:2, :2] = cov
-    full[2:, 2:] = np.diag([0.4, 0.15, 0.35]) ** 2
-    return Gaussian(np.zeros(5), full)
+    errors, misfits = (np.concatenate([getattr(track, name) for track in tracks], 1) for name in ("errors", "misfits"))
+    return Track(errors, misfits, tracks[0].observed, tracks[0].example)

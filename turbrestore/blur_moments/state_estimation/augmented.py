@@ -23,7 +23,7 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
 from ...core.errors import require
-from ...filtering.kalman import Gaussian
+from ...filtering.kalman import Gaussian, predict
 from ..sensor import ExposureTiming, Float64Array
 
 
@@ -43,7 +43,7 @@ class Oscillator:
 
 @dataclass(frozen=True, eq=False)
 class OscillatorMotion:
-    """Motion with the state (y, ẏ, ln g/g₀, ln ω/ω₀, ln ζ/ζ₀), a :class:`.lifting.Motion`."""
+    """Motion with the state (y, ẏ, ln g/g₀, ln ω/ω₀, ln ζ/ζ₀), in place of a :class:`.lifting.LiftedSystem`."""
 
     nominal: Oscillator  # g₀, ω₀ and ζ₀
     timing: ExposureTiming
@@ -59,9 +59,17 @@ class OscillatorMotion:
         """Number n of states."""
         return 5
 
-    def path_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Output in the exposure and its derivative; see :meth:`.lifting.Motion.path_and_jacobian`."""
-        return self._outputs(mean, inputs, self.timing.exposure_steps)
+    def path_and_jacobian(
+        self, mean: Float64Array, inputs: Float64Array, steps: int | None = None
+    ) -> tuple[Float64Array, Float64Array]:
+        """Output and its derivative; see :meth:`.lifting.LiftedSystem.path_and_jacobian`."""
+        steps = steps or self.timing.exposure_steps
+        response = self._responses(mean, steps)
+        slopes = response.y[..., :-1].copy()
+        forced = _convolve(np.diff(response.step, axis=-1), inputs[..., :steps])
+        slopes[..., 2:, :] += forced
+        path = np.einsum("...ki,...k->...i", slopes[..., :2, :], mean[..., :2]) + forced[..., 0, :]
+        return path, np.swapaxes(slopes, -1, -2)
 
     def advance(self, state: Gaussian, inputs: Float64Array) -> Gaussian:
         """Predict the state at the start of the next exposure, linearised at the mean."""
@@ -79,21 +87,7 @@ class OscillatorMotion:
         )
         # The forced response is proportional to the gain, so it equals its derivative with respect to ln g.
         moved[..., :2] += F[..., :2, 2]
-        cov = F @ state.cov @ np.swapaxes(F, -1, -2) + self.Q
-        return Gaussian(moved, 0.5 * (cov + np.swapaxes(cov, -1, -2)))
-
-    def fast_output(self, state: Gaussian, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Mean and variance of the output at every fast step; see :meth:`.lifting.Motion.fast_output`."""
-        path, slopes = self._outputs(state.mean, inputs, self.timing.frame_steps)
-        return path, np.einsum("...in,...nm,...im->...i", slopes, state.cov, slopes)
-
-    def _outputs(self, mean: Float64Array, inputs: Float64Array, steps: int) -> tuple[Float64Array, Float64Array]:
-        response = self._responses(mean, steps)
-        slopes = response.y[..., :-1].copy()
-        forced = _convolve(np.diff(response.step, axis=-1), inputs[..., :steps])
-        slopes[..., 2:, :] += forced
-        path = np.einsum("...ki,...k->...i", slopes[..., :2, :], mean[..., :2]) + forced[..., 0, :]
-        return path, np.swapaxes(slopes, -1, -2)
+        return Gaussian(moved, predict(state, F, self.Q).cov)
 
     def _responses(self, mean: Float64Array, steps: int) -> _Responses:
         """Responses at the times 0, T_f, …, steps · T_f."""

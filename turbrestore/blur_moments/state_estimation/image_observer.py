@@ -29,14 +29,13 @@ from ...core.errors import ConfigurationError, DataError, require
 from ...filtering.kalman import Gaussian, Innovation, update_information
 from ..moments import BlurModel
 from ..sensor import Float64Array
-from .lifting import check_inputs
 
 NORMS = ("map", "two", "infinity")
 _POWERS = {"map": (2,), "two": (2,), "infinity": (2, 8, 32)}
 # Distance of the shifted starts from the prediction, in standard deviations.
 _PERTURBED = 2.0
-# Iterations from every start before only the best ones continue.
-_TRIAL = 2
+# Iterations from every start before only the best ones continue, and their number.
+_TRIAL, _KEPT = 2, 3
 # Squared distances in units of the curvature: a step that the frame cannot resolve; two starts at the same minimum.
 _SETTLED = 1e-3
 _SAME = 0.1
@@ -51,27 +50,28 @@ class ImageFilter:
     """Observer on the whole image."""
 
     norm: str = "map"  # "map" misfit with the prior, "two" without it, "infinity" largest misfit of a pixel
-    # Of the search. One of them from a single start with ``norm="map"`` is the extended Kalman filter on the image.
-    iterations: int = 20
-    multistart: bool = True  # whether to start from the negative and from shifted states as well
-    kept: int = 3  # number of starts that continue after a few iterations
+    iterations: int = 20  # of the search
 
     def __post_init__(self) -> None:
         if self.norm not in NORMS:
             raise ConfigurationError(f"norm: expected one of {', '.join(NORMS)}, found {self.norm!r}")
         require(self.iterations >= 1, f"iterations: expected at least 1, found {self.iterations}")
-        require(self.kept >= 1, f"kept: expected at least 1 start, found {self.kept}")
 
     def step(
         self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
     ) -> tuple[Gaussian, Innovation]:
-        """Correct the predicted state by its frame; see :meth:`.observers.Observer.step`."""
+        """Correct the predicted state by its frame; see :mod:`.observers`."""
         problem = _Problem(model, state, frame, inputs, self.norm)
-        best = problem.start[:, None, :]
-        if self.iterations > 1 or self.norm != "map":
-            starts = _starts(problem.start, problem.cov) if self.multistart else best
-            best = _search(problem, starts, self)
-        return problem.posterior(best[:, 0], state.mean.shape)
+        x = _search(problem, _starts(problem.start, problem.cov), self)[:, 0]
+        # One linear update with the derivative taken at the minimum.
+        residual, derivative, _ = problem.residual(np.arange(len(x)), x)
+        H = np.swapaxes(derivative, -1, -2)
+        linear = residual + np.einsum("fpn,fn->fp", H, x)
+        found, batch = x.reshape(state.mean.shape), state.mean.shape[:-1]
+        prior = state if problem.has_prior else Gaussian(found, state.cov / _WEAK)
+        linear, H = linear.reshape(*batch, -1), H.reshape(*batch, *H.shape[1:])
+        after, innovation = update_information(prior, linear, H, 1.0)
+        return (after if problem.has_prior else Gaussian(found, after.cov)), innovation
 
 
 class _Problem:
@@ -79,7 +79,7 @@ class _Problem:
 
     def __init__(self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike, norm: str) -> None:
         sensor, n, batch = model.sensor, model.motion.order, state.mean.shape[:-1]
-        values = check_inputs(model.motion, state, inputs)
+        values = model.check_inputs(state, inputs)
         image = np.asarray(frame, np.float64)
         if image.shape != (*batch, sensor.pixels.count) or not np.isfinite(image).all():
             raise DataError(f"frame: expected finite {(*batch, sensor.pixels.count)}, found shape {image.shape}")
@@ -123,22 +123,6 @@ class _Problem:
         pull = np.einsum("fab,fb->fa", information, away)
         return cost + (away * pull).sum(-1), right + pull, curvature + information
 
-    def posterior(self, x: Float64Array, shape: tuple[int, ...]) -> tuple[Gaussian, Innovation]:
-        """Gaussian at the minimum: one linear update with the derivative taken there."""
-        residual, derivative, _ = self.residual(np.arange(len(x)), x)
-        H = np.swapaxes(derivative, -1, -2)
-        linear = residual + np.einsum("fpn,fn->fp", H, x)
-        prior = Gaussian(self.start, self.cov) if self.has_prior else Gaussian(x, self.cov / _WEAK)
-        after, innovation = update_information(prior, linear, H, 1.0)
-        mean, batch = after.mean if self.has_prior else x, shape[:-1]
-        fields = (innovation.values, innovation.cov, innovation.normalised_squared, innovation.log_likelihood)
-        values, cov, squared, likelihood = (np.asarray(part).reshape((*batch, *part.shape[1:])) for part in fields)
-        observed = np.broadcast_to(innovation.observed, (len(x),)).reshape(batch)
-        return (
-            Gaussian(mean.reshape(shape), after.cov.reshape((*shape, shape[-1]))),
-            Innovation(values, cov, squared, likelihood, observed),
-        )
-
 
 def _starts(mean: Float64Array, cov: Float64Array) -> Float64Array:
     """Prediction, its negative, and shifts both ways along the axes of the covariance, shape (B, K, n)."""
@@ -152,7 +136,7 @@ def _search(problem: _Problem, starts: Float64Array, settings: ImageFilter) -> F
     """Best minimum of every row, shape (B, 1, n)."""
     powers = _POWERS[settings.norm]
     x, cost, curvature = _descend(problem, starts, powers[0], min(_TRIAL, settings.iterations))
-    order = np.argsort(cost, 1)[:, : settings.kept]
+    order = np.argsort(cost, 1)[:, :_KEPT]
     x, cost = np.take_along_axis(x, order[..., None], 1), np.take_along_axis(cost, order, 1)
     distinct = _distinct(x, np.take_along_axis(curvature, order[..., None, None], 1))
     for power in powers:

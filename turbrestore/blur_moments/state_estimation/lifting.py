@@ -21,13 +21,12 @@ half a period of an oscillation, or an exposure a whole one, so :func:`lift` che
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from ...core.errors import ConfigurationError, DataError, require
+from ...core.errors import ConfigurationError, require
 from ...filtering.kalman import Gaussian, predict
 from ..sensor import ExposureTiming, Float64Array
 
@@ -35,38 +34,6 @@ from ..sensor import ExposureTiming, Float64Array
 _OBSERVABLE = 1e-9
 # In float64 the two eigenvalues of a double root come out about 1e-8 apart.
 _APART = 1e-6
-
-
-class Motion(Protocol):
-    """Interface between systems and observers: :class:`LiftedSystem`, :class:`.augmented.OscillatorMotion`."""
-
-    @property
-    def order(self) -> int:
-        """Number n of states."""
-        ...
-
-    @property
-    def timing(self) -> ExposureTiming:
-        """When the sensor is exposed."""
-        ...
-
-    def path_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Output ŷ at the fast steps of the exposure, and its derivative with respect to the state.
-
-        ``mean`` (..., n); ``inputs`` (..., N); returns ``path`` (..., N_e), ``jacobian`` (..., N_e, n).
-        """
-        ...
-
-    def advance(self, state: Gaussian, inputs: Float64Array) -> Gaussian:
-        """Predict the state at the start of the next exposure."""
-        ...
-
-    def fast_output(self, state: Gaussian, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Output at every fast step of the frame period, within the exposure and until the next one.
-
-        ``inputs`` (..., N); returns ``mean, variance`` (..., N).
-        """
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +83,14 @@ class LiftedSystem:
         """Number n of states."""
         return len(self.C)
 
-    def path_and_jacobian(self, mean: Float64Array, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Output ŷ in the exposure and its derivative; see :meth:`Motion.path_and_jacobian`."""
-        steps = self.timing.exposure_steps
+    def path_and_jacobian(
+        self, mean: Float64Array, inputs: Float64Array, steps: int | None = None
+    ) -> tuple[Float64Array, Float64Array]:
+        """Output ŷ at the first fast steps, by default those of the exposure, and its derivative by the state.
+
+        ``mean`` (..., n); ``inputs`` (..., N); returns ``path`` (..., steps), ``jacobian`` (..., steps, n).
+        """
+        steps = steps or self.timing.exposure_steps
         path = mean @ self.free[:steps].T + inputs[..., :steps] @ self.forced[:steps, :steps].T
         return path, np.broadcast_to(self.free[:steps], (*path.shape, self.order))
 
@@ -126,14 +98,6 @@ class LiftedSystem:
         """Predict the state at the start of the next exposure."""
         ahead = predict(state, self.A, self.Q)
         return Gaussian(ahead.mean + inputs @ self.B.T, ahead.cov)
-
-    def fast_output(self, state: Gaussian, inputs: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Mean and variance of the output at every fast step; see :meth:`Motion.fast_output`.
-
-        The disturbance is added at the end of the frame period, so the variance is that of the state.
-        """
-        mean = state.mean @ self.free.T + inputs @ self.forced.T
-        return mean, np.einsum("in,...nm,im->...i", self.free, state.cov, self.free)
 
 
 def discretise(A: ArrayLike, B: ArrayLike, period: float) -> tuple[Float64Array, Float64Array]:
@@ -200,13 +164,3 @@ def is_observable(A: ArrayLike, C: ArrayLike) -> bool:
         if visible <= _OBSERVABLE * strength:
             return False
     return True
-
-
-def check_inputs(motion: Motion, state: Gaussian, inputs: ArrayLike) -> Float64Array:
-    """Return the inputs of a frame period as float64, after checking that state and inputs belong to a motion."""
-    if state.mean.shape[-1] != motion.order:
-        raise DataError(f"state: expected a mean of shape (..., {motion.order}), found {state.mean.shape}")
-    values, steps = np.asarray(inputs, np.float64), motion.timing.frame_steps
-    if values.ndim < 1 or values.shape[-1] != steps or not np.isfinite(values).all():
-        raise DataError(f"input: expected finite values of shape (..., {steps}), found shape {values.shape}")
-    return values

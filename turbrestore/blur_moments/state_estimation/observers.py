@@ -1,9 +1,9 @@
 """Observers of a fast system behind a slow integrative sensor: fixed gains and filters on moments.
 
 Every observer has one method, ``step(model, state, frame, inputs) -> (state, innovation)``: it corrects the predicted
-state at the start of an exposure by the frame of that exposure.  ``model.motion.advance`` then predicts the state at
-the start of the next exposure, so one loop, :func:`run_observer`, runs all of them.  The observers on the whole image
-are in :mod:`.image_observer`.  Leading axes are batches.
+state at the start of an exposure by the frame of that exposure, ``frame`` (..., count) and ``inputs`` (..., N).
+``model.motion.advance`` then predicts the state at the start of the next exposure, so one loop, :func:`run_observer`,
+runs all of them.  The observers on the whole image are in :mod:`.image_observer`.  Leading axes are batches.
 
 Symbols (paper 1, section V; paper 2, section IV)
 -------------------------------------------------
@@ -24,38 +24,24 @@ has H = 0 at rest: only an input, noise or the unscented form resolves the ambig
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_discrete_are
-from scipy.signal import place_poles
 
 from ...core.errors import ConfigurationError, DataError, require
 from ...filtering.kalman import Gaussian, Innovation, predict, update
 from ..moments import BASES, BlurModel, image_moments, moment_noise, predicted_moments
 from ..sensor import Float64Array
-from .lifting import LiftedSystem, check_inputs
+from .image_observer import ImageFilter
+from .lifting import LiftedSystem
 
-METHODS = ("extended", "iterated", "unscented")
-
-
-class Observer(Protocol):
-    """The interface that :func:`run_observer` calls."""
-
-    def step(
-        self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
-    ) -> tuple[Gaussian, Innovation]:
-        """Correct the predicted state at the start of an exposure by its frame.
-
-        ``frame`` (..., count); ``inputs`` (..., N).
-        """
-        ...
+METHODS = ("extended", "unscented")
 
 
 @dataclass(frozen=True, eq=False)
 class FixedGain:
-    """Luenberger observer on the first moment (paper 2, O1), made by :func:`luenberger` or :func:`steady_kalman`.
+    """Luenberger observer on the first moment (paper 2, O1); :func:`steady_kalman` makes the best one.
 
     The covariance is that of the error for any gain: ``(I − L C) P (I − L C)ᵀ + L R Lᵀ``.
     """
@@ -65,10 +51,11 @@ class FixedGain:
     def step(
         self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
     ) -> tuple[Gaussian, Innovation]:
-        """Correct the predicted state by its frame; see :meth:`Observer.step`."""
+        """Correct the predicted state by its frame."""
         order, size = model.motion.order, np.shape(self.gain)
         require(size == (order,), f"gain: expected shape {(order,)}, found {size}")
-        measured, expected, H, R = _extended_terms(model, state, frame, inputs, MomentFilter((1,)))
+        expected, H, R = predicted_moments(model, state.mean, model.check_inputs(state, inputs), (1,))
+        measured = image_moments(frame, model.sensor.pixels, 1, total=model.sensor.total)[..., 1:]
         # The covariance of the innovation is that of the Kalman update; only the gain differs.
         _, innovation = update(state, measured, H, R, expected)
         F = np.eye(order) - self.gain[:, None] * H
@@ -84,35 +71,28 @@ class MomentFilter:
     # Moments to use: (1,) is the linear Kalman filter, (2,) the second moment only, (1, 2) both.
     orders: tuple[int, ...] = (1, 2)
     basis: str = "monomial"  # or "legendre", whose moments have less noise, see :mod:`.moments`
-    # Linearisation at the prediction, repeated at the estimate ("iterated"), or sigma points ("unscented").
-    method: str = "extended"
-    iterations: int = 5  # of the iterated method
+    method: str = "extended"  # linearisation at the prediction, or sigma points ("unscented")
 
     def __post_init__(self) -> None:
         ascending = all(a < b for a, b in zip((0, *self.orders), self.orders, strict=False))
         require(bool(self.orders) and ascending, f"orders: expected ascending orders from 1, found {self.orders}")
         require(self.basis in BASES, f"basis: expected one of {', '.join(BASES)}, found {self.basis!r}")
         require(self.method in METHODS, f"method: expected one of {', '.join(METHODS)}, found {self.method!r}")
-        require(self.iterations >= 1, f"iterations: expected at least 1, found {self.iterations}")
 
     def step(
         self, model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike
     ) -> tuple[Gaussian, Innovation]:
-        """Correct the predicted state by its frame; see :meth:`Observer.step`."""
-        terms = _sigma_point_terms if self.method == "unscented" else _extended_terms
-        measured, expected, H, R = terms(model, state, frame, inputs, self)
-        after, innovation = update(state, measured, H, R, expected)
-        for _ in range(self.iterations if self.method == "iterated" else 0):
-            h, H, _ = self.predicted(model, after.mean, np.asarray(inputs))
-            expected = h + np.einsum("...mn,...n->...m", H, state.mean - after.mean)
-            after, innovation = update(state, measured, H, R, expected)
-        return after, innovation
+        """Correct the predicted state by its frame."""
+        values, pixels, total = model.check_inputs(state, inputs), model.sensor.pixels, model.sensor.total
+        if self.method == "unscented":
+            expected, H, R = _regressed_moments(model, state, values, self.orders, self.basis)
+        else:
+            expected, H, R = predicted_moments(model, state.mean, values, self.orders, self.basis)
+        measured = image_moments(frame, pixels, max(self.orders), self.basis, total)[..., list(self.orders)]
+        return update(state, measured, H, R, expected)
 
-    def predicted(
-        self, model: BlurModel, mean: Float64Array, inputs: Float64Array
-    ) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Predict the moments of this filter, with H and R; see :func:`.moments.predicted_moments`."""
-        return predicted_moments(model, mean, inputs, self.orders, self.basis)
+
+Observer = FixedGain | MomentFilter | ImageFilter
 
 
 def run_observer(
@@ -130,23 +110,6 @@ def run_observer(
         results.append(observer.step(model, state, frame, given))
         state = model.motion.advance(results[-1][0], given)
     return results
-
-
-def luenberger(motion: LiftedSystem, poles: ArrayLike) -> FixedGain:
-    """Luenberger observer with the given poles of ``A_s − L C_s A_s`` (paper 2, O1).
-
-    ``poles`` (n,).
-    """
-    wanted = np.atleast_1d(np.asarray(poles))
-    require(
-        wanted.shape == (motion.order,) and bool((np.abs(wanted) < 1).all()),
-        f"poles: expected {motion.order} inside the unit circle, found {wanted.tolist()}",
-    )
-    try:
-        placed = place_poles(motion.A.T, (motion.C @ motion.A)[:, None], wanted)
-    except ValueError as error:
-        raise ConfigurationError(f"poles: expected some that one output can place, found {error}") from error
-    return FixedGain(np.asarray(placed.gain_matrix[0], np.float64))
 
 
 def steady_kalman(model: BlurModel) -> tuple[FixedGain, Float64Array]:
@@ -174,22 +137,11 @@ def steady_kalman(model: BlurModel) -> tuple[FixedGain, Float64Array]:
     return FixedGain(gain), np.asarray(cov, np.float64)
 
 
-_Terms = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
-
-
-def _extended_terms(
-    model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike, moments: MomentFilter
-) -> _Terms:
-    """Measured and expected moments, H and R, linearised at the prediction."""
-    values = check_inputs(model.motion, state, inputs)
-    return _measured(model, frame, moments), *moments.predicted(model, state.mean, values)
-
-
-def _sigma_point_terms(
-    model: BlurModel, state: Gaussian, frame: ArrayLike, inputs: ArrayLike, moments: MomentFilter
-) -> _Terms:
-    """Statistical linearisation: regression of the moments on sigma points; R includes the regression residual."""
-    values, n = check_inputs(model.motion, state, inputs), model.motion.order
+def _regressed_moments(
+    model: BlurModel, state: Gaussian, inputs: Float64Array, orders: tuple[int, ...], basis: str
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Moments, H and R by regression of the moments on sigma points; R includes the residual of the regression."""
+    n = model.motion.order
     # n + κ = 3 matches the fourth moments of a Gaussian; κ ≥ 0 keeps the weights non-negative.
     kappa = max(3 - n, 0)
     try:
@@ -200,16 +152,10 @@ def _sigma_point_terms(
     weights = np.full(2 * n + 1, 0.5 / (n + kappa))
     weights[0] = kappa / (n + kappa)
     points = state.mean[..., None, :] + np.swapaxes(offsets, -1, -2)
-    predictions, _, R = moments.predicted(model, points, values[..., None, :])
+    predictions, _, R = predicted_moments(model, points, inputs[..., None, :], orders, basis)
     expected = np.einsum("i,...im->...m", weights, predictions)
     spread = predictions - expected[..., None, :]
     cross = np.einsum("i,...im,...ni->...mn", weights, spread, offsets)
     H = np.swapaxes(np.linalg.solve(state.cov, np.swapaxes(cross, -1, -2)), -1, -2)
     residual = np.einsum("i,...ia,...ib->...ab", weights, spread, spread) - H @ np.swapaxes(cross, -1, -2)
-    R = R + 0.5 * (residual + np.swapaxes(residual, -1, -2))
-    return _measured(model, frame, moments), expected, H, R
-
-
-def _measured(model: BlurModel, frame: ArrayLike, moments: MomentFilter) -> Float64Array:
-    sensor, orders = model.sensor, list(moments.orders)
-    return image_moments(frame, sensor.pixels, max(orders), moments.basis, sensor.total)[..., orders]
+    return expected, H, R + 0.5 * (residual + np.swapaxes(residual, -1, -2))
