@@ -1,4 +1,4 @@
-"""Still images, and animated PNG, WebP and GIF files, by Pillow.
+"""Still images, and animated PNG, WebP and GIF files, by Pillow and imageio.
 
 Pillow reduces 16-bit colour to 8 bits, so OpenCV decodes those images once Pillow has found them whole; TIFF is read by
 :mod:`turbrestore.io.tiff`. The size in the header is checked before anything is decoded.
