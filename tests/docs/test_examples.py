@@ -69,7 +69,7 @@ def test_runs(notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         for figure in figures:
             picture = io.BytesIO()
             # As the documentation shows it.
-            figure.savefig(picture, format="png")
+            figure.savefig(picture, format="png", bbox_inches="tight")
             assert len(picture.getvalue()) < LARGEST_FIGURE
             axes = [ax for ax in figure.axes if ax.axison]
             assert not [ax.get_title() for ax in axes if is_bare(ax.xaxis) or is_bare(ax.yaxis)]
