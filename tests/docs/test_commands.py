@@ -33,8 +33,8 @@ VIDEOS = {
     "moon.fits",
     "clip.npy",
 }
-VIDEOS |= {"night/first.ser", "night/second.ser", "red.ser", "green.ser", "blue.ser", "infrared.ser"}
-FOLDERS = {"flats", "frames"}
+VIDEOS |= {"red.ser", "green.ser", "blue.ser", "infrared.ser"}
+FOLDERS = {"flats"}
 IMAGES = {"photo.png", "mask.png"}
 # Settings that take less time.  Numbers of frames become those of the stand-ins.
 STEPS = ["--deconvolution.iterations", "3", "--quiet"]
@@ -93,15 +93,12 @@ def drop(words, option):
 
 def provide(words, frames):
     """Make the files that a command reads and that no earlier one has made; its third word is what it writes."""
-    for name in {word for index, word in enumerate(words) if index != 2 or words[0] in ("batch", "evaluate")}:
+    for name in {word for index, word in enumerate(words) if index != 2 or words[0] == "evaluate"}:
         path = Path(name)
         if path.exists():
             continue
         if name in VIDEOS:
-            path.parent.mkdir(exist_ok=True)
             save(path, frames)
-        elif name == "night/*.ser":
-            provide(["", "night/first.ser"], frames)
         elif name in FOLDERS:
             path.mkdir()
             for index, frame in enumerate(frames):
