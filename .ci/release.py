@@ -19,6 +19,8 @@ import tempfile
 import venv
 from pathlib import Path
 
+from find_links import find_links
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -31,6 +33,8 @@ def main() -> None:
     version = re.search(r'__version__ = "(.+)"', (ROOT / "turbrestore" / "__init__.py").read_text())[1]
     if options.tag not in (None, f"v{version}"):
         sys.exit(f"release: expected the tag v{version}, found {options.tag}; set the version or the tag right")
+    if links := find_links():
+        os.environ.setdefault("UV_FIND_LINKS", links)
     time = os.environ.get("SOURCE_DATE_EPOCH") or output("git", "log", "-1", "--format=%ct")
     with tempfile.TemporaryDirectory() as folder:
         first, second = (build(Path(folder, name), int(time)) for name in ("first", "second"))

@@ -1,5 +1,6 @@
 """Small synthetic sequences with known motion, shared by several tests."""
 
+import gc
 import os
 import shutil
 import signal
@@ -37,6 +38,16 @@ def browser():
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield browser
         browser.close()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Leave out of the searches for cycles what is imported for good: each would pass through millions of objects."""
+    gc.disable()
+    result = yield
+    gc.freeze()
+    gc.enable()
+    return result
 
 
 @pytest.hookimpl(optionalhook=True)

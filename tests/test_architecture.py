@@ -141,7 +141,7 @@ def test_public_names_load_and_hide_no_module():
 
 def test_the_test_command_of_the_readme_is_what_ci_runs():
     root = PACKAGE.parent
-    commands = (root / ".ci" / "run").read_text().splitlines()
+    commands = [line.strip() for line in (root / ".ci" / "run").read_text().splitlines()]
     assert ".ci/test .venv-ci constraints.txt" in commands
     assert '.venv-ci/bin/python .ci/first_block.py "$fresh"' in commands
     assert "`.ci/test`" in (root / "README.md").read_text()

@@ -156,7 +156,7 @@ def test_the_command_restores_large_frames_in_tiles(tmp_path, monkeypatch, capsy
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
     quick = ["--centroid.iterations=1", "--filter.inner-iterations=1", "--sigma=1"]
-    quick += ["--deconvolution.iterations=4", "--quiet"]
+    quick += ["--deconvolution.iterations=2", "--quiet"]
     limit = f"--memory-limit={least_limit(frames.shape)}"
     assert main(["restore", "clip.npy", "tiled.png", limit, "--json", *quick]) == 0
     assert "tiles of up to" in json.loads(capsys.readouterr().out)["decisions"][0]["choice"]
@@ -207,7 +207,7 @@ def test_a_kept_run_continues_with_another_limit(frames, limited, tmp_path, monk
 
 @pytest.mark.long
 def test_a_limited_run_interrupted_in_the_filter_ends_the_same(tmp_path):
-    frames = make_sequence(seed=52, count=48, size=96, blur=1.0).frames
+    frames = make_sequence(seed=52, count=48, size=64, blur=1.0).frames
     source = FrameSource.from_array(frames)
     (scratch := tmp_path / "scratch").mkdir()
     runtime = replace(TWO, memory_limit=limit_that(frames.shape, in_scratch), scratch=scratch)

@@ -21,7 +21,7 @@ from turbrestore.pipeline import restore
 from turbrestore.results import Restoration
 from turbrestore.settings import RestoreParams
 
-COUNT = 30
+COUNT = 24
 FUSED = RestoreParams(until="filter")
 
 
@@ -247,13 +247,11 @@ class TestRange:
     def test_scale_does_not_matter(self, clip):
         # What is known of the blur does not depend on it; which of two widths loses less may, where they lose alike.
         params = RestoreParams(deconvolution=DeconvolutionParams(sigma=0.8))
-        scores, widths = [], []
-        for k in (1, 0.35, 0.1, 1 / 160):
-            frames = u16(k / 30 + 0.95 * k * clip.frames)
-            scores.append(compare(restore(frames, params).image, clip.scene).psnr_fit)
-            widths.append(restore(frames).posterior.width)
+        clips = [u16(k / 30 + 0.95 * k * clip.frames) for k in (1, 0.35, 0.1, 1 / 160)]
+        scores = [compare(restore(frames, params).image, clip.scene).psnr_fit for frames in clips]
+        widths = [restore(frames).posterior.width for frames in clips[:3]]
         assert np.ptp(scores[1:3]) < 0.1 and np.ptp(scores) < 0.3
-        np.testing.assert_allclose(widths[1:3], widths[:1] * 2, rtol=0.03)
+        np.testing.assert_allclose(widths[1:], widths[:1] * 2, rtol=0.03)
 
     @pytest.mark.parametrize("span", [200, 2000])
     def test_thermal_counts(self, clip, steady, span):

@@ -1,6 +1,9 @@
 """What a release needs: one version, every package and data file in the wheel, a workflow without secrets."""
 
+import os
 import re
+import subprocess
+import sys
 import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
@@ -42,3 +45,15 @@ def test_the_workflow_has_no_secrets_and_writes_nothing():
     assert "secrets." not in text and "password" not in text.replace("no password", "")
     assert re.findall(r"(?m)^ +([\w-]+: write)$", text) == ["id-token: write"]
     assert "python .ci/release.py --tag" in text
+
+
+def test_folders_of_wheels_that_pip_knows_are_named_for_uv(tmp_path):
+    settings = tmp_path / "pip.conf"
+    settings.write_text("[global]\nfind-links =\n    /some/wheels\n    https://wheels.example/more\n")
+    environment = {**os.environ, "PIP_CONFIG_FILE": str(settings), "PIP_FIND_LINKS": "/other /some/wheels"}
+    words = [sys.executable, ROOT / ".ci" / "find_links.py"]
+    found = subprocess.run(words, env=environment, check=True, capture_output=True, text=True).stdout.strip().split(",")
+    assert {"/some/wheels", "https://wheels.example/more", "/other"} <= set(found)
+    assert len(found) == len(set(found))
+    for script in ("test", "run", "release.py"):
+        assert "UV_FIND_LINKS" in (ROOT / ".ci" / script).read_text()

@@ -1,7 +1,7 @@
 """A blur that differs between parts of an image is found and removed; one that does not is taken as one."""
 
 import threading
-from functools import partial
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ WIENER = DeconvolutionParams(method="wiener", exponent=2.0)
 FIRST = GuardParams(ringing=1.0)
 
 
+@cache
 def blurred(name, left, right):
     """Scene, image and true widths: ``left`` up to a quarter, then linearly to ``right`` at three quarters."""
     scene = luminance(SCENES[name](SIDE, SIDE))

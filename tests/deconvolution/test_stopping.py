@@ -109,7 +109,7 @@ def test_change_is_that_of_the_worst_tile_relative_to_the_brightest():
         # The border cuts letters in two.
         ("nltv", "words", 0.002, 128, 160),
         # Bars that the blur has all but extinguished.
-        ("nltv", "chart", 0.002, 192, 360),
+        ("nltv", "chart", 0.002, 128, 320),
         ("tv", "camera", 0.002, 64, 60),
         ("tv", "words", 0.03, 64, 60),
         ("wiener", "words", 0.002, 64, 40),

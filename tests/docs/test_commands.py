@@ -33,26 +33,25 @@ VIDEOS = {
     "moon.fits",
     "clip.npy",
 }
-VIDEOS |= {"night/first.ser", "night/second.ser", "red.ser", "green.ser", "blue.ser", "infrared.ser"}
-FOLDERS = {"flats", "frames"}
+VIDEOS |= {"red.ser", "green.ser", "blue.ser", "infrared.ser"}
+FOLDERS = {"flats"}
 IMAGES = {"photo.png", "mask.png"}
 # Settings that take less time.  Numbers of frames become those of the stand-ins.
 STEPS = ["--deconvolution.iterations", "3", "--quiet"]
 QUICK = {
     "restore": ["--centroid.iterations", "1", "--filter.inner-iterations", "1", *STEPS],
     "register": ["--centroid.iterations", "1", "--filter.inner-iterations", "1", "--quiet"],
-    "batch": ["--centroid.iterations", "1", "--filter.inner-iterations", "1", *STEPS, "--workers", "1"],
     "deconvolve": STEPS,
-    "synthesize": ["--frames", "6", "--quiet"],
+    "synthesize": ["--frames", "4", "--quiet"],
     "steady": ["--frames", "0:4", "--quiet"],
     "moments": ["--seeds", "2"],
 }
-SMALLER = {"--frames": "0:6", "--roi": "0,0,48,48", "--train": "5", "--seeds": "2", "--size": "96x96", "--reach": "2"}
+SMALLER = {"--frames": "0:4", "--roi": "0,0,48,48", "--train": "3", "--seeds": "2", "--size": "96x96", "--reach": "2"}
 # What serves until it is interrupted, or needs a machine that is not there: tests/app and tests/cli start the like.
 ELSEWHERE = re.compile(r"turbrestore (app|sample|--install-completion)\b|--scheduler|--workers|cuda|\||\[")
-# Experiments, which read no file and write none that a page goes on with.  They are understood here, and tests/cli runs
-# them with these options.
-PARSED = {"moments"}
+# What writes no file that a page goes on with is understood here, and run by tests/cli: experiments, and batches, which
+# take processes of their own.
+PARSED = {"moments", "batch"}
 
 
 def parts(page):
@@ -76,14 +75,14 @@ def smaller(line, reports):
         taken = drop(taken, "--report")
     if words[0] == "synthesize":
         is_scene = words[1].isalpha() and words[1] != "centroid"
-        taken += ["--size", "96x96"] if is_scene and "--size" not in words else []
+        taken += ["--size", "72x72"] if is_scene and "--size" not in words else []
         taken = drop(taken, "--frames")
     if words[0] in ("steady", "moments"):
         taken = drop(taken, "--frames" if words[0] == "steady" else "--seeds")
     if words[0] in ("synthesize", "restore"):
         # A page may show two ways to the same file.
         taken.append("--overwrite")
-    blurred = words[0] in ("restore", "batch") and not {"--sigma", "--config"} & set(words)
+    blurred = words[0] == "restore" and not {"--sigma", "--config"} & set(words)
     return [*taken, *QUICK.get(words[0], []), *(["--sigma", "1"] if blurred else [])]
 
 
@@ -94,15 +93,12 @@ def drop(words, option):
 
 def provide(words, frames):
     """Make the files that a command reads and that no earlier one has made; its third word is what it writes."""
-    for name in {word for index, word in enumerate(words) if index != 2 or words[0] in ("batch", "evaluate")}:
+    for name in {word for index, word in enumerate(words) if index != 2 or words[0] == "evaluate"}:
         path = Path(name)
         if path.exists():
             continue
         if name in VIDEOS:
-            path.parent.mkdir(exist_ok=True)
             save(path, frames)
-        elif name == "night/*.ser":
-            provide(["", "night/first.ser"], frames)
         elif name in FOLDERS:
             path.mkdir()
             for index, frame in enumerate(frames):
@@ -124,7 +120,7 @@ def save(path, frames):
 
 @pytest.fixture(scope="module")
 def frames():
-    return open_frames(ROOT / "sample_data" / "chart.mkv", roi=(32, 32, 72, 72)).read(0, 6)
+    return open_frames(ROOT / "sample_data" / "chart.mkv", roi=(32, 32, 72, 72)).read(0, 4)
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ from turbrestore.stacking.placement import settings_of_known_flows
 from turbrestore.synthesis.drawn_scenes import street
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
-SIZE, COUNT = 128, 20
-QUICK = ("--deconvolution.iterations", "20", "--sigma", "0.8", "--quiet")
+SIZE, COUNT = 128, 16
+QUICK = ("--deconvolution.iterations", "5", "--sigma", "0.8", "--quiet")
 
 
 def channels():
@@ -62,9 +62,9 @@ def command(run, folder, *words):
 def test_three_channels_on_one_reference_have_its_geometry(run, folder, monkeypatch):
     monkeypatch.chdir(folder)
     alone = {
-        name: command(run, folder, "restore", f"{name}.npy", f"{name}.tif", "--train", "20") for name in channels()
+        name: command(run, folder, "restore", f"{name}.npy", f"{name}.tif", "--train", "16") for name in channels()
     }
-    command(run, folder, "restore", "red.npy", "kept.tif", "--keep", "run", "--train", "20")
+    command(run, folder, "restore", "red.npy", "kept.tif", "--keep", "run", "--train", "16")
     onto = {"green": "red.tif", "blue": "run"}
     placed = {
         name: command(run, folder, "restore", f"{name}.npy", f"{name}_r.tif", "--reference", onto[name])

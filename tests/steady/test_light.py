@@ -10,7 +10,7 @@ from turbrestore.steady.video import steady_frames
 from turbrestore.steady.windows import coarse_image, light_between, relit
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
-COUNT = 30
+COUNT = 24
 PICTURE = np.float32(skimage.data.coffee()[100:260:2, 200:400:2] / 320)
 
 
