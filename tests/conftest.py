@@ -12,6 +12,7 @@ import pytest
 import skimage.data
 from hypothesis import HealthCheck, settings
 
+from turbrestore.core.arrays import luminance
 from turbrestore.footage.survey import Survey, take_survey
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
@@ -78,8 +79,13 @@ def signals_as_in_the_foreground():
 
 def natural_scene(size: int) -> np.ndarray:
     """The photographer: edges, faint texture, a flat sky."""
-    photo = cv2.resize(skimage.data.camera(), (256, 256), interpolation=cv2.INTER_AREA)
-    return photo[20 : 20 + size, 60 : 60 + size].astype(np.float32) / 255
+    return photograph("camera", 256)[20 : 20 + size, 60 : 60 + size]
+
+
+def photograph(name: str, side: int) -> np.ndarray:
+    """Grey photograph of scikit-image, reduced to a square."""
+    photo = cv2.resize(getattr(skimage.data, name)(), (side, side), interpolation=cv2.INTER_AREA)
+    return luminance(photo.astype(np.float32) / 255)
 
 
 SCENES = {"chart": lambda size: resolution_chart(size, size), "camera": natural_scene}

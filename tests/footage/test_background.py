@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import surveyed
+from conftest import photograph, surveyed
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.footage.passers import without_passers
 from turbrestore.metrics import compare
@@ -16,6 +16,7 @@ from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
 from turbrestore.synthesis.moving_objects import draw_objects
 from turbrestore.synthesis.scenes import SCENES
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 COUNT, SIDE = 40, 128
 
@@ -70,6 +71,14 @@ def test_a_window_of_a_frame_is_cleaned_as_the_whole_frame_is():
 @pytest.mark.parametrize("scene", ["camera", "chart", "brick"])
 def test_turbulence_passes_for_nothing(scene):
     survey = surveyed(clip(scene, d_over_r0=5.0)[1])
+    assert without_passers(survey) == (survey.clip, ())
+
+
+@pytest.mark.parametrize("scene", ["coffee", "page"])
+def test_frames_that_are_bent_by_many_pixels_pass_for_nothing(scene):
+    rng = np.random.default_rng(1)
+    moved = smooth_flows(25, 160, 160, rng, SmoothFlowParams(rms=4.0))
+    survey = surveyed(distort(photograph(scene, 160), moved, rng, blur=1.2, noise=0.01))
     assert without_passers(survey) == (survey.clip, ())
 
 

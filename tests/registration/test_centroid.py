@@ -1,9 +1,10 @@
 import threading
 
+import cv2
 import numpy as np
 import pytest
 
-from conftest import natural_scene
+from conftest import natural_scene, photograph
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.metrics import psnr
 from turbrestore.registration import centroid, flow
@@ -15,6 +16,7 @@ from turbrestore.registration.centroid import (
     mean_registered,
 )
 from turbrestore.registration.flow import FlowParams
+from turbrestore.registration.flow_algebra import invert_flow
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.scratch import to_scratch
@@ -25,8 +27,6 @@ INSIDE = (slice(12, -12), slice(12, -12))
 
 
 def blurred_truth(sequence):
-    import cv2
-
     return cv2.GaussianBlur(sequence.scene, (0, 0), 1.0)[INSIDE]
 
 
@@ -37,6 +37,21 @@ def test_fused_centroid_beats_the_mean_and_one_warped_frame(sequence):
     mean = psnr(sequence.frames.mean(axis=0)[INSIDE], truth)
     assert psnr(single.image[INSIDE], truth) > mean + 1
     assert psnr(fused.image[INSIDE], truth) > psnr(single.image[INSIDE], truth) + 0.5
+
+
+def test_flows_are_searched_for_anew_where_displacements_are_large():
+    scene, rng = photograph("text", 200), np.random.default_rng(1)
+    moved = smooth_flows(12, 200, 200, rng, SmoothFlowParams(rms=5.0))
+    frames = distort(scene, moved, rng, blur=1.2, noise=0.01)
+    truth = cv2.GaussianBlur(warp(scene, invert_flow(moved.mean(axis=0))), (0, 0), 1.2)[INSIDE]
+    found, once = (find_centroid(frames, CentroidParams(iterations=count)) for count in (8, 2))
+    assert psnr(found.image[INSIDE], truth) > psnr(once.image[INSIDE], truth) + 2
+    # Two iterations are enough where detail is as wide as the displacement.
+    sharp, soft = (distort(scene, 0.7 * moved, rng, blur, 0.01) for blur in (1.2, 4.0))
+    assert [len(find_centroid(some, CentroidParams(tolerance=5.0)).mean_flow_sizes) > 2 for some in (sharp, soft)] == [
+        True,
+        False,
+    ]
 
 
 def test_mean_flow_shrinks(sequence):

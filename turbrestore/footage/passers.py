@@ -3,13 +3,14 @@
 Symbols
 -------
 m, v : median of the frames at every place of the scene; squared median deviation, scaled to a variance
+r : reach of the turbulence, pixels: three standard deviations of the displacement, and at least 4
 d : squared deviation of a frame from m, averaged in a Gaussian window
 e : distance of a frame from the range that m has nearby
 
-Turbulence bends edges by a few pixels, so v is large beside edges.  A pixel belongs to what passes where d exceeds the
-largest v around it several times, over an area that holds a disc of 15 pixels.  Flakes and streaks are smaller, but
-bending never leaves the range of the scene nearby, so they are where e² exceeds v several times; this counts if it is
-so in more of the frames than turbulence explains, and what is left, the alternating filter leaves out
+Turbulence bends edges, so v is large beside edges.  A pixel belongs to what passes where d exceeds the largest v within
+r several times, over an area that holds a disc of 15 pixels.  Flakes and streaks are smaller, but bending never leaves
+the range of the scene within r, so they are where e² exceeds v several times; this counts if it is so in more of the
+frames than turbulence explains, and what is left, the alternating filter leaves out
 (:mod:`turbrestore.filtering.frame_noise`).  Such pixels are replaced by the mean of the frames that show the background
 there.  The mean is less sharp than a frame and weighs little in the filter, but flow is no longer pulled along by what
 passes.
@@ -21,6 +22,7 @@ compared at the place of the scene that they show, to whole pixels.  What no fra
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -32,6 +34,7 @@ from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
+from ..registration.opencv_flow import DisParams, dis_solver
 from ..runtime.scratch import iter_frames
 from .survey import Placement, Survey, reduced, spread, within
 
@@ -40,15 +43,17 @@ _SAMPLES, _FEWEST, _ROWS = 25, 9, 64
 _MEDIAN_DEVIATION = 1.4826
 # d counts from the first times the sum of v and the square of the second; windows of d and of v, pixels.
 _EXCEEDS, _LEAST_DEVIATION = 8.0, 0.01
-_WINDOW, _USUAL_WINDOW, _USUAL_REACH = 1.5, 3.0, 4
+_WINDOW, _USUAL_WINDOW = 1.5, 3.0
+# Least r, and r in standard deviations of the displacement; the scene nearby, for e, ends a pixel before r.
+_REACH, _REACHED = 4, 3.0
 # Radii of the gaps that are closed, of the discs that must fit, and of the surroundings that are replaced too, pixels.
 _GAP, _DISC, _AROUND = 2, 7, 3
 # Standard deviation of the transition between frame and background, pixels.
 _FADE = 1.5
 # The same for what is small: e² counts from the first times the sum of a quarter of v, for e is measured in a window,
-# and the square of the least deviation; windows of e and of v, radius of what is nearby, and the transition, pixels.
+# and the square of the least deviation; windows of e and of v, and the transition, pixels.
 _SMALL_EXCEEDS, _SMALL_SHARE, _SLIGHTLY = 9.0, 0.25, 0.2
-_SMALL_WINDOW, _SMALL_USUAL_WINDOW, _NEARBY, _SMALL_FADE = 0.8, 1.5, 3, 0.7
+_SMALL_WINDOW, _SMALL_USUAL_WINDOW, _SMALL_FADE = 0.8, 1.5, 0.7
 # Least share of the frames that is small, which strong turbulence over fine detail reaches by two thirds, and that of
 # what is brighter than the scene nearby, or darker, among it.
 _LEAST_SMALL, _ONE_SIDED = 0.06, 0.75
@@ -91,7 +96,7 @@ class Background:
 
 @dataclass(frozen=True, eq=False)
 class _Usual:
-    """The median, what frames do not exceed where nothing passes (d, the range, e² or None), and the mean of v."""
+    """The median, what frames do not exceed where nothing passes (d, the range, e² or None), the mean of v, and r."""
 
     median: FloatArray
     deviation: FloatArray
@@ -99,10 +104,11 @@ class _Usual:
     high: FloatArray
     excess: FloatArray | None
     spread: float
+    reach: int
 
     def at(self, place: Window) -> _Usual:
         parts = (self.median[place], self.deviation[place], self.low[place], self.high[place])
-        return _Usual(*parts, None if self.excess is None else self.excess[place], self.spread)
+        return _Usual(*parts, None if self.excess is None else self.excess[place], self.spread, self.reach)
 
     def of_large(self) -> _Usual:
         return dataclasses.replace(self, excess=None)
@@ -136,6 +142,9 @@ def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
     still = Placement(dict.fromkeys(source.numbers, (0, 0)), (source.shape[1], source.shape[2]))
     usual = _usual(stack, numbers, still)
     found = _passed_by(stack, numbers, usual, still)
+    reach = _REACH if found is None else math.ceil(_REACHED * _displacement(stack))
+    if reach > _REACH:
+        found = _passed_by(stack, numbers, _usual(stack, numbers, still, reach=reach), still)
     if found is not None:
         return found, still
     if not _moves(_shifts(_reduced(map(_grey, stack), stack.shape), stack.shape)):
@@ -168,6 +177,19 @@ def _grey(plane: NDArray[np.uint8]) -> FloatArray:
     return plane.astype(np.float32) / np.float32(255)
 
 
+def _displacement(stack: NDArray[np.uint8]) -> float:
+    """Return the standard deviation of a component of the displacement, pixels, by flows between distant frames.
+
+    What passes covers less than half of the frames, so the median length of a flow is that of the scene.
+    """
+    half, lengths = len(stack) // 2, []
+    for early, late in zip(stack[:half], stack[-half:], strict=True):
+        (flow,) = dis_solver(DisParams(), early)(late[None], [None], True)
+        lengths.append(np.hypot(*np.moveaxis(flow - np.median(flow, axis=(0, 1)), -1, 0)))
+    # Both frames are displaced, by normal numbers.
+    return float(np.median(lengths) / np.sqrt(2 * 2 * np.log(2)))
+
+
 def _passed_by(stack: NDArray[np.uint8], numbers: Sequence[int], usual: _Usual, placement: Placement) -> _Usual | None:
     """Return what tells what passes in a sample; None where nothing does, or so much that it is the scene."""
     parts = [usual.at(placement.place(number)) for number in numbers]
@@ -177,7 +199,7 @@ def _passed_by(stack: NDArray[np.uint8], numbers: Sequence[int], usual: _Usual, 
         usual, parts, masks = usual.of_large(), [part.of_large() for part in parts], large
     else:
         # Rain widens the spread of the frames, under which some of it hides.
-        usual = _usual(stack, numbers, placement, masks)
+        usual = _usual(stack, numbers, placement, masks, usual.reach)
         parts = [usual.at(placement.place(number)) for number in numbers]
         masks = [_passing(_grey(plane), part) for plane, part in zip(stack, parts, strict=True)]
     touched, share = np.mean([(mask > 0).mean() for mask in masks]), np.mean([mask.mean() / 255 for mask in masks])
@@ -222,6 +244,7 @@ def _usual(
     numbers: Sequence[int],
     placement: Placement,
     masks: Sequence[NDArray[np.uint8]] | None = None,
+    reach: int = _REACH,
 ) -> _Usual:
     """Median over the frames at every place of the scene, and the values that are not exceeded where nothing passes.
 
@@ -247,16 +270,16 @@ def _usual(
         seen[rows] = np.isfinite(values).sum(axis=0) >= _FEWEST
         median[rows] = _median(values)
         variance[rows] = (_MEDIAN_DEVIATION * _median(np.abs(values - median[rows]))) ** 2
-    around = np.ones((2 * _USUAL_REACH + 1,) * 2, np.uint8)
+    around = np.ones((2 * reach + 1,) * 2, np.uint8)
     least, known = np.float32(_LEAST_DEVIATION**2), cv2.erode(seen, around) > 0
     deviation = cv2.dilate(cv2.GaussianBlur(variance, (0, 0), _USUAL_WINDOW), around) + least
     excess = np.float32(_SMALL_SHARE) * cv2.GaussianBlur(variance, (0, 0), _SMALL_USUAL_WINDOW) + least
     deviation, excess = (
         np.where(known, some, np.float32(np.inf)) for some in (_EXCEEDS * deviation, _SMALL_EXCEEDS * excess)
     )
-    smooth, nearby = cv2.GaussianBlur(median, (0, 0), _SMALL_WINDOW), _disc(_NEARBY)
+    smooth, nearby = cv2.GaussianBlur(median, (0, 0), _SMALL_WINDOW), _disc(reach - 1)
     spread = float(variance[seen > 0].mean()) if seen.any() else np.inf
-    return _Usual(median, deviation, cv2.erode(smooth, nearby), cv2.dilate(smooth, nearby), excess, spread)
+    return _Usual(median, deviation, cv2.erode(smooth, nearby), cv2.dilate(smooth, nearby), excess, spread, reach)
 
 
 def _median(values: FloatArray) -> FloatArray:

@@ -7,17 +7,18 @@ W_i : flow from q to frame I_i; W̄ their mean (eq. 12), which vanishes at the c
 V : inverse flow, ``(id + V) = (id + W̄)^{-1}``
 
 The paper warps q by the mean flow, and repeats.  The image moves *with* the mean flow, so backward warping needs the
-inverse, which the paper leaves open: ``q ← q ∘ (id + W̄)^{-1}``.  There are two departures from the paper: flows are
-composed and frames are interpolated once, where the paper warps the warped image again in every iteration; and
-``fused`` (the default) averages all registered frames, where the paper (``single``) keeps one warped frame with all of
-its noise.
+inverse, which the paper leaves open: ``q ← q ∘ (id + W̄)^{-1}``.  There are three departures from the paper: flows are
+composed and frames are interpolated once, where the paper warps the warped image again in every iteration; ``fused``
+(the default) averages all registered frames, where the paper (``single``) keeps one warped frame with all of its noise;
+and where displacements are large, flows are also searched for anew.  A flow to a blurred reference is wrong in places,
+and one that starts from it stays wrong there.  So every other iteration is a draft without a start, of which each frame
+keeps what fits it better than the flow that it has.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from functools import partial
 from itertools import repeat
 from typing import TYPE_CHECKING, Literal
 
@@ -25,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_frames
+from ..core.arrays import FloatArray, check_frames, luminance
 from ..core.errors import require, require_between
 from ..display.maps import plot_displacements
 from ..display.preview import preview
@@ -34,7 +35,7 @@ from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
 from ..runtime.steps import finish
 from ..runtime.threads import map_ahead, sum_in_threads
 from .camera.stabilisation import mean_stabilised
-from .flow import FlowFrame, FlowParams, measure_flows, prepare_reference
+from .flow import FlowFrame, FlowParams, measure_flows, normalise_contrast, prepare_reference
 from .flow_algebra import compose_flows, invert_flow
 from .warp import inside, warp
 
@@ -48,6 +49,14 @@ _STALLED = 0.8
 _DIVERGED = 1.25
 # Weight of a sample of the repeated border, where a sample inside the frame has 1.
 _UNSEEN = 1e-3
+# Root mean square of one component of the displacement above which flows are searched for anew: a quarter of the side
+# of a matched patch, pixels, and half the distance over which the detail of the image changes by its deviation.  Within
+# either, a search at full resolution finds its way back.
+_FAR, _FAR_OF_DETAIL = 2.0, 0.5
+# New flows that leave more than this share of the misfit of the frames are the last ones.
+_EXHAUSTED = 0.97
+# Deviation of the window in which two flows of a frame are compared, pixels.
+_COMPARED = 4.0
 
 
 @dataclass(frozen=True)
@@ -63,7 +72,8 @@ class CentroidParams:
     tolerance : float
         Stop when the mean flow is shorter than this, pixels (mean over the image), or shrinks by less than a fifth;
         stop without convergence when it grows by more than a quarter.  ``fused`` runs at least two iterations, because
-        it starts from the temporal mean, which is a blurred reference.
+        it starts from the temporal mean, which is a blurred reference; where displacements are large, it runs until the
+        misfit of the registered frames falls by less than 3 %.
         The mean flow that remains is the bias of the flow method; correcting it would bend the image.
     start : int
         Frame that ``single`` warps; ``fused`` starts from the temporal mean, of stabilised frames if
@@ -71,7 +81,7 @@ class CentroidParams:
     """
 
     mode: Literal["fused", "single"] = "fused"
-    iterations: int = 5
+    iterations: int = 8
     tolerance: float = 0.15
     start: int = 0
 
@@ -96,7 +106,8 @@ class Centroid:
         Mean length of W̄ in each iteration, pixels.  All but the last have been corrected, and the last too if the
         iteration has not converged.
     converged : bool
-        Whether the last length is below the tolerance, or neither shrank nor grew.
+        Whether the last length is below the tolerance, or neither shrank nor grew; where flows were searched for anew,
+        whether this found nothing more.
     """
 
     image: FloatArray
@@ -195,12 +206,16 @@ def centroid_steps(
     flows = new_stack((*stack.shape[:3], 2), runtime.scratch)
     prepared: list[FlowFrame] = []
     sizes: list[float] = []
+    misfits: list[float] = []
+    fused, far = params.mode == "fused", False
     while True:
         # The first image is a blurred mean, and does not deserve flows at full resolution.
-        draft = not sizes and params.mode == "fused" and params.iterations > 1
-        starts = iter_frames(flows) if sizes else repeat(None)
+        draft = fused and params.iterations > 1 and (not sizes or (far and len(sizes) % 2 == 0))
+        starts = repeat(None) if draft or not sizes else iter_frames(flows)
         reference = prepare_reference(image, flow_params, runtime)
         solved = measure_flows(reference, prepared or iter_frames(stack), starts, draft)
+        if draft and sizes:
+            solved = _better_flows(image, solved, iter_frames(flows), runtime.threads)
         # Prepared frames are kept for the next iteration, unless memory is so short that stacks are in files.
         keep = runtime.scratch is None and not prepared
         for number, (frame, flow) in enumerate(solved):
@@ -212,20 +227,68 @@ def centroid_steps(
         mean_flow = mean_of(flows)  # W̄, eq. 12
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
         change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
+        if fused and len(sizes) == 2:
+            far = _displacement(flows) > max(_FAR, _FAR_OF_DETAIL * _detail_length(image))
         # The temporal mean is a blurred reference, so flow is measured from the first registered mean in any case.
-        settled = len(sizes) > 1 or params.mode == "single" or params.iterations == 1
-        converged = (sizes[-1] <= params.tolerance and settled) or _STALLED < change <= _DIVERGED
+        settled = not far and (len(sizes) > 1 or not fused or params.iterations == 1)
+        converged = settled and (sizes[-1] <= params.tolerance or _STALLED < change <= _DIVERGED)
         if not converged:
             recentre = invert_flow(mean_flow)  # V
-            total = compose_flows(total, recentre) if params.mode == "single" else total
-            onto_new = partial(compose_flows, inner=recentre)
-            for flow, moved in map_ahead(onto_new, iter_frames(flows), runtime.threads):
-                flow[...] = moved
-                drop_pages(flows)
+            total = total if fused else compose_flows(total, recentre)
+            _recentre(flows, recentre, runtime.threads)
         # q ← q ∘ (id + W̄)⁻¹.
-        image = mean_registered(stack, flows, runtime) if params.mode == "fused" else warp(stack[params.start], total)
-        if converged or change > _DIVERGED or len(sizes) == params.iterations:
+        image = mean_registered(stack, flows, runtime) if fused else warp(stack[params.start], total)
+        if far and not draft:
+            misfits.append(_mean_misfit(image, stack, flows, runtime.threads))
+            converged = len(misfits) > 1 and misfits[-1] > _EXHAUSTED * misfits[-2]
+        if converged or (change > _DIVERGED and not far) or len(sizes) == params.iterations:
             return Centroid(image, flows, np.array(sizes), converged)
+
+
+def _displacement(flows: FloatArray) -> float:
+    """Return the root mean square of one component of the flows, pixels, without the motion of whole frames."""
+    return float(np.sqrt(np.mean([np.var(flow, axis=(0, 1)).mean() for flow in iter_frames(flows)])))
+
+
+def _detail_length(image: FloatArray) -> float:
+    """Return the distance, pixels, over which the contrast of an image changes by its standard deviation."""
+    contrast = normalise_contrast(image, FlowParams().contrast_window)
+    slope = float(np.square(np.gradient(contrast)).sum(axis=0).mean())
+    return float(np.sqrt(2 * contrast.var() / slope)) if slope > 0 else np.inf
+
+
+def _better_flows(
+    image: FloatArray, solved: Iterator[tuple[FlowFrame, FloatArray]], flows: Iterator[FloatArray], threads: int
+) -> Iterator[tuple[FlowFrame, FloatArray]]:
+    """Take new flows in those parts of a frame that they bring closer to the image than the flows so far."""
+    grey = luminance(image)
+
+    def merge(pair: tuple[tuple[FlowFrame, FloatArray], FloatArray]) -> tuple[FlowFrame, FloatArray]:
+        (frame, new), old = pair
+        seen = luminance(frame.image)
+        squares = (np.square(warp(seen, flow) - grey) for flow in (new, old))
+        misfit, former = (cv2.GaussianBlur(square, (0, 0), _COMPARED) for square in squares)
+        share = cv2.GaussianBlur((misfit < former).astype(np.float32), (0, 0), _COMPARED)[..., None]
+        return frame, old + share * (new - old)
+
+    return (merged for _, merged in map_ahead(merge, zip(solved, flows, strict=True), threads))
+
+
+def _mean_misfit(image: FloatArray, frames: FloatArray, flows: FloatArray, threads: int) -> float:
+    """Return the mean squared difference of the registered frames from the image."""
+
+    def misfit(pair: tuple[FloatArray, FloatArray]) -> float:
+        return float(np.square(warp(*pair) - image).mean())
+
+    pairs = zip(iter_frames(frames), iter_frames(flows), strict=True)
+    return float(np.mean([found for _, found in map_ahead(misfit, pairs, threads)]))
+
+
+def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:
+    """Compose flows with ``recentre``, in place, so that they start from the recentred image."""
+    for flow, moved in map_ahead(lambda flow: compose_flows(flow, recentre), iter_frames(flows), threads):
+        flow[...] = moved
+        drop_pages(flows)
 
 
 def mean_registered(frames: FloatArray, flows: FloatArray, runtime: Runtime = DEFAULT) -> FloatArray:
