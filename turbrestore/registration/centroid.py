@@ -17,7 +17,7 @@ keeps what fits it better than the flow that it has.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import repeat
 from typing import TYPE_CHECKING, Literal
@@ -53,6 +53,9 @@ _UNSEEN = 1e-3
 # of a matched patch, pixels, and half the distance over which the detail of the image changes by its deviation.  Within
 # either, a search at full resolution finds its way back.
 _FAR, _FAR_OF_DETAIL = 2.0, 0.5
+# Share of the variance of the frames that flows leave at most where displacement makes it: on water whose waves shine
+# they leave more than half, in turbulence less than a third.
+_LEFT = 0.4
 # New flows that leave more than this share of the misfit of the frames are the last ones.
 _EXHAUSTED = 0.97
 # Deviation of the window in which two flows of a frame are compared, pixels.
@@ -227,8 +230,6 @@ def centroid_steps(
         mean_flow = mean_of(flows)  # W̄, eq. 12
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
         change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
-        if fused and len(sizes) == 2:
-            far = _displacement(flows) > max(_FAR, _FAR_OF_DETAIL * _detail_length(image))
         # The temporal mean is a blurred reference, so flow is measured from the first registered mean in any case.
         settled = not far and (len(sizes) > 1 or not fused or params.iterations == 1)
         converged = settled and (sizes[-1] <= params.tolerance or _STALLED < change <= _DIVERGED)
@@ -238,16 +239,23 @@ def centroid_steps(
             _recentre(flows, recentre, runtime.threads)
         # q ← q ∘ (id + W̄)⁻¹.
         image = mean_registered(stack, flows, runtime) if fused else warp(stack[params.start], total)
+        if fused and len(sizes) == 2:
+            far = _is_displaced_far(image, stack, flows, runtime.threads)
         if far and not draft:
-            misfits.append(_mean_misfit(image, stack, flows, runtime.threads))
+            misfits.append(_mean_misfit(image, stack, iter_frames(flows), runtime.threads))
             converged = len(misfits) > 1 and misfits[-1] > _EXHAUSTED * misfits[-2]
         if converged or (change > _DIVERGED and not far) or len(sizes) == params.iterations:
             return Centroid(image, flows, np.array(sizes), converged)
 
 
-def _displacement(flows: FloatArray) -> float:
-    """Return the root mean square of one component of the flows, pixels, without the motion of whole frames."""
-    return float(np.sqrt(np.mean([np.var(flow, axis=(0, 1)).mean() for flow in iter_frames(flows)])))
+def _is_displaced_far(image: FloatArray, frames: FloatArray, flows: FloatArray, threads: int) -> bool:
+    """Tell whether the flows explain the differences of the frames, and lead so far that some of them may be wrong."""
+    # Without the motion of whole frames.
+    displacement = np.sqrt(np.mean([np.var(flow, axis=(0, 1)).mean() for flow in iter_frames(flows)]))
+    if displacement <= max(_FAR, _FAR_OF_DETAIL * _detail_length(image)):
+        return False
+    spread = _mean_misfit(mean_of(frames), frames, repeat(np.zeros_like(flows[0])), threads)
+    return _mean_misfit(image, frames, iter_frames(flows), threads) < _LEFT * spread
 
 
 def _detail_length(image: FloatArray) -> float:
@@ -274,13 +282,13 @@ def _better_flows(
     return (merged for _, merged in map_ahead(merge, zip(solved, flows, strict=True), threads))
 
 
-def _mean_misfit(image: FloatArray, frames: FloatArray, flows: FloatArray, threads: int) -> float:
+def _mean_misfit(image: FloatArray, frames: FloatArray, flows: Iterable[FloatArray], threads: int) -> float:
     """Return the mean squared difference of the registered frames from the image."""
 
     def misfit(pair: tuple[FloatArray, FloatArray]) -> float:
         return float(np.square(warp(*pair) - image).mean())
 
-    pairs = zip(iter_frames(frames), iter_frames(flows), strict=True)
+    pairs = zip(iter_frames(frames), flows, strict=False)
     return float(np.mean([found for _, found in map_ahead(misfit, pairs, threads)]))
 
 
