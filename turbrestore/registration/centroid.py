@@ -3,7 +3,7 @@
 Symbols
 -------
 q : current estimate of the centroid
-W_i : flow from q to frame I_i; W̄ their mean (eq. 12), which vanishes at the centroid
+W_i : flow from q to frame I_i; ``W̄ = (1/N) Σ W_i`` (eq. 12), which vanishes at the centroid
 V : inverse flow, ``(id + V) = (id + W̄)^{-1}``
 
 The paper warps q by the mean flow, and repeats.  The image moves *with* the mean flow, so backward warping needs the
@@ -11,13 +11,13 @@ inverse, which the paper leaves open: ``q ← q ∘ (id + W̄)^{-1}``.  There ar
 composed and frames are interpolated once, where the paper warps the warped image again in every iteration; ``fused``
 (the default) averages all registered frames, where the paper (``single``) keeps one warped frame with all of its noise;
 and where displacements are large, flows are also searched for anew.  A flow to a blurred reference is wrong in places,
-and one that starts from it stays wrong there.  So every other iteration is a draft without a start, of which each frame
-keeps what fits it better than the flow that it has.
+and one that starts from it stays wrong there.  So every other iteration measures draft flows from scratch, and each
+frame keeps them where they fit better than its current flow.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from itertools import repeat
 from typing import TYPE_CHECKING, Literal
@@ -31,7 +31,7 @@ from ..core.errors import require, require_between
 from ..display.maps import plot_displacements
 from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
-from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
+from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack, variance_of
 from ..runtime.steps import finish
 from ..runtime.threads import map_ahead, sum_in_threads
 from .camera.stabilisation import mean_stabilised
@@ -51,7 +51,7 @@ _DIVERGED = 1.25
 _UNSEEN = 1e-3
 # Root mean square of one component of the displacement above which flows are searched for anew: a quarter of the side
 # of a matched patch, pixels, and half the distance over which the detail of the image changes by its deviation.  Within
-# either, a search at full resolution finds its way back.
+# either distance, a search at full resolution recovers.
 _FAR, _FAR_OF_DETAIL = 2.0, 0.5
 # Share of the variance of the frames that flows leave at most where displacement makes it: on water whose waves shine
 # they leave more than half, in turbulence less than a third.
@@ -107,7 +107,7 @@ class Centroid:
         Flows from the centroid to each frame, pixels.
     mean_flow_sizes : ndarray, float64, shape (iterations,)
         Mean length of W̄ in each iteration, pixels.  All but the last have been corrected, and the last too if the
-        iteration has not converged.
+        iteration has not converged, or if flows were searched for anew.
     converged : bool
         Whether the last length is below the tolerance, or neither shrank nor grew; where flows were searched for anew,
         whether this found nothing more.
@@ -213,7 +213,8 @@ def centroid_steps(
     fused, far = params.mode == "fused", False
     while True:
         # The first image is a blurred mean, and does not deserve flows at full resolution.
-        draft = fused and params.iterations > 1 and (not sizes or (far and len(sizes) % 2 == 0))
+        last = len(sizes) + 1 == params.iterations
+        draft = fused and not last and (not sizes or (far and len(sizes) % 2 == 0))
         starts = repeat(None) if draft or not sizes else iter_frames(flows)
         reference = prepare_reference(image, flow_params, runtime)
         solved = measure_flows(reference, prepared or iter_frames(stack), starts, draft)
@@ -239,28 +240,26 @@ def centroid_steps(
             _recentre(flows, recentre, runtime.threads)
         # q ← q ∘ (id + W̄)⁻¹.
         image = mean_registered(stack, flows, runtime) if fused else warp(stack[params.start], total)
-        if fused and len(sizes) == 2:
-            far = _is_displaced_far(image, stack, flows, runtime.threads)
         if far and not draft:
-            misfits.append(_mean_misfit(image, stack, iter_frames(flows), runtime.threads))
+            misfits.append(_mean_misfit(image, stack, flows, runtime.threads))
             converged = len(misfits) > 1 and misfits[-1] > _EXHAUSTED * misfits[-2]
-        if converged or (change > _DIVERGED and not far) or len(sizes) == params.iterations:
+        elif fused and len(sizes) == 2 and not last and _is_displaced_far(image, flows, flow_params.contrast_window):
+            misfits.append(_mean_misfit(image, stack, flows, runtime.threads))
+            far = misfits[0] < _LEFT * float(variance_of(stack).mean())
+            converged = converged and not far
+        if converged or (change > _DIVERGED and not far) or last:
             return Centroid(image, flows, np.array(sizes), converged)
 
 
-def _is_displaced_far(image: FloatArray, frames: FloatArray, flows: FloatArray, threads: int) -> bool:
-    """Tell whether the flows explain the differences of the frames, and lead so far that some of them may be wrong."""
-    # Without the motion of whole frames.
+def _is_displaced_far(image: FloatArray, flows: FloatArray, window: float) -> bool:
+    """Tell whether flows lead so far, without the motion of whole frames, that some of them may be wrong."""
     displacement = np.sqrt(np.mean([np.var(flow, axis=(0, 1)).mean() for flow in iter_frames(flows)]))
-    if displacement <= max(_FAR, _FAR_OF_DETAIL * _detail_length(image)):
-        return False
-    spread = _mean_misfit(mean_of(frames), frames, repeat(np.zeros_like(flows[0])), threads)
-    return _mean_misfit(image, frames, iter_frames(flows), threads) < _LEFT * spread
+    return bool(displacement > max(_FAR, _FAR_OF_DETAIL * _detail_length(image, window)))
 
 
-def _detail_length(image: FloatArray) -> float:
-    """Return the distance, pixels, over which the contrast of an image changes by its standard deviation."""
-    contrast = normalise_contrast(image, FlowParams().contrast_window)
+def _detail_length(image: FloatArray, window: float) -> float:
+    """Return the distance, pixels, over which an image, as the flow sees it, changes by its standard deviation."""
+    contrast = normalise_contrast(image, window) if window > 0 else luminance(image)
     slope = float(np.square(np.gradient(contrast)).sum(axis=0).mean())
     return float(np.sqrt(2 * contrast.var() / slope)) if slope > 0 else np.inf
 
@@ -282,13 +281,13 @@ def _better_flows(
     return (merged for _, merged in map_ahead(merge, zip(solved, flows, strict=True), threads))
 
 
-def _mean_misfit(image: FloatArray, frames: FloatArray, flows: Iterable[FloatArray], threads: int) -> float:
+def _mean_misfit(image: FloatArray, frames: FloatArray, flows: FloatArray, threads: int) -> float:
     """Return the mean squared difference of the registered frames from the image."""
 
     def misfit(pair: tuple[FloatArray, FloatArray]) -> float:
         return float(np.square(warp(*pair) - image).mean())
 
-    pairs = zip(iter_frames(frames), flows, strict=False)
+    pairs = zip(iter_frames(frames), iter_frames(flows), strict=True)
     return float(np.mean([found for _, found in map_ahead(misfit, pairs, threads)]))
 
 
