@@ -33,9 +33,11 @@ REQUIRED = {
     "cv2": "opencv-contrib-python-headless",
     "skimage": "scikit-image",
     "PIL": "pillow",
+    "imageio": "imageio",
     "av": "av",
     "tifffile": "tifffile",
     "imagecodecs": "imagecodecs",
+    "msgspec": "msgspec",
     "numba": "numba",
     "threadpoolctl": "threadpoolctl",
 }

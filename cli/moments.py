@@ -9,6 +9,7 @@ from typing import Any
 from turbrestore.blur_moments.experiments.comparison import Experiment
 from turbrestore.blur_moments.experiments.comparison import mirror as run_mirror
 from turbrestore.blur_moments.experiments.comparison import wavefront as run_wavefront
+from turbrestore.blur_moments.experiments.scenarios import SLOPE_DISTURBANCE
 from turbrestore.core.errors import require_between
 
 from .options import Flag
@@ -19,7 +20,7 @@ from .streams import flush
 _MOST_SEEDS = 100_000
 
 
-def wavefront(*, seeds: int = 200, slope_disturbance: float = 0.038, json: Flag = False) -> None:
+def wavefront(*, seeds: int = 200, slope_disturbance: float = SLOPE_DISTURBANCE, json: Flag = False) -> None:
     """Compare observers of a wavefront slope behind a slow sensor (paper 1).
 
     Parameters

@@ -48,7 +48,7 @@ def settings_file(app: App, commands: tuple[str, ...], arguments: ArgumentCollec
         if argument.hint in (int, int | None):
             _refuse_fractions(argument)
         for kind in get_args(argument.hint):
-            # Types of our own say what they expect; in a union with None nobody would hear of it.
+            # Types of our own say what they expect; in a union with None Cyclopts hides this error.
             if isinstance(kind, type) and issubclass(kind, float) and kind is not float:
                 _read_all(kind, argument)
 

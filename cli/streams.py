@@ -11,7 +11,7 @@ from turbrestore.core.errors import StorageError
 
 
 def open_closed() -> None:
-    """Let closed streams lead nowhere, so that no file that is opened later takes their place."""
+    """Redirect closed streams to the null device, so that no file that is opened later takes their place."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -58,7 +58,7 @@ def tell(text: str) -> None:
 
 
 def silence(stream: TextIO) -> None:
-    """Let a stream lead nowhere: what it still holds back would fail again at the end of the process."""
+    """Redirect a stream to the null device: what it still holds back would fail again at the end of the process."""
     # Streams that are no files hold nothing back.
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

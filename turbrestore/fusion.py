@@ -52,10 +52,7 @@ TileMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
 # Files of floating point are taken for those of 16 bits.
 _MOST_BITS = 16
 # Figures of a filtered tile that are joined or averaged.
-_RECORDED = (
-    *("flow_states", "gains", "innovations", "sharpness", "shares"),
-    *("image_noise", "sharpness_weight"),
-)
+_RECORDED = ("flow_states", "gains", "innovations", "sharpness", "shares", "image_noise", "sharpness_weight")
 
 Result = TypeVar("Result")
 
@@ -86,7 +83,7 @@ class Run:
         return () if self.plan.tile is None else halo_tiles((height, width), self.plan.tile)
 
     def decide(self, *decisions: Decision) -> None:
-        """Record decisions, and tell whoever listens."""
+        """Record decisions, and call ``on_decision``."""
         self.decisions.extend(decisions)
         if self.on_decision is not None:
             for decision in decisions:
@@ -102,10 +99,10 @@ class Run:
     def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:
         """Return a result from the store, or compute it."""
         with self.timed(stage):
-            return self.kept(name, compute)
+            return self.from_store(name, compute)
 
-    def kept(self, name: str, compute: Callable[[], Result]) -> Result:
-        """Return a result from the store, or compute it, within a stage."""
+    def from_store(self, name: str, compute: Callable[[], Result]) -> Result:
+        """Do the same without taking the time, within a stage."""
         return compute() if self.store is None else self.store.get(name, compute)
 
     def counter(self, stage: str, total: int) -> Callable[[object], None]:
@@ -120,7 +117,7 @@ class CentroidTask:
     source: FrameSource  # all frames of the tile
     train: int  # number of training frames
     params: RestoreParams
-    runtime: Runtime  # where it has a scratch folder, that of temporary files is used
+    runtime: Runtime  # a scratch folder is replaced by the worker's folder of temporary files
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +130,7 @@ class FilterTask:
     flows: FloatArray
     counted: NDArray[np.bool_]  # (T,): frames that count
     params: RestoreParams
-    runtime: Runtime  # in another process, where it has a scratch folder, that of temporary files is used
+    runtime: Runtime  # in another process, a scratch folder is replaced by its folder of temporary files
 
 
 def read_training(run: Run, stream: Iterator[FloatArray]) -> tuple[FloatArray, float]:
@@ -169,8 +166,8 @@ def centroid_stage(run: Run, training: FloatArray) -> Centroid:
         found = join_centroids(parts, run.tiles, training.shape, runtime.scratch)
     if params.reference is None:
         return found
-    placed, on_reference = onto_reference(found, training, params.reference, runtime)
-    run.decide(on_reference)
+    placed, reference_decision = onto_reference(found, training, params.reference, runtime)
+    run.decide(reference_decision)
     return placed
 
 
@@ -201,9 +198,9 @@ def _run_centroid_task(task: CentroidTask) -> Centroid:
 def filter_stage(
     run: Run, centroid: Centroid, dynamics: FlowDynamics, training: FloatArray, rest: Iterator[FloatArray]
 ) -> Filtered:
-    """Filter the training frames and those after them, and move the image to its place.
+    """Filter the training frames and those after them, and move the image onto the mean geometry of all frames.
 
-    It is that of the mean geometry of the frames, unless the geometry is that of another clip.
+    With ``reference`` or ``like`` it stays in the geometry of the other clip.
     ``training`` (K, H, W) or (K, H, W, 3).
     """
     params, source = run.params, run.source
@@ -229,14 +226,14 @@ def _filtered_tiles(run: Run, centroid: Centroid, training: FloatArray, counted:
     names = [f"filtered_tile_{number}" for number in range(len(run.tiles))]
     if run.map_tiles is None:
         for number, name in enumerate(names):
-            yield run.kept(name, partial(_filter_tile, run, centroid, training, counted, number))
+            yield run.from_store(name, partial(_filter_tile, run, centroid, training, counted, number))
         return
     stored = () if run.store is None else run.store.stored
     missing = [tile for name, tile in zip(names, run.tiles, strict=True) if f"{name}.npz" not in stored]
     tasks = (_filter_task(run, tile, centroid, counted) for tile in missing)
     results = iter(run.map_tiles(_run_filter_task, tasks))
     for number, name in enumerate(names):
-        part = run.kept(name, lambda: next(results))
+        part = run.from_store(name, lambda: next(results))
         if run.progress is not None:
             run.progress("filter", number + 1, len(names))
         yield part
@@ -342,7 +339,7 @@ def join_filtered(
 
 
 def _here(runtime: Runtime) -> Runtime:
-    """Use the folder of temporary files of this process."""
+    """Replace a scratch folder by the folder of temporary files of this process."""
     return runtime if runtime.scratch is None else replace(runtime, scratch=Path(tempfile.gettempdir()))
 
 

@@ -47,11 +47,11 @@ _FEWEST_TRAINED, _MOST_TRAINED = 40, 100
 _FEWEST_IN_NEED = 10
 # Most that training frames and their flows take where no limit is given, bytes.
 _TRAINING_BYTES = 1.5e9
-# Peak without a limit from which training frames go to a scratch file, bytes, and how often it has to fit on the disk.
+# Peak without a limit from which training frames go to a scratch file, bytes; required free space as a multiple of it.
 _MUCH, _ROOM = 2.2e9, 3
 # Interpreter, libraries and readers, bytes.
 _BASE = 1.6e8
-# What is found out before the stages, such as what passes, bytes a pixel and a pixel and channel.
+# Memory of the preparation, bytes a pixel and bytes a pixel and channel.
 _PREPARED, _PREPARED_COLOUR = 44, 34
 # Images and maps that the stages leave, bytes a pixel and bytes a pixel and channel; with tiles most of them lie in
 # scratch files.
@@ -59,9 +59,9 @@ _RESULTS, _RESULTS_COLOUR = 60, 48
 _RESULTS_OF_TILES, _RESULTS_OF_TILES_COLOUR = 3, 23
 # A report with its pictures, which are at most 2048 pixels wide: bytes, bytes a pixel and a pixel that is shown.
 _REPORT, _REPORT_PIXEL, _REPORT_SHOWN, _SHOWN_SIDE = 6e7, 40, 50, 2048
-# Numbers of the modes that a thread has in hand while they lie in a file.
+# Elements of the modes that a thread holds while they lie in a file.
 _IN_HAND = 1 << 23
-# Shortest side of a tile for which a second thread is given up, and the step in which sides are tried, pixels.
+# Side of a tile below which one thread is used, and the step in which sides are tried, pixels.
 _WORTH, _SIDE_STEP = 640, 32
 # The size of the tiles changes the result, so it must not depend on the number of cores.
 _THREADS_OF_TILES = 2

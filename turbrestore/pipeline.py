@@ -30,7 +30,7 @@ from .io.images import read_image
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import plan_memory
-from .preparation import as_recorded, prepare
+from .preparation import prepare, undo_preparation
 from .registration.centroid import Centroid
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
@@ -58,7 +58,7 @@ from .wording import (
     explain_structure,
 )
 
-# Every pixel of a cropped image is visible in at least this share of the training frames.
+# Every border pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
 # Least noise of dark parts relative to bright ones that is told in words.
 _LEAST_SHARE = 0.01
@@ -77,7 +77,9 @@ def restore(
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
-    Frames are read in order.  Only the training frames are kept, in memory or, if they do not fit, in a scratch file.
+    Frames are read in order: a sample of them to survey the clip, all of them once more where something passes through
+    the scene, then the training frames, and those after them by the filter.  Only the training frames are kept, in
+    memory or, if they do not fit, in a scratch file.
 
     Parameters
     ----------
@@ -111,7 +113,8 @@ def restore(
     InputNotFoundError
         The static mask or the image of the point spread function does not exist.
     ConfigurationError
-        More training frames than frames, a device that is not there, or a memory limit that cannot be kept.
+        More training frames than frames, or as many where those that train are not filtered; a blur wider than an
+        eighth of the shorter side; a device that is not there, or a memory limit that cannot be kept.
     StorageError
         The disk has no space for a scratch file.
 
@@ -128,7 +131,7 @@ def restore(
     """
     params = params or RestoreParams()
     begun = time.perf_counter()
-    source, on_blank = (
+    source, blank_decisions = (
         (frames, ()) if isinstance(frames, FrameSource) else without_blank(FrameSource.from_array(frames))
     )
     params = settings_of_known_flows(params, len(source))
@@ -144,18 +147,20 @@ def restore(
     stretched = _stretched_params(params, prepared.levels)
     run = Run(prepared, stretched, plan, store, progress, on_decision, map_tiles)
     run.seconds["read"] = time.perf_counter() - begun
-    run.decide(*on_blank, *plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method))
+    run.decide(
+        *blank_decisions, *plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method)
+    )
     run.decide(*prepared.decisions)
     with returning_freed_memory(runtime.memory_limit is not None):
-        restoration = _deblurred(run, *_fused(run), psf)
+        restoration = _deblur_and_crop(run, *_fuse(run), psf)
     if params.scale > 1:
-        restoration = _refined(run, restoration)
-    return as_recorded(restoration, prepared)
+        restoration = _add_finer_grid(run, restoration)
+    return undo_preparation(restoration, prepared)
 
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What the frames say about the image that is fused from them."""
+    """What :func:`_deblur_and_crop` needs to know from the training frames, which are freed before it runs."""
 
     saturation: float  # intensity from which the mean is saturated
     is_mean: bool = False  # whether the mean is the image, because the filtered one has structure that they lack
@@ -163,7 +168,7 @@ class _Evidence:
     halves: Halves | None = None  # none for few frames too
 
 
-def _fused(run: Run) -> tuple[Restoration, _Evidence]:
+def _fuse(run: Run) -> tuple[Restoration, _Evidence]:
     """Fuse the frames into one image; the training frames are freed when this function returns."""
     params, source, runtime = run.params, run.source, run.plan.runtime
     total = np.zeros(source.shape[1:])
@@ -183,8 +188,9 @@ def _fused(run: Run) -> tuple[Restoration, _Evidence]:
     if dynamics is not None and params.runs("filter"):
         filtering = partial(filter_stage, run, centroid, dynamics, training, stream)
         filtered = run.stage("filter", "filtered", filtering)
+        # Where the filter came from the store, nobody has read the rest of the frames, and tiles read their own.
         unread = added_up(source, total) if run.tiles else stream
-        mean = run.stage("filter", "mean", lambda: _mean(unread, total, len(source)))
+        mean = run.stage("filter", "mean", lambda: _finish_mean(unread, total, len(source)))
         # The sharpness is NaN for frames that do not count.
         chosen = int(np.isfinite(filtered.sharpness).sum())
         run.decide(*explain_filter(filtered, dynamics, None if params.keep_best == 1 else chosen))
@@ -205,13 +211,13 @@ def _fused(run: Run) -> tuple[Restoration, _Evidence]:
     )
     if filtered is None:
         return fused, _Evidence(saturation)
-    return _compared(run, fused, training, filtered.mean_flow, saturation)
+    return _check_by_frames(run, fused, training, filtered.mean_flow, saturation)
 
 
-def _compared(
+def _check_by_frames(
     run: Run, fused: Restoration, training: FloatArray, mean_flow: FloatArray, saturation: float
 ) -> tuple[Restoration, _Evidence]:
-    """Let the frames say whether they have the structure of the filtered image, and how blurred it is."""
+    """Check that the frames have the structure of the filtered image, else take the mean; measure how blurred it is."""
     image, flows = luminance(fused.image), fused.centroid.flows
     if mean_flow.any():
         # Into the geometry of the centroid.
@@ -230,13 +236,13 @@ def _compared(
     return fused, _Evidence(saturation, False, witnesses, halves)
 
 
-def _deblurred(run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[np.float64] | None) -> Restoration:
-    """Deblur the fused image, let the frames guard what they agree on, and crop it."""
+def _deblur_and_crop(run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[np.float64] | None) -> Restoration:
+    """Deblur the fused image, keep what the halves of the clip agree on, measure its uncertainty, and crop both."""
     params, image, halves = run.params, fused.image, evidence.halves
     deblurred, agreed = None, None
     if params.runs("deconvolve") and not evidence.is_mean:
         photons = None if halves is None else _photon_noise(run, halves)
-        deblurred = run.stage("deconvolve", "deblurred", lambda: _deblur(run, fused, evidence, psf, photons))
+        deblurred = run.stage("deconvolve", "deblurred", lambda: _remove_blur(run, fused, evidence, psf, photons))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
         if halves is not None:
@@ -244,8 +250,8 @@ def _deblurred(run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[n
             run.decide(*agreed.decisions)
             image = agreed.image
     seen = coverage(fused.centroid.flows)
-    crop, on_border = _crop(image, seen, params.border, deblurred)
-    run.decide(on_border)
+    crop, border_decision = _find_crop(image, seen, params.border, deblurred)
+    run.decide(border_decision)
     deviation = _measure_uncertainty(run, image, fused, evidence, seen, deblurred)
     x, y, width, height = crop
     part = np.s_[y : y + height, x : x + width]
@@ -268,19 +274,19 @@ def _deblurred(run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[n
     )
 
 
-def _refined(run: Run, restoration: Restoration) -> Restoration:
+def _add_finer_grid(run: Run, restoration: Restoration) -> Restoration:
     """Add the image on the finer grid."""
     with run.timed("scale"):
-        finer, on_scale = fine_image(run.prepared, restoration, run.params, run.plan.runtime)
-        run.decide(on_scale)
+        finer, scale_decision = fine_image(run.prepared, restoration, run.params, run.plan.runtime)
+        run.decide(scale_decision)
         x, y, width, height = restoration.crop
         upper, left = fine_shape((y, x), run.params.scale)
         lower, right = fine_shape((y + height, x + width), run.params.scale)
     return replace(restoration, finer=finer[upper:lower, left:right], decisions=tuple(run.decisions))
 
 
-def _mean(unread: Iterator[FloatArray], total: NDArray[np.float64], count: int) -> FloatArray:
-    """Mean of frames that have been added up but for those that nobody has read yet."""
+def _finish_mean(unread: Iterator[FloatArray], total: NDArray[np.float64], count: int) -> FloatArray:
+    """Return the mean of all frames: those not yet read are read, which adds them up."""
     deque(unread, 0)
     return (total / count).astype(np.float32)
 
@@ -298,17 +304,18 @@ def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seein
 
 def _find_witnesses(run: Run, training: FloatArray, fused: Restoration) -> BlurWitnesses:
     """Measure what the frames say about their blur."""
-    seeing, known = fused.seeing, None if fused.seeing is None else fused.seeing.displacement_variance
+    seeing = fused.seeing
+    measured = None if seeing is None else seeing.displacement_variance
     rows, columns = picture = run.prepared.picture
     with run.timed("witnesses"):
-        seen, flows = training[:, rows, columns], fused.centroid.flows[:, rows, columns]
-        if seeing is not None and known is not None:
-            displacement, frames = known.value, seeing.independent_frames
+        cropped, flows = training[:, rows, columns], fused.centroid.flows[:, rows, columns]
+        if seeing is not None and measured is not None:
+            displacement, frames = measured.value, seeing.independent_frames
         else:
             # Without a displacement that can be measured, that of the flow stands for it, less what the camera adds.
             about = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
             displacement, frames = float(np.mean(about)), float(len(training))
-        return measure_witnesses(seen, flows, _of_optics(BlurWitnesses(displacement, frames, picture), run, seeing))
+        return measure_witnesses(cropped, flows, _of_optics(BlurWitnesses(displacement, frames, picture), run, seeing))
 
 
 def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWitnesses:
@@ -325,9 +332,10 @@ def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWit
     return replace(known, displacement=made, diffraction=diffraction, spread=float(spread))
 
 
-def _deblur(
+def _remove_blur(
     run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[np.float64] | None, photons: NoiseCurve | None
 ) -> Deblurred:
+    """Estimate the blur and remove it, with the centroid as the guide."""
     params, plan, guide = run.params, run.plan, fused.centroid.image
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
@@ -356,15 +364,17 @@ def _measure_uncertainty(
     if evidence.is_mean:
         return np.full(image.shape[:2], np.inf, np.float32)
     with run.timed("uncertainty"):
-        # A pixel is known if a frame has shown it and no channel is saturated in every frame.
-        known = (seen > 0) & (np.atleast_3d(fused.mean).max(axis=-1) < evidence.saturation)
+        # A pixel can be measured if a frame has shown it and no channel is saturated in every frame.
+        measurable = (seen > 0) & (np.atleast_3d(fused.mean).max(axis=-1) < evidence.saturation)
         if run.prepared.hidden is not None:
-            known &= ~run.prepared.hidden
-        return measure_deviation(image, filtered, dynamics, known, run.params.deconvolution, deblurred)
+            measurable &= ~run.prepared.hidden
+        return measure_deviation(image, filtered, dynamics, measurable, run.params.deconvolution, deblurred)
 
 
-def _crop(image: FloatArray, seen: FloatArray, border: str, deblurred: Deblurred | None) -> tuple[Rectangle, Decision]:
-    """Return the rectangle of the image that is the result."""
+def _find_crop(
+    image: FloatArray, seen: FloatArray, border: str, deblurred: Deblurred | None
+) -> tuple[Rectangle, Decision]:
+    """Find the rectangle of the image that is the result."""
     whole = (0, 0, image.shape[1], image.shape[0])
     if border == "keep":
         return whole, explain_border(float(seen.min()), None)

@@ -44,31 +44,39 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
     """Prepare the frames of a clip, which are read once, and once more where something passes through the scene."""
     mask = None if static_mask in ("auto", "off") else read_static_mask(static_mask, source)
     survey = take_survey(source, scratch)
-    # Before the light, because a stop would be taken for bands of it.
-    survey, bars, on_bars = without_bars(survey)
+    # Bars first: a dark field stop would be mistaken for bands of flicker.
+    survey, bars, bar_decisions = without_bars(survey)
     moments = measure_moments(survey)
-    # Before what stands is looked for, because a dead column stands.
-    survey, on_stripes = without_stripes(survey, moments)
-    hidden, title, on_overlay = None, None, tuple[Decision, ...]()
+    # Stripes before overlays: a dead column is static and would pass for an overlay.
+    survey, stripe_decisions = without_stripes(survey, moments)
+    hidden, title, overlay_decisions = None, None, tuple[Decision, ...]()
     if static_mask != "off":
-        survey, hidden, title, on_overlay = without_overlay(survey, mask, None if on_stripes else moments)
+        survey, hidden, title, overlay_decisions = without_overlay(survey, mask, None if stripe_decisions else moments)
     if source.unseen is not None:
         unseen = source.unseen[source.window]
         hidden = unseen if hidden is None else hidden | unseen
-    survey, on_colours = steady_white_balance(survey)
-    survey, on_light = steady_light(survey)
-    survey, levels, on_range = stretch_levels(survey)
-    clip, on_passers = without_passers(survey) if static_mask != "off" else (survey.clip, ())
-    decisions = (*on_bars, *on_stripes, *on_overlay, *on_colours, *on_light, *on_range, *on_passers)
+    survey, colour_decisions = steady_white_balance(survey)
+    survey, light_decisions = steady_light(survey)
+    survey, levels, range_decisions = stretch_levels(survey)
+    clip, passer_decisions = without_passers(survey) if static_mask != "off" else (survey.clip, ())
+    decisions = (
+        *bar_decisions,
+        *stripe_decisions,
+        *overlay_decisions,
+        *colour_decisions,
+        *light_decisions,
+        *range_decisions,
+        *passer_decisions,
+    )
     return Prepared(clip, levels, bars, hidden, title, decisions)
 
 
-def as_recorded(restoration: Restoration, prepared: Prepared) -> Restoration:
-    """Bring a restoration of prepared frames back to the levels of the clip, and give it back what is no scene."""
+def undo_preparation(restoration: Restoration, prepared: Prepared) -> Restoration:
+    """Bring a restoration of prepared frames back to the levels of the clip, and put title and bars back."""
     if prepared.levels.changed:
         restoration = _at_levels_of_clip(restoration, prepared.levels)
-    for kept in (prepared.title, prepared.bars):
-        restoration = restoration if kept is None else _put_back(restoration, kept)
+    for part in (prepared.title, prepared.bars):
+        restoration = restoration if part is None else _put_back(restoration, part)
     return restoration
 
 
@@ -87,16 +95,16 @@ def _at_levels_of_clip(restoration: Restoration, levels: Levels) -> Restoration:
     )
 
 
-def _put_back(restoration: Restoration, kept: Bars | Title) -> Restoration:
-    image, uncertainty = kept.put_back(restoration.image, *restoration.crop[:2]), restoration.uncertainty
-    finer = restoration.finer
+def _put_back(restoration: Restoration, part: Bars | Title) -> Restoration:
+    """Put what is no scene back into the images of a restoration."""
+    corner, finer, uncertainty = restoration.crop[:2], restoration.finer, restoration.uncertainty
+    image = part.put_back(restoration.image, *corner)
     if finer is not None:
-        changed, usual = (image != restoration.image).astype(np.float32), image
         size = finer.shape[1::-1]
-        hidden, usual = (cv2.resize(one, size, interpolation=cv2.INTER_LINEAR) for one in (changed, usual))
-        finer = np.where(hidden > 0.5, usual, finer)
+        covered = cv2.resize((image != restoration.image).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+        finer = np.where(covered > 0.5, cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), finer)
     if uncertainty is not None:
-        # What lies under it was not seen.
-        hidden = kept.put_back(np.full_like(restoration.image, -1), *restoration.crop[:2]) >= 0
-        uncertainty = np.where(hidden if hidden.ndim == 2 else hidden[..., 0], np.float32(np.inf), uncertainty)
-    return replace(restoration, image=image, mean=kept.put_back(restoration.mean), uncertainty=uncertainty, finer=finer)
+        covered = np.atleast_3d(part.put_back(np.full_like(restoration.image, -1), *corner))[..., 0] >= 0
+        # Pixels under it were never observed.
+        uncertainty = np.where(covered, np.float32(np.inf), uncertainty)
+    return replace(restoration, image=image, mean=part.put_back(restoration.mean), uncertainty=uncertainty, finer=finer)

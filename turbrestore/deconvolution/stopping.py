@@ -1,7 +1,7 @@
 """The loop of the iterative solvers, and when it stops.
 
 A photograph is deblurred after some thirty iterations, the finest bars of a chart after a hundred.  The last change of
-the whole image tells the two apart badly: an image that changes slowly may have far to go, and a few letters on a large
+the whole image hardly separates the two: an image that changes slowly may have far to go, and a few letters on a large
 page change little of it.  So changes are measured in the tile that changes most, and further changes are predicted.
 
 Where the image continues beyond its border, changes of nltv and tv are not measured in the outermost pixels, as many as

@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .figure import ACCENT, INK, add_axes, new_figure, write_instead
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Curve = NDArray[np.float64]
 
 # Least and largest variation that are drawn.
 _LEAST, _MOST = 1e-4, 10.0

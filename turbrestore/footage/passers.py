@@ -96,15 +96,16 @@ class Background:
 
 @dataclass(frozen=True, eq=False)
 class _Usual:
-    """The median, what frames do not exceed where nothing passes (d, the range, e² or None), the mean of v, and r."""
+    """The scene as most frames show it, and what nothing exceeds but what passes; maps have the shape (H', W')."""
 
-    median: FloatArray
-    deviation: FloatArray
+    median: FloatArray  # m
+    deviation: FloatArray  # d above which a pixel belongs to what passes
+    # Range of m nearby.
     low: FloatArray
     high: FloatArray
-    excess: FloatArray | None
-    spread: float
-    reach: int
+    excess: FloatArray | None  # e² above which it does; None if nothing small passes
+    spread: float  # mean of v
+    reach: int  # r
 
     def at(self, place: Window) -> _Usual:
         parts = (self.median[place], self.deviation[place], self.low[place], self.high[place])
@@ -142,7 +143,7 @@ def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
     still = Placement(dict.fromkeys(source.numbers, (0, 0)), (source.shape[1], source.shape[2]))
     usual = _usual(stack, numbers, still)
     found = _passed_by(stack, numbers, usual, still)
-    reach = _REACH if found is None else math.ceil(_REACHED * _displacement(stack))
+    reach = _REACH if found is None else max(_REACH, math.ceil(_REACHED * _displacement(stack)))
     if reach > _REACH:
         found = _passed_by(stack, numbers, _usual(stack, numbers, still, reach=reach), still)
     if found is not None:
@@ -154,7 +155,7 @@ def _usual_of(survey: Survey) -> tuple[_Usual, Placement] | None:
     moving = Placement.by(_shifts(_reduced(small, small.shape), source.shape), source.numbers, still.size)
     if np.prod(moving.shape) > _LARGEST_SCENE * np.prod(moving.size):
         return None
-    followed = _usual(stack, numbers, moving)
+    followed = _usual(stack, numbers, moving, reach=reach)
     found = _passed_by(stack, numbers, followed, moving) if followed.spread < _FOLLOWED * usual.spread else None
     return None if found is None else (found, moving)
 

@@ -31,7 +31,7 @@ from ..core.errors import require, require_between
 from ..display.maps import plot_displacements
 from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
-from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack, variance_of
+from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
 from ..runtime.steps import finish
 from ..runtime.threads import map_ahead, sum_in_threads
 from .camera.stabilisation import mean_stabilised
@@ -53,8 +53,8 @@ _UNSEEN = 1e-3
 # of a matched patch, pixels, and half the distance over which the detail of the image changes by its deviation.  Within
 # either distance, a search at full resolution recovers.
 _FAR, _FAR_OF_DETAIL = 2.0, 0.5
-# Share of the variance of the frames that flows leave at most where displacement makes it: on water whose waves shine
-# they leave more than half, in turbulence less than a third.
+# Share of the variance of the frames, without the motion of whole frames, that flows leave at most where displacement
+# makes it: on water whose waves shine they leave more than half, in turbulence less than a third.
 _LEFT = 0.4
 # New flows that leave more than this share of the misfit of the frames are the last ones.
 _EXHAUSTED = 0.97
@@ -245,7 +245,7 @@ def centroid_steps(
             converged = len(misfits) > 1 and misfits[-1] > _EXHAUSTED * misfits[-2]
         elif fused and len(sizes) == 2 and not last and _is_displaced_far(image, flows, flow_params.contrast_window):
             misfits.append(_mean_misfit(image, stack, flows, runtime.threads))
-            far = misfits[0] < _LEFT * float(variance_of(stack).mean())
+            far = misfits[0] < _LEFT * _misfit_of_shifts(stack, flows, runtime)
             converged = converged and not far
         if converged or (change > _DIVERGED and not far) or last:
             return Centroid(image, flows, np.array(sizes), converged)
@@ -289,6 +289,12 @@ def _mean_misfit(image: FloatArray, frames: FloatArray, flows: FloatArray, threa
 
     pairs = zip(iter_frames(frames), iter_frames(flows), strict=True)
     return float(np.mean([found for _, found in map_ahead(misfit, pairs, threads)]))
+
+
+def _misfit_of_shifts(frames: FloatArray, flows: FloatArray, runtime: Runtime) -> float:
+    """Return the mean squared difference of the frames from their mean, without the motion of whole frames."""
+    shifts = np.broadcast_to(np.mean(flows, axis=(1, 2), keepdims=True), flows.shape)
+    return _mean_misfit(mean_registered(frames, shifts, runtime), frames, shifts, runtime.threads)
 
 
 def _recentre(flows: FloatArray, recentre: FloatArray, threads: int) -> None:

@@ -156,7 +156,7 @@ def _sweep_on_device(problem: FlowProblem, flow: Stack, dual: Stack, params: Swe
 
 
 def add_differences(u: Stack, px: Stack, py: Stack) -> None:
-    """Add ∇u to p, arrays (..., H, W) of NumPy or xp."""
+    """Add ∇u to p, arrays (..., H, W) of NumPy or torch."""
     px[..., :-1] += u[..., 1:]
     px[..., :-1] -= u[..., :-1]
     py[..., :-1, :] += u[..., 1:, :]
