@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -351,9 +352,7 @@ def _areas(tiles: Sequence[HaloTile]) -> NDArray[np.float64]:
 def temporal_mean(source: FrameSource) -> FloatArray:
     """Mean of the frames, read one after the other."""
     total = np.zeros(source.shape[1:])
-    for frame in source:
-        total += frame
-    return (total / len(source)).astype(np.float32)
+    return finish_mean(added_up(source, total), total, len(source))
 
 
 def added_up(frames: Iterable[FloatArray], total: NDArray[np.float64]) -> Iterator[FloatArray]:
@@ -361,3 +360,9 @@ def added_up(frames: Iterable[FloatArray], total: NDArray[np.float64]) -> Iterat
     for frame in frames:
         total += frame
         yield frame
+
+
+def finish_mean(unread: Iterator[FloatArray], total: NDArray[np.float64], count: int) -> FloatArray:
+    """Return the mean of frames that are added up in ``total``: those not yet read are read, which adds them up."""
+    deque(unread, 0)
+    return (total / count).astype(np.float32)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -25,7 +24,7 @@ from .deconvolution.problem import read_blur
 from .dynamics.dynamic_texture import identify
 from .footage.checks.content import without_blank
 from .footage.levels import Levels
-from .fusion import Run, TileMap, added_up, centroid_stage, filter_stage, read_training
+from .fusion import Run, TileMap, added_up, centroid_stage, filter_stage, finish_mean, read_training
 from .io.images import read_image
 from .io.output import check_space
 from .io.source import FrameSource
@@ -190,7 +189,7 @@ def _fuse(run: Run) -> tuple[Restoration, _Evidence]:
         filtered = run.stage("filter", "filtered", filtering)
         # Where the filter came from the store, nobody has read the rest of the frames, and tiles read their own.
         unread = added_up(source, total) if run.tiles else stream
-        mean = run.stage("filter", "mean", lambda: _finish_mean(unread, total, len(source)))
+        mean = run.stage("filter", "mean", partial(finish_mean, unread, total, len(source)))
         # The sharpness is NaN for frames that do not count.
         chosen = int(np.isfinite(filtered.sharpness).sum())
         run.decide(*explain_filter(filtered, dynamics, None if params.keep_best == 1 else chosen))
@@ -283,12 +282,6 @@ def _add_finer_grid(run: Run, restoration: Restoration) -> Restoration:
         upper, left = fine_shape((y, x), run.params.scale)
         lower, right = fine_shape((y + height, x + width), run.params.scale)
     return replace(restoration, finer=finer[upper:lower, left:right], decisions=tuple(run.decisions))
-
-
-def _finish_mean(unread: Iterator[FloatArray], total: NDArray[np.float64], count: int) -> FloatArray:
-    """Return the mean of all frames: those not yet read are read, which adds them up."""
-    deque(unread, 0)
-    return (total / count).astype(np.float32)
 
 
 def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:
