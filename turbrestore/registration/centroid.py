@@ -293,7 +293,8 @@ def _mean_misfit(image: FloatArray, frames: FloatArray, flows: FloatArray, threa
 
 def _misfit_of_shifts(frames: FloatArray, flows: FloatArray, runtime: Runtime) -> float:
     """Return the mean squared difference of the frames from their mean, without the motion of whole frames."""
-    shifts = np.broadcast_to(np.mean(flows, axis=(1, 2), keepdims=True), flows.shape)
+    shifts = np.array([flow.mean(axis=(0, 1)) for flow in iter_frames(flows)])[:, None, None]
+    shifts = np.broadcast_to(shifts, flows.shape)
     return _mean_misfit(mean_registered(frames, shifts, runtime), frames, shifts, runtime.threads)
 
 
