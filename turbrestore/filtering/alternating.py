@@ -1,7 +1,7 @@
 """Alternating-estimation Kalman filter over the image and the state of its flow (paper 3, section 4).
 
-Symbols as in :mod:`turbrestore.filtering.kalman`, which has eqs. 14, 16, 17 and 19; Ŵ is the flow that frames are
-registered by, and β the weight of sharpness, given or chosen by :mod:`turbrestore.filtering.frame_statistics`.
+Symbols as in :mod:`turbrestore.filtering.kalman`, which has eqs. 14 to 19; Ŵ is the flow that frames are registered
+by, and β the weight of sharpness, given or chosen by :mod:`turbrestore.filtering.frame_statistics`.
 
 Given Ŵ the image is a linear state, given ρ the flow is, so each frame updates one after the other:
 
@@ -17,8 +17,9 @@ Departures from the paper, each with its reason:
 
 * Frames are registered by the measured flow, ``Ŵ = W^meas`` (``residual="keep"``): by eq. 10 the flow is ``C ξ + r``,
   and r is mostly motion.  With ``Ŵ = C ξ̂`` (``"drop"``, as printed) that motion stays in the frames and blurs the
-  image, below the centroid that the filter starts from.  Taking a share of r for noise makes the image worse on average
-  (``benchmarks/decisions/filter.md``).  So the flow state describes and predicts the motion, not the image.
+  image, which becomes worse than the centroid that the filter starts from.  Taking a share of r for noise makes the
+  image worse on average (``benchmarks/decisions/filter.md``).  So the flow state describes and predicts the
+  motion, not the image.
 * The measurement equation 13c is nonlinear in image and flow together.  Eqs. 15 and 17, with which the paper replaces
   it, are used alone.  The mean flow W̄ is part of eq. 17 here.
 * The paper first updates the image by the predicted flow (its step 2).  Here the flow is measured first, because the

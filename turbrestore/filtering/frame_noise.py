@@ -1,10 +1,8 @@
 """A frame that is registered to the image, and its measurement noise at every pixel (paper 3, eq. 15).
 
-The measurement of the image by a frame is ``I ∘ ŵ = ρ + ζ`` with ``ζ ~ N(0, Z)`` (eq. 15).
-
 Symbols
 -------
-I ∘ ŵ : frame I warped by the estimated flow; ρ : image; Z : variance of a registered frame about it
+I ∘ ŵ : frame I warped by the estimated flow; Z : its variance about the image
 z : local sharpness of a frame, standardised over the frames; β its weight
 v : variance of z over the frames
 κ : share of the middle of the window that z leaves out, see :func:`local_sharpness`
