@@ -188,7 +188,8 @@ def _filter_blocks(
 ) -> Generator[FilterStep, None, _Position]:
     """Do steps 1 to 4 of the module docstring for one block after the other.
 
-    ``known`` are flows to the first block, and ``trained`` says whether the flow model was identified on them.
+    ``known`` are the flows to the first block; with ``trained`` they are those of the training frames, and their
+    mean is kept.
     """
     size, iterations = settings.params.block, settings.params.inner_iterations
     # The last pass over a block is the first over the next block too, as threads idle at the end of each pass.

@@ -105,7 +105,8 @@ def update(
 ) -> tuple[Gaussian, Innovation]:
     """Measurement update in covariance form, for few components (paper 3, eqs. 17 and 18).
 
-    The blur moments use this form, with the gain of eq. 18; the alternating filter uses the information form of eq. 19.
+    The observers of blur moments use this form, with the gain of eq. 18; the alternating filter uses the information
+    form of eq. 19.
     The new covariance is Joseph's ``(I − M H) P (I − M H)ᵀ + M R Mᵀ`` where the paper has ``(I − M H) P``: both are the
     same in exact arithmetic, but only the first stays symmetric and positive semi-definite in floating point.
     ``measurement`` (..., m); ``H`` (..., m, n); ``R`` (..., m, m); ``predicted`` (..., m).
