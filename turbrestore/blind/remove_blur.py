@@ -220,8 +220,7 @@ def _find_widths(
 ) -> Steps[tuple[BlurMap | None, FloatArray | None, Deconvolution | None]]:
     """Find the widths of tiles and, if they differ, a width for every pixel (H, W).
 
-    If they do not, the third is the result of ``steps``, the deconvolution by one width, where memory allows to run
-    them meanwhile.
+    If they agree, the third is the result of ``steps``, the deconvolution by one width, unless memory is limited.
     """
     first = None
     if runtime.memory_limit is None:
