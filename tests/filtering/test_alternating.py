@@ -171,6 +171,20 @@ def test_drift_keeps_the_gain_up(sequence):
     assert filtered.gains[-1] == pytest.approx(prior / (prior + noise), rel=0.02)
 
 
+def test_the_image_drifts_through_frames_that_do_not_count(sequence):
+    centroid, dynamics = start(sequence)
+    drift, noise, variance = 1e-4, 1e-3, 1.0
+    params = FilterParams(sharpness=0, image_noise=noise, image_drift=drift, inner_iterations=1)
+    frames = [None if number in (3, 4, 15) else frame for number, frame in enumerate(sequence.frames)]
+    filtered = filter_frames(frames, centroid.image, dynamics, params, known_flows=centroid.flows)
+    for frame, gain in zip(frames, filtered.gains, strict=True):
+        variance += drift
+        expected = 0.0 if frame is None else variance / (variance + noise)
+        assert gain == pytest.approx(expected, rel=1e-4)
+        variance *= 1 - expected
+    assert filtered.variance == pytest.approx(variance, rel=1e-3)
+
+
 def test_frames_are_streamed_a_block_at_a_time(sequence):
     centroid, dynamics = start(sequence, 4)
     taken, furthest = 0, 0

@@ -33,8 +33,8 @@ def model_and_frames():
     return measure_frame_statistics(frames, still, scene), scene, frames
 
 
-def noise_of(frame, flow, statistics, sharpness):
-    return frame_noise_variance(frame, flow, inside(flow), statistics, sharpness)
+def noise_of(frame, flow, statistics, sharpness_weight):
+    return frame_noise_variance(frame, flow, inside(flow), statistics, sharpness_weight)
 
 
 def test_the_noise_is_that_of_its_definition(model_and_frames):
@@ -45,7 +45,7 @@ def test_the_noise_is_that_of_its_definition(model_and_frames):
     ux, uy = gradient(flow[..., 0])
     vx, vy = gradient(flow[..., 1])
     assert np.min((1 + ux) * (1 + vy) - uy * vx) > 0
-    noise, sharp = noise_of(frame, flow, model, sharpness=1.5)
+    noise, sharp = noise_of(frame, flow, model, sharpness_weight=1.5)
 
     product = sum(a * b for a, b in zip(gradient(frame), gradient(scene), strict=True))
     energy = sum(a**2 for a in gradient(scene))
@@ -70,11 +70,11 @@ def test_the_noise_is_that_of_its_definition(model_and_frames):
 @pytest.mark.parametrize("row", [1, 77, 100, SHAPE[0] - 3])
 def test_a_fold_is_found_wherever_it_is(model_and_frames, row):
     model, _, frames = model_and_frames
-    calm, _ = noise_of(frames[4], np.zeros((*SHAPE, 2), np.float32), model, sharpness=1.0)
+    calm, _ = noise_of(frames[4], np.zeros((*SHAPE, 2), np.float32), model, sharpness_weight=1.0)
     flow = np.zeros((*SHAPE, 2), np.float32)
     # Rows above come to lie below those underneath.
     flow[row, 100:120, 1], flow[row + 1, 100:120, 1] = 3.0, -3.0
-    torn, _ = noise_of(frames[4], flow, model, sharpness=1.0)
+    torn, _ = noise_of(frames[4], flow, model, sharpness_weight=1.0)
     assert torn[row, 110] > 500 * calm[row, 110]
     assert torn[row, 40] == pytest.approx(calm[row, 40], rel=1e-4)
 

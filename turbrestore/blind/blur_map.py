@@ -24,7 +24,8 @@ from numpy.typing import ArrayLike
 from ..blur.estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidates, removable_width
 from ..core.arrays import FloatArray, check_grey
 from ..core.noise import estimate_noise
-from ..deconvolution.deconvolve import Deconvolution, DeconvolutionState
+from ..deconvolution.deconvolve import Deconvolution
+from ..deconvolution.stopping import Steps
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import iter_frames
 from ..runtime.steps import finish
@@ -111,10 +112,10 @@ def sigma_map(tiles: ArrayLike, shape: tuple[int, int]) -> FloatArray:
 
 
 def varying_deconvolution_steps(
-    attempt: Callable[[float], Generator[DeconvolutionState, None, Deconvolution]],
+    attempt: Callable[[float], Steps[Deconvolution]],
     sigmas: FloatArray,
     runtime: Runtime = DEFAULT,
-) -> Generator[DeconvolutionState, None, Deconvolution]:
+) -> Steps[Deconvolution]:
     """Deconvolve by a width for every pixel (H, W): by a few widths, between whose images is interpolated."""
     widths = _widths_between(float(sigmas.min()), float(sigmas.max()))
     for index, width in enumerate(widths):

@@ -15,14 +15,14 @@ _MOSTLY = 0.8
 
 
 def explain_blur(
-    blur: BlurEstimate | None, sigma: float, tiles: BlurMap | None = None, given: str = "asked for"
+    blur: BlurEstimate | None, sigma: float, blur_map: BlurMap | None = None, given: str = "asked for"
 ) -> Decision:
     """Explain which width is removed; ``given`` is the reason if none was estimated."""
     choice = f"{sigma:.2f} pixels removed" if sigma > 0 else "none removed"
     if blur is None:
         return Decision("blur", choice, given)
-    if tiles is not None and tiles.varies:
-        choice = f"{tiles.removable.min():.2f} to {tiles.removable.max():.2f} pixels removed"
+    if blur_map is not None and blur_map.varies:
+        choice = f"{blur_map.removable.min():.2f} to {blur_map.removable.max():.2f} pixels removed"
     width = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels"
     if blur.edge_limited:
         return Decision("blur", choice, f"{width}, edges are too steep for the wider blur that is likeliest")
@@ -59,14 +59,14 @@ def explain_posterior(posterior: BlurPosterior, removed: float) -> Decision:
     return Decision("blur", choice, reason)
 
 
-def explain_blur_map(tiles: BlurMap | None) -> tuple[Decision, ...]:
+def explain_blur_map(blur_map: BlurMap | None) -> tuple[Decision, ...]:
     """Explain whether every pixel gets a width of its own."""
-    if tiles is None:
+    if blur_map is None:
         return ()
-    choice = "a width for every pixel" if tiles.varies else "one width for the whole image"
-    rows, columns = tiles.sigmas.shape
-    found = f"{tiles.sigmas.min():.2f} to {tiles.sigmas.max():.2f} pixels in {rows}×{columns} tiles"
-    remark = "clearly different" if tiles.varies else "equal within their uncertainties"
+    choice = "a width for every pixel" if blur_map.varies else "one width for the whole image"
+    rows, columns = blur_map.sigmas.shape
+    found = f"{blur_map.sigmas.min():.2f} to {blur_map.sigmas.max():.2f} pixels in {rows}×{columns} tiles"
+    remark = "clearly different" if blur_map.varies else "equal within their uncertainties"
     return (Decision("blur by tiles", choice, f"{found}, {remark}"),)
 
 

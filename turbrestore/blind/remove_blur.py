@@ -1,18 +1,16 @@
 """Blind deconvolution: estimate the blur of the fused image, remove it, and check the result.
 
-The width is given or estimated.  A given width is removed whatever the guards say; guards are evaluated but do not
-override an explicit width.  From an estimated width on, attempts with smaller and smaller widths are made until the
-guards pass.  If the blur clearly differs between parts of the image, each attempt removes a width of its own at every
-pixel.
+The width is given or estimated.  A given width is removed whatever the guards say.  From an estimated width on,
+attempts with smaller and smaller widths are made until the guards pass.  If the blur clearly differs between parts of
+the image, each attempt removes a width of its own at every pixel.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,12 +25,12 @@ from ..core.noise import NoiseCurve
 from ..deconvolution.deconvolve import (
     Deconvolution,
     DeconvolutionParams,
-    DeconvolutionState,
     deconvolve_steps,
     whole_image_fidelity,
 )
 from ..deconvolution.memory import deconvolution_memory
 from ..deconvolution.problem import read_blur
+from ..deconvolution.stopping import Steps
 from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import to_scratch
@@ -41,8 +39,6 @@ from ..runtime.tiling import HALO, HaloTile, add_tile, halo_tiles, largest_tile,
 from .blur_map import BlurMap, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
 from .decisions import explain_blur, explain_blur_map, explain_guards, explain_posterior
 from .guards import GuardParams, GuardReading, evaluate_guards
-
-Result = TypeVar("Result")
 
 # Bytes per pixel, and per pixel and channel, of what is computed before and after the deconvolution; the guards take
 # most.
@@ -64,13 +60,9 @@ class Deblurred:
 
     deconvolution: Deconvolution
     blur: BlurEstimate | None  # none if the width was given
-    tiles: BlurMap | None  # widths of tiles; None if the width was given, or the image is not blurred or small
     readings: tuple[GuardReading, ...]  # one for each width that was removed; empty if no blur was removed
     decisions: tuple[Decision, ...]  # on the blur and on the guards
     posterior: BlurPosterior | None = None  # none if the width was given, or nothing is known but the image
-
-
-Steps = Generator[DeconvolutionState, None, Result]
 
 
 def remove_blur(
@@ -96,7 +88,12 @@ def remove_blur_steps(
     psf: Float64Array | None = None,
     photons: NoiseCurve | None = None,
 ) -> Steps[Deblurred]:
-    """Remove a blur step by step, or a point spread function (h, w); see :func:`remove_blur`."""
+    """Remove a blur step by step; see :func:`remove_blur`.
+
+    With ``side`` the image is deconvolved in tiles of at most that side, pixels, which takes less memory.  Where there
+    are ``witnesses``, the frames tell the blur together with the image.  ``psf`` (h, w) is the point spread
+    function, if it is known.  ``photons`` is the noise of the image at every level, relative to its mean.
+    """
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
     if psf is not None:
         params = replace(params, sigma=read_blur(psf)[1])
@@ -112,16 +109,12 @@ def remove_blur_steps(
         kernel = width if psf is None or width == 0 else psf
         return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles, photons)
 
-    tiles, first = None, None
+    blur_map, widths, first = None, None, None
     # The likelihood of a tile is unreliable where that of the image is, and where frames tell the blur they decide.
     if posterior is None and blur is not None and blur.blurred and not blur.edge_limited:
-        if runtime.memory_limit is None:
-            tiles, first = yield from _map_meanwhile(image, blur, remove(sigma))
-        else:
-            tiles = estimate_blur_map(image, blur, runtime)
-    widths = sigma_map(tiles.removable, image.shape[:2]) if tiles is not None and tiles.varies else None
+        blur_map, widths, first = yield from _find_widths(image, blur, remove(sigma), runtime)
     if widths is not None:
-        sigma, first = float(widths.max()), None
+        sigma = float(widths.max())
 
     def attempt(width: float) -> Steps[Deconvolution]:
         if widths is None or width == 0:
@@ -139,9 +132,10 @@ def remove_blur_steps(
     if posterior is not None:
         on_blur = explain_posterior(posterior, result.sigma)
     else:
-        on_blur = explain_blur(blur, sigma, tiles, "asked for" if psf is None else "the point spread function is given")
-    decisions = (on_blur, *explain_blur_map(tiles), *on_guards)
-    return Deblurred(result, blur, tiles, readings, decisions, posterior)
+        given = "asked for" if psf is None else "the point spread function is given"
+        on_blur = explain_blur(blur, sigma, blur_map, given)
+    decisions = (on_blur, *explain_blur_map(blur_map), *on_guards)
+    return Deblurred(result, blur, readings, decisions, posterior)
 
 
 def tiled_deconvolution_steps(
@@ -152,16 +146,16 @@ def tiled_deconvolution_steps(
     runtime: Runtime = DEFAULT,
     tiles: tuple[HaloTile, ...] = (),
     photons: NoiseCurve | None = None,
-) -> Generator[DeconvolutionState, None, Deconvolution]:
+) -> Steps[Deconvolution]:
     """Deconvolve an image (H, W) or (H, W, 3) in overlapping tiles, by the blur and the fidelity λ of the whole.
 
     The weights, the end of the iterations and a periodic boundary are those of each tile, so the result differs a bit
     from that of the whole image.  ``sigma`` may be a PSF (h, w); ``guide`` (H, W) or (H, W, 3).
     """
     pixels = check_image(image)
-    around = None if guide is None else check_image(guide, "guide")
+    guide_image = None if guide is None else check_image(guide, "guide")
     if not np.any(sigma) or len(tiles) < 2:
-        whole = yield from deconvolve_steps(pixels, sigma, params, around, runtime, photons)
+        whole = yield from deconvolve_steps(pixels, sigma, params, guide_image, runtime, photons)
         return replace(whole, image=to_scratch(whole.image, runtime.scratch))
     params = params or DeconvolutionParams()
     # Each tile chooses its own h for the nonlocal weights, from its guide after sharpening; that of the whole guide
@@ -169,7 +163,7 @@ def tiled_deconvolution_steps(
     params = replace(params, fidelity=whole_image_fidelity(pixels, params))
     restored, parts = new_mosaic(pixels.shape, runtime.scratch), list[Deconvolution]()
     for tile in tiles:
-        guide_part = None if around is None else around[tile.rows, tile.columns]
+        guide_part = None if guide_image is None else guide_image[tile.rows, tile.columns]
         cut = pixels[tile.rows, tile.columns]
         part = yield from deconvolve_steps(cut, sigma, params, guide_part, runtime, photons)
         add_tile(restored, tile, part.image)
@@ -209,13 +203,33 @@ def guarded_steps(
     """Deconvolve an image (H, W[, 3]) by smaller and smaller widths until the guards pass."""
     readings: list[GuardReading] = []
     while sigma > 0 and len(readings) < guards.tries:
-        result, first = first or (yield from attempt(sigma)), None
+        if first is None:
+            result = yield from attempt(sigma)
+        else:
+            result, first = first, None
         readings.append(evaluate_guards(result.image, blurred, sigma, guards))
         if readings[-1].passed:
             return result, tuple(readings)
         sigma *= guards.back_off if len(readings) > 1 else guards.first_back_off(readings[0])
     result = yield from attempt(0.0)
     return result, tuple(readings)
+
+
+def _find_widths(
+    image: FloatArray, blur: BlurEstimate, steps: Steps[Deconvolution], runtime: Runtime
+) -> Steps[tuple[BlurMap | None, FloatArray | None, Deconvolution | None]]:
+    """Find the widths of tiles and, if they differ, a width for every pixel (H, W).
+
+    If they agree, the third is the result of ``steps``, the deconvolution by one width, unless memory is limited.
+    """
+    first = None
+    if runtime.memory_limit is None:
+        blur_map, first = yield from _map_meanwhile(image, blur, steps)
+    else:
+        blur_map = estimate_blur_map(image, blur, runtime)
+    if blur_map is None or not blur_map.varies:
+        return blur_map, None, first
+    return blur_map, sigma_map(blur_map.removable, image.shape[:2]), None
 
 
 def _map_meanwhile(

@@ -49,12 +49,13 @@ from .witnesses.image_evidence import EXPONENTS, ImageEvidence
 from .witnesses.short_exposure import TILT_SPREAD
 from .witnesses.spectral_variation import RINGS, SpectralVariation, measure_variation
 
-# Fidelity of the Wiener filter and exponent of the power of a scene; factors on the width that are tried.
+# Fidelity of the Wiener filter, and exponent of the power of a scene.
 _FIDELITY, _SCENE = 1500.0, 2.2
 # Share of the energy of the scene that is lost even with the right blur, about as on the clips of the calibration.
 _LEAST_LOSS = 0.02
 # How much less likely the narrowest lens is, as a logarithm, where frames have been moved and hence interpolated.
 _INTERPOLATED = 3.0
+# Factors on the width that are tried.
 _FACTORS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
 # Static widths below this are those of the pixels and of the interpolation, and are not removed, pixels.  Where the air
 # has blurred with this probability, of smaller widths the lowest that is likely is removed.
@@ -84,18 +85,14 @@ EXCLUDED = (6.0, 8.0, 10.0)
 
 @dataclass(frozen=True, eq=False)
 class BlurWitnesses:
-    """What the frames say about their blur: s and s_4, if they could be measured, V, and how many are independent.
+    """What the frames say about their blur."""
 
-    ``picture`` is the part of the image that the frames show, without bars.  Of known optics, ``diffraction`` is λ/D in
-    pixels, and ``spread`` the standard deviation of ln V if V is what a measured D/r0 makes.
-    """
-
-    displacement: float
-    frames: float
-    picture: tuple[slice, slice] | None = None
-    variation: SpectralVariation | None = None
-    diffraction: float | None = None
-    spread: float | None = None
+    displacement: float  # V, squared pixels; NaN where it is not known
+    independent_frames: float
+    picture: tuple[slice, slice] | None = None  # part of the image that the frames show, without bars
+    variation: SpectralVariation | None = None  # s and s_4, if they could be measured
+    diffraction: float | None = None  # λ/D of known optics, pixels
+    spread: float | None = None  # standard deviation of ln V, if V is what a measured D/r0 makes
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,36 +149,43 @@ def blur_posterior(
     """
     variation, diffraction = witnesses.variation, witnesses.diffraction
     scale = 1 if variation is None else variation.reduction
-    known = hypotheses(None if diffraction is None else diffraction / scale)
-    prior = known.prior.copy()
+    grid = hypotheses(None if diffraction is None else diffraction / scale)
+    prior = grid.prior.copy()
+    # NaN counts as moving.
     if not witnesses.displacement < _STILL:
         prior[:, 0] -= _INTERPOLATED
-    of_v = displacement_likelihood(known, witnesses.displacement, witnesses.frames, scale, witnesses.spread)[:, None]
-    of_v = of_v + 0 * known.width
-    of_s = 0 * known.width if variation is None else variation_likelihood(known, variation)
+    nothing = np.zeros_like(grid.width)
+    of_air = displacement_likelihood(
+        grid, witnesses.displacement, witnesses.independent_frames, scale, witnesses.spread
+    )
+    of_v = np.broadcast_to(of_air[:, None], grid.width.shape)
+    of_s = nothing if variation is None else variation_likelihood(grid, variation)
     of_v, of_s = (np.maximum(one, one.max() - most) for one, most in ((of_v, EXCLUDED[0]), (of_s, EXCLUDED[1])))
-    kappa = _sharper(known, _normalised(prior + of_v + of_s), ratio)
-    of_image = 0 * known.width if evidence is None else image_likelihood(known, evidence, kappa, scale)
+    kappa = _sharper(grid, _normalised(prior + of_v + of_s), ratio)
+    of_image = nothing if evidence is None else image_likelihood(grid, evidence, kappa, scale)
     weights = _normalised(prior + of_v + of_s + of_image)
-    kappa = _sharper(known, weights, ratio)
+    kappa = _sharper(grid, weights, ratio)
 
     def quantiles(likelihood: Float64Array) -> Float64Array:
         if np.ptp(likelihood) == 0:
             return np.full(len(_QUANTILES), np.nan)
-        return _quantiles(kappa * scale * known.width, _normalised(prior + likelihood))
+        return _quantiles(kappa * scale * grid.width, _normalised(prior + likelihood))
 
-    curves = np.array([np.interp(RINGS * kappa, RINGS, curve) for curve in known.transfer.reshape(-1, len(RINGS))])
+    curves = np.array([np.interp(RINGS * kappa, RINGS, curve) for curve in grid.transfer.reshape(-1, len(RINGS))])
     mean = np.exp(weights.ravel() @ np.log(np.maximum(curves, LEAST_TRANSFER)))
     width, exponent = _least_loss(curves, weights.ravel(), mean, scale)
-    by_image, whole = quantiles(of_image), _quantiles(kappa * scale * known.width, weights)
+    by_image, whole = quantiles(of_image), _quantiles(kappa * scale * grid.width, weights)
     width *= scale
     if by_image[2] < whole[0]:
         # The mean, in logarithm, with the widest blur by the image where the posterior has only wider ones.
         width = (width * min(width, float(by_image[2]))) ** 0.5
     low, _, high = np.array([_quantiles(column, weights.ravel()) for column in curves.T]).T
     air = float(1 - weights[-1].sum())
+    removed = width
+    if width < _LEAST_REMOVED:
+        removed = min(width, float(whole[0])) if air > _SURELY else 0.0
     return BlurPosterior(
-        removed=width if width >= _LEAST_REMOVED else min(width, float(whole[0])) * (air > _SURELY),
+        removed=removed,
         exponent=exponent,
         width=whole,
         by_displacement=quantiles(of_v),
@@ -193,15 +197,15 @@ def blur_posterior(
         transfer=mean,
         lowest=low,
         highest=high,
-        **_measured_and_expected(known, variation, weights),
+        **_measured_and_expected(grid, variation, weights),
     )
 
 
-def _sharper(known: Hypotheses, weights: Float64Array, ratio: Float64Array | None) -> float:
+def _sharper(grid: Hypotheses, weights: Float64Array, ratio: Float64Array | None) -> float:
     """κ, by the half frequencies of the mean transfer function with and without the ratio of the spectra."""
     if ratio is None:
         return 1.0
-    mean = np.exp(np.tensordot(weights, np.log(np.maximum(known.transfer, LEAST_TRANSFER))))
+    mean = np.exp(np.tensordot(weights, np.log(np.maximum(grid.transfer, LEAST_TRANSFER))))
     (before, after), _ = shapes(np.clip(np.stack([mean, mean * ratio]), LEAST_TRANSFER, 1 - 1e-9))
     # Blurs of less than a pixel are not resolved by the ratio.
     return float(np.clip(after / before, 0.6, 1.1)) if mean[-1] < 0.5 and (mean * ratio)[-1] < 0.5 else 1.0
@@ -237,7 +241,7 @@ def _quantiles(widths: Float64Array, weights: Float64Array) -> Float64Array:
 
 
 def _measured_and_expected(
-    known: Hypotheses, measured: SpectralVariation | None, weights: Float64Array
+    grid: Hypotheses, measured: SpectralVariation | None, weights: Float64Array
 ) -> dict[str, Float64Array]:
     """Return s and s_4 as measured and as the posterior expects them, for the usual g and τ."""
     gaps = np.full(len(RINGS), np.nan)
@@ -249,7 +253,7 @@ def _measured_and_expected(
     share, shift = float(np.exp(SHARE_PRIOR[0])), float(np.exp(SHIFT_PRIOR[0]))
     values = ((measured.amplitude, measured.amplitude_error), (measured.power, measured.power_error))
     for kind, (name, (value, error)) in enumerate(zip(names, values, strict=True)):
-        predicted = np.tensordot(weights, expected(known, kind, rings, share, shift, measured.stretch))
+        predicted = np.tensordot(weights, expected(grid, kind, rings, share, shift, measured.stretch))
         for key, figure in ((name, value[rings]), (f"{name}_error", error[rings]), (f"expected_{name}", predicted)):
             found[key] = gaps.copy()
             found[key][rings] = figure
@@ -257,38 +261,38 @@ def _measured_and_expected(
 
 
 def displacement_likelihood(
-    known: Hypotheses, variance: float, frames: float, scale: int, spread: float | None = None
+    grid: Hypotheses, variance: float, independent_frames: float, scale: int, spread: float | None = None
 ) -> Float64Array:
-    """Log likelihood of V, in pixels of the image, for every air in reduced pixels; 0 where V is not known.
+    """Log likelihood of V, in pixels of the image, for every air in reduced pixels; 0 where V is not grid.
 
     ``spread`` is the standard deviation of ln V; by default that of an unknown outer scale.
     """
     if not np.isfinite(variance):
-        return np.zeros(len(known.prior))
+        return np.zeros(len(grid.prior))
     still, measured = variance < _STILL, max(variance, _LEAST_V) / scale**2
     if spread is None:
-        spread = float(np.hypot(TILT_SPREAD, 1.4 / max(frames, 1.0) ** 0.5))
-    of_air = -0.5 * (np.log(measured / known.expected_v) / spread) ** 2 - np.log(spread * np.sqrt(2 * np.pi))
+        spread = float(np.hypot(TILT_SPREAD, 1.4 / max(independent_frames, 1.0) ** 0.5))
+    of_air = -0.5 * (np.log(measured / grid.expected_v) / spread) ** 2 - np.log(spread * np.sqrt(2 * np.pi))
     return np.append(of_air, np.log(0.5 * still + 0.5 / _RANGE_OF_V))
 
 
-def variation_likelihood(known: Hypotheses, measured: SpectralVariation) -> Float64Array:
+def variation_likelihood(grid: Hypotheses, measured: SpectralVariation) -> Float64Array:
     """Log likelihood of s and s_4 for every hypothesis, mean over g and τ."""
     rings = clear_rings(measured)
     if len(rings) < 2:
-        return 0 * known.width
+        return np.zeros_like(grid.width)
     shares, shifts = (
         -0.5 * ((np.log(values) - middle) / spread) ** 2
         for values, (middle, spread) in ((_SHARES, SHARE_PRIOR), (_SHIFTS, SHIFT_PRIOR))
     )
-    total = np.full(known.width.shape, -np.inf)
+    total = np.full(grid.width.shape, -np.inf)
     for share, of_share in zip(_SHARES, shares, strict=True):
         for shift, of_shift in zip(_SHIFTS, shifts, strict=True):
-            likelihood = np.full(known.width.shape, of_share + of_shift)
+            likelihood = np.full(grid.width.shape, of_share + of_shift)
             for kind, (found, error) in enumerate(
                 ((measured.amplitude, measured.amplitude_error), (measured.power, measured.power_error))
             ):
-                predicted = expected(known, kind, rings, share, shift, measured.stretch)
+                predicted = expected(grid, kind, rings, share, shift, measured.stretch)
                 noise = (_NOISE_ERROR[kind] / measured.signal[rings]) ** 2
                 variance = error[rings] ** 2 + noise + (_MODEL_ERROR * predicted) ** 2 + _LEAST_ERROR**2
                 misfit = (found[rings] - predicted) ** 2 / variance + np.log(variance)
@@ -298,11 +302,11 @@ def variation_likelihood(known: Hypotheses, measured: SpectralVariation) -> Floa
 
 
 def expected(
-    known: Hypotheses, kind: int, rings: NDArray[np.int_], share: float, shift: float, stretch: float
+    grid: Hypotheses, kind: int, rings: NDArray[np.int_], share: float, shift: float, stretch: float
 ) -> Float64Array:
     """Return s (kind 0) or s_4 (kind 1) of every hypothesis in some rings."""
-    air = (known.amplitude, known.power)[kind][:, None, rings]
-    stretched = _STRETCH[kind] * stretch**2 * np.log(np.maximum(known.transfer[..., rings], 1e-4)) ** 2
+    air = (grid.amplitude, grid.power)[kind][:, None, rings]
+    stretched = _STRETCH[kind] * stretch**2 * np.log(np.maximum(grid.transfer[..., rings], 1e-4)) ** 2
     return share * air + stretched + _SHIFT[kind] * np.expm1((2 * np.pi * shift * RINGS[rings]) ** 2)
 
 
@@ -314,15 +318,15 @@ def clear_rings(measured: SpectralVariation) -> NDArray[np.int_]:
     return np.arange(_FIRST_RING, min(end, _LAST_RING))
 
 
-def image_likelihood(known: Hypotheses, evidence: ImageEvidence, kappa: float, scale: int) -> Float64Array:
+def image_likelihood(grid: Hypotheses, evidence: ImageEvidence, kappa: float, scale: int) -> Float64Array:
     """Log likelihood of the image for every hypothesis, mean over the softness of the scene."""
     curves = -np.minimum(_GRADIENTS * (evidence.costs - evidence.costs.min()), EXCLUDED[2])
-    place = np.interp(known.exponent, EXPONENTS, np.arange(len(EXPONENTS)))
+    place = np.interp(grid.exponent, EXPONENTS, np.arange(len(EXPONENTS)))
     low = np.minimum(place.astype(int), len(EXPONENTS) - 2)
     share, logs = place - low, np.log(evidence.widths)
-    total = np.full(known.width.shape, -np.inf)
+    total = np.full(grid.width.shape, -np.inf)
     for softness, weight in _SOFTNESS:
-        seen = np.log(np.hypot(kappa * scale * known.width, softness))
+        seen = np.log(np.hypot(kappa * scale * grid.width, softness))
         by_shape = np.array([np.interp(seen, logs, curve, right=-EXCLUDED[2]) for curve in curves])
         below, above = (np.take_along_axis(by_shape, (low + step)[None], 0)[0] for step in (0, 1))
         total = np.logaddexp(total, np.log(weight) + (1 - share) * below + share * above)

@@ -15,7 +15,6 @@ The nltv and tv problems are solved by :mod:`turbrestore.deconvolution.primal_du
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -40,7 +39,7 @@ from .nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
 from .nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from .primal_dual import Penalty, PrimalDual
 from .problem import Problem, margin_around, problem_of, read_blur
-from .stopping import DeconvolutionState, Solution, iterate
+from .stopping import Solution, Steps, iterate
 from .tv import LocalPenalty
 
 if TYPE_CHECKING:
@@ -52,8 +51,6 @@ CHANNELS = ("luminance", "each")
 
 # Smaller images are sharpened one after another: their transforms take less time than waiting for the interpreter lock.
 _PARALLEL_PIXELS = 1 << 15
-
-DeconvolutionSteps = Generator[DeconvolutionState, None, "Deconvolution"]
 
 
 @dataclass(frozen=True)
@@ -232,7 +229,7 @@ def deconvolve_steps(
     guide: ArrayLike | None = None,
     runtime: Runtime = DEFAULT,
     photons: NoiseCurve | None = None,
-) -> DeconvolutionSteps:
+) -> Steps[Deconvolution]:
     """Deblur an image step by step; arguments, errors and result as of :func:`deconvolve`.
 
     ``photons`` is the noise of the image at every level, relative to its mean.
@@ -263,13 +260,13 @@ def deconvolve_steps(
         transfer = load(otf, device)
         problems = [problem_of(plane, margin, photons, transfer, fidelity, runtime.workers) for plane in planes]
         measured = load(margin.mask(rim), device)
-        around = None
+        guide_image = None
         if guide is not None:
             grey = check_grey(guide, "guide")
             if grey.shape != margin.size:
                 raise DataError(f"guide: expected the size of the image {margin.size}, found {grey.shape}")
-            around = margin.pad(grey)
-        solution = yield from _solve(problems, around, measured, params, team)
+            guide_image = margin.pad(grey)
+        solution = yield from _solve(problems, guide_image, measured, params, team)
     restored = join_planes(pixels, [store(u)[margin.inside()] for u in solution.images], params.channels)
     records = (np.array(column) for column in zip(*solution.records, strict=True))
     return Deconvolution(
@@ -305,7 +302,7 @@ def _solve(
     measured: Stack,
     params: DeconvolutionParams,
     team: ThreadTeam,
-) -> Generator[DeconvolutionState, None, Solution]:
+) -> Steps[Solution]:
     stop = measured, params.iterations, params.tolerance
     if params.method in ("wiener", "tikhonov"):
         quadratic = quadratic_solver(problems[0], params.method)

@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.image_stacks import Stack, namespace, store
+from ..runtime.steps import Result
 from .conjugate_gradient import ConjugateGradients
 from .primal_dual import PrimalDual
 from .problem import Problem
@@ -57,6 +58,10 @@ class DeconvolutionState:
     change: float
 
 
+# A deconvolution that yields its state after each iteration.
+Steps = Generator[DeconvolutionState, None, Result]
+
+
 class Solution(NamedTuple):
     """Images, iterations, whether they converged, and records (iteration, energy, change for each iteration)."""
 
@@ -73,7 +78,7 @@ def iterate(
     measured: Stack,
     iterations: int,
     tolerance: float,
-) -> Generator[DeconvolutionState, None, Solution]:
+) -> Steps[Solution]:
     """Step the problems of all channels until no image changes any more."""
     images = [state.image for state in states]
     earlier = deque([images], max(solver.rest, 1))

@@ -6,7 +6,8 @@ paper descends its gradient,
     ∂u/∂t = λ k*∗(f − k∗u) + μ div(∇u / |∇u|),    (22)
 
 which comes to rest at the minimum that :mod:`turbrestore.deconvolution.primal_dual` finds.  Symbols as there:
-``K = ∇``, ``Kᵀ = −div``; μ is 1.
+``K = ∇``, ``Kᵀ = −div``; μ is 1.  The paper has a Neumann border; here the margin of
+:mod:`turbrestore.deconvolution.problem` takes its place.
 """
 
 from __future__ import annotations

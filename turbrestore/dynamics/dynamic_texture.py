@@ -1,13 +1,13 @@
 """Identification of the dynamic texture model of the flow (paper 3, sections 3.1 and 3.2).
 
-The model is ``ξ_{k+1} = A ξ_k + q_k``, ``W_k = W̄ + C ξ_k + r_k`` (eq. 10, which is eq. 7 for flows), see
-:mod:`turbrestore.dynamics.flow_model`.  The maximum likelihood estimate (eq. 8) is replaced by the paper's closed form:
+The model of :mod:`turbrestore.dynamics.flow_model` is eq. 10, which is eq. 7 for flows.  The maximum likelihood
+estimate (eq. 8) is replaced by the paper's closed form:
 
 1. C and Ξ minimise ``|X − C Ξ|`` under CᵀC = I (eq. 9): C is the first n columns of U, Ξ the first n rows of Σ Vᵀ;
 2. A minimises ``|Ξ_{2:τ} − A Ξ_{1:τ−1}|``: ``A = Ξ_{2:τ} Ξ_{1:τ−1}⁺``;
 3. Q is the covariance of e, and R the variance of X − C Ξ.
 
-Symbols as there, and
+Symbols as in :mod:`turbrestore.dynamics.flow_model`, and
 
 X : matrix of W − W̄, 2HW × τ, one flow in each column; U Σ Vᵀ its singular value decomposition
 e : residuals of the one-step prediction, ξ_{k+1} − A ξ_k

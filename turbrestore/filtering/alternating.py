@@ -1,7 +1,7 @@
 """Alternating-estimation Kalman filter over the image and the state of its flow (paper 3, section 4).
 
-Symbols as in :mod:`turbrestore.filtering.kalman`, which has eqs. 14, 16, 17 and 19; Ŵ is the flow that frames are
-registered by, and β the weight of sharpness, given or chosen by :mod:`turbrestore.filtering.frame_statistics`.
+Symbols as in :mod:`turbrestore.filtering.kalman`, which has eqs. 14 to 19; Ŵ is the flow that frames are registered
+by, and β the weight of sharpness, given or chosen by :mod:`turbrestore.filtering.frame_statistics`.
 
 Given Ŵ the image is a linear state, given ρ the flow is, so each frame updates one after the other:
 
@@ -17,8 +17,9 @@ Departures from the paper, each with its reason:
 
 * Frames are registered by the measured flow, ``Ŵ = W^meas`` (``residual="keep"``): by eq. 10 the flow is ``C ξ + r``,
   and r is mostly motion.  With ``Ŵ = C ξ̂`` (``"drop"``, as printed) that motion stays in the frames and blurs the
-  image, below the centroid that the filter starts from.  Taking a share of r for noise makes the image worse on average
-  (``benchmarks/decisions/filter.md``).  So the flow state describes and predicts the motion, not the image.
+  image, which becomes worse than the centroid that the filter starts from.  Taking a share of r for noise makes the
+  image worse on average (``benchmarks/decisions/filter.md``).  So the flow state describes and predicts the
+  motion, not the image.
 * The measurement equation 13c is nonlinear in image and flow together.  Eqs. 15 and 17, with which the paper replaces
   it, are used alone.  The mean flow W̄ is part of eq. 17 here.
 * The paper first updates the image by the predicted flow (its step 2).  Here the flow is measured first, because the
@@ -73,16 +74,14 @@ Flows = FloatArray | Sequence[FloatArray | None]
 
 @dataclass(frozen=True, eq=False)
 class _Position:
-    """State after the blocks that are done, and the block that has begun.
-
-    ``image`` is the reference of the flows that are measured next; it contains the block that has begun too.
-    """
+    """State after the blocks that are done, and the block that has begun."""
 
     state: FilterState
     records: tuple[FrameRecord, ...]
-    image: FloatArray
+    reference: FloatArray  # image that flows are measured from next; it contains the block that has begun too
     block: deque[Frame]
     flows_measured: int
+    flows_known: bool = False  # whether the next pass takes known flows as measured
 
 
 def filter_frames(
@@ -151,79 +150,87 @@ def filter_steps(
     runtime: Runtime = DEFAULT,
     start: FilterCheckpoint | None = None,
 ) -> Generator[FilterStep, None, Filtered]:
-    """Run the filter step by step; :func:`filter_frames` runs it to its end and describes the arguments."""
+    """Run the filter step by step; :func:`filter_frames` runs it to its end and describes the arguments.
+
+    ``start`` resumes from a checkpoint of the same frames and settings.
+    """
     params, flow_params = params or FilterParams(), flow_params or FlowParams()
     image = check_image(reference, "reference")
     flows = _check_flows(image, dynamics, known_flows)
     stream = _checked(frames, image.shape)
     block, known = _first_block(stream, params.block, flows)
+    trained = known is not None
     if known is None:
         counted = [frame for frame in block if frame is not None]
         measured = (flow for _, flow in iterate_flows(image, counted, flow_params, runtime))
         known = [None if frame is None else next(measured) for frame in block]
-    settings = _settings(block, known, image, dynamics, params, flow_params, runtime)
+    settings = _measure_settings(block, known, image, dynamics, params, flow_params, runtime)
     image_noise = settings.statistics.image_noise
     prior = _prior(image, image_noise, dynamics, params)
     if start is None and params.training == "skip":
         start = _after_training(prior, image, dynamics, len(known))
     if start is None:
-        at = _Position(prior, (), image, deque(block), 0)
+        at = _Position(prior, (), image, deque(block), 0, flows_known=True)
     else:
-        _skip(stream, len(start.records) - len(block), start, image.shape, dynamics)
+        _check_checkpoint(start, len(block), image.shape, dynamics)
+        for _ in islice(stream, len(start.records) - len(block)):
+            pass
         flows_measured = len(start.records) * params.inner_iterations - len(known)
         at = _Position(start.state, start.records, start.reference, deque(), flows_measured)
     del block
     with memory_of(settings.runtime.device):
-        at = yield from _filter_blocks(at, stream, known, settings)
-    return _joined(at, settings)
+        at = yield from _filter_blocks(at, stream, known, trained, settings)
+    return _to_filtered(at, settings)
 
 
 def _filter_blocks(
-    at: _Position, stream: Iterator[FloatArray | None], known: Flows, settings: PassSettings
+    at: _Position, stream: Iterator[FloatArray | None], known: Flows, trained: bool, settings: PassSettings
 ) -> Generator[FilterStep, None, _Position]:
-    """Do steps 1 to 4 of the module docstring for one block after the other."""
+    """Do steps 1 to 4 of the module docstring for one block after the other.
+
+    ``known`` are the flows to the first block; with ``trained`` they are those of the training frames, and their
+    mean is kept.
+    """
     size, iterations = settings.params.block, settings.params.inner_iterations
-    once = iterations == 1
-    alone = once or size == 1
-    if at.block:
-        # The flows of the first block are known in its first iteration.
-        at = yield from _iterate(at, settings, known, settle=once, from_known=True)
-        if once:
-            yield FilterStep(at.flows_measured, FilterCheckpoint(at.state, at.records, at.image))
+    # The last pass over a block is the first over the next block too, as threads idle at the end of each pass.
+    joint = iterations > 1 and size > 1
+    passes_done = 0
     while True:
         if not at.block:
-            known, at = (), replace(at, block=deque(islice(stream, size)))
+            at = replace(at, block=deque(islice(stream, size)))
             if not at.block:
                 return at
-            if not once:
-                at = yield from _iterate(at, settings)
-        for _ in range(iterations - 2):
+            known, passes_done = (), 0
+        for _ in range(passes_done, iterations - 1):
             at = yield from _iterate(at, settings, known)
-        # The last iteration of this block and the first of the next are one pass, as threads idle at the end of each.
-        reference = at.image
-        at = yield from _iterate(at, settings, known, settle=True, following=islice(stream, 0 if alone else size))
-        known = ()
-        reference = at.image if alone else reference
+        first_block, reference = not at.records, at.reference
+        at = yield from _iterate(at, settings, known, last=True, following=islice(stream, size if joint else 0))
+        if first_block and trained:
+            training_flow = _mean_flow(at.state.flow_sum, at.records)
+            at = replace(at, state=replace(at.state, training_flow=training_flow))
+        # The joint pass measured the next block's flows from this image, so a resumed run must too; without a joint
+        # pass the next block starts from the newest.
+        reference = reference if joint else at.reference
         yield FilterStep(at.flows_measured, FilterCheckpoint(at.state, at.records, reference))
+        known, passes_done = (), int(joint)
 
 
 def _iterate(
     at: _Position,
     settings: PassSettings,
-    known: Flows = (),
-    settle: bool = False,
+    known: Flows,
+    last: bool = False,
     following: Iterable[FloatArray | None] = (),
-    from_known: bool = False,
 ) -> Generator[FilterStep, None, _Position]:
-    """Run one iteration over the block that has begun, its last if ``settle``, and over the frames that follow it."""
-    settled = len(at.block) if settle else 0
-    frames, starts = chain(_drain(at.block), following), chain(known, repeat(None))
-    reference = None if from_known else at.image
+    """Run one pass over the block that has begun, and over the frames that follow it; ``last`` settles the block."""
+    settled = len(at.block) if last else 0
+    frames, known_flows = chain(_drain(at.block), following), chain(known, repeat(None))
+    reference = None if at.flows_known else at.reference
     device = settings.runtime.device
     image = settled_image = PixelStacks(load_image(at.state.image.mean, device), load(at.state.image.variance, device))
-    flow_sum = at.state.flow_sum.copy() if settle else at.state.flow_sum
+    flow_sum = at.state.flow_sum.copy() if last else at.state.flow_sum
     flow, records, block, flows_measured = at.state.flow, list(at.records), deque[Frame](), at.flows_measured
-    for number, tracked in enumerate(pass_over(frames, starts, reference, at.state.flow, settled, settings)):
+    for number, tracked in enumerate(pass_over(frames, known_flows, reference, at.state.flow, settled, settings)):
         image, record = _update_image(image, tracked, settings)
         if number < settled:
             settled_image, flow = image, tracked.state
@@ -232,21 +239,20 @@ def _iterate(
                 flow_sum += tracked.measured
         else:
             block.append(tracked.frame)
-        if not from_known:
+        if not at.flows_known:
             flows_measured += 1
             yield FilterStep(flows_measured)
-    training_flow = at.state.training_flow
-    if settled and not at.records and isinstance(known, np.ndarray):
-        training_flow = _mean_flow(flow_sum, records)
     pixels = PixelGaussian(store_image(settled_image.mean), store(settled_image.variance))
-    state = FilterState(pixels, flow, flow_sum, training_flow)
+    state = FilterState(pixels, flow, flow_sum, at.state.training_flow)
     return _Position(state, tuple(records), store_image(image.mean), block, flows_measured)
 
 
 def _update_image(image: PixelStacks, tracked: TrackedFrame, settings: PassSettings) -> tuple[PixelStacks, FrameRecord]:
-    """Update the image by a frame (eqs. 14a, 14c, 15 and 16)."""
+    """Predict the image, and update it by a frame that counts (eqs. 14a, 14c, 15 and 16)."""
     frame = tracked.registered or register(tracked, settings)
     if frame is None:
+        # The scene drifts on although nothing is measured (14c).
+        image = image._replace(variance=image.variance + settings.params.image_drift)
         return image, FrameRecord(tracked.state.mean, 0.0, tracked.innovation, np.nan, 0.0)
     image, gains = update_pixels(image, frame.channels, frame.noise, settings.params.image_drift)
     gain, information = float(gains.mean()), float((1 / frame.noise).mean())
@@ -259,7 +265,7 @@ def _drain(block: deque[Frame]) -> Iterator[Frame]:
         yield block.popleft()
 
 
-def _settings(
+def _measure_settings(
     block: list[FloatArray | None],
     known: Flows,
     image: FloatArray,
@@ -309,7 +315,7 @@ def _mean_flow(flow_sum: FloatArray, records: Sequence[FrameRecord]) -> FloatArr
     return flow_sum / np.float32(max(sum(np.isfinite(record.sharpness) for record in records), 1))
 
 
-def _joined(at: _Position, settings: PassSettings) -> Filtered:
+def _to_filtered(at: _Position, settings: PassSettings) -> Filtered:
     """Join the last state and the records of all frames."""
     state, records = at.state, at.records
     information = np.array([record.information for record in records])
@@ -328,7 +334,7 @@ def _joined(at: _Position, settings: PassSettings) -> Filtered:
         sharpness=np.array([record.sharpness for record in records]),
         shares=information / information.sum(),
         image_noise=settings.statistics.image_noise,
-        sharpness_weight=settings.sharpness,
+        sharpness_weight=settings.sharpness_weight,
         mean_flow=mean_flow,
     )
 
@@ -354,7 +360,10 @@ def _checked(frames: Iterable[ArrayLike | None], shape: tuple[int, ...]) -> Iter
 def _first_block(
     stream: Iterator[FloatArray | None], size: int, flows: FloatArray | None
 ) -> tuple[list[FloatArray | None], Flows | None]:
-    """Frames with known flows, else as many as any block has; more where none of them counts, without known flows."""
+    """Read the first block: the frames with known flows, else ``size`` frames.
+
+    It is extended, without known flows, until one frame is in use.
+    """
     block, least = list(islice(stream, size if flows is None else len(flows))), 1 if flows is None else len(flows)
     if len(block) < max(least, 1):
         raise DataError(f"frames: expected at least {least}, found {len(block)}")
@@ -367,20 +376,14 @@ def _first_block(
     return block, known
 
 
-def _skip(
-    stream: Iterator[FloatArray | None],
-    count: int,
-    start: FilterCheckpoint,
-    shape: tuple[int, ...],
-    dynamics: FlowDynamics,
+def _check_checkpoint(
+    start: FilterCheckpoint, first_block: int, shape: tuple[int, ...], dynamics: FlowDynamics
 ) -> None:
-    """Read the frames before a checkpoint that lie behind the first block."""
     state, size = start.state, shape[:2]
     flows, images = (state.flow_sum, state.training_flow), (state.image.mean, start.reference)
     found = tuple(array.shape for array in (*images, state.image.variance, *flows, state.flow.mean))
-    if count < 0 or found != (shape, shape, size, (*size, 2), (*size, 2), (dynamics.rank,)):
+    expected = (shape, shape, size, (*size, 2), (*size, 2), (dynamics.rank,))
+    if len(start.records) < first_block or found != expected:
         raise DataError(
             f"start: expected a checkpoint of these frames, found one of {len(start.records)} frames and shapes {found}"
         )
-    for _ in islice(stream, count):
-        pass

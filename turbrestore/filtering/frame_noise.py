@@ -1,10 +1,8 @@
 """A frame that is registered to the image, and its measurement noise at every pixel (paper 3, eq. 15).
 
-The measurement of the image by a frame is ``I ∘ ŵ = ρ + ζ`` with ``ζ ~ N(0, Z)`` (eq. 15).
-
 Symbols
 -------
-I ∘ ŵ : frame I warped by the estimated flow; ρ : image; Z : variance of a registered frame about it
+I ∘ ŵ : frame I warped by the estimated flow; Z : its variance about the image
 z : local sharpness of a frame, standardised over the frames; β its weight
 v : variance of z over the frames
 κ : share of the middle of the window that z leaves out, see :func:`local_sharpness`
@@ -90,20 +88,20 @@ class RegisteredFrame:
 
 
 def register_frame(
-    image: FloatArray, flow: FloatArray, statistics: FrameStatistics, sharpness: float
+    pixels: FloatArray, flow: FloatArray, statistics: FrameStatistics, sharpness_weight: float
 ) -> RegisteredFrame:
     """Warp a frame (H, W[, 3]) onto the image by Ŵ (H, W, 2) and estimate its noise Z (eq. 15)."""
     loaded = load(flow, statistics.median.device)
-    channels, grey, seen = warp_frame(image, loaded)
-    return RegisteredFrame(channels, *frame_noise_variance(grey, loaded, seen, statistics, sharpness))
+    channels, grey, seen = warp_frame(pixels, loaded)
+    return RegisteredFrame(channels, *frame_noise_variance(grey, loaded, seen, statistics, sharpness_weight))
 
 
-def warp_frame(image: FloatArray, flow: Stack) -> Warped:
+def warp_frame(pixels: FloatArray, flow: Stack) -> Warped:
     """Warp a frame (H, W[, 3]), a NumPy array, by a flow (H, W, 2) that is on the device already."""
     if isinstance(flow, np.ndarray):
-        registered = warp(image, flow)
+        registered = warp(pixels, flow)
         return load_image(registered, CPU), luminance(registered), inside(flow)
-    channels = warp_stack(load_image(image, flow.device), flow)
+    channels = warp_stack(load_image(pixels, flow.device), flow)
     # The luminance of the three unit colours is the weight of each channel.
     weights = luminance(np.eye(3, dtype=np.float32)[None])[0].tolist() if len(channels) == 3 else [1.0]
     grey = sum(weight * channel for weight, channel in zip(weights, channels, strict=True))
@@ -119,17 +117,17 @@ def _within(position: Stack, length: int) -> Stack:
 
 
 def frame_noise_variance(
-    grey: Stack, flow: Stack, seen: Stack, statistics: FrameStatistics, sharpness: float
+    grey: Stack, flow: Stack, seen: Stack, statistics: FrameStatistics, sharpness_weight: float
 ) -> tuple[Stack, float]:
     """Z of one frame, and how sharp the frame is.
 
-    ``grey`` (H, W); ``flow`` (H, W, 2); ``seen`` (H, W); returns ``noise`` (H, W).
+    ``grey`` (H, W); ``flow`` (H, W, 2); ``seen`` (H, W); ``sharpness_weight`` is β; returns ``noise`` (H, W).
     """
-    xp, beta = namespace(grey), float(sharpness)
+    xp, beta = namespace(grey), float(sharpness_weight)
     projection = project_gradient(grey, statistics.template)
-    sharp = float(projection.sum()) / max(statistics.template_energy, 1e-12)
+    sharpness = float(projection.sum()) / max(statistics.template_energy, 1e-12)
     if beta == 0:
-        return xp.full_like(grey, statistics.image_noise), sharp
+        return xp.full_like(grey, statistics.image_noise), sharpness
     excess = squared_deviation(grey, statistics.mean_frame, statistics.deviation) / OUTLIER
     difference = grey - statistics.median
     # Light that has changed is no disagreement.
@@ -146,7 +144,7 @@ def frame_noise_variance(
     exponent = statistics.score_variance * (beta**2 / 2) - score * beta
     exponent = xp.clip(exponent + invalid_mask(flow, seen) * _LOG_INVALID, None, _LARGEST_EXPONENT)
     # The third power: a deviation of twice the tolerance reduces the weight to an eighth.
-    return squared * excess * statistics.image_noise * xp.exp(exponent), sharp
+    return squared * excess * statistics.image_noise * xp.exp(exponent), sharpness
 
 
 def invalid_mask(flow: Stack, seen: Stack) -> Stack:

@@ -38,18 +38,18 @@ class PassSettings:
     dynamics: FlowDynamics
     statistics: FrameStatistics  # its maps are on the device
     params: FilterParams
-    sharpness: float  # β, given or chosen
+    sharpness_weight: float  # β, given or chosen
     flow_params: FlowParams
     runtime: Runtime  # with the device that was found
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """A frame on its way through a pass; a frame that does not count has neither flows nor an image."""
+    """A frame on its way through a pass; a frame that does not count has neither flows nor pixels."""
 
     frame: Frame  # prepared for flow as soon as one is measured
-    start: FloatArray | None  # (H, W, 2): known flow to it, pixels
-    kept: bool  # whether another pass follows, for which the frame has a flow to start from
+    known_flow: FloatArray | None  # (H, W, 2): pixels
+    passes_again: bool  # whether it takes part in another pass, for which it has a flow to start from
     state: Gaussian  # ξ̂ and P after the frame; until then those before the pass
     measured: FloatArray | None = None  # (H, W, 2): W^meas, pixels
     projected: ProjectedFlow | None = None
@@ -57,14 +57,14 @@ class TrackedFrame:
     registered: RegisteredFrame | None = None  # None on a device too, where the update of the image registers it
 
     @property
-    def image(self) -> FloatArray | None:
+    def pixels(self) -> FloatArray | None:
         """The frame as it was read, (H, W) or (H, W, 3)."""
         return self.frame.image if isinstance(self.frame, FlowFrame) else self.frame
 
 
 def pass_over(
     frames: Iterable[Frame],
-    starts: Iterable[FloatArray | None],
+    known_flows: Iterable[FloatArray | None],
     image: FloatArray | None,
     state: Gaussian,
     settled: int,
@@ -72,16 +72,16 @@ def pass_over(
 ) -> Iterator[TrackedFrame]:
     """Measure flows from an image to frames, update the flow state by these flows, and register the frames.
 
-    Without an image the starts are the measured flows.  ``image`` (H, W) or (H, W, 3).
+    With ``image`` None the known flows are taken as measured.  ``image`` (H, W) or (H, W, 3).
     """
     dynamics, on_cpu = settings.dynamics, settings.runtime.device == CPU
     reference = None if image is None else prepare_reference(image, settings.flow_params, settings.runtime)
     size, threads = (1, settings.runtime.threads) if reference is None else (reference.batch, reference.threads)
 
     def measure(batch: list[tuple[int, Frame, FloatArray | None]]) -> list[TrackedFrame]:
-        items = [TrackedFrame(frame, start, number >= settled, state) for number, frame, start in batch]
+        items = [TrackedFrame(frame, known, number >= settled, state) for number, frame, known in batch]
         if reference is None:
-            items = [item if item.frame is None else replace(item, measured=item.start) for item in items]
+            items = [item if item.frame is None else replace(item, measured=item.known_flow) for item in items]
         else:
             items = _measure_flows(items, reference)
         return [
@@ -99,20 +99,20 @@ def pass_over(
 
     def register_all(items: list[TrackedFrame]) -> list[TrackedFrame]:
         # What flow has prepared of a frame takes memory, and is of use in another pass only.
-        plain = [item if item.kept else replace(item, frame=item.image) for item in items]
+        plain = [item if item.passes_again else replace(item, frame=item.pixels) for item in items]
         return [replace(item, registered=register(item, settings)) for item in plain] if on_cpu else plain
 
-    numbered = zip(count(), iter_frames(frames), iter_frames(starts), strict=False)
+    numbered = zip(count(), iter_frames(frames), iter_frames(known_flows), strict=False)
     for tracked in map_in_turns(measure, update_states, register_all, in_batches(numbered, size), threads):
         yield from tracked
 
 
 def register(tracked: TrackedFrame, settings: PassSettings) -> RegisteredFrame | None:
     """Register a frame by the measured flow, or by that of the model; None if the frame does not count."""
-    if tracked.image is None or tracked.measured is None:
+    if tracked.pixels is None or tracked.measured is None:
         return None
     flow = tracked.measured if settings.params.residual == "keep" else flow_of(settings.dynamics, tracked.state.mean)
-    return register_frame(tracked.image, flow, settings.statistics, settings.sharpness)
+    return register_frame(tracked.pixels, flow, settings.statistics, settings.sharpness_weight)
 
 
 def _measure_flows(items: list[TrackedFrame], reference: FlowReference) -> list[TrackedFrame]:
@@ -125,15 +125,15 @@ def _measure_flows(items: list[TrackedFrame], reference: FlowReference) -> list[
         if item.frame is not None:
             # An earlier pass may have prepared it.
             frame = item.frame if isinstance(item.frame, FlowFrame) else reference.prepare(item.frame)
-            start = frame.start if item.start is None else item.start
+            start = frame.start if item.known_flow is None else item.known_flow
             # The first of several flows is where the next one starts.
-            prepared.append(replace(frame, start=start, draft=item.kept and start is None))
+            prepared.append(replace(frame, start=start, draft=item.passes_again and start is None))
     solved = iter(zip(prepared, reference.solve(prepared) if prepared else [], strict=True))
     return [item if item.frame is None else _with_flow(item, *next(solved)) for item in items]
 
 
 def _with_flow(item: TrackedFrame, frame: FlowFrame, flow: FloatArray) -> TrackedFrame:
-    if item.kept and item.start is None:
+    if item.passes_again and item.known_flow is None:
         # Half the resolution and float16 take one byte for each pixel of the image, and are accurate enough to start
         # from: displacements of up to 2,000 pixels are exact to one pixel, and the search recovers from several.
         size = flow.shape[1] // 2, flow.shape[0] // 2

@@ -5,8 +5,8 @@ Symbols
 Z₀ : variance of a registered frame about the image before sharpness is taken into account (paper 3, eq. 15)
 β : weight of sharpness; κ what its window leaves out, see :func:`turbrestore.filtering.frame_noise.local_sharpness`
 
-Frames are warped three times: some of them for a median, which what passes through the scene does not change, and all
-of them three times: for the mean, for the variance, and once more to leave out what deviates from all others.
+All frames are warped twice: for mean and variance, and again to leave out what deviates.  Some are warped once more,
+for a median that what passes does not change.
 """
 
 from __future__ import annotations

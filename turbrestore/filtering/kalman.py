@@ -105,6 +105,8 @@ def update(
 ) -> tuple[Gaussian, Innovation]:
     """Measurement update in covariance form, for few components (paper 3, eqs. 17 and 18).
 
+    The observers of blur moments use this form, with the gain of eq. 18; the alternating filter uses the information
+    form of eq. 19.
     The new covariance is Joseph's ``(I − M H) P (I − M H)ᵀ + M R Mᵀ`` where the paper has ``(I − M H) P``: both are the
     same in exact arithmetic, but only the first stays symmetric and positive semi-definite in floating point.
     ``measurement`` (..., m); ``H`` (..., m, n); ``R`` (..., m, m); ``predicted`` (..., m).
@@ -295,10 +297,10 @@ def first_states(image: FloatArray, variance: float, dynamics: FlowDynamics) -> 
 
 
 class PixelStacks(NamedTuple):
-    """ρ̂ and Σ as arrays or tensors with the channels first: shapes (C, H, W) and (H, W)."""
+    """PixelGaussian as the device holds it, unchecked."""
 
-    mean: Stack
-    variance: Stack
+    mean: Stack  # (C, H, W): ρ̂
+    variance: Stack  # (H, W): Σ
 
 
 def update_pixels(state: PixelStacks, registered: Stack, noise: Stack, drift: float) -> tuple[PixelStacks, Stack]:

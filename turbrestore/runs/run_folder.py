@@ -216,7 +216,7 @@ class RunFolder:
         blur, posterior = self._load_stage("blur", BlurEstimate), self._load_stage("posterior", BlurPosterior)
         if (known.estimated, known.measured) != (blur is not None, posterior is not None):
             return None
-        return Deblurred(result, blur, None, known.readings, known.decisions, posterior)
+        return Deblurred(result, blur, known.readings, known.decisions, posterior)
 
     def _save(self, name: str, result: Any) -> None:
         """Write the files of a result, and then the record that they are there."""

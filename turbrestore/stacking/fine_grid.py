@@ -31,11 +31,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..agreement.last_guard import Halves, keep_agreed
-from ..blind.remove_blur import Steps, guarded_steps
+from ..blind.remove_blur import guarded_steps
 from ..blur.psf import GAUSSIAN, blur_otf
 from ..core.arrays import FloatArray
 from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, deconvolve_steps
+from ..deconvolution.stopping import Steps
 from ..preparation import Prepared
 from ..results import Restoration
 from ..runtime.runtime import Runtime

@@ -138,7 +138,7 @@ class NonlocalGraph:
 
 
 def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None, threads: int = 0) -> NonlocalGraph:
-    """Weights ``w(x, y) = exp(−d(x, y)/h²)``, ``d = Σ_z G_a(z) [g(x + z) − g(y + z)]²`` (paper 3, eq. 23).
+    """Weights of the pairs of pixels of an image (paper 3, eq. 23, as the module writes it).
 
     The printed equation has the absolute difference instead of its square, which does not fit the unit of h²; the
     square is that of the nonlocal means that the paper cites. Beyond the border the guide is reflected.
