@@ -123,7 +123,7 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
         depth = source.bit_depth if order.bit_depth is None else order.bit_depth
         if stages is not None and run is not None:
             save_stages(stages, restoration, run, depth)
-            stages.expect(*order.outputs)
+            stages.announce_outputs(*order.outputs)
         # Other existing files were refused above.
         write_result(
             order.output, restoration, source, depth, command, order.overwrite or order.output.absolute() in left
@@ -136,7 +136,7 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
         if order.report is not None and run is not None:
             write_report(order.report, restoration, run, overwrite=order.overwrite or order.report.absolute() in left)
         if stages is not None:
-            stages.expect()
+            stages.announce_outputs()
     return restoration, source
 
 

@@ -216,7 +216,7 @@ def test_a_limited_run_interrupted_in_the_filter_ends_the_same(tmp_path):
     # After the frames of the training, and between two blocks of those behind them.
     for records in (16, 40):
         (folder := tmp_path / f"kept{records}").mkdir()
-        kept = RunFolder(folder, source, QUICK, runtime, every=1)
+        kept = RunFolder(folder, source, QUICK, runtime, checkpoint_every=1)
         taken = kept.checkpoint
 
         def checkpoint(state, taken=taken, records=records):
