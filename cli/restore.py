@@ -101,11 +101,11 @@ def restore(
     verbose : bool
         Print every decision as it is made.
     """
+    from .clip import Order, restore_clip
     from .cluster import check_cluster
     from .inputs import read_input_image
     from .output import describe, print_json, summary
     from .progress import say
-    from .restoring import Order, restore_clip
 
     require(not (quiet and verbose), "--verbose: contradicts --quiet; leave one of them out")
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
