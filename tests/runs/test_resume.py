@@ -74,7 +74,7 @@ def test_a_run_that_dies_twice_may_still_replace_its_own_outputs(place):
         assert main(WORDS) == 130
     assert (place / "sharp.png").exists()
     with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, "turbrestore.pipeline._crop", 1)
+        interrupt(patch, "turbrestore.pipeline._find_crop", 1)
         assert main([*WORDS, "--resume"]) == 130
     assert main([*WORDS, "--resume"]) == 0
 
