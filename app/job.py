@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
-from turbrestore_cli.application import explain
+from turbrestore_cli.commands import explain
 
 if TYPE_CHECKING:
     from turbrestore.core.decision import Decision

@@ -35,17 +35,18 @@ class StageMemory:
     (1, 1)
     """
 
-    # There are no files.
-    stored = frozenset[str]()
-
     def __init__(self, show: Callable[[str, FloatArray], None] | None = None) -> None:
         self.show = show
         self._results: dict[str, Any] = {}
         self._levels = Levels()
 
-    def begin(self, levels: Levels) -> None:
+    def set_levels(self, levels: Levels) -> None:
         """Take the levels of the stages: what is shown has those of the clip."""
         self._levels = levels
+
+    def has(self, name: str) -> bool:
+        """Tell whether a result of this name is in memory."""
+        return name in self._results
 
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
         """Return what was computed under this name, or compute it."""

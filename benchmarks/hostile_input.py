@@ -40,7 +40,7 @@ IMPORTED = (
     "av",
     "tifffile",
     "PIL.Image",
-    "turbrestore_cli.restoring",
+    "turbrestore_cli.clip",
     "turbrestore_cli.stages",
     "turbrestore_cli.inspection",
 )

@@ -225,7 +225,11 @@ class StageWatch(Watch):
         self.taken[name] = self.lap()
         return result
 
-    def begin(self, levels: object) -> None:
+    def has(self, name: str) -> bool:
+        """Tell that nothing is kept."""
+        return False
+
+    def set_levels(self, levels: object) -> None:
         """Forget the levels."""
 
     def filter_start(self) -> None:

@@ -19,7 +19,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code, see :func:`turbrestore_cli.application.run`; 130 interrupted, 143 terminated.
+        Exit code, see :func:`turbrestore_cli.commands.run`; 130 interrupted, 143 terminated.
     """
     return _command(sys.argv[1:] if arguments is None else arguments, ends_process=False)
 
@@ -36,7 +36,7 @@ def _command(arguments: list[str], ends_process: bool) -> int:
             from .streams import open_closed
 
             open_closed()
-            from .application import run
+            from .commands import run
 
             return run(arguments)
     except BaseException:

@@ -20,12 +20,12 @@ from turbrestore.runtime.threads import available_cores
 from turbrestore.settings import Preset, RestoreParams
 
 from .batch_plan import JOURNAL, TABLE, figures, find_clips, journal_line, key_of, name_outputs, plan, write_summary
+from .clip import Order, restore_clip
 from .cluster import check_cluster, connected
 from .inputs import with_absolute_paths
 from .options import Flag, Machine, Selection, known_sigma
 from .output import print_json
 from .progress import progress_bars, say
-from .restoring import Order, restore_clip
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -112,11 +112,19 @@ def batch(
     shared = Machine(machine.threads or max(1, available_cores() // count), machine.device)
     orders = [
         Order(
-            clip, output, selection, settings, machine if scheduler else shared, bit_depth, each, preset,
-            report=output.with_suffix(".html") if reports else None, tile=tile,
+            input=clip,
+            output=output,
+            selection=selection,
+            params=settings,
+            machine=machine if scheduler else shared,
+            bit_depth=bit_depth,
+            memory_limit=each,
+            preset=preset,
+            report=output.with_suffix(".html") if reports else None,
+            tile=tile,
         )
         for clip, output in zip(clips, outputs, strict=True)
-    ]  # fmt: skip
+    ]
     with lock_folder(out):
         rows, missing = plan(orders, out, resume, overwrite)
         _do(rows, missing, out, scheduler, count, quiet)

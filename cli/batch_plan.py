@@ -23,7 +23,7 @@ from turbrestore.report.batch_page import ClipRow, write_batch_page
 from turbrestore.runs.typed_records import convert_to
 
 if TYPE_CHECKING:
-    from .restoring import Order
+    from .clip import Order
 
 # In a folder, files of these kinds are clips; images, TIFF and FITS files are the frames of one.
 CLIP_SUFFIXES = (".mkv", ".mp4", ".m4v", ".mov", ".webm", ".avi", ".gif", ".ser", ".npy", ".apng")

@@ -32,7 +32,7 @@ def install_completion(
     yes : bool
         Do not ask.
     """
-    from .application import build
+    from .commands import build
 
     try:
         chosen = shell or detect.detect_shell()

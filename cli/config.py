@@ -47,7 +47,7 @@ def config(
     require(init is not None or not overwrite, "--overwrite: has no effect with --check; leave it out")
     require(init is not None or preset == "standard", "--preset: has no effect with --check; leave it out")
     # The commands hang on the application, and the application on this command.
-    from .application import build
+    from .commands import build
 
     app = build()
     if init is not None:

@@ -30,7 +30,7 @@ def kept_stages(
     params: RestoreParams,
     runtime: Runtime,
     resume: bool,
-    every: int,
+    checkpoint_every: int,
     quiet: bool,
 ) -> Iterator[RunFolder | None]:
     """Hold the folder, take over what an earlier run has left, and keep the newest state if this one is interrupted."""
@@ -42,7 +42,7 @@ def kept_stages(
             say(
                 f"{folder}: this file system does not support locks; make sure that no other run uses the folder", quiet
             )
-        stages = RunFolder(folder, source, params, runtime, resume, every)
+        stages = RunFolder(folder, source, params, runtime, resume, checkpoint_every)
         for note in stages.notes:
             say(f"{folder}: {note}", quiet)
         try:
@@ -52,7 +52,9 @@ def kept_stages(
                 stages.flush()
                 stages.withdraw()
             finally:
-                stop.args = (f"{str(stop) or 'interrupted'}; --keep {folder} --resume continues {stages.progress()}",)
+                stop.args = (
+                    f"{str(stop) or 'interrupted'}; --keep {folder} --resume continues {stages.describe_progress()}",
+                )
             raise
         except Exception:
             stages.withdraw()

@@ -112,7 +112,7 @@ def register(
         check_space(flows, 8 * len(source) * source.shape[1] * source.shape[2])
     with kept_stages(keep, source, params, runtime, resume, checkpoint_every, quiet) as stages:
         # A kept run that has been deblurred stays complete.
-        whole = stages is not None and "deconvolution.npz" in stages.stored
+        whole = stages is not None and stages.has("deblurred")
         ordered = dataclasses.replace(params, scale=1.0, until=params.until if whole else "filter")
         with progress_bars(quiet, {"centroid": 2, "filter": 3, "register": 1}) as progress:
             told = None if progress is None or whole else progress

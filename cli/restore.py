@@ -101,11 +101,11 @@ def restore(
     verbose : bool
         Print every decision as it is made.
     """
+    from .clip import Order, restore_clip
     from .cluster import check_cluster
     from .inputs import read_input_image
     from .output import describe, print_json, summary
     from .progress import say
-    from .restoring import Order, restore_clip
 
     require(not (quiet and verbose), "--verbose: contradicts --quiet; leave one of them out")
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
@@ -113,10 +113,28 @@ def restore(
         check_cluster("restore", scheduler, workers)
         tile = TILE if tile is None else tile
     order = Order(
-        input, output, selection, settings, machine, bit_depth, memory_limit, preset,
-        config, keep, resume, checkpoint_every, report, uncertainty, truth, overwrite, quiet, verbose, tile,
-        scheduler, workers,
-    )  # fmt: skip
+        input=input,
+        output=output,
+        selection=selection,
+        params=settings,
+        machine=machine,
+        bit_depth=bit_depth,
+        memory_limit=memory_limit,
+        preset=preset,
+        config=config,
+        keep=keep,
+        resume=resume,
+        checkpoint_every=checkpoint_every,
+        report=report,
+        uncertainty=uncertainty,
+        truth=truth,
+        overwrite=overwrite,
+        quiet=quiet,
+        verbose=verbose,
+        tile=tile,
+        scheduler=scheduler,
+        workers=workers,
+    )
     restoration, _ = restore_clip(order)
     if json:
         # The truth is read again, so that it takes no memory while the stages run.

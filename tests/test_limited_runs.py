@@ -75,9 +75,9 @@ def test_the_truth_is_not_in_memory_while_the_stages_run(tmp_path, monkeypatch, 
         assert [truth() is None for truth in truths] == [True]
         return pipeline.restore(*words, **more)
 
-    for module in ("inputs", "restoring"):
+    for module in ("inputs", "clip"):
         monkeypatch.setattr(f"turbrestore_cli.{module}.read_input_image", read)
-    monkeypatch.setattr("turbrestore_cli.restoring.run_pipeline", run)
+    monkeypatch.setattr("turbrestore_cli.clip.run_pipeline", run)
     quick = ["--centroid.iterations=1", "--sigma=1", "--deconvolution.iterations=2", "--quiet"]
     assert main(["restore", "clip.npy", "image.png", "--truth=truth.png", "--json", *quick]) == 0
     assert "psnr" in json.loads(capsys.readouterr().out)["stages"]["deconvolved"]
@@ -216,7 +216,7 @@ def test_a_limited_run_interrupted_in_the_filter_ends_the_same(tmp_path):
     # After the frames of the training, and between two blocks of those behind them.
     for records in (16, 40):
         (folder := tmp_path / f"kept{records}").mkdir()
-        kept = RunFolder(folder, source, QUICK, runtime, every=1)
+        kept = RunFolder(folder, source, QUICK, runtime, checkpoint_every=1)
         taken = kept.checkpoint
 
         def checkpoint(state, taken=taken, records=records):

@@ -229,8 +229,9 @@ def _filtered_tiles(run: Run, centroid: Centroid, training: FloatArray, counted:
         for number, name in enumerate(names):
             yield run.from_store(name, partial(_filter_tile, run, centroid, training, counted, number))
         return
-    stored = () if run.store is None else run.store.stored
-    missing = [tile for name, tile in zip(names, run.tiles, strict=True) if f"{name}.npz" not in stored]
+    missing = [
+        tile for name, tile in zip(names, run.tiles, strict=True) if run.store is None or not run.store.has(name)
+    ]
     tasks = (_filter_task(run, tile, centroid, counted) for tile in missing)
     results = iter(run.map_tiles(_run_filter_task, tasks))
     for number, name in enumerate(names):

@@ -32,7 +32,7 @@ from .core.decision import Decision
 from .core.errors import ConfigurationError, DataError, require
 from .dynamics.dynamic_texture import identify_memory, modes_memory
 from .filtering.filter_records import filter_memory
-from .footage.survey import survey_bytes, survey_memory
+from .footage.survey import survey_memory, survey_scratch_bytes
 from .registration.flow import MIN_SIDE
 from .registration.opencv_flow import flow_memory
 from .runtime.device import TORCH_BYTES, find_device, needs_torch
@@ -261,7 +261,7 @@ def _scratch_bytes(shape: tuple[int, ...], params: RestoreParams, choice: _Choic
         part = shape[0], *largest_tile((shape[1], shape[2]), choice.tile), *shape[3:]
         # A tile has copies of its frames and flows and a model of its own; tiles of the images overlap up to fourfold.
         size += sum(_stack(part, params, choice.train)) + 4.0 * _pixels(shape) * (6 + 14 * _channels(shape))
-    return int(max(size, survey_bytes(shape)))
+    return int(max(size, survey_scratch_bytes(shape)))
 
 
 def _report(shape: tuple[int, ...]) -> float:

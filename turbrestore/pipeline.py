@@ -142,7 +142,7 @@ def restore(
         check_space(plan.runtime.scratch, plan.scratch_bytes)
     prepared = prepare(source, params.static_mask, plan.runtime.scratch)
     if store is not None:
-        store.begin(prepared.levels)
+        store.set_levels(prepared.levels)
     stretched = _stretched_params(params, prepared.levels)
     run = Run(prepared, stretched, plan, store, progress, on_decision, map_tiles)
     run.seconds["read"] = time.perf_counter() - begun

@@ -48,13 +48,12 @@ class Store(Protocol):
     """
 
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
-        """Return the result of that name: the one that was kept, else the one that is computed now and then kept."""
+        """Return the result of that name: the one that was kept, or compute it, keep it and return it."""
 
-    @property
-    def stored(self) -> frozenset[str]:
-        """Names of the files on disk that hold the results of stages."""
+    def has(self, name: str) -> bool:
+        """Tell whether a result of that name is kept."""
 
-    def begin(self, levels: Levels) -> None:
+    def set_levels(self, levels: Levels) -> None:
         """Take the levels at which the stages are about to work, so that what is kept can be brought back."""
 
     def filter_start(self) -> FilterCheckpoint | None:

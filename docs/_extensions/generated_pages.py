@@ -17,7 +17,7 @@ from types import NoneType
 from typing import TYPE_CHECKING, Any, get_args
 
 import turbrestore
-from turbrestore_cli.application import COMMANDS, build
+from turbrestore_cli.commands import COMMANDS, build
 from turbrestore_cli.examples import EXAMPLES
 
 if TYPE_CHECKING:

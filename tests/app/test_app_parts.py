@@ -42,10 +42,10 @@ QUICK = RestoreParams(centroid=CentroidParams(iterations=1), deconvolution=Decon
 def test_stages_are_shown_at_the_levels_of_the_clip():
     shown = []
     memory = stage_memory.StageMemory(lambda name, image: shown.append((name, image)))
-    memory.begin(Levels(0.25, 2.0))
+    memory.set_levels(Levels(0.25, 2.0))
     kept = memory.get("mean", lambda: np.full((2, 2), 0.5, np.float32))
     assert shown[0][0] == "mean" and (shown[0][1] == 0.5).all() and (kept == 0.5).all()
-    memory.begin(Levels(0.3, 10.0))
+    memory.set_levels(Levels(0.3, 10.0))
     memory.get("mean", lambda: None)
     np.testing.assert_allclose(shown[1][1], 0.35)
 

@@ -25,7 +25,6 @@ from turbrestore.report.batch_page import ClipRow, render_batch
 from turbrestore.runtime.runtime import Runtime
 from turbrestore_cli import batch as command
 from turbrestore_cli import cluster
-from turbrestore_cli import restoring as command_restore
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.batch_plan import find_clips, journal_line, name_outputs, read_journal
 from turbrestore_cli.inputs import open_input
@@ -269,7 +268,7 @@ class TestTiles:
         write_video(tmp_path / "a.npy", frames, 25)
         opened = []
         monkeypatch.setattr(
-            command_restore, "open_input", lambda path, *rest: opened.append(path) or open_input(path, *rest)
+            "turbrestore_cli.clip.open_input", lambda path, *rest: opened.append(path) or open_input(path, *rest)
         )
         monkeypatch.chdir(tmp_path)
         for name, words in {

@@ -19,7 +19,7 @@ from turbrestore.io.images import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.pipeline import RestoreParams
 from turbrestore_cli import doctor
-from turbrestore_cli.application import COMMANDS, build
+from turbrestore_cli.commands import COMMANDS, build
 from turbrestore_cli.examples import EXAMPLES, FIRST_STEPS
 from turbrestore_cli.options import Machine, Selection
 from turbrestore_cli.settings import settings

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from turbrestore_cli.application import COMMANDS, build
+from turbrestore_cli.commands import COMMANDS, build
 from turbrestore_cli.help import _cut
 
 

@@ -5,8 +5,8 @@ from command_line import QUICK
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.pipeline import restore
 from turbrestore.settings import PRESETS, RestoreParams
+from turbrestore_cli.clip import _expected_times
 from turbrestore_cli.progress import TITLES, share_done
-from turbrestore_cli.restoring import _expected_times
 
 
 def test_the_bar_only_moves_on_and_ends_full(sequence):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore_cli import application, signals
+from turbrestore_cli import commands, signals
 from turbrestore_cli.__main__ import main
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="streams are closed and signals sent as POSIX has it")
@@ -98,7 +98,7 @@ sys.exit(main(["info", "clip.npy"]))
 """
 
 
-@pytest.mark.parametrize("module", ["turbrestore_cli.application", "cyclopts", "numpy", "turbrestore.io.video"])
+@pytest.mark.parametrize("module", ["turbrestore_cli.commands", "cyclopts", "numpy", "turbrestore.io.video"])
 @pytest.mark.parametrize("kind", ["-", "turned into another error"])
 def test_an_interruption_of_the_start_is_one_line(place, module, kind):
     words = [sys.executable, "-c", STARTING, module, kind]
@@ -112,7 +112,7 @@ def test_an_interruption_of_the_start_is_one_line(place, module, kind):
 
 ENDING = """
 import atexit, os, signal, time
-from turbrestore_cli import application
+from turbrestore_cli import commands
 from turbrestore_cli.__main__ import program
 def slow(words):
     try:
@@ -126,7 +126,7 @@ def slow(words):
 def late():
     os.kill(os.getpid(), signal.SIGINT)
     time.sleep(0.05)
-application.run = slow
+commands.run = slow
 atexit.register(late)
 program()
 """
@@ -154,7 +154,7 @@ def test_an_interrupted_command_leaves_the_handlers_of_its_caller(monkeypatch, c
     numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
     before = [signal.getsignal(number) for number in numbers]
     for number, code, word in zip(numbers, [130, 143, 129], ["interrupted", "terminated", "terminated"], strict=True):
-        monkeypatch.setattr(application, "run", lambda _, number=number: signal.raise_signal(number))
+        monkeypatch.setattr(commands, "run", lambda _, number=number: signal.raise_signal(number))
         assert main(["info", "clip.npy"]) == code
         assert capsys.readouterr().err == f"turbrestore: {word}\n"
         assert [signal.getsignal(number) for number in numbers] == before

@@ -15,7 +15,7 @@ import pytest
 from turbrestore.io.images import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore_cli.__main__ import main
-from turbrestore_cli.application import build
+from turbrestore_cli.commands import build
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(path for path in (ROOT / "docs").rglob("*.md") if not {"_build", "jupyter_execute"} & set(path.parts))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import turbrestore
-from turbrestore_cli.application import COMMANDS, build
+from turbrestore_cli.commands import COMMANDS, build
 from turbrestore_cli.examples import EXAMPLES
 
 ROOT = Path(__file__).parents[2]

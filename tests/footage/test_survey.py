@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence, surveyed
-from turbrestore.footage.survey import spread, survey_bytes, survey_memory, take_survey
+from turbrestore.footage.survey import spread, survey_memory, survey_scratch_bytes, take_survey
 from turbrestore.io.source import FrameSource
 from turbrestore.pipeline import restore
 from turbrestore.preparation import prepare
@@ -56,7 +56,10 @@ def test_memory_hardly_grows_with_the_clip():
     # Reduced frames take 32 MB, and what is derived from them twice as much.
     many = [survey_memory((count, 480, 640), True) for count in (10**3, 3 * 10**4)]
     assert max(many) < 1.1e8 + 4 * 2 * 480 * 640
-    assert survey_bytes((10**4, 1080, 1920)) < 4.1e8 and survey_bytes((10**4, 4320, 7680)) == 9 * 4 * 4320 * 7680
+    assert (
+        survey_scratch_bytes((10**4, 1080, 1920)) < 4.1e8
+        and survey_scratch_bytes((10**4, 4320, 7680)) == 9 * 4 * 4320 * 7680
+    )
 
 
 def test_a_clip_is_read_for_the_survey_and_for_the_filter_and_once_more_where_something_passes():

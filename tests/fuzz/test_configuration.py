@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from turbrestore.core.errors import ConfigurationError
 from turbrestore_cli.__main__ import main
-from turbrestore_cli.application import build
+from turbrestore_cli.commands import build
 from turbrestore_cli.options import Selection
 from turbrestore_cli.settings import settings as settings_of
 

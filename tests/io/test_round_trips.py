@@ -25,7 +25,7 @@ from turbrestore.registration.flow import FlowParams
 from turbrestore.runs.run_files import load_run, save_run
 from turbrestore.runs.run_record import RunRecord
 from turbrestore.runs.stage_files import KINDS, load_artifact, load_flows, save_artifact, save_flows
-from turbrestore_cli.application import build
+from turbrestore_cli.commands import build
 from turbrestore_cli.options import Machine, Selection
 from turbrestore_cli.output import settings_record, write_settings
 

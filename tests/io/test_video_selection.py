@@ -1,5 +1,6 @@
 """Videos in: ranges of frames, and one frame at a time in memory."""
 
+import dataclasses
 import itertools
 import sys
 import tracemalloc
@@ -135,6 +136,16 @@ class TestSelection:
     def test_empty_read_is_a_usage_error(self, sources):
         with pytest.raises(ConfigurationError):
             open_frames(sources["a.npy"]).read(5, 5)
+
+    def test_frames_and_window_default_to_all_each_by_itself(self):
+        source, part = FrameSource.from_array(np.zeros((5, 4, 6), np.uint8)), (slice(1, 3), slice(2, 6))
+        assert (source.numbers, source.window) == (range(5), (slice(0, 4), slice(0, 6)))
+        fields = {item.name: getattr(source, item.name) for item in dataclasses.fields(source) if item.init}
+        del fields["numbers"], fields["window"]
+        assert FrameSource(**fields, window=part).shape == (5, 2, 4)
+        assert FrameSource(**fields, numbers=(1, 3)).shape == (2, 4, 6)
+        with pytest.raises(DataError, match="expected at least one selected frame, found none"):
+            FrameSource(**fields, numbers=())
 
 
 class TestLaziness:

@@ -13,7 +13,7 @@ from turbrestore.pipeline import RestoreParams
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore_cli.__main__ import main
-from turbrestore_cli.application import build
+from turbrestore_cli.commands import build
 from turbrestore_cli.options import Machine, Selection, known_sigma
 from turbrestore_cli.output import repeating_command, settings_record
 

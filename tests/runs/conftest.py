@@ -82,7 +82,7 @@ def spy(monkeypatch):
 
 
 def params_of(words):
-    from turbrestore_cli.application import build
+    from turbrestore_cli.commands import build
 
     _, bound, _ = build().parse_args(words, exit_on_error=False, print_error=False)
     return bound.arguments["params"]

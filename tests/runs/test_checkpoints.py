@@ -63,7 +63,10 @@ class Recorder:
             self.results[name] = compute()
         return self.results[name]
 
-    def begin(self, levels):
+    def has(self, name):
+        return name in self.results
+
+    def set_levels(self, levels):
         pass
 
     def filter_start(self):

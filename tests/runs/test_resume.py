@@ -23,8 +23,8 @@ PLACES = {
     "third block": ("turbrestore.filtering.alternating.pass_over", 4),
     "deconvolution": ("turbrestore.pipeline.remove_blur_steps", 1),
     "kept images": ("turbrestore_cli.output.write_image", 2),
-    "output": ("turbrestore_cli.restoring.write_result", 1),
-    "settings": ("turbrestore_cli.restoring.write_settings", 1),
+    "output": ("turbrestore_cli.clip.write_result", 1),
+    "settings": ("turbrestore_cli.clip.write_settings", 1),
 }
 
 
@@ -60,7 +60,7 @@ def test_what_is_done_is_not_done_again(place, monkeypatch):
 
 def test_the_record_names_the_outputs_only_while_they_are_written(place):
     with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, "turbrestore_cli.restoring.write_settings", 1)
+        interrupt(patch, "turbrestore_cli.clip.write_settings", 1)
         assert main(WORDS) == 130
     names = {Path(name).name for name in read_stages("kept").outputs}
     assert names == {"sharp.png", "sharp.png.toml"}
@@ -70,7 +70,7 @@ def test_the_record_names_the_outputs_only_while_they_are_written(place):
 
 def test_a_run_that_dies_twice_may_still_replace_its_own_outputs(place):
     with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, "turbrestore_cli.restoring.write_settings", 1)
+        interrupt(patch, "turbrestore_cli.clip.write_settings", 1)
         assert main(WORDS) == 130
     assert (place / "sharp.png").exists()
     with pytest.MonkeyPatch.context() as patch:

@@ -16,7 +16,7 @@ from turbrestore.io.npy import write_npz
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import Centroid, CentroidParams
 from turbrestore.registration.recentring import recentre
-from turbrestore.runs.stage_fields import FIELDS, Array
+from turbrestore.runs.stage_fields import FIELDS, ArraySpec
 from turbrestore.runs.stage_files import (
     KINDS,
     load_artifact,
@@ -132,7 +132,7 @@ def test_flows_of_another_shape_are_refused(tmp_path):
 def test_every_array_of_every_kind_has_its_shape_and_range():
     for kind, cls in KINDS.items():
         others = {name for name, hint in get_type_hints(cls).items() if hint in (bool, int, float, tuple[str, ...])}
-        arrays = {name for name, wanted in FIELDS[kind].items() if isinstance(wanted, Array)}
+        arrays = {name for name, wanted in FIELDS[kind].items() if isinstance(wanted, ArraySpec)}
         assert arrays == {item.name for item in dataclasses.fields(cls)} - others
 
 

@@ -34,7 +34,7 @@ def test_a_resumed_run_of_a_stretched_clip_ends_with_the_same_bytes(clip, tmp_pa
     for where, call in (
         ("turbrestore.filtering.alternating.pass_over", 4),
         ("turbrestore.pipeline.remove_blur_steps", 1),
-        ("turbrestore_cli.restoring.write_result", 1),
+        ("turbrestore_cli.clip.write_result", 1),
     ):
         words = [*WORDS, f"--keep=kept{where[-5:]}", "--overwrite"]
         with pytest.MonkeyPatch.context() as patch:

@@ -21,7 +21,7 @@ from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
-from turbrestore_cli.application import run as run_command
+from turbrestore_cli.commands import run as run_command
 
 OPTICS = Optics(2.75e-6, aperture=0.1, distance=2000.0)
 STRENGTH, CN2 = 2.0, 3.56e-15

@@ -20,7 +20,7 @@ from turbrestore.uncertainty.pixel_deviation import (
     quadratic_fidelity,
     variance_by_blur,
 )
-from turbrestore_cli.application import run as run_command
+from turbrestore_cli.commands import run as run_command
 
 
 def test_gain_is_the_posterior_variance_of_a_linear_gaussian_model():

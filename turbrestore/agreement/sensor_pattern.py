@@ -24,7 +24,8 @@ from scipy.ndimage import median_filter
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.gradient import sobel_gradient
-from ..footage.survey import Moments, Survey, measure_moments, within
+from ..footage.placement import relative_window
+from ..footage.survey import Moments, Survey, measure_moments
 from ..io.source import Window
 
 # Fewest frames from which stripes are found.
@@ -61,7 +62,7 @@ class _Stripes:
 
     def without(self, _: int, values: FloatArray, window: Window) -> FloatArray:
         """Take the stripes out of a frame, or of a window of it."""
-        rows, columns = within(self.window, window)
+        rows, columns = relative_window(self.window, window)
         pattern = self.offsets[0][None, columns] + self.offsets[1][rows, None]
         flat = values - (pattern if values.ndim == 2 else pattern[..., None])
         if self.warm is not None:

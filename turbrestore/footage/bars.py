@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import Window
-from .survey import Survey, within
+from .placement import relative_window
+from .survey import Survey
 
 # A bar is darker than that, even to that in place and time, and the picture beside it differs by that in that share.
 _DARK, _EVEN, _STEP, _SHARE = 0.12, 3.5 / 255, 0.02, 0.5
@@ -61,7 +62,7 @@ def without_bars(survey: Survey) -> tuple[Survey, Bars | None, tuple[Decision, .
         if window != own:
             # A window of the frame may not hold what is mirrored into it.
             whole = next(iter(dataclasses.replace(filled, numbers=(number,), timestamps=None)))
-            return whole[within(own, window)]
+            return whole[relative_window(own, window)]
         values = values if before is None else before(number, values, window)
         return values[places[0]][:, places[1]]
 

@@ -36,7 +36,8 @@ from ..io.images import read_image
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
 from .checks.missing_pixels import continued
-from .survey import Moments, Placement, Survey, measure_moments, within
+from .placement import Placement, relative_window
+from .survey import Moments, Survey, measure_moments
 
 # Fewest and most frames of a clip in which an overlay is looked for.
 FEWEST, _MOST = 3, 1500
@@ -86,7 +87,7 @@ class Overlay:
 
     def without(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Replace the pixels that stand in a frame, or in a window of it, by the scene behind them."""
-        part = within(self.window, window)
+        part = relative_window(self.window, window)
         replaced, chosen = values.copy(), self.mask[part]
         replaced[chosen] = self.scene[self.placement.place(number)][part][chosen]
         return replaced
@@ -102,7 +103,7 @@ class Title:
 
     def without(self, _: int, values: FloatArray, window: Window) -> FloatArray:
         """Continue a frame, or a window of it, over the pixels that stand."""
-        mask = self.mask[within(self.window, window)]
+        mask = self.mask[relative_window(self.window, window)]
         return continued(values, ~mask) if mask.any() else values
 
     def put_back(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:

@@ -36,7 +36,8 @@ from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
 from ..registration.opencv_flow import DisParams, dis_solver
 from ..runtime.scratch import iter_frames
-from .survey import Placement, Survey, reduced, spread, within
+from .placement import Placement, reduce_frames, relative_window
+from .survey import Survey, spread
 
 # Frames of which the median is taken, the fewest that tell what passes, and rows that it is taken of at once.
 _SAMPLES, _FEWEST, _ROWS = 25, 9, 64
@@ -87,7 +88,7 @@ class Background:
         """
         if number not in self.weights:
             return values
-        place, part = self.placement.place(number), within(self.window, window)
+        place, part = self.placement.place(number), relative_window(self.window, window)
         stored = np.asarray(cv2.imdecode(self.weights[number], cv2.IMREAD_GRAYSCALE))[part]
         weight = stored.astype(np.float32) / np.float32(255) * self.known[place][part]
         weight = weight if values.ndim == 2 else weight[..., None]
@@ -166,7 +167,7 @@ def _moves(shifts: NDArray[np.float64]) -> bool:
 
 def _reduced(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> FloatArray:
     """Reduce and smooth T frames of (H, W) pixels, ``shape`` beginning with (T, H, W), to measure their shifts."""
-    return reduced(frames, shape[:3], _REDUCED_SIDE, 16, 1.0)
+    return reduce_frames(frames, shape[:3], _REDUCED_SIDE, 16, 1.0)
 
 
 def _shifts(small: FloatArray, shape: tuple[int, ...]) -> NDArray[np.float64]:

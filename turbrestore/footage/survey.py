@@ -8,14 +8,12 @@ frames are corrected.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import estimate_noise
@@ -31,7 +29,7 @@ _SIDE, _SHORTEST, _NUMBERS = 192, 16, 8e6
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """All frames of a clip in small, and some of them whole; iterating yields the whole ones, corrected."""
+    """All frames of a clip at reduced size, and some of them whole; iterating yields the whole ones, corrected."""
 
     clip: FrameSource  # corrected by what has been found
     numbers: tuple[int, ...]  # of the whole frames, in the file
@@ -99,13 +97,13 @@ def measure_moments(survey: Survey) -> Moments:
 
 
 def survey_memory(shape: tuple[int, ...], in_scratch: bool) -> float:
-    """Bytes that a survey takes of frames of shape (T, H, W) or (T, H, W, 3): what is whole, and what is small."""
+    """Bytes that a survey takes of frames of shape (T, H, W) or (T, H, W, 3): whole and reduced ones."""
     whole = float(np.prod(shape[1:])) * 4 * (2 if in_scratch else _whole_frames(shape, 4))
     # One more while they are corrected, and what the light is measured from.
     return whole + 4.0 * 3 * float(np.prod(_small_shape(shape)))
 
 
-def survey_bytes(shape: tuple[int, ...]) -> float:
+def survey_scratch_bytes(shape: tuple[int, ...]) -> float:
     """Bytes of the scratch file of a survey."""
     return float(np.prod(shape[1:])) * 4 * _whole_frames(shape, 4)
 
@@ -117,69 +115,16 @@ def _whole_frames(shape: tuple[int, ...], itemsize: int) -> int:
 
 def _small_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
     """(T, h, w) or (T, h, w, 3) of the reduced frames: smaller ones where there are many."""
-    longest = max(shape[1:3])
-    side = min(float(_SIDE), (_NUMBERS * longest**2 / np.prod(shape, dtype=float)) ** 0.5)
-    factor = max(1.0, longest / side)
-    return (shape[0], *(max(_SHORTEST, round(length / factor)) for length in shape[1:3]), *shape[3:])
+    side = min(float(_SIDE), (_NUMBERS * max(shape[1:3]) ** 2 / np.prod(shape, dtype=float)) ** 0.5)
+    return reduced_shape(shape, side, _SHORTEST)
+
+
+def reduced_shape(shape: tuple[int, ...], side: float, shortest: int) -> tuple[int, ...]:
+    """(T, h, w) or (T, h, w, 3) of frames that are reduced to a longest side, with no side below ``shortest``."""
+    factor = max(1.0, max(shape[1:3]) / side)
+    return (shape[0], *(max(shortest, round(length / factor)) for length in shape[1:3]), *shape[3:])
 
 
 def spread(count: int, most: int) -> list[int]:
     """Places of at most ``most`` of ``count`` things, spread evenly."""
     return [int(place) for place in np.linspace(0, count - 1, min(most, count)).round()]
-
-
-def reduced(frames: Iterable[FloatArray], shape: tuple[int, ...], side: int, shortest: int, blur: float) -> FloatArray:
-    """Reduce frames to a longest side and, if they are smaller, to a shortest, and blur them.
-
-    ``shape`` (T, H, W) or (T, H, W, 3); returns (T, h, w) or (T, h, w, 3).
-    """
-    factor = max(1.0, max(shape[1:3]) / side)
-    height, width = (max(shortest, round(length / factor)) for length in shape[1:3])
-    small = np.empty((shape[0], height, width, *shape[3:]), np.float32)
-    for plane, frame in zip(small, frames, strict=True):
-        plane[...] = cv2.GaussianBlur(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), (0, 0), blur)
-    return small
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Shifts of frames, and the part of the scene that they show together."""
-
-    shifts: dict[int, tuple[int, int]]  # (dx, dy) of each frame by its number in the file, pixels
-    size: tuple[int, int]  # (H, W) of a frame
-
-    @classmethod
-    def by(cls, shifts: NDArray[np.float64], numbers: Sequence[int], size: tuple[int, int]) -> Placement:
-        """Place frames by shifts (T, 2), rounded to whole pixels."""
-        whole = ((int(dx), int(dy)) for dx, dy in np.rint(shifts))
-        return cls(dict(zip(numbers, whole, strict=True)), size)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(H', W') of the part of the scene that the frames show together."""
-        (left, top), (right, bottom) = self._range
-        return self.size[0] + bottom - top, self.size[1] + right - left
-
-    def place(self, number: int) -> Window:
-        """Return the rows and columns of the scene that a frame shows."""
-        return self.of_shift(*self.shifts[number])
-
-    def of_shift(self, dx: int, dy: int) -> Window:
-        """Return the rows and columns of the scene that a frame of this shift shows."""
-        right, bottom = self._range[1]
-        top, left = bottom - dy, right - dx
-        return slice(top, top + self.size[0]), slice(left, left + self.size[1])
-
-    @cached_property
-    def _range(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Least and greatest (dx, dy)."""
-        across, down = zip(*self.shifts.values(), strict=True)
-        return (min(across), min(down)), (max(across), max(down))
-
-
-def within(whole: Window, window: Window) -> Window:
-    """Return the rows and columns of a window, counted from where another begins."""
-    rows, columns = (
-        slice(part.start - own.start, part.stop - own.start) for own, part in zip(whole, window, strict=True)
-    )
-    return rows, columns

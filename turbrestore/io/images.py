@@ -28,7 +28,17 @@ from .astronomy.fits_output import write_fits
 from .counts import holds_counts, range_of_counts
 from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
 from .output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
-from .pixels import PixelArray, at_levels, check_depth, depth_of, full_scale_of, to_unit, upright, without_alpha
+from .pixels import (
+    ORIENTATION_TAG,
+    PixelArray,
+    at_levels,
+    check_depth,
+    depth_of,
+    full_scale_of,
+    to_unit,
+    upright,
+    without_alpha,
+)
 from .raw_files import RAW_SUFFIXES, read_raw_file
 from .source import FrameSource, check_cut_short
 from .tiff import TIFF_SUFFIXES, read_tiff
@@ -39,8 +49,8 @@ if TYPE_CHECKING:
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", *RAW_SUFFIXES)
 ANIMATION_SUFFIXES = (".png", ".apng", ".webp")
 ANIMATION_OUTPUT_SUFFIXES = (".gif", ".webp")
-# Tag of EXIF and TIFF.
-_ORIENTATION = 274
+# Bytes of a PNG file that state its bits a channel and its type of colour; that of grey with alpha.
+_PNG_DEPTH, _PNG_COLOUR, _GREY_ALPHA = 24, 25, 4
 # Pillow knows many more formats, some of which run other programs.
 _FORMATS, _ANIMATED = ("PNG", "JPEG", "BMP", "PPM", "WEBP"), ("PNG", "WEBP")
 # Modes of Pillow that become RGB, or RGBA where a palette has transparent colours.
@@ -146,9 +156,9 @@ def open_animation(path: Path, stop: int | None, limits: Limits, skip_damaged: b
         with _opened_image(path, data, limits, _ANIMATED) as image:
             # Decoding does not compare the checksums.
             image.verify()
-    deep = mode == "I;16"
+    is_16_bit = mode == "I;16"
     notes: tuple[str, ...] = ("alpha channel ignored",) if mode in ("LA", "RGBA") else ()
-    notes += ("16-bit values read as 8 bits",) if kind == "png" and data[24] == 16 and not deep else ()
+    notes += ("16-bit values read as 8 bits",) if kind == "png" and data[_PNG_DEPTH] == 16 and not is_16_bit else ()
     notes += ("variable frame rate",) if len(set(durations[:-1])) > 1 else ()
     notes += check_cut_short(path, present, stop, skip_damaged, "damaged or cut short") if present < count else ()
     times = np.cumsum([0.0, *durations[:-1]]) / 1000
@@ -156,8 +166,8 @@ def open_animation(path: Path, stop: int | None, limits: Limits, skip_damaged: b
         name=path.name,
         format=f"{kind}/{mode}",
         file_shape=(present, *shape),
-        full_scale=65535 if deep else 255,
-        bit_depth=16 if deep else 8,
+        full_scale=65535 if is_16_bit else 255,
+        bit_depth=16 if is_16_bit else 8,
         pixels=lambda chosen: (
             frame for frame, _ in _animation_frames(path, data, [skipped + number for number in chosen])
         ),
@@ -275,13 +285,13 @@ def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
             # Decoding does not compare the checksums.
             image.verify()
     with _opened_image(path, data, limits, _FORMATS) as image:
-        kind, orientation = image.format, image.getexif().get(_ORIENTATION)
+        kind, orientation = image.format, image.getexif().get(ORIENTATION_TAG)
         target = "RGBA" if image.mode == "P" and "transparency" in image.info else "RGB"
         pixels = np.array(image.convert(target) if image.mode in _OTHER_COLOURS else image)
-    if kind == "PPM" or (kind == "PNG" and data[24] == 16):
+    if kind == "PPM" or (kind == "PNG" and data[_PNG_DEPTH] == 16):
         pixels = _opencv_pixels(path, data)
-        # OpenCV returns grey with alpha (type 4) as RGBA.
-        pixels = pixels[..., [0, 3]] if kind == "PNG" and data[25] == 4 else pixels
+        # OpenCV returns grey with alpha as RGBA.
+        pixels = pixels[..., [0, 3]] if kind == "PNG" and data[_PNG_COLOUR] == _GREY_ALPHA else pixels
         pixels = _at_full_range(pixels, data) if kind == "PPM" else pixels
     if pixels.dtype == bool:
         pixels = np.uint8(255) * pixels
@@ -297,7 +307,7 @@ def _animation_frames(path: Path, data: bytes, places: Iterable[int]) -> Iterato
         for place in places:
             with _image_errors(path):
                 image.seek(place)
-                pixels = upright(np.array(image.convert(target)), image.getexif().get(_ORIENTATION))
+                pixels = upright(np.array(image.convert(target)), image.getexif().get(ORIENTATION_TAG))
             yield pixels, float(image.info.get("duration", 0))
 
 

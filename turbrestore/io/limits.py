@@ -94,14 +94,17 @@ def input_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def format_errors(path: Path, problem: str) -> Iterator[None]:
-    """Turn the exceptions of a library about the content of ``path`` into DataError; system errors pass."""
+def format_errors(path: Path, problem: str, remedy: str = "") -> Iterator[None]:
+    """Turn the exceptions of a library about the content of ``path`` into DataError; system errors pass.
+
+    The message says what the problem is and, after the words of the library, what to do.
+    """
     try:
         yield
     except (TurbrestoreError, OSError):
         raise
     except Exception as error:  # NumPy, zipfile and tifffile document no closed list of exceptions for damaged files
-        raise DataError(f"{path}: {problem} ({first_line(error)})") from error
+        raise DataError(f"{path}: {problem} ({first_line(error)}){remedy and f'; {remedy}'}") from error
 
 
 def check_input(path: Path) -> os.stat_result:

@@ -33,6 +33,8 @@ BAYER_CODES = {
     "bggr": cv2.COLOR_BayerBGGR2RGB,
 }
 BAYER_REMARK = "pixels alternate as in a Bayer mosaic: --bayer rggb (or grbg, gbrg, bggr) gives colours"
+# Number of the tag of EXIF and TIFF that :func:`upright` takes.
+ORIENTATION_TAG = 274
 # In a mosaic neighbours differ by this factor more than the next pixels of their colour; in an image they differ less.
 _ALTERNATING = 1.3
 

@@ -26,6 +26,8 @@ from .pixels import PixelArray, depth_of, full_scale_of, to_unit
 FrameRange = tuple[int | None, int | None] | tuple[int | None, int | None, int | None]
 Roi = tuple[int, int, int, int]
 Window = tuple[slice, slice]
+# Selection that the constructor resolves to all frames, or to all rows and columns; None, but typed as either.
+_ALL: Any = None
 # Number of frames that a message lists before it only counts the others.
 _NAMED = 5
 
@@ -99,8 +101,8 @@ class FrameSource:
     repair: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
     develop: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
     adjust: Callable[[int, FloatArray, Window], FloatArray] | None = field(default=None, repr=False)
-    numbers: range | tuple[int, ...] = range(0)
-    window: Window = (slice(0), slice(0))
+    numbers: range | tuple[int, ...] = _ALL
+    window: Window = _ALL
 
     def __post_init__(self) -> None:
         shape = self.file_shape
@@ -110,9 +112,12 @@ class FrameSource:
             raise DataError(f"{self.name}: expected at least one frame, found none")
         if min(shape[1:3]) < 1:
             raise DataError(f"{self.name}: expected frames of at least one pixel, found {shape[2]}×{shape[1]}")
-        if not self.numbers:
+        if self.numbers is _ALL:
             object.__setattr__(self, "numbers", range(shape[0]))
+        if self.window is _ALL:
             object.__setattr__(self, "window", (slice(0, shape[1]), slice(0, shape[2])))
+        if not self.numbers:
+            raise DataError(f"{self.name}: expected at least one selected frame, found none")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -254,7 +259,7 @@ class FrameSource:
         ...
         turbrestore.core.errors.ConfigurationError: frames: expected a range within 0:5, found 3:9
         """
-        wanted = check_frame_range(frames)
+        wanted = to_slice(frames)
         count = len(self)
         start = wanted.start or 0
         stop = count if wanted.stop is None else wanted.stop
@@ -338,7 +343,7 @@ class FrameSource:
             )
 
 
-def check_frame_range(frames: FrameRange | None) -> slice:
+def to_slice(frames: FrameRange | None) -> slice:
     """Return (start, stop[, step]) as a slice; raise ConfigurationError unless they are integers from 0 or None."""
     wrong = ConfigurationError(
         f"frames: expected (start, stop) or (start, stop, step) of integers from 0 or None, found {frames}"

@@ -23,15 +23,16 @@ from .counts import source_of_numbers
 from .limits import DEFAULT_LIMITS, Limits, format_errors, input_errors
 from .npy import MappedFrames
 from .output import atomic_output, frames_of_one_size
-from .pixels import PixelArray, check_depth, upright
+from .pixels import ORIENTATION_TAG, PixelArray, check_depth, upright
 from .source import FrameSource
 
 if TYPE_CHECKING:
     import tifffile
 
 TIFF_SUFFIXES = (".tif", ".tiff")
+_UNCOMPRESSED = 1
 # Compressions whose decoders are told how much a part may hold: none, fax, LZW, deflate, PackBits, LZMA, Zstandard.
-_BOUNDED = (1, 2, 3, 4, 5, 8, 32946, 50013, 32773, 34925, 34926, 50000)
+_BOUNDED = (_UNCOMPRESSED, 2, 3, 4, 5, 8, 32946, 50013, 32773, 34925, 34926, 50000)
 # Those whose parts are images with sizes of their own: JPEG, JPEG 2000, PNG and WebP.
 _IMAGES = (6, 7, 33007, 34892, 33003, 33004, 33005, 34712, 34933, 34927, 50001)
 # JPEG of which OpenCV reads what is neither grey nor RGB.
@@ -41,7 +42,6 @@ _NOT_TIFF = "not a TIFF file, or damaged"
 _MOST_SAMPLES = 16
 # The description of an OME file may name other files, which are not opened.
 _ALONE: dict[str, Any] = {"_multifile": False}
-_ORIENTATION = 274
 
 
 def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
@@ -97,9 +97,9 @@ def read_tiff(path: Path, data: bytes, limits: Limits) -> tuple[PixelArray | Non
         _check_page(path, page, limits)
         known = _channels(page) is not None and page.bitspersample in (8, 16, 32, 64)
         if known or page.compression not in _JPEG:
-            # OpenCV would print that pixels are missing, and fill them up.
+            # Decode as a check: OpenCV would fill missing pixels.
             pixels = _page_pixels(path, page, limits)
-        return (upright(pixels, page.tags.valueof(_ORIENTATION)), _notes(page)) if known else (None, ())
+        return (upright(pixels, page.tags.valueof(ORIENTATION_TAG)), _notes(page)) if known else (None, ())
 
 
 def write_tiff(path: Path, frames: Iterable[FloatArray], bit_depth: int = 16, overwrite: bool = False) -> None:
@@ -145,7 +145,8 @@ def _check_page(path: Path, page: tifffile.TiffPage, limits: Limits) -> None:
 def _channels(page: tifffile.TiffPage) -> tuple[int, ...] | None:
     """Axes after height and width, without alpha; None unless the page is grey or RGB."""
     whole_bytes = isinstance(page.bitspersample, int) and page.bitspersample % 8 == 0
-    greys = (_BLACK_IS_ZERO, _WHITE_IS_ZERO) if np.issubdtype(page.dtype, np.unsignedinteger) and whole_bytes else (1,)
+    is_invertible = whole_bytes and np.issubdtype(page.dtype, np.unsignedinteger)
+    greys = (_BLACK_IS_ZERO, _WHITE_IS_ZERO) if is_invertible else (_BLACK_IS_ZERO,)
     if page.imagedepth == 1 and page.samplesperpixel - len(page.extrasamples) == 1 and page.photometric in greys:
         return ()
     # Some writers do not mark the fourth channel as alpha.
@@ -208,10 +209,12 @@ def _page_pixels(path: Path, page: tifffile.TiffPage, limits: Limits) -> PixelAr
     parts = [part for part in zip(page.dataoffsets, page.databytecounts, strict=True) if part[1] > 0]
     if page.compression not in (*_BOUNDED, *_IMAGES):
         name = getattr(page.compression, "name", page.compression)
-        raise DataError(f"{path}: expected a compression such as deflate, LZW or JPEG, found {name}; convert the file")
-    if page.compression != 1 and len(parts) < math.prod(page.chunked):
-        raise DataError(f"{path}: expected {math.prod(page.chunked)} parts, found {len(parts)}; the file is damaged")
-    with format_errors(path, _NOT_TIFF if page.compression == 1 else "compressed pixels are damaged"):
+        problem = f"expected a compression such as deflate, LZW or JPEG, found {name}"
+        raise DataError(f"{path}: {problem}; convert the file to one of these")
+    if page.compression != _UNCOMPRESSED and len(parts) < math.prod(page.chunked):
+        raise DataError(f"{path}: expected {math.prod(page.chunked)} parts, found {len(parts)}; copy the file again")
+    problem = _NOT_TIFF if page.compression == _UNCOMPRESSED else "compressed pixels are damaged"
+    with format_errors(path, problem, "copy the file again"):
         if page.compression in _IMAGES:
             _check_images(path, page, parts, limits)
         # Its threads would be beside those of the caller.

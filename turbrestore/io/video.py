@@ -37,7 +37,7 @@ from .limits import DEFAULT_LIMITS, Limits, check_input
 from .npy import open_npy, write_npy
 from .output import check_output
 from .pixels import BAYER_CODES, check_depth, demosaic, to_unit
-from .source import FrameRange, FrameSource, Roi, check_frame_range, numbers_text
+from .source import FrameRange, FrameSource, Roi, numbers_text, to_slice
 from .tiff import TIFF_SUFFIXES, open_tiff, write_tiff
 
 VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES, *FITS_SUFFIXES)
@@ -195,7 +195,7 @@ def _soundtrack(companion: FrameSource | None) -> Soundtrack | None:
 
 def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool, keep_hdr: bool) -> FrameSource:
     """Open a whole video by the reader of its format."""
-    stop = check_frame_range(frames).stop
+    stop = to_slice(frames).stop
     is_folder = stat.S_ISDIR(check_input(path).st_mode)
     suffix = path.suffix.lower()
     if is_folder:

@@ -2,16 +2,7 @@
 
 ``run.json`` (:mod:`turbrestore.runs.run_files`) says what each stage depends on and holds a checksum of each file.  A
 stage is taken over if nothing that it or an earlier stage depends on has changed, and its files are as they were
-written:
-
-==========  =========================================================================================================
-stage       depends on
-==========  =========================================================================================================
-centroid    input, all selected and training frames, region, static mask, settings of flow and centroid, all versions
-dynamics    the centroid, settings of the dynamics
-filtered    the dynamics, settings of the filter, the share of best frames
-deblurred   the filtered image, settings of deconvolution and guards
-==========  =========================================================================================================
+written.  :func:`turbrestore.runs.dependencies.stage_dependencies` lists what that is, package versions among it.
 
 Results, ``mean.npy`` among them, are kept as the stages made them: stretched, where frames use a part of the scale.
 Threads and a memory limit change no result, so nothing depends on them; but where a limit leaves fewer training frames,
@@ -63,6 +54,8 @@ FILES = {
     "deblurred": ("deconvolution.npz", "blur.npz", "posterior.npz"),
 }
 TITLES = {"centroid": "centroid", "dynamics": "flow model", "filtered": "filter", "deblurred": "deconvolution"}
+# The file that tells whether a result is kept, unless it is named after the result.
+_FILE_OF = {"mean": MEAN, "deblurred": FILES["deblurred"][0]}
 _TILE = re.compile(r"filtered_tile_\d+")
 # Left by a writer that was killed.
 _PART = re.compile(r"\.[0-9a-f]{16}\.part")
@@ -78,7 +71,8 @@ class RunFolder:
     :func:`turbrestore.runs.folder_lock.lock_folder`.
 
     With ``resume`` it takes over what still holds, and ``notes`` say what that is, what starts again and why;
-    otherwise everything starts anew.  ``every`` is the number of frames between two checkpoints of the filter.
+    otherwise everything starts anew.  Opening the folder removes files of other runs.  ``checkpoint_every`` is the
+    number of frames between two checkpoints of the filter.
     """
 
     def __init__(
@@ -88,10 +82,10 @@ class RunFolder:
         params: RestoreParams,
         runtime: Runtime = DEFAULT,
         resume: bool = False,
-        every: int = 50,
+        checkpoint_every: int = 50,
     ) -> None:
-        require(every >= 1, f"checkpoint_every: expected at least 1 frame, found {every}")
-        self.folder, self._every, self._block = Path(folder), every, params.filter.block
+        require(checkpoint_every >= 1, f"checkpoint_every: expected at least 1 frame, found {checkpoint_every}")
+        self.folder, self._checkpoint_every, self._block = Path(folder), checkpoint_every, params.filter.block
         plan = plan_memory(source.shape, params, runtime)
         self._scratch = plan.runtime.scratch
         facts = stage_dependencies(source, params, plan)
@@ -106,10 +100,9 @@ class RunFolder:
             self._take_over(record, facts)
         self._remove_the_rest()
 
-    @property
-    def stored(self) -> frozenset[str]:
-        """Names of the files on disk that hold the results of stages."""
-        return frozenset(self._record.files)
+    def has(self, name: str) -> bool:
+        """Tell whether a result of this name is kept."""
+        return _FILE_OF.get(name, f"{name}.npz") in self._record.files
 
     def get(self, name: str, compute: Callable[[], Result]) -> Result:
         """Return a result that was kept, else compute and keep it."""
@@ -117,10 +110,13 @@ class RunFolder:
         if kept is not None:
             return cast(Result, kept)
         result = compute()
-        self._save(name, result)
+        if name == "mean":
+            self._save_mean(result)
+        else:
+            self._save(name, result)
         return result
 
-    def begin(self, levels: Levels) -> None:
+    def set_levels(self, levels: Levels) -> None:
         """Take the levels of the stages, which their files record."""
         self._levels = levels
 
@@ -131,7 +127,7 @@ class RunFolder:
     def checkpoint(self, state: FilterCheckpoint) -> None:
         """Take the newest checkpoint of the filter, and write it if enough frames have passed since the last."""
         self._newest = state
-        if len(state.records) + self._block > self._written + self._every:
+        if len(state.records) + self._block > self._written + self._checkpoint_every:
             self.flush()
 
     def flush(self) -> None:
@@ -141,24 +137,24 @@ class RunFolder:
         save_checkpoint(self.folder / CHECKPOINT, self._newest, self._key)
         self._written = len(self._newest.records)
 
-    def expect(self, *outputs: Path) -> None:
+    def announce_outputs(self, *outputs: Path) -> None:
         """Note which outputs are about to be written, so that a run that dies meanwhile may replace its own."""
         self._record.outputs = tuple(str(path.absolute()) for path in outputs)
         write_record(self.folder, self._record)
 
-    def progress(self) -> str:
+    def describe_progress(self) -> str:
         """Say how far the results on disk go."""
-        stages = itertools.takewhile(lambda stage: FILES[stage][0] in self.stored, FILES)
+        stages = itertools.takewhile(self.has, FILES)
         last = [TITLES[stage] for stage in stages][-1:]
         words = f"after the {last[0]}" if last else "from the start"
-        tiles = _tiles(self.stored)
+        tiles = _tiles(self._record.files)
         if tiles:
             return f"{words} and {len(tiles)} tiles of the filter"
         return f"{words} and {self._written} frames of the filter" if self._written else words
 
     def withdraw(self) -> None:
         """Remove the record of a run that failed before it stored a result."""
-        if self.stored or self._written:
+        if self._record.files or self._written:
             return
         for name in (*RUN_FILES, CHECKPOINT):
             (self.folder / name).unlink(missing_ok=True)
@@ -185,29 +181,29 @@ class RunFolder:
             names += _tiles(record.files)
         for name in names:
             wanted = record.files.get(name)
-            if wanted is not None and _is_whole(self.folder / name, wanted):
+            if wanted is not None and _is_intact(self.folder / name, wanted):
                 self._record.files[name] = wanted
             elif wanted is not None:
                 notes.append(f"{name} is missing or damaged and is made again")
         self._record.deblurred, self._record.outputs = record.deblurred, record.outputs
-        if "filtered" in holds and "filtered.npz" not in self.stored and (self.folder / CHECKPOINT).exists():
+        if "filtered" in holds and not self.has("filtered") and (self.folder / CHECKPOINT).exists():
             try:
                 self._newest = load_checkpoint(self.folder / CHECKPOINT, self._key)
                 self._written = len(self._newest.records)
             except DataError as error:
                 notes.append(str(error))
-        self.notes = (*notes, *([] if notes and not self.stored else [f"continues {self.progress()}"]))
+        self.notes = (*notes, *([] if notes and not self._record.files else [f"continues {self.describe_progress()}"]))
 
     def _load(self, name: str) -> object | None:
         """Read a result whose files are as they were written."""
         if name == "deblurred":
             return self._load_deblurred()
         if name == "mean":
-            return check_image(map_npy(self.folder / MEAN), MEAN) if MEAN in self.stored else None
+            return check_image(map_npy(self.folder / MEAN), MEAN) if self.has("mean") else None
         return self._load_stage(name, KINDS["filtered" if _TILE.fullmatch(name) else name], self._scratch)
 
     def _load_stage(self, name: str, kind: type[Stage], scratch: Path | None = None) -> Stage | None:
-        return load_stage(self.folder / f"{name}.npz", kind, scratch) if f"{name}.npz" in self.stored else None
+        return load_stage(self.folder / f"{name}.npz", kind, scratch) if self.has(name) else None
 
     def _load_deblurred(self) -> Deblurred | None:
         known, result = self._record.deblurred, self._load_stage("deconvolution", Deconvolution, self._scratch)
@@ -218,15 +214,17 @@ class RunFolder:
             return None
         return Deblurred(result, blur, known.readings, known.decisions, posterior)
 
+    def _save_mean(self, mean: Any) -> None:
+        """Write the mean of the frames, and then the record that it is there."""
+        with atomic_output(self.folder / MEAN, overwrite=True) as temporary, temporary.open("wb") as stream:
+            np.save(stream, np.asarray(mean), allow_pickle=False)
+        self._record.files[MEAN] = file_digest(self.folder / MEAN)
+        write_record(self.folder, self._record)
+
     def _save(self, name: str, result: Any) -> None:
-        """Write the files of a result, and then the record that they are there."""
+        """Write the files of a stage, and then the record that they are there."""
         results, record = {name: result}, self._record
-        if name == "mean":
-            with atomic_output(self.folder / MEAN, overwrite=True) as temporary, temporary.open("wb") as stream:
-                np.save(stream, np.asarray(result), allow_pickle=False)
-            record.files[MEAN] = file_digest(self.folder / MEAN)
-            results = {}
-        elif name == "deblurred":
+        if name == "deblurred":
             results = {"deconvolution": result.deconvolution, "blur": result.blur, "posterior": result.posterior}
             record.deblurred = DeblurringRecord(
                 result.blur is not None, result.posterior is not None, result.readings, result.decisions
@@ -242,7 +240,7 @@ class RunFolder:
 
     def _remove_filter_states(self) -> None:
         """Remove checkpoint and tiles once the filter is done."""
-        tiles = _tiles(self.stored)
+        tiles = _tiles(self._record.files)
         for name in (CHECKPOINT, *tiles):
             self._record.files.pop(name, None)
             (self.folder / name).unlink(missing_ok=True)
@@ -252,7 +250,7 @@ class RunFolder:
 
     def _remove_the_rest(self) -> None:
         """Remove what does not belong to this run, such as files of other runs."""
-        kept = {*self.stored, *([CHECKPOINT] if self._written else [])}
+        kept = {*self._record.files, *([CHECKPOINT] if self._written else [])}
         try:
             there = [path.name for path in self.folder.iterdir()]
             parts = [name for name in there if is_part(self.folder / name)]
@@ -274,7 +272,7 @@ def _tiles(names: Iterable[str]) -> list[str]:
     return [name for name in names if name.endswith(".npz") and _TILE.fullmatch(name.removesuffix(".npz"))]
 
 
-def _is_whole(path: Path, digest: str) -> bool:
+def _is_intact(path: Path, digest: str) -> bool:
     try:
         return file_digest(path) == digest
     except OSError:

@@ -1,20 +1,20 @@
 """What the arrays and numbers of every kind of stage file are: shape and range, checked when one is read.
 
 The types of numbers, flags and texts are those of the record that the file becomes.  A number that is not listed lies
-between 0 and a billion.
+between 0 and a billion.  Infinite values are allowed where a bound is infinite.
 
 Shapes name their axes; one name stands for one length within a stage file:
 
-======  ===============================================
+======  =========================================================
 H, W    height and width, pixels
-P       2 H W, components of a flow
+P       2 H W, components of a flow; an earlier field has H and W
 T       flows
 n       states
 τ       flows that the dynamics were fitted to, from n
 N       frames
 i       iterations of the centroid
 k       values of a record, such as one an iteration
-======  ===============================================
+======  =========================================================
 """
 
 from __future__ import annotations
@@ -42,74 +42,72 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
-class Array:
+class ArraySpec:
     """An array of a stage file."""
 
     dtype: str  # as NumPy abbreviates it
     shape: str  # names and lengths of the axes; shapes that are possible too follow after ``|``
-    # Least and largest value; infinite ones are allowed where a bound is infinite.
     low: float = -_MOST
     high: float = _MOST
     gaps: bool = False  # whether NaN is allowed
 
 
 @dataclass(frozen=True)
-class Number:
+class NumberSpec:
     """A number of a stage file."""
 
-    # Least and largest value; infinite ones are allowed where a bound is infinite.
     low: float = 0
     high: float = _MOST
 
 
-_IMAGE = Array("f4", "H W|H W 3")
-FIELDS: dict[str, dict[str, Array | Number]] = {
+_IMAGE = ArraySpec("f4", "H W|H W 3")
+FIELDS: dict[str, dict[str, ArraySpec | NumberSpec]] = {
     "centroid": {
         "image": _IMAGE,
-        "flows": Array("f4", "T H W 2"),
-        "mean_flow_sizes": Array("f8", "i", low=0),
+        "flows": ArraySpec("f4", "T H W 2"),
+        "mean_flow_sizes": ArraySpec("f8", "i", low=0),
     },
     "dynamics": {
-        "mean_flow": Array("f4", "H W 2"),
-        "A": Array("f8", "n n"),
-        "C": Array("f4", "P n"),
-        "Q": Array("f8", "n n"),
-        "residual_variance": Array("f4", "H W", low=0),
-        "states": Array("f8", "n τ"),
-        "singular_values": Array("f8", "τ", low=0),
-        "energy_share": Number(high=1 + _ROUNDING),
+        "mean_flow": ArraySpec("f4", "H W 2"),
+        "A": ArraySpec("f8", "n n"),
+        "C": ArraySpec("f4", "P n"),
+        "Q": ArraySpec("f8", "n n"),
+        "residual_variance": ArraySpec("f4", "H W", low=0),
+        "states": ArraySpec("f8", "n τ"),
+        "singular_values": ArraySpec("f8", "τ", low=0),
+        "energy_share": NumberSpec(high=1 + _ROUNDING),
     },
     "filtered": {
         "image": _IMAGE,
-        "variance": Array("f4", "H W", low=0),
-        "flow_states": Array("f8", "N n"),
-        "gains": Array("f8", "N", low=0),
-        "innovations": Array("f8", "N", low=0, gaps=True),
-        "sharpness": Array("f8", "N", gaps=True),
-        "shares": Array("f8", "N", low=0, high=1 + _ROUNDING),
-        "mean_flow": Array("f4", "H W 2"),
+        "variance": ArraySpec("f4", "H W", low=0),
+        "flow_states": ArraySpec("f8", "N n"),
+        "gains": ArraySpec("f8", "N", low=0),
+        "innovations": ArraySpec("f8", "N", low=0, gaps=True),
+        "sharpness": ArraySpec("f8", "N", gaps=True),
+        "shares": ArraySpec("f8", "N", low=0, high=1 + _ROUNDING),
+        "mean_flow": ArraySpec("f4", "H W 2"),
     },
     "deconvolution": {
         "image": _IMAGE,
-        "fidelity": Number(high=_INFINITE),
-        "recorded": Array("i8", "k", low=0),
-        "objective": Array("f8", "k", low=-_INFINITE, high=_INFINITE, gaps=True),
-        "changes": Array("f8", "k", low=0, high=_INFINITE, gaps=True),
+        "fidelity": NumberSpec(high=_INFINITE),
+        "recorded": ArraySpec("i8", "k", low=0),
+        "objective": ArraySpec("f8", "k", low=-_INFINITE, high=_INFINITE, gaps=True),
+        "changes": ArraySpec("f8", "k", low=0, high=_INFINITE, gaps=True),
     },
     "blur": {
-        "uncertainty": Number(high=_INFINITE),
-        "reduction": Number(low=1),
-        "evidence": Number(low=-_INFINITE, high=_INFINITE),
-        "widths": Array("f8", "k", low=0),
-        "costs": Array("f8", "k", low=-_INFINITE, high=_INFINITE),
+        "uncertainty": NumberSpec(high=_INFINITE),
+        "reduction": NumberSpec(low=1),
+        "evidence": NumberSpec(low=-_INFINITE, high=_INFINITE),
+        "widths": ArraySpec("f8", "k", low=0),
+        "costs": ArraySpec("f8", "k", low=-_INFINITE, high=_INFINITE),
     },
     "posterior": {
-        "width": Array("f8", "3", low=0),
-        **dict.fromkeys(("by_displacement", "by_variation", "by_image"), Array("f8", "3", low=0, gaps=True)),
-        "air": Number(high=1 + _ROUNDING),
-        **dict.fromkeys(("frequencies", "transfer", "lowest", "highest"), Array("f8", "k", low=0)),
+        "width": ArraySpec("f8", "3", low=0),
+        **dict.fromkeys(("by_displacement", "by_variation", "by_image"), ArraySpec("f8", "3", low=0, gaps=True)),
+        "air": NumberSpec(high=1 + _ROUNDING),
+        **dict.fromkeys(("frequencies", "transfer", "lowest", "highest"), ArraySpec("f8", "k", low=0)),
         **{
-            f"{prefix}{name}{suffix}": Array("f8", "k", gaps=True)
+            f"{prefix}{name}{suffix}": ArraySpec("f8", "k", gaps=True)
             for name in ("variation", "power_variation")
             for prefix, suffix in (("", ""), ("", "_error"), ("expected_", ""))
         },
@@ -121,9 +119,9 @@ def check_fields(kind: str, result: DataclassInstance, name: str) -> None:
     """Refuse a result that a stage cannot have made."""
     sizes: dict[str, int] = {}
     numbers = [field for field, value in vars(result).items() if isinstance(value, int | float)]
-    for field, wanted in {**dict.fromkeys(numbers, Number()), **FIELDS[kind]}.items():
+    for field, wanted in {**dict.fromkeys(numbers, NumberSpec()), **FIELDS[kind]}.items():
         value = getattr(result, field)
-        if isinstance(wanted, Array):
+        if isinstance(wanted, ArraySpec):
             complaint = _array_complaint(value, wanted, sizes)
         else:
             complaint = "" if wanted.low <= value <= wanted.high else _range(wanted, value)
@@ -133,7 +131,7 @@ def check_fields(kind: str, result: DataclassInstance, name: str) -> None:
         _check_dynamics(result, name)
 
 
-def _array_complaint(value: NDArray[Any], wanted: Array, sizes: dict[str, int]) -> str:
+def _array_complaint(value: NDArray[Any], wanted: ArraySpec, sizes: dict[str, int]) -> str:
     """Say what is expected of an array and what it is instead; nothing where it is right."""
     if value.dtype != np.dtype(wanted.dtype):
         return f"to be of {np.dtype(wanted.dtype)}, found {value.dtype}"
@@ -155,12 +153,12 @@ def _array_complaint(value: NDArray[Any], wanted: Array, sizes: dict[str, int]) 
     return ""
 
 
-def _range(wanted: Array | Number, found: float) -> str:
+def _range(wanted: ArraySpec | NumberSpec, found: float) -> str:
     return f"from {wanted.low:g} to {wanted.high:g}, found {found!s:.40}"
 
 
 def _fits(shape: tuple[int, ...], axes: list[str], sizes: dict[str, int]) -> bool:
-    """Whether a shape has these axes; lengths that are new are taken down if so."""
+    """Whether a shape has these axes; lengths of new axes are then recorded in `sizes`."""
     if len(shape) != len(axes):
         return False
     found = dict(sizes)

@@ -61,7 +61,7 @@ def save_artifact(path: str | os.PathLike[str], result: DataclassInstance, overw
     ----------
     path : path
         Must end in ``.npz``.
-    result : Centroid, FlowDynamics, Filtered, Deconvolution or BlurEstimate
+    result : Centroid, FlowDynamics, Filtered, Deconvolution, BlurEstimate or BlurPosterior
     overwrite : bool
         Replace an existing file.
 
@@ -127,11 +127,14 @@ def load_artifact(path: str | os.PathLike[str], kind: type[Result], scratch: Pat
 
     Examples
     --------
-    >>> from turbrestore.registration.centroid import Centroid
-    >>> load_artifact("missing.npz", Centroid)
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.InputNotFoundError: missing.npz: no such file
+    >>> import numpy as np, tempfile
+    >>> from turbrestore.registration.centroid import Centroid, find_centroid
+    >>> found = find_centroid(np.random.default_rng(0).uniform(size=(3, 32, 32)).astype(np.float32))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_artifact(folder + "/centroid.npz", found)
+    ...     again = load_artifact(folder + "/centroid.npz", Centroid)
+    >>> again.flows.shape, bool((again.image == found.image).all())
+    ((3, 32, 32, 2), True)
     """
     return at_levels_of_clip(*_read_kind(Path(path), kind, scratch))
 

@@ -1,4 +1,4 @@
-"""Records on disk that others may have changed: what they say, read as the types that it was written from."""
+"""Typed reading of JSON records that users may have edited."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Kind = TypeVar("Kind")
 
 @dataclass(frozen=True)
 class DeblurringRecord:
-    """What of a deblurred image has no stage file."""
+    """The parts of a Deblurred that have no stage file."""
 
     # Whether the width of the blur was estimated by the edges, and measured by all witnesses.
     estimated: bool
@@ -28,7 +28,9 @@ class DeblurringRecord:
 class KeptRecord:
     """What ``run.json`` says; None where a part is not there yet."""
 
-    facts: dict[str, dict[str, Any]] | None = None  # what each stage depends on; None of a run that nothing continues
+    # What each stage depends on; None if the run cannot be resumed, empty if an earlier version of turbrestore kept the
+    # stages, which are then made again.
+    facts: dict[str, dict[str, Any]] | None = None
     files: dict[str, str] = field(default_factory=dict)  # checksum of each file that holds the result of a stage
     deblurred: DeblurringRecord | None = None
     outputs: tuple[str, ...] = ()  # files that the run was about to write

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from ...core.arrays import FloatArray, luminance
 from ...core.decision import Decision
 from ...registration.camera.global_shift import known_shifts
-from ..survey import Survey, reduced
+from ..placement import reduce_frames
+from ..survey import Survey
 
 # Longest side of the reduced frames, pixels, and their blur.
 _SIDE, _BLUR = 64, 1.5
@@ -34,7 +35,7 @@ def steady_white_balance(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
     """Take a white balance that changes out of the frames; others, and grey frames, are returned as they are."""
     if survey.small.ndim != 4 or len(survey.small) < 3:
         return survey, ()
-    ratios = _ratios(reduced(survey.small, survey.small.shape, _SIDE, 1, _BLUR))
+    ratios = _ratios(reduce_frames(survey.small, survey.small.shape, _SIDE, 1, _BLUR))
     changes = ratios.std(axis=0)
     if changes.max() < _LEAST_CHANGE:
         return survey, ()

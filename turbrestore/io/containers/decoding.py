@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ...core.errors import DataError
 from ..limits import Limits, input_errors
 from ..pixels import BAYER_REMARK, PixelArray, looks_like_bayer, upright
-from ..source import FrameRange, FrameSource, check_cut_short, check_frame_range
+from ..source import FrameRange, FrameSource, check_cut_short, to_slice
 from .integrity import ends_early, ffv1_slices_intact, is_cut_short, varies_in_time
 from .pixel_formats import PixelFormat, frame_pixels, has_grey_palette, layout_of
 from .transfer_curves import BT709, remark_on_curve
@@ -104,7 +104,7 @@ def open_container(
     cut = cut or scan.intact < scan.count or (duration is not None and ends_early(scan.times, scan.last, duration))
     # A filter for fields looks at the frames before and after.
     intra = codec in _INTRA_CODECS and scan.keyframes == scan.count and not interlaced
-    notes += check_cut_short(path, scan.intact, check_frame_range(frames).stop, skip_damaged) if cut else ()
+    notes += check_cut_short(path, scan.intact, to_slice(frames).stop, skip_damaged) if cut else ()
     damaged = _check_damage(path, scan, frames, intra, skip_damaged)
     varies = scan.times is not None and varies_in_time(scan.times, scan.tick)
     fps = float(rate) if rate else None
@@ -241,7 +241,7 @@ def _decoded_scan(path: Path, scan: _Scan, limits: Limits) -> tuple[_Scan, int]:
 
 def _check_damage(path: Path, scan: _Scan, frames: FrameRange | None, intra: bool, skip: bool) -> tuple[int, ...]:
     """Refuse damage in the selected frames; return the numbers of damaged frames that can be skipped."""
-    needed = range(scan.intact)[check_frame_range(frames)]
+    needed = range(scan.intact)[to_slice(frames)]
     if needed and not intra:
         needed = range(needed[-1] + 1)
     bad = [number for number in scan.damaged if number in needed]

@@ -1,4 +1,4 @@
-"""The application: its commands, and how failures end."""
+"""The commands, the application that they make up, and how failures end."""
 
 from __future__ import annotations
 

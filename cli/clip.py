@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,7 +97,7 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     """Restore one clip and write what was ordered; ``turbrestore batch`` calls this in every process."""
     if order.bit_depth is not None:
         check_depth(order.bit_depth)
-    left = _check_outputs(order)
+    may_replace = _check_outputs(order)
     runtime = dataclasses.replace(order.machine.runtime(order.process_limit, order.keep), tile=order.tile)
     if order.truth is not None:
         comparable(read_input_image(order.truth, order.selection.limits()), "truth")
@@ -110,7 +110,7 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     check_room(source, params, runtime, order.output, order.keep)
     with kept_stages(order.keep, source, params, runtime, order.resume, order.checkpoint_every, order.quiet) as stages:
         with (
-            _elsewhere(order, source) as map_tiles,
+            _tile_workers(order, source) as map_tiles,
             progress_bars(order.quiet, _expected_times(source, params)) as progress,
         ):
             tell_decision = _say_decision if order.verbose else None
@@ -123,20 +123,15 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
         depth = source.bit_depth if order.bit_depth is None else order.bit_depth
         if stages is not None and run is not None:
             save_stages(stages, restoration, run, depth)
-            stages.expect(*order.outputs)
-        # Other existing files were refused above.
-        write_result(
-            order.output, restoration, source, depth, command, order.overwrite or order.output.absolute() in left
-        )
+            stages.announce_outputs(*order.outputs)
+        write_result(order.output, restoration, source, depth, command, may_replace(order.output))
         write_settings(order.settings_path, record)
         if order.uncertainty is not None and restoration.uncertainty is not None:
-            write_map(
-                order.uncertainty, restoration.uncertainty, order.overwrite or order.uncertainty.absolute() in left
-            )
+            write_map(order.uncertainty, restoration.uncertainty, may_replace(order.uncertainty))
         if order.report is not None and run is not None:
-            write_report(order.report, restoration, run, overwrite=order.overwrite or order.report.absolute() in left)
+            write_report(order.report, restoration, run, overwrite=may_replace(order.report))
         if stages is not None:
-            stages.expect()
+            stages.announce_outputs()
     return restoration, source
 
 
@@ -153,7 +148,7 @@ def _expected_times(source: FrameSource, params: RestoreParams) -> dict[str, flo
 
 
 @contextmanager
-def _elsewhere(order: Order, source: FrameSource) -> Iterator[TileMap | None]:
+def _tile_workers(order: Order, source: FrameSource) -> Iterator[TileMap | None]:
     """Connect to the processes that work on the tiles, if there are to be any."""
     if order.scheduler is None and order.workers is None:
         yield None
@@ -168,27 +163,30 @@ def _elsewhere(order: Order, source: FrameSource) -> Iterator[TileMap | None]:
             yield over_workers(client)
 
 
-def _check_outputs(order: Order) -> set[Path]:
-    """Refuse outputs that cannot be written; return those that a run which died has left."""
+def _check_outputs(order: Order) -> Callable[[Path], bool]:
+    """Refuse outputs that cannot be written; return a function that tells which of them may replace a file."""
     require(
         order.keep is not None or not order.resume, "--resume: expected --keep with the folder of the run to go on with"
     )
     check_distinct(order.outputs)
     inputs = order.inputs
-    left = own_outputs(order.keep) if order.resume and order.keep is not None else set()
-    check_output(order.output, inputs, order.overwrite or order.output.absolute() in left)
-    of_before = order.config == order.settings_path or order.settings_path.absolute() in left
+    leftovers = own_outputs(order.keep) if order.resume and order.keep is not None else set()
+
+    def may_replace(path: Path) -> bool:
+        # A run that died has left outputs of its own.
+        return order.overwrite or path.absolute() in leftovers
+
+    check_output(order.output, inputs, may_replace(order.output))
     others = [path for path in inputs if path != order.config]
-    check_output(order.settings_path, others, order.overwrite or of_before, suffixes=None)
+    replaces_settings = may_replace(order.settings_path) or order.config == order.settings_path
+    check_output(order.settings_path, others, replaces_settings, suffixes=None)
     if order.uncertainty is not None:
         require(
             order.params.runs("filter"),
             f"--uncertainty: expected a run of the filter, found until = {order.params.until}",
         )
-        check_output(
-            order.uncertainty, inputs, order.overwrite or order.uncertainty.absolute() in left, (".tif", ".tiff")
-        )
+        check_output(order.uncertainty, inputs, may_replace(order.uncertainty), (".tif", ".tiff"))
     if order.report is not None:
-        check_report(order.report, inputs, order.overwrite or order.report.absolute() in left)
+        check_report(order.report, inputs, may_replace(order.report))
     check_keep(order.keep, [*inputs, *order.outputs], order.overwrite, order.resume)
-    return left
+    return may_replace
