@@ -333,7 +333,8 @@ def _remove_blur(
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
-    steps = remove_blur_steps(fused.image, guide, *settings, evidence.witnesses, psf, photons)
+    full_scale = run.prepared.levels.full_scale
+    steps = remove_blur_steps(fused.image, guide, *settings, evidence.witnesses, psf, photons, full_scale)
     return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 
 

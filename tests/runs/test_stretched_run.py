@@ -77,5 +77,7 @@ def test_values_beyond_the_range_of_the_scene_are_not_lost_before_the_image(clip
     clip[:, 10, 10] = 65535
     found = restore(FrameSource.from_array(clip), params_of(WORDS))
     assert found.centroid.image[10, 10] > 0.6
+    # The deconvolution makes a lone bright pixel brighter.
+    assert found.deconvolution.image[10, 10] > found.filtered.image[10, 10] > 0.6
     # A lone bright pixel is no reason to call the clip saturated.
     assert "saturation" not in {decision.subject for decision in found.decisions}

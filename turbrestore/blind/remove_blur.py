@@ -87,12 +87,14 @@ def remove_blur_steps(
     witnesses: BlurWitnesses | None = None,
     psf: Float64Array | None = None,
     photons: NoiseCurve | None = None,
+    full_scale: tuple[float, float] = (0.0, 1.0),
 ) -> Steps[Deblurred]:
     """Remove a blur step by step; see :func:`remove_blur`.
 
     With ``side`` the image is deconvolved in tiles of at most that side, pixels, which takes less memory.  Where there
     are ``witnesses``, the frames tell the blur together with the image.  ``psf`` (h, w) is the point spread
-    function, if it is known.  ``photons`` is the noise of the image at every level, relative to its mean.
+    function, if it is known.  ``photons`` is the noise of the image at every level, relative to its mean;
+    ``full_scale`` is black and white.
     """
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
     if psf is not None:
@@ -107,7 +109,7 @@ def remove_blur_steps(
 
     def remove(width: float) -> Steps[Deconvolution]:
         kernel = width if psf is None or width == 0 else psf
-        return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles, photons)
+        return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles, photons, full_scale)
 
     blur_map, widths, first = None, None, None
     # The likelihood of a tile is unreliable where that of the image is, and where frames tell the blur they decide.
@@ -146,6 +148,7 @@ def tiled_deconvolution_steps(
     runtime: Runtime = DEFAULT,
     tiles: tuple[HaloTile, ...] = (),
     photons: NoiseCurve | None = None,
+    full_scale: tuple[float, float] = (0.0, 1.0),
 ) -> Steps[Deconvolution]:
     """Deconvolve an image (H, W) or (H, W, 3) in overlapping tiles, by the blur and the fidelity λ of the whole.
 
@@ -155,7 +158,7 @@ def tiled_deconvolution_steps(
     pixels = check_image(image)
     guide_image = None if guide is None else check_image(guide, "guide")
     if not np.any(sigma) or len(tiles) < 2:
-        whole = yield from deconvolve_steps(pixels, sigma, params, guide_image, runtime, photons)
+        whole = yield from deconvolve_steps(pixels, sigma, params, guide_image, runtime, photons, full_scale)
         return replace(whole, image=to_scratch(whole.image, runtime.scratch))
     params = params or DeconvolutionParams()
     # Each tile chooses its own h for the nonlocal weights, from its guide after sharpening; that of the whole guide
@@ -165,7 +168,7 @@ def tiled_deconvolution_steps(
     for tile in tiles:
         guide_part = None if guide_image is None else guide_image[tile.rows, tile.columns]
         cut = pixels[tile.rows, tile.columns]
-        part = yield from deconvolve_steps(cut, sigma, params, guide_part, runtime, photons)
+        part = yield from deconvolve_steps(cut, sigma, params, guide_part, runtime, photons, full_scale)
         add_tile(restored, tile, part.image)
         parts.append(replace(part, image=restored))
     noise = float(np.sqrt(np.mean([part.noise**2 for part in parts])))

@@ -229,10 +229,12 @@ def deconvolve_steps(
     guide: ArrayLike | None = None,
     runtime: Runtime = DEFAULT,
     photons: NoiseCurve | None = None,
+    full_scale: tuple[float, float] = (0.0, 1.0),
 ) -> Steps[Deconvolution]:
     """Deblur an image step by step; arguments, errors and result as of :func:`deconvolve`.
 
-    ``photons`` is the noise of the image at every level, relative to its mean.
+    ``photons`` is the noise of the image at every level, relative to its mean; ``full_scale`` is black and white, to
+    which the result is clipped.
     """
     params = params or DeconvolutionParams()
     pixels = check_image(image)
@@ -270,7 +272,7 @@ def deconvolve_steps(
     restored = join_planes(pixels, [store(u)[margin.inside()] for u in solution.images], params.channels)
     records = (np.array(column) for column in zip(*solution.records, strict=True))
     return Deconvolution(
-        np.clip(restored, 0, 1), sigma, fidelity, noise, solution.iterations, solution.converged, *records
+        np.clip(restored, *full_scale), sigma, fidelity, noise, solution.iterations, solution.converged, *records
     )
 
 

@@ -71,7 +71,7 @@ def fine_image(
     if done is None:
         choice, reason = f"{scale:g} times as fine, blurred", "no blur is removed before the last stage"
         return image, Decision("scale", choice, reason)
-    removed = _removed(image, done.sigma, params, restoration, runtime)
+    removed = _removed(image, done.sigma, params, restoration, runtime, full_scale)
     sharp = np.clip(_with_usual(removed.image, done.image, done.sigma), *full_scale)
     agreed = keep_agreed(sharp, halves, full_scale)
     choice = f"{scale:g} times as fine, with {removed.sigma:.2f} fine pixels of blur and the pixel removed"
@@ -158,7 +158,12 @@ def _with_usual(fine: FloatArray, usual: FloatArray, sigma: float) -> FloatArray
 
 
 def _removed(
-    image: FloatArray, sigma: float, params: RestoreParams, restoration: Restoration, runtime: Runtime
+    image: FloatArray,
+    sigma: float,
+    params: RestoreParams,
+    restoration: Restoration,
+    runtime: Runtime,
+    full_scale: tuple[float, float],
 ) -> Deconvolution:
     """Remove blur and pixel, by a smaller width of the blur where the guards object to it."""
     scale, blur = params.scale, restoration.posterior or restoration.blur
@@ -168,7 +173,8 @@ def _removed(
     settings = replace(params.deconvolution, sigma=None, exponent=None)
 
     def attempt(width: float) -> Steps[Deconvolution]:
-        found = yield from deconvolve_steps(image, fine_psf(width, exponent, scale), settings, image, runtime)
+        psf = fine_psf(width, exponent, scale)
+        found = yield from deconvolve_steps(image, psf, settings, image, runtime, full_scale=full_scale)
         return replace(found, sigma=width)
 
     if params.deconvolution.sigma is not None:
