@@ -97,6 +97,18 @@ class TestInflation:
             with pytest.raises(DataError, match=f"found {compression.upper()}; convert the file to one of these"):
                 open_tiff(path).read()
 
+    def test_tiff_stacks_whose_jpeg_parts_are_cut_short_are_refused(self, tmp_path):
+        frames = np.random.default_rng(0).integers(0, 256, (2, 48, 64), dtype=np.uint8)
+        tifffile.imwrite(tmp_path / "a.tif", frames, photometric="minisblack", compression="jpeg")
+        assert np.abs(open_tiff(tmp_path / "a.tif").read() - frames / np.float32(255)).mean() < 0.1
+        with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+            start, size = tiff.pages[1].dataoffsets[0], tiff.pages[1].databytecounts[0]
+        data = (tmp_path / "a.tif").read_bytes()
+        half = start + size // 2
+        (tmp_path / "a.tif").write_bytes(data[:half] + bytes(start + size - half) + data[start + size :])
+        with pytest.raises(DataError, match="damaged .cut short.; copy the file again"):
+            open_tiff(tmp_path / "a.tif").read()
+
     @pytest.mark.parametrize("side", [9000, 11_000, 65_500])
     def test_tiff_whose_parts_are_larger_images(self, tmp_path, side):
         packed = bytearray(cv2.imencode(".jpg", np.zeros((40, 50), np.uint8))[1].tobytes())

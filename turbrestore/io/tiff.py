@@ -37,6 +37,7 @@ _BOUNDED = (_UNCOMPRESSED, 2, 3, 4, 5, 8, 32946, 50013, 32773, 34925, 34926, 500
 _IMAGES = (6, 7, 33007, 34892, 33003, 33004, 33005, 34712, 34933, 34927, 50001)
 # JPEG of which OpenCV reads what is neither grey nor RGB.
 _JPEG = (6, 7)
+_JPEG_END = b"\xff\xd9"
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
 _NOT_TIFF = "not a TIFF file, or damaged"
 _MOST_SAMPLES = 16
@@ -227,12 +228,15 @@ def _page_pixels(path: Path, page: tifffile.TiffPage, limits: Limits) -> PixelAr
 
 
 def _check_images(path: Path, page: tifffile.TiffPage, parts: Sequence[tuple[int, int]], limits: Limits) -> None:
-    """Refuse parts that are images of more pixels than are read."""
+    """Refuse parts that are images of more pixels than are read, or JPEG images that are cut short."""
     import PIL.Image
 
     for offset, size in parts:
         page.parent.filehandle.seek(offset)
         data = io.BytesIO(page.parent.filehandle.read(size))
+        # The decoder would make up the pixels that are missing.
+        if page.compression in _JPEG and not data.getvalue().rstrip(b"\0").endswith(_JPEG_END):
+            raise DataError(f"{path}: compressed pixels are damaged (cut short); copy the file again")
         with warnings.catch_warnings():
             # Pillow warns of sizes that the limits may allow.
             warnings.simplefilter("ignore")
