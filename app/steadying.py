@@ -117,7 +117,7 @@ def steady_order(order: SteadyOrder, job: Job[object], film_path: Path) -> Stead
 
 def watch_camera(name: str, job: Job[None]) -> None:
     """Steady what a camera films, and show every frame beside the steadied one, until the job is stopped."""
-    from turbrestore.io.stream import open_camera
+    from turbrestore.io.containers.stream import open_camera
     from turbrestore.steady.video import steady_frames
 
     camera, waiting = open_camera(name), deque[FloatArray]()

@@ -18,11 +18,11 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import ConfigurationError, require
 from turbrestore.footage.checks.content import clean_source, keep_all
 from turbrestore.io.containers.encoding import BY_SUFFIX, Encoding, write_pipe
+from turbrestore.io.containers.stream import open_camera, open_pipe, read_raw, write_raw
 from turbrestore.io.containers.transfer_curves import CURVES
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.io.source import FrameSource
-from turbrestore.io.stream import open_camera, open_pipe, read_raw, write_raw
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video
 from turbrestore.report import SteadyFigures, check_report, write_steady_report
 from turbrestore.runs.run_record import describe_run

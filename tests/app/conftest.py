@@ -140,3 +140,18 @@ def drop(page, name, data):
     page.dispatch_event(".view", "dragenter", {"dataTransfer": files})
     page.get_by_text("Drop the clip to open it").wait_for()
     page.dispatch_event(".view", "drop", {"dataTransfer": files})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("start")
+    write_video(folder / "clip.mkv", make_sequence(seed=5, count=6, size=64).frames, fps=25)
+    (folder / "below").mkdir()
+    (folder / "notes.txt").touch()
+    return folder
+
+
+def ended(job):
+    job.join(60)
+    assert job.state != "running"
+    return job

@@ -16,10 +16,9 @@ from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError, OutputError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.footage.levels import Levels
-from turbrestore.io.video import open_frames, write_video
+from turbrestore.io.video import write_video
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.settings import RestoreParams
-from turbrestore.steady.settings import SteadyParams
 from turbrestore_app import folders, job, restoring, stage_memory, tuning
 from turbrestore_app.clip import open_clip
 from turbrestore_app.folders import Folders
@@ -29,12 +28,12 @@ from turbrestore_app.pictures import Pictures
 from turbrestore_app.restoring import Order, preview_order, restore_order
 from turbrestore_app.saving import Outputs, check_outputs, command_line, save
 from turbrestore_app.several import inputs_of, plan_several
-from turbrestore_app.steadying import SteadyOrder
 from turbrestore_app.tab import Tab
 from turbrestore_app.tuning import impressions, part_around, tuned_params
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.options import Selection
-from turbrestore_cli.steady import Output
+
+from .conftest import ended
 
 QUICK = RestoreParams(centroid=CentroidParams(iterations=1), deconvolution=DeconvolutionParams(sigma=1.0, iterations=5))
 
@@ -51,23 +50,8 @@ def test_stages_are_shown_at_the_levels_of_the_clip():
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("start")
-    write_video(folder / "clip.mkv", make_sequence(seed=5, count=6, size=64).frames, fps=25)
-    (folder / "below").mkdir()
-    (folder / "notes.txt").touch()
-    return folder
-
-
-@pytest.fixture(scope="module")
 def restored(folder):
     return ended(Job(lambda job: restore_order(Order(folder / "clip.mkv", params=QUICK), job))).result
-
-
-def ended(job):
-    job.join(60)
-    assert job.state != "running"
-    return job
 
 
 class TestFolders:
@@ -322,79 +306,6 @@ class TestSeveral:
         entries = tab.folders.listing(tmp_path)
         assert "a.steady.mp4" in [entry.name for entry in entries]
         assert [entry.name for entry in inputs_of(entries)] == ["a.mkv", "b.mkv", "bad.mkv"]
-
-
-class TestSteady:
-    def test_a_camera_is_watched_until_it_is_stopped(self, tmp_path, monkeypatch):
-        released = threading.Event()
-
-        class Camera:
-            def __init__(self, name):
-                self.frames = 0 if name == "/dev/video0" else None
-
-            def read(self):
-                if self.frames is None:
-                    return False, None
-                self.frames += 1
-                return True, np.full((32, 48, 3), self.frames % 200, np.uint8)
-
-            set = get = lambda *_: 0
-
-            def release(self):
-                released.set()
-
-        monkeypatch.setattr("cv2.VideoCapture", Camera)
-        tab = Tab(Folders(tmp_path))
-        watched = tab.watch("/dev/video0")
-        for _ in range(600):
-            if "steadied" in watched.images or watched.state != "running":
-                break
-            watched.join(0.1)
-        seen, steadied = watched.images["camera"], watched.images["steadied"]
-        assert steadied.shape == (32, 48, 3)
-        assert np.abs(seen - steadied).max() < 0.05
-        tab.stop()
-        assert ended(watched).state == "stopped"
-        assert released.wait(10)
-        assert "/dev/video1: expected a camera" in ended(tab.watch("/dev/video1")).message
-
-    def test_the_command_gives_the_same_files(self, folder, tmp_path):
-        tab = Tab(Folders(folder))
-        order = SteadyOrder(
-            folder / "clip.mkv", tmp_path / "a.mp4", Selection(roi="0,0,64,48"), SteadyParams(camera="lock")
-        )
-        job = ended(tab.steady(order))
-        assert (job.state, job.result, tab.steadied.video) == ("done", tab.steadied, tmp_path / "a.mp4"), job.message
-        assert [bar.total for bar in job.bars.values()] == [6, 6]
-        read = [open_frames(path).read() for path in (tab.steadied.film_path, folder / "clip.mkv", order.output)]
-        film, clip, video = (frames if frames.ndim == 3 else frames.mean(axis=3) for frames in read)
-        assert np.abs(film - np.concatenate([clip[:, :48, :64], video], axis=2)).mean() < 0.03
-        command = shlex.split(order.command_line(folder / "clip.mkv", tmp_path / "b.mp4"))
-        assert main([*command[1:], "--quiet"]) == 0
-        for suffix in (".mp4", ".mp4.toml"):
-            assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
-        with pytest.raises(OutputError, match="exists already"):
-            order.check()
-        with pytest.raises(ConfigurationError, match=r"ends in \.mp4"):
-            replace(order, output=tmp_path / "a.mkv").check()
-        tab.close()
-        assert not tab.steadied.film_path.exists()
-
-    def test_a_stop_leaves_nothing(self, folder, tmp_path):
-        tab = Tab(Folders(folder))
-        job = tab.steady(SteadyOrder(folder / "clip.mkv", tmp_path / "a.mp4"))
-        tab.stop()
-        assert ended(job).state == "stopped"
-        assert (tab.steadied, list(tmp_path.iterdir())) == (None, [])
-        tab.close()
-
-    def test_options_are_those_of_the_command(self, folder, tmp_path):
-        params = SteadyParams(camera="steady", sigma=0.8, reach=6, largest=3.5)
-        selection, written = Selection(frames="0:4"), Output("hevc", 20)
-        order = SteadyOrder(folder / "clip.mkv", tmp_path / "a.mp4", selection, params, written)
-        flags = order.command_line(Path("clip.mkv"), Path("a.mp4")).split()[4:]
-        expected = "--camera=steady --codec=hevc --crf=20 --frames=0:4 --largest=3.5 --reach=6 --sigma=0.8"
-        assert " ".join(sorted(flags)) == expected
 
 
 def test_a_clip_has_the_numbers_of_its_file(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.io.containers.encoding import Encoding, write_container, write_pipe
-from turbrestore.io.stream import live_frames, open_pipe, read_raw, write_raw
+from turbrestore.io.containers.stream import live_frames, open_pipe, read_raw, write_raw
 from turbrestore.io.video import open_frames, write_video
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (4, 12, 16, 3), np.uint8)

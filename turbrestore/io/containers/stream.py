@@ -14,13 +14,13 @@ from typing import Any, BinaryIO, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, from_unit
-from ..core.errors import DataError, StorageError
-from .containers.decoding import OPEN_OPTIONS
-from .containers.pixel_formats import convert, native_format
-from .limits import DEFAULT_LIMITS, Limits
-from .output import frames_of_one_size, size_text
-from .pixels import PixelArray, full_scale_of, to_unit
+from ...core.arrays import FloatArray, from_unit
+from ...core.errors import DataError, StorageError
+from ..limits import DEFAULT_LIMITS, Limits
+from ..output import frames_of_one_size, size_text
+from ..pixels import PixelArray, full_scale_of, to_unit
+from .decoding import OPEN_OPTIONS
+from .pixel_formats import convert, native_format
 
 
 @runtime_checkable
