@@ -198,6 +198,17 @@ class TestTitles:
         np.testing.assert_allclose(title.put_back(np.zeros((20, 30)), 5, 55)[title.mask[55:75, 5:35]].max(), 1)
         assert len(check_content(FrameSource.from_array(titled)).stuck) == 0
 
+    def test_a_small_mark_that_a_coder_made_noisy_keeps_its_colour(self, clip):
+        frames = np.repeat(u8(0.8 * clip.frames)[..., None], 3, axis=3)
+        plain = frames.copy()
+        noise = np.random.default_rng(0).normal(0, 6, (COUNT, 6, 6, 1))
+        frames[:, :6, 50:56] = np.clip(np.array([230, 20, 20]) + noise, 0, 255)
+        title = without_overlay(surveyed(frames))[2]
+        assert title is not None and title.mask[:6, 50:56].all() and title.mask.sum() < 100
+        found = restore(FrameSource.from_array(frames))
+        np.testing.assert_allclose(found.image[:6, 50:56], found.mean[:6, 50:56], atol=0.01)
+        assert without_overlay(surveyed(plain))[2] is None
+
 
 class TestClocks:
     """Digits that change keep their pixels, although they do not stand all the time."""

@@ -12,7 +12,8 @@ of the scene.  Flow, fusion and deconvolution then see the scene alone.
 
 With a camera that stands no frame shows what is behind a title.  The scene moves all the same, by the pixel or two that
 the air bends it: every frame is continued over the overlay, whose pixels are put back into the result as they are in
-the mean of the frames.
+the mean of the frames.  A title lacks the noise of the camera, unless a coder has spread that over it; then its edges
+move less by an order of magnitude than those of the scene.
 
 The digits of a clock change, but from one frame to the next most of their strokes stand, as no edge does that the air
 moves.  Where an overlay has been found, the places of such strokes belong to it.
@@ -60,8 +61,9 @@ _AROUND, _REACH, _FREE = 2, 12.0, 0.9
 # With a camera that stands: radius around standing edges in which what has no noise belongs to them, and of the gaps
 # between letters; pixels around them over which the overlay fades.
 _NEAR, _GAP, _FADE = 4, 2, 0.7
-# Deviation of a title, in units of the noise.
-_NOISELESS = 0.7
+# An edge is drawn over the scene if its deviation is below that of the noise by this factor, or its motion is below that
+# of the edges of the scene by this one.
+_NOISELESS, _DRAWN = 0.7, 1 / 8
 # Strokes of a clock: least change of a pixel, in units of the noise and in intensity, that is one; least share of the
 # frames that have an edge there, and of these in which it stands; fewest pixels that belong together.
 _SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5 / 255, 0.2, 0.25, 12
@@ -71,6 +73,8 @@ _TIMES, _USUAL, _ALMOST_USUAL = 2, 0.15, 1.5
 _MOST_DIGITS = 0.1
 # Pixels beside others in which fewer frames need to have it.
 _BESIDE, _REMAINS_BESIDE = 8, 0.18
+# Distance of digits from what stands all the time: at most one line in so many of the height of the frame.
+_LINE = 10
 # Most frames in which they are looked for.
 _LOOKED_AT = 60
 
@@ -179,21 +183,23 @@ def _standing(source: FrameSource, moments: Moments) -> tuple[NDArray[np.bool_] 
     clear = gradient > _DEVIATIONS / _STILL * floor
     motion = _motion(deviation[clear], gradient[clear], usual)
     edges = still & clear & (gradient * min(_STANDS * motion, 1.0) > deviation)
-    if edges.sum() < _LEAST_EDGES * edges.size:
+    # The camera draws a title over its noise, which no edge of the scene lacks; a coder blurs that again.
+    noiseless = _NOISELESS * max(usual, _LEAST_STILL / _STILL)
+    drawn = clear & (deviation < np.maximum(_DRAWN * motion * gradient, noiseless))
+    is_drawn = bool(_large(drawn).any())
+    if edges.sum() < _LEAST_EDGES * edges.size and not is_drawn:
         return None, None
     constant = deviation < _CONSTANT * max(usual, _LEAST_STILL / _STILL)
     # A flat part of the scene does not change either; what stands has no noise of the scene, or is dark like a stop.
     black = float(mean.min())
     dark = mean < black + _DARK * (float(np.median(mean[~still])) - black) if (~still).any() else still
-    mask = _regions((still & dark) | constant | edges, edges)
+    mask = _regions((still & dark) | constant | edges | drawn, edges | drawn)
     if mask.mean() > _LARGEST:
         return None, None
     mask = _around(mask, _AROUND)
-    # The camera draws a title over its noise, which no edge of the scene lacks.
-    edges &= deviation < _NOISELESS * max(usual, _LEAST_STILL / _STILL)
-    if motion < _LEAST_BENDING or edges.sum() < _LEAST_EDGES * edges.size:
+    if motion < _LEAST_BENDING or not is_drawn:
         return mask, None
-    letters = _regions((constant & _around(edges, _NEAR)) | edges, edges).astype(np.uint8)
+    letters = _regions((constant & _around(drawn, _NEAR)) | drawn, drawn).astype(np.uint8)
     letters = cv2.morphologyEx(letters, cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
     return mask, Title(_around(letters, 1), moments.mean, source.window)
 
@@ -218,7 +224,8 @@ def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> N
     # Where the scene hardly moves, its edges stand at times as well.
     usual = max(float(np.quantile(share[moving], 0.9)) / _USUAL, 1.0)
     share[standing < _TIMES] = 0
-    digits = _large(share > _REMAINS * usual)
+    # A clock has a colon, a date or digits that do not change; blocks that a coder copies lie anywhere.
+    digits = _large(_around(mask, len(mask) // _LINE) & (share > _REMAINS * usual))
     if usual <= _ALMOST_USUAL:
         near = _around(digits | mask, _BESIDE)
         digits |= _large(near & (share > _REMAINS_BESIDE * usual))
