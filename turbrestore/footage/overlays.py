@@ -61,8 +61,8 @@ _AROUND, _REACH, _FREE = 2, 12.0, 0.9
 # With a camera that stands: radius around standing edges in which what has no noise belongs to them, and of the gaps
 # between letters; pixels around them over which the overlay fades.
 _NEAR, _GAP, _FADE = 4, 2, 0.7
-# An edge is drawn over the scene if its deviation is below that of the noise by this factor, or its motion below that of
-# the edges of the scene by this one.
+# An edge is drawn over the scene if its deviation is below that of the noise by this factor, or its motion below that
+# of the edges of the scene by this one.
 _NOISELESS, _DRAWN = 0.7, 1 / 8
 # Strokes of a clock: least change of a pixel, in units of the noise and in intensity, that is one; least share of the
 # frames that have an edge there, and of these in which it stands; fewest pixels that belong together.
