@@ -162,6 +162,13 @@ class TestOverlays:
             survey = surveyed(frames)
             assert without_overlay(survey) == (survey, None, None, ())
 
+    def test_edges_along_a_pan_are_no_overlay(self):
+        """They move by no more than the air bends them."""
+        wide = u8(make_sequence(3, 32, 144, "chart", blur=0.8, noise=0.008, rms=0.3).frames)
+        panned = np.stack([frame[20:120, number : number + 100] for number, frame in enumerate(wide)])
+        survey = surveyed(panned)
+        assert without_overlay(survey) == (survey, None, None, ())
+
     def test_a_window_is_that_of_the_whole_frame(self, shaken):
         covered = shaken.copy()
         covered[:, 40, 20:60] = 255
