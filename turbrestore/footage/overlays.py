@@ -165,6 +165,8 @@ def without_overlay(
         choice = f"{100 * float(title.mask.mean()):.1f} % of the frame kept as in the mean of the frames"
         reason = "it stands while the air bends the scene around it; it is neither moved nor deblurred"
         return survey.adjusted(title.without, small), title.mask, title, (Decision("overlay", choice, reason),)
+    if moments is not None and not given and _standing(survey.clip, moments, shifts)[0] is None:
+        return survey, None, None, ()
     overlay = _overlay(survey, mask, shifts)
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
     reason = "asked for" if given else "it stands while the scene moves"
@@ -176,8 +178,13 @@ def without_overlay(
     return survey.adjusted(overlay.without, small), overlay.hidden, None, (decision,)
 
 
-def _standing(source: FrameSource, moments: Moments) -> tuple[NDArray[np.bool_] | None, Title | None]:
-    """Find connected regions with edges that stand: for a camera that moves and, if edges move, for one that stands."""
+def _standing(
+    source: FrameSource, moments: Moments, shifts: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.bool_] | None, Title | None]:
+    """Find connected regions with edges that stand: for a camera that moves and, if edges move, for one that stands.
+
+    Where ``shifts`` (T, 2) of the camera are known, what lies along its path does not count.
+    """
     mean, usual, deviation = luminance(moments.mean), moments.noise, np.sqrt(moments.variance)
     floor = max(_STILL * usual, _LEAST_STILL)
     still = deviation < floor
@@ -185,6 +192,9 @@ def _standing(source: FrameSource, moments: Moments) -> tuple[NDArray[np.bool_] 
     gradient = np.hypot(*slopes)
     clear = gradient > _DEVIATIONS / _STILL * floor
     motion = _motion(np.sqrt(np.maximum(moments.variance - usual**2, 0)), slopes, clear)
+    if shifts is not None:
+        across = np.einsum("iyx,ij,jyx->yx", slopes, np.cov(shifts.T), slopes)
+        motion = np.minimum(motion, np.sqrt(np.maximum(across, 0)) / np.maximum(gradient, 1e-6))
     edges = still & clear & (gradient * np.minimum(_STANDS * motion, 1.0) > deviation)
     # The camera draws a title over its noise, which no edge of the scene lacks; a coder blurs that again.
     noiseless = _NOISELESS * max(usual, _LEAST_STILL / _STILL)
