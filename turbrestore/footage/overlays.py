@@ -49,8 +49,6 @@ _LEAST_MOTION = 3.0
 _STANDS, _DEVIATIONS, _LEAST_BENDING = 1 / 3, 8.0, 0.3
 # Deviation of a pixel that stands, in units of the noise of a frame, and the least in intensity.
 _STILL, _LEAST_STILL = 2.5, 1 / 255
-# Directions of edges whose motion is measured apart.
-_DIRECTIONS = 8
 # Deviation of what has no noise, in units of the noise, and how dark a stop is between black and the scene.
 _CONSTANT, _DARK = 0.5, 0.25
 # Fewest standing edge pixels of an overlay, as a share of the frame, and the largest part of a frame that it may cover.
@@ -191,10 +189,10 @@ def _standing(
     slopes = sobel_gradient(mean)
     gradient = np.hypot(*slopes)
     clear = gradient > _DEVIATIONS / _STILL * floor
-    motion = _motion(np.sqrt(np.maximum(moments.variance - usual**2, 0)), slopes, clear)
+    motion = measured = _motion(deviation[clear], gradient[clear], usual)
     if shifts is not None:
         across = np.einsum("iyx,ij,jyx->yx", slopes, np.cov(shifts.T), slopes)
-        motion = np.minimum(motion, np.sqrt(np.maximum(across, 0)) / np.maximum(gradient, 1e-6))
+        motion = np.minimum(measured, np.sqrt(np.maximum(across, 0)) / np.maximum(gradient, 1e-6))
     edges = still & clear & (gradient * np.minimum(_STANDS * motion, 1.0) > deviation)
     # The camera draws a title over its noise, which no edge of the scene lacks; a coder blurs that again.
     noiseless = _NOISELESS * max(usual, _LEAST_STILL / _STILL)
@@ -210,7 +208,7 @@ def _standing(
     if mask.mean() > _LARGEST:
         return None, None
     mask = _around(mask, _AROUND)
-    if not is_drawn or float(np.median(motion[clear])) < _LEAST_BENDING:
+    if not is_drawn or measured < _LEAST_BENDING:
         return mask, None
     letters = _regions((constant & _around(drawn, _NEAR)) | drawn, drawn).astype(np.uint8)
     letters = cv2.morphologyEx(letters, cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
@@ -264,15 +262,11 @@ def _with_digits(
     return mask | wide, replace(title, mask=letters)
 
 
-def _motion(variation: FloatArray, slopes: tuple[FloatArray, FloatArray], clear: NDArray[np.bool_]) -> FloatArray:
-    """Motion of most edges of the direction of each pixel, pixels: a pan moves no edge that lies along it."""
-    direction = (_DIRECTIONS * np.arctan2(slopes[1], slopes[0]) / np.pi).astype(int) % _DIRECTIONS
-    motion = np.zeros_like(variation)
-    for number in range(_DIRECTIONS):
-        alike = direction == number
-        if (edges := alike & clear).any():
-            motion[alike] = np.median(variation[edges] / np.hypot(slopes[0][edges], slopes[1][edges]))
-    return motion
+def _motion(deviation: NDArray[np.float64], gradient: FloatArray, noise: float) -> float:
+    """Motion of most edges, pixels."""
+    if not deviation.size:
+        return 0.0
+    return float(np.sqrt(np.median(np.maximum(deviation**2 - noise**2, 0) / gradient**2)))
 
 
 def _regions(grown: NDArray[Any], marks: NDArray[np.bool_], fewest: int = 1) -> NDArray[np.bool_]:
