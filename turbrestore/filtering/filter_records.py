@@ -16,7 +16,8 @@ from ..display.curves import plot_frames
 from ..display.preview import preview
 from ..registration.recentring import recentring_flow
 from ..registration.warp import warp
-from .kalman import Gaussian, PixelGaussian
+from .image_state import PixelGaussian
+from .kalman import Gaussian
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

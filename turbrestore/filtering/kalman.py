@@ -1,31 +1,24 @@
-"""Kalman filter: prediction, measurement update in covariance and in information form, and the updates of paper 3.
+"""Kalman filter of a linear state: prediction, and measurement update in covariance and in information form.
 
-The equations of paper 3, section 4, of the image and of the state of its flow::
+The equations of paper 3, section 4, with any measurement z in the place of the flow less its mean, and H of C::
 
-    ρ̂ ← ρ̂,  ξ̂ ← A ξ̂                                           (14a, b)
-    Σ ← Σ + S,  P ← A P Aᵀ + Q                                 (14c, d)
-    I ∘ ŵ = ρ + ζ,  ζ ~ N(0, Z)                                (15)
-    ρ̂ ← ρ̂ + L (I ∘ ŵ − ρ̂),  Σ ← (1 − L) Σ,  L = Σ / (Σ + Z)   (16)
-    W^meas = W̄ + C ξ + r,  r ~ N(0, R)                         (17)
-    ξ̂ ← ξ̂ + M (W^meas − W̄ − C ξ̂),  P ← (I − M C) P
-    M = P Cᵀ (C P Cᵀ + R)⁻¹                                    (18)
-    M = (CᵀR⁻¹C + P⁻¹)⁻¹ CᵀR⁻¹                                 (19)
+    ξ̂ ← A ξ̂                           (14b)
+    P ← A P Aᵀ + Q                    (14d)
+    z = H ξ + r,  r ~ N(0, R)         (17)
+    ξ̂ ← ξ̂ + M (z − H ξ̂)               (18, 19)
+    P ← (I − M H) P
+    M = P Hᵀ (H P Hᵀ + R)⁻¹           (18)
+    M = (HᵀR⁻¹H + P⁻¹)⁻¹ HᵀR⁻¹        (19)
+
+:mod:`turbrestore.filtering.flow_state` applies them to the state of the flow, and
+:mod:`turbrestore.blur_moments.state_estimation.observers` to states that are observed by blur moments.
 
 Symbols
 -------
-ρ̂, Σ : image and its variance; S, Z : variance of its drift, and of a registered frame I ∘ ŵ about it
 ξ̂, P : mean and covariance of the state
-A, C, Q, R, W̄ : flow model of :mod:`turbrestore.dynamics.flow_model`; W^meas : measured flow
-L, M : gains
-z, H, R : measurement, its matrix and the covariance of its noise, where the state is any other
-
-The paper takes Σ, Z and L to be one number each; here they vary from pixel to pixel.  Pixels are independent of each
-other, and channels share the variance.
-
-The paper measures the flow by C ξ alone (eq. 17); here W̄ is added, as the states are identified around the mean flow.
-As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R``: a measured flow enters the update only through
-``z = Cᵀ(W^meas − W̄)``, which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the
-expensive part and needs no state, and predictions and updates have the size n.
+A, Q : transition of the state, and covariance of its noise
+z, H, R : measurement, its matrix, and the covariance of its noise
+M : gain
 
 Matrix operations act on the last two axes, so leading axes are batches and broadcast.  A component of a measurement
 that is NaN is missing.
@@ -34,19 +27,14 @@ that is NaN is missing.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray
 from ..core.errors import DataError
-from ..dynamics.flow_model import Float64Array, FlowDynamics, ProjectedFlow
-from ..runtime.image_stacks import Stack
+from ..dynamics.flow_model import Float64Array
 
 _LOG_2PI = float(np.log(2 * np.pi))
-# Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
-_FLOW_NOISE_FLOOR = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +77,7 @@ class Innovation:
 
 
 def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
-    """Time update: A ξ̂ (paper 3, eq. 14b) and A P Aᵀ + Q (eq. 14d), with A and Q of shape (..., n, n)."""
+    """Predict the state one step ahead: A ξ̂ (14b) and A P Aᵀ + Q (14d), with A and Q of shape (..., n, n)."""
     n = state.mean.shape[-1]
     A, Q = np.asarray(A, np.float64), np.asarray(Q, np.float64)
     _check_matrix(A, n, n, "A")
@@ -100,13 +88,11 @@ def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
         return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ A.mT + Q))  # (14b), (14d)
 
 
-def update(
+def update_covariance_form(
     state: Gaussian, measurement: ArrayLike, H: ArrayLike, R: ArrayLike, predicted: ArrayLike | None = None
 ) -> tuple[Gaussian, Innovation]:
-    """Measurement update in covariance form, for few components (paper 3, eqs. 17 and 18).
+    """Update the state by a measurement (17) with the gain of (18), which suits few components.
 
-    The observers of blur moments use this form, with the gain of eq. 18; the alternating filter uses the information
-    form of eq. 19.
     The new covariance is Joseph's ``(I − M H) P (I − M H)ᵀ + M R Mᵀ`` where the paper has ``(I − M H) P``: both are the
     same in exact arithmetic, but only the first stays symmetric and positive semi-definite in floating point.
     ``measurement`` (..., m); ``H`` (..., m, n); ``R`` (..., m, m); ``predicted`` (..., m).
@@ -138,10 +124,10 @@ def update(
     return after, _innovation(residual, S, squared, log_det, observed)
 
 
-def update_information(
+def update_information_form(
     state: Gaussian, measurement: ArrayLike, H: ArrayLike, noise_variance: ArrayLike
 ) -> tuple[Gaussian, Innovation]:
-    """Measurement update in information form, for many components and few states (paper 3, eq. 19).
+    """Update the state by a measurement (17) with the gain of (19), which suits many components and few states.
 
     ``M = (G + P⁻¹)⁻¹ Hᵀ R⁻¹`` with ``G = Hᵀ R⁻¹ H``: only n×n matrices are decomposed. With ``P = L Lᵀ`` and ``Lᵀ G L =
     V D Vᵀ`` the new covariance is ``T Tᵀ``, ``T = L V (I + D)^(-1/2)``: P may be singular, and the result is symmetric
@@ -243,73 +229,3 @@ def _cholesky(matrix: Float64Array, name: str, kind: str) -> Float64Array:
         return np.asarray(np.linalg.cholesky(matrix), np.float64)
     except np.linalg.LinAlgError:
         raise DataError(f"{name}: expected a {kind} matrix, found one that is not; check the covariances") from None
-
-
-def flow_noise(dynamics: FlowDynamics) -> float:
-    """R, squared pixels, with a floor for flows that lie in the subspace of the model as a whole."""
-    return max(dynamics.R, _FLOW_NOISE_FLOOR)
-
-
-def advance_state(state: Gaussian, measured: ProjectedFlow | None, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
-    """Predict the state of the flow one frame ahead (paper 3, eqs. 14b and 14d), and update it by a measured flow."""
-    predicted = predict(state, dynamics.A, dynamics.Q)
-    return (predicted, np.nan) if measured is None else update_state(predicted, measured, dynamics)
-
-
-def update_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
-    """Update the state of the flow by a measured flow (paper 3, eqs. 17 and 19)."""
-    # Cᵀ(W^meas − W̄) = ξ + noise of covariance R I, by CᵀC = I.
-    state, _ = update_information(predicted, measured.state, np.eye(len(measured.state)), flow_noise(dynamics))
-    # |W − W̄ − C ξ̂|² without the product C ξ̂.
-    squared = measured.squared - float(predicted.mean @ (2 * measured.state - predicted.mean))
-    return state, (max(squared, 0.0) / measured.size) ** 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class PixelGaussian:
-    """Mean and variance of every pixel."""
-
-    mean: NDArray[np.floating]  # (H, W) or (H, W, 3): ρ̂, intensities
-    variance: NDArray[np.floating]  # (H, W): Σ, squared intensities, not negative
-
-    def __post_init__(self) -> None:
-        mean = np.asarray(self.mean)
-        mean = mean if mean.dtype in (np.float32, np.float64) else mean.astype(np.float64)
-        variance = np.asarray(self.variance, mean.dtype)
-        pixels = variance.shape
-        if mean.shape not in (pixels, (*pixels, 3)):
-            raise DataError(f"mean: expected the shape of variance {pixels} or {(*pixels, 3)}, found {mean.shape}")
-        if not np.isfinite(np.sum(mean, dtype=np.float64)):
-            raise DataError("mean: expected finite values, found NaN or infinite ones")
-        if not np.isfinite(np.sum(variance, dtype=np.float64)) or (variance < 0).any():
-            raise DataError("variance: expected finite values of at least 0, found others")
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "variance", variance)
-
-
-def first_states(image: FloatArray, variance: float, dynamics: FlowDynamics) -> tuple[PixelGaussian, Gaussian]:
-    """ρ̂, Σ and ξ̂, P before the first frame: an image (H, W) or (H, W, 3) of one variance, and the state 0.
-
-    The covariance P is that of the training states.
-    """
-    pixels, covariance = np.full(image.shape[:2], variance, np.float32), dynamics.state_covariance
-    return PixelGaussian(image, pixels), Gaussian(np.zeros(len(covariance)), covariance)
-
-
-class PixelStacks(NamedTuple):
-    """PixelGaussian as the device holds it, unchecked."""
-
-    mean: Stack  # (C, H, W): ρ̂
-    variance: Stack  # (H, W): Σ
-
-
-def update_pixels(state: PixelStacks, registered: Stack, noise: Stack, drift: float) -> tuple[PixelStacks, Stack]:
-    """Predict the image and update it by a registered frame (paper 3, eqs. 14a, 14c and 16).
-
-    ``registered`` (C, H, W); ``noise`` (H, W); returns ``gain`` (H, W).
-    """
-    prior = state.variance + drift  # (14c); by (14a) the mean stays
-    gain = prior / (prior + noise)  # L of (16)
-    mean = state.mean + gain * (registered - state.mean)  # (16)
-    # L Z equals (1 − L) Σ of (16) without its cancellation where Z is small.
-    return PixelStacks(mean, gain * noise), gain

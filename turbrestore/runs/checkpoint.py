@@ -9,7 +9,8 @@ import numpy as np
 
 from ..core.errors import DataError
 from ..filtering.filter_records import FilterCheckpoint, FilterState, FrameRecord
-from ..filtering.kalman import Gaussian, PixelGaussian
+from ..filtering.image_state import PixelGaussian
+from ..filtering.kalman import Gaussian
 from ..io.npy import read_npz
 from ..io.output import atomic_output
 
