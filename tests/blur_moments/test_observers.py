@@ -20,7 +20,8 @@ from turbrestore.blur_moments.state_estimation.observers import (
     steady_kalman,
 )
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.filtering.kalman import Gaussian, update_covariance_form
+from turbrestore.filtering.estimates import Gaussian
+from turbrestore.filtering.kalman import update_covariance_form
 
 WAVES = wavefront_setup()
 MODEL = WAVES.model

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from conftest import make_sequence
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
-from turbrestore.filtering.image_state import PixelStacks, predict_image, update_image
-from turbrestore.filtering.kalman import Gaussian, predict, update_information_form
+from turbrestore.filtering.estimates import Gaussian, PixelStacks
+from turbrestore.filtering.image_state import predict_image, update_image
+from turbrestore.filtering.kalman import predict, update_information_form
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 

@@ -9,9 +9,10 @@ from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.filtering.alternating import filter_frames, filter_steps
+from turbrestore.filtering.estimates import Gaussian, PixelStacks
 from turbrestore.filtering.filter_records import FilterParams, filter_memory
-from turbrestore.filtering.image_state import PixelStacks, update_image
-from turbrestore.filtering.kalman import Gaussian, predict, update_covariance_form
+from turbrestore.filtering.image_state import update_image
+from turbrestore.filtering.kalman import predict, update_covariance_form
 from turbrestore.metrics import psnr
 from turbrestore.registration.centroid import find_centroid
 from turbrestore.registration.warp import warp

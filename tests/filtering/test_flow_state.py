@@ -8,8 +8,9 @@ from flow_systems import uneven_flows
 
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import flow_of, project_measured
+from turbrestore.filtering.estimates import Gaussian
 from turbrestore.filtering.flow_state import advance_flow_state, update_flow_state
-from turbrestore.filtering.kalman import Gaussian, predict, update_covariance_form
+from turbrestore.filtering.kalman import predict, update_covariance_form
 
 
 @pytest.fixture

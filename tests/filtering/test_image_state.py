@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import DataError
-from turbrestore.filtering.image_state import PixelGaussian, PixelStacks, predict_image, update_image
-from turbrestore.filtering.kalman import Gaussian, predict, update_covariance_form
+from turbrestore.filtering.estimates import Gaussian, PixelGaussian, PixelStacks
+from turbrestore.filtering.image_state import predict_image, update_image
+from turbrestore.filtering.kalman import predict, update_covariance_form
 
 
 @pytest.fixture

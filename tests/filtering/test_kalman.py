@@ -7,12 +7,8 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from turbrestore.core.errors import DataError
-from turbrestore.filtering.kalman import (
-    Gaussian,
-    predict,
-    update_covariance_form,
-    update_information_form,
-)
+from turbrestore.filtering.estimates import Gaussian
+from turbrestore.filtering.kalman import predict, update_covariance_form, update_information_form
 
 
 def covariance(rng: np.random.Generator, n: int, *batch: int) -> np.ndarray:

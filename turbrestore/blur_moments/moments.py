@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike
 from scipy.special import comb
 
 from ..core.errors import ConfigurationError, DataError, require
-from ..filtering.kalman import Gaussian
+from ..filtering.estimates import Gaussian
 from .sensor import ExposureTable, Float64Array, GaussianKernel, LineSensor, PixelGrid, tabulate
 from .state_estimation.augmented import OscillatorMotion
 from .state_estimation.lifting import LiftedSystem

@@ -24,7 +24,8 @@ from scipy.optimize import minimize_scalar
 
 from ..core.arrays import check_frames, luminance
 from ..core.errors import ConfigurationError, DataError, require, require_between
-from ..filtering.kalman import Gaussian, Innovation
+from ..filtering.estimates import Gaussian
+from ..filtering.kalman import Innovation
 from .moments import BlurModel
 from .sensor import ExposureTiming, Float64Array, GaussianKernel, LineSensor, PixelGrid
 from .state_estimation.lifting import LiftedSystem

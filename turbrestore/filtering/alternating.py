@@ -53,6 +53,7 @@ from ..runtime.device import find_device, memory_of
 from ..runtime.image_stacks import load, load_image, load_record, store, store_image
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
+from .estimates import Gaussian, PixelGaussian, PixelStacks, first_estimates
 from .filter_records import (
     FilterCheckpoint,
     Filtered,
@@ -64,8 +65,7 @@ from .filter_records import (
 from .flow_state import flow_noise
 from .frame_pass import Frame, PassSettings, TrackedFrame, pass_over, register
 from .frame_statistics import measure_frame_statistics
-from .image_state import PixelGaussian, PixelStacks, predict_image, update_image
-from .kalman import Gaussian
+from .image_state import predict_image, update_image
 
 # Variance of an image of which nothing is known: full scale, squared.
 _DIFFUSE = 1.0
@@ -295,11 +295,9 @@ def _measure_settings(
 
 
 def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params: FilterParams) -> FilterState:
-    """State before the first frame: the image with one variance, and the flow state 0 as it is in the training."""
+    """State before the first frame."""
     variance = image_noise / params.prior_frames if params.prior_frames else _DIFFUSE
-    pixels = PixelGaussian(image, np.full(image.shape[:2], variance, np.float32))
-    flow = Gaussian(np.zeros(dynamics.rank), dynamics.state_covariance)
-    return FilterState(pixels, flow, *np.zeros((2, *image.shape[:2], 2), np.float32))
+    return FilterState(*first_estimates(image, variance, dynamics), *np.zeros((2, *image.shape[:2], 2), np.float32))
 
 
 def _after_training(

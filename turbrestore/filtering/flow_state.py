@@ -27,7 +27,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..dynamics.flow_model import FlowDynamics, ProjectedFlow
-from .kalman import Gaussian, predict, update_information_form
+from .estimates import Gaussian
+from .kalman import predict, update_information_form
 
 # Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
 _FLOW_NOISE_FLOOR = 1e-6

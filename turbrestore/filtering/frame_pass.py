@@ -23,10 +23,10 @@ from ..runtime.device import CPU
 from ..runtime.runtime import Runtime
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import in_batches, map_in_turns
+from .estimates import Gaussian
 from .filter_records import FilterParams
 from .flow_state import advance_flow_state
 from .frame_noise import FrameStatistics, RegisteredFrame, register_frame
-from .kalman import Gaussian
 
 # A frame as it was read, or prepared for flow; None for a frame that does not count.
 Frame = FloatArray | FlowFrame | None

@@ -22,43 +22,8 @@ other, and channels share the variance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
-
-from ..core.errors import DataError
 from ..runtime.image_stacks import Stack
-
-
-@dataclass(frozen=True, eq=False)
-class PixelGaussian:
-    """Mean and variance of every pixel."""
-
-    mean: NDArray[np.floating]  # (H, W) or (H, W, 3): ρ̂, intensities
-    variance: NDArray[np.floating]  # (H, W): Σ, squared intensities, not negative
-
-    def __post_init__(self) -> None:
-        mean = np.asarray(self.mean)
-        mean = mean if mean.dtype in (np.float32, np.float64) else mean.astype(np.float64)
-        variance = np.asarray(self.variance, mean.dtype)
-        pixels = variance.shape
-        if mean.shape not in (pixels, (*pixels, 3)):
-            raise DataError(f"mean: expected the shape of variance {pixels} or {(*pixels, 3)}, found {mean.shape}")
-        if not np.isfinite(np.sum(mean, dtype=np.float64)):
-            raise DataError("mean: expected finite values, found NaN or infinite ones")
-        if not np.isfinite(np.sum(variance, dtype=np.float64)) or (variance < 0).any():
-            raise DataError("variance: expected finite values of at least 0, found others")
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "variance", variance)
-
-
-class PixelStacks(NamedTuple):
-    """PixelGaussian as the device holds it, unchecked."""
-
-    mean: Stack  # (C, H, W): ρ̂
-    variance: Stack  # (H, W): Σ
+from .estimates import PixelStacks
 
 
 def predict_image(image: PixelStacks, drift: float) -> PixelStacks:

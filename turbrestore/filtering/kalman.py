@@ -1,23 +1,13 @@
 """Kalman filter of a linear state: prediction, and measurement update in covariance and in information form.
 
-The equations of paper 3, section 4, with any measurement z in the place of the flow less its mean, and H of C::
-
-    ξ̂ ← A ξ̂                           (14b)
-    P ← A P Aᵀ + Q                    (14d)
-    z = H ξ + r,  r ~ N(0, R)         (17)
-    ξ̂ ← ξ̂ + M (z − H ξ̂)               (18, 19)
-    P ← (I − M H) P
-    M = P Hᵀ (H P Hᵀ + R)⁻¹           (18)
-    M = (HᵀR⁻¹H + P⁻¹)⁻¹ HᵀR⁻¹        (19)
-
-:mod:`turbrestore.filtering.flow_state` applies them to the state of the flow, and
-:mod:`turbrestore.blur_moments.state_estimation.observers` to states that are observed by blur moments.
+Equations (14), (17), (18) and (19) are those of :mod:`turbrestore.filtering.flow_state`, with any measurement z in the
+place of the flow less its mean, and its matrix H in the place of C; the observers of blur moments use them as well.
 
 Symbols
 -------
 ξ̂, P : mean and covariance of the state
 A, Q : transition of the state, and covariance of its noise
-z, H, R : measurement, its matrix, and the covariance of its noise
+z, H, R : measurement ``z = H ξ + r``, its matrix, and the covariance of its noise r
 M : gain
 
 Matrix operations act on the last two axes, so leading axes are batches and broadcast.  A component of a measurement
@@ -33,29 +23,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import DataError
 from ..dynamics.flow_model import Float64Array
+from .estimates import Gaussian, check_batches, check_covariance, check_matrix, cholesky
 
 _LOG_2PI = float(np.log(2 * np.pi))
-
-
-@dataclass(frozen=True, eq=False)
-class Gaussian:
-    """Mean and covariance of a state."""
-
-    mean: Float64Array  # (..., n): ξ̂
-    # (..., n, n): P, symmetric positive semi-definite. Its leading axes may be fewer than those of the mean: one
-    # covariance then holds for all of them.
-    cov: Float64Array
-
-    def __post_init__(self) -> None:
-        mean, cov = np.asarray(self.mean, np.float64), np.asarray(self.cov, np.float64)
-        if mean.ndim < 1:
-            raise DataError("mean: expected shape (..., n), found a single number")
-        if not np.isfinite(mean).all():
-            raise DataError("mean: expected finite values, found NaN or infinite ones; the filter may be unstable")
-        _check_covariance(cov, mean.shape[-1], "cov")
-        _check_batches(mean.shape[:-1], cov=cov.shape[:-2])
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "cov", cov)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +50,9 @@ def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
     """Predict the state one step ahead: A ξ̂ (14b) and A P Aᵀ + Q (14d), with A and Q of shape (..., n, n)."""
     n = state.mean.shape[-1]
     A, Q = np.asarray(A, np.float64), np.asarray(Q, np.float64)
-    _check_matrix(A, n, n, "A")
-    _check_covariance(Q, n, "Q")
-    _check_batches(state.mean.shape[:-1], A=A.shape[:-2], Q=Q.shape[:-2])
+    check_matrix(A, n, n, "A")
+    check_covariance(Q, n, "Q")
+    check_batches(state.mean.shape[:-1], A=A.shape[:-2], Q=Q.shape[:-2])
     # Gaussian raises a DataError where the result overflows, so NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
         return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ A.mT + Q))  # (14b), (14d)
@@ -100,8 +70,8 @@ def update_covariance_form(
     n = state.mean.shape[-1]
     z, H, R = np.asarray(measurement, np.float64), np.asarray(H, np.float64), np.asarray(R, np.float64)
     m = _check_measurement(z, H, n)
-    _check_covariance(R, m, "R")
-    _check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2], R=R.shape[:-2])
+    check_covariance(R, m, "R")
+    check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2], R=R.shape[:-2])
     residual = z - (_apply(H, state.mean) if predicted is None else np.asarray(predicted, np.float64))
     missing = np.isnan(z)
     if missing.any():
@@ -111,7 +81,7 @@ def update_covariance_form(
         R = np.where(missing[..., None] | missing[..., None, :], np.eye(m), R)
     HP = H @ state.cov
     S = _symmetric(HP @ H.mT + R)
-    lower = _cholesky(S, "innovation covariance H P Hᵀ + R", "positive definite")
+    lower = cholesky(S, "innovation covariance H P Hᵀ + R", "positive definite")
     M = np.asarray(np.linalg.solve(S, HP), np.float64).mT  # P Hᵀ (H P Hᵀ + R)⁻¹, (18)
     F = np.eye(n) - M @ H
     after = Gaussian(state.mean + _apply(M, residual), _symmetric(F @ state.cov @ F.mT + M @ R @ M.mT))
@@ -137,7 +107,7 @@ def update_information_form(
     n = state.mean.shape[-1]
     z, H = np.asarray(measurement, np.float64), np.asarray(H, np.float64)
     m = _check_measurement(z, H, n)
-    _check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2])
+    check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2])
     variance = np.asarray(noise_variance, np.float64)
     if variance.shape not in ((), (m,)):
         raise DataError(f"noise_variance: expected one number or shape ({m},), found shape {variance.shape}")
@@ -187,45 +157,10 @@ def _symmetric(matrix: Float64Array) -> Float64Array:
     return 0.5 * (matrix + matrix.mT)
 
 
-def _check_matrix(matrix: NDArray[np.floating], rows: int, columns: int, name: str) -> None:
-    if matrix.ndim < 2 or matrix.shape[-2:] != (rows, columns):
-        raise DataError(f"{name}: expected shape (..., {rows}, {columns}), found {matrix.shape}")
-
-
 def _check_measurement(z: NDArray[np.floating], H: NDArray[np.floating], n: int) -> int:
     if z.ndim < 1:
         raise DataError("measurement: expected shape (..., m), found a single number")
-    _check_matrix(H, z.shape[-1], n, "H")
+    check_matrix(H, z.shape[-1], n, "H")
     if np.isinf(z).any():
         raise DataError("measurement: expected finite values, or NaN where missing, found infinite ones")
     return int(z.shape[-1])
-
-
-def _check_covariance(cov: Float64Array, n: int, name: str) -> None:
-    _check_matrix(cov, n, n, name)
-    if not np.isfinite(cov).all():
-        raise DataError(f"{name}: expected finite values, found NaN or infinite ones; the filter may be unstable")
-    diagonal = np.abs(np.diagonal(cov, axis1=-2, axis2=-1))
-    scale = diagonal.max(-1, initial=0.0)[..., None]
-    if (np.abs(cov - cov.mT) > 1e-8 * scale[..., None]).any():
-        raise DataError(f"{name}: expected a symmetric matrix, found one that is not")
-    # Rounding may leave the eigenvalue of a known direction slightly negative; only more than that is an error.
-    slack = 1e-10 * diagonal + 1e-14 * scale + 1e-300
-    _cholesky(cov + slack[..., None] * np.eye(n), name, "positive semi-definite")
-
-
-def _check_batches(state: tuple[int, ...], **batches: tuple[int, ...]) -> None:
-    for name, batch in batches.items():
-        try:
-            np.broadcast_shapes(state, batch)
-        except ValueError:
-            raise DataError(
-                f"{name}: expected leading axes that fit those of the mean {state}, found {batch}"
-            ) from None
-
-
-def _cholesky(matrix: Float64Array, name: str, kind: str) -> Float64Array:
-    try:
-        return np.asarray(np.linalg.cholesky(matrix), np.float64)
-    except np.linalg.LinAlgError:
-        raise DataError(f"{name}: expected a {kind} matrix, found one that is not; check the covariances") from None

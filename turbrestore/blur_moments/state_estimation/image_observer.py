@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.errors import ConfigurationError, DataError, require
-from ...filtering.kalman import Gaussian, Innovation, update_information_form
+from ...filtering.estimates import Gaussian
+from ...filtering.kalman import Innovation, update_information_form
 from ..moments import BlurModel
 from ..sensor import Float64Array
 

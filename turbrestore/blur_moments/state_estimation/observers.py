@@ -7,7 +7,7 @@ runs all of them.  The observers on the whole image are in :mod:`.image_observer
 
 Symbols (paper 1, section V; paper 2, section IV)
 -------------------------------------------------
-x̂, P : mean and covariance of the state, :class:`~turbrestore.filtering.kalman.Gaussian`.
+x̂, P : mean and covariance of the state, :class:`~turbrestore.filtering.estimates.Gaussian`.
 y^(p), h : measured and predicted moments of the frame, :func:`.moments.predicted_moments`.
 C_s, H : derivative of the moments with respect to the state.
 L : gain of the Luenberger observer; K : gain of the Kalman filter.
@@ -30,7 +30,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solve_discrete_are
 
 from ...core.errors import ConfigurationError, DataError, require
-from ...filtering.kalman import Gaussian, Innovation, predict, update_covariance_form
+from ...filtering.estimates import Gaussian
+from ...filtering.kalman import Innovation, predict, update_covariance_form
 from ..moments import BASES, BlurModel, image_moments, moment_noise, predicted_moments
 from ..sensor import Float64Array
 from .image_observer import ImageFilter
