@@ -76,8 +76,8 @@ def restore(
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
-    Frames are read in order: a sample of them to survey the clip, all of them once more where something passes through
-    the scene, then the training frames, and those after them by the filter.  Only the training frames are kept, in
+    Frames are read in order: a sample of them to survey the clip, all of them once more if there are moving
+    objects, then the training frames, and those after them by the filter.  Only the training frames are kept, in
     memory or, if they do not fit, in a scratch file.
 
     Parameters
@@ -305,7 +305,7 @@ def _find_witnesses(run: Run, training: FloatArray, fused: Restoration) -> BlurW
         if seeing is not None and measured is not None:
             displacement, frames = measured.value, seeing.independent_frames
         else:
-            # Without a displacement that can be measured, that of the flow stands for it, less what the camera adds.
+            # Where no displacement can be measured, that of the flow is taken instead, less what the camera adds.
             about = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
             displacement, frames = float(np.mean(about)), float(len(training))
         return measure_witnesses(cropped, flows, _of_optics(BlurWitnesses(displacement, frames, picture), run, seeing))

@@ -1,4 +1,4 @@
-"""What stands on the sensor: columns, rows and lone pixels with an offset of their own, and dead columns and rows.
+"""Static patterns of the sensor: columns, rows and lone pixels with an offset of their own, dead columns and rows.
 
 Symbols
 -------
@@ -6,10 +6,10 @@ m, v : mean of the frames, and variance from one to the next, which shadows hard
 c : offset of a column: median over the rows of m minus m smoothed across the columns
 s : motion of the edges of the scene, pixels
 
-Stripes of the scene move with the air, so v exceeds n² by s² times the squared slope of c.  Those of the sensor stand,
-and v knows nothing of them.  They are subtracted from every frame; a column that does not change while others do is
-filled from beside it.  Rows are the columns of the transposed frames.  A warm pixel is one that stands out of m alone,
-which no detail does that moves, and does not vary by its height times the motion.
+Stripes of the scene move with the air, so v exceeds n² by s² times the squared slope of c.  Those of the sensor stay,
+and do not raise v.  They are subtracted from every frame; a column that does not change while others do is filled from
+beside it.  Rows are the columns of the transposed frames.  A warm pixel exceeds its surroundings in m by itself, as no
+detail does that moves, and does not vary by its height times the motion.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def without_stripes(survey: Survey, moments: Moments | None = None) -> tuple[Sur
         *([f"{count} dead columns or rows filled from beside them"] if count else ()),
         *([f"{warm.sum()} warm pixels evened out"] if warm.any() else ()),
     ]
-    decision = Decision("sensor", "; ".join(kinds), "they stand while the air moves the scene")
+    decision = Decision("sensor", "; ".join(kinds), "they are static while the air moves the scene")
     return survey.adjusted(stripes.without), (decision,)
 
 
@@ -146,7 +146,7 @@ def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
 
 
 def _warm(mean: FloatArray, variance: FloatArray, noise: float, motion: float) -> NDArray[np.bool_]:
-    """Mark pixels that stand out alone of what is around them, and stand."""
+    """Mark static pixels that differ, each alone, from what is around them."""
     height, least = _above_around(mean), max(_CLEARLY * noise, 2 * _LEAST)
     ring = np.ones((3, 3), np.uint8)
     ring[1, 1] = 0

@@ -127,7 +127,7 @@ def _list_pages(path: Path, tiff: tifffile.TiffFile, limits: Limits) -> tuple[in
         limits.check_count(len(seen), str(path))
         if not page.aspage().is_reduced:
             whole.append(number)
-    # tifffile passes over a link that leads to no page.
+    # tifffile ignores a link that leads to no page.
     tiff.filehandle.seek(tiff.pages.next_page_offset or 0)
     if tiff.filehandle.read(tiff.tiff.offsetsize) != bytes(tiff.tiff.offsetsize):
         raise DataError(f"{path}: cut short after {len(seen)} whole pages; copy the file again")

@@ -20,10 +20,10 @@ Texture keeps its flow, an edge takes the component along it from its neighbourh
 Two things keep the estimate from trusting the measurement too much.  A flow method errs by more than noise explains,
 by a factor m in variance, and the part of its error that is none of noise does not average out, so ε falls with A only
 to that of a noise of 0.01.  And the direction of an edge is known to a few degrees only: without κ, changes of the
-tensor's direction from one pixel to the next would pass for a measurement along the edge.  Results lie within the range
+tensor's direction from one pixel to the next would count as a measurement along the edge.  Results lie within the range
 of the measured flow.
 
-J also contains the noise of the reference, which must not pass for texture, so its eigenvalues are lowered by it.
+J also contains the noise of the reference, which must not count as texture, so its eigenvalues are lowered by it.
 """
 
 from __future__ import annotations

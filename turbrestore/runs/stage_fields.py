@@ -3,7 +3,7 @@
 The types of numbers, flags and texts are those of the record that the file becomes.  A number that is not listed lies
 between 0 and a billion.  Infinite values are allowed where a bound is infinite.
 
-Shapes name their axes; one name stands for one length within a stage file:
+Shapes name their axes; one name is one length within a stage file:
 
 ======  =========================================================
 H, W    height and width, pixels

@@ -15,7 +15,7 @@ V : its inverse map, ``(id + D) ∘ (id + V) = id``, about d_k
 
 Exposure and white balance may hunt.  Neighbours get the light of the frame before they are averaged with it, and the
 result gets the mean light of the pairs of neighbours, as far as light changes by the few per cent by which cameras
-hunt; what is switched on passes at once.
+hunt; what is switched on shows at once.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from .windows import Window, WindowFrame, light_between, normalised_image, relit
 _FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
 # Level of the pyramid, above the finest, at which a search with a start begins.
 _START_LEVEL = 1
-# Largest change of the light in a window, logarithm, of which half passes: cameras hunt by less, and lamps change more.
+# Change of the light in a window, logarithm, of which half is taken out: cameras hunt by less, and lamps change more.
 _HUNTING = 0.25
 
 

@@ -55,7 +55,7 @@ class StuckPixelDetector:
         moves = self._highest - self._lowest
         moved = moves.mean(axis=1) >= _MOVING
         still = (self._most - self._least <= _STILL) & moved
-        # A neighbour that stands too, while others move, is part of a letter of a title.
+        # A neighbour that is stuck too, while others move, is part of a letter of a title.
         letter = moved & ((moves <= _STILL).sum(axis=1) >= _OF_LETTER)
         stuck = self._places[(still | (self._alone >= _ALONE)) & ~letter]
         return none if len(stuck) > _MOST_STUCK * self._size else stuck

@@ -5,9 +5,9 @@ Symbols
 f : a frame; r : the reference, a mean of frames; both reduced and blurred, so that motion of the air hardly counts
 g(y) : gain of the frame at row y of the frame, a constant and cosines; b : its offset
 
-``f(x + d) ≈ g(y) r(x) + b`` is fitted by least squares, reweighted so that what passes through the scene does not
-count; d is the shift of the whole frame.  A frame is corrected to ``(f − b) / g``.  The gains of all frames are 1 on
-average, row by row, so that the mean of the frames stays.
+``f(x + d) ≈ g(y) r(x) + b`` is fitted by least squares, reweighted so that moving objects do not count; d is the shift
+of the whole frame.  A frame is corrected to ``(f − b) / g``.  The gains of all frames are 1 on average, row by row, so
+that the mean of the frames stays.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _COSINES = 16
 # Change of a frame by its gain, or by bands, relative to the contrast of the scene, from which light changes.  Steady
 # simulated and real clips reach 0.01, and 0.03 along the rows where somebody walks through.
 _LEAST_CHANGE, _LEAST_BANDS = 0.025, 0.06
-# Share of these below which no model is fitted, as means over a frame include what passes through the scene.
+# Share of these below which no model is fitted, as means over a frame include moving objects.
 _CLEARLY = 0.7
 # Share of the residual that a model has to explain of what a simpler one leaves.
 _EXPLAINED = 0.3

@@ -5,10 +5,10 @@ Symbols
 f : a frame; r : the median of the frames at every place; both reduced and blurred, and at one exposure
 g : gain of a frame, a smooth field; G∗ a Gaussian average
 
-``g = G∗(w r f) / G∗(w r²)`` is the fit of ``f ≈ g r`` in a window, with weights w that leave out what passes through
-the scene.  Motion of the air moves f off g r by its displacement times the gradient of r, which has both signs in a
-window and hardly changes g; a shadow changes all of it.  The fields of all frames are 1 on average, in the logarithm,
-so that the light of the mean stays.
+``g = G∗(w r f) / G∗(w r²)`` is the fit of ``f ≈ g r`` in a window, with weights w that leave moving objects out.
+Motion of the air moves f off g r by its displacement times the gradient of r, which has both signs in a window and
+hardly changes g; a shadow changes all of it.  The fields of all frames are 1 on average, in the logarithm, so that the
+light of the mean stays.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _FEWEST = 8
 # and the share of the squared residual that g has to explain.
 # Behind moving air, with walkers, snow, rain or noise, g explains up to six tenths of it.
 _LEAST_CHANGE, _MOST_OF, _EXPLAINED = 0.03, 90, 0.8
-# Largest shift of a camera that stands, pixels of the reduced frames, root mean square.
+# Largest shift of a static camera, pixels of the reduced frames, root mean square.
 _STANDS = 1.0
 # Gains are limited to this factor; what is added to r, as a share of its bright parts: dark ones count less.
 _LARGEST, _DARK, _BRIGHT = 3.0, 0.03, 95
