@@ -71,11 +71,7 @@ class BlurModel:
 
 
 def predicted_moments(
-    model: BlurModel,
-    mean: Float64Array,
-    inputs: Float64Array,
-    orders: tuple[int, ...],
-    basis: str = "monomial",
+    model: BlurModel, mean: Float64Array, inputs: Float64Array, orders: tuple[int, ...], basis: str = "monomial"
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Predict the moments h(x̂) from a state, with their derivative and the covariance of their noise.
 

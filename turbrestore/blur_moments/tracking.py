@@ -210,12 +210,7 @@ def _run(windows: _Windows, params: TrackParams) -> tuple[Gaussian, Float64Array
 
 
 def _follow(
-    windows: _Windows,
-    axis: int,
-    start: Gaussian,
-    motion: LiftedSystem,
-    kernel: GaussianKernel,
-    observer: MomentFilter,
+    windows: _Windows, axis: int, start: Gaussian, motion: LiftedSystem, kernel: GaussianKernel, observer: MomentFilter
 ) -> list[tuple[Gaussian, Innovation]]:
     """States of one axis after each frame, and innovations."""
     lines, summed = windows.images.sum(axis=1 + axis), windows.images.shape[1 + axis]

@@ -54,14 +54,7 @@ from ..runtime.image_stacks import load, load_image, load_record, store, store_i
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from .estimates import Gaussian, PixelGaussian, PixelStacks, first_estimates
-from .filter_records import (
-    FilterCheckpoint,
-    Filtered,
-    FilterParams,
-    FilterState,
-    FilterStep,
-    FrameRecord,
-)
+from .filter_records import FilterCheckpoint, Filtered, FilterParams, FilterState, FilterStep, FrameRecord
 from .flow_state import flow_noise
 from .frame_pass import Frame, PassSettings, TrackedFrame, pass_over, register
 from .frame_statistics import measure_frame_statistics
@@ -217,11 +210,7 @@ def _filter_blocks(
 
 
 def _iterate(
-    at: _Position,
-    settings: PassSettings,
-    known: Flows,
-    last: bool = False,
-    following: Iterable[FloatArray | None] = (),
+    at: _Position, settings: PassSettings, known: Flows, last: bool = False, following: Iterable[FloatArray | None] = ()
 ) -> Generator[FilterStep, None, _Position]:
     """Run one pass over the block that has begun, and over the frames that follow it; ``last`` settles the block."""
     settled = len(at.block) if last else 0

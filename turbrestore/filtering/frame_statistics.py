@@ -231,11 +231,7 @@ def _deviation(variance: np.ndarray, window: float = OUTLIER_WINDOW) -> FloatArr
 
 
 def _leave_middle_out(
-    moments: _SharpnessMoments,
-    template: FloatArray,
-    energy: FloatArray,
-    noise: FloatArray,
-    window: float,
+    moments: _SharpnessMoments, template: FloatArray, energy: FloatArray, noise: FloatArray, window: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Mean and variance of the local sharpness, the part of the variance that noise explains, and κ.
 

@@ -139,11 +139,7 @@ def _posterior_root(P: Float64Array, G: Float64Array) -> tuple[Float64Array, Flo
 
 
 def _innovation(
-    values: Float64Array,
-    cov: Float64Array,
-    squared: Float64Array,
-    log_det: Float64Array,
-    observed: NDArray[np.intp],
+    values: Float64Array, cov: Float64Array, squared: Float64Array, log_det: Float64Array, observed: NDArray[np.intp]
 ) -> Innovation:
     log_likelihood = -0.5 * (squared + log_det + observed * _LOG_2PI)
     return Innovation(values, cov, np.asarray(squared), np.asarray(log_likelihood), np.asarray(observed))

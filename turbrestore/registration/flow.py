@@ -89,8 +89,7 @@ class FlowParams:
 
     def __post_init__(self) -> None:
         require(
-            self.method in FLOW_METHODS,
-            f"method: expected one of {', '.join(FLOW_METHODS)}, found {self.method!r}",
+            self.method in FLOW_METHODS, f"method: expected one of {', '.join(FLOW_METHODS)}, found {self.method!r}"
         )
         require_between("contrast_window", self.contrast_window, 0, 1000, "pixels")
         require_between("contrast_floor", self.contrast_floor, 1e-6, 1)
@@ -122,10 +121,7 @@ class FlowReference:
 
 
 def estimate_flow(
-    reference: ArrayLike,
-    frames: ArrayLike,
-    params: FlowParams | None = None,
-    runtime: Runtime = DEFAULT,
+    reference: ArrayLike, frames: ArrayLike, params: FlowParams | None = None, runtime: Runtime = DEFAULT
 ) -> FloatArray:
     """Measure the flow from ``reference`` to each of ``frames``.
 
@@ -170,10 +166,7 @@ def estimate_flow(
 
 
 def iterate_flows(
-    reference: ArrayLike,
-    frames: Iterable[ArrayLike],
-    params: FlowParams | None = None,
-    runtime: Runtime = DEFAULT,
+    reference: ArrayLike, frames: Iterable[ArrayLike], params: FlowParams | None = None, runtime: Runtime = DEFAULT
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield frames (H, W[, 3]) and flows (H, W, 2) in order while threads solve a few frames ahead.
 
@@ -205,9 +198,7 @@ def measure_flows(
 
 
 def prepare_reference(
-    reference: ArrayLike,
-    params: FlowParams | None = None,
-    runtime: Runtime = DEFAULT,
+    reference: ArrayLike, params: FlowParams | None = None, runtime: Runtime = DEFAULT
 ) -> FlowReference:
     """Prepare the image (H, W[, 3]) that flows start from."""
     params = params or FlowParams()

@@ -62,11 +62,7 @@ class NumberSpec:
 
 _IMAGE = ArraySpec("f4", "H W|H W 3")
 FIELDS: dict[str, dict[str, ArraySpec | NumberSpec]] = {
-    "centroid": {
-        "image": _IMAGE,
-        "flows": ArraySpec("f4", "T H W 2"),
-        "mean_flow_sizes": ArraySpec("f8", "i", low=0),
-    },
+    "centroid": {"image": _IMAGE, "flows": ArraySpec("f4", "T H W 2"), "mean_flow_sizes": ArraySpec("f8", "i", low=0)},
     "dynamics": {
         "mean_flow": ArraySpec("f4", "H W 2"),
         "A": ArraySpec("f8", "n n"),
