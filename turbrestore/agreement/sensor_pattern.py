@@ -35,7 +35,7 @@ _ACROSS = 3.0
 # Least offset, in standard errors of the mean of the frames and in intensity, that is worth a correction.
 _CLEARLY, _LEAST = 4.0, 5e-4
 # Largest share, of the variance that stripes of the scene would have, of those of the sensor.
-_STANDS = 0.25
+_STATIC = 0.25
 # Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion, pixels.
 _EDGE, _LEAST_MOTION = 8.0, 0.3
 # Parts along the stripes, and the least correlation of their offsets; offsets of a sensor, root mean square, are
@@ -129,7 +129,7 @@ def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float
     steep, flat = slope >= np.quantile(slope, 0.75), slope <= np.quantile(slope, 0.25)
     gained = float(np.median(level[steep]) - np.median(level[flat]))
     expected = motion**2 * float(np.median(slope[steep]) - np.median(slope[flat]))
-    return offsets if gained < _STANDS * expected else np.zeros_like(offsets)
+    return offsets if gained < _STATIC * expected else np.zeros_like(offsets)
 
 
 def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
@@ -152,7 +152,7 @@ def _warm(mean: FloatArray, variance: FloatArray, noise: float, motion: float) -
     ring[1, 1] = 0
     over = np.where(height > 0, mean - cv2.dilate(mean, ring), cv2.erode(mean, ring) - mean)
     alone = (np.abs(height) > least) & (over > _ALONE * np.abs(height))
-    warm = alone & (variance - noise**2 < _STANDS * (motion * height) ** 2)
+    warm = alone & (variance - noise**2 < _STATIC * (motion * height) ** 2)
     # Letters are drawn over the noise; a lone pixel among their strokes is one of them.
     smooth = cv2.medianBlur(mean, 3)
     slope = np.hypot(*sobel_gradient(smooth))

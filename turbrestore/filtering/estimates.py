@@ -1,10 +1,4 @@
-"""Estimates of the image and of the state of the flow, each with its covariance (paper 3, section 4).
-
-Symbols
--------
-ρ̂, Σ : image and its variance, which varies from pixel to pixel
-ξ̂, P : state of the flow and its covariance
-"""
+"""Estimates of the image, ρ̂ and Σ, and of the state of its flow, ξ̂ and P (paper 3, section 4)."""
 
 from __future__ import annotations
 
@@ -71,10 +65,7 @@ class PixelStacks(NamedTuple):
 
 
 def first_estimates(image: FloatArray, variance: float, dynamics: FlowDynamics) -> tuple[PixelGaussian, Gaussian]:
-    """Estimates before the first frame: an image (H, W) or (H, W, 3) of one variance, and the state 0.
-
-    The covariance P is that of the training states.
-    """
+    """Estimates before the first frame: an image (H, W[, 3]) of one variance, and the state 0, with its covariance."""
     pixels, covariance = np.full(image.shape[:2], variance, np.float32), dynamics.state_covariance
     return PixelGaussian(image, pixels), Gaussian(np.zeros(len(covariance)), covariance)
 

@@ -99,8 +99,8 @@ class Background:
 
 
 @dataclass(frozen=True, eq=False)
-class _BackgroundModel:
-    """The scene as most frames show it, and thresholds that moving objects exceed; maps have the shape (H', W')."""
+class _Model:
+    """The background as most frames show it, and thresholds that objects exceed; maps have the shape (H', W')."""
 
     median: FloatArray  # m
     deviation: FloatArray  # d above which a pixel belongs to a large object
@@ -111,11 +111,11 @@ class _BackgroundModel:
     spread: float  # mean of v
     reach: int  # r
 
-    def at(self, place: Window) -> _BackgroundModel:
+    def at(self, place: Window) -> _Model:
         parts = (self.median[place], self.deviation[place], self.low[place], self.high[place])
-        return _BackgroundModel(*parts, None if self.excess is None else self.excess[place], self.spread, self.reach)
+        return _Model(*parts, None if self.excess is None else self.excess[place], self.spread, self.reach)
 
-    def without_small(self) -> _BackgroundModel:
+    def without_small(self) -> _Model:
         return dataclasses.replace(self, excess=None)
 
 
@@ -137,7 +137,7 @@ def without_moving_objects(survey: Survey) -> tuple[FrameSource, tuple[Decision,
     return source.adjusted(background.shown), (decision,)
 
 
-def _model_background(survey: Survey) -> tuple[_BackgroundModel, Placement] | None:
+def _model_background(survey: Survey) -> tuple[_Model, Placement] | None:
     """Model the background of a clip, and place its frames in it; None if there are no moving objects."""
     source, places = survey.clip, spread(len(survey.numbers), _SAMPLES)
     numbers = tuple(survey.numbers[place] for place in places)
@@ -147,10 +147,10 @@ def _model_background(survey: Survey) -> tuple[_BackgroundModel, Placement] | No
         np.rint(255 * np.clip(luminance(frame), 0, 1), out=plane, casting="unsafe")
     still = Placement(dict.fromkeys(source.numbers, (0, 0)), (source.shape[1], source.shape[2]))
     model = _median_model(stack, numbers, still)
-    found = _model_of_objects(stack, numbers, model, still)
+    found = _fitted(stack, numbers, model, still)
     reach = _REACH if found is None else max(_REACH, math.ceil(_REACHED * _displacement(stack)))
     if reach > _REACH:
-        found = _model_of_objects(stack, numbers, _median_model(stack, numbers, still, reach=reach), still)
+        found = _fitted(stack, numbers, _median_model(stack, numbers, still, reach=reach), still)
     if found is not None:
         return found, still
     if not _moves(_shifts(_reduced(map(_grey, stack), stack.shape), stack.shape)):
@@ -163,7 +163,7 @@ def _model_background(survey: Survey) -> tuple[_BackgroundModel, Placement] | No
     followed = _median_model(stack, numbers, moving, reach=reach)
     if followed.spread >= _FOLLOWED * model.spread:
         return None
-    found = _model_of_objects(stack, numbers, followed, moving)
+    found = _fitted(stack, numbers, followed, moving)
     return None if found is None else (found, moving)
 
 
@@ -198,9 +198,7 @@ def _displacement(stack: NDArray[np.uint8]) -> float:
     return float(np.median(lengths) / np.sqrt(2 * 2 * np.log(2)))
 
 
-def _model_of_objects(
-    stack: NDArray[np.uint8], numbers: Sequence[int], model: _BackgroundModel, placement: Placement
-) -> _BackgroundModel | None:
+def _fitted(stack: NDArray[np.uint8], numbers: Sequence[int], model: _Model, placement: Placement) -> _Model | None:
     """Fit a model to the moving objects of a sample; None if there are none, or so many that they are the scene."""
     parts = [model.at(placement.place(number)) for number in numbers]
     large = [_foreground(_grey(plane), part.without_small()) for plane, part in zip(stack, parts, strict=True)]
@@ -219,7 +217,7 @@ def _model_of_objects(
     return model if _is_scene(stack, masks, parts, shifts) else None
 
 
-def _is_precipitation(stack: NDArray[np.uint8], large: list[NDArray[np.uint8]], parts: list[_BackgroundModel]) -> bool:
+def _is_precipitation(stack: NDArray[np.uint8], large: list[NDArray[np.uint8]], parts: list[_Model]) -> bool:
     """Whether more of the frames is beyond the range of the scene, on one side of it, than turbulence explains."""
     shares, brighter = [], []
     for plane, mask, part in zip(stack, large, parts, strict=True):
@@ -233,7 +231,7 @@ def _is_precipitation(stack: NDArray[np.uint8], large: list[NDArray[np.uint8]], 
 
 
 def _is_scene(
-    stack: NDArray[np.uint8], masks: list[NDArray[np.uint8]], parts: list[_BackgroundModel], shifts: NDArray[np.float64]
+    stack: NDArray[np.uint8], masks: list[NDArray[np.uint8]], parts: list[_Model], shifts: NDArray[np.float64]
 ) -> bool:
     """Whether the background is a scene with edges of its own, which does not move against the given shifts.
 
@@ -255,7 +253,7 @@ def _median_model(
     placement: Placement,
     masks: Sequence[NDArray[np.uint8]] | None = None,
     reach: int = _REACH,
-) -> _BackgroundModel:
+) -> _Model:
     """Take the median over the frames at every place of the scene, and the thresholds that moving objects exceed.
 
     Pixels in ``masks``, where objects have been found, are left out unless that leaves too few frames.
@@ -288,7 +286,7 @@ def _median_model(
     smooth, nearby = cv2.GaussianBlur(median, (0, 0), _SMALL_WINDOW), _disc(reach - 1)
     spread = float(variance[seen > 0].mean()) if seen.any() else np.inf
     low, high = cv2.erode(smooth, nearby), cv2.dilate(smooth, nearby)
-    return _BackgroundModel(median, deviation, low, high, excess, spread, reach)
+    return _Model(median, deviation, low, high, excess, spread, reach)
 
 
 def _median(values: FloatArray) -> FloatArray:
@@ -302,7 +300,7 @@ def _median(values: FloatArray) -> FloatArray:
     return np.nan_to_num((low + high) / 2)
 
 
-def _foreground(grey: FloatArray, model: _BackgroundModel) -> NDArray[np.uint8]:
+def _foreground(grey: FloatArray, model: _Model) -> NDArray[np.uint8]:
     """Mark moving objects by 255, fading; a frame that is mostly marked shows another scene, so nothing is marked."""
     mask = (cv2.GaussianBlur((grey - model.median) ** 2, (0, 0), _WINDOW) > model.deviation).view(np.uint8)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _disc(_GAP))
@@ -314,7 +312,7 @@ def _foreground(grey: FloatArray, model: _BackgroundModel) -> NDArray[np.uint8]:
     return np.asarray(weight if weight.mean() <= 255 * _LARGEST_PART else np.zeros_like(weight), np.uint8)
 
 
-def _small_objects(grey: FloatArray, model: _BackgroundModel) -> NDArray[np.uint8]:
+def _small_objects(grey: FloatArray, model: _Model) -> NDArray[np.uint8]:
     """Mark pixels clearly beyond the range of the scene nearby, and those beside them that are slightly beyond it."""
     assert model.excess is not None
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMALL_WINDOW)
@@ -332,9 +330,7 @@ def _faded(mask: NDArray[np.uint8], around: int, fade: float) -> FloatArray:
     return np.maximum(cv2.GaussianBlur(wide, (0, 0), fade) * wide, mask.astype(np.float32))
 
 
-def _average_background(
-    source: FrameSource, model: _BackgroundModel, placement: Placement
-) -> tuple[Background, float, float]:
+def _average_background(source: FrameSource, model: _Model, placement: Placement) -> tuple[Background, float, float]:
     """Average the frames where they show the background.
 
     Returns the shares of the frames, and of the scene at some time, that moving objects cover as well.

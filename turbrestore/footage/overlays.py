@@ -51,11 +51,11 @@ _STATIC, _DEVIATIONS, _LEAST_BENDING = 1 / 3, 8.0, 0.3
 _STILL, _LEAST_STILL = 2.5, 1 / 255
 # Directions of edges whose motion is measured apart.
 _DIRECTIONS = 8
-# Deviation of what has no noise, in units of the noise, and how dark a stop is between black and the scene.
+# Largest deviation of pixels without noise, in units of the noise, and level of a dark stop, from black to the scene.
 _CONSTANT, _DARK = 0.5, 0.25
 # Fewest static edge pixels of an overlay, as a share of the frame, and the largest part of a frame that it may cover.
 _LEAST_EDGES, _LARGEST = 0.0005, 0.7
-# Share of the frame that no frame shows from which it is reported.
+# Least share of the scene, shown by no frame, that the decision states.
 _REPORTED = 0.002
 # Pixels around an overlay that are replaced too, reach of the fill under which shifts are measured, and the share of a
 # reduced pixel beside an overlay that has to show the scene.
@@ -66,18 +66,18 @@ _NEAR, _GAP, _FADE = 4, 2, 0.7
 # An edge is drawn over the scene if its deviation is below that of the noise by this factor, or its motion below that
 # of the edges of the scene by this one.
 _NOISELESS, _DRAWN = 0.7, 1 / 8
-# Strokes of a clock: least change of a pixel, in units of the noise and in intensity, that is one; least share of the
-# frames that have an edge there, and of these in which it stays; fewest pixels that belong together.
+# Strokes of a clock: largest change of a pixel that stays, in units of the noise and in intensity; least share of the
+# frames that have an edge there, and of these in which it stays; fewest connected pixels.
 _SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5 / 255, 0.2, 0.25, 12
 # Fewest frames in which it stays, and the share that 10 % of the edges exceed in a scene that moves by a pixel.
 _TIMES, _USUAL, _ALMOST_USUAL = 2, 0.15, 1.5
 # Largest part of the frame that digits take.
 _MOST_DIGITS = 0.1
-# Pixels beside others in which fewer frames need to have it.
+# Distance from other strokes, pixels, within which a stroke may stay in fewer frames, and the least share of them.
 _BESIDE, _REMAINS_BESIDE = 8, 0.18
-# Largest distance of digits from an overlay, as a part of the height of the frame.
+# Largest distance of digits from an overlay: the height of the frame over this.
 _LINE = 10
-# Most frames in which they are looked for.
+# Most frames in which strokes are looked for.
 _LOOKED_AT = 60
 
 
@@ -276,7 +276,7 @@ def _motion(variation: FloatArray, slopes: tuple[FloatArray, FloatArray], clear:
 
 
 def _regions(grown: NDArray[Any], marks: NDArray[np.bool_], fewest: int = 1) -> NDArray[np.bool_]:
-    """Keep the connected regions that have marks."""
+    """Keep the connected regions that have enough marks."""
     _, labels = cv2.connectedComponents(grown.astype(np.uint8), connectivity=8)
     counts = np.bincount(labels[marks], minlength=int(labels.max()) + 1)
     counts[0] = 0

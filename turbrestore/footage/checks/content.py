@@ -189,7 +189,7 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
 
 
 def _of_file(backdrop: Backdrop, source: FrameSource) -> Backdrop:
-    """Place what belongs to the selected rows and columns among all of the file."""
+    """Bring a backdrop of the selected rows and columns to the size of the frames in the file."""
     values = np.zeros(source.file_shape[1:], np.float32)
     unseen = np.zeros(source.file_shape[1:3], bool)
     values[source.window], unseen[source.window] = backdrop.values, backdrop.unseen

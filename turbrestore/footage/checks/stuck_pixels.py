@@ -21,6 +21,7 @@ _FEWEST_FRAMES = 10
 _DENSE_FRAMES = 8
 # A lone pixel exceeds its highest neighbour by this share of its distance from the median of all neighbours.
 _ALONE = 0.8
+# Largest change of a stuck pixel, least mean change of its neighbours, and still neighbours that make it a letter.
 _STILL, _MOVING, _OF_LETTER = 1.5 / 255, 8 / 255, 1
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _AROUND = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])

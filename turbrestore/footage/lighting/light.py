@@ -31,8 +31,8 @@ _SIDE = 96
 _BLUR, _LEAST_BLUR = 4.0, 1.5
 # Cosines along the rows: bands as narrow as an eighth of the frame are followed.
 _COSINES = 16
-# Change of a frame by its gain, or by bands, relative to the contrast of the scene, from which light changes.  Steady
-# simulated and real clips reach 0.01, and 0.03 along the rows where somebody walks through.
+# Least change by the gain of a frame, and by bands, relative to the contrast of the scene, that is corrected.  Clips
+# under steady light, simulated and real, reach 0.01, and 0.03 along the rows where somebody walks through.
 _LEAST_CHANGE, _LEAST_BANDS = 0.025, 0.06
 # Share of these below which no model is fitted, as means over a frame include moving objects.
 _CLEARLY = 0.7
@@ -42,7 +42,7 @@ _SATURATED = 0.995
 # Weight of a cosine of order j against its square, relative to the information of the frame.
 _SMOOTHNESS = 1e-4
 _ROUNDS = 4
-# Frames that tell whether there are bands.
+# Frames of the sample in which bands are looked for.
 _SOME = 24
 # Rows at which gains are compared, the percentage of frames beyond the range that they wander in, and the least gain.
 _NODES, _FEW, _LEAST_GAIN = 64, 5, 0.05
@@ -93,7 +93,7 @@ def _measure_light(survey: Survey, frames: FloatArray) -> tuple[Light | None, tu
     if reference is None:
         return None, ()
     anchor = prepare_shift_reference(_at_unit_contrast(np.nan_to_num(reference)))
-    # Bands are in all frames or in none, so that some of them tell.
+    # Bands are in all frames or in none, so a sample shows them.
     some = frames[:: max(len(frames) // _SOME, 1)] if as_a_whole else frames
     light = _chosen([_fit_frame(frame, reference, anchor) for frame in some])
     if light is not None and len(some) < len(frames):

@@ -29,12 +29,12 @@ from ...registration.camera.global_shift import known_shifts
 _REACH, _REACH_BLURS = 0.045, 2.0
 # Fewest frames of which a median says anything.
 _FEWEST = 8
-# Deviation over time of the logarithm of g, the largest of nine tenths of the frame, from which light changes in place,
-# and the share of the squared residual that g has to explain.
+# Least deviation over time of the logarithm of g that is corrected, its percentile over the frame, and the share of the
+# squared residual that g has to explain.
 # Behind moving air, with walkers, snow, rain or noise, g explains up to six tenths of it.
 _LEAST_CHANGE, _MOST_OF, _EXPLAINED = 0.03, 90, 0.8
 # Largest shift of a static camera, pixels of the reduced frames, root mean square.
-_STANDS = 1.0
+_STATIC = 1.0
 # Gains are limited to this factor; what is added to r, as a share of its bright parts: dark ones count less.
 _LARGEST, _DARK, _BRIGHT = 3.0, 0.03, 95
 _ROUNDS = 3
@@ -83,7 +83,7 @@ def measure_shade(
     if change < _LEAST_CHANGE or explained[1] > (1 - _EXPLAINED) * explained[0]:
         return None, ()
     shifts = known_shifts(frames / max(float(frames.std()), 1e-6))[0]
-    if float(np.square(shifts - shifts.mean(axis=0)).sum(axis=1).mean()) > _STANDS**2:
+    if float(np.square(shifts - shifts.mean(axis=0)).sum(axis=1).mean()) > _STATIC**2:
         return None, ()
     gains = np.exp(logarithms).astype(np.float16)
     low, high = (float(value) for value in np.percentile(gains, (1, 99)))

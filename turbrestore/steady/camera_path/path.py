@@ -39,7 +39,7 @@ LONGEST = 48
 _FITS = (6, 2), (6, 1), (12, 1), (24, 1), (LONGEST, 1), (LONGEST, 0)
 _FEWEST = 4
 # κ, less for a static camera, since that is the assumption that a slow pan breaks.
-_DOUBT, _STANDING = 2.0, 1.5
+_DOUBT, _RESTING = 2.0, 1.5
 _AT_ENDS = 0.5
 # Frames from one to the next whose residuals are compared, and the greatest correlation ρ that they count for.
 _SUCCESSIVE, _MOST_ALIKE = 2, 0.95
@@ -89,7 +89,7 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
         share *= 1 / (1 + (size / max(tolerance, _LEAST)) ** 8)
         if before is not None:
             differs = camera_size((value - before).reshape(2, 3), shape)
-            share *= 1 / (1 + (differs / max((_DOUBT if order else _STANDING) * doubt, _LEAST)) ** 4)
+            share *= 1 / (1 + (differs / max((_DOUBT if order else _RESTING) * doubt, _LEAST)) ** 4)
         smooth = smooth + share * (value - smooth)
         doubt = size * spread * _alikeness(times[near], left)
     return smooth.reshape(2, 3)
